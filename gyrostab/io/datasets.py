@@ -177,15 +177,22 @@ def _make_filters(compression: str | None) -> dict[str, Any]:
     if compression not in (None, "zstd", "zlib"):
         raise OptionError(f"compression={compression!r}: give 'zstd' or 'zlib'")
     if compression == "zstd":
-        with netCDF4.Dataset("probe", "w", diskless=True, persist=False) as probe:
-            if probe.has_zstd_filter():
-                return {"compression": "zstd", "complevel": 3, "fletcher32": True}
+        if _has_zstd():
+            return {"compression": "zstd", "complevel": 3, "fletcher32": True}
         warnings.warn(
             f"netCDF library {netCDF4.__netcdf4libversion__} has no zstd here: "
             "the log is compressed with zlib",
             stacklevel=3,
         )
     return {"zlib": True, "complevel": 4, "shuffle": True}
+
+
+def _has_zstd() -> bool:
+    """Whether the NetCDF library can compress with zstd."""
+    import netCDF4
+
+    with netCDF4.Dataset("probe", "w", diskless=True, persist=False) as probe:
+        return bool(probe.has_zstd_filter())
 
 
 def to_zarr(

@@ -12,6 +12,7 @@ import gyrostab
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion, remove_known_motion
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.task import Task, lines_without_motion
 from gyrostab.progress import no_stage
 from gyrostab.simulate import simulate
@@ -83,7 +84,7 @@ def test_a_telegraph_leaves_no_line_against_its_own_model():
 
 def test_a_part_of_moving_blocks_has_no_lines(jumped):
     """The log is read again for its lines, without the blocks that are left out."""
-    task = Task(jumped, None, None, 5.0, 0, 100, 0.01, no_stage)
+    task = Task(jumped, None, None, 5.0, 0, 100, 0.01, no_stage, Settings())
     blocks = reduce_log(jumped)
     baseline = calibrate_noise(blocks)
     course = np.zeros((1, blocks.sizes["block"]))
