@@ -238,7 +238,9 @@ def _find_hdf_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterat
         raise FormatError(f"{path.name}: {what}; it may be cut off, copy it again") from error
     found: list[tuple[str, Any]] = []
 
-    def visit(name: str, item: Any) -> None:
+    def visit(name: str | bytes, item: Any) -> None:
+        if isinstance(name, bytes):  # h5py leaves a name that is not UTF-8 as it is
+            name = name.decode("utf-8", "backslashreplace")
         text = item.attrs.get("MATLAB_class", b"double")
         kind = text.decode() if isinstance(text, bytes) else str(text)
         if "MATLAB_object_decode" in item.attrs and not name.startswith("#"):
