@@ -129,7 +129,7 @@ def diagnose(
 def _run_steps(task: Task, block: Any) -> Diagnosis:
     """Run the seven steps in their order; each reason to compare again occurs at most once."""
     started = time.perf_counter()
-    task, blocks = _reduce(task, block)
+    task, blocks = _reduce_recording(task, block)
     comparison = _compare(task, *_calibrate(task, blocks))
     for revise in (_leave_out_motion, _take_out_fast_switching):
         revised = revise(task, comparison)
@@ -139,7 +139,7 @@ def _run_steps(task: Task, block: Any) -> Diagnosis:
     return finish_diagnosis(task, comparison, started)
 
 
-def _reduce(task: Task, block: Any) -> tuple[Task, xr.Dataset]:
+def _reduce_recording(task: Task, block: Any) -> tuple[Task, xr.Dataset]:
     """Step 1: reduce the axes that vary to block statistics."""
     aligned = align_channels(task.log)
     for note in aligned.notes:

@@ -17,7 +17,7 @@ __all__ = ["DEFAULTS", "INTERVAL_TAILS", "Settings"]
 INTERVAL_TAILS = (0.025, 0.975)
 
 
-def _number(value: float, unit: str, meaning: str, source: str) -> Any:
+def _setting(value: float, unit: str, meaning: str, source: str) -> Any:
     """Declare a setting."""
     return field(default=value, metadata={"unit": unit, "meaning": meaning, "source": source})
 
@@ -41,13 +41,13 @@ class Settings:
     (4.6, 6.0)
     """
 
-    component_nats: float = _number(
+    component_nats: float = _setting(
         2.0,
         "nat",
         "Evidence that an axis must add to be named with the others.",
         "choice: odds of 7 to 1 (ln 7.4 = 2.0)",
     )
-    ambiguous_nats: float = _number(
+    ambiguous_nats: float = _setting(
         3.0,
         "nat",
         "Difference of evidence within which two effects are alternatives, and by which another "
@@ -55,39 +55,39 @@ class Settings:
         "odds of 20 to 1, ln 20 = 3.0 (strong evidence: Kass and Raftery, 1995, "
         "doi:10.1080/01621459.1995.10476572)",
     )
-    reject_nats: float = _number(
+    reject_nats: float = _setting(
         6.0,
         "nat",
         "Evidence that rejects the simpler of two forms: one term in place of two, one filter for "
         "all axes.",
         "odds of 400 to 1 (ln 400 = 6.0), the square of the odds of `ambiguous_nats`",
     )
-    disagreement_nats: float = _number(
+    disagreement_nats: float = _setting(
         8.0,
         "nat",
         "Half of the chi-square by which the eighths of a record may differ, or spectrum and means "
         "about B and K.",
         "chi-square of 16: P = 0.025 with 7 and 0.0003 with 2 degrees of freedom",
     )
-    form_error_share: float = _number(
+    form_error_share: float = _setting(
         0.01,
         "1",
         "Share of the evidence of an effect that an error of its form may leave to others.",
         "choice: square of a size error of 10 %, as evidence grows with the square of the size",
     )
-    spectrum_error_share: float = _number(
+    spectrum_error_share: float = _setting(
         0.1,
         "1",
         "Share of the evidence that an error of the spectrum, or of the course in time, may leave.",
         "choice: square of a size error of 32 %; 0.08 occurs in simulated strong vibration",
     )
-    size_error_share: float = _number(
+    size_error_share: float = _setting(
         0.04,
         "1",
         "Error of the form of an effect as a share of its size, added to its standard error.",
         "coverage of the intervals with wrong forms: docs/diagnosis.md, benchmarks/intervals.py",
     )
-    clear_sigma: float = _number(
+    clear_sigma: float = _setting(
         3.0,
         "standard error",
         "Distance from its allowed range at which a size is impossible, from the earlier level at "
@@ -95,103 +95,103 @@ class Settings:
         "the mismatch next to it.",
         "two-sided P = 0.0027 for a normal error",
     )
-    visible_sigma: float = _number(
+    visible_sigma: float = _setting(
         2.0,
         "standard error",
         "Size of a harmonic of the rotation below which it is dropped, and score of a short window "
         "that belongs to a mismatch of a long one.",
         "two-sided P = 0.046 for a normal error",
     )
-    min_switches: float = _number(
+    min_switches: float = _setting(
         5.0,
         "switch",
         "Expected switches below which a bias has no two levels.",
         "choice: one or two switches are jumps",
     )
-    two_level_nats: float = _number(
+    two_level_nats: float = _setting(
         10.0,
         "nat",
         "Evidence by which two levels within blocks must exceed normal noise of any spectrum.",
         "choice: odds of 2e4 to 1, as the spectrum of normal noise is fitted by an autoregression",
     )
-    refuting_nats: float = _number(
+    refuting_nats: float = _setting(
         20.0,
         "nat",
         "Evidence of means within blocks, not those of two levels, that refutes a telegraph bias.",
         "choice: twice `two_level_nats`",
     )
-    surrogate_share: float = _number(
+    surrogate_share: float = _setting(
         0.01,
         "1",
         "Share of the time-shifted surrogates that may explain as much as the channel.",
         "the default false-alarm probability; two of the 200 surrogates",
     )
-    surrogate_correlation: float = _number(
+    surrogate_correlation: float = _setting(
         0.5,
         "1",
         "Correlation with the channel above which a time-shifted surrogate is not a control.",
         "choice: such a surrogate has 0.25 of the evidence of the channel, the correlation squared",
     )
-    term_correlation: float = _number(
+    term_correlation: float = _setting(
         0.999,
         "1",
         "Correlation of the errors of two terms above which the data do not separate them.",
         "standard errors grow by 1 / sqrt(1 - r^2) = 22 over those of one term",
     )
-    level_correlation: float = _number(
+    level_correlation: float = _setting(
         0.97,
         "1",
         "Correlation of g and g^2 above which the vibration has one level.",
         "that of values uniform over one octave and more: 0.97 for g from 0 to 1, where "
         "corr(g, g^2) = sqrt(15) / 4",
     )
-    moving_power_ratio: float = _number(
+    moving_power_ratio: float = _setting(
         1.5,
         "1",
         "Power over expected power, in any band, above which an axis moves.",
         "the mean over at least 24 blocks of a band exceeds 1.5 by chance with P = 0.01 "
         "(chi-square with 48 degrees of freedom)",
     )
-    min_comb_lines: int = _number(
+    min_comb_lines: int = _setting(
         3, "1", "Lines that may be one comb.", "two lines define a spacing; the third tests it"
     )
-    min_fringe_step: float = _number(
+    min_fringe_step: float = _setting(
         6e4,
         "degree hour-1",
         "Smallest step that may be a fringe hop.",
         "one fringe, lambda c / (L D), of 5 km of fibre on a coil of 30 cm at 1.55 um",
     )
-    min_rotation_share: float = _number(
+    min_rotation_share: float = _setting(
         1e-5,
         "1",
         "Share of the rotation that an axis must sense for real motion.",
         "choice: alignment of 10 urad (2 arcsec), beyond that of any mounting",
     )
-    max_misalignment_share: float = _number(
+    max_misalignment_share: float = _setting(
         0.02,
         "1",
         "Share of the rotation that an axis across it may sense; a larger one is along it.",
         "choice: sine of 1.1 degrees, a coarse mounting error",
     )
-    rest_sigma: float = _number(
+    rest_sigma: float = _setting(
         6.0,
         "standard deviation",
         "Distance from the level at rest within which the mean of a block is at rest.",
         "choice: P = 2e-9 for normal noise; means that wander scatter more",
     )
-    motion_sigma: float = _number(
+    motion_sigma: float = _setting(
         100.0,
         "standard deviation",
         "Distance from the level at rest that an unexplained motion must reach to be left out.",
         "choice: smaller motion is left to the effects; a rotation of the tool exceeds it by far",
     )
-    max_moving_share: float = _number(
+    max_moving_share: float = _setting(
         2.0 / 3.0,
         "1",
         "Largest share of the blocks that an axis may move.",
         "choice: the level at rest is that of the closest quarter of the means; a third is safe",
     )
-    min_rest_blocks: int = _number(
+    min_rest_blocks: int = _setting(
         12,
         "block",
         "Blocks at rest that determine level and scatter.",
@@ -199,139 +199,139 @@ class Settings:
     )
 
     # calibration of the noise
-    noisy_sigma: float = _number(
+    noisy_sigma: float = _setting(
         4.5,
         "standard deviation",
         "Excess of the noise level of a block above which it is not quiescent.",
         "one-sided P = 3.4e-6: 0.06 of 6000 blocks and three spans, the longest record",
     )
-    excess_sigma: float = _number(
+    excess_sigma: float = _setting(
         4.0,
         "standard deviation",
         "Excess above which the noise of the mean of a block is raised, and difference from the "
         "noise terms above which a band of a simulation has a separate form.",
         "one-sided P = 3.2e-5: 0.2 of 6000 blocks, and then by the excess itself",
     )
-    quiescent_share: float = _number(
+    quiescent_share: float = _setting(
         0.25,
         "1",
         "Share of the blocks that must be quiescent; below it the quietest are taken.",
         "choice: N from a quarter of a record is known twice as badly as from the whole",
     )
-    min_quiescent_blocks: int = _number(
+    min_quiescent_blocks: int = _setting(
         16,
         "block",
         "Quiescent blocks that must be found; below it the quietest are taken.",
         "choice: drift is known up to 16 blocks",
     )
-    after_restart_s: float = _number(
+    after_restart_s: float = _setting(
         900.0,
         "s",
         "Time after a restart that is not quiescent, at most a tenth of the record.",
         "choice: warm-up of a fibre-optic gyro without temperature control, some minutes",
     )
-    coherency_probability: float = _number(
+    coherency_probability: float = _setting(
         1e-4,
         "1",
         "Chance probability of the coherency of two axes of a simulation below which it is real.",
         "a hundredth of the default false-alarm probability, for three pairs",
     )
-    line_nats: float = _number(
+    line_nats: float = _setting(
         12.0,
         "nat",
         "Evidence of a line of a simulation above which it is known.",
         "odds of 1.6e5 to 1: more than the number of frequencies of a spectrum",
     )
     # thresholds from null records
-    tail_share: float = _number(
+    tail_share: float = _setting(
         0.25,
         "1",
         "Share of the null records, the largest, to which an exponential tail is fitted.",
         "a hundred of the 400 null records: the scale of the tail is known to 10 %",
     )
-    pooled_records: float = _number(
+    pooled_records: float = _setting(
         100.0,
         "null record",
         "Weight of the variance over windows of one length in the variance of a cell.",
         "choice: from as many records the own variance of a cell is known to sqrt(2 / n) = 14 %",
     )
     # regions of mismatches
-    window_sum_share: float = _number(
+    window_sum_share: float = _setting(
         0.8,
         "1",
         "Share of the score of a window that its short windows must reach to set its ends.",
         "choice: the share is 1 for a constant deviation; moves the ends of regions",
     )
-    whole_record_sigma: float = _number(
+    whole_record_sigma: float = _setting(
         0.7,
         "standard deviation",
         "Score by which a part of the record must exceed the whole to be the region.",
         "choice; moves the ends of regions",
     )
-    region_excess_share: float = _number(
+    region_excess_share: float = _setting(
         0.25,
         "1",
         "Share of the largest excess that the other averaging times of a region must have.",
         "choice: half of the largest deviation in amplitude; moves the averaging times of regions",
     )
-    common_time_share: float = _number(
+    common_time_share: float = _setting(
         0.5,
         "1",
         "Share of the time of two regions above which they are one.",
         "choice: the larger part",
     )
-    gap_time_share: float = _number(
+    gap_time_share: float = _setting(
         0.25,
         "1",
         "Gap between two regions that are one, as a share of the longer.",
         "choice; moves the ends of regions",
     )
-    line_width_share: float = _number(
+    line_width_share: float = _setting(
         0.02,
         "1",
         "Difference of two frequencies that are one line, as a share of the frequency.",
         "choice: slow changes of the speed of a pump or a tool",
     )
-    max_mean_regions: int = _number(
+    max_mean_regions: int = _setting(
         3,
         "region",
         "Regions of the mean of an axis beyond which its mean wanders.",
         "choice; one mismatch that wanders takes the place of many",
     )
     # attribution of mismatches to effects, and verdict
-    active_share: float = _number(
+    active_share: float = _setting(
         0.1,
         "1",
         "Share of the largest contribution of an effect above which it acts, and of its largest "
         "step above which it moves the rate within a block.",
         "choice: 1 % of the largest power",
     )
-    rest_share: float = _number(
+    rest_share: float = _setting(
         0.05,
         "1",
         "Share of the largest contribution below which an effect rests, and share of the blocks at "
         "rest that makes zero its level at rest.",
         "choice: half of `active_share`",
     )
-    overlap_share: float = _number(
+    overlap_share: float = _setting(
         0.3,
         "1",
         "Share of the shorter of effect and mismatch that must overlap for them to coincide.",
         "choice: the ends of a region are known to one of its short windows",
     )
-    score_error_share: float = _number(
+    score_error_share: float = _setting(
         0.3,
         "1",
         "Share of the score of a mismatch that an error of the form of its effect may leave.",
         "root of `spectrum_error_share`: evidence is the square of a score",
     )
-    needed_share: float = _number(
+    needed_share: float = _setting(
         0.5,
         "1",
         "Share of an equal contribution from which an effect is needed to explain a mismatch.",
         "choice: with two effects, a quarter of what they explain together",
     )
-    coverage_tolerance: float = _number(
+    coverage_tolerance: float = _setting(
         0.013,
         "1",
         "Fall of the share of cells within their 95 % band that counts as worse.",

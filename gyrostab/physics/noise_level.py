@@ -211,7 +211,7 @@ class _FollowsVibration(Effect):
         "1", "power of the vibration with which the noise grows", default=1.0, low=0.1, high=4.0
     )
 
-    def _growth(self, drivers: Mapping[str, Array]) -> Array:
+    def _raise_to_power(self, drivers: Mapping[str, Array]) -> Array:
         """Compute the vibration [g] to the power of the added variance."""
         return np.asarray(np.abs(drivers["vibration"]) ** (2.0 * self.exponent))
 
@@ -219,7 +219,7 @@ class _FollowsVibration(Effect):
         """List exponents."""
         return {"exponent": np.array([0.5, 1.0, 2.0])}
 
-    def _law(self, errors: Mapping[str, float] | None) -> str:
+    def _describe_law(self, errors: Mapping[str, float] | None) -> str:
         """Describe how the sizes add up and grow."""
         if self.exponent == 1.0:
             return "added in squares"
@@ -281,7 +281,7 @@ class VibrationNoise(_FollowsVibration):
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
         """Compute squared N and Q for every sample."""
-        excited = self._growth(chunk.drivers)
+        excited = self._raise_to_power(chunk.drivers)
         return {
             "N": chunk.level["N"] + self.white**2 * excited,
             "Q": chunk.level["Q"] + self.quantization**2 * excited,
@@ -289,7 +289,7 @@ class VibrationNoise(_FollowsVibration):
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict the added spectra of independent noise on each axis."""
-        excited = self._growth(windows.drivers)[:, None]
+        excited = self._raise_to_power(windows.drivers)[:, None]
         return Prediction(
             spectrum={
                 name: excited * sampled_psd(symbol, windows.frequency, windows.rate)
@@ -306,7 +306,7 @@ class VibrationNoise(_FollowsVibration):
             if getattr(self, name)
         ]
         size = " and ".join(terms) or "nothing"
-        return f"Vibration raises the noise {self.on_axes()}: {size}, {self._law(errors)}."
+        return f"Vibration raises the noise {self.on_axes()}: {size}, {self._describe_law(errors)}."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -350,11 +350,13 @@ class VibrationRandomWalk(_FollowsVibration):
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
         """Compute squared K for every sample."""
-        return {"K": chunk.level["K"] + self.sensitivity**2 * self._growth(chunk.drivers)}, state
+        return {
+            "K": chunk.level["K"] + self.sensitivity**2 * self._raise_to_power(chunk.drivers)
+        }, state
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict the added spectrum of a random walk averaged over each sample."""
-        excited = self._growth(windows.drivers)[:, None]
+        excited = self._raise_to_power(windows.drivers)[:, None]
         walk = sampled_psd("K", windows.frequency, windows.rate)
         return Prediction(
             spectrum={"sensitivity": excited * walk},
@@ -363,5 +365,5 @@ class VibrationRandomWalk(_FollowsVibration):
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Describe the effect in one sentence."""
-        size = f"{self.quantity('sensitivity', errors)} of K"
-        return f"Vibration adds rate random walk {self.on_axes()}: {size}, {self._law(errors)}."
+        size = f"{self.quantity('sensitivity', errors)} of K, {self._describe_law(errors)}"
+        return f"Vibration adds rate random walk {self.on_axes()}: {size}."
