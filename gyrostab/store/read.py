@@ -22,6 +22,7 @@ from gyrostab.errors import FormatError, reading_of
 from gyrostab.kernels.encoding.counts import from_counts
 from gyrostab.store.cf import decode_stamps, index_dim, parse_time_grids
 from gyrostab.store.chunk_cache import ChunkCache
+from gyrostab.store.hdf5_heaps import check_global_heaps
 from gyrostab.store.layout import ChunkDamage, is_readable, read_chunk
 from gyrostab.store.lazy import FileVariable, RowSource, make_dask
 from gyrostab.store.private import close_function
@@ -59,6 +60,8 @@ def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
 def _open_dataset(path: Path, *, strict: bool) -> xr.Dataset:
     engine: Any = "zarr" if path.is_dir() else "netcdf4"
     name = "Zarr" if path.is_dir() else "NetCDF"
+    if path.is_file():
+        check_global_heaps(path)
     try:
         stored = xr.open_dataset(
             path, engine=engine, chunks=None, decode_times=False, create_default_indexes=False

@@ -30,6 +30,7 @@ from gyrostab.ingest.formats.matlab5 import check_structure
 from gyrostab.ingest.formats.packing import ATTRIBUTES, fold_packing, text_attributes
 from gyrostab.ingest.limits import check_chunk, check_stored
 from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.store.hdf5_heaps import check_global_heaps
 from gyrostab.store.rows import LibraryRows, Rows, hdf5_rows
 
 __all__ = ["matches", "read", "scan"]
@@ -231,6 +232,7 @@ def _to_text(value: Any) -> str:
 def _find_hdf_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[tuple[str, Any]]:
     import h5py
 
+    check_global_heaps(path)
     try:
         file = stack.enter_context(h5py.File(path, "r"))
     except OSError as error:

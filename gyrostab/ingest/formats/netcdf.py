@@ -37,6 +37,7 @@ from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
 from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name
 from gyrostab.store.cf import from_disk
+from gyrostab.store.hdf5_heaps import check_global_heaps
 from gyrostab.store.layout import read_attribute
 from gyrostab.store.read import open_stored
 from gyrostab.store.rows import LibraryRows, Rows
@@ -106,6 +107,7 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
     """Open a regular log, of gyrostab or with a stamp for each sample; None for other files."""
     if path.is_file():
         read_classic_header(path)  # before the library allocates what a damaged header asks for
+        check_global_heaps(path)
     content = _content_kind(path)
     if content == "log":
         return _open_own(path, options)
