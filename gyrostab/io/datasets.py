@@ -21,7 +21,7 @@ import xarray as xr
 from gyrostab.errors import FormatError, OptionError, SchemaError, TimeError, reading_of
 from gyrostab.ingest.convert import as_log
 from gyrostab.schema import SIGNAL_UNITS, check_log, check_product, check_surface
-from gyrostab.store.cf import from_disk, index_dim, to_disk
+from gyrostab.store.cf import GRID, from_disk, index_dim, to_disk
 from gyrostab.store.netcdf_compression import append_compressed, large_variables
 from gyrostab.store.output import find_foreign_item, find_sources, new_output
 from gyrostab.store.private import library_lock
@@ -40,6 +40,8 @@ __all__ = ["open_dataset", "open_log", "open_product", "open_surface", "to_netcd
 
 #: Values in one compressed chunk of a surface or product: 1 MiB of float64.
 CHUNK_VALUES = 2**17
+#: Samples from which a log is stored without the time of each sample by default.
+MAX_STAMPED_SAMPLES = 10**7
 
 
 def to_netcdf(
@@ -48,6 +50,7 @@ def to_netcdf(
     *,
     overwrite: bool = False,
     compression: str | None = None,
+    stamps: bool | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Write a product, a DAVAR surface or a log as one flat CF NetCDF file.
@@ -68,6 +71,9 @@ def to_netcdf(
     compression : {"zstd", "zlib"}, optional
         zlib is read by every NetCDF program and is the default; zstd is two to four times as fast,
         and Octave, MATLAB and h5netcdf do not read it.
+    stamps : bool, optional
+        Store the time of every sample of a log as a CF coordinate, for programs other than
+        gyrostab; by default in logs of less than 10 000 000 samples.
     progress : callable, optional
         Called with the share of the long variables that is written.
 
@@ -100,7 +106,7 @@ def to_netcdf(
     """
     dataset = _compute_time_axes(dataset)
     sources = find_sources(dataset)
-    stored = to_disk(dataset, "to_netcdf")
+    stored = to_disk(dataset, "to_netcdf", stamps=_wants_stamps(dataset, stamps))
     filters = _make_filters(compression)
 
     def write(packed: xr.Dataset) -> None:
@@ -132,6 +138,11 @@ def _compute_time_axes(dataset: Any) -> xr.Dataset:
         ):
             return as_log(dataset)
     return dataset
+
+
+def _wants_stamps(dataset: xr.Dataset, stamps: bool | None) -> bool:
+    """Whether the computed times of a log are stored."""
+    return dataset.sizes.get("time", 0) < MAX_STAMPED_SAMPLES if stamps is None else stamps
 
 
 def _begin_netcdf(rest: xr.Dataset, path: Path, encoding: dict[Any, dict[str, Any]]) -> None:
@@ -200,6 +211,7 @@ def to_zarr(
     path: str | os.PathLike[str],
     *,
     overwrite: bool = False,
+    stamps: bool | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Write a product, a DAVAR surface or a log as a Zarr store (a directory, format 2).
@@ -215,6 +227,9 @@ def to_zarr(
     overwrite : bool
         Replace an existing store, unless other files are in it, or the dataset is lazy and still
         reads from it.
+    stamps : bool, optional
+        Store the time of every sample of a log as a CF coordinate, for programs other than
+        gyrostab; by default in logs of less than 10 000 000 samples.
     progress : callable, optional
         Called with the share of the long variables that is written.
 
@@ -241,7 +256,7 @@ def to_zarr(
     """
     dataset = _compute_time_axes(dataset)
     sources = find_sources(dataset)
-    stored = to_disk(dataset, "to_zarr")
+    stored = to_disk(dataset, "to_zarr", stamps=_wants_stamps(dataset, stamps))
 
     def write(packed: xr.Dataset) -> None:
         long = long_variables(packed) if _find_rate(packed) is not None else {}
@@ -285,7 +300,9 @@ def _zarr_encoding(stored: xr.Dataset) -> dict[Any, dict[str, Any]]:
             encoding[name]["_FillValue"] = variable.dtype.type(np.nan)
         if variable.ndim and variable.size:
             encoding[name]["chunks"] = _plan_chunks(variable, _find_rate(stored))
-            if _find_rate(stored) is not None and variable.dtype.kind in "if":
+            if _has_rule(variable):  # from which they are restored: a checksum is not needed
+                encoding[name]["compressors"] = Blosc("zlib", clevel=4, shuffle=Blosc.SHUFFLE)
+            elif _find_rate(stored) is not None and variable.dtype.kind in "if":
                 encoding[name] |= {
                     "compressors": Blosc("lz4", clevel=5, shuffle=Blosc.SHUFFLE),
                     "filters": [Fletcher32()],
@@ -325,6 +342,11 @@ def _find_rate(stored: xr.Dataset) -> float | None:
     )
 
 
+def _has_rule(variable: xr.Variable) -> bool:
+    """Whether a variable holds the stamps of a computed time axis."""
+    return GRID in variable.attrs and variable.ndim == 1
+
+
 def _is_data(dataset: xr.Dataset, name: Any) -> bool:
     """Whether a variable is data, not a coordinate or its bounds."""
     bounds = {variable.attrs.get("bounds") for variable in dataset.variables.values()}
@@ -344,7 +366,8 @@ def _plan_chunks(variable: xr.Variable, rate: float | None) -> tuple[int, ...]:
     )
     most = max(1, CHUNK_VALUES // max(1, inner))
     if rate is not None:
-        most = chunk_samples(rate if variable.dims[-1] in ("time", index_dim("time")) else 0.0)
+        on_time = variable.dims[-1] in ("time", index_dim("time")) and not _has_rule(variable)
+        most = chunk_samples(rate if on_time else 0.0)  # a few stamps are read on opening
     last = max(1, min(variable.shape[-1], most))
     return tuple(
         last if dim == variable.dims[-1] else 1 if dim in ("axis", "term") else size

@@ -388,7 +388,7 @@ def _compute_missing(
             map(_is_own_log, job.files)
         ):  # some may be damaged; the two kinds do not mix
             stage("storing", 0)
-            to_zarr(log, store)
+            to_zarr(log, store, stamps=False)
             write_store_checksum(job.folder)
         if store.exists():
             source = {"paths": _make_absolute([store])}

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, SchemaError
 from gyrostab.schema import check_log, check_product, check_surface, texts
-from gyrostab.store.lazy import transpose_lazy
+from gyrostab.store.lazy import RowSource, make_dask, transpose_lazy
 from gyrostab.store.private import close_function, is_in_memory
 from gyrostab.store.safe_names import (
     is_storable,
@@ -32,10 +32,19 @@ from gyrostab.store.safe_names import (
     restore_names,
 )
 from gyrostab.time.clock import time_of_day
-from gyrostab.time.grid import TimeGridIndex, grid_times, time_coordinate
+from gyrostab.time.grid import TimeGridIndex, grid_times, period_ns, time_coordinate
 from gyrostab.units import ON_DISK, on_disk
 
-__all__ = ["PACKING", "decode_stamps", "from_disk", "index_dim", "parse_time_grids", "to_disk"]
+__all__ = [
+    "GRID",
+    "PACKING",
+    "decode_stamps",
+    "from_disk",
+    "index_dim",
+    "parse_time_grids",
+    "replace_stamps",
+    "to_disk",
+]
 
 CONVENTIONS = "CF-1.11, ACDD-1.3"
 TITLES = {
@@ -49,6 +58,8 @@ TITLES = {
 _ORDER = ("axis", "term", "tau")
 #: Attribute with the rule of a computed time axis, on the variable that holds its first stamp.
 GRID = "sampling_grid"
+#: Stamps that are computed together.
+_STAMPS_CHUNK = 2**20
 _EPOCH = "1970-01-01T00:00:00"
 _CALENDAR = {"calendar": "proleptic_gregorian", "units_metadata": "leap_seconds: none"}
 #: What the encoding of integer counts consists of, where a reader declares them.
@@ -74,12 +85,15 @@ def _find_kind(dataset: xr.Dataset) -> str:
     return "dataset"
 
 
-def to_disk(dataset: xr.Dataset, verb: str) -> xr.Dataset:
-    """Encode a dataset as the file will hold it; `verb` is added to its history."""
+def to_disk(dataset: xr.Dataset, verb: str, *, stamps: bool = False) -> xr.Dataset:
+    """Encode a dataset as the file will hold it; `verb` is added to its history.
+
+    With `stamps`, a computed time axis becomes a lazy coordinate, with its rule as an attribute.
+    """
     kind = _find_kind(dataset)
     dataset = make_names_storable(dataset)
     grids = _find_time_grids(dataset)
-    divisor = 1000 if _has_whole_microseconds(dataset, grids) else 1
+    divisor = 1000 if _has_whole_microseconds(dataset, grids, stamps=stamps) else 1
     since = {
         "units": f"{'microseconds' if divisor == 1000 else 'nanoseconds'} since {_EPOCH}",
         **_CALENDAR,
@@ -92,7 +106,8 @@ def to_disk(dataset: xr.Dataset, verb: str) -> xr.Dataset:
     variables: dict[Any, xr.Variable] = {}
     for name, variable in dataset.variables.items():
         if name in grids:
-            variables[f"{name}_start"] = _encode_first_stamp(
+            encode = _encode_all_stamps if stamps else _encode_first_stamp
+            variables[name if stamps else f"{name}_start"] = encode(
                 grids[name], variable.attrs, divisor, since
             )
             continue
@@ -123,9 +138,10 @@ def to_disk(dataset: xr.Dataset, verb: str) -> xr.Dataset:
         if name not in bounds and name in variables
     }
     stored_set = xr.Dataset(variables, coords=xr.Coordinates(coords, indexes={}))
-    stored_set = stored_set.rename_dims(
-        {dim: index_dim(dim) for dim in grids if dim in stored_set.dims}
-    )
+    if not stamps:
+        stored_set = stored_set.rename_dims(
+            {dim: index_dim(dim) for dim in grids if dim in stored_set.dims}
+        )
     if "avar" in variables:
         ancillary = [
             name for name in ("count", "coverage", "edf", "estimator") if name in variables
@@ -180,6 +196,32 @@ def _encode_first_stamp(
 ) -> xr.Variable:
     """Encode a computed time axis: its first stamp, with rate and exact rule as attributes."""
     (dim,) = grid.dims
+    first = int(grid_times(grid.start, grid.rate, grid.first))
+    attributes = {
+        "long_name": f"time of the first sample on the dimension {index_dim(dim)}",
+        "comment": "sample n (from 0) is at this time + n / sampling_rate_hz; "
+        f"{GRID} is the exact rule: "
+        "start_ns + round((first + stride * n) * 1e9 / rate_hz) nanoseconds since 1970",
+        "sampling_rate_hz": grid.rate / grid.stride,
+    }
+    return xr.Variable(
+        (), np.int64(first // divisor), {**attributes, **_encode_rule(grid, attrs), **since}
+    )
+
+
+def _encode_all_stamps(
+    grid: Any, attrs: dict[Any, Any], divisor: int, since: dict[str, Any]
+) -> xr.Variable:
+    """Encode a computed time axis as a lazy CF coordinate, with its exact rule as an attribute."""
+    (dim,) = grid.dims
+    attributes = {"long_name": "time", "standard_name": "time"}
+    attributes |= {"axis": "T"} if dim == "time" else {}
+    stamps = make_dask(_GridStamps(grid, divisor), min(max(grid.size, 1), _STAMPS_CHUNK))
+    return xr.Variable((dim,), stamps, {**attributes, **_encode_rule(grid, attrs), **since})
+
+
+def _encode_rule(grid: Any, attrs: dict[Any, Any]) -> dict[str, str]:
+    (dim,) = grid.dims
     rule = {
         "dim": dim,
         "start_ns": grid.start,
@@ -188,24 +230,37 @@ def _encode_first_stamp(
         "stride": grid.stride,
         "size": grid.size,
     }
-    first = int(grid_times(grid.start, grid.rate, grid.first))
-    attributes = {
-        "long_name": f"time of the first sample on the dimension {index_dim(dim)}",
-        "comment": "sample n (from 0) is at this time + n / sampling_rate_hz; "
-        f"{GRID} is the exact rule: "
-        "start_ns + round((first + stride * n) * 1e9 / rate_hz) nanoseconds since 1970",
-        "sampling_rate_hz": grid.rate / grid.stride,
+    return {
         GRID: json.dumps(rule),
         **({"axis_attributes": json.dumps(dict(attrs), default=str)} if attrs else {}),
     }
-    return xr.Variable((), np.int64(first // divisor), {**attributes, **since})
 
 
-def _has_whole_microseconds(dataset: xr.Dataset, grids: dict[Any, Any]) -> bool:
+class _GridStamps(RowSource):
+    """Stamps of a computed time axis, in whole units of `divisor` nanoseconds since 1970."""
+
+    def __init__(self, grid: Any, divisor: int):
+        self.grid, self.divisor = grid, divisor
+        self.shape, self.dtype = (grid.size,), np.dtype(np.int64)
+
+    def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
+        """Compute the stamps of the samples from `begin` on."""
+        grid = self.grid
+        samples = grid.first + grid.stride * np.arange(begin, begin + out.size)
+        np.floor_divide(grid_times(grid.start, grid.rate, samples), self.divisor, out=out)
+
+
+def _has_whole_microseconds(
+    dataset: xr.Dataset, grids: dict[Any, Any], *, stamps: bool = False
+) -> bool:
     """Whether microseconds represent every time exactly; fewer programs read nanoseconds."""
     for name, variable in dataset.variables.items():
         if name in grids:
-            if int(grid_times(grids[name].start, grids[name].rate, grids[name].first)) % 1000:
+            grid = grids[name]
+            whole, fraction = period_ns(grid.rate)
+            if int(grid_times(grid.start, grid.rate, grid.first)) % 1000 or (
+                stamps and (fraction or whole * grid.stride % 1000)
+            ):
                 return False
         elif variable.dtype.kind == "M" and np.any(_as_nanoseconds(variable.values) % 1000):
             return False
@@ -380,6 +435,41 @@ def decode_stamps(variable: xr.Variable, attrs: dict[Any, Any] | None = None) ->
     return decoded.astype("datetime64[ns]")
 
 
+def replace_stamps(stored: xr.Dataset, where: object) -> xr.Dataset:
+    """Replace stored stamps by the rule that they follow.
+
+    A rule that another program has left unchanged with other stamps is dropped: `stored` then has
+    an ordinary time coordinate.
+    """
+    for name, rule in parse_time_grids(stored, where).items():
+        stamps = stored.variables[name]
+        if not stamps.ndim:
+            continue
+        if _has_stamps_of(rule, stamps):
+            start = xr.Variable((), 0, stamps.attrs)
+            stored = stored.drop_vars(name).assign({f"{name}_start": start})
+        else:
+            rest = {key: value for key, value in stamps.attrs.items() if key != GRID}
+            changed = xr.Variable(stamps.dims, stamps.data, rest, stamps.encoding)
+            stored = stored.drop_vars(name).assign_coords(
+                xr.Coordinates({name: changed}, indexes={})
+            )
+    return stored
+
+
+def _has_stamps_of(rule: dict[str, Any], stamps: xr.Variable) -> bool:
+    """Whether stamps on disk agree in number and at both ends with a rule."""
+    if stamps.shape != (rule["size"],):
+        return False
+    ends = np.unique([0, max(rule["size"] - 1, 0)])[: rule["size"]]
+    samples = rule["first"] + rule["stride"] * ends
+    try:
+        found = _as_nanoseconds(decode_stamps(stamps[ends], stamps.attrs).values)
+    except Exception:  # damaged stamps, for which the libraries raise errors of many kinds
+        return True
+    return np.array_equal(found, grid_times(rule["start_ns"], rule["rate_hz"], samples))
+
+
 def parse_time_grids(stored: xr.Dataset, where: object) -> dict[str, dict[str, Any]]:
     """Parse the rules of the computed time axes that a file declares, by name of the variable."""
     declared = {
@@ -439,7 +529,7 @@ def _make_time_axes(
     axes = {}
     for name, rule in grids.items():
         dim = rule["dim"]
-        size = stored.sizes.get(index_dim(dim), 0)
+        size = stored.sizes.get(index_dim(dim), stored.sizes.get(dim, 0))
         if size != rule["size"]:
             raise FormatError(
                 f"{where}: has {size} samples on {index_dim(dim)!r}, but was written with "

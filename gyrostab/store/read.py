@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, reading_of
 from gyrostab.kernels.encoding.counts import from_counts
-from gyrostab.store.cf import decode_stamps, index_dim, parse_time_grids
+from gyrostab.store.cf import decode_stamps, index_dim, parse_time_grids, replace_stamps
 from gyrostab.store.chunk_cache import ChunkCache
 from gyrostab.store.hdf5_heaps import check_global_heaps
 from gyrostab.store.layout import ChunkDamage, is_readable, read_chunk
@@ -70,6 +70,9 @@ def _open_dataset(path: Path, *, strict: bool) -> xr.Dataset:
         raise FormatError(
             f"{path}: is not {name}, or is damaged or cut short ({error}); make or copy it again"
         ) from error
+    close = close_function(stored)
+    stored = replace_stamps(stored, path)
+    stored.set_close(close)
     is_log = stored.attrs.get("gyrostab_content") == "log"
     long = _find_long_variables(stored, path, strict=strict) if is_log else {}
     opened = _make_variables_lazy(stored, long, path, small=MIN_LAZY_VALUES if is_log else 0)
@@ -162,7 +165,11 @@ def _find_chunk_spans(
     stored: xr.Dataset, dim: str, length: int, path: Path
 ) -> dict[str, Any] | tuple[tuple[int, int], ...]:
     """Find the rule of a computed time axis, or the first and last stamp [ns] of each chunk."""
-    rules = {index_dim(rule["dim"]): rule for rule in parse_time_grids(stored, path).values()}
+    rules = {
+        name: rule
+        for rule in parse_time_grids(stored, path).values()
+        for name in (rule["dim"], index_dim(rule["dim"]))
+    }
     if dim in rules:
         return rules[dim]
     if dim not in stored.variables:

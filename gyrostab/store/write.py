@@ -132,9 +132,9 @@ def common_packing(encodings: Iterable[Mapping[Any, Any]]) -> dict[str, Any]:
 def long_variables(stored: xr.Dataset) -> dict[str, xr.Variable]:
     """Find the lazy variables along time, which are written in batches."""
     lazy = {
-        str(name): array.variable
-        for name, array in stored.data_vars.items()
-        if array.chunks is not None and array.size
+        str(name): variable
+        for name, variable in stored.variables.items()
+        if variable.chunks is not None and variable.size
     }
     return {
         name: variable
@@ -279,12 +279,13 @@ def _compute_batch(long: dict[str, xr.Variable], batch: list[_Segment]) -> _Batc
 def _plan_batches(
     long: dict[str, xr.Variable], lengths: dict[str, int], most_bytes: int
 ) -> Iterator[list[_Segment]]:
-    """Plan batches of whole chunks of all variables on one time axis, each a list of segments."""
-    for dim in dict.fromkeys(variable.dims[-1] for variable in long.values()):
+    """Plan batches of whole chunks of variables with the same chunks, each a list of segments."""
+    kinds = {name: (variable.dims[-1], lengths[name]) for name, variable in long.items()}
+    for kind in dict.fromkeys(kinds.values()):
         rows = [
             (name, row)
             for name, variable in long.items()
-            if variable.dims[-1] == dim
+            if kinds[name] == kind
             for row in np.ndindex(*variable.shape[:-1])
         ]
         name = rows[0][0]

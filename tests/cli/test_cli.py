@@ -96,6 +96,19 @@ def test_the_stages_one_by_one_give_the_same_product(log, product, tmp_path):
         xr.testing.assert_allclose(staged[name], whole[name], rtol=1e-9)
 
 
+@pytest.mark.parametrize("form", ["nc", "zarr"])
+@pytest.mark.parametrize(("option", "stored"), [((), True), (("--no-stamps",), False)])
+def test_ingest_stores_the_time_of_every_sample(log, tmp_path, form, option, stored):
+    assert call("ingest", log, "-o", tmp_path / f"log.{form}", *option) == 0
+    engine = "zarr" if form == "zarr" else "netcdf4"
+    with xr.open_dataset(tmp_path / f"log.{form}", engine=engine) as plain:
+        assert ("time" in plain.coords) is stored
+        with open_log(tmp_path / f"log.{form}") as own:
+            np.testing.assert_array_equal(plain.rate.values, own.rate.values)
+            if stored:
+                np.testing.assert_array_equal(plain.time.values, own.time.values)
+
+
 def test_ingest_to_zarr_holds_the_same_log(log, tmp_path):
     assert call("ingest", log, "-o", tmp_path / "log.nc") == 0
     assert call("ingest", log, "-o", tmp_path / "log.zarr") == 0

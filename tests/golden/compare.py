@@ -90,7 +90,18 @@ def open_any(path: Path) -> xr.Dataset:
     with xr.open_dataset(
         path, engine="zarr" if path.is_dir() else "netcdf4", decode_cf=False
     ) as data:
-        return data.load()
+        return without_stamps(data.load())
+
+
+def without_stamps(data: xr.Dataset) -> xr.Dataset:
+    """Replace stored times that follow a rule by the first, as in logs without stamps."""
+    for name in [n for n in data.coords if "sampling_grid" in data[n].attrs and data[n].ndim]:
+        rule = json.loads(data[name].attrs["sampling_grid"])
+        attrs = {**data[name].attrs, "sampling_rate_hz": rule["rate_hz"] / rule["stride"]}
+        start = xr.Variable((), data[name].values[0], attrs)
+        bare = data.drop_vars(name).rename_dims({name: f"{name}_index"})
+        data = bare.assign({f"{name}_start": start})
+    return data
 
 
 def compare_items(a: Path, b: Path, rtol: float) -> Iterator[str]:

@@ -62,7 +62,7 @@ def log() -> xr.Dataset:
 
 
 def as_stored(log: xr.Dataset) -> xr.Dataset:
-    """What other programs find of a log: in place of each computed time axis its start."""
+    """What other programs find of a log without stamps: in place of each time axis its start."""
     starts = {
         f"{name}_start": log[name][0].drop_vars(name).variable
         for name in ("time", "time_temperature")
@@ -70,14 +70,18 @@ def as_stored(log: xr.Dataset) -> xr.Dataset:
     return log.drop_vars(["time", "time_temperature"]).assign(starts)
 
 
-@pytest.fixture(scope="module", params=["product", "log", "correlation"])
-def case(request, tmp_path_factory) -> tuple[xr.Dataset, Path, xr.Dataset]:
-    """Write a file with zlib, as other programs seldom have zstd; return what it must hold."""
-    made = {"product": product, "log": log, "correlation": correlation}[request.param]()
+@pytest.fixture(scope="module", params=["product", "log", "log without stamps", "correlation"])
+def case(request, tmp_path_factory) -> tuple[xr.Dataset, Path, xr.Dataset, dict[str, bool]]:
+    """Write a file with zlib; return what it must hold, its source, and how it was written."""
+    made = {"product": product, "correlation": correlation}.get(request.param, log)()
+    stamps = request.param != "log without stamps"
     path = to_netcdf(
-        made, tmp_path_factory.mktemp("interop") / f"{request.param}.nc", compression="zlib"
+        made,
+        tmp_path_factory.mktemp("interop") / f"{request.param}.nc",
+        compression="zlib",
+        stamps=stamps,
     )
-    return (as_stored(made) if request.param == "log" else made), path, made
+    return made if stamps else as_stored(made), path, made, {"stamps": stamps}
 
 
 def disk_order(variable: xr.DataArray) -> np.ndarray:
@@ -105,7 +109,7 @@ def test_the_cases_hold_missing_values():
 
 
 def test_xarray_alone(case):
-    made, path, _ = case
+    made, path, *_ = case
     with xr.open_dataset(path) as seen:
         for name in names(made):
             if made[name].dtype.kind == "M":
@@ -117,8 +121,8 @@ def test_xarray_alone(case):
 
 
 def test_xarray_opens_zarr(case, tmp_path):
-    made, _, source = case
-    with xr.open_zarr(to_zarr(source, tmp_path / "case.zarr")) as seen:
+    made, _, source, options = case
+    with xr.open_zarr(to_zarr(source, tmp_path / "case.zarr", **options)) as seen:
         for name in names(made):
             np.testing.assert_array_equal(disk_order(seen[name]), disk_order(made[name]))
 
@@ -126,8 +130,8 @@ def test_xarray_opens_zarr(case, tmp_path):
 def test_zarr_alone(case, tmp_path):
     import zarr
 
-    made, _, source = case
-    group = zarr.open_group(to_zarr(source, tmp_path / "case.zarr"), mode="r")
+    made, _, source, options = case
+    group = zarr.open_group(to_zarr(source, tmp_path / "case.zarr", **options), mode="r")
     for name in names(made):
         if made[name].dtype.kind == "f":
             found = group[name][:]
@@ -147,7 +151,7 @@ def test_zarr_alone(case, tmp_path):
 def test_netcdf4_python_alone(case):
     import netCDF4
 
-    made, path, _ = case
+    made, path, *_ = case
     with netCDF4.Dataset(path) as file:
         for name in names(made):
             stored, wanted = file[name][:], disk_order(made[name])
@@ -182,7 +186,7 @@ def test_netcdf4_python_dates(tmp_path):
 def test_ncdump(case):
     if shutil.which("ncdump") is None:
         pytest.skip("ncdump is absent; on Debian: apt-get install netcdf-bin")
-    made, path, _ = case
+    made, path, *_ = case
     text = subprocess.run(
         ["ncdump", "-p", "9,17", str(path)], capture_output=True, text=True, check=True
     ).stdout
@@ -243,7 +247,7 @@ def run_octave(program: str, *arguments: str) -> subprocess.CompletedProcess[str
 
 
 def test_octave(case, octave, tmp_path):
-    made, path, _ = case
+    made, path, *_ = case
     done = run_octave(octave, str(HERE / "read_all.m"), str(path), str(tmp_path / "seen.txt"))
     assert (tmp_path / "seen.txt").exists(), done.stderr
     lines = (tmp_path / "seen.txt").read_text().splitlines()

@@ -58,6 +58,7 @@ def ingest(
     *,
     output: Output,
     compression: Literal["zstd", "zlib"] | None = None,
+    stamps: bool | None = None,
     reading: Reading = Reading(),
     common: Common = Common(),
 ) -> None:
@@ -76,6 +77,9 @@ def ingest(
     compression
         Compression of a NetCDF file. Every program reads zlib; zstd is faster, but Octave, MATLAB
         and h5netcdf cannot read it (default: zlib).
+    stamps
+        Store the time of every sample, which programs other than gyrostab need (default: yes, below
+        10 000 000 samples).
     """
     from gyrostab.io.datasets import to_netcdf, to_zarr
     from gyrostab.jobs.run import count_samples, load_log
@@ -97,9 +101,14 @@ def ingest(
             stage("writing", samples, round(share * samples))
 
         if zarr:
-            to_zarr(log, target, overwrite=common.overwrite, progress=tell)
+            to_zarr(log, target, overwrite=common.overwrite, stamps=stamps, progress=tell)
         else:
             to_netcdf(
-                log, target, overwrite=common.overwrite, compression=compression, progress=tell
+                log,
+                target,
+                overwrite=common.overwrite,
+                compression=compression,
+                stamps=stamps,
+                progress=tell,
             )
     print(target)

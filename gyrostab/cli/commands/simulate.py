@@ -23,6 +23,7 @@ def simulate(
     duration: Annotated[str | None, Parameter(metavar="DURATION")] = None,
     like: Annotated[list[Path] | None, Parameter(metavar="RECORDING", negative=())] = None,
     seed: Annotated[int | None, Parameter(metavar="N")] = None,
+    stamps: bool | None = None,
     reading: Reading = Reading(),
     common: Common = Common(),
 ) -> None:
@@ -48,6 +49,9 @@ def simulate(
     seed
         Seed of the random numbers. The same seed gives the same log, and the same noise with and
         without effects (default: the seed in the model, or 0).
+    stamps
+        Store the time of every sample, which programs other than gyrostab need (default: yes, below
+        10 000 000 samples).
     """
     from gyrostab.io.datasets import to_netcdf, to_zarr
     from gyrostab.jobs.run import count_samples, load_log
@@ -70,5 +74,5 @@ def simulate(
             log = make(model, duration=duration, rate=reading.rate, start=reading.start, seed=seed)
         stage("simulating", count_samples(log))
         write = to_zarr if target.suffix.lower() == ".zarr" else to_netcdf
-        write(log, target, overwrite=common.overwrite)
+        write(log, target, overwrite=common.overwrite, stamps=stamps)
     print(target)
