@@ -15,7 +15,8 @@ __all__ = ["TAUS", "averaging_factors", "duration_seconds", "is_bare_number", "s
 
 #: Examples of averaging times, for messages.
 TAUS = "--taus 40 (how many), octave, all or 0.1s,1s,10s"
-_SAMPLE_COUNT = re.compile(r"^\s*(\d+)\s*samples?\s*$")
+_SAMPLE_COUNT = re.compile(r"^\s*(\d{1,18})\s*samples?\s*$", re.ASCII)
+_COUNT = re.compile(r"^\d{1,18}$", re.ASCII)
 _NUMBER = re.compile(r"^\s*[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?\s*$", re.IGNORECASE)
 
 
@@ -46,7 +47,7 @@ def duration_seconds(value: Any, option: str, *, example: str = "10min, 30s or 2
             seconds = pd.Timedelta(value).value / 1e9
     except OptionError:
         raise
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise OptionError(
             f"{option} {value!r} is not a duration; write for instance {example}"
         ) from error
@@ -156,18 +157,15 @@ def averaging_factors(
             return np.asarray(2 ** np.arange(int(np.log2(limit)) + 1), dtype=np.int64)
         if text == "all":
             return np.arange(1, limit + 1, dtype=np.int64)
-        taus = int(text) if text.isdigit() else [part for part in text.split(",") if part.strip()]
+        is_count = _COUNT.match(text)
+        taus = int(text) if is_count else [part for part in text.split(",") if part.strip()]
     if isinstance(taus, (int, np.integer)):
         if taus < 1:
             raise OptionError(
                 f"taus={taus}: give a number of averaging times above 0, 'octave', 'all' "
                 "or a list such as 0.1s,1s"
             )
-        return (
-            np.unique(np.round(np.geomspace(1, limit, int(taus))).astype(np.int64))
-            if limit > 1
-            else np.array([1], dtype=np.int64)
-        )
+        return _spaced_factors(int(taus), limit)
     ks = []
     for tau in taus:
         k = round(duration_seconds(tau, "tau", example=TAUS) * rate)
@@ -186,6 +184,12 @@ def averaging_factors(
     if not ks:
         raise OptionError(f"no averaging time is given; write for instance {TAUS}")
     return np.unique(np.asarray(ks, dtype=np.int64))
+
+
+def _spaced_factors(count: int, limit: int) -> NDArray[np.int64]:
+    if count >= 2 * limit * np.log(limit) + 2:  # spaced by less than half a sample everywhere
+        return np.arange(1, limit + 1, dtype=np.int64)
+    return np.unique(np.round(np.geomspace(1, limit, count)).astype(np.int64))
 
 
 def thin(ks: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -1,0 +1,46 @@
+"""Averaging times and durations of any size: an answer or a clear error."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gyrostab.errors import OptionError
+from gyrostab.time.durations import averaging_factors, duration_seconds, samples
+
+
+@given(window=st.integers(2, 3000), taus=st.integers(1, 10**20))
+def test_averaging_factors_are_rising_and_fit_the_window(window, taus):
+    factors = averaging_factors(taus, rate=100.0, window=window)
+    assert factors[0] == 1
+    assert (np.diff(factors) > 0).all()
+    assert factors[-1] <= max(1, window // 3)
+    assert factors.size <= taus
+
+
+@given(window=st.integers(6, 2000), excess=st.floats(0.0, 3.0))
+def test_enough_averaging_times_are_all_of_them(window, excess):
+    """The spacing in log falls below half a sample where the shortcut begins."""
+    limit = window // 3
+    count = int((2 * limit * np.log(limit) + 2) * (1 + excess)) + 1
+    spaced = np.unique(np.round(np.geomspace(1, limit, count)).astype(int))
+    np.testing.assert_array_equal(averaging_factors(count, rate=1.0, window=window), spaced)
+    np.testing.assert_array_equal(spaced, np.arange(1, limit + 1))
+
+
+@pytest.mark.parametrize("text", ["1" + "0" * 400, "9" * 5000, "²", "٣", "1" + "0" * 400 + "s"])
+def test_numbers_of_any_length_are_refused_clearly(text):
+    with pytest.raises(OptionError):
+        averaging_factors(text, rate=100.0, window=1000)
+    with pytest.raises(OptionError):
+        samples(text, 100.0, "window")
+
+
+@pytest.mark.parametrize("value", ["9" * 5000 + "samples", 10**400, "1e400s", float("inf")])
+def test_lengths_out_of_range_are_refused_clearly(value):
+    with pytest.raises(OptionError):
+        samples(value, 100.0, "window")
+    with pytest.raises(OptionError):
+        duration_seconds(value, "window")
