@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from importlib import metadata
+from importlib import metadata, resources
 from typing import Any
+
+from gyrostab.report.charts import plotly_script
 
 __all__ = ["page_text"]
 
@@ -34,7 +36,13 @@ def page_text(template: str, *, title: str, **content: Any) -> str:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
+    script = resources.files("gyrostab.report").joinpath("charts.js")
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     return templates.get_template(template).render(
-        title=title, made=made, version=metadata.version("gyrostab"), **content
+        title=title,
+        made=made,
+        version=metadata.version("gyrostab"),
+        plotly=plotly_script(),
+        charts_script=script.read_text(encoding="utf-8"),
+        **content,
     )

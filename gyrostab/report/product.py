@@ -13,6 +13,7 @@ from gyrostab.ingest.convert import as_log
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import duration, embedded
 from gyrostab.report.page import page_text
+from gyrostab.report.product_charts import product_charts, window_data
 from gyrostab.schema import GAP_CAUSES, OBSERVABLE, check_product, texts
 from gyrostab.store.output import new_output
 
@@ -76,6 +77,8 @@ def write_report(
             findings=_describe_findings(product, table),
             facts=_list_facts(product),
             table=table,
+            charts={chart.name: chart for chart in product_charts(product, log)},
+            window_data=window_data(product),
             figures=_make_figures(product, log),
             gaps=gaps,
             gap_summary=_summarise_gaps(log, gaps) if log is not None and gaps else "",
@@ -241,6 +244,7 @@ def _coefficient_rows(terms: list[TermSummary]) -> list[dict[str, Any]]:
     return [
         {
             "symbol": term.symbol,
+            "value": _value_text(term),
             "name": LAWS[term.symbol].name,
             "unit": term.unit,
             "median": _number_text(term.median),
@@ -256,6 +260,14 @@ def _coefficient_rows(terms: list[TermSummary]) -> list[dict[str, Any]]:
         }
         for term in terms
     ]
+
+
+def _value_text(term: TermSummary) -> str:
+    """State the median of the observed values, else of the upper limits."""
+    if term.status == "not_observable":
+        return "not observable"
+    below = "< " if term.status == "upper_limit_only" else ""
+    return f"{below}{_number_text(term.value)}"
 
 
 def _list_gaps(log: xr.Dataset) -> list[dict[str, Any]]:
@@ -286,7 +298,7 @@ def _summarise_gaps(log: xr.Dataset, gaps: list[dict[str, Any]]) -> str:
 
 
 def _make_figures(product: xr.Dataset, log: xr.Dataset | None) -> list[dict[str, str]]:
-    from gyrostab.plot import plot_adev, plot_coefficients, plot_davar, plot_davar_3d, plot_signal
+    from gyrostab.plot import plot_adev, plot_coefficients, plot_davar, plot_signal
 
     figures = []
     if log is not None:
@@ -312,16 +324,6 @@ def _make_figures(product: xr.Dataset, log: xr.Dataset | None) -> list[dict[str,
                 _CAPTIONS["adev"],
             )
         )
-    if min(product.sizes["time"], product.sizes["tau"]) < 2:
-        return figures
-    first = str(product["axis"].values[0])
-    figures.append(
-        embedded(
-            plot_davar_3d(product, axis=first),
-            f"Dynamic Allan deviation as a surface, axis {first}",
-            _CAPTIONS["davar_3d"],
-        )
-    )
     return figures
 
 
@@ -359,9 +361,5 @@ _CAPTIONS = {
         "terms, each with its own slope; the legend gives upper limits for the others. The black "
         "line is the sum of all five terms: where it leaves the band repeatedly, the five terms do "
         "not describe this gyro."
-    ),
-    "davar_3d": (
-        "The dynamic Allan deviation of the first axis; height and colour are the Allan deviation. "
-        "A ridge or furrow across all averaging times is an event in time; holes are gaps."
     ),
 }

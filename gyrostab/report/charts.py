@@ -1,0 +1,147 @@
+"""What the charts of a page share: frame, axes, escaping, and the plotly script."""
+
+from __future__ import annotations
+
+import functools
+import html
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import plotly.graph_objects as go
+
+__all__ = [
+    "DEVIATION_LABEL",
+    "SYMBOLS",
+    "TAU_LABEL",
+    "TIME_AXIS",
+    "Chart",
+    "decade_bar",
+    "embeddable",
+    "gap_shapes",
+    "log_axis",
+    "milliseconds",
+    "new_chart",
+    "plain_text",
+    "plotly_script",
+    "single",
+]
+
+DEVIATION_LABEL, TAU_LABEL = "Allan deviation [deg/h]", "averaging time [s]"
+TIME_AXIS = {"type": "date", "title": {"text": "time (UTC)"}}
+#: Markers of the axes, by number, like `gyrostab.plot.style.MARKERS`.
+SYMBOLS = ("circle", "square", "diamond", "cross", "x", "star")
+_GAP_COLOUR = "rgba(120, 120, 120, 0.25)"
+_MAX_GAPS = 200
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A chart of a page.
+
+    Attributes
+    ----------
+    name, title, caption : str
+        Identifier in the page, heading, and how to read the chart.
+    figure : str
+        Plotly figure as JSON that can stand in a script element.
+    """
+
+    name: str
+    title: str
+    caption: str
+    figure: str
+
+
+@functools.cache
+def plotly_script() -> str:
+    """Return the source text of plotly.js, which a page needs to work without a network."""
+    from plotly.offline import get_plotlyjs
+
+    return str(get_plotlyjs())
+
+
+def embeddable(text: str) -> str:
+    """Escape what would end a script element."""
+    return text.replace("<", "\\u003c")
+
+
+def gap_shapes(log: xr.Dataset | None) -> list[dict[str, Any]]:
+    """Shade the longest gaps of a log over the height of a chart."""
+    if log is None or "gap_start" not in log.variables:
+        return []
+    longest = np.argsort(-np.asarray(log["gap_samples"].values), kind="stable")[:_MAX_GAPS]
+    return [
+        {
+            "type": "rect",
+            "xref": "x",
+            "yref": "paper",
+            "x0": str(log["gap_start"].values[i]),
+            "x1": str(log["gap_end"].values[i]),
+            "y0": 0,
+            "y1": 1,
+            "fillcolor": _GAP_COLOUR,
+            "line": {"width": 0},
+            "layer": "below",
+        }
+        for i in longest
+    ]
+
+
+def new_chart(**layout: Any) -> go.Figure:
+    """Start a figure with the looks of the page, and more of plotly's layout."""
+    import plotly.graph_objects as go
+
+    shared = {
+        "template": "plotly_white",
+        "font": {"size": 14, "color": "#1a1a1a"},
+        "margin": {"l": 70, "r": 20, "t": 20, "b": 50},
+        "legend": {"orientation": "h", "yanchor": "bottom", "y": 1.0},
+        "hovermode": "closest",
+    }
+    return go.Figure(layout={**shared, **layout})
+
+
+def log_axis(
+    title: str, values: NDArray[np.float64], *, labels: int = 12, **options: Any
+) -> dict[str, Any]:
+    """Label a logarithmic axis at 1, 2 and 5 of each decade, or with many decades at 1 only."""
+    shown = values[np.isfinite(values) & (values > 0)]
+    decades = np.log10(shown.max() / shown.min()) if shown.size else 1.0
+    step = "D2" if 3 * decades <= labels else max(1, round(decades / labels))
+    title_ = {"text": title}
+    return {"type": "log", "title": title_, "tickformat": "~g", "dtick": step, **options}
+
+
+def milliseconds(product: xr.Dataset) -> NDArray[np.float64]:
+    """Return window centres as plotly counts them [ms since 1970]."""
+    nanoseconds = product["time"].values.astype("datetime64[ns]").astype(np.int64)
+    return np.asarray(nanoseconds / 1e6)
+
+
+def single(values: Any) -> NDArray[np.float32]:
+    """Convert numbers to 32 bits, which halves their size in the page."""
+    return np.asarray(values, dtype=np.float32)
+
+
+def plain_text(value: Any) -> str:
+    """Escape a name of the user, because plotly takes labels for HTML."""
+    return html.escape(str(value))
+
+
+def decade_bar(values: NDArray[np.float64]) -> dict[str, Any]:
+    """Label a colour scale of logarithms with the numbers themselves."""
+    shown = values[np.isfinite(values)]
+    low, high = (shown.min(), shown.max()) if shown.size else (0.0, 1.0)
+    marks = np.array([factor * 10.0**n for n in range(-12, 13) for factor in (1, 2, 5)])
+    marks = marks[(np.log10(marks) >= low) & (np.log10(marks) <= high)]
+    step = max(1, -(-marks.size // 8))
+    return {
+        "title": {"text": "deg/h"},
+        "tickvals": np.log10(marks[::step]),
+        "ticktext": [f"{mark:g}" for mark in marks[::step]],
+    }

@@ -1,0 +1,412 @@
+"""Charts of a product that can be zoomed, turned and read off, and data of its windows."""
+
+from __future__ import annotations
+
+import base64
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.noise import LAWS
+from gyrostab.plot.adev import band
+from gyrostab.plot.style import axis_style, unit_label, unit_of_time
+from gyrostab.report.charts import (
+    DEVIATION_LABEL,
+    SYMBOLS,
+    TAU_LABEL,
+    TIME_AXIS,
+    Chart,
+    decade_bar,
+    embeddable,
+    gap_shapes,
+    log_axis,
+    milliseconds,
+    new_chart,
+    plain_text,
+    single,
+)
+from gyrostab.schema import OBSERVABLE
+
+if TYPE_CHECKING:
+    import plotly.graph_objects as go
+
+__all__ = ["product_charts", "window_data"]
+
+_LIMIT, _SEEN = OBSERVABLE.index("upper_limit_only"), OBSERVABLE.index("observed")
+#: Largest numbers of windows that are drawn over time, and of windows and averaging times of which
+#: the whole surface is in the page: a page of three axes then has about 7 MB, 4.8 of them plotly.
+_MAX_WINDOWS, _MAX_SURFACE_WINDOWS, _MAX_TAUS = 1000, 200, 60
+_MAX_CHANNELS = 4
+
+
+def product_charts(product: xr.Dataset, log: xr.Dataset | None = None) -> list[Chart]:
+    """Make the charts of a product.
+
+    Parameters
+    ----------
+    product : xarray.Dataset
+        Product with ``avar(axis, time, tau)`` [degree2 hour-2] and the coefficients.
+    log : xarray.Dataset, optional
+        Its log, for the gaps.
+
+    Returns
+    -------
+    list of Chart
+        ``record``, ``coefficients``, ``map``, ``window`` and, with at least two windows and
+        averaging times, ``surface``. The last three show the first axis; `window_data` holds the
+        others.
+    """
+    gaps = gap_shapes(log)
+    surface = _thin(product, _MAX_SURFACE_WINDOWS, _MAX_TAUS)
+    times = _thin(product, _MAX_WINDOWS, product.sizes["tau"])
+    charts = [
+        ("record", "Allan deviation of the whole record", _draw_record(product)),
+        ("coefficients", "Noise coefficients over time", _draw_coefficients(times, gaps)),
+        ("map", "Dynamic Allan deviation", _draw_map(surface, gaps)),
+        ("window", "Allan deviation of one window", _draw_window(surface)),
+    ]
+    if min(surface.sizes["time"], surface.sizes["tau"]) > 1:
+        title = "Dynamic Allan deviation as a surface"
+        charts.append(("surface", title, _draw_surface(surface)))
+    thinned = {"coefficients": times, "map": surface, "surface": surface}
+    return [
+        Chart(
+            name,
+            title,
+            _CAPTIONS[name] + _describe_thinning(product, thinned.get(name, product)),
+            embeddable(figure.to_json()),
+        )
+        for name, title, figure in charts
+    ]
+
+
+def window_data(product: xr.Dataset) -> str:
+    """Return what the chart of one window shows, for every window and axis, as JSON.
+
+    Parameters
+    ----------
+    product : xarray.Dataset
+        As for `product_charts`.
+
+    Returns
+    -------
+    str
+        ``axes``, ``colours``, ``times`` (labels), ``tau`` [s] and for each axis ``measured``,
+        ``low``, ``high`` and ``fitted`` [degree hour-1], 32-bit floats in base 64, window by
+        window. It can stand in a script element.
+    """
+    part = _thin(product, _MAX_SURFACE_WINDOWS, _MAX_TAUS)
+    low, high = band(part["avar"].values, part["edf"].values)
+    squares = {
+        "measured": part["avar"].values,
+        "low": low,
+        "high": high,
+        "fitted": _fitted_avar(part),
+    }
+    names = [str(name) for name in part["axis"].values]
+    content = {
+        "axes": names,
+        "colours": [axis_style(product, name)["color"] for name in names],
+        "times": [str(time).replace("T", " ") for time in part["time"].values.astype("M8[s]")],
+        "tau": part["tau"].values.tolist(),
+        "values": [
+            {key: _encode(np.sqrt(values[row])) for key, values in squares.items()}
+            for row in range(len(names))
+        ],
+    }
+    return embeddable(json.dumps(content))
+
+
+def _encode(values: NDArray[np.float64]) -> str:
+    return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode("ascii")
+
+
+def _thin(product: xr.Dataset, windows: int, taus: int) -> xr.Dataset:
+    """Select at most so many windows and averaging times, evenly spaced."""
+    chosen = {
+        dim: np.unique(np.linspace(0, product.sizes[dim] - 1, most).round().astype(int))
+        for dim, most in (("time", windows), ("tau", taus))
+        if product.sizes[dim] > most
+    }
+    if "tau" in chosen:  # evenly in the logarithm
+        tau = product["tau"].values
+        wanted = np.geomspace(tau[0], tau[-1], taus)
+        chosen["tau"] = np.unique(np.searchsorted(tau, wanted * (1 - 1e-9)).clip(0, tau.size - 1))
+    return product.isel(chosen).compute()
+
+
+def _describe_thinning(product: xr.Dataset, part: xr.Dataset) -> str:
+    every = product.sizes["time"] / part.sizes["time"]
+    return f" One window in {every:.3g} is drawn." if every > 1 else ""
+
+
+def _fitted_avar(part: xr.Dataset) -> NDArray[np.float64]:
+    """Return the Allan variance of the fitted terms (axis, time, tau) [degree2 hour-2]."""
+    from gyrostab.allan.fit import refit
+
+    estimates, tau = refit(part), part["tau"].values
+    squares = np.stack([estimates[symbol].values ** 2 for symbol in LAWS], axis=-1)
+    unit = np.array([law.avar(tau) for law in LAWS.values()])
+    fitted = np.isfinite(squares).any(axis=-1, keepdims=True)
+    return np.where(fitted, np.nan_to_num(squares) @ unit, np.nan)
+
+
+def _draw_record(product: xr.Dataset) -> go.Figure:
+    """Draw the Allan deviation of each axis over all windows, with the terms fitted to it."""
+    record = _average_windows(product)
+    measured, fitted = (
+        np.sqrt(part[:, 0]) for part in (record["avar"].values, _fitted_avar(record))
+    )
+    figure = new_chart(
+        xaxis=log_axis(TAU_LABEL, record["tau"].values),
+        yaxis=log_axis(DEVIATION_LABEL, measured),
+        height=460,
+    )
+    for row, name in enumerate(map(str, record["axis"].values)):
+        style = axis_style(product, name)
+        shared = {
+            "x": record["tau"].values,
+            "legendgroup": name,
+            "hovertemplate": "%{x:.3g} s: %{y:.3g} deg/h",
+        }
+        figure.add_scatter(
+            **shared,
+            y=measured[row],
+            mode="markers",
+            name=f"axis {plain_text(name)}, measured",
+            marker={"color": style["color"], "size": 8, "symbol": SYMBOLS[row % len(SYMBOLS)]},
+        )
+        figure.add_scatter(
+            **shared,
+            y=fitted[row],
+            mode="lines",
+            name=f"axis {plain_text(name)}, fitted",
+            line={"color": style["color"], "width": 1.5},
+        )
+    return figure
+
+
+def _average_windows(product: xr.Dataset) -> xr.Dataset:
+    """Average the surface over all windows, as one window with the terms of all of them."""
+    part = _thin(product, _MAX_WINDOWS, _MAX_TAUS)
+    surface = part[[name for name in part.data_vars if part[name].dims[-1:] == ("tau",)]]
+    weight = part["count"].where(part["avar"].notnull(), 0.0)
+    mean = surface.weighted(weight).mean("time", keep_attrs=True).expand_dims(time=1, axis=1)
+    span = (part["time"].values[-1] - part["time"].values[0]) / np.timedelta64(1, "s")
+    independent = 1.0 + span / float(product.attrs.get("window_s", np.inf))
+    middle = part.isel(time=[part.sizes["time"] // 2])
+    return middle.assign({name: mean[name].transpose(*part[name].dims) for name in surface}).assign(
+        edf=(part["edf"].dims, mean["edf"].values * independent)
+    )
+
+
+def _draw_coefficients(product: xr.Dataset, gaps: list[dict[str, Any]]) -> go.Figure:
+    """Draw the coefficients and the channels over time, one panel each on one time axis."""
+    channels = [
+        str(name)
+        for name in product.data_vars
+        if product[name].dims == ("time",) and product[name].dtype.kind == "f"
+    ][:_MAX_CHANNELS]
+    panels = len(LAWS) + len(channels)
+    height = 1.0 / panels
+    axes: dict[str, Any] = {}
+    for row in range(panels):
+        top = 1.0 - row * height
+        axes[f"yaxis{row + 1 if row else ''}"] = {
+            "domain": [top - 0.78 * height, top - 0.08 * height],
+            "tickformat": "~g",
+            "nticks": 5,
+        }
+    figure = new_chart(
+        **axes,
+        xaxis={**TIME_AXIS, "anchor": f"y{panels}"},
+        height=130 * panels + 70,
+        hovermode="x unified",
+        hoversubplots="axis",
+        shapes=gaps,
+    )
+    for row, symbol in enumerate(LAWS):
+        panel = f"y{row + 1 if row else ''}"
+        label = LAWS[symbol].label.replace("sqrt(h)", "√h")
+        _label_panel(figure, panel, f"{symbol}, {LAWS[symbol].name} [{label}]")
+        _add_coefficient(figure, product, symbol, panel, label)
+    for row, name in enumerate(channels, start=len(LAWS)):
+        unit = unit_label(product[name].attrs.get("units"))
+        _label_panel(figure, f"y{row + 1}", plain_text(f"{name.replace('_', ' ')} {unit}"))
+        figure.add_scatter(
+            x=milliseconds(product),
+            y=single(product[name].values),
+            yaxis=f"y{row + 1}",
+            name=plain_text(name.replace("_", " ")),
+            line={"color": "#404040", "width": 1.5},
+            showlegend=False,
+        )
+    return figure
+
+
+def _label_panel(figure: go.Figure, panel: str, text: str) -> None:
+    """Write above the left end of a panel what it shows."""
+    place = {"xref": "paper", "x": 0.0, "xanchor": "left", "yref": f"{panel} domain", "y": 1.0}
+    figure.add_annotation(text=text, yanchor="bottom", showarrow=False, font_size=12, **place)
+
+
+def _add_coefficient(
+    figure: go.Figure, product: xr.Dataset, symbol: str, panel: str, label: str
+) -> None:
+    """Add estimates as points with standard errors, and upper limits as open triangles."""
+    state = product["observable"].sel(term=symbol).values
+    figure.layout[panel.replace("y", "yaxis")].update(_scale_of(product, symbol, state))
+    for row, name in enumerate(map(str, product["axis"].values)):
+        colour = axis_style(product, name)["color"]
+        shared = {"x": milliseconds(product), "yaxis": panel, "legendgroup": name}
+        limits = np.where(state[row] == _LIMIT, product[f"{symbol}_upper"].values[row], np.nan)
+        if np.isfinite(limits).any():
+            figure.add_scatter(
+                **shared,
+                y=single(limits),
+                mode="markers",
+                name=f"axis {plain_text(name)}, upper limit",
+                marker={"color": colour, "symbol": "triangle-down-open", "size": 7},
+                hovertemplate=f"< %{{y:.3g}} {label}",
+                showlegend=False,
+            )
+        values = np.where(state[row] == _SEEN, product[symbol].values[row], np.nan)
+        figure.add_scatter(
+            **shared,
+            y=single(values),
+            error_y={
+                "array": single(product[f"{symbol}_stderr"].values[row]),
+                "color": colour,
+                "thickness": 1,
+                "width": 0,
+            },
+            mode="lines+markers",
+            name=f"axis {plain_text(name)}",
+            line={"color": colour, "width": 1},
+            marker={"size": 5, "symbol": SYMBOLS[row % len(SYMBOLS)]},
+            hovertemplate=f"%{{y:.3g}} {label}",
+            showlegend=symbol == "N",
+        )
+
+
+def _scale_of(product: xr.Dataset, symbol: str, state: NDArray[np.int8]) -> dict[str, Any]:
+    """Choose a logarithmic scale for numbers over more than a decade, else one from zero."""
+    shown = np.concatenate(
+        [
+            product[symbol].values[state == _SEEN],
+            product[f"{symbol}_upper"].values[state == _LIMIT],
+        ]
+    )
+    shown = shown[np.isfinite(shown) & (shown > 0)]
+    is_wide = shown.size > 0 and shown.max() > 10 * shown.min()
+    return log_axis("", shown, labels=5) if is_wide else {"rangemode": "tozero"}
+
+
+def _log_deviation(product: xr.Dataset) -> NDArray[np.float64]:
+    """Return the logarithm of the Allan deviation of the first axis, (tau, time)."""
+    avar = product["avar"].values[0].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(avar > 0, 0.5 * np.log10(avar), np.nan)
+
+
+def _draw_map(product: xr.Dataset, gaps: list[dict[str, Any]]) -> go.Figure:
+    figure = new_chart(
+        xaxis=TIME_AXIS,
+        yaxis=log_axis(TAU_LABEL, product["tau"].values),
+        height=380,
+        shapes=gaps,
+    )
+    values = _log_deviation(product)
+    figure.add_heatmap(
+        x=milliseconds(product),
+        y=product["tau"].values,
+        z=single(values),
+        customdata=single(10.0**values),
+        colorscale="Viridis",
+        colorbar=decade_bar(values),
+        hovertemplate="%{x}<br>%{y:.3g} s: %{customdata:.3g} deg/h<extra></extra>",
+    )
+    return figure
+
+
+def _draw_window(product: xr.Dataset) -> go.Figure:
+    """Draw the frame of the chart of one window, which the page fills."""
+    avar, tau = product["avar"].values, product["tau"].values
+    shown = np.sqrt(avar[np.isfinite(avar) & (avar > 0)])
+    limits = (shown.min() / 2, shown.max() * 2) if shown.size else (0.1, 10.0)
+    figure = new_chart(
+        xaxis=log_axis(TAU_LABEL, tau),
+        yaxis=log_axis(DEVIATION_LABEL, shown, range=np.log10(limits), autorange=False),
+        height=400,
+    )
+    empty = np.full(tau.size, np.nan)
+    for name, look in (
+        ("low", {"line": {"width": 0}, "showlegend": False, "hoverinfo": "skip"}),
+        ("95 % band", {"line": {"width": 0}, "fill": "tonexty", "hoverinfo": "skip"}),
+        ("fitted", {"line": {"color": "#1a1a1a", "width": 1.5}}),
+        ("measured", {"mode": "markers", "marker": {"size": 7}}),
+    ):
+        figure.add_scatter(
+            **{"x": tau, "y": empty, "mode": "lines", "name": name, **look},
+            hovertemplate="%{x:.3g} s: %{y:.3g} deg/h",
+        )
+    return figure
+
+
+def _draw_surface(product: xr.Dataset) -> go.Figure:
+    values = _log_deviation(product)
+    # from the first window, because WebGL computes with 32 bits
+    seconds = (milliseconds(product) - milliseconds(product)[0]) / 1e3
+    size, unit = unit_of_time(float(seconds[-1]))
+    figure = new_chart(
+        scene={
+            "xaxis": {"title": {"text": f"time [{unit}]"}},
+            "yaxis": log_axis(TAU_LABEL, product["tau"].values),
+            "zaxis": log_axis("deg/h", 10.0**values),
+            "camera": {"eye": {"x": -1.7, "y": -2.0, "z": 1.0}, "center": {"z": -0.2}},
+            "aspectratio": {"x": 1.8, "y": 1.1, "z": 0.8},
+        },
+        height=520,
+        margin={"l": 0, "r": 0, "t": 30, "b": 0},
+    )
+    figure.add_surface(
+        x=seconds / size,
+        y=product["tau"].values,
+        z=single(10.0**values),
+        surfacecolor=single(values),
+        colorscale="Viridis",
+        colorbar=decade_bar(values),
+        hovertemplate=f"%{{x:.4g}} {unit}<br>%{{y:.3g}} s: %{{z:.3g}} deg/h<extra></extra>",
+    )
+    return figure
+
+
+#: How to read each chart.
+_CAPTIONS = {
+    "record": (
+        "The mean over all windows. Points are measured, lines are the five terms fitted to them; "
+        "they leave the points where the noise changes over the record. A slope of -1/2 is angle "
+        "random walk, a level part is bias instability, a slope of +1/2 rate random walk."
+    ),
+    "coefficients": (
+        "Points are estimates with their standard errors, open triangles are 95 % upper limits. "
+        "A level line means that the noise does not change. Gaps are grey. Panels share the time "
+        "axis: zoom in one and all follow."
+    ),
+    "map": (
+        "Colour is the Allan deviation of the axis chosen above. Move the pointer over it, or the "
+        "slider, to choose the window of the next chart."
+    ),
+    "window": (
+        "Points are measured; at each point the band holds the true value with 95 % confidence. "
+        "Where the line, the sum of the fitted terms, leaves the band repeatedly, the five terms "
+        "do not describe this gyro."
+    ),
+    "surface": (
+        "Drag to turn, scroll to zoom. A ridge or furrow across all averaging times is an event in "
+        "time; holes are gaps."
+    ),
+}

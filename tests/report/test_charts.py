@@ -1,0 +1,169 @@
+"""The interactive charts of a report: their numbers, their size, and that a browser draws them."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+from gyrostab.noise import model_avar
+from gyrostab.plot.style import COLOURS
+from gyrostab.report import write_report
+from gyrostab.report.product_charts import product_charts, window_data
+from tests.support import synthetic
+
+_BROWSER = next(filter(None, map(shutil.which, ("chromium", "google-chrome", "chrome"))), None)
+
+
+def _figures(product, log=None):
+    return {chart.name: json.loads(chart.figure) for chart in product_charts(product, log)}
+
+
+def _numbers(packed):
+    """Decode a typed array as plotly writes it."""
+    if isinstance(packed, list):
+        return np.array(packed, dtype=float)
+    values = np.frombuffer(base64.b64decode(packed["bdata"]), dtype=packed["dtype"])
+    return values.reshape([int(n) for n in str(packed.get("shape", values.size)).split(",")])
+
+
+def test_windows_of_every_axis_are_in_the_page():
+    product = synthetic.product()
+    data = json.loads(window_data(product))
+    assert data["axes"] == ["x", "y", "z"]
+    assert data["colours"] == list(COLOURS[:3])
+    assert data["tau"] == product.tau.values.tolist()
+    shape = product.sizes["time"], product.sizes["tau"]
+    for row, axis in enumerate(data["axes"]):
+        values = {
+            name: np.frombuffer(base64.b64decode(text), dtype="<f4").reshape(shape)
+            for name, text in data["values"][row].items()
+        }
+        measured = np.sqrt(product.avar.sel(axis=axis).values)
+        np.testing.assert_allclose(values["measured"], measured, rtol=1e-6)
+        inside = np.isfinite(measured)
+        assert (values["low"][inside] < measured[inside]).all()
+        assert (values["high"][inside] > measured[inside]).all()
+
+
+def test_the_map_shows_the_first_axis_by_time_and_averaging_time():
+    product = synthetic.product()
+    trace = _figures(product)["map"]["data"][0]
+    milliseconds = product.time.values.astype("M8[ms]").astype(float)
+    np.testing.assert_allclose(_numbers(trace["x"]), milliseconds, atol=1)
+    np.testing.assert_allclose(_numbers(trace["y"]), product.tau.values)
+    expected = 0.5 * np.log10(product.avar.isel(axis=0).values.T)
+    np.testing.assert_allclose(_numbers(trace["z"]), expected, rtol=1e-5)
+
+
+def test_the_record_is_the_mean_of_the_windows_and_its_fit_follows():
+    product = synthetic.product(axes="x").load()
+    terms = {"Q": 0.0, "N": 0.01, "B": 0.0, "K": 0.2, "R": 0.0}
+    tau = product.tau.values
+    product["avar"] = product.avar * 0 + model_avar(tau, terms)
+    measured, fitted = _figures(product)["record"]["data"]
+    np.testing.assert_allclose(_numbers(measured["y"]), np.sqrt(model_avar(tau, terms)), rtol=1e-6)
+    np.testing.assert_allclose(_numbers(fitted["y"]), np.sqrt(model_avar(tau, terms)), rtol=0.02)
+
+
+def test_coefficients_are_estimates_or_limits_on_one_time_axis():
+    product = synthetic.product()
+    figure = _figures(product)["coefficients"]
+    n_of_y = [
+        trace for trace in figure["data"] if trace["yaxis"] == "y2" and trace["name"] == "axis y"
+    ]
+    seen = product.observable.sel(axis="y", term="N").values == 2
+    expected = np.where(seen, product.N.sel(axis="y").values, np.nan)
+    np.testing.assert_allclose(_numbers(n_of_y[0]["y"]), expected, rtol=1e-6)
+    limits = [trace for trace in figure["data"] if trace["name"] == "axis z, upper limit"]
+    assert limits
+    assert all(trace["marker"]["symbol"] == "triangle-down-open" for trace in limits)
+    assert {trace.get("xaxis", "x") for trace in figure["data"]} == {"x"}
+
+
+def test_a_long_product_is_thinned_and_says_so(tmp_path):
+    product = synthetic.product(windows=2500)
+    charts = {chart.name: chart for chart in product_charts(product)}
+    assert "One window in 2.5 is drawn." in charts["coefficients"].caption
+    assert "One window in 12.5 is drawn." in charts["map"].caption
+    times = _numbers(json.loads(charts["map"].figure)["data"][0]["x"])
+    assert times.size == 200
+    stamps = product.time.values.astype("M8[ms]").astype(float)
+    assert times[[0, -1]] == pytest.approx(stamps[[0, -1]], abs=1)
+    assert write_report(product, tmp_path / "report.html").stat().st_size < 8e6
+
+
+def test_names_of_the_user_do_not_become_markup():
+    product = synthetic.product(windows=6, axes="x")
+    hostile = "</script><a href='http://example.org'>"
+    product = product.rename(temperature=hostile)
+    charts = {chart.name: chart.figure for chart in product_charts(product)}
+    assert not any("<" in figure for figure in charts.values())
+    labels = [note["text"] for note in json.loads(charts["coefficients"])["layout"]["annotations"]]
+    assert "&lt;/script&gt;&lt;a href=&#x27;http://example.org&#x27;&gt; [°C]" in labels
+
+
+_PROBE = """<script>
+window.addEventListener("load", () => setTimeout(() => {
+  const state = () => [document.getElementById("window-label").textContent,
+    JSON.stringify(Array.from(document.getElementById("window").data[3].y))];
+  const slider = document.getElementById("window-slider");
+  const before = state();
+  slider.value = 3;
+  slider.dispatchEvent(new Event("input"));
+  const after = state();
+  const select = document.getElementById("axis-select");
+  select.value = "1";
+  select.dispatchEvent(new Event("change"));
+  const result = document.createElement("pre");
+  result.id = "probe";
+  result.textContent = JSON.stringify({ before, after, axis: state(),
+    drawn: document.querySelectorAll(".chart .main-svg").length,
+    wide: document.documentElement.scrollWidth, seen: document.documentElement.clientWidth,
+    unnamed: document.querySelectorAll("input:not([id]), select:not([id])").length });
+  document.body.append(result);
+}, 3000));
+</script></body>"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(_BROWSER is None, reason="needs Chromium")
+@pytest.mark.parametrize("width", [1280, 500])
+def test_a_browser_draws_the_page_without_errors_or_requests(tmp_path, width):
+    product = synthetic.product()
+    path = write_report(product, tmp_path / "report.html", log=synthetic.log(samples=20_000))
+    path.write_text(path.read_text(encoding="utf-8").replace("</body>", _PROBE), encoding="utf-8")
+    command = [
+        str(_BROWSER), "--headless", "--no-sandbox", "--enable-unsafe-swiftshader",
+        "--enable-logging=stderr", "--v=0", "--host-resolver-rules=MAP * ~NOTFOUND",
+        f"--user-data-dir={tmp_path / 'profile'}", f"--window-size={width},900",
+        "--virtual-time-budget=20000", "--dump-dom", path.as_uri(),
+    ]  # fmt: skip
+    ended = subprocess.run(
+        command, capture_output=True, text=True, timeout=300, check=True, env={**os.environ}
+    )
+    console = [line for line in ended.stderr.splitlines() if ":CONSOLE" in line]
+    assert not [line for line in console if re.search(r"error|failed|refused|net::", line, re.I)]
+    found = re.search(r'<pre id="probe">(.*?)</pre>', ended.stdout, re.S)
+    assert found is not None
+    state = json.loads(found[1].replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&"))
+    assert state["drawn"] >= 5
+    assert state["unnamed"] == 0
+    assert state["wide"] <= state["seen"]  # nothing to scroll sideways
+    times = [str(time).replace("T", " ") for time in product.time.values.astype("M8[s]")]
+    assert times[20] in state["before"][0]
+    assert state["after"][0] == f"axis x, window centred on {times[3]} UTC"
+    assert state["axis"][0] == f"axis y, window centred on {times[3]} UTC"
+    for (_, shown), axis, row in (
+        (state["after"], "x", 3),
+        (state["axis"], "y", 3),
+    ):
+        expected = np.sqrt(product.avar.sel(axis=axis).values[row])
+        drawn = np.array([np.nan if value is None else value for value in json.loads(shown)])
+        np.testing.assert_allclose(drawn, expected, rtol=1e-5)
