@@ -164,10 +164,11 @@ def check_span(start: int, rate: float, size: int, where: str) -> None:
         When the last one is outside the years 1678 to 2262.
     """
     last = start + max(size - 1, 0) * NANOSECONDS / rate
-    if not abs(last) < 2.0**63:
+    if not max(abs(start), abs(last)) < 2.0**63:
+        first = np.datetime64(int(start) // NANOSECONDS, "s")  # of any year
         raise TimeError(
-            f"{where}: {size} samples at {rate:.6g} Hz from {np.datetime64(start, 'ns')} "
-            "would end outside the years 1678 to 2262; "
+            f"{where}: {size} samples at {rate:.6g} Hz from {first} "
+            "would begin or end outside the years 1678 to 2262; "
             "check the sampling rate and the start"
         )
 
