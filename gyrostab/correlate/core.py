@@ -15,7 +15,6 @@ from gyrostab.correlate.judge import VERDICTS, describe_coupling, driver_limits,
 from gyrostab.errors import OptionError
 from gyrostab.kernels.regression.coupling import (
     Laws,
-    block_averages,
     calibrated,
     decompose,
     fit_lags,
@@ -28,6 +27,7 @@ from gyrostab.kernels.regression.coupling import (
     uncalibrated,
     weights,
 )
+from gyrostab.kernels.regression.windows import average_windows
 from gyrostab.noise import TERMS
 from gyrostab.schema import OBSERVABLE, check_product
 from gyrostab.time.durations import duration_seconds
@@ -42,6 +42,16 @@ _MAX_WINDOWS_PER_LENGTH = 8  # more add no information
 _MIN_BLOCKS = 12
 _SIGNIFICANCE = 0.05
 _NOISE_DRAWS = (300, 4000)  # the second where the result of the first may be significant
+#: Smallest share of the variance of a driver that the other drivers do not explain.
+_MIN_UNEXPLAINED = 1e-3
+#: Keys of `_estimate_sensitivity`, and those of the same numbers given the other drivers.
+_PARTIAL = {
+    "slope": "partial",
+    "stderr": "partial_stderr",
+    "low": "partial_low",
+    "high": "partial_high",
+    "p_value": "p_partial",
+}
 #: Largest share of one block in the variance of the driver; above it, that block decides alone.
 _MAX_LEVERAGE = 0.35
 
@@ -60,7 +70,7 @@ class _Blocks(NamedTuple):
 def correlate(
     product: xr.Dataset,
     *,
-    channel: str | xr.DataArray = "temperature",
+    channel: str | xr.DataArray | Sequence[str | xr.DataArray] = "temperature",
     variables: str | Sequence[str] | None = None,
     max_lag: Any = None,
     level: float = 0.95,
@@ -78,9 +88,11 @@ def correlate(
     ----------
     product : xarray.Dataset
         Product of `gyrostab.fit_noise`.
-    channel : str or DataArray
+    channel : str, DataArray or sequence of them
         Channel of the product, or a channel with a separate time coordinate, which is averaged over
-        the windows.
+        the windows. With several, the rates of change are drivers only if they are named
+        (``["temperature", "temperature_rate", "vibration"]``), and the partial effect of each
+        driver is estimated, given the others at their best-fitting lags.
     variables : str or sequence of str, optional
         Names with dims ``(axis, time)``; by default ``window_mean`` and every coefficient that is
         observed in at least one window.
@@ -98,7 +110,9 @@ def correlate(
         ``p_value_adjusted``, ``effective_samples``, ``windows_used``, ``coupling_verdict``,
         ``coupling_limits`` (flags), ``statement``; by ``axis`` the sensitivity
         ``<variable>_per_<driver>`` with ``_stderr``, ``_low``, ``_high``, ``_rising``, ``_falling``
-        [units of the variable per unit of the driver]; and the series themselves.
+        [units of the variable per unit of the driver]; and the series themselves. With several
+        channels also ``p_value_partial``, and ``<variable>_per_<driver>_partial`` with
+        ``_partial_stderr``, ``_partial_low``, ``_partial_high``.
 
     Raises
     ------
@@ -121,8 +135,9 @@ def correlate(
     time = (product["time"].values - product["time"].values[0]) / np.timedelta64(1, "s")
     length, step = _window_lengths(product, time)
     lags = _choose_lags(max_lag, float(time[-1] - time[0]) if time.size else 0.0, step)
-    drivers = align_drivers(product, channel, lags, step)
-    others = other_channels(product, drivers[0].name)
+    channels = [channel] if isinstance(channel, str | xr.DataArray) else list(channel)
+    drivers = align_drivers(product, channels, lags, step)
+    others = [product[name].values for name in other_channels(product, drivers)]
     entries: dict[tuple[int, int, int], dict[str, Any]] = {}
     groups: dict[bytes, list[tuple[int, int]]] = {}
     masks, lags, drivers = _usable_windows(product, names, lags, drivers)
@@ -137,16 +152,15 @@ def correlate(
             if blocks
             else np.empty((0, len(places)))
         )
-        for d, driver in enumerate(drivers):
-            other_series = [product[name].values for name in others]
-            for place, entry in zip(
-                places,
-                _fit_driver(
-                    blocks, series, driver, other_series, lags.astype(np.float64) * step, level
-                ),
-                strict=True,
-            ):
-                entries[(*place, d)] = entry
+        fitted = [
+            _fit_driver(blocks, series, driver, others, lags.astype(np.float64) * step, level)
+            for driver in drivers
+        ]
+        if len(channels) > 1:
+            for row, of_series in zip(series.T, zip(*fitted, strict=True), strict=True):
+                _fit_partial_effects(blocks, row, drivers, of_series, level)
+        for d, of_driver in enumerate(fitted):
+            entries |= {(*place, d): entry for place, entry in zip(places, of_driver, strict=True)}
     _adjust_p_values(entries)
     for (a, v, d), entry in entries.items():
         entry["unit_label"] = slope_label(product[names[v]], drivers[d].units)
@@ -186,9 +200,11 @@ def _window_lengths(product: xr.Dataset, time: Array) -> tuple[float, float]:
 
 
 def _choose_lags(max_lag: Any, span: float, step: float) -> NDArray[np.int64]:
-    longest = (
-        0.1 * span if max_lag is None else duration_seconds(max_lag, "max_lag") if max_lag else 0.0
-    )
+    longest = 0.0
+    if max_lag is None:
+        longest = 0.1 * span
+    elif max_lag and str(max_lag).strip() != "0s":
+        longest = duration_seconds(max_lag, "max_lag")
     if longest > span:
         raise OptionError(
             f"max_lag {max_lag} is longer than the record ({span:g} s); give a shorter --max-lag"
@@ -205,7 +221,7 @@ def _usable_windows(
     Lags that would cost more than a third of the windows are left out.
     """
     known = np.logical_and.accumulate(
-        np.isfinite(drivers[0].values) & np.isfinite(drivers[1].values), axis=0
+        np.all([np.isfinite(driver.values) for driver in drivers], axis=0), axis=0
     )
     most = int(np.flatnonzero(known.sum(axis=1) >= min(2 / 3 * known[0].sum(), known[0].sum()))[-1])
     lags = lags[: most + 1]
@@ -241,9 +257,8 @@ def _make_blocks(
     numbers = np.unique((centres_s / block_length).astype(np.int64), return_inverse=True)[1]
     if numbers[-1] + 1 < _MIN_BLOCKS:
         return None
-    average, centre, white = block_averages(
-        numbers, centres_s, length, np.clip(share[windows], 0.05, 1.0)
-    )
+    average = average_windows(numbers)
+    centre = np.asarray(average @ centres_s)
     spacing = np.diff(centre)
     covered = (numbers[-1] + 1) * block_length
     pieces = np.concatenate(
@@ -252,7 +267,8 @@ def _make_blocks(
     pieces = pieces.astype(np.int64)
     offsets = (pieces[:, None] == np.arange(pieces[-1] + 1)).astype(np.float64)
     trend = ((centre - centre.mean()) / (np.ptp(centre) or 1.0))[:, None]
-    return _Blocks(average, windows, pieces, offsets, trend, noise_laws(centre, white))
+    laws = noise_laws(average, centres_s, length, np.clip(share[windows], 0.05, 1.0))
+    return _Blocks(average, windows, pieces, offsets, trend, laws)
 
 
 def _fit_driver(
@@ -326,6 +342,44 @@ def _fit_driver(
             entry["p_channels"] = float(p_values(channel_fit)[0, 0])
         entries.append(entry)
     return entries
+
+
+def _fit_partial_effects(
+    blocks: _Blocks | None,
+    row: Array,
+    drivers: list[Driver],
+    entries: Sequence[dict[str, Any]],
+    level: float,
+) -> None:
+    """Fit one series on every driver, given the others at their best-fitting lags."""
+    for entry in entries:
+        entry |= dict.fromkeys(_PARTIAL.values(), np.nan)
+    fitted = [d for d, entry in enumerate(entries) if "best" in entry]
+    if blocks is None:
+        return
+    y = np.asarray(blocks.average @ row)
+    columns = {
+        d: np.asarray(blocks.average @ drivers[d].values[entries[d]["best"], blocks.windows])
+        for d in fitted
+    }
+    for d in fitted:
+        others = [_standardise_series(columns[e])[:, None] for e in fitted if e != d]
+        nuisance = np.concatenate([blocks.offsets, blocks.trend, *others], axis=1)
+        if (
+            y.size - nuisance.shape[1] - 1 < _MIN_BLOCKS // 2
+            or _unexplained_share(columns[d], nuisance) < _MIN_UNEXPLAINED
+        ):
+            continue
+        found = _estimate_sensitivity(
+            project_out(blocks.laws, nuisance), y, columns[d][:, None], np.zeros(1), level
+        )
+        entries[d].update({partial: found[name] for name, partial in _PARTIAL.items()})
+
+
+def _unexplained_share(x: Array, given: Array) -> float:
+    """Compute the share of the variance of a series that a linear fit leaves."""
+    q, _ = np.linalg.qr(given)
+    return float(np.sum((x - q @ (q.T @ x)) ** 2) / max(float(np.var(x)) * x.size, 1e-300))
 
 
 def _estimate_sensitivity(
@@ -481,7 +535,8 @@ def _adjust_p_values(entries: dict[tuple[int, int, int], dict[str, Any]]) -> Non
         elif entry["p_adjusted"] >= _SIGNIFICANCE:
             verdict = "none_seen"
         else:
-            if entry.get("p_channels", 0.0) >= _SIGNIFICANCE:
+            # a partial effect that cannot be estimated (NaN) does not count as evidence
+            if not all(entry.get(p, 0.0) < _SIGNIFICANCE for p in ("p_channels", "p_partial")):
                 entry["limits"].add("other_channel")
             verdict = (
                 "not_told_apart"

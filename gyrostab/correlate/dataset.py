@@ -37,6 +37,13 @@ _STATISTICS = {
     "effective_samples": ("effective", "effective number of independent samples", "1"),
 }
 _SLOPES = {"": "slope", "_stderr": "stderr", "_low": "low", "_high": "high"}
+_PARTIAL_STATISTICS = {
+    "p_value_partial": ("p_partial", "p-value of the sensitivity, given the other drivers", "1")
+}
+#: The same, given the other drivers: only where several channels are named.
+_PARTIAL_SLOPES = {
+    f"_{name}": name for name in ("partial", "partial_stderr", "partial_low", "partial_high")
+}
 _SLOPES |= {f"_{name}": name for name in ("rising", "rising_stderr", "falling", "falling_stderr")}
 
 
@@ -71,7 +78,9 @@ def assemble(
             if driver.name in product.data_vars
             else ("time", driver.values[0], attributes)
         )
-    for name, (key, label, units) in _STATISTICS.items():
+    is_partial = "p_partial" in next(iter(entries.values()))
+    statistics = _STATISTICS | (_PARTIAL_STATISTICS if is_partial else {})
+    for name, (key, label, units) in statistics.items():
         made[name] = (dims, table(key), {"long_name": label, "units": units})
     made["windows_used"] = (
         dims,
@@ -94,7 +103,7 @@ def assemble(
                 "units": slope_units(str(product[name].attrs.get("units", "1")), driver.units),
                 "unit_label": slope_label(product[name], driver.units),
             }
-            for suffix, key in _SLOPES.items():
+            for suffix, key in (_SLOPES | (_PARTIAL_SLOPES if is_partial else {})).items():
                 series = name.replace("_", " ")
                 label = f"sensitivity of {series} to {driver.label}{_slope_label(key, level)}"
                 made[f"{name}_per_{driver.name}{suffix}"] = (
@@ -153,6 +162,9 @@ def _slope_label(key: str, level: float) -> str:
         for way, verb in (("rising", "rises"), ("falling", "falls"))
         for end, text in (("", ""), ("_stderr", ", standard error"))
     }
+    if key.startswith("partial"):
+        end = ends.get(key.removeprefix("partial_"))
+        return ", given the other drivers" + (f", {end}" if end else "")
     text = {**ends, **ramps}.get(key)
     return f", {text}" if text else ""
 

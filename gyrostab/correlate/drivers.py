@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,11 +24,7 @@ _MAX_GAP_SPACINGS = 3.0
 
 # Names in the denominator of a sensitivity: a difference of temperatures is in kelvin, and UDUNITS
 # takes "g" for the gram.
-_DIFFERENCE_UNITS = {
-    "degree_Celsius": "K",
-    "g": "standard_free_fall",
-    "9.80665": "standard_free_fall",
-}
+_DIFFERENCE_UNITS = {"degree_Celsius": "K", "g": "standard_free_fall"}
 
 
 @dataclass(frozen=True)
@@ -41,27 +38,54 @@ class Driver:
 
 
 def align_drivers(
-    product: xr.Dataset, channel: str | xr.DataArray, lags: NDArray[np.int64], step: float
+    product: xr.Dataset,
+    channels: Sequence[str | xr.DataArray],
+    lags: NDArray[np.int64],
+    step: float,
 ) -> list[Driver]:
-    """Average a channel and its rate of change over the windows, for every lag.
+    """Average channels over the windows, for every lag.
 
     Parameters
     ----------
     product : xarray.Dataset
         Product with ``time`` and ``time_bounds``.
-    channel : str or DataArray
-        Channel of the product, or a channel with a separate time coordinate.
+    channels : sequence of str or DataArray
+        Channels of the product, or with a separate time coordinate.
     lags : int64 (n_lags,)
-        Lags by which the gyro follows the channel [steps].
+        Lags by which the gyro follows the channels [steps].
     step : float
         Step of the windows [s].
 
     Returns
     -------
     list of Driver
-        The channel and its rate of change; NaN where they are unknown. Gaps up to one window or
-        three spacings of the channel are interpolated; nothing is extrapolated.
+        A single channel and its rate of change, or several channels without theirs; then a name
+        such as ``temperature_rate`` is the rate of change of a channel. NaN where they are unknown.
+        Gaps up to one window or three spacings of the channel are interpolated; nothing is
+        extrapolated.
     """
+    if not channels:
+        raise OptionError("give at least one channel, for instance temperature")
+    if len(channels) == 1:
+        return _align_channel(product, channels[0], lags, step)
+    drivers = []
+    for channel in channels:
+        rate_of = (
+            channel.removesuffix("_rate")
+            if isinstance(channel, str) and channel not in product
+            else channel
+        )
+        drivers.append(_align_channel(product, rate_of, lags, step)[0 if rate_of is channel else 1])
+    names = [driver.name for driver in drivers]
+    if len(set(names)) < len(names):
+        raise OptionError(f"the channels {', '.join(names)} are not all different; name each once")
+    return drivers
+
+
+def _align_channel(
+    product: xr.Dataset, channel: str | xr.DataArray, lags: NDArray[np.int64], step: float
+) -> list[Driver]:
+    """Average a channel and its rate of change over the windows, for every lag."""
     if isinstance(channel, str):
         if channel not in product.data_vars or product[channel].dims != ("time",):
             available = ", ".join(_channel_names(product)) or "none"
@@ -86,10 +110,11 @@ def align_drivers(
     ]
 
 
-def other_channels(product: xr.Dataset, driver: str) -> list[str]:
-    """List the channels of the product except the driver and its rate of change."""
-    bare = driver.removesuffix("_of_file")
-    return [name for name in _channel_names(product) if name not in (driver, bare, f"{bare}_rate")]
+def other_channels(product: xr.Dataset, drivers: Sequence[Driver]) -> list[str]:
+    """List the channels of the product except the drivers and their rates of change."""
+    bare = {driver.name.removesuffix("_of_file").removesuffix("_rate") for driver in drivers}
+    taken = bare | {f"{name}_rate" for name in bare} | {driver.name for driver in drivers}
+    return [name for name in _channel_names(product) if name not in taken]
 
 
 def _channel_names(product: xr.Dataset) -> list[str]:
@@ -253,7 +278,8 @@ def _unit_powers(units: str) -> dict[str, int]:
 
 def _difference_unit(units: str) -> str:
     """Give the unit of a difference: kelvin for degrees Celsius."""
-    return " ".join(_DIFFERENCE_UNITS.get(word, word) for word in units.split())
+    bare = units.replace("9.80665 m s-2", "g")
+    return " ".join(_DIFFERENCE_UNITS.get(word, word) for word in bare.split())
 
 
 def _multiply_units(units: str, more: dict[str, int]) -> str:
@@ -271,6 +297,8 @@ def slope_units(units: str, driver: str) -> str:
     --------
     >>> slope_units(INNER["rate"], INNER["temperature"]), slope_units("microradian", "K hour-1")
     ('degree hour-1 K-1', 'microradian K-1 hour')
+    >>> slope_units(INNER["rate"], "9.80665 m s-2")
+    'degree hour-1 standard_free_fall-1'
     """
     below = {name: -power for name, power in _unit_powers(_difference_unit(driver)).items()}
     return _multiply_units(_difference_unit(units) if units in INNER.values() else units, below)

@@ -36,6 +36,7 @@ LIMITS = {
     "look alike",
     "other_channel": "another channel explains it equally well",
 }
+_READABLE = {"degree": "deg", "hour": "h", "degree_Celsius": "K", "standard_free_fall": "g"}
 _MIN_BLOCKS = 12
 _MIN_RANGE = {"degree_Celsius": 0.02}  # a channel with a smaller range counts as constant
 
@@ -94,7 +95,7 @@ def readable_units(units: str) -> str:
     for word in units.split():
         name = word.rstrip("-0123456789") or word
         power = word[len(name) :]
-        name = {"degree": "deg", "hour": "h", "degree_Celsius": "K"}.get(name, name)
+        name = _READABLE.get(name, name)
         size = power.removeprefix("-")
         name += f"^{size}" if size not in ("", "1") else ""
         if power.startswith("-"):
@@ -148,6 +149,9 @@ def describe_coupling(entry: dict[str, Any], driver: str, series: str) -> str:
     number = f"{entry['slope']:.3g} ({between}) {units}"
     late = f" {entry['lag']:.6g} s later" if entry["lag"] else ""
     start = series[0].upper() + series[1:]
+    if np.isfinite(entry.get("partial", np.nan)):
+        ends = f"{entry['partial_low']:.3g} to {entry['partial_high']:.3g}"
+        number += f", given the other drivers {entry['partial']:.3g} ({ends})"
     odds = f"p {'' if entry['p_adjusted'] < 1e-4 else '= '}{format_p_value(entry['p_adjusted'])}"
     if verdict == "none_seen":
         apart = not entry["low"] <= 0.0 <= entry["high"]

@@ -50,6 +50,7 @@ def correlation_rows(result: xr.Dataset) -> list[dict[str, str]]:
                         f"{result.attrs['interval_level']:.0%} interval": "-"
                         if np.isnan(low)
                         else f"{low:.3g} .. {high:.3g}",
+                        **_partial_column(cell, f"{name}_per_{driver}_partial"),
                         "unit": str(slope.attrs["unit_label"]),
                         "r": r,
                         "n eff": n,
@@ -60,8 +61,20 @@ def correlation_rows(result: xr.Dataset) -> list[dict[str, str]]:
     return rows
 
 
+def _partial_column(cell: xr.Dataset, name: str) -> dict[str, str]:
+    """Format the slope given the other drivers, if there is one."""
+    if name not in cell:
+        return {}
+    value, low, high = (float(cell[f"{name}{end}"]) for end in ("", "_low", "_high"))
+    return {
+        "given the others": "-" if np.isnan(value) else f"{value:.3g} ({low:.3g} .. {high:.3g})"
+    }
+
+
 def format_correlation(result: xr.Dataset) -> str:
     """Format the result as a table, with a sentence on each coupling that is or may be there.
+
+    Couplings that the record cannot show are counted in one line.
 
     Parameters
     ----------
@@ -74,7 +87,8 @@ def format_correlation(result: xr.Dataset) -> str:
         Text of several lines.
     """
     rows = correlation_rows(result)
-    table = [tuple(rows[0]), *(tuple(row.values()) for row in rows)]
+    told = [row for row in rows if row["verdict"] != "cannot tell"]
+    table = [tuple(rows[0]), *(tuple(row.values()) for row in told)] if told else []
     verdicts = result["coupling_verdict"].values.ravel()
     sentences = result["statement"].values.ravel()
     statements = [
@@ -83,11 +97,8 @@ def format_correlation(result: xr.Dataset) -> str:
     ]
     cannot = np.flatnonzero(verdicts == VERDICTS.index("cannot_tell"))
     if cannot.size:
-        statements.append(
-            str(sentences[cannot[0]])
-            + (f" ({cannot.size - 1} more like it)" if cannot.size > 1 else "")
-        )
-    widths = [max(len(row[column]) for row in table) for column in range(len(table[0]))]
+        statements.append(_count_untold(cannot.size, rows, str(sentences[cannot[0]])))
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     lines = [
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
         for row in table
@@ -96,4 +107,16 @@ def format_correlation(result: xr.Dataset) -> str:
         "Lag, sensitivity and interval are those of the best-fitting lag; "
         "p adjusted is for the whole search."
     )
-    return "\n".join([*lines, note, "", *(statements or ["No coupling is seen."])])
+    lines += [note, ""] if told else []
+    return "\n".join([*lines, *(statements or ["No coupling is seen."])])
+
+
+def _count_untold(count: int, rows: list[dict[str, str]], example: str) -> str:
+    """Fold the couplings of which the record shows nothing into one line."""
+    if count == 1:
+        return example
+    names = dict.fromkeys(row["variable"] for row in rows if row["verdict"] == "cannot tell")
+    return (
+        f"{count} of {len(rows)} combinations ({', '.join(names)}) cannot be judged, for instance: "
+        f"{example}"
+    )

@@ -16,9 +16,9 @@ import xarray as xr
 import gyrostab
 from gyrostab.cli import main
 from gyrostab.correlate.judge import VERDICTS
+from gyrostab.correlate.table import format_correlation
 from gyrostab.errors import OptionError, TimeError
 from gyrostab.kernels.regression.coupling import (
-    block_averages,
     calibrated,
     decompose,
     fit_lags,
@@ -86,6 +86,68 @@ def test_rising_and_falling_slopes_are_fitted_separately():
         assert abs(slope - 0.3) < 4 * error < 0.2
 
 
+def shaken_product(**options):
+    """Make a product with a vibration that moves mostly with temperature."""
+    product = coupled.product(noises="white", terms=False, **options)
+    warm = product["temperature"].values
+    alike = (warm - warm.mean()) / warm.std()
+    shaking = alike + 0.15 * np.sin(np.linspace(0, 40, warm.size))
+    product["vibration"] = ("time", 2 + 0.5 * shaking, {"units": "9.80665 m s-2"})
+    return product
+
+
+def test_partial_effects_separate_two_drivers_that_move_together():
+    product = shaken_product(slope=0.3)
+    alone = gyrostab.correlate(product, channel="vibration", variables="window_mean", max_lag=0)
+    assert float(alone["p_value"].sel(axis="x", driver="vibration").item()) < 0.01
+    found = gyrostab.correlate(
+        product, channel=["temperature", "vibration"], variables="window_mean", max_lag=0
+    )
+    assert list(found["driver"].values) == ["temperature", "vibration"]
+    warmed = {"axis": "x", "variable": "window_mean", "driver": "temperature"}
+    shaken = warmed | {"driver": "vibration"}
+    assert verdict(found, **warmed) == "coupled"
+    assert verdict(found, **shaken) == "not_told_apart"
+    low, high = (found[f"window_mean_per_temperature_partial_{end}"][0] for end in ("low", "high"))
+    assert low < 0.3 < high
+    low, high = (found[f"window_mean_per_vibration_partial_{end}"][0] for end in ("low", "high"))
+    assert low < 0.0 < high
+    assert found["p_value_partial"].sel(shaken) > 0.05
+    assert "another channel explains it equally well" in str(found["statement"].sel(shaken).values)
+    assert "given the other drivers" in format_correlation(found)
+
+
+def test_rate_of_change_is_a_driver_only_if_it_is_named_with_others():
+    product = shaken_product().drop_vars("temperature_rate")
+    found = gyrostab.correlate(
+        product, channel=["vibration", "temperature_rate"], variables="window_mean", max_lag=0
+    )
+    assert list(found["driver"].values) == ["vibration", "temperature_rate"]
+    with pytest.raises(OptionError, match="name each once"):
+        gyrostab.correlate(product, channel=["vibration", "vibration"])
+    with pytest.raises(OptionError, match="at least one channel"):
+        gyrostab.correlate(product, channel=[])
+
+
+def test_several_drivers_on_the_command_line(tmp_path, capsys):
+    path = gyrostab.to_netcdf(shaken_product(slope=0.3), tmp_path / "product.nc")
+    command = ["correlate", str(path), "--max-lag", "0s"]
+    assert main([*command, "--with", "temperature,vibration"]) == 0
+    together = capsys.readouterr().out
+    assert "given the others" in together
+    assert main([*command, "--with", "temperature", "--with", "vibration"]) == 0
+    assert capsys.readouterr().out == together
+
+
+def test_combinations_that_cannot_be_judged_take_one_line():
+    few = gyrostab.correlate(coupled.product(windows=16))
+    table = format_correlation(few)
+    assert len(gyrostab.correlation_rows(few)) == 18
+    assert len(table.splitlines()) == 1
+    assert table.startswith("18 of 18 combinations (window_mean, N, B) cannot be judged")
+    assert "too few independent windows" in table
+
+
 def test_fit_under_white_noise_is_ordinary_least_squares():
     rng = np.random.default_rng(3)
     y, x = rng.normal(size=(40, 1)), rng.normal(size=(40, 1))
@@ -98,20 +160,6 @@ def test_fit_under_white_noise_is_ordinary_least_squares():
     assert slope_interval(fit, 0, 0, 0.05)[3] == pytest.approx(
         solved[1, 0] + 2.024394 * error, rel=1e-5
     )
-
-
-def test_overlap_of_windows_enters_the_covariance():
-    """Compare with the covariance of block means of windows cut from white noise."""
-    rng = np.random.default_rng(4)
-    cells = rng.normal(size=(20000, 14))
-    windows = 0.5 * (cells[:, 1:] + cells[:, :-1])[:, :12]
-    mean, _, white = block_averages(
-        np.repeat(np.arange(3), 4), np.arange(12) * 30.0, 60.0, np.ones(12)
-    )
-    blocks = windows @ mean.toarray().T
-    np.testing.assert_allclose(
-        np.cov(blocks.T) * 2, white, atol=0.02
-    )  # a full window of two cells has variance 1/2
 
 
 def test_calibration_of_p_values_is_inverted_exactly():

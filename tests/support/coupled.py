@@ -25,8 +25,17 @@ def temperature(kind: str, cells: int, rng: np.random.Generator) -> np.ndarray:
     return np.full(cells, 40.0)
 
 
+def averaged_walk(step: float, cells: int, rng: np.random.Generator) -> np.ndarray:
+    """Means over the cells of a random walk that changes by `step` (one sigma) in a cell.
+
+    The mean of a Brownian bridge over its cell has the variance step^2 / 12.
+    """
+    ends = np.cumsum(rng.normal(0, step, cells + 1))
+    return 0.5 * (ends[1:] + ends[:-1]) + rng.normal(0, step / np.sqrt(12), cells)
+
+
 def noise(kind: str, cells: int, rng: np.random.Generator) -> np.ndarray:
-    """Cell means [deg/h]: white, with flicker, with random walk, or with slow autoregression."""
+    """Cell means [deg/h]: white, with flicker, random walk, or slow autoregression."""
     white = rng.normal(size=cells)
     if kind == "flicker":
         f = np.fft.rfftfreq(4 * cells)[1:]
@@ -35,8 +44,10 @@ def noise(kind: str, cells: int, rng: np.random.Generator) -> np.ndarray:
             shape * (rng.normal(size=shape.size) + 1j * rng.normal(size=shape.size))
         )[:cells]
         return white + 1.5 * slow / slow.std()
-    if kind == "walk":
-        return white + np.cumsum(rng.normal(0, 0.3, cells))
+    if kind in ("weak walk", "walk", "strong walk"):
+        return white + averaged_walk(
+            {"weak walk": 0.15, "walk": 0.5, "strong walk": 5.0}[kind], cells, rng
+        )
     if kind == "slow":
         slow, step = np.zeros(cells), rng.normal(size=cells)
         for i in range(1, cells):

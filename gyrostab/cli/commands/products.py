@@ -66,24 +66,30 @@ def correlate(
     product: Product,
     /,
     *,
-    with_: Annotated[str, Parameter(name="--with", metavar="CHANNEL")] = "temperature",
+    with_: Annotated[
+        list[str] | None, Parameter(name="--with", metavar="CHANNEL,...", negative=())
+    ] = None,
     max_lag: Annotated[str | None, Parameter(metavar="DURATION")] = None,
     output: Annotated[Path | None, Parameter(name=["--output", "-o"], metavar="FILE")] = None,
     other: ChannelFile = ChannelFile(),
     common: Common = Common(),
 ) -> None:
-    """Correlate noise coefficients and window means with temperature or another channel.
+    """Correlate noise coefficients and window means with temperature or other channels.
 
-    Prints which quantities follow the channel, how strongly, and with what lag.
+    Prints which quantities follow the channel, how strongly, and with what lag. With several
+    channels, also the effect of each given the others.
 
-    Example: gyrostab correlate product.nc --with temperature --max-lag 2h -o coupling.nc
+    Example: gyrostab correlate product.nc --with temperature,vibration --max-lag 2h -o coupling.nc
 
     Parameters
     ----------
     product
         File written by gyrostab run or gyrostab fit.
     with_
-        Channel of the product, or of the file given by --channel.
+        Channel of the product, or of the file given by --channel (default: temperature). Several
+        are separated by commas; of these, --channel gives those that the product lacks. One channel
+        is compared together with its rate of change; of several, name the rate too
+        (temperature_rate).
     max_lag
         Longest lag of the gyro behind the channel (default: one tenth of the record; 0s for none).
     output
@@ -106,9 +112,13 @@ def correlate(
     with show_stages(common) as stage:
         stage("correlating", 0)
         dataset = open_product(product)
-        found = compute(
-            dataset, channel=read_channel(file, with_, **given) if file else with_, max_lag=max_lag
-        )
+        names = [name.strip() for part in with_ or ["temperature"] for name in part.split(",")]
+        from_file = {name for name in names if len(names) == 1 or name not in dataset}
+        channels = [
+            read_channel(file, name, **given) if file and name in from_file else name
+            for name in names
+        ]
+        found = compute(dataset, channel=channels, max_lag=max_lag)
         if target and picture:
             with new_output(picture, overwrite=common.overwrite) as temporary:
                 save_png(plot_correlation(found), temporary)

@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.sparse import csr_array
 from scipy.special import stdtr, stdtrit
+
+from gyrostab.kernels.regression.windows import slow_covariance, white_covariance
 
 __all__ = [
     "LagFit",
     "Laws",
-    "block_averages",
     "calibrated",
     "decompose",
     "fit_lags",
@@ -34,8 +34,12 @@ Array = NDArray[np.float64]
 #: white part's at one cycle per record.
 _TIMES = (0.03, 0.1, 0.3, 1.0, 10.0)
 _RATIOS = (1.0, 4.0, 16.0, 64.0, 1e3, 1e4, 1e6)
-# against the correlation time for each slow law: a short memory must show itself in the data
-_WHITE_PRIOR = 150.0
+# Prior weights: the correlation time times a power of the ratio for each slow law, so that a short
+# memory or a weak slow part must show itself in the data, and this for white noise alone. Chosen
+# for p-values below 5 % in 5 to 8 % of records with a weak random walk, which is the hardest case:
+# docs/temperature.md.
+_RATIO_POWER = 0.5
+_WHITE_PRIOR = 50.0
 _TAIL = 60  # smallest of the simulated p-values, from which the law of still smaller ones is taken
 _STEEPEST = 1.5  # power of the share against the p-value in the tail, at most
 
@@ -60,52 +64,8 @@ class LagFit(NamedTuple):
     freedom: int
 
 
-def block_averages(
-    block: NDArray[np.int64], time: Array, length: float, share: Array
-) -> tuple[Any, Array, Array]:
-    """Average windows into blocks, with the covariance of the blocks in white noise.
-
-    Parameters
-    ----------
-    block : int64 (n,)
-        Number of the block of each window, consecutive from 0.
-    time, length : float64 (n,), float
-        Centres and length of the windows [s]. Two windows share white noise as far as they overlap.
-    share : float64 (n,)
-        Share of samples present in each window; its white variance is inversely proportional.
-
-    Returns
-    -------
-    mean : sparse (n_blocks, n)
-        Averaging matrix.
-    centre : float64 (n_blocks,)
-        Mean time of the windows of each block [s].
-    white : float64 (n_blocks, n_blocks)
-        Covariance of the blocks when the noise is white with unit variance in a full window.
-    """
-    n, count = time.size, int(block[-1]) + 1
-    sizes = np.bincount(block, minlength=count)
-    mean = csr_array((1.0 / sizes[block], (block, np.arange(n))), shape=(count, n))
-    last = np.searchsorted(time, time + length, side="left")
-    rows = np.repeat(np.arange(n), last - np.arange(n))
-    columns = np.arange(rows.size) - np.repeat(
-        np.cumsum(last - np.arange(n)) - last, last - np.arange(n)
-    )
-    overlap = (1.0 - (time[columns] - time[rows]) / length) / np.sqrt(share[rows] * share[columns])
-    upper = csr_array((overlap, (rows, columns)), shape=(n, n))
-    half = (mean @ upper @ mean.T).toarray()
-    white = (
-        half
-        + half.T
-        - (
-            mean @ csr_array((1.0 / share, (np.arange(n), np.arange(n))), shape=(n, n)) @ mean.T
-        ).toarray()
-    )
-    return mean, np.asarray(mean @ time), white
-
-
-def noise_laws(centre: Array, white: Array) -> Laws:
-    """Make the noise laws of the blocks, with their prior weights.
+def noise_laws(mean: Any, time: Array, length: float, share: Array) -> Laws:
+    """Make the noise laws of blocks of windows, with their prior weights.
 
     White noise alone, and white noise with a slow part: an Ornstein-Uhlenbeck process, which is a
     random walk when its correlation time is longer than the record. Mixtures of several look like
@@ -113,29 +73,25 @@ def noise_laws(centre: Array, white: Array) -> Laws:
 
     Parameters
     ----------
-    centre : float64 (n,)
-        Times of the blocks [s].
-    white : float64 (n, n)
-        Covariance under white noise.
+    mean : sparse (n, n_windows)
+        Result of `average_windows`.
+    time, length, share : float64 (n_windows,), float, float64 (n_windows,)
+        Centres [s], length [s], and share of samples present: see `white_covariance`.
 
     Returns
     -------
     Laws
         Without nuisance columns (see `project_out`).
     """
-    record = float(np.ptp(centre)) or 1.0
-    distance = np.abs(centre[:, None] - centre[None, :]) / record
-    density = float(np.mean(np.diag(white))) / centre.size
+    record = float(np.ptp(mean @ time)) or 1.0
+    white = white_covariance(mean, time, length, share)
+    density = float(np.mean(np.diag(white))) / white.shape[0]
     family, prior = [white], [_WHITE_PRIOR]
-    for length in _TIMES:
-        slow = (
-            np.exp(-distance / length)
-            * density
-            * (1.0 + (2.0 * np.pi * length) ** 2)
-            / (2.0 * length)
-        )
+    for memory in _TIMES:
+        slow = slow_covariance(mean, time, length, memory * record)
+        slow *= density * (1.0 + (2.0 * np.pi * memory) ** 2) / (2.0 * memory)
         family += [white + ratio * slow for ratio in _RATIOS]
-        prior += [length] * len(_RATIOS)
+        prior += [memory * ratio**_RATIO_POWER for ratio in _RATIOS]
     return decompose(family, np.log(prior))
 
 
