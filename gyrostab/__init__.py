@@ -147,9 +147,20 @@ def __getattr__(name: str) -> Any:
 
         return version("gyrostab")
     if name in _HOME:
-        return getattr(importlib.import_module(f"gyrostab.{_HOME[name]}"), name)
+        found = getattr(importlib.import_module(f"gyrostab.{_HOME[name]}"), name)
+        _register_accessor()
+        return found
     raise AttributeError(f"module 'gyrostab' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
     return sorted(__all__)
+
+
+def _register_accessor() -> None:
+    """Register the accessor ``.gyro`` of xarray objects if xarray is loaded."""
+    if "xarray" in sys.modules:
+        importlib.import_module("gyrostab.xarray")
+
+
+_register_accessor()

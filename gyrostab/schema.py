@@ -211,7 +211,8 @@ def _require_variables(dataset: xr.Dataset, what: str, dims: dict[str, tuple[str
     if not isinstance(dataset, xr.Dataset):
         raise SchemaError(
             f"this is a {type(dataset).__name__}, not a {what}: give the whole xarray.Dataset; "
-            f"{_MAKERS[what]} makes one"
+            f"{_MAKERS[what]} makes one, and gyrostab.from_dataframe and gyrostab.from_dataarray "
+            "make logs"
         )
     for name, expected in dims.items():
         if name not in dataset.variables:
@@ -237,6 +238,7 @@ _MAKERS = {
 
 def check_raw(raw: xr.Dataset) -> None:
     """Raise `SchemaError` unless `raw` is what a reader returns (see `gyrostab.ingest`)."""
+    _require_variables(raw, "raw log", {})
     name = signal_name(raw)
     _require_variables(raw, "raw log", {name: ("axis", "row")})
     _check_units(raw, name)
@@ -271,7 +273,7 @@ def _check_units(dataset: xr.Dataset, name: str) -> None:
     if units != SIGNAL_UNITS[name]:
         raise SchemaError(
             f"variable {name!r} has units {units!r}, expected {SIGNAL_UNITS[name]!r}; "
-            "convert it and say so"
+            f"gyrostab.from_dataarray(dataset[{name!r}]) converts it"
         )
 
 

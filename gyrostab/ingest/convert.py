@@ -15,6 +15,8 @@ from gyrostab.errors import MissingUnitError, OptionError, SchemaError, TimeErro
 from gyrostab.ingest.uniform import as_uniform
 from gyrostab.noise import HOUR
 from gyrostab.schema import SIGNAL_UNITS, texts
+from gyrostab.store.private import is_in_memory
+from gyrostab.store.read import MIN_LAZY_VALUES, make_variable_lazy
 from gyrostab.units import Unit, known_units, parse_unit
 
 __all__ = ["as_log", "from_dataarray", "from_dataframe"]
@@ -47,7 +49,20 @@ def as_log(data: Any) -> xr.Dataset:
         return as_uniform(_dataset_of(data, None, None)[0])
     if isinstance(data, pd.DataFrame | pd.Series):
         return from_dataframe(data)
-    return as_uniform(data)
+    return as_uniform(_keep_on_disk(data) if isinstance(data, xr.Dataset) else data)
+
+
+def _keep_on_disk(log: xr.Dataset) -> xr.Dataset:
+    """Make dask arrays of long variables that xarray has not read yet, to read them in parts."""
+    unread = {
+        name: make_variable_lazy(array.variable, Path(str(array.encoding.get("source", "log"))))
+        for name, array in log.data_vars.items()
+        if array.size >= MIN_LAZY_VALUES
+        and array.chunks is None
+        and array.dtype.kind in "iuf"
+        and not is_in_memory(array.variable)
+    }
+    return log.assign(unread) if unread else log
 
 
 def from_dataframe(
@@ -151,9 +166,17 @@ def _read_frame(
     def fetch(source: int, begin: int, end: int) -> Any:
         return stamps[begin:end] if source == 0 else table.iloc[begin:end, source - 1].to_numpy()
 
-    plan = plan_columns(Path("DataFrame"), ["time", *headers], options, stamped=[0])
-    raw = read_columns(plan, options, len(table), fetch)
-    check_options([raw])
+    try:
+        plan = plan_columns(Path("DataFrame"), ["time", *headers], options, stamped=[0])
+        raw = read_columns(plan, options, len(table), fetch)
+        check_options([raw])
+    except MissingUnitError as error:
+        problem = str(error).split("; give")[0]
+        raise MissingUnitError(
+            f"{problem}; give it: gyrostab.from_dataframe(df, units='deg/s'), "
+            "units={'gyro': 'deg/s', 'temperature': 'degC'}, df.attrs['units'] = 'deg/s', or the "
+            "name of the column, 'gyro_x [deg/s]'"
+        ) from error
     return raw
 
 

@@ -21,7 +21,7 @@ import xarray as xr
 from gyrostab.errors import FormatError, OptionError, SchemaError, TimeError, reading_of
 from gyrostab.ingest.convert import as_log
 from gyrostab.schema import SIGNAL_UNITS, check_log, check_product, check_surface
-from gyrostab.store.cf import GRID, from_disk, index_dim, to_disk
+from gyrostab.store.cf import GRID, find_kind, from_disk, index_dim, to_disk
 from gyrostab.store.netcdf_compression import append_compressed, large_variables
 from gyrostab.store.output import find_foreign_item, find_sources, new_output
 from gyrostab.store.private import library_lock
@@ -513,6 +513,32 @@ def open_log(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Datase
         "make one with 'gyrostab ingest'",
         strict=strict,
     )
+    return _restore_log(log, path)
+
+
+def open_content(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Dataset:
+    """Open a log, a surface or a product, whichever the file holds, as the functions above do.
+
+    Raises
+    ------
+    FormatError
+        When the file does not exist, when it is damaged, or when it holds something else.
+    SchemaError, TimeError
+        When it holds a log of other units, or one whose time is not uniform.
+    """
+    dataset = open_dataset(path, strict=strict)
+    if any(name in dataset.data_vars for name in SIGNAL_UNITS):
+        return _restore_log(dataset, path)
+    if "gyrostab_content" not in dataset.attrs and find_kind(dataset) == "dataset":
+        dataset.close()
+        raise FormatError(
+            f"{path}: holds no log, surface or product of gyrostab; gyrostab.read_log reads logs "
+            "of other programs"
+        )
+    return dataset
+
+
+def _restore_log(log: xr.Dataset, path: str | os.PathLike[str]) -> xr.Dataset:
     try:
         return as_log(log)
     except (SchemaError, TimeError) as error:

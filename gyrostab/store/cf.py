@@ -39,6 +39,7 @@ __all__ = [
     "GRID",
     "PACKING",
     "decode_stamps",
+    "find_kind",
     "from_disk",
     "index_dim",
     "parse_time_grids",
@@ -77,7 +78,8 @@ _SAFE_UNIT = re.compile(
 )
 
 
-def _find_kind(dataset: xr.Dataset) -> str:
+def find_kind(dataset: xr.Dataset) -> str:
+    """Return ``"product"``, ``"surface"`` or ``"log"``, or ``"dataset"`` for anything else."""
     for kind, check in (("product", check_product), ("surface", check_surface), ("log", check_log)):
         with contextlib.suppress(SchemaError):
             check(dataset)
@@ -90,7 +92,7 @@ def to_disk(dataset: xr.Dataset, verb: str, *, stamps: bool = False) -> xr.Datas
 
     With `stamps`, a computed time axis becomes a lazy coordinate, with its rule as an attribute.
     """
-    kind = _find_kind(dataset)
+    kind = find_kind(dataset)
     dataset = make_names_storable(dataset)
     grids = _find_time_grids(dataset)
     divisor = 1000 if _has_whole_microseconds(dataset, grids, stamps=stamps) else 1

@@ -28,7 +28,7 @@ from gyrostab.store.lazy import FileVariable, RowSource, make_dask
 from gyrostab.store.private import close_function
 from gyrostab.time.grid import grid_times
 
-__all__ = ["open_stored"]
+__all__ = ["MIN_LAZY_VALUES", "make_variable_lazy", "open_stored"]
 
 #: Values from which a variable of a log is a dask array.
 MIN_LAZY_VALUES = 2**17
@@ -93,7 +93,7 @@ def _make_variables_lazy(
     ready = {  # text is always small, and dask cannot find the size of its chunks
         name: item.load()
         if item.size < small or item.dtype.kind in "OSU"
-        else _make_variable_lazy(item, path)
+        else make_variable_lazy(item, path)
         for name, item in rest.items()
     }
     coords = xr.Coordinates(
@@ -107,7 +107,8 @@ def _make_variables_lazy(
     return lazy
 
 
-def _make_variable_lazy(variable: xr.Variable, path: Path) -> xr.Variable:
+def make_variable_lazy(variable: xr.Variable, path: Path) -> xr.Variable:
+    """Make a dask array, by the chunks on disk, of a variable that xarray has opened without."""
     cut = variable.encoding.get("preferred_chunks")
     chunks = tuple(cut[dim] for dim in variable.dims) if cut else "auto"
     lazy = make_dask(FileVariable(variable, path), chunks)

@@ -527,8 +527,19 @@ class TestDataFrame:
 
     def test_invalid_input_is_refused(self):
         x = record()
-        with pytest.raises(MissingUnitError, match="no unit"):
+        with pytest.raises(
+            MissingUnitError,
+            match=r"'gyro_x' carries no unit; give it: gyrostab\.from_dataframe\(df, units='deg/s'",
+        ):
             gyrostab.davar(self.frame(x), window="8s")
+        for function in (gyrostab.regularise, gyrostab.fit_noise, gyrostab.plot_davar):
+            with pytest.raises(SchemaError, match=r"this is a DataFrame.*gyrostab\.from_dataframe"):
+                function(self.frame(x))
+        with pytest.raises(SchemaError, match="no table of gaps"):
+            gyrostab.gap_table(self.frame(x))
+        foreign = make(x).assign(rate=make(x).rate.assign_attrs(units="deg/s"))
+        with pytest.raises(SchemaError, match=r"gyrostab\.from_dataarray\(dataset\['rate'\]\)"):
+            gyrostab.davar(foreign, window="8s")
         with pytest.raises(SchemaError, match=r"transpose it: df\.T"):
             gyrostab.davar(self.frame(x).T, window="8s")
         with pytest.raises(SchemaError, match="not times"):

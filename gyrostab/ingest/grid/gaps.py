@@ -122,7 +122,7 @@ def gap_table(log: xr.Dataset) -> pd.DataFrame:
        seconds  samples  rows    cause
     0     0.02        2     0  missing
     """
-    if "gap_start" not in log.variables:
+    if not isinstance(log, xr.Dataset) or "gap_start" not in log.variables:
         raise SchemaError(
             "this log has no table of gaps (gap_start, gap_end, ...); gyrostab.regularise makes "
             "logs with one"

@@ -374,7 +374,8 @@ def regularise(
     >>> log.attrs["sampling_rate_hz"]
     100.0
     """
-    if "row" not in raw.dims and "sampling_rate_hz" in raw.attrs:
+    is_log = isinstance(raw, xr.Dataset) and "row" not in raw.dims
+    if is_log and "sampling_rate_hz" in raw.attrs:
         return as_uniform(raw)
     check_raw(raw)
     _check_options(rate=rate, tolerance=tolerance, chunk=chunk, block=block)
