@@ -29,17 +29,17 @@ __all__ = ["attach_channels", "concatenate", "memory_bytes", "move_to_disk", "wi
 
 
 def memory_bytes(part: xr.Dataset) -> int:
-    """Return the size of the columns of a raw log that are in memory [bytes]."""
-    arrays = sum(
-        variable.nbytes
-        for name, variable in part.variables.items()
-        if name != "axis" and variable.chunks is None
-    )
+    """Return the size of the columns of a raw log that are in memory [bytes]; 0 for other logs."""
+    arrays = sum(variable.nbytes for variable in _columns(part).values() if variable.chunks is None)
     return arrays + sum(pieces.memory_bytes for pieces in _columns_in_pieces(part))
 
 
+def _columns(part: xr.Dataset) -> dict[Any, xr.Variable]:
+    return {name: variable for name, variable in part.variables.items() if "row" in variable.dims}
+
+
 def _columns_in_pieces(part: xr.Dataset) -> list[PiecewiseColumn]:
-    return [pieces for variable in part.variables.values() for pieces in pieces_of(variable.data)]
+    return [pieces for variable in _columns(part).values() for pieces in pieces_of(variable.data)]
 
 
 def move_to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
@@ -55,11 +55,7 @@ def move_to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
 
     for pieces in _columns_in_pieces(part):
         pieces.move_to(spool)
-    long = {
-        name: variable
-        for name, variable in part.variables.items()
-        if name != "axis" and variable.chunks is None
-    }
+    long = {name: variable for name, variable in _columns(part).items() if variable.chunks is None}
     return part.assign({name: (v.dims, moved(v), v.attrs, v.encoding) for name, v in long.items()})
 
 

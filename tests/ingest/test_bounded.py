@@ -19,8 +19,10 @@ from gyrostab import davar, make_log, read_log, regularise, scan, to_netcdf, to_
 from gyrostab.allan.davar import davar_part
 from gyrostab.errors import FormatError, OptionError, TimeError
 from gyrostab.ingest import ReadOptions
+from gyrostab.ingest.columns import pieces
 from gyrostab.ingest.columns import typed as arrays
 from gyrostab.ingest.columns.pieces import Spool
+from gyrostab.ingest.files import Reader
 from gyrostab.ingest.formats import matlab
 from gyrostab.ingest.formats import netcdf as netcdf_reader
 from gyrostab.ingest.limits import check_limits
@@ -57,12 +59,23 @@ def test_foreign_netcdf_takes_less_memory_than_its_stamps(
     monkeypatch.setattr(arrays, "BATCH_ROWS", 2**16)
     rows = 1_500_000
     path = write_stamped_netcdf(tmp_path / "log.nc", rows)
-    netcdf_reader.read(
-        write_stamped_netcdf(tmp_path / "short.nc", 3000), ReadOptions(), limit=1000
-    )  # loads modules
-    assert (
-        peak_of(lambda: netcdf_reader.read(path, ReadOptions(), limit=2**20)) < 8 * rows
-    )  # the stamps alone have that many
+    read_with(1000, write_stamped_netcdf(tmp_path / "short.nc", 3000))  # loads modules
+    assert peak_of(lambda: read_with(2**20, path)) < 8 * rows  # the stamps alone have that many
+
+
+def read_with(limit: int, path: Path, reader: Reader = netcdf_reader) -> xr.Dataset:
+    """Read a file whose columns leave memory above a number of bytes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pieces, "SPILL_BYTES", limit)
+        return reader.read(path, ReadOptions())
+
+
+def test_regular_log_is_read_without_its_time_axis(tmp_path: Path) -> None:
+    rows = 1_000_000
+    log = make_log(np.zeros(rows, np.int16), rate=400.0, unit="deg/h")
+    path = to_zarr(log, tmp_path / "log.zarr")
+    read_log(path)  # loads modules
+    assert peak_of(lambda: read_log(path)) < 8 * rows
 
 
 def write_csv(path: Path, stamps_ns: np.ndarray) -> Path:
@@ -210,17 +223,18 @@ FOREIGN = {
 
 
 @pytest.mark.parametrize("name", FOREIGN)
-def test_values_of_foreign_files_stay_in_the_file(
+def test_values_of_foreign_files_stay_in_the_file_unless_compressed(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / name
     FOREIGN[name](path)
     monkeypatch.setattr(arrays, "BATCH_ROWS", 1024)
-    monkeypatch.setattr(
-        Spool, "add", lambda *_: pytest.fail("a column was moved to a temporary file")
-    )
+    moved: list[np.ndarray] = []
+    add = Spool.add
+    monkeypatch.setattr(Spool, "add", lambda spool, part: (moved.append(part), add(spool, part))[1])
     reader = matlab if path.suffix in (".h5", ".mat") else netcdf_reader
-    whole, lazy = (reader.read(path, ReadOptions(), limit=limit) for limit in (2**27, 1000))
+    whole, lazy = (read_with(limit, path, reader) for limit in (2**27, 1000))
+    assert bool(moved) == ("chunks" in name or path.suffix == ".zarr")
     assert whole["rate"].chunks is None
     assert lazy["rate"].chunks is not None
     for raw in (whole, lazy):
@@ -233,7 +247,7 @@ def test_windows_of_values_in_a_file_equal_those_in_memory(
     tmp_path: Path,
 ) -> None:
     path = write_stamped_netcdf(tmp_path / "log.nc", 300_000)
-    raw = netcdf_reader.read(path, ReadOptions(), limit=1000)
+    raw = read_with(1000, path)
     log = regularise(raw)
     part = davar_part(log, part=slice(0, 5), window="60s", step="30s")
     whole = davar(regularise(netcdf_reader.read(path, ReadOptions())), window="60s", step="30s")
@@ -405,9 +419,7 @@ def test_log_of_values_in_a_file_equals_that_in_memory(
     stamps = START_NS + np.arange(20_000) * 2_500_000
     stamps[10_000:] += 0 if even else 7_500_000
     path = write_gappy_netcdf(tmp_path / "log.nc", 20_000, stamps)
-    whole, lazy = (
-        regularise(netcdf_reader.read(path, ReadOptions(), limit=limit)) for limit in (2**27, 1000)
-    )
+    whole, lazy = (regularise(read_with(limit, path)) for limit in (2**27, 1000))
     xr.testing.assert_identical(whole.drop_attrs(deep=False), lazy.load().drop_attrs(deep=False))
     assert whole.attrs["notes"] == lazy.attrs["notes"]
 
@@ -417,7 +429,7 @@ def test_even_stamps_are_placed_from_the_beginning_alone(
 ) -> None:
     monkeypatch.setattr(regularise_module, "_EVEN_ROWS", 2**14)
     path = write_stamped_netcdf(tmp_path / "log.nc", 100_000)
-    whole, lazy = (netcdf_reader.read(path, ReadOptions(), limit=limit) for limit in (2**27, 1000))
+    whole, lazy = (read_with(limit, path) for limit in (2**27, 1000))
     seen = []
     rate = regularise_module.estimate_rate
     monkeypatch.setattr(

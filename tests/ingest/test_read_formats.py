@@ -19,6 +19,7 @@ from scipy.io import savemat
 import gyrostab
 from gyrostab.errors import FormatError, MissingUnitError, OptionError
 from gyrostab.ingest import ReadOptions, read_log, readers, scan_file
+from gyrostab.ingest.columns import pieces
 from gyrostab.ingest.columns.pieces import Buffers, PiecewiseColumn, Spool, as_lazy
 from gyrostab.schema import check_raw
 
@@ -201,7 +202,8 @@ def test_columns_on_disk_equal_columns_in_memory(
     path, options = made
     in_memory = read_log(path, **options)
     module = __import__(f"gyrostab.ingest.formats.{scan_file(path).format}", fromlist=["read"])
-    on_disk = module.read(path, ReadOptions(**options), limit=1000)
+    monkeypatch.setattr(pieces, "SPILL_BYTES", 1000)
+    on_disk = module.read(path, ReadOptions(**options))
     assert on_disk.rate.chunks is not None
     assert on_disk.time.chunks is not None
     xr.testing.assert_identical(on_disk.compute().drop_attrs(), in_memory.drop_attrs())
@@ -362,12 +364,13 @@ def test_shorter_matlab_vectors_are_left_out_with_a_note(tmp_path: Path) -> None
         read_log(path, rate=1)
 
 
-def test_buffers_spill_to_disk_and_read_back() -> None:
+def test_buffers_spill_to_disk_and_read_back(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     blocks = [{"a": rng.normal(size=n), "b": np.arange(n)} for n in (5, 1, 30, 7)]
     expected = {key: np.concatenate([block[key] for block in blocks]) for key in "ab"}
     for limit in (0, 200, 10**6):
-        buffers = Buffers({"a": np.float64, "b": np.int64}, limit=limit)
+        monkeypatch.setattr(pieces, "SPILL_BYTES", limit)
+        buffers = Buffers({"a": np.float64, "b": np.int64})
         for block in blocks:
             buffers.add(block)
         found = buffers.finish()

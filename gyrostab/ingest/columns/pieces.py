@@ -288,16 +288,14 @@ class PiecewiseColumn(RowSource):
 class Buffers:
     """Columns of 8-byte numbers that grow block by block.
 
-    Up to `limit` bytes they stay in memory; beyond it they are appended to a spool. Small columns
+    Up to `SPILL_BYTES` they stay in memory; beyond it they are appended to a spool. Small columns
     in memory are returned as arrays, and the columns `rows_of` as the rows of one matrix.
     """
 
-    def __init__(
-        self, dtypes: Mapping[Any, Any], *, limit: int = SPILL_BYTES, rows_of: Sequence[Any] = ()
-    ):
+    def __init__(self, dtypes: Mapping[Any, Any], *, rows_of: Sequence[Any] = ()):
         self.rows_of = rows_of
         self.dtypes = {key: np.dtype(dtype) for key, dtype in dtypes.items()}
-        self.limit = limit
+        self.limit = SPILL_BYTES
         self.rows = 0
         self._pieces: dict[Any, list[Piece]] = {key: [] for key in dtypes}
         self._spool: Spool | None = None

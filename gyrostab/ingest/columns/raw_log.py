@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.pieces import (
-    SPILL_BYTES,
     Buffers,
     DecimalPiece,
     EvenStampsPiece,
@@ -83,11 +82,9 @@ class RawLogBuilder:
         Role and unit of each column.
     options : ReadOptions
         Reading options of the user.
-    limit : int
-        Size of the columns above which they move to disk [bytes].
     """
 
-    def __init__(self, plan: Plan, options: ReadOptions, *, limit: int = SPILL_BYTES):
+    def __init__(self, plan: Plan, options: ReadOptions):
         self.plan, self.options = plan, options
         self.time = plan.time
         self.gyro, self.channels = plan.of("gyro"), plan.of("channel")
@@ -96,7 +93,7 @@ class RawLogBuilder:
         }
         if self.time is not None:
             dtypes[self.time.source] = np.int64
-        self.buffers = Buffers(dtypes, limit=limit, rows_of=[column.source for column in self.gyro])
+        self.buffers = Buffers(dtypes, rows_of=[column.source for column in self.gyro])
         self.tens = {
             column.source: 1.0 for column in [*self.gyro, *self.channels]
         }  # power of ten to try when packing decimals; 0: not packed

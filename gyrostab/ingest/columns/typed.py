@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.ingest.columns.pieces import SPILL_BYTES, EvenStampsPiece, FilePiece
+from gyrostab.ingest.columns.pieces import EvenStampsPiece, FilePiece
 from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
 from gyrostab.ingest.columns.stamps import (
@@ -100,8 +100,8 @@ def read_columns(
     fetch: Fetch,
     *,
     notes: Sequence[str] = (),
-    limit: int = SPILL_BYTES,
-    lasting: bool = False,
+    parallel: bool = False,
+    stay: bool = False,
 ) -> xr.Dataset:
     """Build the raw log of columns that can be fetched by ranges of rows.
 
@@ -117,20 +117,20 @@ def read_columns(
         Column number, first row, row after the last one -> values.
     notes : sequence of str
         Notes of the reader.
-    limit : int
-        Size of the columns above which they are not held in memory [bytes].
-    lasting : bool
-        Whether `fetch` is thread-safe and can be called at any later time; columns above the limit
-        then stay in the file.
+    parallel : bool
+        Whether `fetch` is thread-safe.
+    stay : bool
+        Whether `fetch` is as fast as reading a temporary file, and can be called at any later time;
+        columns that exceed the memory limit then stay in the file.
     """
-    builder = RawLogBuilder(plan.check(), options, limit=limit)
-    stay = lasting and 8 * rows * len(plan.columns) > limit
+    builder = RawLogBuilder(plan.check(), options)
+    stay = stay and 8 * rows * len(plan.columns) > builder.buffers.limit
     if stay:
         builder.tens = dict.fromkeys(builder.tens, 0.0)  # nothing is packed
     step = batch_rows(len(plan.columns))
     spans = ((start, min(start + step, rows)) for start in range(0, rows, step))
     take = partial(_convert_span, builder, plan, options, fetch, stay)
-    for converted in map_in_order(take, spans) if lasting else map(take, spans):
+    for converted in map_in_order(take, spans) if parallel else map(take, spans):
         builder.add(converted)
     return builder.finish(notes)
 

@@ -22,7 +22,6 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import FormatError, OptionError
-from gyrostab.ingest.columns.pieces import SPILL_BYTES
 from gyrostab.ingest.formats.tables import Table, read_tables, scan_tables
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
@@ -63,10 +62,10 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
     return scan_tables(path, "binary", [table], options, notes)
 
 
-def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
+def read(path: Path, options: ReadOptions) -> xr.Dataset:
     """Return the raw log of a binary file; see `gyrostab.ingest.read_log`."""
     table, notes = _make_table(path)
-    return read_tables(path, [table], options, notes=notes, limit=limit)
+    return read_tables(path, [table], options, notes=notes)
 
 
 def _layout_path(path: Path) -> Path:

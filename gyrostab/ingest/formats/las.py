@@ -16,7 +16,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.pieces import SPILL_BYTES
 from gyrostab.ingest.columns.stamps import dates_to_ns
 from gyrostab.ingest.columns.typed import holds_dates
 from gyrostab.ingest.formats.tables import Table, library, read_tables, scan_tables, sliced
@@ -41,9 +40,9 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
     return scan_tables(path, "las", [_read_curves(path, options)], options)
 
 
-def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
+def read(path: Path, options: ReadOptions) -> xr.Dataset:
     """Return the raw log of a LAS file; see `gyrostab.ingest.read_log`."""
-    return read_tables(path, [_read_curves(path, options)], options, limit=limit)
+    return read_tables(path, [_read_curves(path, options)], options)
 
 
 def _read_curves(path: Path, options: ReadOptions) -> Table:

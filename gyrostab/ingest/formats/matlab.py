@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,15 +22,13 @@ from gyrostab.ingest.columns.headers import (
     TIME_PATTERN,
     is_time_unit,
 )
-from gyrostab.ingest.columns.pieces import SPILL_BYTES
-from gyrostab.ingest.columns.plan import Plan, plan_columns
-from gyrostab.ingest.columns.typed import Fetch, float32_note, read_columns, summarise_columns
 from gyrostab.ingest.formats.matlab5 import check_structure
-from gyrostab.ingest.formats.packing import ATTRIBUTES, fold_packing, text_attributes
-from gyrostab.ingest.limits import check_chunk, check_stored
+from gyrostab.ingest.formats.packing import ATTRIBUTES
+from gyrostab.ingest.formats.stored import StoredColumn, StoredTable, plan_stored
+from gyrostab.ingest.limits import check_chunk
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.store.hdf5_heaps import check_global_heaps
-from gyrostab.store.rows import LibraryRows, Rows, hdf5_rows
+from gyrostab.store.rows import LibraryRows, hdf5_rows
 
 __all__ = ["matches", "read", "scan"]
 
@@ -44,19 +41,6 @@ _PLAIN_ARRAYS = (
 MAX_COLUMNS = 64
 
 
-@dataclass(frozen=True)
-class _Vector:
-    """One column of the file: the array that contains it, and the location of its numbers."""
-
-    header: str
-    array: Any  # numpy array or h5py dataset
-    stored: Rows
-
-    @property
-    def rows(self) -> int:
-        return int(max(self.array.shape))
-
-
 def matches(path: Path) -> bool:
     """Return whether the suffix is ``.mat``, ``.h5`` or ``.hdf5`` (MATLAB 7.3 files are HDF5)."""
     return path.is_file() and path.suffix.lower() in (".mat", *HDF_SUFFIXES)
@@ -65,33 +49,22 @@ def matches(path: Path) -> bool:
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Summarise variables, shapes, and first and last stamps."""
     with ExitStack() as stack:
-        vectors, plan, fetch, notes = _plan_file(path, options, stack)
         name = "hdf5" if path.suffix.lower() in HDF_SUFFIXES else "matlab"
-        return summarise_columns(name, plan, options, vectors[0].rows, fetch, notes)
+        return _plan_file(path, options, stack).scan(name)
 
 
-def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
+def read(path: Path, options: ReadOptions) -> xr.Dataset:
     """Return the raw log of a MATLAB file; see `gyrostab.ingest.read_log`."""
     with ExitStack() as stack:
-        vectors, plan, fetch, notes = _plan_file(path, options, stack)
-        notes += float32_note(plan, [vector.array.dtype for vector in vectors])
-        check_stored(path, vectors[0].rows, len(plan.columns), options.limits)
-        lasting = all(
-            not isinstance(vectors[column.source].stored, LibraryRows) for column in plan.columns
-        )
-        return read_columns(
-            plan, options, vectors[0].rows, fetch, notes=notes, limit=limit, lasting=lasting
-        )
+        return _plan_file(path, options, stack).read()
 
 
-def _plan_file(
-    path: Path, options: ReadOptions, stack: ExitStack
-) -> tuple[list[_Vector], Plan, Fetch, list[str]]:
+def _plan_file(path: Path, options: ReadOptions, stack: ExitStack) -> StoredTable:
     objects: list[str] = []
     found = [
-        vector
+        (max(array.shape), column)
         for name, array in _find_arrays(path, stack, objects)
-        for vector in _vectors_of(path, name, array, options)
+        for column in _columns_of(path, name, array, options)
     ]
     if not found and objects:
         what = f"it holds {', '.join(dict.fromkeys(objects))}, which MATLAB alone can read"
@@ -100,9 +73,9 @@ def _plan_file(
         raise FormatError(
             f"{path.name}: there is no vector or matrix of numbers in it; save plain arrays"
         )
-    rows = max(vector.rows for vector in found)
-    kept = [vector for vector in found if vector.rows == rows]
-    others = [vector.header for vector in found if vector.rows != rows]
+    rows = int(max(size for size, _ in found))
+    kept = [column for size, column in found if size == rows]
+    others = [column.header for size, column in found if size != rows]
     notes = (
         [
             f"left out, as they are shorter than the {rows} rows of the longest: "
@@ -116,19 +89,8 @@ def _plan_file(
             f"left out, as MATLAB alone can read it: {', '.join(dict.fromkeys(objects))}; to "
             f"keep it, {_PLAIN_ARRAYS}"
         )
-    attributes = [_number_attributes(vector.array) for vector in kept]
-    units, calendars = (text_attributes(attributes, name) for name in ("units", "calendar"))
-    headers = [vector.header for vector in kept]
-    plan = plan_columns(
-        path, headers, options, units=units, calendars=calendars, coded=_known_fields(headers)
-    )
-    plan, decoders = fold_packing(plan, [vector.array.dtype for vector in kept], attributes)
-    return (
-        kept,
-        plan,
-        lambda source, start, stop: decoders[source](kept[source].stored.read(start, stop)),
-        notes,
-    )
+    coded = _known_fields([column.header for column in kept])
+    return plan_stored(path, kept, rows, options, notes=notes, coded=coded)
 
 
 def _known_fields(headers: Sequence[str]) -> dict[int, str]:
@@ -148,13 +110,7 @@ def _known_fields(headers: Sequence[str]) -> dict[int, str]:
     return {place: name for place, name in found.items() if "." in headers[place]}
 
 
-def _number_attributes(array: Any) -> dict[str, Any]:
-    """Return the CF attributes of an HDF5 dataset that define how its numbers are read."""
-    attributes = getattr(array, "attrs", {})
-    return {name: attributes[name] for name in ATTRIBUTES if name in attributes}
-
-
-def _vectors_of(path: Path, name: str, array: Any, options: ReadOptions) -> Iterator[_Vector]:
+def _columns_of(path: Path, name: str, array: Any, options: ReadOptions) -> Iterator[StoredColumn]:
     shape = array.shape
     if len(shape) not in (1, 2) or max(shape, default=0) <= 1:
         return
@@ -164,12 +120,11 @@ def _vectors_of(path: Path, name: str, array: Any, options: ReadOptions) -> Iter
     locate = (None if isinstance(array, np.ndarray) else hdf5_rows(path, array)) or partial(
         LibraryRows, array
     )
-    if size == 1:
-        yield _Vector(name, array, locate(along, 0))
-    elif size <= MAX_COLUMNS:
-        yield from (
-            _Vector(f"{name}/{place}", array, locate(along, place)) for place in range(size)
-        )
+    stored = getattr(array, "attrs", {})
+    attributes = {key: stored[key] for key in ATTRIBUTES if key in stored}
+    for place in range(size) if size <= MAX_COLUMNS else ():
+        header = name if size == 1 else f"{name}/{place}"
+        yield StoredColumn(header, array.dtype, attributes, locate(along, place))
 
 
 def _find_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[tuple[str, Any]]:

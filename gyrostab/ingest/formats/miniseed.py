@@ -17,7 +17,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.pieces import SPILL_BYTES
 from gyrostab.ingest.formats.tables import (
     ReadSlice,
     Table,
@@ -66,14 +65,13 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
     )
 
 
-def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
+def read(path: Path, options: ReadOptions) -> xr.Dataset:
     """Return the raw log of a miniSEED file; see `gyrostab.ingest.read_log`."""
     return read_tables(
         path,
         _group_traces(_read_traces(path, unpack=True)),
         options,
         notes=_cut_note(path),
-        limit=limit,
     )
 
 

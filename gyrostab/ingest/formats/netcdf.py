@@ -11,7 +11,6 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,17 +20,15 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, SchemaError, TimeError, reading_of
-from gyrostab.ingest.columns.pieces import SPILL_BYTES
-from gyrostab.ingest.columns.plan import Plan, plan_columns
 from gyrostab.ingest.columns.stamps import names_epoch
-from gyrostab.ingest.columns.typed import float32_note, read_columns, summarise_columns
 from gyrostab.ingest.formats.netcdf_classic import read_classic_header
 from gyrostab.ingest.formats.netcdf_variables import (
     StoredVariable,
     open_variables,
     with_default_fill,
 )
-from gyrostab.ingest.formats.packing import Decoder, decode_variables, fold_packing, text_attributes
+from gyrostab.ingest.formats.packing import decode_variables
+from gyrostab.ingest.formats.stored import StoredColumn, StoredTable, plan_stored
 from gyrostab.ingest.limits import check_stored
 from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
 from gyrostab.ingest.uniform import as_uniform
@@ -40,7 +37,6 @@ from gyrostab.store.cf import from_disk
 from gyrostab.store.hdf5_heaps import check_global_heaps
 from gyrostab.store.layout import read_attribute
 from gyrostab.store.read import open_stored
-from gyrostab.store.rows import LibraryRows, Rows
 from gyrostab.time.grid import grid_times, time_coordinate
 from gyrostab.units import ON_DISK
 
@@ -58,13 +54,6 @@ _UNDECODED: dict[str, Any] = {
 _OTHER_CONTENT = {"surface": "a dynamic Allan variance", "product": "a product"}
 
 
-@dataclass(frozen=True)
-class _Column:
-    header: str
-    variable: StoredVariable
-    rows: Rows
-
-
 def matches(path: Path) -> bool:
     """Return whether the path is a NetCDF file, by suffix or first bytes, or a Zarr store."""
     if path.is_dir():
@@ -80,27 +69,16 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
         with log:
             return _summarise_log(path, log)
     with open_variables(path, options.limits) as variables:
-        columns, rows, plan, decoders, notes = _plan_file(path, variables, options)
-        name = "zarr" if path.is_dir() else "netcdf"
-        return summarise_columns(
-            name, plan, options, rows, partial(_fetch_column, columns, decoders), notes
-        )
+        return _plan_file(path, variables, options).scan("zarr" if path.is_dir() else "netcdf")
 
 
-def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
+def read(path: Path, options: ReadOptions) -> xr.Dataset:
     """Open a regular log lazily, or read the raw log of a foreign file; see `read_log`."""
     log = _open_log(path, options)
     if log is not None:
         return log
     with open_variables(path, options.limits) as variables:
-        columns, rows, plan, decoders, notes = _plan_file(path, variables, options)
-        notes += float32_note(plan, [column.variable.dtype for column in columns])
-        check_stored(path, rows, len(plan.columns), options.limits)
-        lasting = all(
-            not isinstance(columns[column.source].rows, LibraryRows) for column in plan.columns
-        )
-        fetch = partial(_fetch_column, columns, decoders)
-        return read_columns(plan, options, rows, fetch, notes=notes, limit=limit, lasting=lasting)
+        return _plan_file(path, variables, options).read()
 
 
 def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
@@ -294,15 +272,9 @@ def _stamp_at(log: xr.Dataset, place: int) -> np.datetime64:
     )
 
 
-def _fetch_column(
-    columns: list[_Column], decoders: dict[int, Decoder], source: int, start: int, stop: int
-) -> Any:
-    return decoders[source](columns[source].rows.read(start, stop))
-
-
 def _plan_file(
     path: Path, variables: Mapping[str, StoredVariable], options: ReadOptions
-) -> tuple[list[_Column], int, Plan, dict[int, Decoder], list[str]]:
+) -> StoredTable:
     numeric = [v for v in variables.values() if v.dtype.kind in "iuf" and len(v.shape) in (1, 2)]
     sizes = {dim: size for v in numeric for dim, size in zip(v.dimensions, v.shape, strict=True)}
     lines = Counter(v.dimensions[0] for v in numeric if len(v.shape) == 1)
@@ -313,7 +285,7 @@ def _plan_file(
             "so store variables at the top level"
         )
     dim = max(lines, key=lambda d: (sizes[d], lines[d]))
-    columns: list[_Column] = []
+    columns: list[StoredColumn] = []
     notes: list[str] = []
     left: list[str] = []
     for variable in numeric:
@@ -322,20 +294,15 @@ def _plan_file(
         left += [] if found else [variable.name]
     if left:
         notes.append(f"left out, as they do not run along {dim!r} alone: {', '.join(left[:20])}")
-    attributes = [column.variable.attributes for column in columns]
-    units, calendars = (text_attributes(attributes, name) for name in ("units", "calendar"))
-    plan = plan_columns(
-        path, [column.header for column in columns], options, units=units, calendars=calendars
-    )
-    plan, decoders = fold_packing(plan, [column.variable.dtype for column in columns], attributes)
-    return columns, sizes[dim], plan, decoders, notes
+    return plan_stored(path, columns, sizes[dim], options, notes=notes)
 
 
 def _columns_of(
     variables: Mapping[str, StoredVariable], variable: StoredVariable, dim: str
-) -> list[_Column]:
+) -> list[StoredColumn]:
+    make = partial(StoredColumn, dtype=variable.dtype, attributes=variable.attributes)
     if variable.dimensions == (dim,):
-        return [_Column(variable.name, variable, variable.locate(0, 0))]
+        return [make(variable.name, rows=variable.locate(0, 0))]
     if dim not in variable.dimensions or len(variable.shape) != 2:
         return []
     along = variable.dimensions.index(dim)
@@ -347,6 +314,6 @@ def _columns_of(
         labels = [str(label) for label in np.ma.getdata(variables[other].values[:])]
     stem = "gyro_" if variable.name.lower() in ("gyro", "rate") else f"{variable.name}/"
     return [
-        _Column(f"{stem}{label}", variable, variable.locate(along, place))
+        make(f"{stem}{label}", rows=variable.locate(along, place))
         for place, label in enumerate(labels)
     ]

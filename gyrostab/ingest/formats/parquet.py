@@ -10,7 +10,6 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.pieces import SPILL_BYTES
 from gyrostab.ingest.columns.plan import Plan, plan_columns
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder
 from gyrostab.ingest.columns.typed import (
@@ -62,12 +61,12 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
     return summarise_columns("parquet", plan, options, file.metadata.num_rows, fetch)
 
 
-def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
+def read(path: Path, options: ReadOptions) -> xr.Dataset:
     """Return the raw log of a Parquet file; see `gyrostab.ingest.read_log`."""
     file, plan = _open_parquet(path, options)
     names = file.schema_arrow.names
     check_stored(path, file.metadata.num_rows, len(plan.columns), options.limits)
-    builder = RawLogBuilder(plan.check(), options, limit=limit)
+    builder = RawLogBuilder(plan.check(), options)
     wanted = [names[column.source] for column in plan.columns]
 
     def convert(batch: Any) -> ConvertedBlock:

@@ -13,7 +13,6 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import FormatError, OptionError
-from gyrostab.ingest.columns.pieces import SPILL_BYTES
 from gyrostab.ingest.columns.plan import Plan, plan_columns
 from gyrostab.ingest.columns.typed import read_columns, summarise_columns
 from gyrostab.ingest.combine import concatenate, with_channels
@@ -159,7 +158,6 @@ def read_tables(
     options: ReadOptions,
     *,
     notes: Sequence[str] = (),
-    limit: int = SPILL_BYTES,
 ) -> xr.Dataset:
     """Return the raw log of the tables with gyro axes; other channels keep separate stamps.
 
@@ -183,12 +181,11 @@ def read_tables(
                     table.rows,
                     fetch,
                     notes=table_notes,
-                    limit=limit,
                 )
             )
         elif plan.of("channel"):
             plan = replace(plan, signal=None, kind=None, notes=())
-            others.append(read_columns(plan, options, table.rows, fetch, limit=limit))
+            others.append(read_columns(plan, options, table.rows, fetch))
     log = with_channels(concatenate(main) if len(main) > 1 else main[0], others)
     return (
         log.assign_attrs(source_files=[path.name], row_start=[0])

@@ -16,7 +16,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.pieces import SPILL_BYTES
 from gyrostab.ingest.columns.stamps import NAT, dates_to_ns
 from gyrostab.ingest.formats.tables import (
     ReadSlice,
@@ -50,10 +49,10 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
         return scan_tables(path, "tdms", tables, options)
 
 
-def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
+def read(path: Path, options: ReadOptions) -> xr.Dataset:
     """Return the raw log of a TDMS file; see `gyrostab.ingest.read_log`."""
     with _open_tables(path) as tables:
-        return read_tables(path, tables, options, limit=limit)
+        return read_tables(path, tables, options)
 
 
 @contextmanager

@@ -21,7 +21,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.pieces import SPILL_BYTES
 from gyrostab.ingest.columns.plan import Column, Plan, plan_columns
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
 from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, looks_iso, texts_to_ns
@@ -90,20 +89,19 @@ def read(
     path: Path,
     options: ReadOptions,
     *,
-    limit: int = SPILL_BYTES,
     stop: Callable[[], bool] | None = None,
 ) -> xr.Dataset:
     """Return the raw log of a text file; raise `CancelledError` once `stop` returns true."""
     layout, plan = _plan_file(path, options)
     options = options if plan.rate is None else replace(options, rate=plan.rate)
-    builder = RawLogBuilder(plan.check(), options, limit=limit)
+    builder = RawLogBuilder(plan.check(), options)
     parse = partial(_parse_block, parser=BlockParser(layout, plan, options), builder=builder)
     line = layout.line
-    for converted, block, starts in map_in_order(parse, _read_blocks(path, layout.offset)):
+    for converted, block, starts, lines in map_in_order(parse, _read_blocks(path, layout.offset)):
         if stop is not None and stop():
             raise CancelledError
         builder.add(converted, partial(_line_names, block, starts, line))
-        line += block.count(b"\n")
+        line += lines
     return builder.finish(layout.notes)
 
 
@@ -257,9 +255,9 @@ def _read_blocks(path: Path, offset: int) -> Iterator[bytes]:
 
 def _parse_block(
     block: bytes, parser: BlockParser, builder: RawLogBuilder
-) -> tuple[ConvertedBlock, bytes, NDArray[np.int64]]:
-    values, stamps, words, starts = parser.parse(block)
-    return builder.prepare(values, stamps, words=words), block, starts
+) -> tuple[ConvertedBlock, bytes, NDArray[np.int64], int]:
+    values, stamps, words, starts, lines = parser.parse(block)
+    return builder.prepare(values, stamps, words=words), block, starts, lines
 
 
 def _line_names(

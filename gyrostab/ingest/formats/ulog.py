@@ -10,7 +10,6 @@ from pathlib import Path
 import xarray as xr
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.pieces import SPILL_BYTES
 from gyrostab.ingest.formats.tables import (
     Table,
     library,
@@ -40,10 +39,10 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
     return scan_tables(path, "ulog", tables, options, notes)
 
 
-def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
+def read(path: Path, options: ReadOptions) -> xr.Dataset:
     """Return the raw log of a PX4 log; see `gyrostab.ingest.read_log`."""
     tables, notes = _make_tables(path)
-    return read_tables(path, tables, options, notes=notes, limit=limit)
+    return read_tables(path, tables, options, notes=notes)
 
 
 def _make_tables(path: Path) -> tuple[list[Table], list[str]]:

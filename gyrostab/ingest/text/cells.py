@@ -32,12 +32,15 @@ class ParsedBlock(NamedTuple):
         Channel cells that are neither a number nor void.
     starts : ndarray of int64
         Position of each row in the block.
+    lines : int
+        Number of lines, with comments and empty lines.
     """
 
     values: dict[int, NDArray[np.float64]]
     stamps: NDArray[np.int64] | None
     words: int
     starts: NDArray[np.int64]
+    lines: int
 
 
 class BlockParser:
@@ -85,7 +88,7 @@ class BlockParser:
         stamps = None if self.time is None else self._since_epoch(counts[:row])
         words = self._parse_cells(others, values, stamps) if others else 0
         found = dict(zip(self.sources, values[:, :row], strict=True))
-        return ParsedBlock(found, stamps, words, starts[:row])
+        return ParsedBlock(found, stamps, words, starts[:row], lines)
 
     def _since_epoch(self, counts: NDArray[np.int64]) -> NDArray[np.int64]:
         """Convert counts of nanoseconds or of a non-decimal unit to stamps [ns since 1970]."""

@@ -1,0 +1,97 @@
+"""Columns that NetCDF, Zarr and HDF5 (MATLAB 7.3) files store with CF attributes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.ingest.columns.plan import Plan, plan_columns
+from gyrostab.ingest.columns.typed import float32_note, read_columns, summarise_columns
+from gyrostab.ingest.formats.packing import Decoder, fold_packing, text_attributes
+from gyrostab.ingest.limits import check_stored
+from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.store.rows import EvenRows, LibraryRows, Rows
+
+__all__ = ["StoredColumn", "StoredTable", "plan_stored"]
+
+
+@dataclass(frozen=True)
+class StoredColumn:
+    """A column of a file: its name, its stored numbers, and the CF attributes that decode them."""
+
+    header: str
+    dtype: np.dtype[Any]
+    attributes: Mapping[str, Any]
+    rows: Rows = field(repr=False)
+
+
+@dataclass(frozen=True)
+class StoredTable:
+    """The columns of a file with their plan; the file must be open for columns of a library."""
+
+    columns: Sequence[StoredColumn]
+    rows: int
+    plan: Plan
+    decoders: Mapping[int, Decoder]
+    options: ReadOptions
+    notes: Sequence[str]
+
+    def scan(self, form: str) -> FileSummary:
+        """Summarise columns, number of rows, and first and last stamps."""
+        fetch = partial(_fetch, self.columns, self.decoders)
+        return summarise_columns(form, self.plan, self.options, self.rows, fetch, self.notes)
+
+    def read(self) -> xr.Dataset:
+        """Return the raw log."""
+        plan, columns = self.plan, self.columns
+        check_stored(plan.path, self.rows, len(plan.columns), self.options.limits)
+        wanted = [columns[column.source].rows for column in plan.columns]
+        return read_columns(
+            plan,
+            self.options,
+            self.rows,
+            partial(_fetch, columns, self.decoders),
+            notes=[*self.notes, *float32_note(plan, [column.dtype for column in columns])],
+            parallel=not any(isinstance(rows, LibraryRows) for rows in wanted),
+            stay=all(isinstance(rows, EvenRows) for rows in wanted),
+        )
+
+
+def plan_stored(
+    path: Path,
+    columns: Sequence[StoredColumn],
+    rows: int,
+    options: ReadOptions,
+    *,
+    notes: Sequence[str] = (),
+    coded: Mapping[int, str] | None = None,
+) -> StoredTable:
+    """Determine roles and units of stored columns, with their packing folded into the factors.
+
+    Raises
+    ------
+    FormatError
+        When an attribute of a column that is read has no usable value.
+    """
+    attributes = [column.attributes for column in columns]
+    units, calendars = (text_attributes(attributes, name) for name in ("units", "calendar"))
+    headers = [column.header for column in columns]
+    plan = plan_columns(path, headers, options, units=units, calendars=calendars, coded=coded)
+    plan, decoders = fold_packing(plan, [column.dtype for column in columns], attributes)
+    return StoredTable(columns, rows, plan, decoders, options, notes)
+
+
+def _fetch(
+    columns: Sequence[StoredColumn],
+    decoders: Mapping[int, Decoder],
+    source: int,
+    start: int,
+    stop: int,
+) -> Any:
+    return decoders[source](columns[source].rows.read(start, stop))
