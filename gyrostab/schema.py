@@ -24,6 +24,7 @@ __all__ = [
     "ESTIMATORS",
     "GAP_CAUSES",
     "OBSERVABLE",
+    "SIGNAL_LONG_NAMES",
     "SIGNAL_UNITS",
     "VARIABLES",
     "attributes",
@@ -59,6 +60,9 @@ _TAU_TOLERANCE = 1e-9
 
 #: Name of the gyro signal -> its unit; a log has one of them, and its ``kind`` attribute names it.
 SIGNAL_UNITS = {"rate": INNER["rate"], "angle": INNER["angle"]}
+
+#: Name of the gyro signal -> its label in figures.
+SIGNAL_LONG_NAMES = {"rate": "rotation rate", "angle": "angle"}
 
 
 def _flag_attributes(meanings: tuple[str, ...]) -> dict[str, Any]:
@@ -137,10 +141,8 @@ def _add_coefficients() -> None:
         note = ""
         if law.tau_ref_hours is not None:
             extra["tau_ref"] = f"{law.tau_ref_hours:g} h"
-            note = (
-                f", stored as the Allan deviation of its term at tau = {law.tau_ref_hours:g} h "
-                f"(numerically {symbol} in {law.label})"
-            )
+            extra["comment"] = f"numerically {symbol} in {law.label}"
+            note = f", Allan deviation of its term at {law.tau_ref_hours:g} h"
         base = {"units": law.units, **extra}
         VARIABLES[symbol] = {"long_name": f"{law.name} coefficient{note}", **base}
         VARIABLES[f"{symbol}_stderr"] = {

@@ -14,14 +14,12 @@ import xarray as xr
 from gyrostab.errors import MissingUnitError, OptionError, SchemaError, TimeError, UnitError
 from gyrostab.ingest.uniform import as_uniform
 from gyrostab.noise import HOUR
-from gyrostab.schema import SIGNAL_UNITS, texts
+from gyrostab.schema import SIGNAL_LONG_NAMES, SIGNAL_UNITS, texts
 from gyrostab.store.private import is_in_memory
 from gyrostab.store.read import MIN_LAZY_VALUES, make_variable_lazy
 from gyrostab.units import Unit, known_units, parse_unit
 
 __all__ = ["as_log", "from_dataarray", "from_dataframe"]
-
-_LONG_NAMES = {"rate": "rotation rate", "angle": "angle"}
 
 
 def as_log(data: Any) -> xr.Dataset:
@@ -324,7 +322,7 @@ def _dataset_of(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[
         if signal.dtype.kind in "iu" and not increments
         else {}
     )
-    attrs = {"long_name": _LONG_NAMES[name], **da.attrs, "units": SIGNAL_UNITS[name]}
+    attrs = {"long_name": SIGNAL_LONG_NAMES[name], **da.attrs, "units": SIGNAL_UNITS[name]}
     bare = array.coords.to_dataset().drop_vars(
         [coord for coord in array.coords if coord not in ("time", "axis")]
     )

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import OptionError
-from gyrostab.schema import SIGNAL_UNITS
+from gyrostab.schema import SIGNAL_LONG_NAMES, SIGNAL_UNITS
 from gyrostab.time.grid import check_rate, check_span, stamp_ns, time_coordinate
 from gyrostab.units import INNER, parse_unit
 
@@ -87,7 +87,7 @@ def make_log(
     coordinates = time_coordinate(stamp_ns(start), rate, data.shape[1])
     attrs = {
         "units": SIGNAL_UNITS[kind],
-        "long_name": "rotation rate" if kind == "rate" else "angle",
+        "long_name": SIGNAL_LONG_NAMES[kind],
     }
     log = xr.Dataset(
         {kind: (("axis", "time"), data, attrs, packing)},

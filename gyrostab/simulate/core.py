@@ -21,6 +21,7 @@ from gyrostab.noise import TERMS
 from gyrostab.physics.base import STAGES, Effect, Setup, driver_error
 from gyrostab.schema import (
     GAP_CAUSES,
+    SIGNAL_LONG_NAMES,
     SIGNAL_UNITS,
     attributes,
     check_log,
@@ -405,7 +406,7 @@ def _label_log(
             "rate": (
                 ("axis", "time"),
                 data,
-                {"units": SIGNAL_UNITS["rate"], "long_name": "rotation rate"},
+                {"units": SIGNAL_UNITS["rate"], "long_name": SIGNAL_LONG_NAMES["rate"]},
             ),
             **gap_variables(table, frame.start, frame.rate),
         }

@@ -22,7 +22,14 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, SchemaError
-from gyrostab.schema import check_log, check_product, check_surface, texts
+from gyrostab.schema import (
+    SIGNAL_LONG_NAMES,
+    VARIABLES,
+    check_log,
+    check_product,
+    check_surface,
+    texts,
+)
 from gyrostab.store.lazy import RowSource, make_dask, transpose_lazy
 from gyrostab.store.private import close_function, is_in_memory
 from gyrostab.store.safe_names import (
@@ -63,6 +70,8 @@ GRID = "sampling_grid"
 _STAMPS_CHUNK = 2**20
 _EPOCH = "1970-01-01T00:00:00"
 _CALENDAR = {"calendar": "proleptic_gregorian", "units_metadata": "leap_seconds: none"}
+#: Labels of variables that have none.
+_LONG_NAMES = {**SIGNAL_LONG_NAMES, "axis": VARIABLES["axis"]["long_name"]}
 #: What the encoding of integer counts consists of, where a reader declares them.
 PACKING = ("dtype", "scale_factor", "add_offset")
 _JSON_NAMES = "json_attributes"
@@ -118,7 +127,8 @@ def to_disk(dataset: xr.Dataset, verb: str, *, stamps: bool = False) -> xr.Datas
             if name not in dataset.dims
             else variable
         )
-        attrs = _encode_attributes({"long_name": str(name).replace("_", " "), **variable.attrs})
+        label = _LONG_NAMES.get(str(name), str(name).replace("_", " "))
+        attrs = _encode_attributes({"long_name": label, **variable.attrs})
         data = stored.data if name not in dataset.dims else None
         if variable.dtype.kind == "M":
             data = _encode_stamps(name, stored, divisor)

@@ -192,3 +192,18 @@ def test_davar_takes_what_xarray_opens(tmp_path):
     with xr.open_dataset(path) as plain, open_log(path) as own:
         one, other = (gyrostab.davar(data, window="5s") for data in (plain, own))
     xr.testing.assert_equal(one, other)
+
+
+def test_a_plain_plot_of_xarray_is_right(tmp_path, monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    import matplotlib.pyplot as plt
+
+    log = gap_log()
+    with xr.open_dataset(to_netcdf(log, tmp_path / "log.nc")) as plain:
+        (line,) = plain.rate.sel(axis="y").plot()
+    assert line.axes.get_ylabel() == "rotation rate [degree hour-1]"
+    assert line.axes.get_xlabel() == "time"
+    assert line.axes.get_title() == "axis = y"
+    np.testing.assert_array_equal(line.get_xdata(), log.time.values)
+    np.testing.assert_array_equal(line.get_ydata(), log.rate[1].values)
+    plt.close("all")
