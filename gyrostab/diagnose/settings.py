@@ -8,10 +8,11 @@ candidates decide too; the rest set only the accuracy or the cost of a computati
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
-__all__ = ["DEFAULTS", "INTERVAL_TAILS", "Settings"]
+__all__ = ["DEFAULTS", "INTERVAL_TAILS", "Settings", "stored_settings"]
 
 #: Probabilities at the ends of all reported intervals; `diagnosis.json` fixes them to 95 %.
 INTERVAL_TAILS = (0.025, 0.975)
@@ -364,3 +365,12 @@ class Settings:
 
 
 DEFAULTS = Settings()
+
+
+def stored_settings(values: Mapping[str, Any]) -> Settings:
+    """Make settings of those that a diagnosis recorded, perhaps with another version of gyrostab.
+
+    Names that this version does not know are left out; those that it lacks have their defaults.
+    """
+    known = {field.name for field in fields(Settings)}
+    return Settings(**{name: value for name, value in values.items() if name in known})

@@ -25,7 +25,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["plot_change", "plot_deviations", "plot_means", "plot_spectra", "plot_surfaces"]
+__all__ = [
+    "plot_change",
+    "plot_deviations",
+    "plot_means",
+    "plot_spectra",
+    "plot_surfaces",
+    "select_channels",
+]
 
 Array = NDArray[np.float64]
 _TITLES = {"recording": "Recording", "before": "Simulation before", "after": "Simulation after"}
@@ -242,7 +249,7 @@ def plot_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
         Contents of `diagnosis.json`.
     """
     names = [str(name) for name in surfaces["axis"].values]
-    channels = _select_channels(surfaces, content)
+    channels = select_channels(surfaces, content)
     size, unit = unit_of_time(float(surfaces["end"].values[-1]))
     time = (surfaces["begin"].values + surfaces["end"].values) / (2.0 * size)
     block = (surfaces["block_begin"].values + surfaces["block_end"].values) / (2.0 * size)
@@ -300,7 +307,7 @@ def _limit_to_middle(panel: Axes, values: Array) -> None:
         panel.set_ylim(low - 0.25 * (high - low) - 1e-12, high + 0.25 * (high - low) + 1e-12)
 
 
-def _select_channels(surfaces: xr.Dataset, content: Mapping[str, Any]) -> list[str]:
+def select_channels(surfaces: xr.Dataset, content: Mapping[str, Any]) -> list[str]:
     """Return the channels to draw: first those that named effects follow."""
     available = [
         str(name).removeprefix("channel_")

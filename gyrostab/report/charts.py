@@ -23,12 +23,14 @@ __all__ = [
     "decade_bar",
     "embeddable",
     "gap_shapes",
+    "label_panel",
     "log_axis",
     "milliseconds",
     "new_chart",
     "plain_text",
     "plotly_script",
     "single",
+    "stacked_panels",
 ]
 
 DEVIATION_LABEL, TAU_LABEL = "Allan deviation [deg/h]", "averaging time [s]"
@@ -145,3 +147,28 @@ def decade_bar(values: NDArray[np.float64]) -> dict[str, Any]:
         "tickvals": np.log10(marks[::step]),
         "ticktext": [f"{mark:g}" for mark in marks[::step]],
     }
+
+
+def stacked_panels(count: int, *, height: int) -> go.Figure:
+    """Start a figure with panels below each other on one time axis, each `height` pixels high."""
+    axes: dict[str, Any] = {}
+    for row in range(count):
+        top = 1.0 - row / count
+        axes[f"yaxis{row + 1 if row else ''}"] = {
+            "domain": [top - 0.78 / count, top - 0.08 / count],
+            "tickformat": "~g",
+            "nticks": 5,
+        }
+    return new_chart(
+        **axes,
+        xaxis={**TIME_AXIS, "anchor": f"y{count if count > 1 else ''}"},
+        height=height * count + 70,
+        hovermode="x unified",
+        hoversubplots="axis",
+    )
+
+
+def label_panel(figure: go.Figure, panel: str, text: str) -> None:
+    """Write above the left end of a panel what it shows."""
+    place = {"xref": "paper", "x": 0.0, "xanchor": "left", "yref": f"{panel} domain", "y": 1.0}
+    figure.add_annotation(text=text, yanchor="bottom", showarrow=False, font_size=12, **place)

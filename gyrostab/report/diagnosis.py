@@ -21,6 +21,7 @@ from gyrostab.diagnose.result.text import (
 from gyrostab.diagnose.statistics.wording import axes_text, length_text
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import embedded
+from gyrostab.report.diagnosis_charts import diagnosis_charts
 from gyrostab.report.page import page_text
 from gyrostab.store.output import new_output
 
@@ -72,6 +73,8 @@ def write_diagnosis_report(
     """
     content = diagnosis.content
     check_diagnosis(content)
+    rows = [_mismatch_row(region, content) for region in content["mismatches"]]
+    cards = [_effect_card(effect, content, rows) for effect in content["effects"]]
     with new_output(path, overwrite=overwrite) as temporary:
         text = page_text(
             "diagnosis.html.jinja",
@@ -80,8 +83,12 @@ def write_diagnosis_report(
             verdict=content["verdict"],
             summary=summary(content),
             facts=_fact_rows(content),
-            effects=[_effect_card(effect, content) for effect in content["effects"]],
-            mismatches=[_mismatch_row(region, content) for region in content["mismatches"]],
+            effects=cards,
+            mismatches=rows,
+            unexplained=[
+                row for row in rows if not any(row in card["mismatches"] for card in cards)
+            ],
+            charts=diagnosis_charts(diagnosis.surfaces, content),
             figures=_make_figures(diagnosis),
             evidence=_evidence_rows(content),
             limits=_limit_rows(content),
@@ -160,7 +167,9 @@ def _source_text(baseline: Mapping[str, Any]) -> str:
     return f"{text}, noise scaled to quiescent stretches of this recording" if is_scaled else text
 
 
-def _effect_card(effect: Mapping[str, Any], content: Mapping[str, Any]) -> dict[str, Any]:
+def _effect_card(
+    effect: Mapping[str, Any], content: Mapping[str, Any], rows: list[dict[str, Any]]
+) -> dict[str, Any]:
     evidence, title = effect["held_out_gain"], plain_name(effect["name"])
     return {
         "title": f"{title[0].upper()}{title[1:]}, {axes_text(effect['axes'])}",
@@ -182,9 +191,11 @@ def _effect_card(effect: Mapping[str, Any], content: Mapping[str, Any]) -> dict[
         ),
         "alternatives": [f"{plain_name(name)} ({name})" for name in effect["alternatives"]],
         "next": next_measurement(effect["name"], effect["alternatives"]),
+        "nats": max(float(evidence["nats"]), 0.0),
+        "threshold": max(float(evidence["threshold"]), 0.0),
         "mismatches": [
-            region["id"]
-            for region in content["mismatches"]
+            row
+            for row, region in zip(rows, content["mismatches"], strict=True)
             if effect["name"] in region["explained_by"]
             and set(effect["axes"]) & set(region["axes"])
         ],
@@ -197,8 +208,6 @@ def _mismatch_row(region: Mapping[str, Any], content: Mapping[str, Any]) -> dict
         "statistic": _VIEW_TEXT[region["view"]],
         "statement": without_chance(region["statement"]),
         "chance": chance_share(region["p_value"]),
-        "explained": "; ".join(plain_name(name) for name in region["explained_by"])
-        or ("not explained" if region["id"] in content["unexplained"] else "–"),
     }
 
 

@@ -22,11 +22,13 @@ from gyrostab.report.charts import (
     decade_bar,
     embeddable,
     gap_shapes,
+    label_panel,
     log_axis,
     milliseconds,
     new_chart,
     plain_text,
     single,
+    stacked_panels,
 )
 from gyrostab.schema import OBSERVABLE
 
@@ -210,32 +212,16 @@ def _draw_coefficients(product: xr.Dataset, gaps: list[dict[str, Any]]) -> go.Fi
         for name in product.data_vars
         if product[name].dims == ("time",) and product[name].dtype.kind == "f"
     ][:_MAX_CHANNELS]
-    panels = len(LAWS) + len(channels)
-    height = 1.0 / panels
-    axes: dict[str, Any] = {}
-    for row in range(panels):
-        top = 1.0 - row * height
-        axes[f"yaxis{row + 1 if row else ''}"] = {
-            "domain": [top - 0.78 * height, top - 0.08 * height],
-            "tickformat": "~g",
-            "nticks": 5,
-        }
-    figure = new_chart(
-        **axes,
-        xaxis={**TIME_AXIS, "anchor": f"y{panels}"},
-        height=130 * panels + 70,
-        hovermode="x unified",
-        hoversubplots="axis",
-        shapes=gaps,
-    )
+    figure = stacked_panels(len(LAWS) + len(channels), height=130)
+    figure.update_layout(shapes=gaps)
     for row, symbol in enumerate(LAWS):
         panel = f"y{row + 1 if row else ''}"
         label = LAWS[symbol].label.replace("sqrt(h)", "√h")
-        _label_panel(figure, panel, f"{symbol}, {LAWS[symbol].name} [{label}]")
+        label_panel(figure, panel, f"{symbol}, {LAWS[symbol].name} [{label}]")
         _add_coefficient(figure, product, symbol, panel, label)
     for row, name in enumerate(channels, start=len(LAWS)):
         unit = unit_label(product[name].attrs.get("units"))
-        _label_panel(figure, f"y{row + 1}", plain_text(f"{name.replace('_', ' ')} {unit}"))
+        label_panel(figure, f"y{row + 1}", plain_text(f"{name.replace('_', ' ')} {unit}"))
         figure.add_scatter(
             x=milliseconds(product),
             y=single(product[name].values),
@@ -245,12 +231,6 @@ def _draw_coefficients(product: xr.Dataset, gaps: list[dict[str, Any]]) -> go.Fi
             showlegend=False,
         )
     return figure
-
-
-def _label_panel(figure: go.Figure, panel: str, text: str) -> None:
-    """Write above the left end of a panel what it shows."""
-    place = {"xref": "paper", "x": 0.0, "xanchor": "left", "yref": f"{panel} domain", "y": 1.0}
-    figure.add_annotation(text=text, yanchor="bottom", showarrow=False, font_size=12, **place)
 
 
 def _add_coefficient(

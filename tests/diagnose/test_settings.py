@@ -12,7 +12,7 @@ import pytest
 
 from gyrostab.diagnose.identify.forward_search import tail_level
 from gyrostab.diagnose.result.verdict import failed_checks
-from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.diagnose.settings import DEFAULTS, Settings, stored_settings
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -54,3 +54,9 @@ def test_a_setting_changes_the_decision() -> None:
 def test_impossible_numbers_are_refused(value: float) -> None:
     with pytest.raises(ValueError, match="ambiguous_nats"):
         replace(DEFAULTS, ambiguous_nats=value)
+
+
+def test_settings_of_another_version_are_read():
+    other = {**Settings(coverage_tolerance=0.03).to_dict(), "a_number_of_the_future": 7.0}
+    del other["tail_share"]
+    assert stored_settings(other) == Settings(coverage_tolerance=0.03)

@@ -14,8 +14,10 @@ import pytest
 
 from gyrostab.noise import model_avar
 from gyrostab.plot.style import COLOURS
-from gyrostab.report import write_report
+from gyrostab.report import write_diagnosis_report, write_report
+from gyrostab.report.diagnosis_charts import diagnosis_charts
 from gyrostab.report.product_charts import product_charts, window_data
+from tests.diagnose.result.test_diagnosis import content, diagnosis, surfaces
 from tests.support import synthetic
 
 _BROWSER = next(filter(None, map(shutil.which, ("chromium", "google-chrome", "chrome"))), None)
@@ -132,17 +134,12 @@ window.addEventListener("load", () => setTimeout(() => {
 </script></body>"""
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(_BROWSER is None, reason="needs Chromium")
-@pytest.mark.parametrize("width", [1280, 500])
-def test_a_browser_draws_the_page_without_errors_or_requests(tmp_path, width):
-    product = synthetic.product()
-    path = write_report(product, tmp_path / "report.html", log=synthetic.log(samples=20_000))
-    path.write_text(path.read_text(encoding="utf-8").replace("</body>", _PROBE), encoding="utf-8")
+def _browse(path, width):
+    """Return the page as a browser without a network sees it; fail on errors in its console."""
     command = [
         str(_BROWSER), "--headless", "--no-sandbox", "--enable-unsafe-swiftshader",
         "--enable-logging=stderr", "--v=0", "--host-resolver-rules=MAP * ~NOTFOUND",
-        f"--user-data-dir={tmp_path / 'profile'}", f"--window-size={width},900",
+        f"--user-data-dir={path.parent / 'profile'}", f"--window-size={width},900",
         "--virtual-time-budget=20000", "--dump-dom", path.as_uri(),
     ]  # fmt: skip
     ended = subprocess.run(
@@ -150,7 +147,18 @@ def test_a_browser_draws_the_page_without_errors_or_requests(tmp_path, width):
     )
     console = [line for line in ended.stderr.splitlines() if ":CONSOLE" in line]
     assert not [line for line in console if re.search(r"error|failed|refused|net::", line, re.I)]
-    found = re.search(r'<pre id="probe">(.*?)</pre>', ended.stdout, re.S)
+    return ended.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(_BROWSER is None, reason="needs Chromium")
+@pytest.mark.parametrize("width", [1280, 500])
+def test_a_browser_draws_the_page_without_errors_or_requests(tmp_path, width):
+    product = synthetic.product()
+    path = write_report(product, tmp_path / "report.html", log=synthetic.log(samples=20_000))
+    path.write_text(path.read_text(encoding="utf-8").replace("</body>", _PROBE), encoding="utf-8")
+    dom = _browse(path, width)
+    found = re.search(r'<pre id="probe">(.*?)</pre>', dom, re.S)
     assert found is not None
     state = json.loads(found[1].replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&"))
     assert state["drawn"] >= 5
@@ -167,3 +175,41 @@ def test_a_browser_draws_the_page_without_errors_or_requests(tmp_path, width):
         expected = np.sqrt(product.avar.sel(axis=axis).values[row])
         drawn = np.array([np.nan if value is None else value for value in json.loads(shown)])
         np.testing.assert_allclose(drawn, expected, rtol=1e-5)
+
+
+def test_change_is_the_ratio_of_recording_and_simulation():
+    stored = surfaces()
+    figure = {chart.name: chart.figure for chart in diagnosis_charts(stored, content())}["change"]
+    traces = json.loads(figure)["data"]
+    assert len(traces) == 2 * stored.sizes["axis"]
+    avar = stored["avar"].isel(axis=0).transpose("case", "tau", "window")
+    for trace, case in zip(traces[:: stored.sizes["axis"]], ("before", "after"), strict=True):
+        expected = np.sqrt(avar.sel(case="recording") / avar.sel(case=case)).values
+        np.testing.assert_allclose(_numbers(trace["customdata"]), expected, rtol=1e-6)
+    shapes = json.loads(figure)["layout"]["shapes"]
+    framed = {shape["label"]["text"] for shape in shapes if shape.get("label", {}).get("text")}
+    assert framed == {
+        str(region["id"]) for region in content()["mismatches"] if region["view"] == "davar"
+    }
+
+
+def test_a_narrow_line_survives_the_thinning_of_the_spectrum():
+    stored = surfaces().drop_vars(["line_density", "line_frequency"])
+    density = np.ones((stored.sizes["axis"], 100_003))
+    density[:, 77_777] = 50.0
+    stored = stored.assign_coords(line_frequency=("line", np.arange(1.0, 100_004.0)))
+    stored["line_density"] = (("axis", "line"), density)
+    figure = {chart.name: chart.figure for chart in diagnosis_charts(stored, content())}["spectra"]
+    trace = json.loads(figure)["data"][0]
+    values = _numbers(trace["y"])
+    assert values.size <= 4000
+    assert values.max() == 50.0
+    assert _numbers(trace["x"])[values.argmax()] == 77_778
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(_BROWSER is None, reason="needs Chromium")
+def test_a_browser_draws_the_page_of_a_diagnosis(tmp_path):
+    path = write_diagnosis_report(diagnosis(), tmp_path / "report.html")
+    dom = _browse(path, 1280)
+    assert dom.count('class="main-svg"') >= 4

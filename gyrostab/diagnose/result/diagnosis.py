@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.result.text import chance_share, next_measurement, summary, without_chance
-from gyrostab.diagnose.settings import Settings
+from gyrostab.diagnose.settings import Settings, stored_settings
 from gyrostab.physics.base import Effect
 
 __all__ = ["Diagnosis", "effect_table", "model_text", "plain"]
@@ -56,7 +56,7 @@ class Diagnosis:
     @property
     def settings(self) -> Settings:
         """Return the numbers that decided what is reported."""
-        return Settings(**self.content["settings"])
+        return stored_settings(self.content["settings"])
 
     def to_json(self) -> str:
         """Return the contents as JSON."""

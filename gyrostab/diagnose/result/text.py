@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gyrostab.diagnose.result.verdict import failed_checks
-from gyrostab.diagnose.settings import Settings
+from gyrostab.diagnose.settings import stored_settings
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.diagnose.statistics.wording import axes_text, subject
 from gyrostab.physics.registry import effects
@@ -422,7 +422,9 @@ def summary(content: Mapping[str, Any]) -> str:
     if not content["effects"]:
         return f"{differs}; none of the known effects explains {them}."
     names = _list_effects(content["effects"])
-    failed = failed_checks(content["held_out"], settings=Settings(**content.get("settings", {})))
+    failed = failed_checks(
+        content["held_out"], settings=stored_settings(content.get("settings", {}))
+    )
     doubt = f" The effects do not describe the record well: {'; '.join(failed)}." if failed else ""
     if content["verdict"] == "unknown":
         return f"{differs}. The effects that were found do not explain {them}: {names}.{doubt}"

@@ -1,0 +1,284 @@
+"""Charts of a diagnosis: recording and simulations, before and after the effects are added."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.noise import NORMAL_95
+from gyrostab.plot.diagnosis import INSIDE_BAND_OPACITY, select_channels
+from gyrostab.plot.style import COLOURS, axis_style, unit_label
+from gyrostab.report.charts import (
+    DEVIATION_LABEL,
+    SYMBOLS,
+    TAU_LABEL,
+    Chart,
+    embeddable,
+    label_panel,
+    log_axis,
+    new_chart,
+    plain_text,
+    single,
+    stacked_panels,
+)
+
+if TYPE_CHECKING:
+    import plotly.graph_objects as go
+
+__all__ = ["diagnosis_charts"]
+
+_RED = "#D00000"
+_CASES = {"before": "simulation before", "after": "simulation after"}
+_MAX_LINES = 4000
+
+
+def diagnosis_charts(surfaces: xr.Dataset, content: Mapping[str, Any]) -> list[Chart]:
+    """Make the charts of a diagnosis.
+
+    Parameters
+    ----------
+    surfaces : xarray.Dataset
+        Contents of ``diagnosis.nc``: ``avar(axis, tau, case, window)`` [degree2 hour-2], means,
+        spectra and channels.
+    content : mapping
+        Contents of ``diagnosis.json``; its mismatches are framed.
+
+    Returns
+    -------
+    list of Chart
+        ``change``, ``means``, ``deviations`` and ``spectra``.
+    """
+    draw: dict[str, tuple[str, Callable[..., go.Figure], str]] = {
+        "change": ("Where recording and simulation differ", _draw_change, _CHANGE_TEXT),
+        "means": ("Mean rate over time, and what drives it", _draw_means, _MEANS_TEXT),
+        "deviations": ("Allan deviation of the whole record", _draw_deviations, _DEVIATIONS_TEXT),
+        "spectra": ("Power spectrum of the whole record", _draw_spectra, _SPECTRA_TEXT),
+    }
+    return [
+        Chart(name, title, text, embeddable(function(surfaces, content).to_json()))
+        for name, (title, function, text) in draw.items()
+    ]
+
+
+def _stamps(
+    surfaces: xr.Dataset, content: Mapping[str, Any], kind: str = ""
+) -> NDArray[np.float64]:
+    """Return the centres of windows, or with "block_" of blocks [ms since 1970]."""
+    start = np.datetime64(content["recording"]["start"].removesuffix("Z"), "ns").astype(np.int64)
+    seconds = (surfaces[f"{kind}begin"].values + surfaces[f"{kind}end"].values) / 2.0
+    return np.asarray(start / 1e6 + 1e3 * seconds)
+
+
+def _axis_names(surfaces: xr.Dataset) -> list[str]:
+    return [str(name) for name in surfaces["axis"].values]
+
+
+def _draw_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
+    """Draw the recording over the simulations, by time and averaging time."""
+    from plotly.subplots import make_subplots
+
+    names, tau = _axis_names(surfaces), surfaces["tau"].values
+    frame = make_subplots(
+        rows=len(names), cols=2, shared_xaxes="all", shared_yaxes="all",
+        horizontal_spacing=0.03, vertical_spacing=0.05,
+        column_titles=["without the effects", "with the effects"],
+    )  # fmt: skip
+    recording = surfaces["avar"].sel(case="recording").transpose("axis", "tau", "window")
+    for column, case in enumerate(_CASES, start=1):
+        avar, low, high = (
+            surfaces[name].sel(case=case).transpose("axis", "tau", "window").values
+            for name in ("avar", "avar_low", "avar_high")
+        )
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = np.sqrt(recording.values / avar)
+            usual = (recording.values >= low) & (recording.values <= high)
+            colour = np.log2(ratio) * np.where(usual, INSIDE_BAND_OPACITY, 1.0)
+        for row in range(len(names)):
+            frame.add_heatmap(
+                x=_stamps(surfaces, content), y=tau, z=single(colour[row]),
+                customdata=single(ratio[row]), coloraxis="coloraxis", row=row + 1, col=column,
+                hovertemplate="%{x}<br>%{y:.3g} s: %{customdata:.2f}<extra></extra>",
+            )  # fmt: skip
+    frame.update_yaxes(log_axis("", tau, labels=5))
+    for row, name in enumerate(names, start=1):
+        title = f"axis {plain_text(name)}<br>{TAU_LABEL}"
+        frame.update_yaxes(title={"text": title, "font": {"size": 12}}, col=1, row=row)
+    frame.update_xaxes(type="date")
+    for row, name in enumerate(names):
+        for region in content["mismatches"]:
+            if name in region["axes"] and region["view"] in ("davar", "cross_axis"):
+                _frame_region(frame, region, row)
+    figure = new_chart(
+        height=170 * len(names) + 110,
+        coloraxis={
+            "colorscale": "PuOr_r", "cmin": -1, "cmax": 1,
+            "colorbar": {
+                "tickvals": [-1, -0.5, 0, 0.5, 1], "ticktext": ["≤ 0.5", "0.7", "1", "1.4", "≥ 2"],
+            },
+        },
+    )  # fmt: skip
+    return frame.update_layout(figure.layout)
+
+
+def _frame_region(figure: go.Figure, region: Mapping[str, Any], row: int) -> None:
+    if not region["tau_min_s"]:
+        return
+    for column in (0, 1):
+        number = 2 * row + column + 1
+        axis = str(number) if number > 1 else ""
+        figure.add_shape(
+            type="rect", xref=f"x{axis}", yref=f"y{axis}", x0=region["start"], x1=region["end"],
+            y0=region["tau_min_s"] / 1.3, y1=region["tau_max_s"] * 1.3,
+            line={"color": _RED, "width": 1 if column else 2, "dash": "dot" if column else "solid"},
+            label=None if column else _region_label(region),
+        )  # fmt: skip
+
+
+def _region_label(region: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "text": str(region["id"]),
+        "textposition": "top left",
+        "font": {"color": _RED, "size": 14, "weight": 700},
+    }
+
+
+def _draw_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
+    """Draw the mean rate of each axis with both simulations, and the channels below."""
+    names, channels = _axis_names(surfaces), select_channels(surfaces, content)
+    figure = stacked_panels(len(names) + len(channels), height=170)
+    window, block = _stamps(surfaces, content), _stamps(surfaces, content, "block_")
+    for row, name in enumerate(names):
+        panel, one = f"y{row + 1 if row else ''}", surfaces.sel(axis=name)
+        label_panel(figure, panel, f"axis {plain_text(name)}, mean rate [deg/h]")
+        shared = {"yaxis": panel, "showlegend": row == 0}
+        figure.add_scatter(
+            x=block, y=single(one["block_mean"].values), mode="markers", name="recording",
+            legendgroup="recording", marker={"color": "#595959", "size": 3}, **shared,
+        )  # fmt: skip
+        for number, (case, title) in enumerate(_CASES.items()):
+            colour = COLOURS[1 - number]
+            mean = one["mean"].sel(case=case).values
+            band = NORMAL_95 * one["mean_stderr"].sel(case=case).values
+            for values, look in (
+                (mean - band, {"line": {"width": 0}, "showlegend": False}),
+                (
+                    mean + band,
+                    {
+                        "line": {"width": 0},
+                        "fill": "tonexty",
+                        "fillcolor": f"{colour}2e",
+                        "showlegend": False,
+                    },
+                ),
+                (mean, {"line": {"color": colour, "dash": "solid" if number else "dash"}}),
+            ):
+                figure.add_scatter(
+                    **{
+                        "x": window, "y": single(values), "mode": "lines",
+                        "name": f"{title}, 95 %", "legendgroup": case, **shared, **look,
+                    }
+                )  # fmt: skip
+        for region in content["mismatches"]:
+            if name in region["axes"] and region["view"] in ("mean", "restart"):
+                figure.add_shape(
+                    type="rect", xref="x", yref=f"{panel} domain", x0=region["start"],
+                    x1=region["end"], y0=0, y1=1, fillcolor=_RED, opacity=0.12, line={"width": 0},
+                    label=_region_label(region),
+                )  # fmt: skip
+    for row, channel in enumerate(channels, start=len(names)):
+        course = surfaces[f"channel_{channel}"]
+        unit = unit_label(course.attrs.get("units"))
+        label_panel(figure, f"y{row + 1}", plain_text(f"{channel.replace('_', ' ')} {unit}"))
+        figure.add_scatter(
+            x=block, y=single(course.values), yaxis=f"y{row + 1}", mode="lines",
+            name=plain_text(channel.replace("_", " ")), line={"color": COLOURS[2], "width": 1.5},
+            showlegend=False,
+        )  # fmt: skip
+    return figure
+
+
+def _add_cases(
+    figure: go.Figure, surfaces: xr.Dataset, x: NDArray[np.float64], values: xr.DataArray
+) -> None:
+    """Add lines of the simulations before (dashed) and after, in the colour of each axis."""
+    for name in _axis_names(surfaces):
+        colour = axis_style(surfaces, name)["color"]
+        for case, title in _CASES.items():
+            figure.add_scatter(
+                x=x, y=single(values.sel(axis=name, case=case).values), mode="lines",
+                name=f"axis {plain_text(name)}, {title}", legendgroup=name,
+                line={"color": colour, "dash": "dash" if case == "before" else "solid"},
+            )  # fmt: skip
+
+
+def _draw_deviations(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
+    tau = surfaces["tau"].values
+    with np.errstate(invalid="ignore"):
+        whole = surfaces["avar"].mean("window", skipna=True) ** 0.5
+    figure = new_chart(
+        xaxis=log_axis(TAU_LABEL, tau), yaxis=log_axis(DEVIATION_LABEL, whole.values), height=460
+    )
+    for row, name in enumerate(_axis_names(surfaces)):
+        figure.add_scatter(
+            x=tau, y=single(whole.sel(axis=name, case="recording").values), mode="markers",
+            name=f"axis {plain_text(name)}, recording", legendgroup=name,
+            marker={
+                "color": axis_style(surfaces, name)["color"], "size": 8,
+                "symbol": SYMBOLS[row % len(SYMBOLS)],
+            },
+        )  # fmt: skip
+    _add_cases(figure, surfaces, tau, whole)
+    return figure
+
+
+def _draw_spectra(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
+    frequency, lines = surfaces["line_frequency"].values, surfaces["line_density"]
+    figure = new_chart(
+        xaxis=log_axis("frequency [Hz]", frequency),
+        yaxis=log_axis("power density [(deg/h)²/Hz]", lines.values),
+        height=460,
+    )
+    for name in _axis_names(surfaces):
+        colour = axis_style(surfaces, name)["color"]
+        chosen = _find_highest(lines.sel(axis=name).values)
+        figure.add_scatter(
+            x=single(frequency[chosen]), y=single(lines.sel(axis=name).values[chosen]),
+            mode="lines", name=f"axis {plain_text(name)}, recording", legendgroup=name,
+            line={"color": colour, "width": 0.7}, opacity=0.6,
+        )  # fmt: skip
+    _add_cases(figure, surfaces, surfaces["frequency"].values, surfaces["density"])
+    return figure
+
+
+def _find_highest(values: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Select at most `_MAX_LINES` places: the highest value of each group of neighbours."""
+    step = -(-values.size // _MAX_LINES)
+    padded = np.full(-(-values.size // step) * step, -np.inf)
+    padded[: values.size] = np.nan_to_num(values, nan=-np.inf)
+    groups = padded.reshape(-1, step)
+    return np.asarray(np.arange(len(groups)) * step + groups.argmax(axis=1))
+
+
+_CHANGE_TEXT = (
+    "The Allan deviation of the recording divided by that of the simulation, by time and averaging "
+    "time: white where they agree, orange where the recording is noisier, purple where it is "
+    "quieter. Pale cells lie inside the 95 % band of the simulation. Red frames are the numbered "
+    "mismatches."
+)
+_MEANS_TEXT = (
+    "The Allan variance does not show what is constant within a window. Each dot is the mean rate "
+    "of a short block; lines are the simulations with their 95 % bands. Red areas are the numbered "
+    "mismatches of the mean rate. Below: channels."
+)
+_DEVIATIONS_TEXT = (
+    "All windows together. Points are the recording; where they leave the dashed line, the "
+    "simulation before is wrong. Click a name to hide it, click it twice to see it alone."
+)
+_SPECTRA_TEXT = (
+    "Thin lines are the recording at full resolution, so that narrow lines show; the highest value "
+    "is drawn where several fall together. The others are the simulations, averaged over bands."
+)
