@@ -383,7 +383,7 @@ def _decode_variable(
         read = partial(_read_stamps, packing, unit)
         return Converted(source, read, "datetime64[ns]"), attrs, chunks
     if packing.is_identity and packing.dtype == variable.dtype:
-        return source, variable.attrs, variable.encoding
+        return source, attrs, variable.encoding
     encoding = dict(chunks)
     if packing.dtype.kind in "iu" and packing.scale != 1.0:
         encoding |= {"dtype": variable.dtype, "scale_factor": packing.scale}
