@@ -27,6 +27,9 @@ app = App(
     help_format="markdown",
     suppress_keyboard_interrupt=False,
 )
+app.register_install_completion_command(
+    help="Install the completion of commands and options for this shell (bash, zsh, fish)."
+)
 
 
 @contextmanager

@@ -188,7 +188,7 @@ def _make_filters(compression: str | None) -> dict[str, Any]:
     if compression not in (None, "zstd", "zlib"):
         raise OptionError(f"compression={compression!r}: give 'zstd' or 'zlib'")
     if compression == "zstd":
-        if _has_zstd():
+        if has_zstd():
             return {"compression": "zstd", "complevel": 3, "fletcher32": True}
         warnings.warn(
             f"netCDF library {netCDF4.__netcdf4libversion__} has no zstd here: "
@@ -198,7 +198,7 @@ def _make_filters(compression: str | None) -> dict[str, Any]:
     return {"zlib": True, "complevel": 4, "shuffle": True}
 
 
-def _has_zstd() -> bool:
+def has_zstd() -> bool:
     """Whether the NetCDF library can compress with zstd."""
     import netCDF4
 

@@ -7,9 +7,11 @@ import io
 import os
 import pty
 import re
+import shutil
 import subprocess
 import sys
 import time
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +37,7 @@ COMMANDS = (
     "export",
     "simulate",
     "diagnose",
+    "doctor",
 )
 
 
@@ -224,6 +227,39 @@ def test_help_of_a_command_has_an_example_that_parses(command, capsys):
     )
     assert example, text
     app[command].parse_args(example.group().split()[2:], exit_on_error=False, print_error=False)
+
+
+def test_doctor_describes_the_installation(capsys, monkeypatch):
+    assert call("doctor") == 0
+    shown = capsys.readouterr().out
+    assert f"numpy {np.__version__}" in shown
+    assert "pip install" not in shown
+    assert re.search(r"compiled kernels: (\d+ files of|none yet)", shown)
+    true = metadata.version
+
+    def version(name: str) -> str:
+        if name == "pyulog":
+            raise metadata.PackageNotFoundError(name)
+        return "1.26.4" if name == "numpy" else true(name)
+
+    monkeypatch.setattr(metadata, "version", version)
+    assert call("doctor") == 2
+    shown = capsys.readouterr()
+    assert "extra ulog: pyulog missing; pip install 'gyrostab[ulog]'" in shown.out
+    assert "numpy 1.26.4 (needs >=2.1): install gyrostab again" in shown.err
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="bash is absent")
+def test_completion_is_installed_in_the_shell_of_the_user(tmp_path):
+    home = {**os.environ, "HOME": str(tmp_path), "SHELL": "/bin/bash"}
+    command = [sys.executable, "-m", "gyrostab", "--install-completion"]
+    subprocess.run(command, env=home, check=True, capture_output=True)
+    (script,) = (path for path in tmp_path.rglob("gyrostab") if path.is_file())
+    shown = subprocess.run(
+        ["bash", "-c", f"source {script} && complete -p gyrostab"], capture_output=True, text=True
+    )
+    assert shown.stdout.startswith("complete -F")
+    assert all(command in script.read_text(encoding="utf-8") for command in COMMANDS)
 
 
 def test_version(capsys):

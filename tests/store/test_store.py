@@ -149,7 +149,7 @@ def test_compression_and_checksums(tmp_path):
 
 
 def test_a_library_without_zstd_warns_and_compresses_with_zlib(tmp_path, monkeypatch):
-    monkeypatch.setattr(datasets, "_has_zstd", lambda: False)
+    monkeypatch.setattr(datasets, "has_zstd", lambda: False)
     with pytest.warns(UserWarning, match="has no zstd here: the log is compressed with zlib"):
         path = to_netcdf(counts_log(samples=100), tmp_path / "log.nc", compression="zstd")
     with netCDF4.Dataset(path) as file:
