@@ -19,6 +19,7 @@ from gyrostab.ingest.columns.pieces import (
     as_lazy,
     pieces_of,
 )
+from gyrostab.ingest.columns.stamps import NAT, read_stamps
 from gyrostab.ingest.concat import group_axes, merge_notes, name_some, split_axes
 from gyrostab.ingest.overlap import drop_repeats, stamp_span
 from gyrostab.schema import SIGNAL_UNITS
@@ -142,10 +143,9 @@ def _in_order(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
 
 def _first_stamp(part: xr.Dataset) -> int:
     for start in range(0, part.sizes["row"], 2**16):
-        stamps = part["time"][start : start + 2**16].values
-        good = stamps[~np.isnat(stamps)]
-        if len(good):
-            return int(good[0].astype("datetime64[ns]").view(np.int64))
+        stamps = read_stamps(part, start, start + 2**16)
+        if (stamps != NAT).any():
+            return int(stamps[np.argmax(stamps != NAT)])
     return int(np.iinfo(np.int64).max)
 
 

@@ -6,8 +6,10 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.errors import SchemaError
 from gyrostab.schema import GAP_CAUSES
 from gyrostab.time.grid import grid_index, grid_times
 from gyrostab.units import HOUR
@@ -26,6 +28,8 @@ __all__ = [
     "gap_variables",
     "merge_neighbours",
     "name_lost",
+    "read_gap_columns",
+    "read_gaps",
 ]
 
 #: Largest table; in a longer one, neighbours of one cause are merged into one row.
@@ -150,3 +154,54 @@ def gap_variables(table: NDArray[np.int64], start: int, rate: float) -> dict[str
             {"long_name": "cause of the gap", **flags},
         ),
     }
+
+
+def read_gaps(log: xr.Dataset, start: int, rate: float) -> NDArray[np.int64] | None:
+    """Read the table of gaps in grid samples (`COLUMNS`); None if it is inconsistent."""
+    found = read_gap_columns(log)
+    if found is None:
+        return None
+    first, end, *rest = found
+    return np.stack(
+        [
+            *(np.rint(grid_index(start, rate, stamps)).astype(np.int64) for stamps in (first, end)),
+            *rest,
+        ],
+        axis=1,
+    )
+
+
+def read_gap_columns(log: xr.Dataset) -> list[NDArray[np.int64]] | None:
+    """Return stamps of both ends [ns since 1970], samples, rows, cause; None if inconsistent."""
+    columns: list[NDArray[np.int64]] = []
+    for name, kind in (
+        ("gap_start", "M"),
+        ("gap_end", "M"),
+        ("gap_samples", "iu"),
+        ("gap_rows", "iu"),
+        ("gap_cause", "iu"),
+    ):
+        variable = log.variables.get(name)
+        if variable is None and name == "gap_rows":
+            columns.append(np.zeros_like(columns[-1]))
+            continue
+        if variable is None or variable.dims != ("gap",) or variable.dtype.kind not in kind:
+            return None
+        values = np.asarray(variable.values)
+        if kind == "M" and np.isnat(values).any():
+            raise SchemaError(
+                f"{name!r} holds {int(np.isnat(values).sum())} missing times (NaT); every time "
+                "must be known"
+            )
+        columns.append(
+            values.astype("datetime64[ns]").view(np.int64)
+            if kind == "M"
+            else values.astype(np.int64)
+        )
+    first, end, samples, _, cause = columns
+    spoilt = (
+        np.any(end < first)
+        or np.any(samples < 0)
+        or np.any((cause < 0) | (cause >= len(GAP_CAUSES)))
+    )
+    return None if spoilt else columns

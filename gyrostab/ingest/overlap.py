@@ -6,9 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-from gyrostab.ingest.columns.stamps import NAT
+from gyrostab.ingest.columns.stamps import NAT, read_stamps
 from gyrostab.schema import SIGNAL_UNITS
 
 __all__ = ["drop_repeats", "stamp_span"]
@@ -80,19 +79,11 @@ def _with_note(part: xr.Dataset, note: str) -> xr.Dataset:
     return part.assign_attrs(notes=[*part.attrs["notes"], note])
 
 
-def _read_stamps(part: xr.Dataset, begin: int, end: int) -> NDArray[np.int64]:
-    return (
-        np.asarray(part["time"][max(begin, 0) : end].values)
-        .astype("datetime64[ns]", copy=False)
-        .view(np.int64)
-    )
-
-
 def stamp_span(part: xr.Dataset) -> tuple[int, int]:
     """Return the first and the latest stamp of a raw log [ns since 1970]."""
     first, latest = None, NAT
     for begin in range(0, part.sizes["row"], _BLOCK_ROWS):
-        stamps = _read_stamps(part, begin, begin + _BLOCK_ROWS)
+        stamps = read_stamps(part, begin, begin + _BLOCK_ROWS)
         latest = max(latest, int(stamps.max()))  # NAT is the smallest integer
         if first is None and latest != NAT:
             first = int(stamps[np.argmax(stamps != NAT)])
@@ -103,7 +94,7 @@ def _rows_from(part: xr.Dataset, first: int) -> int:
     """Return the row from which all stamps are `first` or later, searching from the end."""
     row = part.sizes["row"]
     while row > 0:
-        stamps = _read_stamps(part, row - _BLOCK_ROWS, row)
+        stamps = read_stamps(part, row - _BLOCK_ROWS, row)
         early = np.flatnonzero((stamps < first) & (stamps != NAT))
         if len(early):
             return row - len(stamps) + int(early[-1]) + 1
@@ -114,7 +105,7 @@ def _rows_from(part: xr.Dataset, first: int) -> int:
 def _rows_until(part: xr.Dataset, last: int) -> int:
     """Return the number of rows before the first stamp later than `last`."""
     for begin in range(0, part.sizes["row"], _BLOCK_ROWS):
-        late = np.flatnonzero(_read_stamps(part, begin, begin + _BLOCK_ROWS) > last)
+        late = np.flatnonzero(read_stamps(part, begin, begin + _BLOCK_ROWS) > last)
         if len(late):
             return begin + int(late[0])
     return part.sizes["row"]
@@ -135,7 +126,7 @@ def _count_common(
     held: xr.Dataset, part: xr.Dataset, rows: tuple[int, int], others: tuple[int, int]
 ) -> tuple[int, int]:
     """Count rows with equal stamps, and those with equal values; NaN equals anything."""
-    ours, theirs = _read_stamps(held, *rows), _read_stamps(part, *others)
+    ours, theirs = read_stamps(held, *rows), read_stamps(part, *others)
     stamps, a, b = np.intersect1d(ours, theirs, return_indices=True)
     a, b = a[stamps != NAT], b[stamps != NAT]
     signal = next(

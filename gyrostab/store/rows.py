@@ -12,7 +12,7 @@ import threading
 import uuid
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -67,6 +67,18 @@ class EvenRows:
     begin: int
     stride: int
 
+    @classmethod
+    def of_array(
+        cls, path: Path, dtype: np.dtype[Any], begin: int, stride: int, along: int, place: int
+    ) -> EvenRows:
+        """Locate one column of an array in the file.
+
+        `begin` is its first byte, `stride` the bytes from one index of the first dimension to the
+        next, `along` the dimension of the rows, and `place` the index along the other one.
+        """
+        across, step = (dtype.itemsize, stride) if along == 0 else (stride, dtype.itemsize)
+        return cls(path, dtype, begin + place * across, step)
+
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Return the numbers of some rows as they are stored."""
         out = np.empty(max(stop - start, 0), self.dtype)
@@ -112,7 +124,7 @@ class ChunkedRows:
     along, place : int
         Dimension of the rows, and index along the other one.
     key : tuple
-        Identifier of one opening of the variable.
+        Identifier of one opening of the variable, common to its columns.
     """
 
     load: Callable[[tuple[int, ...]], NDArray[Any] | None]
@@ -120,9 +132,9 @@ class ChunkedRows:
     chunks: tuple[int, ...]
     dtype: np.dtype[Any]
     fill: Any
-    along: int = 0
-    place: int = 0
-    key: tuple[Any, ...] = field(default_factory=lambda: (uuid.uuid4().hex,))
+    along: int
+    place: int
+    key: tuple[str]
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Return the numbers of some rows as they are stored."""
@@ -214,7 +226,8 @@ def hdf5_rows(path: Path, variable: Any) -> Callable[[int, int], Rows] | None:
         and not plist.get_external_count()
         and variable.id.get_offset() is not None
     ):
-        return partial(_make_even_rows, path.absolute(), dtype, variable.id.get_offset(), shape)
+        stride = dtype.itemsize * math.prod(shape[1:])
+        return partial(EvenRows.of_array, path.absolute(), dtype, variable.id.get_offset(), stride)
     if plist.get_layout() != h5py.h5d.CHUNKED or not has_known_filters(plist):
         return None
     if (
@@ -225,22 +238,9 @@ def hdf5_rows(path: Path, variable: Any) -> Callable[[int, int], Rows] | None:
         > _MAX_CHUNKS
     ):
         return None  # a table of their places would be larger than the chunks
-    key = (uuid.uuid4().hex, variable.name)
-    load = partial(_load_hdf5, path.absolute(), variable.name, variable.chunks, key[0])
-    return lambda along, place: ChunkedRows(
-        load, shape, variable.chunks, dtype, variable.fillvalue, along, place, key
-    )
-
-
-def _make_even_rows(
-    path: Path, dtype: np.dtype[Any], begin: int, shape: tuple[int, ...], along: int, place: int
-) -> EvenRows:
-    wide = dtype.itemsize
-    if len(shape) == 1:
-        return EvenRows(path, dtype, begin, wide)
-    if along == 0:
-        return EvenRows(path, dtype, begin + place * wide, shape[1] * wide)
-    return EvenRows(path, dtype, begin + place * shape[1] * wide, wide)
+    key = uuid.uuid4().hex
+    load = partial(_load_hdf5, path.absolute(), variable.name, variable.chunks, key)
+    return partial(ChunkedRows, load, shape, variable.chunks, dtype, variable.fillvalue, key=(key,))
 
 
 def _load_hdf5(

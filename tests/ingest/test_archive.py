@@ -7,16 +7,19 @@ import subprocess
 import sys
 from pathlib import Path
 
+import dask.array as da
 import numpy as np
 import pytest
 import xarray as xr
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from gyrostab import make_log
 from gyrostab.errors import OptionError, TimeError, UnitError
 from gyrostab.ingest import read_log
 from gyrostab.ingest.concat import concatenate_logs
 from gyrostab.ingest.concat.grid import runs_of
+from gyrostab.ingest.grid.place import append_runs
 from gyrostab.ingest.grid.regularise import gap_table, regularise
 from gyrostab.io import datasets as export
 from gyrostab.schema import GAP_CAUSES
@@ -238,6 +241,13 @@ def test_runs_are_the_nearest_samples(off: float, ratio: float, size: int, first
     assert sorted(taken) == sorted(set(np.rint(position).astype(int)))
 
 
+def test_a_run_that_is_extended_twice_stays_one() -> None:
+    runs: list[np.ndarray] = []
+    for begin in range(0, 12, 4):
+        append_runs(runs, np.arange(begin, begin + 4) + 7, np.arange(begin, begin + 4))
+    assert np.concatenate(runs).tolist() == [[7, 0, 12]]
+
+
 def test_logs_of_other_rates_and_kinds_are_refused_by_name() -> None:
     values = signal(200)
     first, second = log_of(values), log_of(values, 400, rate=RATE * 1.0002)
@@ -353,6 +363,25 @@ def test_channels_with_separate_stamps_are_concatenated_without_duplicates(lazy:
     )
     np.testing.assert_array_equal(joined.temperature, np.arange(60.0))
     assert joined.temperature.dims == ("time_temperature",)
+
+
+def test_a_lazy_channel_keeps_its_type() -> None:
+    logs = [
+        make_log(np.zeros(100), rate=10.0, unit="deg/h", start=f"2026-01-01T00:0{n}:00").assign(
+            supply_voltage=(
+                "time_supply_voltage",
+                da.arange(5, dtype=np.float32, chunks=2),
+                {"units": "V"},
+            ),
+            time_supply_voltage=np.datetime64(f"2026-01-01T00:0{n}:00", "ns")
+            + np.arange(5) * np.timedelta64(2, "s"),
+        )
+        for n in range(2)
+    ]
+    channel = concatenate_logs(logs, ["a.nc", "b.nc"])["supply_voltage"]
+    assert channel.dtype == np.float32
+    assert channel.chunks is not None
+    np.testing.assert_array_equal(channel, [*range(5)] * 2)
 
 
 def test_a_channel_that_is_slow_in_one_log_only_lies_on_the_common_time() -> None:

@@ -15,9 +15,11 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import UnitError
+from gyrostab.store.lazy import read_slice
 from gyrostab.time.grid import split_instant
 
 __all__ = [
@@ -30,6 +32,7 @@ __all__ = [
     "looks_iso",
     "names_epoch",
     "parse_time_unit",
+    "read_stamps",
     "signed_counts",
     "texts_to_ns",
 ]
@@ -193,6 +196,12 @@ def dates_to_ns(dates: NDArray[Any]) -> NDArray[np.int64]:
     if native.dtype == np.dtype("datetime64[ns]") or not outside.any():
         return native.astype("datetime64[ns]").view(np.int64)
     return np.where(outside, np.datetime64("NaT"), native).astype("datetime64[ns]").view(np.int64)
+
+
+def read_stamps(raw: xr.Dataset, begin: int, end: int) -> NDArray[np.int64]:
+    """Read the stamps of rows of a raw log [ns since 1970], `NAT` where unreadable."""
+    stamps = read_slice(raw["time"].data, max(begin, 0), min(end, raw.sizes["row"]))
+    return stamps.astype("datetime64[ns]", copy=False).view(np.int64)
 
 
 def texts_to_ns(texts: Sequence[Any] | NDArray[Any]) -> NDArray[np.int64]:

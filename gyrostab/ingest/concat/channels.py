@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,7 +10,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import UnitError
 from gyrostab.ingest.concat.grid import PlacedLog
-from gyrostab.ingest.concat.lazy import PlacedArray, chunk_of, place_on_grid
+from gyrostab.ingest.concat.lazy import PlacedArray, place_on_grid
 from gyrostab.schema import log_channels
 from gyrostab.time.grid import grid_index, grid_times
 
@@ -20,7 +18,6 @@ __all__ = ["concatenate_channels"]
 
 # stamps of two copies of a value differ by the rounding of each to its own grid
 _SAME_STAMP_PERIODS = 0.75
-_MAX_SLICES_PER_LOG = 16  # values in more slices than that are loaded
 
 
 def concatenate_channels(
@@ -155,28 +152,9 @@ def _own_time(
 
 
 def _select_values(arrays: Sequence[Any], places: NDArray[np.int64]) -> Any:
-    """Select the values at `places` as lazy slices; load them if the slices would be very many."""
+    """Select the values at `places` of the concatenated arrays; lazily if one of them is lazy."""
     if all(isinstance(array, np.ndarray) for array in arrays):
         return np.concatenate(arrays)[places]
-    if np.count_nonzero(np.diff(places) != 1) >= _MAX_SLICES_PER_LOG * (len(arrays) + 1):
-        import dask.array as da
+    import dask.array as da
 
-        return np.asarray(da.concatenate([da.asarray(array) for array in arrays]))[places]
-    return place_on_grid([_slices_at(arrays, places)], len(places), chunk_of(arrays), flat=True)
-
-
-def _slices_at(arrays: Sequence[Any], places: NDArray[np.int64]) -> list[PlacedArray]:
-    """Return the values at `places` as slices of the arrays."""
-    begins = np.cumsum([0, *map(len, arrays)]).tolist()
-    edges = [0, *(np.flatnonzero(np.diff(places) != 1) + 1).tolist(), len(places)]
-    parts: list[PlacedArray] = []
-    for at, end in pairwise(edges):
-        while at < end:
-            place = int(places[at])
-            owner = bisect_right(begins, place) - 1
-            size = min(end - at, begins[owner + 1] - place)
-            parts.append(
-                (arrays[owner], None, np.array([[at, place - begins[owner], size]], dtype=np.int64))
-            )
-            at += size
-    return parts
+    return da.concatenate([da.asarray(array) for array in arrays])[places]

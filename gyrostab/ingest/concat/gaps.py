@@ -10,9 +10,15 @@ from numpy.typing import NDArray
 
 from gyrostab.ingest.concat.axes import group_axes
 from gyrostab.ingest.concat.grid import PlacedLog
-from gyrostab.ingest.gap_table import CAUSE, END, FIRST, clip_table, merge_neighbours
+from gyrostab.ingest.gap_table import (
+    CAUSE,
+    END,
+    FIRST,
+    clip_table,
+    merge_neighbours,
+    read_gaps,
+)
 from gyrostab.schema import GAP_CAUSES
-from gyrostab.time.grid import grid_index
 
 __all__ = ["merge_gaps"]
 
@@ -25,24 +31,11 @@ _MAX_SAMPLE = np.iinfo(np.int64).max // 2
 
 def _own_gaps(piece: PlacedLog) -> Table:
     """Return the table of gaps of one log, on the common grid."""
-    log, source = piece.source.log.variables, piece.source
-    table = _EMPTY
-    if "gap_start" in log and log["gap_start"].size:
-        ends = (
-            log[name].values.astype("datetime64[ns]").view(np.int64)
-            for name in ("gap_start", "gap_end")
-        )
-        first, end = (
-            piece.on_grid(np.rint(grid_index(source.start, source.rate, stamps)).astype(np.int64))
-            for stamps in ends
-        )
-        samples = log["gap_samples"].values.astype(np.int64)
-        rows = (
-            log["gap_rows"].values.astype(np.int64) if "gap_rows" in log else np.zeros_like(samples)
-        )
-        table = np.stack(
-            [first, end, samples, rows, log["gap_cause"].values.astype(np.int64)], axis=1
-        )
+    table = read_gaps(piece.source.log, piece.source.start, piece.source.rate)
+    if table is None:
+        table = _EMPTY
+    for column in (FIRST, END) if len(table) else ():
+        table[:, column] = piece.on_grid(table[:, column])
     return np.concatenate([table, _rate_slips(piece)]) if len(piece.runs) > 1 else table
 
 

@@ -47,12 +47,7 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
 
 def _read_curves(path: Path, options: ReadOptions) -> Table:
     lasio = library("lasio", path, extra="las")
-    try:
-        curves = lasio.read(str(path)).curves
-    except Exception as error:  # the library raises many kinds on damaged files
-        raise FormatError(
-            f"{path.name}: this LAS file cannot be read ({error}); it may be cut off, copy it again"
-        ) from error
+    curves = lasio.read(str(path)).curves
     units = tuple(
         None if holds_dates(curve.data) else str(curve.unit or "").strip() or None
         for curve in curves

@@ -137,13 +137,7 @@ def _find_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[t
     from scipy.io import loadmat
 
     check_structure(path)
-    try:
-        content = loadmat(path, simplify_cells=False, struct_as_record=True, chars_as_strings=True)
-    except Exception as error:  # scipy raises bare errors of many kinds on damaged files
-        raise FormatError(
-            f"{path.name}: this MATLAB file cannot be read ({error}); it may be cut off, copy it "
-            "again"
-        ) from error
+    content = loadmat(path, simplify_cells=False, struct_as_record=True, chars_as_strings=True)
     for name, value in content.items():
         if not name.startswith("__"):
             yield from _flatten_struct(name, value, objects)
@@ -188,11 +182,7 @@ def _find_hdf_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterat
     import h5py
 
     check_global_heaps(path)
-    try:
-        file = stack.enter_context(h5py.File(path, "r"))
-    except OSError as error:
-        what = f"this HDF5 file (MATLAB 7.3 is one) cannot be opened ({error})"
-        raise FormatError(f"{path.name}: {what}; it may be cut off, copy it again") from error
+    file = stack.enter_context(h5py.File(path, "r"))
     found: list[tuple[str, Any]] = []
 
     def visit(name: str | bytes, item: Any) -> None:

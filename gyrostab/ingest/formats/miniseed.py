@@ -16,7 +16,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.errors import FormatError
 from gyrostab.ingest.formats.tables import (
     ReadSlice,
     Table,
@@ -99,29 +98,22 @@ def _cut_note(path: Path) -> list[str]:
 def _read_traces(path: Path, *, unpack: bool) -> list[_Trace]:
     pymseed = library("pymseed", path, extra="miniseed")
     traces: dict[tuple[str, float], _Trace] = {}
-    try:
-        found = pymseed.MS3TraceList.from_file(str(path), unpack_data=unpack)
-        for trace in found:
-            for piece in trace:
-                if (
-                    piece.samplecnt < 1
-                    or piece.samprate <= 0
-                    or (unpack and piece.sampletype not in ("i", "f", "d"))
-                ):
-                    continue  # text and log records of the station
-                code = pymseed.sourceid2nslc(trace.sourceid)
-                channel = traces.setdefault(
-                    (trace.sourceid, piece.samprate), _Trace(tuple(code), piece.samprate)
-                )
-                channel.starts.append(int(piece.starttime))
-                channel.sizes.append(int(piece.samplecnt))
-                if unpack:
-                    channel.values.append(np.array(piece.np_datasamples))
-    except pymseed.MiniSEEDError as error:
-        raise FormatError(
-            f"{path.name}: this miniSEED file cannot be read ({error}); it may be cut off, copy "
-            "it again"
-        ) from error
+    for trace in pymseed.MS3TraceList.from_file(str(path), unpack_data=unpack):
+        for piece in trace:
+            if (
+                piece.samplecnt < 1
+                or piece.samprate <= 0
+                or (unpack and piece.sampletype not in ("i", "f", "d"))
+            ):
+                continue  # text and log records of the station
+            code = pymseed.sourceid2nslc(trace.sourceid)
+            channel = traces.setdefault(
+                (trace.sourceid, piece.samprate), _Trace(tuple(code), piece.samprate)
+            )
+            channel.starts.append(int(piece.starttime))
+            channel.sizes.append(int(piece.samplecnt))
+            if unpack:
+                channel.values.append(np.array(piece.np_datasamples))
     return list(traces.values())
 
 

@@ -19,7 +19,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.errors import FormatError, SchemaError, TimeError, reading_of
+from gyrostab.errors import FormatError, SchemaError, TimeError
 from gyrostab.ingest.columns.stamps import names_epoch
 from gyrostab.ingest.formats.netcdf_classic import read_classic_header
 from gyrostab.ingest.formats.netcdf_variables import (
@@ -141,13 +141,7 @@ def _open_regular(path: Path) -> xr.Dataset | None:
         return None
     engine: Any = "zarr" if path.is_dir() else "netcdf4"
     extra: Any = {"consolidated": False} if path.is_dir() else {}
-    try:
-        stored = xr.open_dataset(path, engine=engine, **_UNDECODED, **extra)
-    except Exception as error:  # the backends raise errors of many kinds on damaged files
-        raise FormatError(
-            f"{path.name}: this {engine} file cannot be opened ({error}); it may be cut off, "
-            "copy it again"
-        ) from error
+    stored = xr.open_dataset(path, engine=engine, **_UNDECODED, **extra)
     if not _is_regular(stored):
         stored.close()
         return None
@@ -177,9 +171,8 @@ def _read_group(path: Path) -> tuple[int, dict[str, Any]]:
     """Return format and attributes of a Zarr group, also of one that xarray cannot open."""
     import zarr
 
-    with reading_of(path):
-        group = zarr.open_group(path, mode="r")
-        return group.metadata.zarr_format, dict(group.attrs)
+    group = zarr.open_group(path, mode="r")
+    return group.metadata.zarr_format, dict(group.attrs)
 
 
 def _read_labels(path: Path, labels: xr.DataArray) -> NDArray[np.str_]:

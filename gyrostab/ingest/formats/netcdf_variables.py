@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import base64
+import math
 import struct
-from collections.abc import Callable, Iterator, Mapping
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.errors import reading_of
 from gyrostab.ingest.formats.netcdf_classic import read_classic_header
 from gyrostab.ingest.limits import check_chunk
 from gyrostab.store.private import library_lock
@@ -74,19 +75,17 @@ def open_variables(path: Path, limits: Mapping[str, float]) -> Iterator[dict[str
         return
     import netCDF4
 
-    with reading_of(path):
-        file = netCDF4.Dataset(path)
-    with file:
-        with reading_of(path):
-            found = {
-                name: _netcdf_variable(path, variable, limits)
-                for name, variable in file.variables.items()
-            }
-            _locate_directly(path, found)
-        yield found
+    with netCDF4.Dataset(path) as file:
+        located = _find_rows(path, list(file.variables.values()))
+        yield {
+            name: _netcdf_variable(path, variable, located.get(name), limits)
+            for name, variable in file.variables.items()
+        }
 
 
-def _netcdf_variable(path: Path, variable: Any, limits: Mapping[str, float]) -> StoredVariable:
+def _netcdf_variable(
+    path: Path, variable: Any, located: Locate | None, limits: Mapping[str, float]
+) -> StoredVariable:
     variable.set_auto_maskandscale(False)
     dtype = variable.dtype if isinstance(variable.dtype, np.dtype) else np.dtype(object)
     attributes = with_default_fill(
@@ -94,130 +93,81 @@ def _netcdf_variable(path: Path, variable: Any, limits: Mapping[str, float]) -> 
     )
     cut = variable.chunking()
     if isinstance(cut, list | tuple):
-        check_chunk(path, variable.name, _bytes_of(cut, dtype), limits)
-    locate = partial(LibraryRows, variable)
+        check_chunk(path, variable.name, dtype.itemsize * math.prod(map(int, cut)), limits)
+    locate = located or partial(LibraryRows, variable)
     return StoredVariable(
         variable.name, variable.dimensions, variable.shape, dtype, attributes, variable, locate
     )
 
 
-def _locate_directly(path: Path, found: dict[str, StoredVariable]) -> None:
-    """Locate the numbers, so that they can be read without the library where possible."""
+def _find_rows(path: Path, variables: Sequence[Any]) -> dict[str, Locate]:
+    """Locate the numbers of the variables that can be read without the library."""
     import h5py
 
     numeric = [
         variable
-        for variable in found.values()
-        if variable.dtype.kind in "iuf" and len(variable.shape) in (1, 2)
+        for variable in variables
+        if isinstance(variable.dtype, np.dtype)
+        and variable.dtype.kind in "iuf"
+        and len(variable.shape) in (1, 2)
     ]
     classic = read_classic_header(path)
-    for variable in numeric if classic is not None else ():
-        assert classic is not None
-        place = classic.get(variable.name)
-        if place is not None and place.shape == variable.shape:
-            _replace_locate(
-                found,
-                variable,
-                partial(
-                    _classic_rows,
-                    path.absolute(),
-                    place.dtype,
-                    place.begin,
-                    place.stride,
-                    place.shape,
-                ),
+    if classic is not None:
+        places = [classic[v.name] for v in numeric if v.name in classic]
+        shapes = {variable.name: variable.shape for variable in numeric}
+        return {
+            place.name: partial(
+                EvenRows.of_array, path.absolute(), place.dtype, place.begin, place.stride
             )
-    if classic is not None or not h5py.is_hdf5(path):
-        return
+            for place in places
+            if place.shape == shapes[place.name]
+        }
+    if not h5py.is_hdf5(path):
+        return {}
+    found = {}
     with library_lock(), h5py.File(path, "r") as file:
         for variable in numeric:
             stored = file.get(variable.name)
-            if (
-                isinstance(stored, h5py.Dataset)
-                and stored.shape == variable.shape
-                and stored.dtype == variable.dtype
+            if isinstance(stored, h5py.Dataset) and (stored.shape, stored.dtype) == (
+                variable.shape,
+                variable.dtype,
             ):
-                located = hdf5_rows(path, stored)
-                if located is not None:
-                    _replace_locate(found, variable, located)
-
-
-def _replace_locate(
-    found: dict[str, StoredVariable], variable: StoredVariable, locate: Locate
-) -> None:
-    found[variable.name] = replace(variable, locate=locate)
-
-
-def _classic_rows(
-    path: Path,
-    dtype: np.dtype[Any],
-    begin: int,
-    stride: int,
-    shape: tuple[int, ...],
-    along: int,
-    place: int,
-) -> EvenRows:
-    if len(shape) == 1 or along == 0:
-        return EvenRows(path, dtype, begin + place * dtype.itemsize, stride)
-    return EvenRows(path, dtype, begin + place * stride, dtype.itemsize)
+                found[variable.name] = hdf5_rows(path, stored)
+    return {name: locate for name, locate in found.items() if locate is not None}
 
 
 def _zarr_variables(path: Path, limits: Mapping[str, float]) -> Iterator[StoredVariable]:
     import zarr
 
-    with reading_of(path):
-        arrays = sorted(zarr.open_group(path, mode="r").arrays())
-    for name, array in arrays:
-        with reading_of(path):
-            attributes = dict(array.attrs)
-            named: Any = attributes.pop("_ARRAY_DIMENSIONS", None) or getattr(
-                array.metadata, "dimension_names", None
-            )
-            dims = [
-                dim or f"rows_{size}"
-                for dim, size in zip(named or [None] * array.ndim, array.shape, strict=True)
-            ]
-            attributes |= _zarr_fill(array, attributes)
-            chunks, dtype = tuple(array.chunks), np.dtype(array.dtype)
-        check_chunk(path, name, _bytes_of(chunks, dtype), limits)
-        load = partial(_load_zarr, path, array, chunks)
-
-        def locate(
-            along: int,
-            place: int,
-            array: Any = array,
-            load: Any = load,
-            key: tuple[Any, ...] = (str(path), name),
-        ) -> ChunkedRows:
-            opened = (*key, id(array))
-            return ChunkedRows(
-                load,
-                array.shape,
-                tuple(array.chunks),
-                np.dtype(array.dtype),
-                array.fill_value,
-                along,
-                place,
-                opened,
-            )
-
+    for name, array in sorted(zarr.open_group(path, mode="r").arrays()):
+        attributes = dict(array.attrs)
+        named: Any = attributes.pop("_ARRAY_DIMENSIONS", None) or getattr(
+            array.metadata, "dimension_names", None
+        )
+        dims = [
+            dim or f"rows_{size}"
+            for dim, size in zip(named or [None] * array.ndim, array.shape, strict=True)
+        ]
+        attributes |= _zarr_fill(array, attributes)
+        chunks, dtype = tuple(array.chunks), np.dtype(array.dtype)
+        check_chunk(path, name, dtype.itemsize * math.prod(map(int, chunks)), limits)
+        locate = partial(
+            ChunkedRows,
+            partial(_load_zarr, array, chunks),
+            array.shape,
+            chunks,
+            dtype,
+            array.fill_value,
+            key=(uuid.uuid4().hex,),
+        )
         yield StoredVariable(
             name, tuple(map(str, dims)), array.shape, dtype, attributes, array, locate
         )
 
 
-def _load_zarr(
-    path: Path, array: Any, chunks: tuple[int, ...], at: tuple[int, ...]
-) -> NDArray[Any]:
-    with reading_of(path):
-        return np.asarray(
-            array[
-                tuple(
-                    slice(number * length, (number + 1) * length)
-                    for number, length in zip(at, chunks, strict=True)
-                )
-            ]
-        )
+def _load_zarr(array: Any, chunks: tuple[int, ...], at: tuple[int, ...]) -> NDArray[Any]:
+    box = [slice(n * length, (n + 1) * length) for n, length in zip(at, chunks, strict=True)]
+    return np.asarray(array[tuple(box)])
 
 
 def _zarr_fill(array: Any, attributes: Mapping[str, Any]) -> dict[str, Any]:
@@ -249,10 +199,3 @@ def with_default_fill(attributes: dict[str, Any], dtype: Any) -> dict[str, Any]:
     ):
         return attributes
     return {**attributes, "_FillValue": dtype.type(netCDF4.default_fillvals[dtype.str[1:]])}
-
-
-def _bytes_of(chunks: Any, dtype: np.dtype[Any]) -> int:
-    total = dtype.itemsize
-    for length in chunks:  # Python integers do not overflow
-        total *= int(length)
-    return total

@@ -85,23 +85,16 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
 
 
 def _open_parquet(path: Path, options: ReadOptions) -> tuple[Any, Plan]:
-    import pyarrow as pa
     from pyarrow import parquet
 
-    try:
-        file = parquet.ParquetFile(path, buffer_size=_BUFFER_BYTES, pre_buffer=False)
-        schema = file.schema_arrow
-        head = next(file.iter_batches(batch_size=50), None)
-    except (pa.ArrowException, OSError) as error:
-        raise FormatError(
-            f"{path.name}: this Parquet file cannot be opened ({error}); it may be cut off, copy "
-            "it again"
-        ) from error
-    units = {}
-    for index, entry in enumerate(schema):
-        text = (entry.metadata or {}).get(b"units")
-        if text is not None:
-            units[index] = text.decode()
+    file = parquet.ParquetFile(path, buffer_size=_BUFFER_BYTES, pre_buffer=False)
+    schema = file.schema_arrow
+    head = next(file.iter_batches(batch_size=50), None)
+    units = {
+        index: text.decode()
+        for index, entry in enumerate(schema)
+        if (text := (entry.metadata or {}).get(b"units")) is not None
+    }
     dates = [
         index
         for index in range(len(schema))

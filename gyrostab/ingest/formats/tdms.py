@@ -59,14 +59,7 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
 def _open_tables(path: Path) -> Iterator[list[Table]]:
     """Group channels of one length and clock into tables; without a clock, of one group."""
     nptdms = library("nptdms", path, extra="tdms")
-    try:
-        file = nptdms.TdmsFile.open(str(path))
-    except Exception as error:  # the library raises many kinds on damaged files
-        raise FormatError(
-            f"{path.name}: this TDMS file cannot be read ({error}); it may be cut off, copy it "
-            "again"
-        ) from error
-    with file:
+    with nptdms.TdmsFile.open(str(path)) as file:
         channels = [
             channel for group in file.groups() for channel in group.channels() if len(channel)
         ]

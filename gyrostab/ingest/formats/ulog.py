@@ -9,7 +9,6 @@ from pathlib import Path
 
 import xarray as xr
 
-from gyrostab.errors import FormatError
 from gyrostab.ingest.formats.tables import (
     Table,
     library,
@@ -47,12 +46,7 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
 
 def _make_tables(path: Path) -> tuple[list[Table], list[str]]:
     pyulog = library("pyulog", path, extra="ulog")
-    try:
-        log = pyulog.ULog(str(path))
-    except Exception as error:  # the library raises many kinds on damaged files
-        raise FormatError(
-            f"{path.name}: this PX4 log cannot be read ({error}); it may be cut off, copy it again"
-        ) from error
+    log = pyulog.ULog(str(path))
     found = []
     for message in log.data_list:
         name = message.name + (f"_{message.multi_id}" if message.multi_id else "")

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.ingest.columns.stamps import read_stamps
 from gyrostab.ingest.concat.lazy import GridSource, place_on_grid
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS
@@ -101,7 +102,6 @@ def gather_channel(
 ) -> tuple[NDArray[np.datetime64], NDArray[np.float64]]:
     """Return stamps and values of the filled rows of a slow channel."""
     channel = raw[name].data
-    clock = raw["time"].data if "time" in raw.variables else None
     breaks = placement.events[np.isin(placement.events[:, 0], (STEP, RESTART))]
     breaks = breaks[np.argsort(breaks[:, 2], kind="stable")]
     moved = np.concatenate(
@@ -109,19 +109,14 @@ def gather_channel(
     )
     stamps, values = [], []
     for begin in range(0, channel.shape[0], BLOCK_ROWS):
-        block = read_slice(channel, begin, min(begin + BLOCK_ROWS, channel.shape[0])).astype(
-            np.float64, copy=False
-        )
+        end = min(begin + BLOCK_ROWS, channel.shape[0])
+        block = read_slice(channel, begin, end).astype(np.float64, copy=False)
         rows = np.flatnonzero(np.isfinite(block))
         sample = samples_of(placement, rows + begin)
         known = sample >= 0
         when = grid_times(placement.start, rate, sample)
-        if clock is not None and not known.all():
-            written = (
-                read_slice(clock, begin, min(begin + BLOCK_ROWS, channel.shape[0]))
-                .astype("datetime64[ns]")
-                .view(np.int64)[rows]
-            )
+        if "time" in raw.variables and not known.all():
+            written = read_stamps(raw, begin, end)[rows]
             own = written + moved[np.searchsorted(breaks[:, 2], rows + begin, side="right")]
             when = np.where(known, when, own)
             known |= written != NO_STAMP

@@ -10,6 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import TimeError
+from gyrostab.ingest.columns.stamps import read_stamps
 from gyrostab.ingest.gap_table import format_duration, format_stamp
 from gyrostab.ingest.grid.rate import RateEstimate
 from gyrostab.ingest.grid.scan_pass import file_of
@@ -24,7 +25,6 @@ from gyrostab.kernels.grid.stamps import (
     RESTART,
     STEP,
 )
-from gyrostab.store.lazy import read_slice
 from gyrostab.time.grid import period_ns
 
 __all__ = [
@@ -91,7 +91,7 @@ def make_placement(
     start: int, runs: list[NDArray[np.int64]], events: list[NDArray[np.int64]], wander: float = 0.0
 ) -> Placement:
     """Make a placement of lists of runs and events, sorted by sample."""
-    table = np.concatenate([part for part in runs if len(part)])
+    table = np.concatenate(runs)
     happened = np.concatenate([*events, np.empty((0, 5), dtype=np.int64)])
     table = table[np.argsort(table[:, 0], kind="stable")]
     return Placement(start, table, happened[np.argsort(happened[:, 1], kind="stable")], wander)
@@ -124,13 +124,9 @@ def check_grid(
     holes = runs[1:, 0] - runs[:-1, 0] - runs[:-1, 2]
     widest = int(np.argmax(holes))
     rows = [int(runs[widest, 1] + runs[widest, 2] - 1), int(runs[widest + 1, 1])]
-    stamps = [
-        int(read_slice(raw["time"].data, row, row + 1).astype("datetime64[ns]").view(np.int64)[0])
-        for row in rows
-    ]
     places = [
-        f"{format_stamp(stamp)} (row {file_of(raw, row)[1]})"
-        for stamp, row in zip(stamps, rows, strict=True)
+        f"{format_stamp(int(read_stamps(raw, row, row + 1)[0]))} (row {file_of(raw, row)[1]})"
+        for row in rows
     ]
     gap = holes[widest] / rate
     if gap >= 1.0:
@@ -154,20 +150,17 @@ def check_grid(
 
 def append_runs(
     runs: list[NDArray[np.int64]], sample: NDArray[np.int64], rows: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """Make runs of rows and samples; extend the last run of `runs` if they continue it."""
+) -> None:
+    """Append runs of rows and samples to `runs`; extend the last run if they continue it."""
     new = np.flatnonzero((np.diff(sample) != 1) | (np.diff(rows) != 1)) + 1
     first = np.concatenate([[0], new])
     table = np.stack([sample[first], rows[first], np.diff(np.append(first, len(rows)))], axis=1)
-    before = runs[-1][-1] if runs and len(runs[-1]) else None
-    if (
-        before is not None
-        and before[0] + before[2] == table[0, 0]
-        and before[1] + before[2] == table[0, 1]
-    ):
+    before = runs[-1][-1] if runs else None
+    if before is not None and (before[:2] + before[2] == table[0, :2]).all():
         before[2] += table[0, 2]
         table = table[1:]
-    return table
+    if len(table):
+        runs.append(table)
 
 
 def place_without_time(rows: int, start: int) -> Placement:
@@ -391,7 +384,6 @@ def _counted_runs(
             continue
         count = np.arange(done, done + len(rows))
         grid = count + shifts[np.searchsorted(cuts, count, side="right") - 1]
-        if len(table := append_runs(runs, grid, rows)):
-            runs.append(table)
+        append_runs(runs, grid, rows)
         done += len(rows)
     return runs

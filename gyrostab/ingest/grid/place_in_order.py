@@ -157,7 +157,7 @@ class _Placer:
             rows, sample = rows[kept], sample[kept]
         if len(rows):
             self.last = int(sample[-1])
-            self.runs.append(append_runs(self.runs, sample, rows))
+            append_runs(self.runs, sample, rows)
 
 
 def place_rows(

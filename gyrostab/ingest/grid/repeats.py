@@ -6,6 +6,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.ingest.columns.stamps import read_stamps
 from gyrostab.ingest.grid.fill import samples_of
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS
@@ -53,18 +54,12 @@ def find_repeats(raw: xr.Dataset, name: str, placement: Placement) -> NDArray[np
     return np.array(found, dtype=np.int64).reshape(-1, 3)
 
 
-def _read_stamps(raw: xr.Dataset, begin: int, end: int) -> NDArray[np.int64]:
-    return (
-        read_slice(raw["time"].data, begin, end).astype("datetime64[ns]", copy=False).view(np.int64)
-    )
-
-
 def _rows_at(raw: xr.Dataset, stamp: int, before: int) -> list[int]:
     """Return the first few rows with a stamp."""
     rows: list[int] = []
     for begin in range(0, before, BLOCK_ROWS):
         rows += (
-            np.flatnonzero(_read_stamps(raw, begin, min(begin + BLOCK_ROWS, before)) == stamp)
+            np.flatnonzero(read_stamps(raw, begin, min(begin + BLOCK_ROWS, before)) == stamp)
             + begin
         ).tolist()
         if len(rows) >= _MAX_CANDIDATES:
@@ -78,8 +73,8 @@ def _same_stamps(raw: xr.Dataset, source: int, row: int) -> int:
     for begin in range(0, room, BLOCK_ROWS):
         end = min(begin + BLOCK_ROWS, room)
         other = np.flatnonzero(
-            _read_stamps(raw, source + begin, source + end)
-            != _read_stamps(raw, row + begin, row + end)
+            read_stamps(raw, source + begin, source + end)
+            != read_stamps(raw, row + begin, row + end)
         )
         if len(other):
             return begin + int(other[0])
@@ -111,7 +106,7 @@ def with_repeats(placement: Placement, raw: xr.Dataset, repeats: NDArray[np.int6
     for row, source, length in repeats.tolist():
         rows = np.arange(length)
         sample = np.maximum.accumulate(np.maximum(samples_of(placement, rows + source), 0))
-        stamps = _read_stamps(raw, row, row + length)
+        stamps = read_stamps(raw, row, row + length)
         known = stamps != NO_STAMP
         table = np.stack([np.full(length, DUPLICATE), sample, rows + row, stamps, stamps], axis=1)
         events.append(table[known])

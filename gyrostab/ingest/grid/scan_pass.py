@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.pieces import InspectedRows
+from gyrostab.ingest.columns.stamps import read_stamps
 from gyrostab.schema import texts
 from gyrostab.store.lazy import find_source, read_slice
 from gyrostab.store.row_inspection import RowInspection, inspect_rows
@@ -162,10 +163,9 @@ def stamp_blocks(
 def _read_stamp_blocks(
     raw: xr.Dataset, scanned: ScanPass, block: int, *, all_rows: bool
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    stamps = raw["time"].data
     for begin in range(0, scanned.rows, block):
         end = min(scanned.rows, begin + block)
-        values = read_slice(stamps, begin, end).astype("datetime64[ns]", copy=False).view(np.int64)
+        values = read_stamps(raw, begin, end)
         if not scanned.repeated and (all_rows or scanned.absent == 0):
             yield np.arange(begin, end), values
         else:

@@ -19,6 +19,8 @@ from gyrostab.ingest.gap_table import (
     clip_table,
     gap_variables,
     merge_neighbours,
+    read_gap_columns,
+    read_gaps,
 )
 from gyrostab.ingest.uniform.grid import UniformGrid, find_grid
 from gyrostab.schema import GAP_CAUSES, check_log, signal_name, texts
@@ -33,7 +35,6 @@ __all__ = [
     "grid_of",
     "has_gap_table",
     "place_samples",
-    "read_table",
     "with_table",
 ]
 
@@ -154,7 +155,7 @@ def _with_true_table(
     log: xr.Dataset, grid: UniformGrid, declared: float | None, *, computed: bool
 ) -> xr.Dataset:
     """Return the log with a table of gaps that fits its time, or without one if that is unknown."""
-    table = read_table(log, grid.start, grid.rate)
+    table = read_gaps(log, grid.start, grid.rate)
     if table is None:
         return with_table(log, None, grid.start, grid.rate)
     same_rate = declared is not None and abs(declared / grid.rate - 1) < 1e-9
@@ -245,64 +246,13 @@ def has_gap_table(log: xr.Dataset) -> bool:
     return "gap" in log.dims
 
 
-def read_table(log: xr.Dataset, start: int, rate: float) -> Table | None:
-    """Read the table of gaps in grid samples (`gap_table.COLUMNS`); None if it is inconsistent."""
-    found = _read_columns(log)
-    if found is None:
-        return None
-    first, end, *rest = found
-    return np.stack(
-        [
-            *(np.rint(grid_index(start, rate, stamps)).astype(np.int64) for stamps in (first, end)),
-            *rest,
-        ],
-        axis=1,
-    )
-
-
-def _read_columns(log: xr.Dataset) -> list[NDArray[np.int64]] | None:
-    """Return stamps of both ends [ns since 1970], samples, rows, cause; None if inconsistent."""
-    columns: list[NDArray[np.int64]] = []
-    for name, kind in (
-        ("gap_start", "M"),
-        ("gap_end", "M"),
-        ("gap_samples", "iu"),
-        ("gap_rows", "iu"),
-        ("gap_cause", "iu"),
-    ):
-        variable = log.variables.get(name)
-        if variable is None and name == "gap_rows":
-            columns.append(np.zeros_like(columns[-1]))
-            continue
-        if variable is None or variable.dims != ("gap",) or variable.dtype.kind not in kind:
-            return None
-        values = np.asarray(variable.values)
-        if kind == "M" and np.isnat(values).any():
-            raise SchemaError(
-                f"{name!r} holds {int(np.isnat(values).sum())} missing times (NaT); every time "
-                "must be known"
-            )
-        columns.append(
-            values.astype("datetime64[ns]").view(np.int64)
-            if kind == "M"
-            else values.astype(np.int64)
-        )
-    first, end, samples, _, cause = columns
-    spoilt = (
-        np.any(end < first)
-        or np.any(samples < 0)
-        or np.any((cause < 0) | (cause >= len(GAP_CAUSES)))
-    )
-    return None if spoilt else columns
-
-
 def change_rate(table: Table, log: xr.Dataset, old_rate: float, start: int, rate: float) -> Table:
     """Convert the table for a log of which every n-th sample was selected.
 
     Parameters
     ----------
     table : ndarray of int64, shape (n, 5)
-        Table of `read_table`, on the grid of the selected samples.
+        Table of `read_gaps`, on the grid of the selected samples.
     log : xarray.Dataset
         Log with the exact ends of the gaps.
     old_rate : float
@@ -310,8 +260,8 @@ def change_rate(table: Table, log: xr.Dataset, old_rate: float, start: int, rate
     start, rate : int, float
         First stamp [ns since 1970] and present sampling rate [Hz].
     """
-    columns = _read_columns(log)
-    assert columns is not None  # read_table has read them
+    columns = read_gap_columns(log)
+    assert columns is not None  # read_gaps has read them
     table = table.copy()
     old_length = np.rint((columns[1] - columns[0]) * (old_rate / 1e9)).astype(np.int64)
     for column, stamps in ((FIRST, columns[0]), (END, columns[1])):

@@ -13,13 +13,12 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.ingest.gap_table import clip_table
+from gyrostab.ingest.gap_table import clip_table, read_gaps
 from gyrostab.ingest.uniform.core import (
     add_spans,
     grid_of,
     has_gap_table,
     place_samples,
-    read_table,
     with_table,
 )
 from gyrostab.ingest.uniform.grid import UniformGrid
@@ -272,7 +271,7 @@ def _cut_channels(
 def _cut_table(
     log: xr.Dataset, grid: UniformGrid, low: int, high: int, excluded: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    table = read_table(log, grid.start, grid.rate) if has_gap_table(log) else None
+    table = read_gaps(log, grid.start, grid.rate) if has_gap_table(log) else None
     pieces = [np.empty((0, 5), dtype=np.int64)]
     edges = [low, *excluded.ravel().tolist(), high]
     for first, end in zip(edges[::2], edges[1::2], strict=True):
