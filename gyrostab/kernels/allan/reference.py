@@ -85,11 +85,15 @@ def direct_sums(
 
 
 @njit(**INNER)
-def _second_difference(theta, present, missing, m, k):  # type: ignore[no-untyped-def]
-    """Compute the second difference at m, and whether it is present; zero if not (Eq. 21-22)."""
-    if present[m] and present[m + k] and present[m + 2 * k] and missing[m] == missing[m + 2 * k]:
-        return theta[m + 2 * k] - 2.0 * theta[m + k] + theta[m], 1
-    return 0.0, 0
+def _square_differences(theta, present, missing, k, squares, valid):  # type: ignore[no-untyped-def]
+    """Compute the square of each second difference; zero where it is missing (Eq. 21-22)."""
+    begin, middle, end = theta, theta[k:], theta[2 * k :]
+    for m in range(end.size):
+        here = present[m] and present[m + k] and present[m + 2 * k]
+        is_valid = here and missing[m] == missing[m + 2 * k]
+        difference = end[m] - 2.0 * middle[m] + begin[m]
+        squares[m] = difference * difference if is_valid else 0.0
+        valid[m] = is_valid
 
 
 @njit(**KERNEL)
@@ -101,21 +105,19 @@ def recursive_sums(theta, present, missing, window_points, step, n_windows, ks):
     """
     sums = np.zeros((n_windows, ks.size))
     counts = np.zeros((n_windows, ks.size), np.int64)
+    squares, valid = np.zeros(theta.size), np.zeros(theta.size, np.int8)
     for i in range(ks.size):
-        k = ks[i]
-        length = window_points - 2 * k
-        total = 0.0
-        count = 0
+        length = window_points - 2 * ks[i]
+        _square_differences(theta, present, missing, ks[i], squares, valid)
+        total, count = 0.0, 0
         for m in range(length):  # the starting value, Eq. 20
-            d, here = _second_difference(theta, present, missing, m, k)
-            total += d * d
-            count += here
+            total += squares[m]
+            count += valid[m]
         sums[0, i], counts[0, i] = total, count
-        for n in range((n_windows - 1) * step):
-            new, new_here = _second_difference(theta, present, missing, n + length, k)
-            old, old_here = _second_difference(theta, present, missing, n, k)
-            total += new * new - old * old
-            count += new_here - old_here
-            if (n + 1) % step == 0:
-                sums[(n + 1) // step, i], counts[(n + 1) // step, i] = total, count
+        newest, newest_valid = squares[length:], valid[length:]
+        for j in range(1, n_windows):
+            for n in range((j - 1) * step, j * step):
+                total += newest[n] - squares[n]
+                count += newest_valid[n] - valid[n]
+            sums[j, i], counts[j, i] = total, count
     return sums, counts
