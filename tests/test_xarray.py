@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.errors import FormatError, SchemaError
+from gyrostab.errors import FormatError, OptionError, SchemaError
 from gyrostab.io.datasets import open_log, open_product, open_surface, to_netcdf, to_zarr
 from gyrostab.store import read
 from gyrostab.store.private import is_in_memory
@@ -137,6 +137,29 @@ def test_a_dataset_of_the_engine_can_be_sent_to_another_process(tmp_path):
     with xr.open_dataset(to_netcdf(log, tmp_path / "log.nc"), engine="gyrostab") as seen:
         sent = pickle.loads(pickle.dumps(seen))
     np.testing.assert_array_equal(sent.rate[:, -5:].values, log.rate[:, -5:].values)
+
+
+@pytest.mark.parametrize("chunks", [None, {}])
+@pytest.mark.parametrize("form", WRITERS)
+def test_what_the_engine_opened_can_be_written(tmp_path, form, chunks):
+    path = WRITERS[form](long_log(), tmp_path / f"log.{form}")
+    with xr.open_dataset(path, engine="gyrostab", chunks=chunks) as seen:
+        again = WRITERS[form](seen, tmp_path / f"again.{form}")
+        with pytest.raises(OptionError, match="is also an input"):
+            WRITERS[form](seen, path, overwrite=True)
+    with open_log(path) as one, open_log(again) as other:
+        xr.testing.assert_equal(one.compute(), other.compute())
+
+
+@pytest.mark.parametrize("form", WRITERS)
+@pytest.mark.parametrize("name", ["product", "surface"])
+def test_what_xarray_wrote_is_opened(tmp_path, form, name):
+    make, opener = CASES[name]
+    data, path = make(), tmp_path / f"data.{form}"
+    data.to_zarr(path) if form == "zarr" else data.to_netcdf(path)
+    with opener(path) as own, xr.open_dataset(path, engine="gyrostab") as seen:
+        xr.testing.assert_equal(own.compute(), data)
+        xr.testing.assert_equal(seen.compute(), data)
 
 
 def test_other_files_are_refused(tmp_path):

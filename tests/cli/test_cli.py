@@ -99,6 +99,17 @@ def test_the_stages_one_by_one_give_the_same_product(log, product, tmp_path):
         xr.testing.assert_allclose(staged[name], whole[name], rtol=1e-9)
 
 
+def test_a_dry_run_describes_the_product_and_writes_nothing(log, product, tmp_path, capsys):
+    assert call("run", log, "-o", tmp_path / "product.nc", *WINDOW, "--dry-run") == 0
+    assert not list(tmp_path.iterdir())
+    shown = capsys.readouterr().out
+    made = open_product(product)
+    assert re.search(rf"^windows +{made.sizes['time']} of {made.window_s:g} s", shown, re.M)
+    assert re.search(rf"^averaging +{made.sizes['tau']} times from {made.tau[0]:.4g}", shown, re.M)
+    (size,) = re.findall(r"^output +about (\S+) MB$", shown, re.M)
+    assert float(size) * 1e6 == pytest.approx(product.stat().st_size, rel=0.2)
+
+
 @pytest.mark.parametrize("form", ["nc", "zarr"])
 @pytest.mark.parametrize(("option", "stored"), [((), True), (("--no-stamps",), False)])
 def test_ingest_stores_the_time_of_every_sample(log, tmp_path, form, option, stored):

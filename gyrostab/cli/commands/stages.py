@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from gyrostab.cli.frame import Logs, Output, app, show_stages
-from gyrostab.cli.options import Common, Fitting, Reading, Running, Windows
+from gyrostab.cli.options import Common, Fitting, Flag, Reading, Running, Windows
 
 __all__ = ["davar", "fit", "run"]
 
@@ -23,6 +23,7 @@ def run(
     fitting: Fitting = Fitting(),
     reading: Reading = Reading(),
     running: Running = Running(),
+    dry_run: Flag = False,
     common: Common = Common(),
 ) -> None:
     """Analyse logs: dynamic Allan variance and noise coefficients of every window.
@@ -39,7 +40,19 @@ def run(
         One or more logs, in any order.
     output
         NetCDF file to write.
+    dry_run
+        Print the windows and averaging times, and the time, memory and size of the output as
+        estimated from the first part, and write nothing.
     """
+    if dry_run:
+        from gyrostab.jobs.estimate import estimate_run
+
+        options = {"reading": reading.options(), "windows": windows.options()}
+        with show_stages(common) as stage:
+            stage("estimating", 0)
+            shown = estimate_run(logs, **options, fitting=fitting.options(), workers=common.workers)
+        print(shown)
+        return
     target = _run_job(logs, output, windows, reading, running, common, fitting=fitting.options())
     _print_product(target)
 

@@ -1,0 +1,88 @@
+"""Estimate of a run: its windows, and time, memory and size from a part that is computed."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from gyrostab.allan.davar import davar_parts
+from gyrostab.io.datasets import to_netcdf
+from gyrostab.jobs.engine import compute_part
+from gyrostab.jobs.run import load_log
+
+__all__ = ["estimate_run"]
+
+
+def estimate_run(
+    paths: Sequence[str | Path],
+    *,
+    reading: Mapping[str, Any],
+    windows: Mapping[str, Any],
+    fitting: Mapping[str, Any] | None,
+    workers: int | None = None,
+) -> str:
+    """Describe what a run would do, without writing its output.
+
+    The first part is computed on one core; the time and the size of the rest are taken to be in
+    proportion to the number of windows.
+
+    Parameters
+    ----------
+    paths : sequence of path
+        Logs.
+    reading, windows, fitting : mapping
+        Options as for `gyrostab.jobs.run.run`.
+    workers : int, optional
+        Number of cores; all by default.
+
+    Returns
+    -------
+    str
+        Lines to print.
+    """
+    begun = time.perf_counter()
+    log = load_log(paths, **reading)
+    parts = davar_parts(log, **windows)
+    total, first = parts[-1].stop, parts[0]
+    _, base = _measure_part(log, slice(0, 1), windows, fitting)  # also loads the kernels
+    opened = time.perf_counter() - begun
+    begun = time.perf_counter()
+    part, size = _measure_part(log, first, windows, fitting)
+    share = total / first.stop
+    cores = workers or os.cpu_count() or 1
+    seconds = opened + (time.perf_counter() - begun) * share / min(cores, len(parts))
+    tau = part["tau"].values
+    return "\n".join(
+        [
+            f"record     {log.sizes['time'] / log.attrs['sampling_rate_hz']:.6g} s at "
+            f"{log.attrs['sampling_rate_hz']:.6g} Hz, axes {', '.join(part['axis'].values)}",
+            f"windows    {total} of {part.attrs['window_s']:g} s, one every "
+            f"{part.attrs['step_s']:g} s, in {len(parts)} parts",
+            f"averaging  {tau.size} times from {tau[0]:.4g} to {tau[-1]:.4g} s",
+            f"time       about {seconds:.2g} s on {cores} cores",
+            f"memory     {_peak_mb():.0f} MB with one core",
+            f"output     about {(base + (size - base) * share) / 1e6:.2g} MB",
+        ]
+    )
+
+
+def _measure_part(log: Any, part: slice, windows: Any, fitting: Any) -> tuple[Any, int]:
+    """Compute a part; return it and its size as a file [bytes]."""
+    found = compute_part(log, part, windows, fitting)
+    with tempfile.TemporaryDirectory() as folder:
+        return found, to_netcdf(found, Path(folder) / "part.nc").stat().st_size
+
+
+def _peak_mb() -> float:
+    """Return the peak of the memory of this process [MB]; NaN where the system does not say."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return float("nan")
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
