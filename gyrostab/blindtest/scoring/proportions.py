@@ -50,7 +50,7 @@ class Target:
 NO_TARGET = Target("")
 
 
-def wilson(hits: int, total: int, *, z: float = 1.959964) -> tuple[float, float]:
+def wilson(hits: int, total: int) -> tuple[float, float]:
     """Compute Wilson's 95 % interval of a share.
 
     Examples
@@ -60,10 +60,10 @@ def wilson(hits: int, total: int, *, z: float = 1.959964) -> tuple[float, float]
     """
     if total == 0:
         return 0.0, 1.0
-    part, spread = hits / total, z**2 / total
-    middle = (part + spread / 2) / (1 + spread)
-    half = z * math.sqrt(part * (1 - part) / total + spread / (4 * total)) / (1 + spread)
-    return max(0.0, middle - half), min(1.0, middle + half)
+    from scipy.stats import binomtest
+
+    interval = binomtest(hits, total).proportion_ci(0.95, "wilson")
+    return float(interval.low), float(interval.high)
 
 
 def _make_line(
