@@ -119,6 +119,10 @@ VARIABLES: dict[str, dict[str, Any]] = {
         "long_name": "single samples of the window that are far from both neighbours",
         "units": "1",
     },
+    "gap_edge_ratio": {
+        "long_name": "scatter of the samples next to gaps over that of the others",
+        "units": "1",
+    },
     "window_coverage": {
         "long_name": "share of the window's samples that are present",
         "units": "1",

@@ -18,6 +18,7 @@ from gyrostab.allan.channels import window_channels
 from gyrostab.allan.plan import MOST_CELLS, Plan, last_sample, make_plan, units_of_work
 from gyrostab.errors import OptionError
 from gyrostab.ingest.convert import as_log
+from gyrostab.kernels.allan.gap_edges import gap_edge_ratio
 from gyrostab.kernels.allan.outlier_count import count_outliers
 from gyrostab.kernels.allan.pairs import white_pair_sum
 from gyrostab.kernels.allan.reference import direct_sums, recursive_sums, reference_theta
@@ -33,7 +34,7 @@ from gyrostab.time.grid import first_stamp, grid_times
 __all__ = ["davar", "davar_part", "davar_parts"]
 
 #: Variables by axis and window, in the order in which `_compute_unit` returns them.
-_PLANE_FIELDS = ("window_mean", "window_coverage", "outlier_count")
+_PLANE_FIELDS = ("window_mean", "window_coverage", "outlier_count", "gap_edge_ratio")
 #: Largest number of samples of a part of which all axes are read together.
 _MAX_SAMPLES_READ_AT_ONCE = 2**21
 #: Smallest number of parts for the threads to share, if there are as many units of work.
@@ -111,9 +112,10 @@ def davar(
     -------
     xarray.Dataset
         ``avar, count, coverage, edf, estimator, white_response, quantization_response,
-        ramp_response (axis, time, tau)``, ``window_mean, window_coverage, outlier_count (axis,
-        time)``, and every channel of the log averaged over each window; ``time`` is the centre of
-        the window, with ``time_bounds``; ``tau`` [s]. Units are attributes of the variables.
+        ramp_response (axis, time, tau)``, ``window_mean, window_coverage, outlier_count,
+        gap_edge_ratio (axis, time)``, and every channel of the log averaged over each window;
+        ``time`` is the centre of the window, with ``time_bounds``; ``tau`` [s]. Units are
+        attributes of the variables.
 
     Raises
     ------
@@ -305,7 +307,7 @@ def _read_spans(
 def _compute_unit(
     x: NDArray[np.generic], unit: Unit, tables: tuple[Any, ...], space: Workspace | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Compute one unit: cells (9, n_windows, n_tau) and plane fields (3, n_windows).
+    """Compute one unit: cells (9, n_windows, n_tau) and plane fields (4, n_windows).
 
     The last field of the cells holds the degrees of freedom.
     """
@@ -314,14 +316,16 @@ def _compute_unit(
         cells, means = (part.copy() for part in _empty_surface(_with_tuples(unit), x.size))
     else:
         cells, means = surface_unit(x, unit, space)
-    outliers = count_outliers(x, np.arange(means.shape[1]) * unit.step, unit.window)
+    first = np.arange(means.shape[1]) * unit.step
+    outliers = count_outliers(x, first, unit.window)
+    edges = gap_edge_ratio(x, first, unit.window)
     scale = (
         HOUR if unit.angle else 1.0
     )  # angles are in degree, so their slopes in degree per second
     cells[0] *= scale**2
     dof = identify_noise(cells[0], cells[5], cells[6], cells[7], cells[3], *tables)
     means[0] *= scale
-    return np.concatenate([cells, dof[None]]), np.concatenate([means, outliers[None]])
+    return np.concatenate([cells, dof[None]]), np.concatenate([means, outliers[None], edges[None]])
 
 
 def _cached_tables_of(plan: Plan) -> tuple[Any, ...]:
@@ -363,7 +367,7 @@ def _noise_tables(unit: Unit, rate: float) -> tuple[Any, ...]:
 
 
 def _run_units(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:
-    """Run the units of work: cells (9, axis, time, tau), plane fields (3, axis, time).
+    """Run the units of work: cells (9, axis, time, tau), plane fields (4, axis, time).
 
     The results are dask arrays if `data` is one.
     """
@@ -397,7 +401,7 @@ def _run_units(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:
 def _run_published_method(
     signal: xr.DataArray, unit: Unit, rate: float, method: str, *, paper: bool
 ) -> tuple[Any, Any]:
-    """Run a published algorithm in memory: cells (9, axis, time, tau), plane (3, axis, time)."""
+    """Run a published algorithm in memory: cells (9, axis, time, tau), plane (4, axis, time)."""
     points = unit.window + (0 if paper and not unit.angle else 1)
     all_points = signal.sizes["time"] + (0 if unit.angle or paper else 1)
     n_windows = (all_points - points) // unit.step + (0 if paper else 1)
@@ -431,7 +435,9 @@ def _run_published_method(
             cells[0, row], cells[5, row], cells[6, row], cells[7, row], cells[3, row], *tables
         )
         means[:2, row] = window_means(x, unit)[:, :n_windows]
-        means[2, row] = count_outliers(x, np.arange(n_windows) * unit.step, unit.window)
+        first = np.arange(n_windows) * unit.step
+        means[2, row] = count_outliers(x, first, unit.window)
+        means[3, row] = gap_edge_ratio(x, first, unit.window)
         means[0, row] *= HOUR if unit.angle else 1.0
     return cells, means
 

@@ -36,6 +36,9 @@ _MIN_TAU_RATIO = 10.0
 #: Twice the rotation rate of the Earth, 15.041 deg/h: the largest change of the mean rate that a
 #: change of attitude at rest can cause.
 _MAX_CHANGE_AT_REST_DPH = 30.082
+#: Largest median over the windows of the scatter next to gaps over that elsewhere that is not
+#: reported: at least 1.7 standard deviations in a record of one window with few gaps.
+_MAX_EDGE_RATIO = 1.25
 
 
 @dataclass(frozen=True)
@@ -296,9 +299,15 @@ def describe_record(product: xr.Dataset) -> list[str]:
     Returns
     -------
     list of str
-        One sentence on the misfit, and one each on outliers and motion if there are any.
+        One sentence on the misfit, and one each on outliers, losses of noisy samples and motion if
+        there are any.
     """
-    return [*_describe_misfit(product), *_describe_outliers(product), *_describe_motion(product)]
+    return [
+        *_describe_misfit(product),
+        *_describe_outliers(product),
+        *_describe_losses(product),
+        *_describe_motion(product),
+    ]
 
 
 def _number_text(value: float) -> str:
@@ -351,6 +360,29 @@ def _describe_outliers(product: xr.Dataset) -> list[str]:
         if affected
         else []
     )
+
+
+def _describe_losses(product: xr.Dataset) -> list[str]:
+    """Say which axes lose samples while their noise is high, and how low that makes N."""
+    if "gap_edge_ratio" not in product:
+        return []
+    affected = []
+    for axis in product["axis"].values:
+        part = product.sel(axis=axis)
+        judged = np.isfinite(part["gap_edge_ratio"].values) & (part["outlier_count"].values == 0)
+        if not judged.any():
+            continue
+        ratio = float(np.median(part["gap_edge_ratio"].values[judged]))
+        present = float(np.median(part["window_coverage"].values[judged]))
+        if ratio > _MAX_EDGE_RATIO:
+            low = 1.0 - 1.0 / np.sqrt(present + (1.0 - present) * ratio**2)
+            affected.append(f"{axis} {_number_text(ratio)} times (N may be {low:.0%} low)")
+    if not affected:
+        return []
+    return [
+        f"Noise next to gaps is higher than elsewhere: {', '.join(affected)}: samples are lost "
+        "while the noise is high, and the record underestimates it."
+    ]
 
 
 def _describe_motion(product: xr.Dataset) -> list[str]:

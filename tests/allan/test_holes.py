@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from gyrostab.allan.davar import davar
+from gyrostab.allan.fit import fit_noise
+from gyrostab.allan.summary import describe_record
 from gyrostab.ingest.make_log import make_log
+from gyrostab.kernels.allan.gap_edges import EDGE_SAMPLES, gap_edge_ratio
 
 
 @pytest.mark.parametrize(("present", "estimator"), [(4, 0), (6, 2)])
@@ -35,3 +38,45 @@ def test_step_inside_a_gap_does_not_enter_strict_terms():
         make_log(rate, rate=100.0, unit="deg/h"), window="2000samples", taus=[1.0], min_strict=1.0
     )
     assert float(clusters.avar.max()) > 0.1
+
+
+def noisy_spells(rng, *, lost_when_noisy: bool):
+    """Two minutes at 100 Hz; every fourth second has three times the noise, or loses samples."""
+    noisy = (np.arange(12_000) // 100) % 4 == 0
+    x = rng.normal(size=12_000) * np.where(noisy, 3.0, 1.0)
+    bursts = np.repeat(rng.random(1200) < 0.5, 10)
+    x[bursts & (noisy if lost_when_noisy else np.roll(noisy, 137))] = np.nan
+    return x
+
+
+def test_losses_while_the_noise_is_high_are_noticed():
+    rng = np.random.default_rng(3)
+    options = {"window": "60s", "step": "20s", "taus": 12}
+    informative = make_log(noisy_spells(rng, lost_when_noisy=True), rate=100.0, unit="deg/h")
+    surface = davar(informative, **options)
+    assert float(surface["gap_edge_ratio"].min()) > 1.8
+    (line,) = [
+        line for line in describe_record(fit_noise(surface)) if line.startswith("Noise next to")
+    ]
+    assert "samples are lost while the noise is high" in line
+    plain = np.where(np.repeat(rng.random(1200) < 0.1, 10), np.nan, rng.normal(size=12_000))
+    product = fit_noise(davar(make_log(plain, rate=100.0, unit="deg/h"), **options))
+    np.testing.assert_allclose(product["gap_edge_ratio"], 1.0, atol=0.15)
+    assert not [line for line in describe_record(product) if line.startswith("Noise next to")]
+
+
+def test_edge_ratio_equals_its_definition_and_ignores_gaps_outside_the_window():
+    rng = np.random.default_rng(8)
+    x = rng.normal(size=3000)
+    x[::150] = x[1000:1040] = np.nan
+    found = gap_edge_ratio(x, np.array([300, 500]), 2000)
+    for start, ratio in zip((300, 500), found, strict=True):
+        part = x[start : start + 2000]
+        beside, elsewhere = [], []
+        for i in range(EDGE_SAMPLES + 1, 2000 - EDGE_SAMPLES - 1):
+            second = abs(part[i - 1] - 2 * part[i] + part[i + 1])
+            around = part[i - 1 - EDGE_SAMPLES : i + 2 + EDGE_SAMPLES]
+            if np.isfinite(second):
+                (beside if np.isnan(around).any() else elsewhere).append(second)
+        assert ratio == pytest.approx(np.mean(beside) / np.mean(elsewhere), rel=1e-12)
+    assert np.isnan(gap_edge_ratio(np.arange(3000), np.array([0]), 3000)[0])  # integers
