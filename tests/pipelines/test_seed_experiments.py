@@ -16,6 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "seeds.md"
 
 
+SLOW = [pytest.mark.slow]
 SCRIPT = load_script("pipelines/seed_experiments.py")
 ERRATA = load_script("benchmarks/seed_errata.py")
 
@@ -189,6 +190,31 @@ def test_page_has_every_experiment_and_figure():
     for name, entry in SCRIPT.PLAN["experiment"].items():
         assert (ROOT / "data" / "models" / f"{name}.toml").exists()
         assert set(cells(on_the_page(name))) == set(entry["rows"])
+
+
+def parse(cell: str) -> tuple[str, float]:
+    """Split a cell into its text, without the number, and the number; NaN without one."""
+    found = re.search(r"-?[\d.]+(e[+-]?\d+)?$", cell)
+    return (cell[: found.start()], float(found[0])) if found else (cell, math.nan)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name in ("x3", "p16_vibration", "l13_vibration") else SLOW)
+        for name in SCRIPT.PLAN["experiment"]
+    ],
+)
+@pytest.mark.filterwarnings("ignore:All-NaN slice")
+def test_page_holds_the_current_figures_of_each_experiment(name, tmp_path, monkeypatch):
+    """If this fails after a change of the fit, run pipelines/seed_experiments.py again."""
+    monkeypatch.setitem(SCRIPT.PLAN["experiment"][name], "figure", {})
+    made, written = cells(SCRIPT.experiment(name, tmp_path)), cells(on_the_page(name))
+    for label in written.keys() - {"time [s]"}:
+        for here, there in zip(made[label], written[label], strict=True):
+            (text, number), (old_text, old_number) = parse(here), parse(there)
+            assert text == old_text, label
+            assert number == pytest.approx(old_number, rel=2e-3, nan_ok=True), label
 
 
 def test_table_replaces_the_text_between_its_markers():
