@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,7 @@ from gyrostab.ingest.columns.stamps import read_stamps
 from gyrostab.ingest.gap_table import format_duration, format_stamp
 from gyrostab.ingest.grid.rate import RateEstimate
 from gyrostab.ingest.grid.scan_pass import file_of
-from gyrostab.ingest.grid.starting_period import Stamps
+from gyrostab.ingest.grid.starting_period import Stamps, recut_blocks
 from gyrostab.ingest.limits import describe_limit, is_absurd_grid
 from gyrostab.kernels.grid import stamps as kernel
 from gyrostab.kernels.grid.stamps import (
@@ -168,27 +168,6 @@ def place_without_time(rows: int, start: int) -> Placement:
     return make_placement(start, [np.array([[0, 0, rows]], dtype=np.int64)], [])
 
 
-def _look_ahead_stretches(
-    stamps: Stamps,
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], int]]:
-    """Yield stretches of rows and stamps with `LOOK_AHEAD` more rows, and the rows to place."""
-    rest_rows, rest_stamps = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
-    for rows, values in stamps():
-        rest_rows, rest_stamps = (
-            np.concatenate([rest_rows, rows]),
-            np.concatenate([rest_stamps, values]),
-        )
-        at = 0
-        while len(rest_rows) - at > LOOK_AHEAD:
-            n = min(_STRETCH_ROWS, len(rest_rows) - at - LOOK_AHEAD)
-            end = at + n + LOOK_AHEAD
-            yield rest_rows[at:end], rest_stamps[at:end], n
-            at += n
-        rest_rows, rest_stamps = rest_rows[at:], rest_stamps[at:]
-    if len(rest_rows):
-        yield rest_rows, rest_stamps, len(rest_rows)
-
-
 def place_by_stamp(
     stamps: Stamps, rate: float, *, tolerance: float, max_gap: float, where: str
 ) -> Placement:
@@ -219,7 +198,8 @@ def place_by_stamp(
     state, ring = kernel.new_state()
     runs: list[NDArray[np.int64]] = []
     events: list[NDArray[np.int64]] = []
-    for rows, values, n in _look_ahead_stretches(stamps):
+    for rows, values in recut_blocks(stamps, _STRETCH_ROWS, LOOK_AHEAD):
+        n = _STRETCH_ROWS if len(rows) == _STRETCH_ROWS + LOOK_AHEAD else len(rows)
         new, happened = kernel.place(
             rows, values, n, period, 0.5 + tolerance, max_gap * rate, state, ring
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
@@ -17,12 +16,12 @@ from gyrostab.ingest.grid.jitter import (
     observe_rows,
 )
 from gyrostab.ingest.grid.place import NO_STAMPS, Placement, append_runs, make_placement
-from gyrostab.ingest.grid.starting_period import SECOND, Stamps
+from gyrostab.ingest.grid.starting_period import SECOND, Stamps, recut_blocks
 from gyrostab.kernels.grid.course import find_breaks, find_phase, trace
 from gyrostab.kernels.grid.stamps import DUPLICATE, RESTART, STEP
 from gyrostab.time.grid import period_ns
 
-__all__ = ["place_in_order", "place_rows"]
+__all__ = ["place_in_order"]
 
 
 _AHEAD_ROWS = 1 << 12
@@ -160,59 +159,6 @@ class _Placer:
             append_runs(self.runs, sample, rows)
 
 
-def place_rows(
-    blocks: Iterator[tuple[Integers, Integers]],
-    jitter: JitterModel,
-    period: float,
-    *,
-    hold: float,
-    max_gap_ns: float,
-    by_row: bool,
-) -> tuple[int | None, list[Integers], list[Integers]]:
-    """Place rows in order along the most likely sequence of samples.
-
-    Parameters
-    ----------
-    blocks : iterator
-        Blocks of (row numbers, stamps [ns]).
-    jitter : JitterModel
-        Period and jitter of the stamps.
-    period : float
-        Sampling period of the grid [ns].
-    hold : float
-        Largest phase; beyond it a sample is skipped or a row dropped [samples].
-    max_gap_ns : float
-        A longer step ahead is taken as a step of the clock [ns].
-    by_row : bool
-        Whether rows that are left out occupy samples.
-
-    Returns
-    -------
-    start : int or None
-        Stamp of sample 0 [ns]; None if no stamp is readable.
-    runs, events : list of ndarray
-        As in `gyrostab.ingest.grid.place.Placement`.
-    """
-    ahead = int(min(_AHEAD_ROWS * np.ceil(jitter.group), _MAX_AHEAD_ROWS))
-    size = int(min(TRACE_ROWS * np.ceil(jitter.group), _MAX_ROWS))
-    placer = _Placer(jitter, period, hold, max_gap_ns)
-    held = [np.empty(0, dtype=np.int64)] * 3
-    done = 0
-    for rows, stamps in blocks:
-        count = rows if by_row else np.arange(done, done + len(rows))
-        done += len(rows)
-        held = [np.concatenate(pair) for pair in zip(held, (rows, count, stamps), strict=True)]
-        at = 0
-        while len(held[0]) - at >= size + ahead:
-            part = slice(at, at + size + ahead)
-            placer.add(held[0][part], held[1][part], held[2][part], size)
-            at += size
-        held = [column[at:] for column in held]
-    if len(held[0]):
-        placer.add(held[0], held[1], held[2], len(held[0]))
-    return placer.start, placer.runs, placer.events
-
-
 def place_in_order(
     stamps: Stamps,
     jitter: JitterModel,
@@ -239,15 +185,12 @@ def place_in_order(
     TimeError
         When no stamp can be read.
     """
-    whole, fraction = period_ns(rate)
-    start, runs, events = place_rows(
-        stamps(),
-        jitter,
-        whole + fraction,
-        hold=0.5 + tolerance,
-        max_gap_ns=max_gap * SECOND,
-        by_row=by_row,
-    )
-    if start is None:
+    ahead = int(min(_AHEAD_ROWS * np.ceil(jitter.group), _MAX_AHEAD_ROWS))
+    size = int(min(TRACE_ROWS * np.ceil(jitter.group), _MAX_ROWS))
+    placer = _Placer(jitter, sum(period_ns(rate)), 0.5 + tolerance, max_gap * SECOND)
+    for number, (rows, values) in enumerate(recut_blocks(stamps, size, ahead)):
+        count = rows if by_row else np.arange(number * size, number * size + len(rows))
+        placer.add(rows, count, values, size if len(rows) == size + ahead else len(rows))
+    if placer.start is None:
         raise TimeError(NO_STAMPS.format(where=where))
-    return make_placement(start, runs, events)
+    return make_placement(placer.start, placer.runs, placer.events)

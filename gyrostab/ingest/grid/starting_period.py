@@ -34,20 +34,24 @@ Stamps = Callable[[], Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]]
 
 
 def recut_blocks(
-    stamps: Stamps, size: int
+    stamps: Stamps, size: int, ahead: int = 0
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Yield rows and stamps in blocks of `size`, independent of the input blocks."""
+    """Yield rows and stamps in blocks of `size`, independent of the input blocks.
+
+    Each block has `ahead` more rows, with which the next one begins; only the last is shorter.
+    """
     held: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
     waiting = 0
     for block in stamps():
         held.append(block)
         waiting += len(block[0])
-        if waiting < size:
+        if waiting < size + ahead:
             continue
         rows, values = _concatenate_blocks(held)
-        whole = waiting // size * size
+        whole = (waiting - ahead) // size * size
         for begin in range(0, whole, size):
-            yield rows[begin : begin + size], values[begin : begin + size]
+            end = begin + size + ahead
+            yield rows[begin:end], values[begin:end]
         held, waiting = [(rows[whole:], values[whole:])], waiting - whole
     if waiting:
         yield _concatenate_blocks(held)
