@@ -91,10 +91,8 @@ def _coarse_grid(posterior: Posterior, density: float, span: float) -> tuple[Arr
     """Return K and B of the coarse grid, and the log posterior around every point."""
     centres = np.sqrt(np.median(posterior.slow, axis=0))
     least = visible_coefficients(density, span)
-    K, B = (
-        grid_values("K", float(centres[1]), least[0]),
-        grid_values("B", float(centres[0]), least[1]),
-    )
+    K = grid_values("K", float(centres[1]), least[0])
+    B = grid_values("B", float(centres[0]), least[1])
     place = []
     for fine, coarse in ((posterior.K, K), (posterior.B, B)):
         between = np.sqrt(coarse[1:-1] * coarse[2:])
@@ -170,11 +168,8 @@ def _calibrate_axes(
     """Compute the noise of every axis from the chosen blocks (axis, block)."""
     columns = noise_powers(blocks)
     common, rest = common_variance(blocks)
-    power, shape = (
-        blocks["power"].transpose("axis", "block", "band").values,
-        blocks["shape"].transpose("axis", "block", "band").values,
-    )
-    mean = blocks["mean"].transpose("axis", "block").values
+    power, shape = blocks["power"].values, blocks["shape"].values
+    mean = blocks["mean"].values
     step = float(blocks.attrs["block_s"])
     posteriors = []
     for row, axis in enumerate(blocks["axis"].values):
@@ -242,10 +237,7 @@ def assemble_baseline(
     square = np.stack([posterior.square for posterior in posteriors])
     noise = np.einsum("abfn,an->abf", columns, square)
     expected = noise if spectrum is None else spectrum
-    power, shape = (
-        blocks["power"].transpose("axis", "block", "band").values,
-        blocks["shape"].transpose("axis", "block", "band").values,
-    )
+    power, shape = blocks["power"].values, blocks["shape"].values
     floor = np.array([1e-3 * levels.min() / HOUR for levels in expected])
     white = white_variance(
         blocks,
@@ -380,7 +372,7 @@ def _mean_coefficients(posteriors: list[Posterior]) -> tuple[Array, Array]:
 def _ramp_error(blocks: xr.Dataset, white: Array, value: Array, quiet: NDArray[np.bool_]) -> Array:
     """Return the error of a ramp fitted to the quiescent means [deg/h^2]."""
     hours = (blocks["begin"].values + blocks["end"].values)[:, None] / (2.0 * HOUR)
-    present = quiet & np.isfinite(blocks["mean"].transpose("axis", "block").values)
+    present = quiet & np.isfinite(blocks["mean"].values)
     error = np.zeros(len(white))
     for row in range(len(white)):
         K, B = value[row, 3:4], value[row, 2:3]
@@ -504,11 +496,7 @@ def _scale_axes(posteriors: list[Posterior], factor: Array, error: Array) -> lis
 
 
 def baseline_from_simulation(
-    blocks: xr.Dataset,
-    simulated: xr.Dataset,
-    *,
-    quiet: Any = None,
-    settings: Settings = DEFAULTS,
+    blocks: xr.Dataset, simulated: xr.Dataset, *, quiet: Any = None, settings: Settings = DEFAULTS
 ) -> xr.Dataset:
     """Take the noise of a simulated log with its calibration error, and its level over time.
 
@@ -574,10 +562,8 @@ def baseline_from_simulation(
         chosen, attrs["quiet_by"] = find_quiescent_blocks(blocks, quiet, settings=settings)
         attrs["calibrated_on"] = find_quiescent_spans(blocks, chosen)
         factor, error = quiescent_level(blocks, spectrum, 0.0 * spectrum, chosen)
-        posteriors, spectrum = (
-            _scale_axes(posteriors, factor, error),
-            spectrum * factor[:, None, None],
-        )
+        posteriors = _scale_axes(posteriors, factor, error)
+        spectrum = spectrum * factor[:, None, None]
     return add_extra_statistics(
         assemble_baseline(
             blocks, posteriors, quiet=chosen, attrs=attrs, spectrum=spectrum, settings=settings
@@ -616,9 +602,7 @@ def _calibrate_simulation(
 
 def _level_over_time(simulated: xr.Dataset, plain: Array, settings: Settings) -> Array:
     """Return the noise level of every block (axis, block); 1 if not significant."""
-    power, shape = (
-        simulated[name].transpose("axis", "block", "band").values for name in ("power", "shape")
-    )
+    power, shape = (simulated[name].values for name in ("power", "shape"))
     level = np.ones(plain.shape[:2])
     for row in range(len(plain)):
         risen, deviation = noise_level_excess(

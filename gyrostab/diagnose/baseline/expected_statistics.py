@@ -84,9 +84,9 @@ def common_variance(blocks: xr.Dataset) -> tuple[Array, Array]:
     shape : ndarray, shape (axis, block, band)
         Of the gamma distribution of each power, given the common factor.
     """
-    shape = blocks["shape"].transpose("axis", "block", "band").values
-    near = blocks["neighbours"].transpose("axis", "block").values
-    samples = np.maximum(blocks["samples"].transpose("axis", "block").values, 1)
+    shape = blocks["shape"].values
+    near = blocks["neighbours"].values
+    samples = np.maximum(blocks["samples"].values, 1)
     scattered = np.clip(1.0 - np.where(np.isfinite(near), near, 1.0), 0.0, 1.0)
     weights = taper(int(blocks.attrs["block_samples"]))
     scattered = np.maximum(
@@ -104,8 +104,8 @@ def white_variance(blocks: xr.Dataset, square: Array) -> Array:
 
     The squares have the shape (axis, 4).
     """
-    samples = blocks["samples"].transpose("axis", "block").values.astype(np.float64)
-    near = blocks["neighbours"].transpose("axis", "block").values
+    samples = blocks["samples"].values.astype(np.float64)
+    near = blocks["neighbours"].values
     rate, count = float(blocks.attrs["sampling_rate_hz"]), np.maximum(samples, 1.0)
     apart = 1.0 - np.where(np.isfinite(near), near, samples / float(blocks.attrs["block_samples"]))
     # Each run of samples leaves a rounding of the angle at either end.

@@ -304,9 +304,9 @@ def expect_known_motion(blocks: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.
     ----------
     blocks, baseline : xarray.Dataset
     """
-    step = np.abs(np.diff(baseline["known_mean"].transpose("axis", "block").values, axis=1))
+    step = np.abs(np.diff(baseline["known_mean"].values, axis=1))
     moved = np.maximum(np.pad(step, ((0, 0), (0, 1))), np.pad(step, ((0, 0), (1, 0))))
-    noise = baseline["spectrum"].transpose("axis", "block", "band").values[..., 0]
+    noise = baseline["spectrum"].values[..., 0]
     moving = moved**2 * float(blocks.attrs["block_s"]) > _MIN_MOTION_RATIO * noise
     return np.asarray(moving & (moving.mean(axis=1, keepdims=True) <= _MAX_MOVING_SHARE))
 
@@ -392,11 +392,9 @@ def _resonance_density(
     """
     if not math.isfinite(getattr(effect, "quality", math.inf)) or "line_frequency" not in blocks:
         return None
-    frequency, finer, size = (
-        blocks["line_frequency"].values,
-        2 * _PLACES_BETWEEN,
-        int(blocks.attrs["block_samples"]),
-    )
+    frequency = blocks["line_frequency"].values
+    finer = 2 * _PLACES_BETWEEN
+    size = int(blocks.attrs["block_samples"])
     fine = frequency[0] / finer * np.arange(1, finer * frequency.size + 1)
     prediction = _predict_effect(effect, blocks, axes, fine)
     density = prediction.spectrum[name].reshape(-1, fine.size)[0].copy()
@@ -472,10 +470,7 @@ def remove_known_lines(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     """
     if "lines" not in baseline:
         return blocks
-    power, weight = (
-        blocks["line_power"].transpose("axis", "part", "line"),
-        blocks["line_weight"].transpose("axis", "part"),
-    )
+    power, weight = blocks["line_power"], blocks["line_weight"]
     noise = expected_lines(baseline, blocks["line_frequency"].values)[:, None]
     known, largest = (baseline[name].values[:, None] for name in ("lines", "lines_most"))
     with np.errstate(divide="ignore", invalid="ignore"):

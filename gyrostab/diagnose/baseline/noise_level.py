@@ -45,9 +45,7 @@ def quiescent_level(
     SchemaError
         If an axis has no spectrum in its quiescent blocks.
     """
-    power, shape = (
-        blocks[name].transpose("axis", "block", "band").values for name in ("power", "shape")
-    )
+    power, shape = (blocks[name].values for name in ("power", "shape"))
     common, alone = common_variance(blocks)
     factors = []
     for row, axis in enumerate(blocks["axis"].values):

@@ -64,7 +64,7 @@ def _rounded_by_spectrum(
         baseline = calibrate_noise(blocks)
     rate = float(blocks.attrs["sampling_rate_hz"])
     white = baseline["square"].sel(noise="N").values * HOUR * rate
-    quiet = baseline["quiet"].transpose("axis", "block").values
+    quiet = baseline["quiet"].values
     share = np.array(
         [
             _mean_angle_share(*row)
@@ -72,10 +72,8 @@ def _rounded_by_spectrum(
         ]
     )
     angle_square = np.where(step > 0.0, share * step**2 / 12.0 / (rate * URAD_PER_S) ** 2, np.nan)
-    ratio, error = (
-        _fit_q_square(blocks, baseline) / angle_square,
-        baseline["square_stderr"].sel(noise="Q").values / angle_square,
-    )
+    ratio = _fit_q_square(blocks, baseline) / angle_square
+    error = baseline["square_stderr"].sel(noise="Q").values / angle_square
     with np.errstate(divide="ignore", invalid="ignore"):
         known = (step**2 / 12.0 > _MIN_VARIANCE_SHARE * white) & np.isfinite(ratio) & (error > 0.0)
         shortfall = (1.0 - ratio) / error
@@ -94,14 +92,9 @@ def _fit_q_square(blocks: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.float6
     """Return the Q^2 that fits the quiescent powers best; negative if they fall at the end."""
     out = []
     for number in range(blocks.sizes["axis"]):
-        quiet = baseline["quiet"].transpose("axis", "block").values[number]
-        power, shape = (
-            blocks[name].transpose("axis", "block", "band").values[number][quiet]
-            for name in ("power", "shape")
-        )
-        columns = (
-            baseline["columns"].transpose("axis", "block", "band", "noise").values[number][quiet]
-        )
+        quiet = baseline["quiet"].values[number]
+        power, shape = (blocks[name].values[number][quiet] for name in ("power", "shape"))
+        columns = baseline["columns"].values[number][quiet]
         fit = average_blocks(power, shape, columns)
         square = fit_squares(fit)[0]
         weight = fit.weight / (fit.columns @ square) ** 2

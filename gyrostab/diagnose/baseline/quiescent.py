@@ -106,10 +106,8 @@ def noise_level_excess(
         better = (z > deviation) & (deviation < settings.noisy_sigma)
         level[better] = 1.0 + (excess / np.maximum(shape, 1e-9))[better]
         deviation = np.maximum(deviation, z)
-    block_level, spread = (
-        1.0 + total[:, 0] / np.maximum(count[:, 0], 1e-9),
-        3.0 / np.sqrt(np.maximum(count[:, 0], 1e-9)),
-    )
+    block_level = 1.0 + total[:, 0] / np.maximum(count[:, 0], 1e-9)
+    spread = 3.0 / np.sqrt(np.maximum(count[:, 0], 1e-9))
     # The noise of a neighbour is not that of the block.
     level = np.clip(
         level, block_level / (1.0 + spread), np.maximum(block_level, 0.0) * (1.0 + spread) + spread
@@ -132,10 +130,7 @@ def _drop_noisy_blocks(
     blocks: xr.Dataset, start: NDArray[np.bool_], settings: Settings
 ) -> NDArray[np.bool_]:
     """Return blocks (axis, block) that are not noisier than the typical block of `start`."""
-    power, shape = (
-        blocks["power"].transpose("axis", "block", "band").values,
-        blocks["shape"].transpose("axis", "block", "band").values,
-    )
+    power, shape = blocks["power"].values, blocks["shape"].values
     quiescent = np.broadcast_to(start, power.shape[:2]).copy()
     for row in range(len(power)):
         for _ in range(3):

@@ -104,9 +104,7 @@ def measure_extra_statistics(
 
 def _spectral_form(simulated: xr.Dataset, expected: Array) -> tuple[Array, Array]:
     """Return powers over expected powers, (axis, band), and the shape of their distribution."""
-    power, shape = (
-        simulated[name].transpose("axis", "block", "band").values for name in ("power", "shape")
-    )
+    power, shape = (simulated[name].values for name in ("power", "shape"))
     return _weighted_mean(power / expected, shape)
 
 
@@ -129,10 +127,7 @@ def _measure_coherency(
     if "cross" not in simulated:
         return np.zeros((0, expected.shape[2]), np.complex128), np.zeros((0, expected.shape[2]))
     axes = [str(axis) for axis in simulated["axis"].values]
-    cross, shape = (
-        simulated[name].transpose("pair", "block", "band").values
-        for name in ("cross", "cross_shape")
-    )
+    cross, shape = (simulated[name].values for name in ("cross", "cross_shape"))
     pairs = [(axes.index(one), axes.index(other)) for one, other in pair_rows(simulated)]
     geometric_mean = (
         np.stack([np.sqrt(expected[one] * expected[other]) for one, other in pairs])
@@ -154,10 +149,7 @@ def _measure_lines(
     simulated: xr.Dataset, expected: Array, unexplained: NDArray[np.bool_], line_nats: float
 ) -> tuple[Array, Array]:
     """Return the power of significant lines, with leakage, and of peaks near unexplained bands."""
-    power, weight = (
-        simulated["line_power"].transpose("axis", "part", "line").values,
-        simulated["line_weight"].values,
-    )
+    power, weight = simulated["line_power"].values, simulated["line_weight"].values
     slope = expected_lines(
         xr.Dataset(
             {"spectrum": (("axis", "block", "band"), expected)},
@@ -220,7 +212,7 @@ def add_extra_statistics(
     )
     if extra.coherency.any():
         axes = [str(axis) for axis in blocks["axis"].values]
-        spectrum = baseline["spectrum"].transpose("axis", "block", "band").values
+        spectrum = baseline["spectrum"].values
         geometric_mean = np.stack(
             [
                 np.sqrt(spectrum[axes.index(one)] * spectrum[axes.index(other)])

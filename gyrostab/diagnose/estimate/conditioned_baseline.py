@@ -72,7 +72,7 @@ def predict_baseline(
             )
     weight = _powers_without(state, baseline, is_left_out)
     state = replace(state, blocks=seen, masked=identifications.state.masked)
-    mean = baseline["known_mean"].transpose("axis", "block").values.copy()
+    mean = baseline["known_mean"].values.copy()
     for row, axis in enumerate(state.axes):
         columns = state.given.get(("mean", axis), [])
         kept = ~np.array(is_left_out.get(("mean", axis), []), np.bool_)
@@ -84,8 +84,8 @@ def predict_baseline(
             size, _ = mean_mixture(alone, axis, columns).moments()
             mean[row] += np.tensordot(size[kept], np.stack(columns)[kept], axes=1)
     after = baseline.assign(
-        spectrum=baseline["spectrum"].transpose("axis", "block", "band").copy(data=weight),
-        known_mean=baseline["known_mean"].transpose("axis", "block").copy(data=mean),
+        spectrum=baseline["spectrum"].copy(data=weight),
+        known_mean=baseline["known_mean"].copy(data=mean),
     )
     remaining = [
         identification
@@ -112,7 +112,7 @@ def _powers_without(
 ) -> NDArray[np.float64]:
     """Return the expected powers without some of the columns in the model."""
     weight = state.weight.copy()
-    least = MIN_POWER_RATIO * baseline["spectrum"].transpose("axis", "block", "band").values
+    least = MIN_POWER_RATIO * baseline["spectrum"].values
     for row, axis in enumerate(state.axes):
         chosen = np.array(is_left_out.get(("power", axis), []), np.bool_)
         if chosen.any():

@@ -371,8 +371,6 @@ def _make_estimate(
     if sd <= 0.0:  # a count is exact
         return Estimate(mean, 0.0, mean, mean, unit)
     low, high = ends or (mean - NORMAL_95 * sd, mean + NORMAL_95 * sd)
-    low, high = (
-        mean - math.hypot(mean - low, NORMAL_95 * form),
-        mean + math.hypot(high - mean, NORMAL_95 * form),
-    )
+    low = mean - math.hypot(mean - low, NORMAL_95 * form)
+    high = mean + math.hypot(high - mean, NORMAL_95 * form)
     return Estimate(mean, math.hypot(sd, form), max(low, 0.0) if positive else low, high, unit)

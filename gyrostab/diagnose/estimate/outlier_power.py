@@ -35,7 +35,7 @@ def add_outlier_power(
     """
     axes = [str(axis) for axis in blocks["axis"].values]
     frequency, rate = blocks["frequency"].values, float(blocks.attrs["sampling_rate_hz"])
-    spectrum = baseline["spectrum"].transpose("axis", "block", "band")
+    spectrum = baseline["spectrum"]
     added = np.zeros(spectrum.shape)
     for one in fitted:
         if one.effect is None or not any(

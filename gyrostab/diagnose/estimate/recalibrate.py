@@ -31,11 +31,7 @@ from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.filter_response import band_response
-from gyrostab.diagnose.predict.linear_model import (
-    State,
-    initial_state,
-    spread_by_gaps,
-)
+from gyrostab.diagnose.predict.linear_model import State, initial_state, spread_by_gaps
 from gyrostab.diagnose.predict.windows import make_windows, rebuild_variant
 from gyrostab.physics.base import Effect
 
@@ -109,9 +105,9 @@ def recalibrate(
     for identification in identifications.identified:
         state = condition_on(state, list(identification.components))
     found: list[Posterior] = []
-    power = baseline["spectrum"].transpose("axis", "block", "band").values.copy()
+    power = baseline["spectrum"].values.copy()
     columns = noise_powers(blocks)
-    changed, quiet = [], baseline["quiet"].transpose("axis", "block").values.copy()
+    changed, quiet = [], baseline["quiet"].values.copy()
     for row, axis in enumerate(state.axes):
         seen = _collect_effects(identifications, baseline, fitted, axis)
         posterior = None
@@ -139,7 +135,7 @@ def recalibrate(
     for row, axis in enumerate(state.axes):
         if axis not in changed:
             for name in _AXIS_VARIABLES:
-                out[name][row] = baseline[name].transpose("axis", ...).values[row]
+                out[name][row] = baseline[name].values[row]
     return out
 
 
@@ -179,8 +175,8 @@ def _kept_posterior(baseline: xr.Dataset, row: int) -> Posterior:
     one = baseline.isel(axis=row)
     K, B = one["grid_K"].values, one["grid_B"].values
     weight = np.exp(one["grid_calibrated"].values)
-    draws = one["posterior"].transpose("draw", "noise").values
-    slow = one["posterior_slow"].transpose("draw", "slow").values
+    draws = one["posterior"].values
+    slow = one["posterior_slow"].values
     return Posterior(
         one["square"].values,
         one["square_stderr"].values,
@@ -281,9 +277,7 @@ def _fit_noise(
 ) -> Posterior | None:
     """Fit the noise of an axis with the effects; None where too little is left to determine it."""
     blocks = state.blocks
-    power, shape = (
-        blocks[name].transpose("axis", "block", "band").values[row] for name in ("power", "shape")
-    )
+    power, shape = (blocks[name].values[row] for name in ("power", "shape"))
     chosen = chosen & (np.isfinite(power) & np.isfinite(shape)).any(axis=1)
     if chosen.sum() < MIN_BLOCKS:
         return None
@@ -305,7 +299,7 @@ def _fit_noise(
     count = blocks.sizes["axis"]
     variance = white_variance(blocks, np.tile(square, (count, 1)))[row]
     variance = variance * np.maximum(state.weight[row, :, 0] / (columns[:, 0] @ square), 0.1)
-    mean = blocks["mean"].transpose("axis", "block").values[row]
+    mean = blocks["mean"].values[row]
     effect_means = np.stack(seen.means, axis=1) if seen.means else None
     return noise_posterior(
         fit,
@@ -370,10 +364,8 @@ def _average_groups(
     known = flat[2][:, None]
     precision = np.zeros(free.shape[1])
     if np.any(known > 0.0):  # the predicted power has an error too
-        free, precision = (
-            np.concatenate([free, known], axis=1),
-            np.append(precision, 1.0 / seen.doubt**2),
-        )
+        free = np.concatenate([free, known], axis=1)
+        precision = np.append(precision, 1.0 / seen.doubt**2)
     return Fit(
         flat[0],
         flat[1],

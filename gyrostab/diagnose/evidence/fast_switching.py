@@ -145,11 +145,11 @@ def switching_evidence(
         share = np.repeat(courses.share[0].reshape(shape), merged, axis=1)
         levels_found = courses.switch_count[0] >= settings.min_switches and evidence_nats > 0.0
         similar = levels_found and _is_like_two_levels(courses, variance, present)
-        is_switching, refuted = (
-            similar and beyond > settings.two_level_nats,
+        is_switching = similar and beyond > settings.two_level_nats
+        refuted = (
             levels_found
             and evidence_nats > settings.refuting_nats
-            and (not similar or beyond < -settings.refuting_nats),
+            and (not similar or beyond < -settings.refuting_nats)
         )
         result = SwitchingEvidence(
             evidence_nats if is_switching else -np.inf,
@@ -206,8 +206,8 @@ def _count_equal_neighbours(share: Array) -> Array:
 def _sub_block_means(data: xr.Dataset, baseline: xr.Dataset, axis: str) -> tuple[Array, Array, int]:
     """Return means over sub-blocks, their white variance, and how many are merged in each."""
     result, known = data.sel(axis=axis), baseline.sel(axis=axis)
-    samples = result["sub_block_samples"].transpose("block", "sub_block").values.astype(np.float64)
-    mean = result["sub_block_mean"].transpose("block", "sub_block").values
+    samples = result["sub_block_samples"].values.astype(np.float64)
+    mean = result["sub_block_mean"].values
     merged = 1
     while samples.size // merged > _MAX_MEANS and merged < samples.shape[1]:
         merged *= 2

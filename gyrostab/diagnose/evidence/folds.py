@@ -74,7 +74,7 @@ def fold_subsets(fold: xr.DataArray) -> NDArray[np.bool_]:
     -------
     ndarray of bool, shape (1 + lengths * FOLDS, block)
     """
-    values = fold.transpose("length", "block").values
+    values = fold.values
     subsets = [values != number for number in range(FOLDS)]
     held = np.stack(subsets, axis=1).reshape(-1, values.shape[1])
     return np.concatenate([np.ones((1, values.shape[1]), np.bool_), held])

@@ -186,20 +186,15 @@ def noise_columns(baseline: xr.Dataset, *, axis: str, tier: Tier = "free") -> tu
     precision : ndarray, shape (term, term)
         For changes of the squared coefficients.
     """
-    spectrum = baseline["spectrum"].sel(axis=axis).transpose("block", "band").values
-    columns = (
-        baseline["columns"].sel(axis=axis).transpose("block", "band", "noise").values
-        / spectrum[..., None]
-    )
+    spectrum = baseline["spectrum"].sel(axis=axis).values
+    columns = baseline["columns"].sel(axis=axis).values / spectrum[..., None]
     square = baseline["square"].sel(axis=axis).values
     error = baseline["square_stderr"].sel(axis=axis).values
     if tier == "free":
         names = [str(name) for name in baseline["noise"].values]
         freedom = np.array([{"Q": 1.0, "N": 1e3, "B": 3.0, "K": 3.0}[name] for name in names])
         if "posterior" in baseline:
-            within = (
-                baseline["posterior"].sel(axis=axis).transpose("draw", "noise").values.std(axis=0)
-            )
+            within = baseline["posterior"].sel(axis=axis).values.std(axis=0)
             error = np.where(np.array(names) == "Q", np.minimum(error, within), error)
         error = freedom * np.hypot(square, error)
     free = error > 0.0
@@ -270,9 +265,7 @@ def linear_model_factors(model: LinearModel, folds: xr.DataArray) -> Array:
     numbers = [
         np.arange(end - array.shape[2], end) for array, end in zip(model.designs, ends, strict=True)
     ]
-    classes, member = np.unique(
-        folds.transpose("block", "length").values, axis=0, return_inverse=True
-    )
+    classes, member = np.unique(folds.values.T, axis=0, return_inverse=True)
     products = []
     for number in range(len(classes)):
         chosen = member.ravel() == number

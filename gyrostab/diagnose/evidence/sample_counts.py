@@ -115,7 +115,7 @@ class ExpectedCounts:
         """Add some null records."""
         for name in self.sums:
             if name in nulls:
-                values = nulls[name].transpose("record", "axis", "block").values.astype(np.float64)
+                values = nulls[name].values.astype(np.float64)
                 self.sums[name].append(excess_extremes(values) if name == "extremes" else values)
 
     def block_count(self, name: str) -> Array:

@@ -36,7 +36,7 @@ def expected_lines(baseline: xr.Dataset, frequency: Array) -> Array:
 
     Shape (axis, line) [degree2 hour-2 Hz-1].
     """
-    spectrum = baseline["spectrum"].mean("block").transpose("axis", "band").values
+    spectrum = baseline["spectrum"].mean("block").values
     bands = np.log(baseline["frequency"].values)
     if "line_spectrum" in baseline:
         spectrum = np.maximum(
@@ -138,7 +138,7 @@ def line_skirt(blocks: xr.Dataset, axis: str, place: int) -> NDArray[np.bool_]:
     phase is wider than the leakage; its slopes are not further lines.
     """
     weight = blocks["line_weight"].sel(axis=axis).values
-    power = blocks["line_power"].sel(axis=axis).transpose("part", "line").values
+    power = blocks["line_power"].sel(axis=axis).values
     good = (weight > 0) & np.isfinite(power).all(axis=1)
     total = (power[good] * weight[good, None]).sum(axis=0) / max(float(weight[good].sum()), 1e-300)
     limit = local_level(total[None])[0] * (

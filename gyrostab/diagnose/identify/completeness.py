@@ -122,11 +122,8 @@ def _power_levels(state: State, row: int, axis: str) -> tuple[Array, Array, Arra
 
     The level is relative to the expected one, less 1.
     """
-    shape = state.baseline["shape_alone"].sel(axis=axis).transpose("block", "band").values
-    ratio = (
-        state.blocks["power"].transpose("axis", "block", "band").values[row] / state.weight[row]
-        - 1.0
-    )
+    shape = state.baseline["shape_alone"].sel(axis=axis).values
+    ratio = state.blocks["power"].values[row] / state.weight[row] - 1.0
     use = np.where(np.isfinite(shape) & np.isfinite(ratio), shape, 0.0)
     total = use.sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):

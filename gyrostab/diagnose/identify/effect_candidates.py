@@ -125,11 +125,7 @@ def _driver_assignments(
 
 
 def _matching_channels(
-    channel: str,
-    unit: str,
-    channels: tuple[str, ...],
-    blocks: xr.Dataset,
-    units: Mapping[str, str],
+    channel: str, unit: str, channels: tuple[str, ...], blocks: xr.Dataset, units: Mapping[str, str]
 ) -> list[str]:
     """Return channels of the log for one of the effect's: vectors by name, others by prefix."""
     if sum(other[:-1] == channel[:-1] for other in channels) > 1 and channel[-1] in "xyz":
@@ -246,7 +242,7 @@ def _drop_hidden_means(
     """
     if name not in LARGEST_SIZE or not prediction.mean:
         return prediction
-    good = np.isfinite(blocks["mean"].transpose("axis", "block").values)
+    good = np.isfinite(blocks["mean"].values)
     white = coefficient.sel(term="N").values * np.sqrt(HOUR / float(blocks.attrs["block_s"]))
     mean = {}
     for column, design in prediction.mean.items():

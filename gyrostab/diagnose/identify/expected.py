@@ -7,11 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from gyrostab.diagnose.identify.components import (
-    axes_of,
-    group_components,
-    sum_evidence,
-)
+from gyrostab.diagnose.identify.components import axes_of, group_components, sum_evidence
 from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
 from gyrostab.diagnose.predict.condition import condition_on

@@ -217,7 +217,7 @@ def _has_more_levels(component: Component, state: State) -> bool:
 def _is_moving(axis: str, state: State) -> bool:
     """Return whether an axis exceeds its noise at some frequency; what is at rest cannot leak."""
     row = state.axes.index(axis)
-    expected = state.baseline["spectrum"].transpose("axis", "block", "band").values[row]
+    expected = state.baseline["spectrum"].values[row]
     return bool(
         np.nanmax(np.nanmean(measured(state.blocks, "power").values[row] / expected, axis=0))
         > state.settings.moving_power_ratio

@@ -187,9 +187,7 @@ def _average_powers(axis: str, state: State) -> tuple[Fit, Array]:
     """
     blocks = state.blocks
     row = state.axes.index(axis)
-    power, shape = (
-        blocks[name].transpose("axis", "block", "band").values[row] for name in ("power", "shape")
-    )
+    power, shape = (blocks[name].values[row] for name in ("power", "shape"))
     use = np.where(
         np.isfinite(power) & np.isfinite(shape) & ~state.masked[row][:, None], shape, 0.0
     )

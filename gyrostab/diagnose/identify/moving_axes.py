@@ -52,7 +52,7 @@ def moving_blocks(blocks: xr.Dataset, *, settings: Settings = DEFAULTS) -> NDArr
     >>> moving_blocks(reduce_log(make_log(rate, rate=100.0, unit="deg/h"), block="5s")).sum(axis=1)
     array([ 0, 24])
     """
-    means = blocks["mean"].transpose("axis", "block").values
+    means = blocks["mean"].values
     return np.stack([_moving_blocks_of_axis(row, settings) for row in means])
 
 

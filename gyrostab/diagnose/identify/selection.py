@@ -48,16 +48,9 @@ from gyrostab.diagnose.identify.switching import (
     renew_component,
 )
 from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
-from gyrostab.diagnose.predict.condition import (
-    condition_on,
-    condition_on_components,
-    refit_weights,
-)
+from gyrostab.diagnose.predict.condition import condition_on, condition_on_components, refit_weights
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.search import (
-    compute_evidence,
-    reusable_mean_evidence,
-)
+from gyrostab.diagnose.predict.search import compute_evidence, reusable_mean_evidence
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
 __all__ = ["Search"]

@@ -65,10 +65,8 @@ def _has_possible_cause(component: Component, led: Sequence[Component], state: S
 def _explained_share(component: Component, other: Component, state: State) -> float:
     """Return the share of the variance of a course that another component explains."""
     row = state.axes.index(component.row[0])
-    course, beside = (
-        mean_columns(component.variant, row)[0],
-        np.stack(mean_columns(other.variant, row), axis=1),
-    )
+    course = mean_columns(component.variant, row)[0]
+    beside = np.stack(mean_columns(other.variant, row), axis=1)
     good = (
         np.isfinite(state.blocks["mean"].values[row])
         & np.isfinite(beside).all(axis=1)

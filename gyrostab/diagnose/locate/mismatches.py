@@ -148,7 +148,7 @@ def _locate_mean_regions(
     """
     name = statistic.name
     critical, found = null.critical(name, level), []
-    known = baseline["known_mean"].transpose("axis", "block").copy(deep=True)
+    known = baseline["known_mean"].copy(deep=True)
     open_rows = set(range(blocks.sizes["axis"]))
     for _ in range(MAX_PER_ROW):
         now = baseline.assign(known_mean=known)

@@ -109,10 +109,8 @@ def _extend_region(region: Region, other: Region, settings: Settings) -> None:
             max(region["end"], other["end"]),
         )
         if region["what"] != "line":
-            low, high = (
-                min(region["tau_min_s"], other["tau_min_s"]),
-                max(region["tau_max_s"], other["tau_max_s"]),
-            )
+            low = min(region["tau_min_s"], other["tau_min_s"])
+            high = max(region["tau_max_s"], other["tau_max_s"])
             region["tau_min_s"], region["tau_max_s"] = low, high
     names = region["axes"].split()
     region["axes"] = " ".join(
@@ -138,10 +136,8 @@ def merge_wandering_regions(
         mine = [region for region in regions if region["axes"] == axes]
         if len(mine) > settings.max_mean_regions:
             largest = max(mine, key=lambda region: abs(region["z"]))
-            begin, end = (
-                min(region["begin"] for region in mine),
-                max(region["end"] for region in mine),
-            )
+            begin = min(region["begin"] for region in mine)
+            end = max(region["end"] for region in mine)
             mine = [largest | {"sign": 0, "begin": begin, "end": end, "tau_max_s": end - begin}]
         found += mine
     return found

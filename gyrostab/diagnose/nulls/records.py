@@ -139,18 +139,13 @@ def repeatable_null_records(
     return recall
 
 
-def _values_in_order(data: xr.Dataset, name: str, *dims: str) -> Array:
-    """Return a variable with its dimensions in this order."""
-    return np.asarray(data[name].transpose(*dims).values)
-
-
 def _prepare_nulls(
     blocks: xr.Dataset, baseline: xr.Dataset, rng: np.random.Generator
 ) -> _NullSetup:
     """Compute the quantities common to all null records."""
-    columns = _values_in_order(baseline, "columns", "axis", "block", "band", "noise")
+    columns = baseline["columns"].values
     noise = np.einsum("abfn,an->abf", columns, baseline["square"].values)
-    effects = _values_in_order(baseline, "spectrum", "axis", "block", "band") / noise
+    effects = baseline["spectrum"].values / noise
     lines = line_columns(blocks)
     sd = []
     for square in baseline["square"].values:
@@ -164,21 +159,14 @@ def _prepare_nulls(
                 )
             ]
         )
-    peaks = (
-        _values_in_order(baseline, "peaks", "axis", "line")
-        if "peaks" in baseline
-        else np.zeros((len(sd), len(lines)))
-    )
+    peaks = baseline["peaks"].values if "peaks" in baseline else np.zeros((len(sd), len(lines)))
     density = [
         np.column_stack([lines * square, peak])
         for square, peak in zip(baseline["square"].values, peaks, strict=True)
     ]
     tails = np.array([_kurtosis_excess(blocks, one, rng) for one in density])
-    shape = _values_in_order(blocks, "shape", "axis", "block", "band")
-    ties = _common_shapes(
-        _values_in_order(baseline, "shape_alone", "axis", "block", "band"),
-        int(blocks.attrs["block_samples"]),
-    )
+    shape = blocks["shape"].values
+    ties = _common_shapes(baseline["shape_alone"].values, int(blocks.attrs["block_samples"]))
     return _NullSetup(
         blocks,
         baseline,
@@ -269,19 +257,17 @@ def _draw_records(setup: _NullSetup, count: int, rng: np.random.Generator) -> xr
     )
     expected = np.einsum("abfn,ran->rabf", setup.columns, squares) * setup.effects
     if "form_shape" in baseline:  # the form of the spectrum was measured on a simulated log
-        form = _values_in_order(baseline, "form_shape", "axis", "band")
+        form = baseline["form_shape"].values
         expected *= _draw_gamma(form, np.ones((count, *form.shape)), rng)[:, :, None]
     if setup.shared is None:
-        shape_alone = _values_in_order(baseline, "shape_alone", "axis", "block", "band")
-        power, between = (
-            _draw_correlated_gamma(shape_alone, setup.ties, expected, rng),
-            np.empty(0, np.complex128),
-        )
+        shape_alone = baseline["shape_alone"].values
+        power = _draw_correlated_gamma(shape_alone, setup.ties, expected, rng)
+        between = np.empty(0, np.complex128)
     else:
         power, between = draw_shared_spectra(setup.shared, count, rng)
         power *= expected
         if "cross_error" in baseline:
-            error = _values_in_order(baseline, "cross_error", "pair", "band")
+            error = baseline["cross_error"].values
             between += (
                 error * (rng.standard_normal((count, *error.shape, 2)) @ np.array([1.0, 1j]))
             )[:, :, None]
@@ -292,7 +278,7 @@ def _draw_records(setup: _NullSetup, count: int, rng: np.random.Generator) -> xr
         rng,
     )[..., None]
     power *= swell
-    power[..., np.isnan(_values_in_order(blocks, "power", "axis", "block", "band"))] = np.nan
+    power[..., np.isnan(blocks["power"].values)] = np.nan
     variables: dict[str, Any] = {
         "mean": (("axis", "block"), _draw_means(setup, squares, slow, rng)),
         "power": (("axis", "block", "band"), power),
@@ -357,14 +343,14 @@ def _draw_means(setup: _NullSetup, squares: Array, slow: Array, rng: np.random.G
     level = np.divide(
         drawn, usual, out=np.ones_like(drawn), where=np.broadcast_to(usual > 0.0, drawn.shape)
     )
-    white = np.sqrt(_values_in_order(baseline, "mean_variance", "axis", "block") * level)
+    white = np.sqrt(baseline["mean_variance"].values * level)
     times = flicker_times(1.0 / step, low=1.0 / (2.0 * np.pi * 8.0 * n * step))
     drawn = (
         rng.standard_normal(white.shape)
         if setup.shared is None
         else draw_shared_white(setup.shared, len(white), rng)
     )
-    total = _values_in_order(baseline, "known_mean", "axis", "block") + white * drawn
+    total = baseline["known_mean"].values + white * drawn
     for place in np.ndindex(*white.shape[:2]):
         B2, K2 = slow[place]
         flicker, _ = flicker_means(
@@ -382,18 +368,18 @@ def _draw_means(setup: _NullSetup, squares: Array, slow: Array, rng: np.random.G
                 rng.standard_normal((n, 2)), memory / step, float(rng.standard_normal())
             )
             total[place] += np.sqrt(square) * wander
-    total[..., np.isnan(_values_in_order(blocks, "mean", "axis", "block"))] = np.nan
+    total[..., np.isnan(blocks["mean"].values)] = np.nan
     return np.asarray(total)
 
 
 def _draw_lines(setup: _NullSetup, squares: Array, rng: np.random.Generator) -> Array:
     """Draw the mean periodograms of the parts of the record."""
     blocks = setup.blocks
-    weight = _values_in_order(blocks, "line_weight", "axis", "part")
+    weight = blocks["line_weight"].values
     part_count, n = weight.shape[1], blocks.sizes["block"]
     columns = line_columns(blocks)
     part_of = np.arange(n) * part_count // n
-    near = _values_in_order(blocks, "neighbours", "axis", "block")
+    near = blocks["neighbours"].values
     frequency, bands = np.log(blocks["line_frequency"].values), np.log(blocks["frequency"].values)
     plain = squares @ columns.T
     flat = plain.mean(axis=-1, keepdims=True)
@@ -444,9 +430,9 @@ def _draw_independent_cross(
     size = np.sqrt(power[:, one] * power[:, other])
     shape = np.minimum(setup.shape[one], setup.shape[other])
     if "cross_shape" in setup.blocks:
-        shape = _values_in_order(setup.blocks, "cross_shape", "pair", "block", "band")
+        shape = setup.blocks["cross_shape"].values
     cross = size * draw_coherency(shape, size.shape, rng)
-    cross[..., np.isnan(_values_in_order(setup.blocks, "cross", "pair", "block", "band"))] = np.nan
+    cross[..., np.isnan(setup.blocks["cross"].values)] = np.nan
     return np.asarray(cross)
 
 
@@ -457,7 +443,7 @@ def _scale_shared_cross(
     assert setup.shared is not None
     one, other = ([pair[side] for pair in setup.shared.pairs] for side in (0, 1))
     cross = between * np.sqrt(level[:, one] * level[:, other])
-    cross[..., np.isnan(_values_in_order(setup.blocks, "cross", "pair", "block", "band"))] = np.nan
+    cross[..., np.isnan(setup.blocks["cross"].values)] = np.nan
     return np.asarray(cross)
 
 
@@ -493,10 +479,8 @@ def _widen_tails(score: Array, n: Array) -> Array:
 def _draw_kurtosis(setup: _NullSetup, count: int, rng: np.random.Generator) -> Array:
     """Draw the excess kurtosis of the noise; with few levels, that of other blocks."""
     blocks = setup.blocks
-    recorded = _values_in_order(blocks, "kurtosis", "axis", "block")
-    samples = np.maximum(
-        _values_in_order(blocks, "samples", "axis", "block").astype(np.float64), 20.0
-    )
+    recorded = blocks["kurtosis"].values
+    samples = np.maximum(blocks["samples"].values.astype(np.float64), 20.0)
     mean, variance, a = _kurtosis_moments(samples)
     root = (
         1.0

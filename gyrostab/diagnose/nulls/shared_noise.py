@@ -46,15 +46,9 @@ def find_shared_noise(blocks: xr.Dataset, baseline: xr.Dataset) -> SharedNoise |
         return None
     axes = [str(axis) for axis in blocks["axis"].values]
     pairs = [(axes.index(a), axes.index(b)) for a, b in pair_rows(blocks)]
-    spectrum, axis_shape = (
-        baseline[name].transpose("axis", "block", "band").values
-        for name in ("spectrum", "shape_alone")
-    )
-    cross = baseline["cross"].transpose("pair", "block", "band").values
-    samples, joint_samples = (
-        blocks["samples"].transpose("axis", "block").values,
-        blocks["cross_samples"].transpose("pair", "block").values,
-    )
+    spectrum, axis_shape = (baseline[name].values for name in ("spectrum", "shape_alone"))
+    cross = baseline["cross"].values
+    samples, joint_samples = blocks["samples"].values, blocks["cross_samples"].values
     matrix = np.zeros((*spectrum.shape[1:], len(axes), len(axes)), np.complex128)
     matrix[..., range(len(axes)), range(len(axes))] = 1.0
     white = matrix[:, 0].real.copy()
@@ -68,7 +62,7 @@ def find_shared_noise(blocks: xr.Dataset, baseline: xr.Dataset) -> SharedNoise |
         _correlation_root(matrix),
         pairs,
         axis_shape,
-        blocks["cross_shape"].transpose("pair", "block", "band").values,
+        blocks["cross_shape"].values,
         _correlation_root(white),
     )
 

@@ -136,7 +136,7 @@ def _fit_powers(
     state: State, row: int, axis: str, named: Array, rounds: int
 ) -> tuple[Array, Array]:
     """Fit the powers of an axis; return them and the sizes of the named columns."""
-    expected = state.baseline["spectrum"].sel(axis=axis).transpose("block", "band").values
+    expected = state.baseline["spectrum"].sel(axis=axis).values
     level, precision = noise_columns(state.baseline, axis=axis)
     columns = np.concatenate([level * expected[..., None], named], axis=-1).reshape(
         expected.size, -1

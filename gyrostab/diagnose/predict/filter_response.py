@@ -79,10 +79,8 @@ def undo_filter(
     """
     frequency = blocks["line_frequency"].values
     full = _response_at(effects()[effect].example(**values), blocks, frequency)
-    weight, power = (
-        blocks["line_weight"].sel(axis=axis).values,
-        blocks["line_power"].sel(axis=axis).transpose("part", "line").values,
-    )
+    weight = blocks["line_weight"].sel(axis=axis).values
+    power = blocks["line_power"].sel(axis=axis).values
     good = (weight > 0) & np.isfinite(power).all(axis=1)
     response = full
     if good.any():

@@ -93,7 +93,7 @@ def initial_state(
     blocks: xr.Dataset, baseline: xr.Dataset, *, settings: Settings = DEFAULTS
 ) -> State:
     """Return the state in which no effect is named."""
-    weight = baseline["spectrum"].transpose("axis", "block", "band").values
+    weight = baseline["spectrum"].values
     return State(blocks, baseline, weight, np.zeros(weight.shape[:2], np.bool_), settings=settings)
 
 
@@ -111,9 +111,7 @@ def unspread_share(blocks: xr.Dataset, row: str = "axis") -> Array:
     Shape (axis or pair, block). Random gaps spread the rest over all frequencies. The missing
     neighbours at the tapered ends of a block spread nothing.
     """
-    near = (
-        blocks["neighbours" if row == "axis" else "cross_neighbours"].transpose(row, "block").values
-    )
+    near = blocks["neighbours" if row == "axis" else "cross_neighbours"].values
     weights = taper(int(blocks.attrs["block_samples"]))
     whole = float((weights[1:] * weights[:-1]).sum() / (weights**2).sum())
     return np.minimum(np.where(np.isfinite(near), near, whole) / whole, 1.0)
@@ -200,25 +198,17 @@ def power_column(density: Array, row: int, state: State) -> Array:
 
 def cross_column(density: Array, row: int, blocks: xr.Dataset) -> Array:
     """Return a cross-density (1, block or 1, band) of a pair with gaps, complex (block, band)."""
-    shape = blocks["cross"].transpose("pair", "block", "band").shape
+    shape = blocks["cross"].shape
     return np.asarray(np.broadcast_to(spread_by_gaps(density + 0j, blocks, "pair"), shape)[row])
 
 
 def expected_cross(baseline: xr.Dataset) -> Array | None:
     """Return the cross-spectra of the baseline, (pair, block, band); None if it has none."""
-    return (
-        np.asarray(baseline["cross"].transpose("pair", "block", "band").values)
-        if "cross" in baseline
-        else None
-    )
+    return np.asarray(baseline["cross"].values) if "cross" in baseline else None
 
 
 def reference_channel_power(name: str, blocks: xr.Dataset) -> Array:
     """Return the power of a channel on the log's time, or of an axis as measured, (block, band)."""
     if name in blocks["axis"].values:
-        return np.asarray(
-            measured(blocks, "power").sel(axis=name).transpose("block", "band").values
-        )
-    return np.asarray(
-        blocks["reference_power"].sel(reference=name).transpose("block", "band").values
-    )
+        return np.asarray(measured(blocks, "power").sel(axis=name).values)
+    return np.asarray(blocks["reference_power"].sel(reference=name).values)

@@ -74,7 +74,7 @@ def mean_mixture(
     """
     baseline = state.baseline
     row = state.axes.index(axis)
-    y = (state.blocks["mean"] - baseline["known_mean"]).transpose("axis", "block").values[row]
+    y = (state.blocks["mean"] - baseline["known_mean"]).values[row]
     all_columns = [*columns, *state.given.get(("mean", axis), [])]
     stacked = np.stack(all_columns, axis=1) if all_columns else np.empty((y.size, 0))
     present = np.isfinite(y)

@@ -54,13 +54,7 @@ def make_windows(blocks: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
         Channels of the log by channel of the effect.
     """
     axes = tuple(str(axis) for axis in blocks["axis"].values)
-    own = dict(
-        zip(
-            axes,
-            map(_fill_linearly, measured(blocks, "mean").transpose("axis", "block").values),
-            strict=True,
-        )
-    )
+    own = dict(zip(axes, map(_fill_linearly, measured(blocks, "mean").values), strict=True))
 
     def spans(name: str) -> Array:
         if f"{name}_begin" not in blocks:

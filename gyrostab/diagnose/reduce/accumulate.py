@@ -165,10 +165,8 @@ class Accumulator:
                 present[row], inner, axis=1, dtype=np.float64
             )
         for name, fine in self.channel_parts.items():
-            row, edges = (
-                self.axes + self.channels.index(name),
-                np.arange(CHANNEL_PARTS) * self.length // CHANNEL_PARTS,
-            )
+            row = self.axes + self.channels.index(name)
+            edges = np.arange(CHANNEL_PARTS) * self.length // CHANNEL_PARTS
             total = np.add.reduceat(np.where(present[row], batch.values[row], 0.0), edges, axis=1)
             with np.errstate(invalid="ignore", divide="ignore"):
                 fine[block_range] = total / np.add.reduceat(
@@ -180,9 +178,7 @@ class Accumulator:
         ]
         self.kept_samples += [
             batch.values[
-                : self.axes,
-                number - block_range.start,
-                : _GRID_SAMPLES_PER_AXIS // _GRID_BLOCKS,
+                : self.axes, number - block_range.start, : _GRID_SAMPLES_PER_AXIS // _GRID_BLOCKS
             ].copy()
             for number in chosen
         ]
@@ -192,10 +188,8 @@ class Accumulator:
             phase = batch.values[self.ramp]
             self._count_ramp_turns(block_range, phase)
             for row in range(self.axes):
-                sums, counts = (
-                    self.profile_sums[row, block_range],
-                    self.profile_counts[row, block_range],
-                )
+                sums = self.profile_sums[row, block_range]
+                counts = self.profile_counts[row, block_range]
                 kernel.phase_profile(
                     centred[row], present[row], phase, *self.ramp_range, sums, counts
                 )

@@ -198,23 +198,17 @@ def _place_channel(log: xr.Dataset, name: str) -> _Placed | str | None:
     hold_previous = log[name].attrs.get("interpolation") == "previous"
     choose: _Choose
     if ratio > MAX_SAME_PERIODS:
-        choose, reach, method = (
-            partial(_interpolate_linearly, hold_previous=hold_previous),
-            MAX_BRIDGED_PERIODS,
-            f"it is interpolated from {1e9 / period:.4g} Hz",
-        )
+        choose = partial(_interpolate_linearly, hold_previous=hold_previous)
+        reach = MAX_BRIDGED_PERIODS
+        method = f"it is interpolated from {1e9 / period:.4g} Hz"
     elif is_ramp or ratio * MAX_SAME_PERIODS >= 1.0:
-        choose, reach, method = (
-            _take_nearest,
-            MAX_NEAREST_PERIODS,
-            "each sample has the nearest value",
-        )
+        choose = _take_nearest
+        reach = MAX_NEAREST_PERIODS
+        method = "each sample has the nearest value"
     else:
-        choose, reach, method = (
-            _average_around,
-            1.0,
-            f"each sample has the mean of its values at {1e9 / period:.4g} Hz",
-        )
+        choose = _average_around
+        reach = 1.0
+        method = f"each sample has the mean of its values at {1e9 / period:.4g} Hz"
     place_chunk = partial(
         _place_samples,
         clock,

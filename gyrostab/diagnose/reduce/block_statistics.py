@@ -206,7 +206,7 @@ def noise_at_orders(blocks: xr.Dataset, expected: Array) -> Array:
     """
     if "order_level" not in blocks:
         return expected
-    nearby = blocks["order_level"].transpose("axis", "block", "harmonic").values
+    nearby = blocks["order_level"].values
     return np.where(nearby > _MIN_NEIGHBOUR_RATIO * expected, nearby, expected)
 
 

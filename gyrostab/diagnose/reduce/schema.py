@@ -132,10 +132,7 @@ def label_variables(arrays: Mapping[str, Any]) -> dict[str, Any]:
         name: (
             BLOCK_STATISTICS[name].dims,
             array,
-            {
-                "long_name": BLOCK_STATISTICS[name].long_name,
-                "units": BLOCK_STATISTICS[name].units,
-            },
+            {"long_name": BLOCK_STATISTICS[name].long_name, "units": BLOCK_STATISTICS[name].units},
         )
         for name, array in arrays.items()
     }

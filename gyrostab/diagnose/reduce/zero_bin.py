@@ -164,9 +164,7 @@ def possibly_truncated_axes(blocks: xr.Dataset) -> NDArray[np.bool_]:
 
 def _read_widths(blocks: xr.Dataset) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Return the widths, their errors, and which axes have them."""
-    width, error = (
-        blocks[name].transpose("axis", "bin").values for name in ("bin_width", "bin_width_stderr")
-    )
+    width, error = (blocks[name].values for name in ("bin_width", "bin_width_stderr"))
     return width, error, np.isfinite(width).all(axis=1) & np.isfinite(error).all(axis=1)
 
 

@@ -320,10 +320,8 @@ def _moving_spans(
     identification: Identification, blocks: xr.Dataset, after: xr.Dataset, settings: Settings
 ) -> list[tuple[float, float]]:
     """Return the blocks [s] in which an effect moves the rate of an axis within the block."""
-    axes, moving = (
-        [str(axis) for axis in blocks["axis"].values],
-        expect_known_motion(blocks, after),
-    )
+    axes = [str(axis) for axis in blocks["axis"].values]
+    moving = expect_known_motion(blocks, after)
     there = np.zeros(blocks.sizes["block"], np.bool_)
     for component in (
         component

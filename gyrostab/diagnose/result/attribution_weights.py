@@ -47,9 +47,7 @@ def statistic_scores(
         blocks,
         [component for identification in identified for component in identification.components],
     )
-    turns_left_out = drop_changed_tails(
-        blocks, after["spectrum"].transpose("axis", "block", "band").values
-    )
+    turns_left_out = drop_changed_tails(blocks, after["spectrum"].values)
     lines = seen
     if still is not None:
         lines = seen.assign({name: still[name] for name in ("line_power", "line_weight")})
@@ -85,14 +83,8 @@ def _with_shared_lines(
     ]
     if "cross" not in blocks or len(lines) < 2:
         return after
-    seen, shape = (
-        blocks[name].transpose("pair", "block", "band").values for name in ("cross", "cross_shape")
-    )
-    known = (
-        after["cross"].transpose("pair", "block", "band").values
-        if "cross" in after
-        else np.zeros_like(seen)
-    )
+    seen, shape = (blocks[name].values for name in ("cross", "cross_shape"))
+    known = after["cross"].values if "cross" in after else np.zeros_like(seen)
     weight = np.where(np.isfinite(seen) & np.isfinite(shape), shape, 0.0)
     total = weight.sum(axis=1)
     mean = np.divide(

@@ -85,11 +85,7 @@ def finish_diagnosis(task: Task, comparison: Comparison, started: float) -> Diag
         "recording": recording_table(blocks),
         "baseline": baseline_table(baseline, fit.expected),
         "verdict": decide_verdict(
-            mismatches,
-            fit.identifications.identified,
-            unexplained,
-            held,
-            settings=task.settings,
+            mismatches, fit.identifications.identified, unexplained, held, settings=task.settings
         ),
         "false_alarm_level": task.level,
         "settings": task.settings.to_dict(),
@@ -238,11 +234,9 @@ def _attributed_mismatches(
     task: Task, comparison: Comparison, fit: Fit, after: xr.Dataset
 ) -> list[dict[str, Any]]:
     """Return the mismatches that were located or identified, each with what explains it."""
-    blocks, found, identified = (
-        comparison.blocks,
-        comparison.mismatches,
-        fit.identifications.identified,
-    )
+    blocks = comparison.blocks
+    found = comparison.mismatches
+    identified = fit.identifications.identified
 
     def without(left_out: Sequence[Identification]) -> xr.Dataset:
         return predict_baseline(fit.identifications, fit.noise, left_out=left_out)

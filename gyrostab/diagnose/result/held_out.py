@@ -14,7 +14,7 @@ from gyrostab.diagnose.evidence.products import mean_products
 from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.statistics.mean import window_means
 from gyrostab.diagnose.statistics.power import allan_surface
-from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, values_in_order
+from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score
 from gyrostab.errors import OptionError
 from gyrostab.noise import NORMAL_95
 
@@ -140,7 +140,7 @@ def _gains_on_longer_stretches(
 ) -> list[Gain]:
     """Return the gains on longer stretches, one for each length."""
     found = []
-    for fold in fold_blocks(blocks).transpose("length", "block").values[1:]:
+    for fold in fold_blocks(blocks).values[1:]:
         whole = Gain(more_gain, 2.0 * abs(more_gain))
         for number in range(FOLDS):
             held = fold == number
@@ -159,10 +159,8 @@ def cut_stretches(blocks: xr.Dataset) -> Windows:
     OptionError
         When there are too few blocks.
     """
-    block_count, span = (
-        blocks.sizes["block"],
-        blocks.sizes["block"] * float(blocks.attrs["block_s"]),
-    )
+    block_count = blocks.sizes["block"]
+    span = blocks.sizes["block"] * float(blocks.attrs["block_s"])
     if block_count < MIN_BLOCKS:
         raise OptionError(
             f"the record has {block_count} blocks, and {MIN_BLOCKS} are needed to hold some out; "
@@ -221,13 +219,8 @@ def _gain_variance(
     For the powers it follows from the scatter of their cells about `after`; for normal laws it is
     twice the gain.
     """
-    power, shape = (
-        values_in_order(blocks, name, "axis", "block", "band") for name in ("power", "shape")
-    )
-    one, other = (
-        values_in_order(baseline, "spectrum", "axis", "block", "band")
-        for baseline in (after, before)
-    )
+    power, shape = (blocks[name].values for name in ("power", "shape"))
+    one, other = (baseline["spectrum"].values for baseline in (after, before))
     with np.errstate(divide="ignore", invalid="ignore"):
         terms = np.square(shape * (1.0 / one - 1.0 / other) * (power - one))[:, held]
     by_power = float((_power_terms(blocks, after) - _power_terms(blocks, before))[held].sum())
@@ -236,10 +229,8 @@ def _gain_variance(
 
 def _power_terms(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:
     """Return the log-likelihood of the band powers of every block, by gamma laws."""
-    power, shape = (
-        values_in_order(blocks, name, "axis", "block", "band") for name in ("power", "shape")
-    )
-    spectrum = values_in_order(baseline, "spectrum", "axis", "block", "band")
+    power, shape = (blocks[name].values for name in ("power", "shape"))
+    spectrum = baseline["spectrum"].values
     has_data = np.isfinite(power) & np.isfinite(shape) & (spectrum > 0)
     safe = np.where(has_data, spectrum, 1.0)
     return np.asarray(
@@ -258,17 +249,12 @@ def _cross_terms(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:
     axes = [str(axis) for axis in blocks["axis"].values]
     left = [axes.index(str(axis)) for axis in blocks["first"].values]
     right = [axes.index(str(axis)) for axis in blocks["second"].values]
-    power, shape = (
-        np.moveaxis(values_in_order(blocks, name, "axis", "block", "band"), 0, -1)
-        for name in ("power", "shape")
-    )
-    spectrum = np.moveaxis(values_in_order(baseline, "spectrum", "axis", "block", "band"), 0, -1)
+    power, shape = (np.moveaxis(blocks[name].values, 0, -1) for name in ("power", "shape"))
+    spectrum = np.moveaxis(baseline["spectrum"].values, 0, -1)
     with np.errstate(divide="ignore", invalid="ignore"):
         both = np.sqrt(spectrum[..., left] * spectrum[..., right])
-        seen = np.moveaxis(values_in_order(blocks, "cross", "pair", "block", "band"), 0, -1) / both
-        model = (
-            np.moveaxis(values_in_order(baseline, "cross", "pair", "block", "band"), 0, -1) / both
-        )
+        seen = np.moveaxis(blocks["cross"].values, 0, -1) / both
+        model = np.moveaxis(baseline["cross"].values, 0, -1) / both
         flat = power / spectrum
     has_data = (
         np.isfinite(seen).all(axis=-1)
@@ -295,11 +281,8 @@ def _mean_evidence(
 
     It is averaged over the calibrated random walk and flicker.
     """
-    residual = (
-        values_in_order(blocks, "mean", "axis", "block")[axis]
-        - values_in_order(baseline, "known_mean", "axis", "block")[axis]
-    )
-    variance = values_in_order(baseline, "mean_variance", "axis", "block")[axis]
+    residual = blocks["mean"].values[axis] - baseline["known_mean"].values[axis]
+    variance = baseline["mean_variance"].values[axis]
     present = used & np.isfinite(residual) & np.isfinite(variance) & (variance > 0)
     if "grid_K" in baseline:
         walk, flicker = baseline["grid_K"].values[axis], baseline["grid_B"].values[axis]

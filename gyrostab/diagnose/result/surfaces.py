@@ -10,7 +10,7 @@ from scipy.special import gammaincinv
 
 from gyrostab.diagnose.statistics.mean import window_means
 from gyrostab.diagnose.statistics.power import allan_surface
-from gyrostab.diagnose.statistics.scores import Array, Windows, sum_over_windows, values_in_order
+from gyrostab.diagnose.statistics.scores import Array, Windows, sum_over_windows
 
 __all__ = ["CASES", "make_surfaces"]
 
@@ -43,16 +43,11 @@ def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> 
     plain = before.assign(known_mean=before["known_mean"] * 0.0)
     recorded = allan_surface(blocks, plain, windows)
     keep = (recorded["columns"]["what"] == "avar") & np.isfinite(recorded["shape"]).any(axis=(0, 1))
-    avar, low, high = (
-        [recorded["observed"][..., keep]],
-        [np.full(recorded["observed"][..., keep].shape, np.nan)],
-        [],
-    )
+    avar = [recorded["observed"][..., keep]]
+    low = [np.full(recorded["observed"][..., keep].shape, np.nan)]
+    high = []
     high.append(low[0])
-    mean, error = (
-        [_average_windows(blocks, values_in_order(blocks, "mean", "axis", "block"), windows)],
-        [],
-    )
+    mean, error = [_average_windows(blocks, blocks["mean"].values, windows)], []
     error.append(np.full(mean[0].shape, np.nan))
     for baseline in (before, after):
         noise = allan_surface(blocks, baseline, windows)
@@ -79,11 +74,7 @@ def _make_windows(block_count: int) -> Windows:
 
 def _known_avar(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> Array:
     """Return the Allan variance of the known mean, which that of the noise does not include."""
-    means = np.where(
-        np.isfinite(values_in_order(blocks, "mean", "axis", "block")),
-        values_in_order(baseline, "known_mean", "axis", "block"),
-        np.nan,
-    )
+    means = np.where(np.isfinite(blocks["mean"].values), baseline["known_mean"].values, np.nan)
     alone = blocks.assign(mean=(("axis", "block"), means))
     found = allan_surface(alone, baseline.assign(known_mean=baseline["known_mean"] * 0.0), windows)
     return np.asarray(
@@ -95,11 +86,7 @@ def _known_avar(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> A
 
 def _average_windows(blocks: xr.Dataset, values: Array, windows: Windows) -> Array:
     """Average over windows, weighted with the samples present where the recording has a mean."""
-    weight = np.where(
-        np.isfinite(values_in_order(blocks, "mean", "axis", "block")),
-        values_in_order(blocks, "samples", "axis", "block"),
-        0.0,
-    )
+    weight = np.where(np.isfinite(blocks["mean"].values), blocks["samples"].values, 0.0)
     sums = sum_over_windows((np.where(weight > 0, values, 0.0) * weight)[..., None], windows)[
         ..., 0
     ]
@@ -110,13 +97,8 @@ def _average_windows(blocks: xr.Dataset, values: Array, windows: Windows) -> Arr
 
 def _predicted_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> Array:
     """Return the window means of the effects plus the constant that fits the recording."""
-    known, mean = (
-        values_in_order(baseline, "known_mean", "axis", "block"),
-        values_in_order(blocks, "mean", "axis", "block"),
-    )
-    weight = np.where(
-        np.isfinite(mean), 1.0 / values_in_order(baseline, "mean_variance", "axis", "block"), 0.0
-    )
+    known, mean = baseline["known_mean"].values, blocks["mean"].values
+    weight = np.where(np.isfinite(mean), 1.0 / baseline["mean_variance"].values, 0.0)
     weight = np.where(np.isfinite(weight), weight, 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
         level = (weight * np.nan_to_num(mean - known)).sum(axis=-1, keepdims=True) / weight.sum(

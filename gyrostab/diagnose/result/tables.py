@@ -276,11 +276,9 @@ def motion_tables(
     """
     if "moving" not in blocks:
         return []
-    begin, end, block = (
-        blocks["begin"].values,
-        blocks["end"].values,
-        float(blocks.attrs["block_s"]),
-    )
+    begin = blocks["begin"].values
+    end = blocks["end"].values
+    block = float(blocks.attrs["block_s"])
     out: list[dict[str, Any]] = []
     for axis, moving, mean in zip(
         map(str, blocks["axis"].values),
@@ -423,13 +421,8 @@ def surfaces_with_blocks(
     }
     with np.errstate(invalid="ignore"):
         cases = [blocks["power"], before["spectrum"], after["spectrum"]]
-        has_data = np.isfinite(blocks["power"].transpose("axis", "block", "band").values)
-        density = np.stack(
-            [
-                _average_where(one.transpose("axis", "block", "band").values, has_data)
-                for one in cases
-            ]
-        )
+        has_data = np.isfinite(blocks["power"].values)
+        density = np.stack([_average_where(one.values, has_data) for one in cases])
         lines = blocks["line_power"].weighted(blocks["line_weight"].fillna(0.0)).mean("part")
     step = max(1, lines.sizes["line"] // MAX_LINES)
     lines = lines.coarsen(line=step, boundary="trim").max() if step > 1 else lines
@@ -440,11 +433,7 @@ def surfaces_with_blocks(
     )
     added = xr.Dataset(
         {
-            "block_mean": (
-                ("axis", "block"),
-                blocks["mean"].transpose("axis", "block").values,
-                dict(blocks["mean"].attrs),
-            ),
+            "block_mean": (("axis", "block"), blocks["mean"].values, dict(blocks["mean"].attrs)),
             "density": (
                 ("case", "axis", "band"),
                 density,
@@ -452,7 +441,7 @@ def surfaces_with_blocks(
             ),
             "line_density": (
                 ("axis", "line"),
-                lines.transpose("axis", "line").values,
+                lines.values,
                 {
                     "units": power,
                     "long_name": "two-sided power density of the recording at full resolution",

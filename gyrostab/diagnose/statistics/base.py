@@ -282,12 +282,7 @@ class Statistic:
     # ---------------------------------------------------------------------- sizes
 
     def mixture(
-        self,
-        component: Component,
-        state: State,
-        variant: Variant,
-        *,
-        variance: Array | None = None,
+        self, component: Component, state: State, variant: Variant, *, variance: Array | None = None
     ) -> Mixture:
         """Compute the sizes of a component's columns; by default from the linear model."""
         return linear_mixture(component, state, variant)

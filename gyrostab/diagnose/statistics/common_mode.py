@@ -19,7 +19,6 @@ from gyrostab.diagnose.statistics.scores import (
     cube_root_score,
     statistic_dataset,
     sum_over_windows,
-    values_in_order,
     window_set,
 )
 from gyrostab.diagnose.statistics.wording import subject, taus_text
@@ -68,9 +67,7 @@ class CommonMode(Statistic):
         if len(axes) < 2 or not spans:
             return None
         windows = window_set(block_count, LENGTHS)
-        residual = values_in_order(blocks, "mean", "axis", "block") - values_in_order(
-            baseline, "known_mean", "axis", "block"
-        )
+        residual = blocks["mean"].values - baseline["known_mean"].values
         present = np.isfinite(residual).reshape(-1, *residual.shape[-2:]).all(axis=0)
         increments = _whiten_means(residual, present, blocks, baseline)
         pairs = list(combinations(range(len(axes)), 2))
@@ -80,10 +77,8 @@ class CommonMode(Statistic):
         correlations = [
             _correlate_pairs(increments, present, pairs, windows, span, shared) for span in spans
         ]
-        r, count = (
-            np.stack([first for first, _ in correlations], axis=-1),
-            np.stack([first for _, first in correlations], axis=-1),
-        )
+        r = np.stack([first for first, _ in correlations], axis=-1)
+        count = np.stack([first for _, first in correlations], axis=-1)
         z = correlation_score(r, np.broadcast_to(count, r.shape))
         rows = [f"{axes[a]} {axes[b]}" for a, b in pairs]
         if len(rows) > 1:
@@ -121,12 +116,10 @@ def _whiten_means(
 ) -> Array:
     """Whiten block means by (record), axis, block; zero where missing."""
     terms = [str(term) for term in baseline["term"].values]
-    white = baseline["mean_variance"].transpose("axis", "block").values
-    begin, end, block = (
-        blocks["begin"].values,
-        blocks["end"].values,
-        float(blocks.attrs["block_s"]),
-    )
+    white = baseline["mean_variance"].values
+    begin = blocks["begin"].values
+    end = blocks["end"].values
+    block = float(blocks.attrs["block_s"])
     share, times, faster = flicker_states(block, float(end[-1] - begin[0]))
     increments = np.empty_like(residual)
     for axis in range(residual.shape[-2]):
@@ -158,11 +151,9 @@ def _shared_increments(
     The increments are by probe, axis, block.
     """
     series = np.random.default_rng(_PROBE_SEED).standard_normal((_PROBE_COUNT, 1, present.shape[1]))
-    series = series * np.sqrt(
-        np.nan_to_num(baseline["mean_variance"].transpose("axis", "block").values)
-    )
-    spectrum = baseline["spectrum"].transpose("axis", "block", "band").values[..., 0]
-    cross = baseline["cross"].transpose("pair", "block", "band").values[..., 0].real
+    series = series * np.sqrt(np.nan_to_num(baseline["mean_variance"].values))
+    spectrum = baseline["spectrum"].values[..., 0]
+    cross = baseline["cross"].values[..., 0].real
     first, second = ([pair[side] for pair in pairs] for side in (0, 1))
     with np.errstate(divide="ignore", invalid="ignore"):
         share = cross / np.sqrt(spectrum[first] * spectrum[second])

@@ -34,7 +34,6 @@ from gyrostab.diagnose.statistics.scores import (
     cube_root_score,
     statistic_dataset,
     sum_over_windows,
-    values_in_order,
     window_set,
 )
 from gyrostab.diagnose.statistics.shared_factors import estimate_shared_factors
@@ -92,8 +91,7 @@ class CrossSpectrum(Statistic):
         if len(rows) > 1:
             z, r = (
                 np.concatenate(
-                    [part, np.full((*part.shape[:-3], 1, *part.shape[-2:]), np.nan)],
-                    axis=-3,
+                    [part, np.full((*part.shape[:-3], 1, *part.shape[-2:]), np.nan)], axis=-3
                 )
                 for part in (z, r)
             )
@@ -145,11 +143,8 @@ class CrossSpectrum(Statistic):
         i, j = (state.axes.index(axis) for axis in pair)
         known = expected_cross(state.baseline)
         shared = known[row] if known is not None else np.zeros(1)
-        values = (
-            records_last(data["cross"].transpose(..., "pair", "block", "band").values, 3)[row]
-            - shared[..., None]
-        )
-        shape = state.blocks["cross_shape"].transpose("pair", "block", "band").values[row]
+        values = records_last(data["cross"].values, 3)[row] - shared[..., None]
+        shape = state.blocks["cross_shape"].values[row]
         # The scatter is larger in phase with shared noise, and smaller in quadrature.
         alone, apart = state.weight[i] * state.weight[j], (shared**2).real
         weight = np.concatenate(
@@ -232,14 +227,11 @@ def _pair_coherency(
     The last band is that of all bands together. If both axes are noisy in only a few blocks, these
     dominate: the number is that of equal blocks with the same scatter.
     """
-    cross = values_in_order(blocks, "cross", "pair", "block", "band")
+    cross = blocks["cross"].values
     if "cross" in baseline:
-        cross = cross - values_in_order(baseline, "cross", "pair", "block", "band")
-    power, shape = (
-        values_in_order(blocks, "power", "axis", "block", "band"),
-        values_in_order(blocks, "shape", "axis", "block", "band"),
-    )
-    spectrum = values_in_order(baseline, "spectrum", "axis", "block", "band")
+        cross = cross - baseline["cross"].values
+    power, shape = blocks["power"].values, blocks["shape"].values
+    spectrum = baseline["spectrum"].values
     with np.errstate(divide="ignore", invalid="ignore"):
         flat = power / spectrum
         cross = cross / np.sqrt(spectrum[left] * spectrum[right])

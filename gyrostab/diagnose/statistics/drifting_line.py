@@ -17,7 +17,6 @@ from gyrostab.diagnose.statistics.scores import (
     cube_root_score,
     exponential_score,
     statistic_dataset,
-    values_in_order,
 )
 from gyrostab.diagnose.statistics.wording import axes_text
 
@@ -70,10 +69,7 @@ class DriftingLine(Statistic):
         """
         if "line_power" not in blocks:
             return None
-        power, weight = (
-            values_in_order(blocks, "line_power", "axis", "part", "line"),
-            values_in_order(blocks, "line_weight", "axis", "part"),
-        )
+        power, weight = blocks["line_power"].values, blocks["line_weight"].values
         present = np.isfinite(power).reshape(-1, *power.shape[-3:]).all(axis=(0, 3)) & (weight > 0)
         parts = np.flatnonzero(present.all(axis=0))
         lines = power.shape[-1]
@@ -86,12 +82,10 @@ class DriftingLine(Statistic):
         )
         axes = [str(axis) for axis in blocks["axis"].values]
         if len(axes) > 1:
-            cells, axes = (
-                np.concatenate(
-                    [cells, cells.sum(axis=-3, keepdims=True) / np.sqrt(len(axes))], axis=-3
-                ),
-                [*axes, " ".join(axes)],
+            cells = np.concatenate(
+                [cells, cells.sum(axis=-3, keepdims=True) / np.sqrt(len(axes))], axis=-3
             )
+            axes = [*axes, " ".join(axes)]
         # Axes with common noise add up to more.
         cells = cells / np.maximum(cells.std(axis=(-2, -1), keepdims=True), 1.0)
         edges = np.stack([parts, parts + 1]) - parts[0]
@@ -179,11 +173,7 @@ def _largest_path_sums(cells: Array, edges: Array) -> tuple[Array, Array]:
     for move, bend in _path_shapes(lines):
         shift = np.rint(move * (edges + bend * edges * (1.0 - edges))).astype(np.int64)
         low, high = shift.min(axis=0), shift.max(axis=0) + 1
-        begin, end, step = (
-            max(0, -move),
-            lines - max(0, move),
-            max(1, abs(move) // (2 * parts)),
-        )
+        begin, end, step = max(0, -move), lines - max(0, move), max(1, abs(move) // (2 * parts))
         start = np.arange(begin, end, step)
         sums = np.zeros((*cells.shape[:-2], start.size))
         for part in range(parts):

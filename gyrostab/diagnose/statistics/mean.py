@@ -30,7 +30,6 @@ from gyrostab.diagnose.statistics.scores import (
     Windows,
     statistic_dataset,
     sum_over_windows,
-    values_in_order,
     window_set,
 )
 from gyrostab.diagnose.statistics.wording import axes_text, is_higher
@@ -87,12 +86,7 @@ class BlockMeanStatistic(Statistic):
     is_in_baseline = True
 
     def mixture(
-        self,
-        component: Component,
-        state: State,
-        variant: Variant,
-        *,
-        variance: Array | None = None,
+        self, component: Component, state: State, variant: Variant, *, variance: Array | None = None
     ) -> Mixture:
         """Compute sizes over the grid of random walk and flicker."""
         columns = mean_columns(variant, state.axes.index(component.row[0]))
@@ -136,10 +130,8 @@ class Mean(BlockMeanStatistic):
         windows = window_set(blocks.sizes["block"], LENGTHS, whole=False)
         amount, information = window_means(blocks, baseline, windows)
         with np.errstate(divide="ignore", invalid="ignore"):
-            z, estimate = (
-                (amount / np.sqrt(information))[..., None],
-                (amount / information)[..., None],
-            )
+            z = (amount / np.sqrt(information))[..., None]
+            estimate = (amount / information)[..., None]
         block = float(blocks.attrs["block_s"])
         return statistic_dataset(
             "mean",
@@ -223,9 +215,7 @@ def window_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> 
     amount, information : ndarray ((record,) axis, window), (axis, window)
         [degree-1 hour], [degree-2 hour2]; NaN if too little of the window is present.
     """
-    residual = values_in_order(blocks, "mean", "axis", "block") - values_in_order(
-        baseline, "known_mean", "axis", "block"
-    )
+    residual = blocks["mean"].values - baseline["known_mean"].values
     amount = np.full((*residual.shape[:-1], windows.first.size), np.nan)
     information = np.full((residual.shape[-2], windows.first.size), np.nan)
     for axis in range(residual.shape[-2]):
@@ -278,12 +268,10 @@ def mean_noise(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, present: Arr
     block, span = float(blocks.attrs["block_s"]), float(end[-1] - begin[0])
     share, times, white = flicker_states(block, span)
     known = expected_processes(baseline, axis)
-    slow, times = (
-        np.append(b**2 * share, known.square * block_mean_variance(block, known.time)),
-        np.append(times, known.time),
-    )
+    slow = np.append(b**2 * share, known.square * block_mean_variance(block, known.time))
+    times = np.append(times, known.time)
     decay = np.exp(-step[:, None] / times)
-    variance = baseline["mean_variance"].transpose(..., "axis", "block").values[axis] + b**2 * white
+    variance = baseline["mean_variance"].values[axis] + b**2 * white
     present = present & np.isfinite(variance) & (variance > 0)
     n = variance.size
     innovation, gain = np.empty(n), np.empty((n, times.size + 1))
@@ -308,10 +296,7 @@ def region_mean(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, inside: Arr
 
     By generalised least squares with a constant of the record.
     """
-    residual = (
-        values_in_order(blocks, "mean", "axis", "block")[axis]
-        - values_in_order(baseline, "known_mean", "axis", "block")[axis]
-    )
+    residual = blocks["mean"].values[axis] - baseline["known_mean"].values[axis]
     noise = mean_noise(blocks, baseline, axis, np.isfinite(residual))
     rows = apply_precision(np.stack([np.ones(residual.size), inside.astype(float)]), noise)
     columns = np.stack([np.ones(residual.size), inside.astype(float)])

@@ -41,9 +41,9 @@ def null_counts(
     -------
     dict of str to ndarray of int, shape (record, axis, block)
     """
-    samples = blocks["samples"].transpose("axis", "block").values.astype(np.int64)
-    adjacent = blocks["adjacent"].transpose("axis", "block").values.astype(np.int64)
-    mean = _interpolate_means(blocks["mean"].transpose("axis", "block").values)
+    samples = blocks["samples"].values.astype(np.int64)
+    adjacent = blocks["adjacent"].values.astype(np.int64)
+    mean = _interpolate_means(blocks["mean"].values)
     repeat, zero = np.zeros(samples.shape), np.zeros(samples.shape)
     truncated = truncated_axes(blocks)
     for axis, step in enumerate(blocks["quantization_step"].values):
@@ -82,8 +82,8 @@ def _filled_zeros(
     rng: np.random.Generator,
 ) -> NDArray[np.int64]:
     """Return the zeros (record, axis, block) that look filled because they coincide by chance."""
-    subset = blocks["axes_at_once"].transpose("subset", "axis").values.astype(bool)
-    number = blocks["at_once"].transpose("subset", "block").values.astype(np.int64)
+    subset = blocks["axes_at_once"].values.astype(bool)
+    number = blocks["at_once"].values.astype(np.int64)
     share = zeros / np.maximum(samples, 1)
     if len(samples) == 1:
         coinciding = rng.binomial(zeros, 1.0 - (1.0 - share) ** 2)  # zeros next to another one

@@ -31,7 +31,6 @@ from gyrostab.diagnose.statistics.scores import (
     cube_root_score,
     statistic_dataset,
     sum_over_windows,
-    values_in_order,
     window_set,
 )
 from gyrostab.diagnose.statistics.wording import is_higher, subject, taus_text
@@ -129,10 +128,8 @@ class Power(Statistic):
 
         Constant coherent densities are left to the cross-spectra.
         """
-        frequency, rate = (
-            case.blocks["frequency"].values,
-            float(case.blocks.attrs["sampling_rate_hz"]),
-        )
+        frequency = case.blocks["frequency"].values
+        rate = float(case.blocks.attrs["sampling_rate_hz"])
         level: dict[str, Array] = {}
         for (symbol, name), share in case.seen.level.items():
             square = (
@@ -175,15 +172,9 @@ class Power(Statistic):
     ) -> LinearModel:
         """Build the model of the band powers of an axis."""
         axis = state.axes[row]
-        expected = state.baseline["spectrum"].sel(axis=axis).transpose("block", "band").values
-        values = (
-            records_last(data["power"].transpose(..., "axis", "block", "band").values, 3)[row]
-            - expected[..., None]
-        )
-        weight = (
-            state.baseline["shape_alone"].sel(axis=axis).transpose("block", "band").values
-            / state.weight[row] ** 2
-        )
+        expected = state.baseline["spectrum"].sel(axis=axis).values
+        values = records_last(data["power"].values, 3)[row] - expected[..., None]
+        weight = state.baseline["shape_alone"].sel(axis=axis).values / state.weight[row] ** 2
         weight = np.where(state.masked[row][:, None], 0.0, weight)
         level, precision = noise_columns(state.baseline, axis=axis)
         known = [level[..., number] * expected for number in range(level.shape[2])]
@@ -277,11 +268,8 @@ def _surface_within_blocks(
 ) -> dict[str, Any]:
     """Compute the surface within blocks, from band powers."""
     rate, block = float(blocks.attrs["sampling_rate_hz"]), float(blocks.attrs["block_s"])
-    power, shape = (
-        values_in_order(blocks, "power", "axis", "block", "band"),
-        values_in_order(blocks, "shape", "axis", "block", "band"),
-    )
-    spectrum = values_in_order(baseline, "spectrum", "axis", "block", "band")
+    power, shape = blocks["power"].values, blocks["shape"].values
+    spectrum = baseline["spectrum"].values
     k = 2 ** np.arange(max(1, int(np.log2(block * rate / 4.0)) + 1))
     weights = allan_transfer(
         blocks["band_low"].values, blocks["band_high"].values, k / rate, rate
@@ -290,11 +278,9 @@ def _surface_within_blocks(
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = np.where(present, 1.0 / shape, 0.0)
         relative = np.where(present, power / spectrum * shape, 0.0).sum(axis=-1, keepdims=True)
-    power, spectrum, used_shape = (
-        np.where(present, power, 0.0),
-        np.where(present, spectrum, 0.0),
-        np.where(present, shape, 0.0),
-    )
+    power = np.where(present, power, 0.0)
+    spectrum = np.where(present, spectrum, 0.0)
+    used_shape = np.where(present, shape, 0.0)
     total = used_shape.sum(axis=-1, keepdims=True)
     observed = sum_over_windows(np.concatenate([power @ weights, relative], axis=-1), windows)
     expected = sum_over_windows(np.concatenate([spectrum @ weights, total], axis=-1), windows)
@@ -319,10 +305,8 @@ def _surface_within_blocks(
 def _surface_of_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> dict[str, Any]:
     """Compute the surface at whole blocks, from all overlapping differences of block means."""
     block, block_count = float(blocks.attrs["block_s"]), blocks.sizes["block"]
-    means = values_in_order(blocks, "mean", "axis", "block") - values_in_order(
-        baseline, "known_mean", "axis", "block"
-    )
-    white = values_in_order(baseline, "mean_variance", "axis", "block")
+    means = blocks["mean"].values - baseline["known_mean"].values
+    white = baseline["mean_variance"].values
     sizes = [k for k in (1, 2, 4, 8, 16, 32) if 4 * k <= block_count]
     surfaces: dict[str, list[Array]] = {"observed": [], "expected": [], "shape": []}
     for k in sizes:
@@ -401,9 +385,7 @@ def _pad_end(values: Array, size: int) -> Array:
 
 def _slow_allan_variance(blocks: xr.Dataset, baseline: xr.Dataset, tau: float) -> Array:
     """Return the Allan variance of B and K by axis [degree2 hour-2], without a ramp."""
-    coefficient = values_in_order(
-        baseline.transpose(..., "axis", "term"), "coefficient", "axis", "term"
-    )
+    coefficient = baseline["coefficient"].values
     total = np.zeros(blocks.sizes["axis"])
     for place, term in enumerate(baseline["term"].values):
         if str(term) in ("B", "K"):
@@ -426,7 +408,7 @@ def _filter_change(
 ) -> Array:
     """Return the change of the baseline spectrum by a response."""
     total = np.zeros((coefficient.sizes["axis"], 1, frequency.size))
-    size, terms = coefficient.transpose("axis", "term").values, list(coefficient["term"].values)
+    size, terms = coefficient.values, list(coefficient["term"].values)
     for symbol in (one for one in "QNBK" if one in terms):
         total += size[:, terms.index(symbol), None, None] ** 2 * sampled_psd(
             symbol, frequency, rate

@@ -23,7 +23,6 @@ from gyrostab.diagnose.statistics.scores import (
     cube_root_score,
     statistic_dataset,
     sum_over_windows,
-    values_in_order,
     window_set,
 )
 from gyrostab.diagnose.statistics.wording import axes_text
@@ -115,9 +114,7 @@ class RampPhase(Statistic):
         self, candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
     ) -> LinearModel:
         """Build the model of the ramp profile of an axis."""
-        values = records_last(data["profile"].transpose(..., "axis", "block", "phase").values, 3)[
-            row
-        ]
+        values = records_last(data["profile"].values, 3)[row]
         rate = float(state.blocks.attrs["sampling_rate_hz"])
         width = (state.blocks["band_high"] - state.blocks["band_low"]).values
         variance = rate * (state.weight[row] * width).sum(axis=-1) / width.sum()
@@ -166,22 +163,15 @@ class RampPhase(Statistic):
 
 def _score_profile(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, ...]:
     """Return score, ratio and rms of the mean by phase, by (record), axis, window, 1."""
-    profile = values_in_order(blocks, "profile", "axis", "block", "phase")
-    samples = values_in_order(blocks, "profile_samples", "axis", "block", "phase")
+    profile = blocks["profile"].values
+    samples = blocks["profile_samples"].values
     width = (blocks["band_high"] - blocks["band_low"]).values
-    variance = (
-        2.0
-        * (baseline["spectrum"].transpose("axis", "block", "band").values * width).sum(axis=-1)[
-            ..., None
-        ]
-    )
+    variance = 2.0 * (baseline["spectrum"].values * width).sum(axis=-1)[..., None]
     present = np.isfinite(profile) & (samples > 0) & np.isfinite(variance)
     with np.errstate(divide="ignore", invalid="ignore"):
         weight = np.where(present, samples / variance, 0.0)
-        sums, total = (
-            sum_over_windows(np.where(present, profile, 0.0) * weight, windows),
-            sum_over_windows(weight, windows),
-        )
+        sums = sum_over_windows(np.where(present, profile, 0.0) * weight, windows)
+        total = sum_over_windows(weight, windows)
         used = (total > 0).sum(axis=-1, keepdims=True)
         square = np.where(total > 0, sums**2 / total, 0.0).sum(axis=-1, keepdims=True)
         ratio = np.where(used > 1, square / used, np.nan)
@@ -191,10 +181,8 @@ def _score_profile(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -
 
 def _ramp_lines(state: State) -> NDArray[np.bool_]:
     """Return the lines at multiples of the ramp frequency, aliased by the sampling."""
-    lines, rate = (
-        state.blocks["line_frequency"].values,
-        float(state.blocks.attrs["sampling_rate_hz"]),
-    )
+    lines = state.blocks["line_frequency"].values
+    rate = float(state.blocks.attrs["sampling_rate_hz"])
     turns = np.abs(state.blocks["ramp_turns"].values)
     turns = turns[np.isfinite(turns)]
     if not turns.size:
@@ -228,10 +216,8 @@ def _profile_power(component: Component, state: State) -> Array:
 
 def _draw_profiles(draw: NullDraw) -> Array:
     """Draw ramp profiles."""
-    recorded = values_in_order(draw.blocks, "profile", "axis", "block", "phase")
-    samples = values_in_order(draw.blocks, "profile_samples", "axis", "block", "phase").astype(
-        np.float64
-    )
+    recorded = draw.blocks["profile"].values
+    samples = draw.blocks["profile_samples"].values.astype(np.float64)
     safe = np.maximum(samples, 1.0)
     noise = draw.rng.standard_normal((draw.record_count, *recorded.shape))
     noise = noise * draw.sample_sd[:, :1, None] / np.sqrt(safe)

@@ -17,9 +17,7 @@ from gyrostab.diagnose.predict.candidates import (
 )
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import Trial
-from gyrostab.diagnose.statistics.mean import (
-    BlockMeanStatistic,
-)
+from gyrostab.diagnose.statistics.mean import BlockMeanStatistic
 
 Array = NDArray[Any]
 

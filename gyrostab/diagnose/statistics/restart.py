@@ -10,7 +10,7 @@ import xarray as xr
 
 from gyrostab.diagnose.statistics.base import Statistic
 from gyrostab.diagnose.statistics.mean import MeanNoise, apply_precision, mean_noise
-from gyrostab.diagnose.statistics.scores import Array, Windows, statistic_dataset, values_in_order
+from gyrostab.diagnose.statistics.scores import Array, Windows, statistic_dataset
 from gyrostab.diagnose.statistics.wording import axes_text
 
 __all__ = ["Restart"]
@@ -42,9 +42,7 @@ class Restart(Statistic):
             return None
         block, block_count = float(blocks.attrs["block_s"]), blocks.sizes["block"]
         designs, windows = _restart_designs(restarts, block_count)
-        residual = values_in_order(blocks, "mean", "axis", "block") - values_in_order(
-            baseline, "known_mean", "axis", "block"
-        )
+        residual = blocks["mean"].values - baseline["known_mean"].values
         z, estimate = (np.full((*residual.shape[:-1], len(designs)), np.nan) for _ in range(2))
         for axis in range(blocks.sizes["axis"]):
             present = np.isfinite(residual[..., axis, :]).reshape(-1, block_count).any(axis=0)
@@ -98,10 +96,8 @@ def _restart_designs(restarts: np.ndarray, block_count: int) -> tuple[Array, Win
     for start in restarts:
         age[start:] = np.arange(block_count - start)
     rows = [np.exp(-age / k) for k in _DECAY_BLOCKS]
-    first, stop = (
-        [int(restarts[0])] * len(_DECAY_BLOCKS),
-        [int(min(restarts[-1] + 2 * k, block_count)) for k in _DECAY_BLOCKS],
-    )
+    first = [int(restarts[0])] * len(_DECAY_BLOCKS)
+    stop = [int(min(restarts[-1] + 2 * k, block_count)) for k in _DECAY_BLOCKS]
     for start in restarts:
         row = np.zeros(block_count)
         low, high = max(start - _SIDE_BLOCKS, 0), min(start + _SIDE_BLOCKS, block_count)
@@ -114,10 +110,8 @@ def _restart_designs(restarts: np.ndarray, block_count: int) -> tuple[Array, Win
 
 def _matched_filter(residual: Array, designs: Array, noise: MeanNoise) -> tuple[Array, Array]:
     """Return filter output and information of each design, both independent of a constant."""
-    weighted, one = (
-        apply_precision(designs, noise),
-        apply_precision(np.ones((1, designs.shape[-1])), noise)[0],
-    )
+    weighted = apply_precision(designs, noise)
+    one = apply_precision(np.ones((1, designs.shape[-1])), noise)[0]
     weighted = weighted - np.outer(weighted.sum(axis=-1) / one.sum(), one)
     information = (weighted * designs).sum(axis=-1)
     return np.nan_to_num(residual) @ weighted.T, np.where(information > 0, information, np.nan)

@@ -24,12 +24,7 @@ from gyrostab.diagnose.predict.linear_model import (
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.reduce.block_statistics import noise_at_orders
 from gyrostab.diagnose.statistics.base import NullDraw, SizeFit, Sizes, Statistic
-from gyrostab.diagnose.statistics.scores import (
-    Windows,
-    exponential_score,
-    sum_over_windows,
-    values_in_order,
-)
+from gyrostab.diagnose.statistics.scores import Windows, exponential_score, sum_over_windows
 from gyrostab.noise import NORMAL_95
 from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Prediction
@@ -97,7 +92,7 @@ class RotationOrder(Statistic):
         self, candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
     ) -> LinearModel:
         """Build the model of the rotation orders of an axis, or of all axes together."""
-        values = records_last(data["order"].transpose(..., "axis", "block", "harmonic").values, 3)
+        values = records_last(data["order"].values, 3)
         weight = order_weight(state)
         count = weight.shape[-1]
         if candidates[0].each:
@@ -251,9 +246,9 @@ def order_columns(pattern: Array, chosen: tuple[int, ...]) -> list[Array]:
 def _draw_orders(draw: NullDraw) -> NDArray[np.complex128]:
     """Draw Gaussian amplitudes at the rotation orders, with the density near that frequency."""
     blocks, expected = draw.blocks, draw.expected
-    recorded = values_in_order(blocks, "order", "axis", "block", "harmonic")
+    recorded = blocks["order"].values
     rate = float(blocks.attrs["sampling_rate_hz"])
-    samples = np.maximum(values_in_order(blocks, "samples", "axis", "block"), 1)
+    samples = np.maximum(blocks["samples"].values, 1)
     turning = np.abs(np.nan_to_num(blocks["channel_rotation_rate"].values)) / 360.0
     bands = np.log(blocks["frequency"].values)
     density = np.empty((len(expected), *recorded.shape))
@@ -301,13 +296,10 @@ def turns_per_second(blocks: xr.Dataset) -> Array:
 
 def score_orders(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, ...]:
     """Return score, ratio and amplitude of the coherent sum by (record), axis, window, harmonic."""
-    order = values_in_order(blocks, "order", "axis", "block", "harmonic")
-    samples = values_in_order(blocks, "samples", "axis", "block")
+    order = blocks["order"].values
+    samples = blocks["samples"].values
     rate = float(blocks.attrs["sampling_rate_hz"])
-    turning, spectrum = (
-        turns_per_second(blocks),
-        baseline["spectrum"].transpose("axis", "block", "band").values,
-    )
+    turning, spectrum = turns_per_second(blocks), baseline["spectrum"].values
     bands = np.log(baseline["frequency"].values)
     log_frequency = np.log(
         np.clip(

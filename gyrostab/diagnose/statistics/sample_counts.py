@@ -36,7 +36,6 @@ from gyrostab.diagnose.statistics.scores import (
     Array,
     statistic_dataset,
     sum_over_windows,
-    values_in_order,
     window_set,
 )
 from gyrostab.diagnose.statistics.wording import subject
@@ -93,18 +92,15 @@ class SampleCounts(Statistic):
             are the count, or the mean kurtosis.
         """
         windows = window_set(blocks.sizes["block"], LENGTHS)
-        samples = values_in_order(blocks, "samples", "axis", "block").astype(float)
+        samples = blocks["samples"].values.astype(float)
         counts_by_block = {
-            name: np.nan_to_num(values_in_order(blocks, name, "axis", "block").astype(float))
-            for name in COUNTS
+            name: np.nan_to_num(blocks[name].values.astype(float)) for name in COUNTS
         }
         counts_by_block["extremes"] = excess_extremes(counts_by_block["extremes"])
         counts = sum_over_windows(
             np.stack([counts_by_block[name] for name in COUNTS], axis=-1), windows
         )
-        tail_score, used = kurtosis_score(
-            values_in_order(blocks, "kurtosis", "axis", "block"), samples
-        )
+        tail_score, used = kurtosis_score(blocks["kurtosis"].values, samples)
         # Rounding has no tails, so that the noise itself may differ from 0.
         usual = np.median(tail_score, axis=-1, keepdims=True)
         tail_score = np.where(
@@ -115,9 +111,7 @@ class SampleCounts(Statistic):
             tails = np.where(
                 n > 0, sum_over_windows(tail_score[..., None], windows) / np.sqrt(n), np.nan
             )
-            excess = np.where(
-                used > 0, np.nan_to_num(values_in_order(blocks, "kurtosis", "axis", "block")), 0.0
-            )
+            excess = np.where(used > 0, np.nan_to_num(blocks["kurtosis"].values), 0.0)
             mean = sum_over_windows(excess[..., None], windows) / n
         rate = float(blocks.attrs["sampling_rate_hz"])
         number = np.concatenate([counts, np.broadcast_to(mean, tails.shape)], axis=-1)
@@ -266,7 +260,7 @@ def _count_evidence(
         )
     if name not in data or name not in count_evidence.of:
         return np.zeros((records, len(state.axes)))
-    values = data[name].transpose(..., "axis", "block").values.astype(np.float64)
+    values = data[name].values.astype(np.float64)
     values = values if values.ndim == 3 else values[None]
     values = excess_extremes(values) if name == "extremes" else values
     compute = kurtosis_evidence if name == "kurtosis" else sample_count_evidence
@@ -275,7 +269,7 @@ def _count_evidence(
 
 def _grid_evidence(state: State, count_evidence: CountEvidence) -> Array:
     """Count samples of a rounded rate, one nat each: unrounded noise is never on the grid."""
-    samples = state.blocks["samples"].transpose("axis", "block").values.sum(axis=1)
+    samples = state.blocks["samples"].values.sum(axis=1)
     return (
         np.where(count_evidence.rounded, samples, 0.0).astype(np.float64)
         if count_evidence.rounded.size

@@ -42,8 +42,7 @@ def estimate_from_counts(
     error = math.sqrt(count + usual)
     if effect == "spikes":
         count = max(
-            float(blocks["peaks"].sel(axis=axis).where(blocks[mark].sel(axis=axis) > 0).sum()),
-            1.0,
+            float(blocks["peaks"].sel(axis=axis).where(blocks[mark].sel(axis=axis) > 0).sum()), 1.0
         )
         error = math.sqrt(count)
         outliers = _estimate_outliers(blocks, axis)

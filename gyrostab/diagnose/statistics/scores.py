@@ -17,7 +17,6 @@ __all__ = [
     "exponential_score",
     "statistic_dataset",
     "sum_over_windows",
-    "values_in_order",
     "window_set",
 ]
 
@@ -120,11 +119,6 @@ def exponential_score(value: Array) -> Array:
     return np.asarray(-ndtri_exp(-value))
 
 
-def values_in_order(blocks: xr.Dataset, name: str, *dims: str) -> Any:
-    """Return the values of a variable with `dims` last; a dimension of records stays first."""
-    return blocks[name].transpose(..., *dims).values
-
-
 def statistic_dataset(
     name: str,
     blocks: xr.Dataset,
@@ -184,10 +178,7 @@ def statistic_dataset(
             "ratio": (dims, ratio, {"units": "1", "long_name": "observed over expected"}),
         },
         coords={
-            "axes": (
-                "row",
-                np.asarray(blocks["axis"].values if rows is None else rows, dtype=str),
-            ),
+            "axes": ("row", np.asarray(blocks["axis"].values if rows is None else rows, dtype=str)),
             "begin": ("window", begin[windows.first], {"units": "s"}),
             "end": ("window", end[windows.stop - 1], {"units": "s"}),
             "first": ("window", windows.first),

@@ -185,9 +185,7 @@ def _max_factor(axis: str, variant: Variant, state: State) -> float:
     blocks = state.blocks
     row = next(number for number, pair in enumerate(pair_rows(blocks)) if axis in pair)
     design = cross_column(variant.design[0], row, blocks).real
-    power, shape = (
-        blocks[name].sel(axis=axis).transpose("block", "band").values for name in ("power", "shape")
-    )
+    power, shape = (blocks[name].sel(axis=axis).values for name in ("power", "shape"))
     weight = (
         np.where(np.isfinite(power) & np.isfinite(shape), shape, 0.0)
         / state.weight[state.axes.index(axis)] ** 2

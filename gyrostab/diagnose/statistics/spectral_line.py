@@ -33,7 +33,6 @@ from gyrostab.diagnose.statistics.scores import (
     cube_root_score,
     statistic_dataset,
     sum_over_windows,
-    values_in_order,
 )
 from gyrostab.diagnose.statistics.wording import axes_text
 
@@ -70,10 +69,7 @@ class SpectralLine(Statistic):
         """
         if "line_power" not in blocks:
             return None
-        power, weight = (
-            values_in_order(blocks, "line_power", "axis", "part", "line"),
-            values_in_order(blocks, "line_weight", "axis", "part"),
-        )
+        power, weight = blocks["line_power"].values, blocks["line_weight"].values
         frequency = blocks["line_frequency"].values
         windows = _part_windows(blocks)
         expected = expected_lines(baseline, frequency)[:, None, :]
@@ -117,12 +113,10 @@ class SpectralLine(Statistic):
 
     def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
         """Compute the evidence of one steady line on all axes."""
-        power = trial.data["line_power"].transpose(..., "axis", "part", "line").values
+        power = trial.data["line_power"].values
         power = power if power.ndim == 4 else power[None]
         expected = expected_lines(trial.state.baseline, trial.state.blocks["line_frequency"].values)
-        evidence_nats = line_evidence(
-            power, trial.state.blocks["line_weight"].transpose("axis", "part").values, expected
-        )
+        evidence_nats = line_evidence(power, trial.state.blocks["line_weight"].values, expected)
         taken = trial.state.given.get(("line", "all"), [])
         for mask in taken:
             evidence_nats = np.where(mask, -np.inf, evidence_nats)
@@ -228,9 +222,7 @@ def _part_windows(blocks: xr.Dataset) -> Windows:
 
 def _equal_block_share(blocks: xr.Dataset, windows: Windows) -> Array:
     """Return the equivalent share of equal-power blocks in a mean, by window and line."""
-    power, shape = (
-        values_in_order(blocks, name, "axis", "block", "band") for name in ("power", "shape")
-    )
+    power, shape = (blocks[name].values for name in ("power", "shape"))
     present = np.isfinite(power) & (shape > 0)
     power, present_count = np.where(present, power, 0.0), present.astype(float)
     square = np.where(present, power**2 * shape / (1.0 + shape), 0.0)
@@ -279,7 +271,7 @@ def estimate_line(
     """
     lines = blocks["line_frequency"].values
     weight = blocks["line_weight"].sel(axis=axis).values
-    power = blocks["line_power"].sel(axis=axis).transpose("part", "line").values
+    power = blocks["line_power"].sel(axis=axis).values
     good = (weight > 0) & np.isfinite(power).all(axis=1)
     total = (power[good] * weight[good, None]).sum(axis=0) / weight[good].sum()
     level = local_level(total[None, None])[0, 0]

@@ -29,10 +29,7 @@ from gyrostab.diagnose.predict.linear_model import State, power_column
 from gyrostab.diagnose.predict.search import Trial
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.statistics.base import SizeFit, Sizes
-from gyrostab.diagnose.statistics.mean import (
-    BlockMeanStatistic,
-    condition_means,
-)
+from gyrostab.diagnose.statistics.mean import BlockMeanStatistic, condition_means
 
 Array = NDArray[Any]
 

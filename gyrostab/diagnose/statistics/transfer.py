@@ -29,7 +29,6 @@ from gyrostab.diagnose.predict.windows import distinct_variants
 from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.diagnose.statistics.base import NullDraw, Statistic
 from gyrostab.diagnose.statistics.cross_spectrum import draw_coherency
-from gyrostab.diagnose.statistics.scores import values_in_order
 from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Prediction, Windows
 from gyrostab.physics.registry import effects
@@ -182,9 +181,7 @@ def reference_channel_of(
     """
     axes = [str(one) for one in blocks["axis"].values]
     if name in axes:
-        cross = records_last(
-            measured(data, "cross").transpose(..., "pair", "block", "band").values, 3
-        )
+        cross = records_last(measured(data, "cross").values, 3)
         has_power = np.isfinite(blocks["power"].values[row])[..., None]
         known = expected_cross(baseline)
         cross = cross if known is None else cross - known[..., None]
@@ -196,9 +193,7 @@ def reference_channel_of(
                 )
         return cross_power, reference_channel_power(name, blocks)
     place = [str(one) for one in blocks["reference"].values].index(name)
-    cross = records_last(
-        data["reference_cross"].transpose(..., "axis", "reference", "block", "band").values, 4
-    )
+    cross = records_last(data["reference_cross"].values, 4)
     return cross[row, place], reference_channel_power(name, blocks)
 
 
@@ -212,7 +207,7 @@ def _moving_share(name: str, power: Array, state: State) -> Array:
     if name not in state.axes:
         return np.ones_like(power)
     row = state.axes.index(name)
-    noise = state.baseline["spectrum"].transpose("axis", "block", "band").values[row]
+    noise = state.baseline["spectrum"].values[row]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a band without data has no motion
         noise = np.fmax(noise, np.nanquantile(power, _QUIESCENT_QUANTILE, axis=0))
@@ -251,9 +246,9 @@ def _transferred_power(component: Component, state: State) -> Array:
 
 def _draw_channel_cross(draw: NullDraw) -> NDArray[np.complex128]:
     """Draw cross-spectra of axes with reference channels."""
-    recorded = values_in_order(draw.blocks, "reference_cross", "axis", "reference", "block", "band")
-    shape = values_in_order(draw.blocks, "shape", "axis", "block", "band")
-    channel_power = values_in_order(draw.blocks, "reference_power", "reference", "block", "band")
+    recorded = draw.blocks["reference_cross"].values
+    shape = draw.blocks["shape"].values
+    channel_power = draw.blocks["reference_power"].values
     size = np.sqrt(draw.power[:, :, None] * channel_power)
     cross = size * draw_coherency(shape[:, None], size.shape, draw.rng)
     cross[..., np.isnan(recorded)] = np.nan

@@ -18,7 +18,6 @@ from gyrostab.diagnose.statistics.scores import (
     cube_root_score,
     statistic_dataset,
     sum_over_windows,
-    values_in_order,
     window_set,
 )
 from gyrostab.diagnose.statistics.wording import axes_text, length_text, taus_text
@@ -148,11 +147,8 @@ def scale_to_expected(
     """
     if not spans:
         return blocks
-    power, spectrum = (
-        one.transpose("axis", "block", "band").values
-        for one in (blocks["power"], baseline["spectrum"])
-    )
-    shape, power = blocks["shape"].transpose("axis", "block", "band").values, power.copy()
+    power, spectrum = (one.values for one in (blocks["power"], baseline["spectrum"]))
+    shape, power = blocks["shape"].values, power.copy()
     for axes, begin, end in spans:
         inside = np.flatnonzero(
             (blocks["begin"].values >= begin - 1e-6) & (blocks["end"].values <= end + 1e-6)
@@ -160,10 +156,8 @@ def scale_to_expected(
         pieces = np.split(inside, [1, 2, -2, -1] if inside.size > 4 else range(1, inside.size))
         rows = np.flatnonzero(np.isin(blocks["axis"].values.astype(str), list(axes)))
         for row, block_count in product(rows, pieces):
-            ratio, weight = (
-                power[row, block_count] / spectrum[row, block_count],
-                np.nan_to_num(shape[row, block_count]),
-            )
+            ratio = power[row, block_count] / spectrum[row, block_count]
+            weight = np.nan_to_num(shape[row, block_count])
             weight = np.where(np.isfinite(ratio), weight, 0.0)
             with np.errstate(invalid="ignore", divide="ignore"):
                 power[row, block_count] /= (np.nan_to_num(ratio) * weight).sum(axis=0) / weight.sum(
@@ -218,11 +212,8 @@ def _relative_levels(
 
     By (record), row, block, group of bands.
     """
-    power, spectrum = (
-        values_in_order(blocks, "power", "axis", "block", "band"),
-        values_in_order(baseline, "spectrum", "axis", "block", "band"),
-    )
-    shape = values_in_order(blocks, "shape", "axis", "block", "band")[..., used]
+    power, spectrum = blocks["power"].values, baseline["spectrum"].values
+    shape = blocks["shape"].values[..., used]
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = (power / spectrum)[..., used]
         present = np.isfinite(ratio) & (shape > 0)
@@ -278,8 +269,8 @@ def _coherence_factor(
     one, other = (
         [axes.index(str(axis)) for axis in blocks[name].values] for name in ("first", "second")
     )
-    power = np.nan_to_num(values_in_order(blocks, "power", "axis", "block", "band")[..., used])
-    cross = np.nan_to_num(values_in_order(blocks, "cross", "pair", "block", "band")[..., used])
+    power = np.nan_to_num(blocks["power"].values[..., used])
+    cross = np.nan_to_num(blocks["cross"].values[..., used])
     with np.errstate(divide="ignore", invalid="ignore"):
         squared = np.abs(cross.sum(axis=-2)) ** 2 / (
             power[..., one, :, :].sum(axis=-2) * power[..., other, :, :].sum(axis=-2)
@@ -337,14 +328,10 @@ def _score_scatter(
     # An incomplete average at the end of the record does not count.
     begin = np.minimum(-(-windows.first // span), count)
     inside = Windows(begin, np.maximum(windows.stop // span, begin))
-    first, square = (
-        sum_over_windows(total * average, inside),
-        sum_over_windows(total * average**2, inside),
-    )
-    number, weights = (
-        sum_over_windows(present.astype(float), inside),
-        sum_over_windows(total, inside),
-    )
+    first = sum_over_windows(total * average, inside)
+    square = sum_over_windows(total * average**2, inside)
+    number = sum_over_windows(present.astype(float), inside)
+    weights = sum_over_windows(total, inside)
     with np.errstate(divide="ignore", invalid="ignore"):
         scatter = (square - first**2 / weights) / (first / weights) ** 2
     mean, variance = scatter_moments(number, weights, sum_over_windows(inverse, inside))
