@@ -160,7 +160,7 @@ def _calibrate(task: Task, blocks: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
     task.progress("calibrating", 0)
     baseline = _make_baseline(task, blocks)
     if isinstance(task.simulation, Model):
-        moving = expect_known_motion(blocks, baseline)
+        moving = expect_known_motion(blocks, baseline, settings=task.settings)
         if moving.any():
             blocks = _at_rest(task, blocks, moving).drop_vars("moving")  # the model has the motion
             baseline = _make_baseline(task, blocks)
@@ -188,7 +188,7 @@ def _compare(task: Task, blocks: xr.Dataset, baseline: xr.Dataset) -> Comparison
     Identified effects and located mismatches have half of the false-alarm level each.
     """
     level = task.level / 2.0
-    seen = remove_known_lines(blocks, baseline)
+    seen = remove_known_lines(blocks, baseline, settings=task.settings)
     records = repeatable_null_records(seen, baseline, task.nulls, task.seed)
     task.progress("comparing", 0)
     null = null_scores(baseline, records(), settings=task.settings)

@@ -1,8 +1,9 @@
 """Numbers that decide what a diagnosis reports: value, unit and source of each.
 
-Other numbers are local to their modules. Some of those of the reduction, the statistics and the
-candidates decide too; the rest set only the accuracy or the cost of a computation.
-`benchmarks/settings_sensitivity.py` scales each of them and compares the diagnoses.
+Other numbers are local to their modules: those that define what a block or a statistic measures,
+because null records are measured and scored alike, and those that set only the accuracy or the cost
+of a computation. `benchmarks/settings_sensitivity.py` scales each of them and compares the
+diagnoses; `benchmarks/settings_derivations.py` computes probabilities that some of them come from.
 """
 
 from __future__ import annotations
@@ -42,11 +43,19 @@ class Settings:
     (4.6, 6.0)
     """
 
+    majority_share: float = _setting(
+        0.5,
+        "1",
+        "Share that makes a part the larger one: common time of two regions that are one, "
+        "blocks that a motion may move, evidence that a filter leaves of a line, variance of "
+        "a switching course that another effect explains, Q^2 of an angle counter.",
+        "nearer to the whole than to nothing; no other value separates two alternatives equally",
+    )
     component_nats: float = _setting(
         2.0,
         "nat",
         "Evidence that an axis must add to be named with the others.",
-        "choice: odds of 7 to 1 (ln 7.4 = 2.0)",
+        "odds of 7 to 1: positive evidence is 1 to 3 nats (Kass and Raftery, 1995)",
     )
     ambiguous_nats: float = _setting(
         3.0,
@@ -113,7 +122,8 @@ class Settings:
         10.0,
         "nat",
         "Evidence by which two levels within blocks must exceed normal noise of any spectrum.",
-        "choice: odds of 2e4 to 1, as the spectrum of normal noise is fitted by an autoregression",
+        "twice the 5 nats of very strong evidence (Kass and Raftery, 1995), as an "
+        "autoregression fits the spectrum of the rival, normal noise",
     )
     refuting_nats: float = _setting(
         20.0,
@@ -143,15 +153,63 @@ class Settings:
         0.97,
         "1",
         "Correlation of g and g^2 above which the vibration has one level.",
-        "that of values uniform over one octave and more: 0.97 for g from 0 to 1, where "
-        "corr(g, g^2) = sqrt(15) / 4",
+        "that of g uniform from 1.5 % of its largest value up; sqrt(15) / 4 = 0.968 from zero "
+        "(benchmarks/settings_derivations.py)",
     )
     moving_power_ratio: float = _setting(
         1.5,
         "1",
         "Power over expected power, in any band, above which an axis moves.",
-        "the mean over at least 24 blocks of a band exceeds 1.5 by chance with P = 0.01 "
-        "(chi-square with 48 degrees of freedom)",
+        "P = 0.06 that any of 13 bands exceeds it by chance in the shortest record, 24 blocks; "
+        "none in long ones (benchmarks/settings_derivations.py)",
+    )
+    fast_blocks: float = _setting(
+        2.0,
+        "block",
+        "Mean time on a level up to which sub-blocks show two levels better than block means.",
+        "choice: a course of shorter stays is rarely on one level for a whole block",
+    )
+    refuted_blocks: float = _setting(
+        3.0,
+        "block",
+        "Mean time on a level up to which sub-blocks can refute a telegraph bias.",
+        "choice: sub-blocks show every switch, blocks of one level only from there",
+    )
+    misfit_nats: float = _setting(
+        0.2,
+        "nat",
+        "Model error of two levels that each switch may have.",
+        "choice: with five switches 1 nat, a factor of e in the odds",
+    )
+    max_level_sigma: float = _setting(
+        8.0,
+        "standard deviation",
+        "Deviation of the noise level of a block beyond which it is clipped.",
+        "choice: one block adds 32 nats at most to the evidence of a level that wanders",
+    )
+    max_event_share: float = _setting(
+        0.1,
+        "1",
+        "Share of the record that an event between two equal levels lasts at most.",
+        "choice: longer ones are two jumps",
+    )
+    reweight_thresholds: float = _setting(
+        3.0,
+        "threshold",
+        "Evidence of the strongest power, from which all powers are weighted with it.",
+        "choice: an effect of three thresholds raises some powers several times",
+    )
+    min_surrogates: int = _setting(
+        20,
+        "surrogate",
+        "Time-shifted surrogates without which a channel is not tested.",
+        "choice: a tenth of the 200 surrogates",
+    )
+    max_earth_rate: float = _setting(
+        20.0,
+        "degree hour-1",
+        "Largest earth rate on an axis.",
+        "choice: 15.04 deg/h and a third for the error of the scale",
     )
     min_comb_lines: int = _setting(
         3, "1", "Lines that may be one comb.", "two lines define a spacing; the third tests it"
@@ -174,6 +232,13 @@ class Settings:
         "Share of the rotation that an axis across it may sense; a larger one is along it.",
         "choice: sine of 1.1 degrees, a coarse mounting error",
     )
+    step_power_ratio: float = _setting(
+        5.0,
+        "1",
+        "Squared step of the mean times the length of a block, over the noise density of its "
+        "lowest band, above which the mean moves within the block.",
+        "a step of D within T seconds adds D^2 T / pi^2 to the density at 1 / T: half of the noise",
+    )
     rest_sigma: float = _setting(
         6.0,
         "standard deviation",
@@ -192,6 +257,12 @@ class Settings:
         "Largest share of the blocks that an axis may move.",
         "choice: the level at rest is that of the closest quarter of the means; a third is safe",
     )
+    motion_margin_blocks: int = _setting(
+        2,
+        "block",
+        "Blocks on either side of a motion that belong to it.",
+        "choice: a ramp at its begin and end",
+    )
     min_rest_blocks: int = _setting(
         12,
         "block",
@@ -200,18 +271,39 @@ class Settings:
     )
 
     # calibration of the noise
+    calm_share: float = _setting(
+        0.2,
+        "1",
+        "Quantile of vibration and rotation over the blocks that is their level at rest.",
+        "choice: below `quiescent_share`, so that a quarter at rest suffices",
+    )
+    calm_ratio: float = _setting(
+        2.0,
+        "1",
+        "Vibration or rotation over its level at rest, up to which a block is quiescent.",
+        "choice: noise by rectification is then 4 times that at rest",
+    )
+    calm_slope_share: float = _setting(
+        0.3,
+        "1",
+        "Rate of change of temperature up to which a block is quiescent, as a share of the "
+        "largest.",
+        "choice: a Shupe bias is then below a third of its largest",
+    )
     noisy_sigma: float = _setting(
         4.5,
         "standard deviation",
         "Excess of the noise level of a block above which it is not quiescent.",
-        "one-sided P = 3.4e-6: 0.06 of 6000 blocks and three spans, the longest record",
+        "P = 8e-6 a block of 1000 lines, 0.05 of 6000 blocks; 6e-5 with 49 lines "
+        "(benchmarks/settings_derivations.py)",
     )
     excess_sigma: float = _setting(
         4.0,
         "standard deviation",
         "Excess above which the noise of the mean of a block is raised, and difference from the "
         "noise terms above which a band of a simulation has a separate form.",
-        "one-sided P = 3.2e-5: 0.2 of 6000 blocks, and then by the excess itself",
+        "P = 6e-5 a block of 1000 lines, 0.4 of 6000 blocks, and then by the excess itself "
+        "(benchmarks/settings_derivations.py)",
     )
     quiescent_share: float = _setting(
         0.25,
@@ -225,6 +317,20 @@ class Settings:
         "Quiescent blocks that must be found; below it the quietest are taken.",
         "choice: drift is known up to 16 blocks",
     )
+    min_information_share: float = _setting(
+        1e-4,
+        "1",
+        "Share of its information that N must keep with the effects in the model.",
+        "the standard error of N is then 100 times that without effects, above N itself",
+    )
+    max_level_step: float = _setting(
+        0.2,
+        "1",
+        "Relative change of the noise level from block to block, above which kurtosis and "
+        "outliers are not those of steady noise.",
+        "excess kurtosis 3 var(s^2) / mean(s^2)^2 = 0.01 for a linear change of 0.2 within a "
+        "block, the error sqrt(24 / n) of n = 240 000 samples",
+    )
     after_restart_s: float = _setting(
         900.0,
         "s",
@@ -235,13 +341,21 @@ class Settings:
         1e-4,
         "1",
         "Chance probability of the coherency of two axes of a simulation below which it is real.",
-        "a hundredth of the default false-alarm probability, for three pairs",
+        "three pairs of axes add 3e-4, 3 % of the default false-alarm probability",
+    )
+    known_line_sigma: float = _setting(
+        5.0,
+        "standard error",
+        "Excess over a known line above which it is another line.",
+        "P = 7e-4 a line and part of the shortest record, 1e-6 of the longest "
+        "(benchmarks/settings_derivations.py)",
     )
     line_nats: float = _setting(
         12.0,
         "nat",
         "Evidence of a line of a simulation above which it is known.",
-        "odds of 1.6e5 to 1: more than the number of frequencies of a spectrum",
+        "the largest evidence of 1000 lines of noise is 7.3 nats in 400 records of 24 blocks, "
+        "and 1.0 of 6000 blocks (benchmarks/settings_derivations.py)",
     )
     # thresholds from null records
     tail_share: float = _setting(
@@ -275,17 +389,18 @@ class Settings:
         "Share of the largest excess that the other averaging times of a region must have.",
         "choice: half of the largest deviation in amplitude; moves the averaging times of regions",
     )
-    common_time_share: float = _setting(
-        0.5,
-        "1",
-        "Share of the time of two regions above which they are one.",
-        "choice: the larger part",
-    )
     gap_time_share: float = _setting(
         0.25,
         "1",
         "Gap between two regions that are one, as a share of the longer.",
         "choice; moves the ends of regions",
+    )
+    line_tau_ratio: float = _setting(
+        4.0,
+        "1",
+        "Averaging time over that at which the Allan variance of a line is largest, up to "
+        "which the line shows.",
+        "that of a sine, sin(x)^4 / x^2, falls to 0.09 of its largest value above, to 0.15 below",
     )
     line_width_share: float = _setting(
         0.02,
@@ -319,6 +434,12 @@ class Settings:
         "1",
         "Share of the shorter of effect and mismatch that must overlap for them to coincide.",
         "choice: the ends of a region are known to one of its short windows",
+    )
+    outlier_law_error: float = _setting(
+        0.1,
+        "1",
+        "Relative error of number and size of outliers, as the law of their sizes is unknown.",
+        "choice; at least half of the share of outliers that is not seen",
     )
     score_error_share: float = _setting(
         0.3,

@@ -75,11 +75,11 @@ def lines_without_motion(task: Task, blocks: xr.Dataset, known: xr.Dataset) -> x
     line spectrum. The log is read again when a block has to be left out.
     """
     has_data = np.isfinite(blocks["power"].values).any(axis=-1)
-    moving = expect_known_motion(blocks, known)
+    moving = expect_known_motion(blocks, known, settings=task.settings)
     if not (moving & has_data).any():
         return blocks
     at_rest = without_motion(
         task.log, blocks, moving | ~has_data, restart_gap=task.restart_gap, progress=task.progress
     )
     lines = {name: at_rest[name] for name in ("line_power", "line_weight")}
-    return remove_known_lines(blocks.assign(lines), known)
+    return remove_known_lines(blocks.assign(lines), known, settings=task.settings)

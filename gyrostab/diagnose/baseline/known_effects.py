@@ -21,11 +21,13 @@ from gyrostab.diagnose.evidence.spectral_lines import LEAK_LINES, expected_lines
 from gyrostab.diagnose.predict.filter_response import band_response, frequencies_in_bands
 from gyrostab.diagnose.predict.linear_model import (
     cross_without,
+    moves_within_blocks,
     pair_rows,
     spread_by_gaps,
     unspread_share,
 )
 from gyrostab.diagnose.predict.windows import make_windows
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
 from gyrostab.physics.base import Effect, driver_error
 from gyrostab.physics.logger import LoggerFilter
@@ -45,14 +47,8 @@ __all__ = [
 Array = NDArray[np.float64]
 _LEAK_LINES = 100  # on either side, that a line leaks into; limits time
 _PLACES_BETWEEN = 4  # positions of a line on either side of a frequency of the spectrum
-#: Relative error of the power of a known line: more than twice that of its amplitude (4 %).
-_LINE_POWER_ERROR = 0.1
 _PEAK_POINTS = 1000  # within a step of a density
 _EVERYWHERE = "lattice"  # the anomaly of every sample
-_MIN_MOTION_RATIO = 5.0  # of a squared step of the mean over its noise, for motion; design choice
-_MAX_MOVING_SHARE = 0.5  # of the blocks that may be left out; design choice
-_MIN_LINE_SIGMA = 5.0  # by which a line exceeds the known one; design choice
-_MIN_LEAK_RATIO = 0.1  # of the noise; smaller leakage is subtracted as expected; design choice
 
 
 class KnownEffects(NamedTuple):
@@ -294,7 +290,9 @@ def _process_squares(active: _ActingEffect, blocks: xr.Dataset) -> dict[str, Arr
     return squares
 
 
-def expect_known_motion(blocks: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.bool_]:
+def expect_known_motion(
+    blocks: xr.Dataset, baseline: xr.Dataset, *, settings: Settings = DEFAULTS
+) -> NDArray[np.bool_]:
     """Find the blocks in which a known mean moves far above its noise, (axis, block).
 
     None on an axis where most blocks move. The mean of such a block is known, but not the motion
@@ -304,21 +302,21 @@ def expect_known_motion(blocks: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.
     ----------
     blocks, baseline : xarray.Dataset
     """
-    step = np.abs(np.diff(baseline["known_mean"].values, axis=1))
-    moved = np.maximum(np.pad(step, ((0, 0), (0, 1))), np.pad(step, ((0, 0), (1, 0))))
-    noise = baseline["spectrum"].values[..., 0]
-    moving = moved**2 * float(blocks.attrs["block_s"]) > _MIN_MOTION_RATIO * noise
-    return np.asarray(moving & (moving.mean(axis=1, keepdims=True) <= _MAX_MOVING_SHARE))
+    return moves_within_blocks(
+        baseline["known_mean"].values, baseline["spectrum"].values[..., 0], blocks, settings
+    )
 
 
-def remove_known_motion(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
+def remove_known_motion(
+    blocks: xr.Dataset, baseline: xr.Dataset, *, settings: Settings = DEFAULTS
+) -> xr.Dataset:
     """Drop powers, kurtosis and cross-spectra of blocks in which a known mean moves.
 
     Parameters
     ----------
     blocks, baseline : xarray.Dataset
     """
-    moving = expect_known_motion(blocks, baseline)
+    moving = expect_known_motion(blocks, baseline, settings=settings)
     if not moving.any():
         return blocks
     still = xr.DataArray(~moving, dims=("axis", "block"))
@@ -458,7 +456,9 @@ def _line_leakage(size: int, apart: float = 0.0) -> tuple[Array, Array, Array]:
     return inside[:, _PLACES_BETWEEN], np.average(inside, axis=1, weights=ends), inside.max(axis=1)
 
 
-def remove_known_lines(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
+def remove_known_lines(
+    blocks: xr.Dataset, baseline: xr.Dataset, *, settings: Settings = DEFAULTS
+) -> xr.Dataset:
     """Subtract the known steady lines from the line spectrum.
 
     The excess over a known line stays if it exceeds the model error of an effect and the scatter of
@@ -476,15 +476,14 @@ def remove_known_lines(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     with np.errstate(divide="ignore", invalid="ignore"):
         scatter = np.sqrt((noise**2 + 2.0 * noise * largest) / weight.values[..., None])
     above = power.values - noise - known
-    exceeds = (
-        power.values - noise - largest > _LINE_POWER_ERROR * largest + _MIN_LINE_SIGMA * scatter
-    )
+    error = settings.spectrum_error_share
+    exceeds = power.values - noise - largest > error * largest + settings.known_line_sigma * scatter
     padded_lines = np.pad(exceeds, ((0, 0), (0, 0), (LEAK_LINES, LEAK_LINES)))
     # With the lines that it leaks into.
     exceeds = np.lib.stride_tricks.sliding_window_view(
         padded_lines, 2 * LEAK_LINES + 1, axis=-1
     ).any(axis=-1)
-    freed = noise + np.where(exceeds | (largest < _MIN_LEAK_RATIO * noise), above, 0.0)
+    freed = noise + np.where(exceeds | (largest < error * noise), above, 0.0)
     freed = np.where(known > 0.0, np.maximum(freed, 0.0), power.values)
     return blocks.assign(
         line_power=power.copy(data=np.where(np.isfinite(power.values), freed, np.nan))

@@ -20,20 +20,17 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.posterior import average_blocks, fit_squares
 from gyrostab.diagnose.reduce.zero_bin import truncated_axes
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.noise import HOUR, URAD_PER_S
 
 __all__ = ["angle_share", "rounded_rates"]
 
-_MIN_STDERRS_ALL = 4.0  # by which all axes together must fall short of a counter's Q^2
-_MIN_STDERRS_AXIS = 2.0  # by which each axis must fall short of it; design choices
-#: Largest share of a counter's Q^2 for a rounded rate, on either side of 0: nearer to 0 than to 1.
-#: A filter takes more from the highest frequencies.
-_MAX_Q_SHARE = 0.5
-_MIN_VARIANCE_SHARE = 0.01  # of rounding in a sample: the spectrum is not known better
 _SERIES_TERMS = 40  # of the correlation series of `angle_share`
 
 
-def rounded_rates(blocks: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.bool_]:
+def rounded_rates(
+    blocks: xr.Dataset, baseline: xr.Dataset, *, settings: Settings = DEFAULTS
+) -> NDArray[np.bool_]:
     """Find the axes with a rounded or truncated rate, by the spectrum and the zero bin.
 
     Parameters
@@ -51,17 +48,23 @@ def rounded_rates(blocks: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.bool_]
     step = blocks["quantization_step"].values
     if not (step > 0.0).any():
         return np.zeros(step.shape, np.bool_)
-    return np.asarray(truncated_axes(blocks) | _rounded_by_spectrum(blocks, baseline, step))
+    return np.asarray(
+        truncated_axes(blocks) | _rounded_by_spectrum(blocks, baseline, step, settings)
+    )
 
 
 def _rounded_by_spectrum(
-    blocks: xr.Dataset, baseline: xr.Dataset, step: NDArray[np.float64]
+    blocks: xr.Dataset, baseline: xr.Dataset, step: NDArray[np.float64], settings: Settings
 ) -> NDArray[np.bool_]:
-    """Return the axes whose spectrum rules out the Q of an angle grid."""
+    """Return the axes whose spectrum rules out the Q of an angle grid.
+
+    The Q^2 of a rounded rate is nearer to 0 than to that of a counter of angles, on either side: a
+    filter takes more from the highest frequencies.
+    """
     if baseline.attrs.get("source") != "calibrated":
         from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 
-        baseline = calibrate_noise(blocks)
+        baseline = calibrate_noise(blocks, settings=settings)
     rate = float(blocks.attrs["sampling_rate_hz"])
     white = baseline["square"].sel(noise="N").values * HOUR * rate
     quiet = baseline["quiet"].values
@@ -75,17 +78,19 @@ def _rounded_by_spectrum(
     ratio = _fit_q_square(blocks, baseline) / angle_square
     error = baseline["square_stderr"].sel(noise="Q").values / angle_square
     with np.errstate(divide="ignore", invalid="ignore"):
-        known = (step**2 / 12.0 > _MIN_VARIANCE_SHARE * white) & np.isfinite(ratio) & (error > 0.0)
+        known = step**2 / 12.0 > settings.form_error_share * white
+        known &= np.isfinite(ratio) & (error > 0.0)
         shortfall = (1.0 - ratio) / error
     if not known.any():
         return known
     weight = error[known] ** -2.0  # one logger writes all axes in one way
     mean_ratio = float(weight @ ratio[known] / weight.sum())
-    if (1.0 - mean_ratio) * np.sqrt(weight.sum()) < _MIN_STDERRS_ALL or abs(
-        mean_ratio
-    ) > _MAX_Q_SHARE:
+    falls_short = (1.0 - mean_ratio) * np.sqrt(weight.sum()) >= settings.excess_sigma
+    if not falls_short or abs(mean_ratio) > settings.majority_share:
         return np.zeros(step.shape, np.bool_)
-    return np.asarray(known & (ratio < _MAX_Q_SHARE) & (shortfall > _MIN_STDERRS_AXIS))
+    return np.asarray(
+        known & (ratio < settings.majority_share) & (shortfall > settings.visible_sigma)
+    )
 
 
 def _fit_q_square(blocks: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.float64]:

@@ -40,14 +40,16 @@ def _distance_from_rest(blocks: xr.Dataset, settings: Settings) -> dict[str, Arr
             continue
         values = blocks[name].values.astype(np.float64)
         good = np.isfinite(values)
-        if good.sum() < max(settings.min_quiescent_blocks, values.size // 4):
+        if good.sum() < max(settings.min_quiescent_blocks, settings.quiescent_share * values.size):
             continue
         place = np.arange(values.size)
         filled = np.interp(place, place[good], values[good])
         if name.startswith("channel_vibration") or name == "channel_rotation_rate":
             size = np.abs(filled)
             distances[name] = size / max(
-                2.0 * float(np.quantile(size, 0.2)), 0.05 * float(size.max()), np.finfo(float).tiny
+                settings.calm_ratio * float(np.quantile(size, settings.calm_share)),
+                settings.rest_share * float(size.max()),
+                np.finfo(float).tiny,
             )
         elif name.startswith("channel_temperature"):
             smooth = (
@@ -58,7 +60,9 @@ def _distance_from_rest(blocks: xr.Dataset, settings: Settings) -> dict[str, Arr
             # Scatter of the slope by noise and digits.
             scatter = float(np.median(np.abs(np.diff(filled, 2)))) / (5.0 * step)
             distances[name] = slope / max(
-                0.3 * float(np.quantile(slope, 0.95)), 3.0 * scatter, np.finfo(float).tiny
+                settings.calm_slope_share * float(np.quantile(slope, 1.0 - settings.rest_share)),
+                settings.clear_sigma * scatter,
+                np.finfo(float).tiny,
             )
     if "moving" in blocks:
         # More than 1: not at rest.
@@ -142,7 +146,8 @@ def _drop_noisy_blocks(
             )
             kept = start & (deviation < settings.noisy_sigma)
             if (
-                kept.sum() < max(settings.min_quiescent_blocks, 0.3 * start.sum())
+                kept.sum()
+                < max(settings.min_quiescent_blocks, settings.quiescent_share * start.sum())
                 or (kept == quiescent[row]).all()
             ):
                 break

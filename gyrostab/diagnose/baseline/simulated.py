@@ -98,7 +98,7 @@ def measure_extra_statistics(
     coherency, error = _measure_coherency(
         simulated, expected * form[:, None], settings.coherency_probability
     )
-    lines, peaks = _measure_lines(simulated, expected, unexplained, settings.line_nats)
+    lines, peaks = _measure_lines(simulated, expected, unexplained, settings)
     return ExtraStatistics(form, form_shape, coherency, error, lines, peaks)
 
 
@@ -146,7 +146,7 @@ def _measure_coherency(
 
 
 def _measure_lines(
-    simulated: xr.Dataset, expected: Array, unexplained: NDArray[np.bool_], line_nats: float
+    simulated: xr.Dataset, expected: Array, unexplained: NDArray[np.bool_], settings: Settings
 ) -> tuple[Array, Array]:
     """Return the power of significant lines, with leakage, and of peaks near unexplained bands."""
     power, weight = simulated["line_power"].values, simulated["line_weight"].values
@@ -166,9 +166,9 @@ def _measure_lines(
         known = np.zeros(evidence_nats.shape[1], np.bool_)
         for _ in range(_MAX_LINES):
             place = int(np.argmax(np.where(known, -np.inf, evidence_nats[row])))
-            if known[place] or not evidence_nats[row, place] > line_nats:
+            if known[place] or not evidence_nats[row, place] > settings.line_nats:
                 break
-            known |= line_skirt(simulated, str(axis), place)
+            known |= line_skirt(simulated, str(axis), place, settings)
         good = (weight[row] > 0.0) & np.isfinite(power[row]).all(axis=1)
         if not good.any():
             continue

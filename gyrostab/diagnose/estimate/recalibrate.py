@@ -33,14 +33,13 @@ from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import State, initial_state, spread_by_gaps
 from gyrostab.diagnose.predict.windows import make_windows, rebuild_variant
+from gyrostab.diagnose.reduce.block_statistics import MIN_BLOCKS
 from gyrostab.physics.base import Effect
 
 __all__ = ["recalibrate", "remove_fast_switching", "with_noise"]
 
 Array = NDArray[np.float64]
 LEVEL_GROUPS = 150  # of blocks of similar level, over which powers are averaged
-MIN_BLOCKS = 24  # as the shortest record that is diagnosed
-MIN_INFORMATION_SHARE = 1e-4  # of its information, that N must keep with the effects in the model
 
 
 @dataclass
@@ -217,7 +216,7 @@ def _collect_effects(
             and effect is not None
             and not in_power
             and any(
-                component.statistic.has_power_of_effect(component, blocks)
+                component.statistic.has_power_of_effect(component, identifications.state)
                 for component in components
             )
         ):
@@ -293,7 +292,7 @@ def _fit_noise(
             * fit.columns[:, 1] ** 2
         ).sum()
     )
-    if not information[1, 1] > MIN_INFORMATION_SHARE * plain or not square[1] > 0.0:
+    if not information[1, 1] > state.settings.min_information_share * plain or not square[1] > 0.0:
         return None
     square = np.maximum(square, [0.0, floor_square(fit), 0.0, 0.0])
     count = blocks.sizes["axis"]

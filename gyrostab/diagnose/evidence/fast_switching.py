@@ -39,10 +39,7 @@ Array = NDArray[np.float64]
 _AR_ORDERS = (0, 1, 2, 4, 8, 16, 32)  # of the autoregression that approximates any spectrum
 _MAX_MEANS = 12_000  # in the search of a course; sub-blocks are merged beyond; limits time
 _PARTS_PER_SUB_BLOCK = 64  # each on one level; design choice
-_BETWEEN_SHARE = 0.1  # distance of a share from a level, from which it is between the levels
 _SURROGATE_RECORDS = 16  # limits time
-_MAX_BELOW_SIGMA = 4.0  # below the likelihood of surrogate records; design choice
-_MISFIT_NATS_PER_SWITCH = 0.2  # tolerated model error; design choice
 _MIN_SAMPLE_SHARE = 0.5  # of a mean that must be present; design choice
 _MIN_WHITE_RATIO = 1e-4  # lowest white variance over the expected one; design choice
 _NORMAL_SQUARE_MEDIAN = 0.455  # median of the square of a standard normal variable
@@ -144,7 +141,7 @@ def switching_evidence(
         evidence_nats -= np.log(2.0)
         share = np.repeat(courses.share[0].reshape(shape), merged, axis=1)
         levels_found = courses.switch_count[0] >= settings.min_switches and evidence_nats > 0.0
-        similar = levels_found and _is_like_two_levels(courses, variance, present)
+        similar = levels_found and _is_like_two_levels(courses, variance, present, settings)
         is_switching = similar and beyond > settings.two_level_nats
         refuted = (
             levels_found
@@ -167,7 +164,7 @@ def switching_evidence(
 
 
 def _is_like_two_levels(
-    courses: TelegraphCourses, variance: Array, present: NDArray[np.bool_]
+    courses: TelegraphCourses, variance: Array, present: NDArray[np.bool_], settings: Settings
 ) -> bool:
     """Return whether the bias is between its levels as rarely as a switching bias.
 
@@ -182,24 +179,22 @@ def _is_like_two_levels(
         count=_SURROGATE_RECORDS,
         rng=np.random.default_rng(0),
     )
-    similar = _count_equal_neighbours(share)
+    similar = _count_equal_neighbours(share, settings.active_share)
     return bool(
         courses.log[0]
         > log.mean()
-        - _MAX_BELOW_SIGMA * log.std()
-        - _MISFIT_NATS_PER_SWITCH * float(courses.switch_count[0])
-        and _count_equal_neighbours(courses.share)[0]
-        < similar.mean() + _MAX_BELOW_SIGMA * max(float(similar.std()), 1.0)
+        - settings.excess_sigma * log.std()
+        - settings.misfit_nats * float(courses.switch_count[0])
+        and _count_equal_neighbours(courses.share, settings.active_share)[0]
+        < similar.mean() + settings.excess_sigma * max(float(similar.std()), 1.0)
     )
 
 
-def _count_equal_neighbours(share: Array) -> Array:
+def _count_equal_neighbours(share: Array, least: float) -> Array:
     """Count neighbouring sub-blocks (record,) with equal shares, between the levels."""
-    between = (share > _BETWEEN_SHARE) & (share < 1.0 - _BETWEEN_SHARE)
+    between = (share > least) & (share < 1.0 - least)
     return np.asarray(
-        (between[:, 1:] & between[:, :-1] & (np.abs(np.diff(share, axis=1)) < _BETWEEN_SHARE)).sum(
-            axis=1
-        )
+        (between[:, 1:] & between[:, :-1] & (np.abs(np.diff(share, axis=1)) < least)).sum(axis=1)
     )
 
 

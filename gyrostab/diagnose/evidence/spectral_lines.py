@@ -10,6 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.folds import FOLDS
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 
 __all__ = [
     "LEAK_LINES",
@@ -27,7 +28,6 @@ _LEVEL_LINES = 25  # lines on each side that define the level; design choice
 _SIDE_LINES = 8  # lines next to it, on either side, that a line must exceed; design choice
 _EDGE_LINES = 2  # lowest lines, without lines below them
 _MIN_LEVEL_RATIO = 1e-3  # of the median level, a lower limit of the level; design choice
-_MIN_SKIRT_SIGMA = 3.0  # above the level; the skirt of a line ends below; design choice
 _MAX_SKIRT_LINES = 40  # design choice
 
 
@@ -131,7 +131,9 @@ def local_level(total: Array) -> Array:
     return np.asarray(medians[..., low] + (place - low) * (medians[..., high] - medians[..., low]))
 
 
-def line_skirt(blocks: xr.Dataset, axis: str, place: int) -> NDArray[np.bool_]:
+def line_skirt(
+    blocks: xr.Dataset, axis: str, place: int, settings: Settings = DEFAULTS
+) -> NDArray[np.bool_]:
     """Find the lines that belong to the one at `place`: its leakage and its skirt.
 
     The skirt extends on both sides until the power falls to the level. A line with a wandering
@@ -142,7 +144,7 @@ def line_skirt(blocks: xr.Dataset, axis: str, place: int) -> NDArray[np.bool_]:
     good = (weight > 0) & np.isfinite(power).all(axis=1)
     total = (power[good] * weight[good, None]).sum(axis=0) / max(float(weight[good].sum()), 1e-300)
     limit = local_level(total[None])[0] * (
-        1.0 + _MIN_SKIRT_SIGMA / np.sqrt(max(float(weight[good].sum()), 1.0))
+        1.0 + settings.clear_sigma / np.sqrt(max(float(weight[good].sum()), 1.0))
     )
     in_skirt = np.abs(np.arange(total.size) - place) <= LEAK_LINES
     for step in (-1, 1):

@@ -22,9 +22,6 @@ __all__ = ["excess_low_frequency_noise", "variance_fluctuation", "with_neighbour
 Array = NDArray[np.float64]
 #: Flicker and random walk that are tried, as multiples of the least that the record can show.
 _NOISE_STEPS = (1.0, 3.0, 10.0, 30.0)
-#: Deviation of the level of one block, in standard deviations, beyond which it is clipped.
-MAX_LEVEL_SIGMA = 8.0
-MIN_BLOCKS = 8  # fewer do not show a course in time
 
 
 def with_neighbouring_variants(
@@ -91,7 +88,7 @@ def variance_fluctuation(state: State, axis: str) -> float:
     row = state.axes.index(axis)
     level, variance, columns = _power_levels(state, row, axis)
     present = np.isfinite(level) & np.isfinite(variance) & ~state.masked[row]
-    if present.sum() < MIN_BLOCKS:
+    if present.sum() < state.settings.min_rest_blocks:
         return 0.0
     step = float(state.blocks.attrs["block_s"])
     usual = float(np.median(variance[present]))
@@ -103,10 +100,8 @@ def variance_fluctuation(state: State, axis: str) -> float:
         )
     )
     safe = np.where(present, variance, usual)
-    error = np.sqrt(safe)
-    values = np.clip(
-        np.where(present, level, 0.0), -MAX_LEVEL_SIGMA * error, MAX_LEVEL_SIGMA * error
-    )[:, None]
+    most = state.settings.max_level_sigma * np.sqrt(safe)
+    values = np.clip(np.where(present, level, 0.0), -most, most)[:, None]
     products = mean_products(values, columns, variance=safe, step=step, K=K, B=B, present=present)
     gram = products.gram + 1e-9 * np.eye(columns.shape[1]) * (
         1.0 + np.trace(products.gram, axis1=1, axis2=2)[:, None, None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
@@ -21,6 +22,7 @@ from gyrostab.diagnose.predict.windows import (
     make_windows,
     predict_exogenous,
 )
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS
 from gyrostab.errors import OptionError
 from gyrostab.noise import HOUR
@@ -28,19 +30,16 @@ from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Prediction, Windows
 from gyrostab.physics.registry import effects
 
-__all__ = ["LARGEST_SIZE", "effect_candidates"]
+__all__ = ["effect_candidates", "largest_size"]
 
 Array = NDArray[Any]
 _MAX_VALUES = 60  # of a nuisance parameter; limits time
 _MAX_VARIANTS = 200  # of a candidate; limits time
-#: Effect -> largest plausible size of each of its parameters. Design choice.
-LARGEST_SIZE = {"misalignment": 20.0, "earth_rate": 20.0}
-_MIN_SIZE_STDERRS = 3.0  # of an effect of the largest size, to be tried; design choice
 _SAME_DESIGN = {"fringe_hop": "bias_jump"}  # effects with the same design; the size decides
 
 
 def effect_candidates(
-    blocks: xr.Dataset, coefficient: xr.DataArray
+    blocks: xr.Dataset, coefficient: xr.DataArray, *, settings: Settings = DEFAULTS
 ) -> tuple[list[Candidate], dict[str, str]]:
     """Build the candidates of all registered effects that this record can show.
 
@@ -83,7 +82,7 @@ def effect_candidates(
             reasons[name] = "not identifiable: the quantization grid is too coarse"
             continue
         for drivers in _driver_assignments(kind, blocks, units):
-            added, why = _candidates_of_effect(kind, blocks, drivers, coefficient)
+            added, why = _candidates_of_effect(kind, blocks, drivers, coefficient, settings)
             built += added
             reason = reason or why
         found += built
@@ -149,7 +148,11 @@ def _matching_channels(
 
 
 def _candidates_of_effect(
-    kind: type[Effect], blocks: xr.Dataset, drivers: dict[str, str], coefficient: xr.DataArray
+    kind: type[Effect],
+    blocks: xr.Dataset,
+    drivers: dict[str, str],
+    coefficient: xr.DataArray,
+    settings: Settings,
 ) -> tuple[list[Candidate], str]:
     """Build the candidates of an effect with its channels, by statistic; or say why not."""
     if kind.channels and not drivers:
@@ -169,7 +172,7 @@ def _candidates_of_effect(
                 (
                     values,
                     _drop_hidden_means(
-                        kind.name, predict_exogenous(effect, windows), blocks, coefficient
+                        kind.name, predict_exogenous(effect, windows), blocks, coefficient, settings
                     ),
                 )
             )
@@ -232,15 +235,28 @@ def _thin_out(values: Array, most: int) -> list[Any]:
     return list(values[every // 2 :: every])
 
 
+def largest_size(effect: str, settings: Settings) -> float:
+    """Return the largest plausible size of the parameters of an effect, infinite for most."""
+    return {
+        "misalignment": 1e3 * settings.max_misalignment_share,  # mrad
+        "earth_rate": settings.max_earth_rate,
+    }.get(effect, math.inf)
+
+
 def _drop_hidden_means(
-    name: str, prediction: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
+    name: str,
+    prediction: Prediction,
+    blocks: xr.Dataset,
+    coefficient: xr.DataArray,
+    settings: Settings,
 ) -> Prediction:
     """Drop predicted means that white noise hides on every axis even at the largest size.
 
     An axis at rest cannot leak into others: its noise, taken for motion, would only blur real
     motion.
     """
-    if name not in LARGEST_SIZE or not prediction.mean:
+    largest = largest_size(name, settings)
+    if math.isinf(largest) or not prediction.mean:
         return prediction
     good = np.isfinite(blocks["mean"].values)
     white = coefficient.sel(term="N").values * np.sqrt(HOUR / float(blocks.attrs["block_s"]))
@@ -248,6 +264,6 @@ def _drop_hidden_means(
     for column, design in prediction.mean.items():
         rows = np.where(good, np.broadcast_to(np.atleast_2d(design), good.shape), np.nan)
         moved = np.sqrt(np.nansum((rows - np.nanmean(rows, axis=1, keepdims=True)) ** 2, axis=1))
-        if (LARGEST_SIZE[name] * moved > _MIN_SIZE_STDERRS * white).any():
+        if (largest * moved > settings.clear_sigma * white).any():
             mean[column] = design
     return replace(prediction, mean=mean)

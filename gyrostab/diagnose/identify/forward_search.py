@@ -73,7 +73,7 @@ def name_effects(
     Identifications
     """
     folds = fold_blocks(blocks)
-    effects, reasons = effect_candidates(blocks, baseline["coefficient"])
+    effects, reasons = effect_candidates(blocks, baseline["coefficient"], settings=settings)
     candidates = [*effects, *nuisance_alternatives(blocks)]
     start = initial_state(blocks, baseline, settings=settings)
     best, count_evidence = _score_null_records(
@@ -139,7 +139,8 @@ def _score_null_records(
         kept.append(chunk[[name for name in expected.sums if name in chunk]])
         records += chunk.sizes["record"]
         progress("naming", 0, records)
-    count_evidence = CountEvidence.gathered(expected, rounded_rates(state.blocks, state.baseline))
+    rounded = rounded_rates(state.blocks, state.baseline, settings=state.settings)
+    count_evidence = CountEvidence.gathered(expected, rounded)
     best = []
     for linear_sums, chunk in zip(sums, kept, strict=True):
         count_sums = evidence_by_effect(

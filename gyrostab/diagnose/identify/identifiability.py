@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from gyrostab.diagnose.evidence.telegraph import telegraph_evidence
-from gyrostab.diagnose.identify.effect_candidates import LARGEST_SIZE
+from gyrostab.diagnose.identify.effect_candidates import largest_size
 from gyrostab.diagnose.identify.identification import Identification, Unidentified
 from gyrostab.diagnose.identify.jumps import is_lasting, is_sudden, lead_to_levels
 from gyrostab.diagnose.identify.logger_filters import fits_all_axes
@@ -145,10 +145,9 @@ def _is_component_physical(component: Component, state: State) -> bool:
         < state.settings.min_fringe_step
     ):
         return False
-    if effect in LARGEST_SIZE and component.variant.columns[0] != "any":
-        return bool(
-            np.abs(component_mixture(component, state).moments()[0]).max() <= LARGEST_SIZE[effect]
-        )
+    largest = largest_size(effect, state.settings)
+    if np.isfinite(largest) and component.variant.columns[0] != "any":
+        return bool(np.abs(component_mixture(component, state).moments()[0]).max() <= largest)
     if statistic.is_linear_in_means and not _is_in_range(component, state):
         return False
     if statistic.is_power and not _is_above_least(component, state):

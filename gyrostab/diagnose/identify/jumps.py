@@ -18,7 +18,6 @@ Array = NDArray[np.float64]
 _JUMP, _INSTANT = "bias_jump", "at"
 _TRANSITION_BLOCKS = (4, 8)  # lengths of the gradual changes that a jump is compared with
 EVENT_LENGTHS = 48  # that are tried, from two blocks up
-MAX_EVENT_SHARE = 0.1  # of the record, that an event lasts at most, but eight blocks always
 MIN_EVENT_LIMIT_BLOCKS = 8.0
 MIN_LEVEL_BLOCKS = 3  # before and after an event, that determine the level there
 _VARIANCE_FACTORS = (10.0, 100.0, 1e3, 1e4, 1e5)  # over the usual variance of the means
@@ -173,7 +172,9 @@ def _event_spans(component: Component, state: State) -> list[tuple[int, int]]:
     at = round(float(component.variant.values[_INSTANT]) / block)
     lengths = np.unique(
         np.geomspace(
-            2.0, max(MAX_EVENT_SHARE * block_count, MIN_EVENT_LIMIT_BLOCKS), EVENT_LENGTHS
+            2.0,
+            max(state.settings.max_event_share * block_count, MIN_EVENT_LIMIT_BLOCKS),
+            EVENT_LENGTHS,
         ).astype(int)
     ).tolist()
     both = [span for length in lengths for span in ((at, at + length), (at - length, at))]

@@ -25,7 +25,6 @@ from gyrostab.physics.registry import effects
 __all__ = ["fit_filter_sizes", "fits_all_axes", "without_slopes"]
 
 Array = NDArray[np.float64]
-MIN_LINE_SHARE = 0.5  # of its evidence, that a line must keep with a filter in the model
 ZOOM_POINTS, ZOOM_STEPS = 21, 4  # of the refinement of a cutoff on its grid
 GRID_REACH = 0.25  # distance in ln(cutoff) of one place on the grid of filters
 MIN_ELSEWHERE_SHARE = 0.02  # of the probability, from which on other places widen the interval
@@ -51,7 +50,9 @@ def without_slopes(
         key: sum(max(component.evidence_nats, 0.0) for component in components[key])
         for key in lines
     }
-    real = {key for key in lines if left.get(key, 0.0) > MIN_LINE_SHARE * before[key]}
+    real = {
+        key for key in lines if left.get(key, 0.0) > state.settings.majority_share * before[key]
+    }
     return [
         key for key in passing if (key in real if key in lines else key not in filters or not real)
     ]

@@ -22,7 +22,6 @@ from gyrostab.progress import Stage, no_stage
 __all__ = ["moving_blocks", "unexplained_motion", "without_motion"]
 
 Array = NDArray[np.float64]
-NEIGHBOUR_BLOCKS = 2  # to either side, that belong to a motion
 #: Share of the blocks whose means lie closest together, and the width of the central quarter of a
 #: normal law in standard deviations: 2 * 0.3186.
 CORE_SHARE, CORE_WIDTH_SIGMA = 0.25, 0.637
@@ -79,7 +78,7 @@ def _moving_blocks_of_axis(mean: Array, settings: Settings) -> NDArray[np.bool_]
         return nothing
     place = np.flatnonzero(good)
     near = (
-        np.convolve(is_moving[place], np.ones(2 * NEIGHBOUR_BLOCKS + 1), "same") > 0.5
+        np.convolve(is_moving[place], np.ones(2 * settings.motion_margin_blocks + 1), "same") > 0.5
     )  # neighbours among the blocks that are there
     out = nothing.copy()
     out[place] = near

@@ -59,8 +59,6 @@ __all__ = ["Search"]
 MAX_EFFECTS = 10
 #: Lines are counted apart: whatever rotates or switches makes combs of them.
 MAX_LINES = 40
-#: Powers are weighted anew with the strongest effect when its evidence exceeds so many thresholds.
-REWEIGHT_THRESHOLDS = 3.0
 #: Effects that change the white variance of the means, which the calibration then misjudges.
 _SPECTRAL_SHAPES = ("logger_filter", "held_samples", "gauss_markov", "telegraph")
 #: Sample counts of zeros: a sample is zero for one reason only.
@@ -204,7 +202,8 @@ class Search:
             strongest = max(powers, key=_positive_evidence, default=None)
             if (
                 strongest is None
-                or _positive_evidence(strongest) < REWEIGHT_THRESHOLDS * self.threshold
+                or _positive_evidence(strongest)
+                < self.settings.reweight_thresholds * self.threshold
             ):
                 break
             trial = condition_on(state, find_components(strongest, settings=self.settings))

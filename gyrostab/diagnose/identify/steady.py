@@ -11,12 +11,11 @@ from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture
+from gyrostab.diagnose.reduce.accumulate import RECORD_PARTS
 
 __all__ = ["is_always_present"]
 
 _STEADY = ("gauss_markov", "telegraph", "logger_filter")
-RECORD_PARTS = 8  # of the record, that are compared
-MIN_PART_BLOCKS = 3
 
 
 def is_always_present(component: Component, state: State) -> bool:
@@ -31,11 +30,7 @@ def is_always_present(component: Component, state: State) -> bool:
     state : State
         With all other effects in the model.
     """
-    if (
-        component.candidate.effect not in _STEADY
-        or not component.statistic.is_power
-        or state.blocks.sizes["block"] < RECORD_PARTS * MIN_PART_BLOCKS
-    ):
+    if component.candidate.effect not in _STEADY or not component.statistic.is_power:
         return True
     state = replace(state, weight=condition_on(state, [component]).weight)
     size, error = np.array(

@@ -19,7 +19,6 @@ __all__ = ["TIME_SHIFTS", "passes_time_shift_test"]
 
 #: Number of time-shifted surrogates: two of them make the allowed share of 1 %.
 TIME_SHIFTS = 200
-MIN_SURROGATES = 20
 SHIFT_RANGE = (0.05, 0.95)  # of the record
 _FOLLOWING_AXES = ("misalignment",)  # effects that follow the means of other axes
 
@@ -80,7 +79,7 @@ def passes_time_shift_test(
         values = np.array([one.evidence_nats[0, row] for one in found])
         real += float(values[0])
         shifted += values[1:]
-    if valid.sum() < MIN_SURROGATES:
+    if valid.sum() < state.settings.min_surrogates:
         return True, np.nan
     p_value = float(np.mean(shifted[valid] >= real))
     return p_value <= state.settings.surrogate_share, p_value

@@ -27,9 +27,6 @@ __all__ = [
     "renew_component",
 ]
 
-#: Share of the variance of a switching course that a channel explains if it may be its cause.
-LEADING_SHARE = 0.5
-
 
 def put_followers_first(
     passing: list[str], components: Mapping[str, Sequence[Component]], state: State
@@ -57,7 +54,7 @@ def _has_possible_cause(component: Component, led: Sequence[Component], state: S
     beside = [one for one in led if component.statistic.is_switching and one.row == component.row]
     return any(
         one.evidence_nats >= component.evidence_nats
-        or _explained_share(component, one, state) > LEADING_SHARE
+        or _explained_share(component, one, state) > state.settings.majority_share
         for one in beside
     )
 

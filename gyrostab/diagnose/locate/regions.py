@@ -42,7 +42,7 @@ def merge_regions(regions: Sequence[Region], *, settings: Settings = DEFAULTS) -
         for other in kept:
             if not _are_alike(region, other, settings):
                 continue
-            if _common_share(region, other) > settings.common_time_share or _are_adjacent(
+            if _common_share(region, other) > settings.majority_share or _are_adjacent(
                 region, other, settings
             ):
                 _extend_region(other, region, settings)
@@ -103,7 +103,7 @@ def _are_adjacent(one: Region, other: Region, settings: Settings) -> bool:
 
 def _extend_region(region: Region, other: Region, settings: Settings) -> None:
     """Extend a region to another one."""
-    if _common_share(region, other) <= settings.common_time_share:
+    if _common_share(region, other) <= settings.majority_share:
         region["begin"], region["end"] = (
             min(region["begin"], other["begin"]),
             max(region["end"], other["end"]),

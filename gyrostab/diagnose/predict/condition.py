@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.evidence.held_out import noise_columns
 from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.linear_model import State, pair_rows
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 
 __all__ = [
     "MIN_POWER_RATIO",
@@ -29,7 +30,6 @@ __all__ = [
 Array = NDArray[np.float64]
 #: Least fitted power over the expected one. Design choice.
 MIN_POWER_RATIO = 0.2
-_MAX_LOG_POWER_STEP = 0.2  # of noise, from block to block, for usable tails; design choice
 
 
 def condition_on(state: State, components: list[Component]) -> State:
@@ -91,7 +91,9 @@ def refit_weights(state: State, *, rounds: int = 4) -> State:
                 np.stack([np.broadcast_to(one, weight.shape[1:]) for one in named], axis=-1),
                 rounds,
             )[0]
-    return replace(state, weight=weight, blocks=drop_changed_tails(state.blocks, weight))
+    return replace(
+        state, weight=weight, blocks=drop_changed_tails(state.blocks, weight, state.settings)
+    )
 
 
 def power_shares(state: State, axis: str, *, rounds: int = 4) -> Array:
@@ -104,7 +106,9 @@ def power_shares(state: State, axis: str, *, rounds: int = 4) -> Array:
     return np.stack([size * one for size, one in zip(sizes, named, strict=True)])
 
 
-def drop_changed_tails(blocks: xr.Dataset, expected: Array) -> xr.Dataset:
+def drop_changed_tails(
+    blocks: xr.Dataset, expected: Array, settings: Settings = DEFAULTS
+) -> xr.Dataset:
     """Drop kurtosis and outliers that a changing noise level explains.
 
     Two levels in one block have tails that neither level has. Another noise level has another
@@ -117,10 +121,10 @@ def drop_changed_tails(blocks: xr.Dataset, expected: Array) -> xr.Dataset:
         Expected power.
     """
     level = np.log(expected @ (blocks["band_high"].values - blocks["band_low"].values))
-    step = np.abs(np.diff(level, axis=1)) > _MAX_LOG_POWER_STEP
+    step = np.abs(np.diff(level, axis=1)) > settings.max_level_step
     turns = np.pad(step, ((0, 0), (1, 0))) | np.pad(step, ((0, 0), (0, 1)))
     unusual = turns | (
-        np.abs(level - np.median(level, axis=1, keepdims=True)) > _MAX_LOG_POWER_STEP
+        np.abs(level - np.median(level, axis=1, keepdims=True)) > settings.max_level_step
     )
     left_out = {"kurtosis": (unusual, np.nan), "outliers": (turns, 0)}
     return blocks.assign(

@@ -28,6 +28,7 @@ __all__ = [
     "given_columns",
     "initial_state",
     "mix_with_mean",
+    "moves_within_blocks",
     "pair_rows",
     "power_column",
     "real_and_imaginary",
@@ -147,6 +148,22 @@ def pair_rows(blocks: xr.Dataset) -> list[tuple[str, ...]]:
         (str(a), str(b))
         for a, b in zip(blocks["first"].values, blocks["second"].values, strict=True)
     ]
+
+
+def moves_within_blocks(
+    mean: Array, density: Array, blocks: xr.Dataset, settings: Settings
+) -> NDArray[np.bool_]:
+    """Find the blocks in which a mean (..., block) moves far above noise of this density.
+
+    None where most blocks move. A step of D in the middle of a block of T seconds adds the power
+    D^2 T / pi^2 to its lowest frequency, 1 / T.
+    """
+    step = np.abs(np.diff(mean, axis=-1))
+    sides = [(0, 0)] * (step.ndim - 1)
+    moved = np.maximum(np.pad(step, [*sides, (0, 1)]), np.pad(step, [*sides, (1, 0)]))
+    moving = moved**2 * float(blocks.attrs["block_s"]) > settings.step_power_ratio * density
+    is_rare = moving.mean(axis=-1, keepdims=True) <= settings.majority_share
+    return np.asarray(moving & is_rare)
 
 
 def cross_without(blocks: xr.Dataset, left_out: NDArray[np.bool_]) -> xr.DataArray:

@@ -49,10 +49,10 @@ _BLOCK_S = 20.0  # default block; design choice
 _MIN_DEFAULT_BLOCKS = 90  # shorter blocks in shorter records; design choice
 _MAX_BLOCKS = 6000  # longer blocks in longer records; limits memory and time
 _MIN_BLOCK_SAMPLES = 100  # of a default block; design choice
-_MIN_BLOCKS = 24  # fewer are refused: held-out stretches and calibration need them
+MIN_BLOCKS = 24  # fewer are refused: held-out stretches and calibration need them
 _MAX_SMOOTHING_BLOCKS = 2.0  # longest time scale of the smoothing of a channel; design choice
 _STEP_VALUES_PER_BLOCK = 256  # values from which the quantization step is found; limits time
-_MIN_MEAN_SHARE = 0.1  # of a block that must be present for its mean; design choice
+MIN_MEAN_SHARE = 0.1  # of a block that must be present for its mean; design choice
 _RATE_UNIT = INNER["rate"]
 _MIN_NEIGHBOUR_RATIO = 2.0  # times expected density from which noise near an order is significant
 
@@ -93,12 +93,12 @@ def block_samples(size: int, rate: float, block: Any = None) -> int:
                 f"block {block!r} holds {length} samples at {rate:g} Hz; "
                 f"a block needs 16 ({16 / rate:g} s) at least"
             )
-    if size < _MIN_BLOCKS * length:
-        what = f"{_MIN_BLOCKS} blocks of {length / rate:g} s"
+    if size < MIN_BLOCKS * length:
+        what = f"{MIN_BLOCKS} blocks of {length / rate:g} s"
         raise OptionError(
             f"the record of {size / rate:.4g} s ({size} samples at {rate:g} Hz) "
             "is too short to diagnose: "
-            f"it must hold {what}, {_MIN_BLOCKS * length / rate:g} s at least"
+            f"it must hold {what}, {MIN_BLOCKS * length / rate:g} s at least"
             + ("; give a shorter block" if block is not None else "")
         )
     return length
@@ -215,7 +215,7 @@ def _label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> 
     axes = slice(0, work.axes)
     counts, moments = work.counts[axes], work.moments[axes]
     present = counts[..., 0]
-    enough = present >= max(_MIN_MEAN_SHARE * work.length, 1)
+    enough = present >= max(MIN_MEAN_SHARE * work.length, 1)
     with np.errstate(invalid="ignore", divide="ignore"):
         kurtosis = moments[..., 2] / moments[..., 1] ** 2 - 3.0
     peaks, outliers = count_outliers(work.histogram, work.peaks)

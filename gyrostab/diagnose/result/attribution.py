@@ -150,7 +150,8 @@ def attribute_mismatches(
         {str(name): found[name].values[number] for name in found.data_vars}
         for number in range(found.sizes["mismatch"])
     ]
-    scores = statistic_scores(blocks, after, null, regions, identified, still=still)
+    score_with = partial(statistic_scores, still=still, settings=settings)
+    scores = score_with(blocks, after, null, regions, identified)
     known: dict[tuple[int, ...], Scores] = {(): scores}
 
     def left(region: Mapping[str, Any], out: Sequence[Identification]) -> tuple[float, float]:
@@ -165,7 +166,7 @@ def attribute_mismatches(
                 for number, identification in enumerate(identified)
                 if number not in chosen
             ]
-            known[chosen] = statistic_scores(blocks, without(out), null, regions, rest, still=still)
+            known[chosen] = score_with(blocks, without(out), null, regions, rest)
         return score_left(region, known[chosen], null, level, settings.score_error_share)
 
     when = [_explained_spans(identification, blocks, settings) for identification in identified]
@@ -248,7 +249,8 @@ def drop_expected(
         one
         for one in expected
         if any(
-            component.statistic.is_count and find_anomalous_blocks(component, blocks).any()
+            component.statistic.is_count
+            and find_anomalous_blocks(component, blocks, settings).any()
             for component in one.components
         )
     ]
@@ -321,7 +323,7 @@ def _moving_spans(
 ) -> list[tuple[float, float]]:
     """Return the blocks [s] in which an effect moves the rate of an axis within the block."""
     axes = [str(axis) for axis in blocks["axis"].values]
-    moving = expect_known_motion(blocks, after)
+    moving = expect_known_motion(blocks, after, settings=settings)
     there = np.zeros(blocks.sizes["block"], np.bool_)
     for component in (
         component

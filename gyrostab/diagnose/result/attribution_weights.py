@@ -33,6 +33,7 @@ def statistic_scores(
     identified: Iterable[Identification] = (),
     *,
     still: xr.Dataset | None = None,
+    settings: Settings = DEFAULTS,
 ) -> Scores:
     """Score the recording against a baseline with effects.
 
@@ -41,13 +42,14 @@ def statistic_scores(
     lines of `still`, by default those of `blocks`.
     """
     out = []
-    blocks = remove_known_motion(blocks, after)
+    blocks = remove_known_motion(blocks, after, settings=settings)
     after = _with_shared_lines(blocks, after, identified := list(identified))
     seen = mask_anomalous_blocks(
         blocks,
         [component for identification in identified for component in identification.components],
+        settings,
     )
-    turns_left_out = drop_changed_tails(blocks, after["spectrum"].values)
+    turns_left_out = drop_changed_tails(blocks, after["spectrum"].values, settings)
     lines = seen
     if still is not None:
         lines = seen.assign({name: still[name] for name in ("line_power", "line_weight")})

@@ -179,7 +179,9 @@ def measure_evidence(
         if component.statistic.is_count
     )
     clean = mask_anomalous_blocks(
-        blocks, [*_components(identified), *_components(without_telegraph.expected)]
+        blocks,
+        [*_components(identified), *_components(without_telegraph.expected)],
+        identifications.state.settings,
     )
 
     def train(chosen: Identifications, known: NDArray[np.bool_]) -> xr.Dataset:

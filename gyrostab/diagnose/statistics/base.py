@@ -275,7 +275,7 @@ class Statistic:
         given = self.condition(state, component).given
         return 0.0, given.get(("power", axis), []), given.get(("mean", axis), [])
 
-    def has_power_of_effect(self, component: Component, blocks: xr.Dataset) -> bool:
+    def has_power_of_effect(self, component: Component, state: State) -> bool:
         """Return whether only the effect itself, and no column, gives the power of a component."""
         return False
 

@@ -201,7 +201,7 @@ class CrossSpectrum(Statistic):
         """Return nothing: only the effect itself gives the power of each axis."""
         return 0.0, [], []
 
-    def has_power_of_effect(self, component: Component, blocks: xr.Dataset) -> bool:
+    def has_power_of_effect(self, component: Component, state: State) -> bool:
         """Return True: the powers of the axes have no column."""
         return True
 

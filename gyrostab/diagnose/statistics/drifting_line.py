@@ -12,6 +12,7 @@ from scipy.special import log_ndtr
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines, local_level
 from gyrostab.diagnose.statistics.base import Statistic
 from gyrostab.diagnose.statistics.scores import (
+    SINE_TAU_CYCLES,
     Array,
     Windows,
     cube_root_score,
@@ -31,9 +32,6 @@ _MAX_CELL_SIGMA, _MAX_PART_SIGMA = 4.0, 3.0
 _MAX_LINES = 250  # more are averaged in groups; limits time
 _INDEPENDENT_SHARE = 0.2  # of the paths that are tried; estimate
 _MAX_EXPECTED_PATHS = 20.0  # that noise has; beyond, a score is as low as any
-_ADEV_PEAK_PRODUCT = (
-    0.371  # tau times frequency at which the Allan variance of a sine peaks; derived
-)
 
 
 class DriftingLine(Statistic):
@@ -208,6 +206,6 @@ def _path_columns(frequency: Array) -> dict[str, Any]:
             f"drifting {middle[a]:.3g} {middle[b]:.3g}"
             for a, b in zip(begin_section, end_section, strict=True)
         ],
-        "tau_min_s": _ADEV_PEAK_PRODUCT / edges[np.maximum(begin_section, end_section) + 1],
-        "tau_max_s": _ADEV_PEAK_PRODUCT / edges[np.minimum(begin_section, end_section)],
+        "tau_min_s": SINE_TAU_CYCLES / edges[np.maximum(begin_section, end_section) + 1],
+        "tau_max_s": SINE_TAU_CYCLES / edges[np.minimum(begin_section, end_section)],
     }

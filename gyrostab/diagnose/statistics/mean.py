@@ -20,7 +20,7 @@ from gyrostab.diagnose.predict.candidates import (
     Variant,
 )
 from gyrostab.diagnose.predict.condition import mean_columns
-from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.predict.linear_model import State, moves_within_blocks
 from gyrostab.diagnose.predict.search import Trial, collect_evidence
 from gyrostab.diagnose.predict.sizes import Mixture, mean_mixture
 from gyrostab.diagnose.settings import Settings
@@ -55,7 +55,6 @@ __all__ = [
 
 #: Lengths of the windows [blocks].
 LENGTHS = (1, 5, 15, 45)
-_MAX_MASKED_SHARE = 0.5  # of the blocks; design choice
 
 
 class MeanNoise(NamedTuple):
@@ -323,11 +322,6 @@ def _moving_blocks(state: State, row: int, columns: list[Array]) -> NDArray[np.b
     design = design[:, largest > 0.0] / largest[largest > 0.0]
     size, *_ = np.linalg.lstsq(design[good], y[good], rcond=None)
     curve = design @ size
-    step = np.abs(np.diff(curve))
-    moved = np.maximum(np.append(step, 0.0), np.append(0.0, step))
-    seconds = float(blocks.attrs["block_s"])
-    strong = moved**2 * seconds > 5.0 * state.weight[row, :, 0]
     mask = np.zeros_like(state.masked)
-    if strong.mean() <= _MAX_MASKED_SHARE:
-        mask[row] = strong
+    mask[row] = moves_within_blocks(curve, state.weight[row, :, 0], blocks, state.settings)
     return mask

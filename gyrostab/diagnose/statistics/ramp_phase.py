@@ -11,6 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.held_out import LinearModel
+from gyrostab.diagnose.evidence.spectral_lines import LEAK_LINES
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect, Variant
 from gyrostab.diagnose.predict.condition import free_shape
 from gyrostab.diagnose.predict.linear_model import State, given_columns, records_last, stack_columns
@@ -18,6 +19,7 @@ from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.statistics.base import NullDraw, Statistic, column_choices
 from gyrostab.diagnose.statistics.rotation_order import score_orders, turns_per_second
 from gyrostab.diagnose.statistics.scores import (
+    SINE_TAU_CYCLES,
     Array,
     Windows,
     cube_root_score,
@@ -32,7 +34,6 @@ __all__ = ["LENGTHS", "RampPhase"]
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (5, 15)
-_LINE_REACH = 3  # lines on each side that belong to a line; leakage of the taper
 
 
 class RampPhase(Statistic):
@@ -74,8 +75,10 @@ class RampPhase(Statistic):
                 if turning_blocks.size
                 else (1.0 / block, rate / 2.0)
             )
-            tau_min += [0.371 / (h * high) for h in range(1, blocks.sizes["harmonic"] + 1)]
-            tau_max += [0.371 / (h * low) for h in range(1, blocks.sizes["harmonic"] + 1)]
+            tau_min += [
+                SINE_TAU_CYCLES / (h * high) for h in range(1, blocks.sizes["harmonic"] + 1)
+            ]
+            tau_max += [SINE_TAU_CYCLES / (h * low) for h in range(1, blocks.sizes["harmonic"] + 1)]
         if "profile" in blocks:
             scored.append(_score_profile(blocks, baseline, windows))
             what.append("ramp phase")
@@ -189,7 +192,7 @@ def _ramp_lines(state: State) -> NDArray[np.bool_]:
         return np.zeros(lines.size, np.bool_)
     number = np.arange(1, max(2, int(rate / max(turns.mean(), lines[0]))))
     low, high = (fold(number * one, rate) for one in (turns.min(), turns.max()))
-    reach = _LINE_REACH * lines[0]
+    reach = LEAK_LINES * lines[0]
     near = (lines[:, None] >= np.minimum(low, high) - reach) & (
         lines[:, None] <= np.maximum(low, high) + reach
     )

@@ -29,6 +29,8 @@ from gyrostab.diagnose.predict.candidates import (
 from gyrostab.diagnose.predict.condition import free_shape
 from gyrostab.diagnose.predict.linear_model import State, cross_without
 from gyrostab.diagnose.predict.search import Trial
+from gyrostab.diagnose.reduce.block_statistics import MIN_MEAN_SHARE
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics.base import NullDraw, SizeFit, Sizes, Statistic
 from gyrostab.diagnose.statistics.null_counts import null_counts
 from gyrostab.diagnose.statistics.sample_sizes import estimate_from_counts
@@ -46,8 +48,6 @@ __all__ = ["COUNTS", "LENGTHS", "SampleCounts"]
 LENGTHS = (1, 5, 15)
 #: Counts of samples.
 COUNTS = ("outliers", "repeats", "extremes", "zeros")
-_MAX_ANOMALOUS_SHARE = 0.75  # of an axis's blocks, left out for anomalous samples; design choice
-_MIN_SAMPLE_SHARE = 0.1  # of the fullest block's samples, from which an axis has a block
 _SAMPLES = {
     "outliers": "outliers",
     "repeats": "more repeated samples than noise produces",
@@ -169,7 +169,10 @@ class SampleCounts(Statistic):
         """Leave out blocks with anomalous samples; if too many, free the shape of the spectrum."""
         if _is_everywhere(component):
             return state
-        axis, anomalous = component.row[0], find_anomalous_blocks(component, state.blocks)
+        axis, anomalous = (
+            component.row[0],
+            find_anomalous_blocks(component, state.blocks, state.settings),
+        )
         if not anomalous.any():
             return free_shape(state, axis)
         keep = xr.DataArray(~anomalous, dims="block")
@@ -188,9 +191,9 @@ class SampleCounts(Statistic):
         """Return nothing: counts have no columns."""
         return 0.0, [], []
 
-    def has_power_of_effect(self, component: Component, blocks: xr.Dataset) -> bool:
+    def has_power_of_effect(self, component: Component, state: State) -> bool:
         """Return whether no block is left out: with the blocks their power may be left out too."""
-        return not find_anomalous_blocks(component, blocks).any()
+        return not find_anomalous_blocks(component, state.blocks, state.settings).any()
 
     def estimate(self, fit: SizeFit) -> Sizes:
         """Estimate the parameters of an effect on the sample distribution."""
@@ -200,6 +203,7 @@ class SampleCounts(Statistic):
             fit.components[0].row[0],
             fit.state.blocks,
             fit.counts,
+            fit.state.settings,
         )
 
     def is_modelled_in(self, region: Mapping[str, Any], *, together: bool) -> bool:
@@ -285,25 +289,34 @@ def _is_everywhere(component: Component) -> bool:
     )
 
 
-def find_anomalous_blocks(component: Component, blocks: xr.Dataset) -> NDArray[np.bool_]:
-    """Return the blocks left out for anomalous samples; none if too many, or if all are alike."""
+def find_anomalous_blocks(
+    component: Component, blocks: xr.Dataset, settings: Settings = DEFAULTS
+) -> NDArray[np.bool_]:
+    """Return the blocks left out for anomalous samples; none if all are alike.
+
+    None either if fewer than the least quiescent share of the blocks would be left.
+    """
     samples = blocks["samples"].sel(axis=component.row[0]).values
-    kept = samples > _MIN_SAMPLE_SHARE * samples.max(initial=0)
+    kept = samples > MIN_MEAN_SHARE * samples.max(initial=0)
     if _is_everywhere(component) or not kept.any():
         return np.zeros(kept.size, np.bool_)
     count = blocks[component.variant.columns[0]].sel(axis=component.row[0]).values
     # The noise has a negligible number of outliers.
     usual = 0.0 if component.variant.columns[0] == "outliers" else float(np.median(count[kept]))
-    anomalous = count > usual + 3.0 * np.sqrt(max(usual, 0.0))
-    return np.asarray(anomalous & (anomalous[kept].mean() <= _MAX_ANOMALOUS_SHARE))
+    anomalous = count > usual + settings.clear_sigma * np.sqrt(max(usual, 0.0))
+    return np.asarray(anomalous & (anomalous[kept].mean() <= 1.0 - settings.quiescent_share))
 
 
-def mask_anomalous_blocks(blocks: xr.Dataset, components: Iterable[Component]) -> xr.Dataset:
+def mask_anomalous_blocks(
+    blocks: xr.Dataset, components: Iterable[Component], settings: Settings = DEFAULTS
+) -> xr.Dataset:
     """Leave out blocks with named anomalous samples, whose powers have no model."""
     axes = [str(axis) for axis in blocks["axis"].values]
     anomalous = np.zeros((len(axes), blocks.sizes["block"]), np.bool_)
     for component in (component for component in components if component.statistic.is_count):
-        anomalous[axes.index(component.row[0])] |= find_anomalous_blocks(component, blocks)
+        anomalous[axes.index(component.row[0])] |= find_anomalous_blocks(
+            component, blocks, settings
+        )
     if not anomalous.any():
         return blocks
     kept = xr.DataArray(~anomalous, dims=("axis", "block"))

@@ -9,6 +9,7 @@ import xarray as xr
 
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.reduce.outliers import outlier_limit
+from gyrostab.diagnose.settings import Settings
 from gyrostab.units import HOUR
 
 __all__ = ["estimate_from_counts"]
@@ -18,14 +19,16 @@ __all__ = ["estimate_from_counts"]
 MEDIAN_DEPARTURE_SIGMA = 1.08
 VARIANCE_TOLERANCE_SHARE = 0.2  # by which chance may raise the variance of a single block
 MIN_CLEAN_BLOCKS = 5  # without an outlier, that determine the noise level
-#: Relative error of number and size of outliers because the law of their sizes is unknown; at least
-#: half of the share that is not seen.
-LAW_ERROR_SHARE = 0.1
 Pair = tuple[float, float]
 
 
 def estimate_from_counts(
-    effect: str, mark: str, axis: str, blocks: xr.Dataset, count_evidence: CountEvidence
+    effect: str,
+    mark: str,
+    axis: str,
+    blocks: xr.Dataset,
+    count_evidence: CountEvidence,
+    settings: Settings,
 ) -> dict[str, Pair]:
     """Estimate the parameters of an effect on the sample distribution."""
     from scipy.stats import norm
@@ -50,7 +53,7 @@ def estimate_from_counts(
             return {"per_hour": (count / hours, error / hours)}
         seen, size, many = outliers
         number = count / seen
-        law = max(LAW_ERROR_SHARE, 0.5 * (1.0 - seen))
+        law = max(settings.outlier_law_error, 0.5 * (1.0 - seen))
         doubt = math.hypot(1.0 / math.sqrt(2.0 * many), law)
         return {
             "per_hour": (number / hours, number / hours * math.hypot(1.0 / error, law)),

@@ -21,6 +21,8 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+#: tau * f at the maximum of sin(pi f tau)^4 / (pi f tau)^2, the Allan variance of a sine.
+SINE_TAU_CYCLES = 0.371
 _WINDOW_STEP = 0.2  # of the length of a window, from one to the next; design choice
 _MAX_DENSE_BLOCKS = 1000  # of a record with this step; limits time
 _LONG_WINDOW_STEP = 0.4  # the same for longer records

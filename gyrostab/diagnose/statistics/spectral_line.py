@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.evidence.spectral_lines import (
+    LEAK_LINES,
     expected_lines,
     line_evidence,
     line_skirt,
@@ -25,9 +26,10 @@ from gyrostab.diagnose.predict.candidates import (
 from gyrostab.diagnose.predict.condition import bands_at, free_covariance
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import Trial
-from gyrostab.diagnose.settings import Settings
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics.base import SizeFit, Sizes, Statistic
 from gyrostab.diagnose.statistics.scores import (
+    SINE_TAU_CYCLES,
     Array,
     Windows,
     cube_root_score,
@@ -38,11 +40,6 @@ from gyrostab.diagnose.statistics.wording import axes_text
 
 __all__ = ["SpectralLine"]
 
-# Lines next to a strong one, and share of its frequency, that belong to it.
-REGION_REACH_BINS = 3
-#: tau * f at the maximum of sin(pi f tau)^4 / (pi f tau)^2, the Allan variance of a sine.
-SINE_TAU_CYCLES = 0.371
-TAU_REACH_FACTOR = 4.0  # averaging times around that maximum at which a line still shows
 _LEAK_LINES = 2  # lines on either side that a line leaks into
 _AROUND_LINES = 40  # lines on either side that define the level; design choice
 
@@ -87,7 +84,7 @@ class SpectralLine(Statistic):
         # A sum over lines, which only a recording needs.
         excess = _sum_leakage(flat - around) * expected if flat.ndim == 3 else np.zeros(1)
         z = cube_root_score(ratio, count / (1.0 + 1.0 / (2.0 * _AROUND_LINES)))
-        half = 0.371 / frequency  # at which the Allan variance of a sine is largest
+        half = SINE_TAU_CYCLES / frequency  # at which the Allan variance of a sine is largest
         return statistic_dataset(
             "spectrum",
             blocks,
@@ -146,7 +143,8 @@ class SpectralLine(Statistic):
                 continue  # another line in the same band is already given
             state = state.with_columns("power", axis, [column])
             state = free_covariance(state, (axis,), column)
-        return state.with_columns("line", "all", [line_skirt(state.blocks, axis, component.place)])
+        skirt = line_skirt(state.blocks, axis, component.place, state.settings)
+        return state.with_columns("line", "all", [skirt])
 
     def estimate(self, fit: SizeFit) -> Sizes:
         """Estimate amplitudes and the frequency, from the power about the line."""
@@ -158,7 +156,7 @@ class SpectralLine(Statistic):
             fit.components, key=lambda component: component.evidence_nats
         ):  # the strongest of several lines of an axis is last
             amplitude, frequency = estimate_line(
-                fit.state.blocks, component.row[0], component.place
+                fit.state.blocks, component.row[0], component.place, fit.state.settings
             )
             label = "" if len(fit.axes) == 1 or name == "sway" else f".{component.row[0]}"
             out[f"{name}{label}"], out["frequency"] = amplitude, frequency
@@ -183,11 +181,13 @@ class SpectralLine(Statistic):
         if np.isfinite(region["frequency"]):
             return bool(
                 abs(region["frequency"] - mine)
-                <= REGION_REACH_BINS * (lines[1] - lines[0]) + settings.line_width_share * mine
+                <= LEAK_LINES * (lines[1] - lines[0]) + settings.line_width_share * mine
             )
         tau = SINE_TAU_CYCLES / mine  # where the Allan variance of a sine is largest
         return str(region["what"]).startswith(("avar", "level", "variance")) and bool(
-            region["tau_min_s"] / TAU_REACH_FACTOR <= tau <= region["tau_max_s"] * TAU_REACH_FACTOR
+            region["tau_min_s"] / settings.line_tau_ratio
+            <= tau
+            <= region["tau_max_s"] * settings.line_tau_ratio
         )
 
     def is_modelled_in(self, region: Mapping[str, Any], *, together: bool) -> bool:
@@ -263,7 +263,7 @@ def _mean_around(flat: Array) -> Array:
 
 
 def estimate_line(
-    blocks: xr.Dataset, axis: str, place: int
+    blocks: xr.Dataset, axis: str, place: int, settings: Settings = DEFAULTS
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Estimate amplitude [degree hour-1] and frequency [Hz] of a line, each with its error.
 
@@ -275,7 +275,7 @@ def estimate_line(
     good = (weight > 0) & np.isfinite(power).all(axis=1)
     total = (power[good] * weight[good, None]).sum(axis=0) / weight[good].sum()
     level = local_level(total[None, None])[0, 0]
-    near = line_skirt(blocks, axis, place)
+    near = line_skirt(blocks, axis, place, settings)
     step = float(np.diff(lines[:2])[0])
     above = total[near] - level[near]
     square = 4.0 * max(float(above.sum()) * step, 0.0)

@@ -16,7 +16,11 @@ from gyrostab.diagnose.evidence.fast_switching import (
     switching_evidence,
     switching_powers,
 )
-from gyrostab.diagnose.evidence.telegraph import TelegraphCourses, telegraph_evidence
+from gyrostab.diagnose.evidence.telegraph import (
+    PARTS_PER_BLOCK,
+    TelegraphCourses,
+    telegraph_evidence,
+)
 from gyrostab.diagnose.predict.candidates import (
     Candidate,
     CandidateEvidence,
@@ -33,13 +37,7 @@ from gyrostab.diagnose.statistics.mean import BlockMeanStatistic, condition_mean
 
 Array = NDArray[Any]
 
-_MAX_FAST_BLOCKS = 2.0  # mean time on a level, up to which sub-blocks are better; design choice
-_MAX_REFUTED_BLOCKS = 3.0  # mean time on a level, up to which sub-blocks can refute it
-#: Standard deviations of a block mean; for larger steps four parts of a block are too few for the
-#: course. Design choice.
-_MAX_COARSE_STEP_SIGMA = 16.0
 _MAX_NULL_BLOCKS = 20_000  # of null records that are searched for two levels; limits time
-_MIN_SHARE_RANGE = 0.05  # within a block, of a course that switches there; design choice
 
 
 class Telegraph(BlockMeanStatistic):
@@ -116,7 +114,7 @@ class Telegraph(BlockMeanStatistic):
         )
         state = add_fast_switching(state, component)
         state = state.with_columns("power", axis, [power_column(power[None], row, state)])
-        moves = xr.DataArray(np.ptp(inside, axis=1) > _MIN_SHARE_RANGE, dims="block") & (
+        moves = xr.DataArray(np.ptp(inside, axis=1) > state.settings.rest_share, dims="block") & (
             state.blocks["axis"] == axis
         )
         blank = {
@@ -166,12 +164,13 @@ def _search_fast_switching(
     if found is None:
         return None, False
     if not _is_resolved(found, block):
-        return None, found.refuted and float(course.times[0].min()) < _MAX_REFUTED_BLOCKS
+        return None, found.refuted and float(course.times[0].min()) < state.settings.refuted_blocks
     deviation = float(np.sqrt(np.nanmedian(state.baseline["mean_variance"].sel(axis=axis).values)))
-    coarse = (
-        np.isfinite(evidence_nats) and float(course.step[0]) < _MAX_COARSE_STEP_SIGMA * deviation
-    )
-    return (None if coarse and found.times.min() > _MAX_FAST_BLOCKS * block else found), False
+    # in block means the share of a block on a level is known to half of one of its parts
+    error = float(course.step[0]) / (2.0 * PARTS_PER_BLOCK)
+    coarse = np.isfinite(evidence_nats) and error < state.settings.visible_sigma * deviation
+    is_slow = found.times.min() > state.settings.fast_blocks * block
+    return (None if coarse and is_slow else found), False
 
 
 def fast_switching_evidence(data: xr.Dataset, state: State, axis: str) -> SwitchingEvidence | None:

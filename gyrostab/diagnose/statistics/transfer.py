@@ -35,10 +35,6 @@ from gyrostab.physics.registry import effects
 
 Array = NDArray[Any]
 
-#: Power over noise beyond which the power of an axis is motion, three in amplitude. Design choice.
-_MIN_MOTION_RATIO = 9.0
-_QUIESCENT_QUANTILE = 0.25  # of the powers over blocks, taken as power at rest; design choice
-
 
 class Transfer(Statistic):
     """What an axis has in common with a channel on the log's time, or with another axis."""
@@ -210,9 +206,9 @@ def _moving_share(name: str, power: Array, state: State) -> Array:
     noise = state.baseline["spectrum"].values[row]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a band without data has no motion
-        noise = np.fmax(noise, np.nanquantile(power, _QUIESCENT_QUANTILE, axis=0))
+        noise = np.fmax(noise, np.nanquantile(power, state.settings.quiescent_share, axis=0))
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(power > _MIN_MOTION_RATIO * noise, 1.0 - noise / power, 0.0)
+        return np.where(power > state.settings.clear_sigma**2 * noise, 1.0 - noise / power, 0.0)
 
 
 def _is_known_channel(channel: str) -> bool:

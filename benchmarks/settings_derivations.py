@@ -1,0 +1,78 @@
+"""Probabilities behind settings of `gyrostab.diagnose` that have no textbook value.
+
+    python benchmarks/settings_derivations.py [--records 400]
+
+Prints, for the shortest and the longest blocks, how often white noise alone exceeds `noisy_sigma`,
+`excess_sigma`, `moving_power_ratio`, `known_line_sigma` and `line_nats`, and which vibrations
+exceed `level_correlation`. The powers of white noise are gamma distributed with as many degrees of
+freedom as a band has lines, so that all but `line_nats` follow in closed form.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+from page import machine
+from scipy.optimize import brentq
+from scipy.stats import gamma
+
+from gyrostab.diagnose.evidence.spectral_lines import line_evidence
+from gyrostab.diagnose.reduce.accumulate import RECORD_PARTS
+from gyrostab.diagnose.reduce.block_statistics import MIN_BLOCKS
+from gyrostab.diagnose.settings import DEFAULTS
+from gyrostab.kernels.spectra.periodogram import band_edges, ordinates
+
+#: Samples of the shortest default block, and of one of 20 s at 100 Hz; blocks of the record.
+CASES = ((100, MIN_BLOCKS), (2000, 6000))
+
+
+def exceedance(sigma: float, shape: float) -> float:
+    """Return how often the mean of a gamma law of this shape exceeds 1 by so many deviations."""
+    return float(gamma.sf(shape + sigma * np.sqrt(shape), shape))
+
+
+def largest_line(count: int, records: int, lines: int = 1000) -> np.ndarray:
+    """Return the largest evidence of any line of white noise in each record [nats]."""
+    rng = np.random.default_rng(0)
+    weight = np.full((1, RECORD_PARTS), count / RECORD_PARTS)
+    power = rng.gamma(weight[0, 0], 1.0 / weight[0, 0], (records, 1, RECORD_PARTS, lines))
+    return np.asarray(line_evidence(power, weight).max(axis=(1, 2)))
+
+
+def level_correlation(lowest: float) -> float:
+    """Return the correlation of g and g^2 for g uniform from `lowest` to 1."""
+    g = np.linspace(lowest, 1.0, 100_001)
+    return float(np.corrcoef(g, g**2)[0, 1])
+
+
+def main() -> None:
+    """Print the probabilities."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--records", type=int, default=400)
+    records = parser.parse_args().records
+    print(f"{machine()}\n")
+    for samples, blocks in CASES:
+        lines = ordinates(samples)
+        bands = np.diff(band_edges(samples))
+        print(f"{blocks} blocks of {samples} samples, {lines} lines in {bands.size} bands:")
+        for name in ("noisy_sigma", "excess_sigma"):
+            share = exceedance(getattr(DEFAULTS, name), lines)
+            print(f"- {name}: P = {share:.2g} a block, {share * blocks:.2g} blocks of a record")
+        above = gamma.sf(DEFAULTS.moving_power_ratio * blocks * bands, blocks * bands)
+        print(f"- moving_power_ratio: P = {1.0 - np.prod(1.0 - above):.2g} of any band")
+        share = exceedance(DEFAULTS.known_line_sigma, blocks / RECORD_PARTS)
+        print(f"- known_line_sigma: P = {share:.2g} a line and part")
+        best = np.sort(largest_line(blocks, records))
+        print(
+            f"- line_nats: largest of 1000 lines {best[-1]:.2f} nats in {records} records, "
+            f"95 % below {np.quantile(best, 0.95):.2f}"
+        )
+    lowest = brentq(lambda low: level_correlation(low) - DEFAULTS.level_correlation, 0.0, 0.5)
+    print(f"- level_correlation: that of g uniform from {lowest:.3f} to 1")
+
+
+if __name__ == "__main__":
+    main()
