@@ -49,16 +49,12 @@ class Comparison(NamedTuple):
 
     Attributes
     ----------
-    blocks : xarray.Dataset
-        Block statistics of the recording.
     baseline : xarray.Dataset
         What the simulation predicts for them.
     mismatches : xarray.Dataset
         From `gyrostab.diagnose.locate.mismatches.locate_mismatches`.
     identifications : Identifications
         The effects that explain the differences.
-    null : NullScores
-        Scores of the null records.
     """
 
     blocks: xr.Dataset

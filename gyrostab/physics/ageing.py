@@ -40,6 +40,11 @@ class AgeingBias(Effect):
 
     name: ClassVar[str] = "ageing_bias"
     short: ClassVar[str] = "bias trends with time"
+    plain: ClassVar[str] = "a bias trend in time"
+    next_measurement: ClassVar[str] = (
+        "reverse the temperature once: a trend in time continues, a bias that follows temperature "
+        "returns"
+    )
     stage: ClassVar[Stage] = "rate"
     size_parameters: ClassVar[tuple[str, ...]] = ("slope", "logarithmic")
 
@@ -117,6 +122,8 @@ class AgeingNoise(Effect):
 
     name: ClassVar[str] = "ageing_noise"
     short: ClassVar[str] = "N trends with time"
+    plain: ClassVar[str] = "white noise with a trend in time"
+    next_measurement: ClassVar[str] = "repeat the record at the same temperature some days later"
     stage: ClassVar[Stage] = "noise"
     terms: ClassVar[str] = "N"
     size_parameters: ClassVar[tuple[str, ...]] = ("growth",)

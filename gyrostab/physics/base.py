@@ -142,6 +142,10 @@ class Effect:
         Name in models, results and documents.
     short : str
         Description in a few words.
+    plain : str
+        What a sentence calls the effect; `short` by default.
+    next_measurement : str
+        Measurement that separates it from the effects that it is confused with.
     stage : str
         One of `STAGES`; it determines what *generate* returns.
     channels : mapping of str to str
@@ -163,6 +167,8 @@ class Effect:
 
     name: ClassVar[str] = ""
     short: ClassVar[str] = ""
+    plain: ClassVar[str] = ""
+    next_measurement: ClassVar[str] = ""
     stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {}
     size_parameters: ClassVar[tuple[str, ...]] = ()

@@ -54,6 +54,8 @@ class SupplyBias(Effect):
 
     name: ClassVar[str] = "supply_bias"
     short: ClassVar[str] = "bias follows supply voltage or light power"
+    plain: ClassVar[str] = "a bias that follows supply voltage or light power"
+    next_measurement: ClassVar[str] = "change the supply voltage in steps at a steady temperature"
     stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {
         "supply_voltage": INNER["voltage"],
@@ -205,6 +207,10 @@ class GaussMarkov(Effect):
 
     name: ClassVar[str] = "gauss_markov"
     short: ClassVar[str] = "exponentially correlated bias"
+    plain: ClassVar[str] = "a slowly wandering bias (Gauss-Markov process)"
+    next_measurement: ClassVar[str] = (
+        "record at rest for at least ten times the correlation time of the bias"
+    )
     stage: ClassVar[Stage] = "rate"
     size_parameters: ClassVar[tuple[str, ...]] = ("rms",)
     references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997, annex C",)
@@ -284,6 +290,8 @@ class Clipping(Effect):
 
     name: ClassVar[str] = "clipping"
     short: ClassVar[str] = "missing tails"
+    plain: ClassVar[str] = "clipped extremes"
+    next_measurement: ClassVar[str] = "widen the output range"
     stage: ClassVar[Stage] = "electronics"
     size_parameters: ClassVar[tuple[str, ...]] = ("limit",)
     references: ClassVar[tuple[str, ...]] = ("Lefevre 2014, The Fiber-Optic Gyroscope",)
@@ -345,6 +353,8 @@ class ClockError(Effect):
 
     name: ClassVar[str] = "clock_error"
     short: ClassVar[str] = "wrong or drifting rate of time"
+    plain: ClassVar[str] = "an error of the clock"
+    next_measurement: ClassVar[str] = "log a second clock, or a known line such as the mains"
     stage: ClassVar[Stage] = "sampling"
     size_parameters: ClassVar[tuple[str, ...]] = ("error", "drift")
     references: ClassVar[tuple[str, ...]] = ("Allan 1987, IEEE Trans. UFFC",)

@@ -115,6 +115,11 @@ class BiasJump(Effect):
 
     name: ClassVar[str] = "bias_jump"
     short: ClassVar[str] = "bias changes at restarts, shocks"
+    plain: ClassVar[str] = "a bias jump"
+    next_measurement: ClassVar[str] = (
+        "switch off and on several times with nothing else changed, and compare the bias before "
+        "and after"
+    )
     stage: ClassVar[Stage] = "rate"
     size_parameters: ClassVar[tuple[str, ...]] = ("restart", "shock", "step")
     references: ClassVar[tuple[str, ...]] = ("Wang et al. 2016, Sensors",)
@@ -219,6 +224,10 @@ class Telegraph(Effect):
 
     name: ClassVar[str] = "telegraph"
     short: ClassVar[str] = "bias switches between levels"
+    plain: ClassVar[str] = "a bias that switches between two levels"
+    next_measurement: ClassVar[str] = (
+        "record longer, for at least ten switches: the histogram of the means then shows two levels"
+    )
     stage: ClassVar[Stage] = "rate"
     size_parameters: ClassVar[tuple[str, ...]] = ("step",)
     references: ClassVar[tuple[str, ...]] = ("Machlup 1954, J. Appl. Phys.",)
@@ -325,6 +334,10 @@ class FringeHop(Effect):
 
     name: ClassVar[str] = "fringe_hop"
     short: ClassVar[str] = "steps of one fringe"
+    plain: ClassVar[str] = "steps of one fringe"
+    next_measurement: ClassVar[str] = (
+        "compare the size of the steps with the rate of one fringe of this coil"
+    )
     stage: ClassVar[Stage] = "electronics"
     size_parameters: ClassVar[tuple[str, ...]] = ("order",)
     references: ClassVar[tuple[str, ...]] = ("Lefevre 2014, The Fiber-Optic Gyroscope",)

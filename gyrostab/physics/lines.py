@@ -55,6 +55,11 @@ class SpectralLine(Effect):
 
     name: ClassVar[str] = "spectral_line"
     short: ClassVar[str] = "steady line, resonance"
+    plain: ClassVar[str] = "a steady spectral line or resonance"
+    next_measurement: ClassVar[str] = (
+        "change the sampling rate: an aliased line moves, a true one stays; change the rotation "
+        "rate to see whether the line follows"
+    )
     stage: ClassVar[Stage] = "rate"
     size_parameters: ClassVar[tuple[str, ...]] = ("amplitude",)
     references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997, annex C",)
@@ -169,6 +174,10 @@ class RotationLine(Effect):
 
     name: ClassVar[str] = "rotation_line"
     short: ClassVar[str] = "lines locked to tool rotation, pump or stick-slip"
+    plain: ClassVar[str] = "lines locked to the rotation of the tool"
+    next_measurement: ClassVar[str] = (
+        "repeat at another rotation rate: lines locked to the tool move with it"
+    )
     stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {"rotation_rate": INNER["rotation_rate"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("amplitude",)

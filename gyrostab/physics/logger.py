@@ -59,6 +59,11 @@ class LoggerFilter(Effect):
 
     name: ClassVar[str] = "logger_filter"
     short: ClassVar[str] = "low-pass, integrate-and-dump, decimation"
+    plain: ClassVar[str] = "a filter in the logger"
+    next_measurement: ClassVar[str] = (
+        "read the logger settings, or log at a higher rate: a filter leaves the long averaging "
+        "times unchanged"
+    )
     stage: ClassVar[Stage] = "sampling"
     size_parameters: ClassVar[tuple[str, ...]] = ("cutoff", "length", "pick")
     references: ClassVar[tuple[str, ...]] = (
@@ -247,6 +252,8 @@ class RateQuantization(Effect):
 
     name: ClassVar[str] = "rate_quantization"
     short: ClassVar[str] = "quantization grid of the rate"
+    plain: ClassVar[str] = "quantization of the output"
+    next_measurement: ClassVar[str] = "log with one more bit, or in counts"
     stage: ClassVar[Stage] = "logger"
     size_parameters: ClassVar[tuple[str, ...]] = ("step",)
     references: ClassVar[tuple[str, ...]] = ("Widrow and Kollar 2008, Quantization Noise",)
@@ -311,6 +318,10 @@ class Spikes(Effect):
 
     name: ClassVar[str] = "spikes"
     short: ClassVar[str] = "bit errors, outliers"
+    plain: ClassVar[str] = "bit errors or outliers"
+    next_measurement: ClassVar[str] = (
+        "log the raw data words: bit errors change them by powers of two counts"
+    )
     stage: ClassVar[Stage] = "logger"
     size_parameters: ClassVar[tuple[str, ...]] = ("per_hour",)
     references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997",)
@@ -407,6 +418,8 @@ class HeldSamples(Effect):
 
     name: ClassVar[str] = "held_samples"
     short: ClassVar[str] = "repeated or zero-filled samples"
+    plain: ClassVar[str] = "repeated or zero-filled samples"
+    next_measurement: ClassVar[str] = "log a counter with each sample"
     stage: ClassVar[Stage] = "logger"
     size_parameters: ClassVar[tuple[str, ...]] = ("per_hour",)
     references: ClassVar[tuple[str, ...]] = ("Wang et al. 2016, Sensors",)

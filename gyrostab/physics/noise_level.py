@@ -69,6 +69,11 @@ class TemperatureNoise(Effect):
 
     name: ClassVar[str] = "temperature_noise"
     short: ClassVar[str] = "N follows T"
+    plain: ClassVar[str] = "white noise that varies with temperature"
+    next_measurement: ClassVar[str] = (
+        "return to the first temperature: noise that follows temperature returns too, noise that "
+        "follows age does not"
+    )
     stage: ClassVar[Stage] = "noise"
     terms: ClassVar[str] = "N"
     channels: ClassVar[Mapping[str, str]] = {"temperature": INNER["temperature"]}
@@ -136,6 +141,10 @@ class LightPowerNoise(Effect):
 
     name: ClassVar[str] = "light_power_noise"
     short: ClassVar[str] = "N follows light power"
+    plain: ClassVar[str] = "white noise that varies with light power"
+    next_measurement: ClassVar[str] = (
+        "change the light power in steps at a steady temperature, and log it"
+    )
     stage: ClassVar[Stage] = "noise"
     terms: ClassVar[str] = "N"
     channels: ClassVar[Mapping[str, str]] = {"light_power": INNER["power"]}
@@ -260,6 +269,11 @@ class VibrationNoise(_FollowsVibration):
 
     name: ClassVar[str] = "vibration_noise"
     short: ClassVar[str] = "noise level follows vibration"
+    plain: ClassVar[str] = "noise that rises with vibration"
+    next_measurement: ClassVar[str] = (
+        "log an accelerometer at the full rate: its spectrum and its coherence with the gyro "
+        "separate noise from motion"
+    )
     terms: ClassVar[str] = "QN"
     size_parameters: ClassVar[tuple[str, ...]] = ("white", "quantization")
     references: ClassVar[tuple[str, ...]] = (
@@ -337,6 +351,11 @@ class VibrationRandomWalk(_FollowsVibration):
 
     name: ClassVar[str] = "vibration_random_walk"
     short: ClassVar[str] = "K follows vibration"
+    plain: ClassVar[str] = "a random walk that rises with vibration"
+    next_measurement: ClassVar[str] = (
+        "vibrate evenly for at least half an hour: a random walk keeps growing between the edges, "
+        "a step does not"
+    )
     terms: ClassVar[str] = "K"
     size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity",)
     references: ClassVar[tuple[str, ...]] = (

@@ -52,6 +52,8 @@ class DeadZone(Effect):
 
     name: ClassVar[str] = "dead_zone"
     short: ClassVar[str] = "output sticks near zero rate"
+    plain: ClassVar[str] = "a dead zone near zero rate"
+    next_measurement: ClassVar[str] = "add a slow known rotation that carries the rate through zero"
     stage: ClassVar[Stage] = "sensor"
     size_parameters: ClassVar[tuple[str, ...]] = ("width",)
     references: ClassVar[tuple[str, ...]] = ("Cao et al. 2025, Opt. Commun.", "US patent 6744519")
@@ -137,6 +139,11 @@ class FeedbackReset(Effect):
 
     name: ClassVar[str] = "feedback_reset"
     short: ClassVar[str] = "error tied to the phase or resets of the feedback ramp"
+    plain: ClassVar[str] = "an error of the feedback ramp"
+    next_measurement: ClassVar[str] = (
+        "log the phase of the feedback ramp, and repeat at another rotation rate: lines of the "
+        "ramp move with it"
+    )
     stage: ClassVar[Stage] = "electronics"
     channels: ClassVar[Mapping[str, str]] = {"ramp": INNER["number"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("kick", "tail", "sawtooth")
@@ -393,6 +400,10 @@ class SharedSource(Effect):
 
     name: ClassVar[str] = "shared_source"
     short: ClassVar[str] = "broadband noise common to axes"
+    plain: ClassVar[str] = "noise common to the axes (shared light source)"
+    next_measurement: ClassVar[str] = (
+        "log the light power of the source, or run the axes on separate sources"
+    )
     stage: ClassVar[Stage] = "rate"
     size_parameters: ClassVar[tuple[str, ...]] = ("N",)
     references: ClassVar[tuple[str, ...]] = (

@@ -48,6 +48,11 @@ class ScaleFactor(Effect):
 
     name: ClassVar[str] = "scale_factor"
     short: ClassVar[str] = "error proportional to (a function of) rotation rate"
+    plain: ClassVar[str] = "a scale-factor error"
+    next_measurement: ClassVar[str] = (
+        "rotate at two known rates in both directions: a scale-factor error is proportional to "
+        "the rate"
+    )
     stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {
         "rotation_rate": INNER["rotation_rate"],
@@ -156,6 +161,8 @@ class Misalignment(Effect):
 
     name: ClassVar[str] = "misalignment"
     short: ClassVar[str] = "another axis's rate leaks in"
+    plain: ClassVar[str] = "rotation about another axis, coupled in by misalignment"
+    next_measurement: ClassVar[str] = "rotate about one axis at a time and read the others"
     stage: ClassVar[Stage] = "rate"
     size_parameters: ClassVar[tuple[str, ...]] = ("x", "y", "z")
     references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997",)
@@ -244,6 +251,10 @@ class EarthRate(Effect):
 
     name: ClassVar[str] = "earth_rate"
     short: ClassVar[str] = "earth rate modulated by tool rotation"
+    plain: ClassVar[str] = "earth rate, which varies with the tool face"
+    next_measurement: ClassVar[str] = (
+        "stop the rotation at four tool faces 90 degrees apart: earth rate follows the tool face"
+    )
     stage: ClassVar[Stage] = "motion"
     channels: ClassVar[Mapping[str, str]] = {"rotation_rate": INNER["rotation_rate"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("rate",)
@@ -393,6 +404,11 @@ class RealMotion(Effect):
 
     name: ClassVar[str] = "real_motion"
     short: ClassVar[str] = "rotation that is not an error"
+    plain: ClassVar[str] = "real rotation of the tool, not a sensor error"
+    next_measurement: ClassVar[str] = (
+        "log accelerometers and a second gyro on the same block: real motion shows in all of "
+        "them, a sensor error in one"
+    )
     stage: ClassVar[Stage] = "motion"
     channels: ClassVar[Mapping[str, str]] = {
         "rotation_rate": INNER["rotation_rate"]

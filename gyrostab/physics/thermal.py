@@ -47,6 +47,11 @@ class TemperatureBias(Effect):
 
     name: ClassVar[str] = "temperature_bias"
     short: ClassVar[str] = "bias follows T"
+    plain: ClassVar[str] = "a bias that follows temperature"
+    next_measurement: ClassVar[str] = (
+        "heat and cool once with a hold at each end: a bias that follows temperature stays during "
+        "the hold and returns later"
+    )
     stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {"temperature": INNER["temperature"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity", "quadratic", "cubic")
@@ -126,6 +131,11 @@ class Shupe(Effect):
 
     name: ClassVar[str] = "shupe"
     short: ClassVar[str] = "bias follows (lagged) dT/dt"
+    plain: ClassVar[str] = "a bias that follows the rate of change of temperature (Shupe effect)"
+    next_measurement: ClassVar[str] = (
+        "hold the temperature after a ramp: a Shupe bias decays, and changes sign when the ramp "
+        "is reversed"
+    )
     stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {"temperature": INNER["temperature"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity", "transient")
@@ -290,6 +300,8 @@ class ThermalGradient(Effect):
 
     name: ClassVar[str] = "thermal_gradient"
     short: ClassVar[str] = "bias follows a difference of two temperatures"
+    plain: ClassVar[str] = "a bias that follows a temperature difference"
+    next_measurement: ClassVar[str] = "log a second temperature at the other end of the coil"
     stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = dict.fromkeys(
         ("temperature", "temperature_2"), INNER["temperature"]
@@ -389,6 +401,11 @@ class ThermalHysteresis(Effect):
 
     name: ClassVar[str] = "thermal_hysteresis"
     short: ClassVar[str] = "bias depends on the history of T"
+    plain: ClassVar[str] = "a bias with temperature hysteresis"
+    next_measurement: ClassVar[str] = (
+        "run a closed temperature cycle twice: with hysteresis heating and cooling differ, and "
+        "the loop repeats"
+    )
     stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {"temperature": INNER["temperature"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity",)

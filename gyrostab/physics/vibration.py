@@ -79,6 +79,11 @@ class GSensitivity(_Vector):
 
     name: ClassVar[str] = "g_sensitivity"
     short: ClassVar[str] = "bias follows acceleration"
+    plain: ClassVar[str] = "a bias that follows acceleration"
+    next_measurement: ClassVar[str] = (
+        "turn the tool over, at rest: g-sensitivity changes sign with gravity, rectification does "
+        "not"
+    )
     stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = dict.fromkeys(
         ("accel_x", "accel_y", "accel_z"), INNER["acceleration"]
@@ -138,6 +143,11 @@ class VibrationRectification(Effect):
 
     name: ClassVar[str] = "vibration_rectification"
     short: ClassVar[str] = "bias follows g_rms squared"
+    plain: ClassVar[str] = "a bias caused by vibration (vibration rectification)"
+    next_measurement: ClassVar[str] = (
+        "repeat at twice the vibration: rectification grows fourfold, g-sensitivity twofold; then "
+        "turn the tool over: g-sensitivity changes sign"
+    )
     stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {"vibration": INNER["acceleration"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity", "quartic")
@@ -220,6 +230,10 @@ class AliasedVibration(Effect):
 
     name: ClassVar[str] = "aliased_vibration"
     short: ClassVar[str] = "vibration above Nyquist folded down"
+    plain: ClassVar[str] = "vibration aliased by the sampling"
+    next_measurement: ClassVar[str] = (
+        "log at a higher rate, or with an analogue filter: an aliased band moves or disappears"
+    )
     stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {"vibration": INNER["acceleration"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity",)
@@ -359,6 +373,10 @@ class Magnetic(_Vector):
 
     name: ClassVar[str] = "magnetic"
     short: ClassVar[str] = "bias follows the magnetic field"
+    plain: ClassVar[str] = "a bias that follows the magnetic field"
+    next_measurement: ClassVar[str] = (
+        "turn a magnet, or turn the tool in the earth's field, and log a magnetometer"
+    )
     stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = dict.fromkeys(
         ("mag_x", "mag_y", "mag_z"), INNER["magnetic"]

@@ -49,6 +49,10 @@ class WarmUp(Effect):
 
     name: ClassVar[str] = "warm_up"
     short: ClassVar[str] = "exponential bias after every power-on"
+    plain: ClassVar[str] = "warm-up after power-on"
+    next_measurement: ClassVar[str] = (
+        "switch off and on again at a steady outside temperature: warm-up repeats after every start"
+    )
     stage: ClassVar[Stage] = "rate"
     size_parameters: ClassVar[tuple[str, ...]] = ("amplitude", "slow_amplitude")
     references: ClassVar[tuple[str, ...]] = ("Lefevre 2014, The Fiber-Optic Gyroscope",)

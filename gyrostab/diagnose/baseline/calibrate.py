@@ -43,9 +43,10 @@ from gyrostab.diagnose.baseline.simulated import (
 )
 from gyrostab.diagnose.baseline.wandering import with_wandering
 from gyrostab.diagnose.evidence.products import mean_products
+from gyrostab.diagnose.reduce.schema import BASELINE, label_variables
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.noise import HOUR, LAWS, TERMS
+from gyrostab.noise import HOUR, TERMS
 from gyrostab.simulate.model import Model, read_model
 
 __all__ = [
@@ -64,7 +65,6 @@ DRAWS = 512
 _FACTORS = {"K": (0.0, 1.0 / 3.0, 1.0, 3.0, 10.0, 30.0), "B": (0.0, 1.0, 3.0, 10.0)}
 _MIN_LOW_SHAPE = 20.0  # of the lowest bands, which define the white noise of a block mean
 _MIN_BANDS = 6  # that the noise terms are fitted to, with any spectral shape
-_POWER_UNIT = "degree2 hour-2 Hz-1"
 
 
 def _mean_noise_excess(power: Array, shape: Array, spectrum: Array, settings: Settings) -> Array:
@@ -110,29 +110,16 @@ def calibrate_noise(
 
     Parameters
     ----------
-    blocks : xarray.Dataset
-        From `reduce_log`.
     quiet : array_like of bool (block,), or (start, end) or several of these, optional
         Known quiescent time: seconds since the start, or ISO times. By default blocks with little
         vibration, steady temperature, no rotation, some time after a restart, and no more noise
         than most.
-    settings : Settings
 
     Returns
     -------
     xarray.Dataset
-        - ``coefficient``, ``stderr`` (axis, term) [units of the noise table]; a ramp is an effect,
-          so that R is 0, with its error.
-        - ``quiet(axis, block)``: the calibration blocks.
-        - ``spectrum(axis, block, band)``: expected power [degree2 hour-2 Hz-1]; its terms in
-          ``columns(axis, block, band, noise)``, ``square`` and ``square_stderr`` (axis, noise).
-        - ``common(axis, block)``, ``shape_alone(axis, block, band)``: scatter of the powers of a
-          block, common to all and separate.
-        - ``known_mean``, ``mean_variance`` (axis, block) [degree hour-1, degree2 hour-2].
-        - ``grid_K``, ``grid_B``, ``grid_prior``, ``grid_calibrated`` (axis, grid): possible noise
-          of the means, log weights.
-        - ``posterior(axis, draw, noise)``, ``posterior_slow(axis, draw, slow)``: draws of the
-          squares in powers and in means.
+        Variables of `gyrostab.diagnose.reduce.schema.BASELINE`. A ramp is an effect, so that R is
+        0, with its error.
 
     Raises
     ------
@@ -221,7 +208,6 @@ def assemble_baseline(
 
     Parameters
     ----------
-    blocks : xarray.Dataset
     posteriors : list of Posterior
         One for each axis.
     quiet : ndarray of bool, shape (axis, block)
@@ -231,7 +217,6 @@ def assemble_baseline(
         Known means of effects [degree hour-1].
     spectrum : ndarray, shape (axis, block, band), optional
         Expected power including effects; that of the noise by default.
-    settings : Settings
     """
     columns = noise_powers(blocks)
     square = np.stack([posterior.square for posterior in posteriors])
@@ -257,91 +242,27 @@ def assemble_baseline(
         _coarse_grid(posterior, max(posterior.square[1], least) * HOUR, span)
         for posterior, least in zip(posteriors, floor, strict=True)
     ]
-    draws = np.stack([posterior.draws for posterior in posteriors])
     common, rest = common_variance(blocks)
     value, error = _mean_coefficients(posteriors)
     value[:, 4], error[:, 4] = 0.0, _ramp_error(blocks, white, value, quiet)
-    plane, cube = ("axis", "block"), ("axis", "block", "band")
-    units = ", ".join(f"{term} in {LAWS[term].label}" for term in TERMS)
-    variables: dict[str, Any] = {
-        "coefficient": (
-            ("axis", "term"),
-            value,
-            {"long_name": "noise coefficient", "units": units},
-        ),
-        "stderr": (
-            ("axis", "term"),
-            error,
-            {"long_name": "standard error of the coefficient", "units": units},
-        ),
-        "quiet": (plane, quiet, {"long_name": "block is calibrated on", "units": "1"}),
-        "spectrum": (cube, expected, {"long_name": "expected power", "units": _POWER_UNIT}),
-        "known_mean": (
-            plane,
-            np.zeros(quiet.shape) if known_mean is None else known_mean,
-            {"units": "degree hour-1"},
-        ),
-        "mean_variance": (
-            plane,
-            variance,
-            {"long_name": "white variance of the block mean", "units": "degree2 hour-2"},
-        ),
-        "common": (
-            plane,
-            common,
-            {
-                "long_name": "relative variance that the powers of a block have in common",
-                "units": "1",
-            },
-        ),
-        "shape_alone": (
-            cube,
-            rest,
-            {
-                "long_name": "shape of the gamma distribution of a power without the common part",
-                "units": "1",
-            },
-        ),
-        "columns": (
-            (*cube, "noise"),
-            columns,
-            {"long_name": "expected power per squared coefficient", "units": _POWER_UNIT},
-        ),
-        "square": (
-            ("axis", "noise"),
-            square,
-            {
-                "long_name": "squared coefficient that fits the powers",
-                "units": f"square of {units}",
-            },
-        ),
-        "square_stderr": (
-            ("axis", "noise"),
-            np.stack([posterior.error for posterior in posteriors]),
-            {"units": f"square of {units}"},
-        ),
-        "posterior": (
-            ("axis", "draw", "noise"),
-            draws,
-            {"long_name": "draws of the squares in powers", "units": f"square of {units}"},
-        ),
-        "posterior_slow": (
-            ("axis", "draw", "slow"),
-            np.stack([posterior.slow for posterior in posteriors]),
-            {"units": f"square of {units}"},
-        ),
-        "grid_K": (("axis", "grid"), np.stack([grid[0] for grid in grids]), {"units": "deg/h^1.5"}),
-        "grid_B": (("axis", "grid"), np.stack([grid[1] for grid in grids]), {"units": "deg/h"}),
-        "grid_prior": (
-            ("axis", "grid"),
-            np.full((len(posteriors), grids[0][0].size), -np.log(grids[0][0].size)),
-            {"units": "1"},
-        ),
-        "grid_calibrated": (
-            ("axis", "grid"),
-            np.stack([grid[2] for grid in grids]),
-            {"units": "1"},
-        ),
+    variables = {
+        "coefficient": value,
+        "stderr": error,
+        "quiet": quiet,
+        "spectrum": expected,
+        "known_mean": np.zeros(quiet.shape) if known_mean is None else known_mean,
+        "mean_variance": variance,
+        "common": common,
+        "shape_alone": rest,
+        "columns": columns,
+        "square": square,
+        "square_stderr": np.stack([posterior.error for posterior in posteriors]),
+        "posterior": np.stack([posterior.draws for posterior in posteriors]),
+        "posterior_slow": np.stack([posterior.slow for posterior in posteriors]),
+        "grid_K": np.stack([grid[0] for grid in grids]),
+        "grid_B": np.stack([grid[1] for grid in grids]),
+        "grid_prior": np.full((len(grids), grids[0][0].size), -np.log(grids[0][0].size)),
+        "grid_calibrated": np.stack([grid[2] for grid in grids]),
     }
     coordinates = {
         name: blocks[name]
@@ -354,7 +275,7 @@ def assemble_baseline(
         if not posterior.joined
     ]
     return xr.Dataset(
-        variables,
+        label_variables(variables, BASELINE),
         coords={**coordinates, "term": list(TERMS), "noise": list(NOISE), "slow": ["B", "K"]},
         attrs={**attrs, "slow_noise_apart": not_joined},
     )
@@ -399,7 +320,6 @@ def baseline_from_model(
         Quiescent time of the recording. One factor for each axis then fits the noise of the model
         to it; the noise terms keep their proportions, and the effects their sizes. By default the
         noise is taken unchanged.
-    settings : Settings
 
     Returns
     -------
@@ -454,19 +374,8 @@ def baseline_from_model(
         settings=settings,
     )
     out = with_wandering(out, known.wandering, known.spectrum)
-    if known.cross is not None:
-        out["cross"] = (
-            ("pair", "block", "band"),
-            known.cross,
-            {"long_name": "expected cross-spectrum", "units": _POWER_UNIT},
-        )
-    for name, values in known.lines.items():
-        last = "band" if name == "line_spectrum" else "line"
-        out[name] = (
-            ("axis", last),
-            values,
-            {"long_name": "expected power of lines", "units": _POWER_UNIT},
-        )
+    extra = known.lines if known.cross is None else {"cross": known.cross, **known.lines}
+    out = out.assign(label_variables(extra, BASELINE))
     if known.lines:
         noise = np.stack([line_columns(blocks) @ posterior.square for posterior in posteriors])
         out["shape_alone"] *= independent_line_share(noise + known.lines["peaks"], blocks)[:, None]
@@ -511,7 +420,6 @@ def baseline_from_simulation(
     quiet : array_like of bool (block,), or (start, end) or several of these, optional
         Quiescent time of the recording: one factor for each axis fits the noise of the simulation
         to it.
-    settings : Settings
 
     Raises
     ------

@@ -60,7 +60,6 @@ def noise_powers(blocks: xr.Dataset, response: Array | None = None) -> Array:
 
     Parameters
     ----------
-    blocks : xarray.Dataset
     response : ndarray, shape (band,), optional
         Power response of a filter before samples were lost.
 

@@ -85,8 +85,6 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
 
     Parameters
     ----------
-    blocks : xarray.Dataset
-    model : Model
     square : ndarray, shape (axis, 4)
         Squared noise coefficients.
 
@@ -144,7 +142,6 @@ class _ActingEffect(NamedTuple):
 
     Attributes
     ----------
-    effect : Effect
     rows : list of int
         Indices of the axes that it acts on.
     axes : tuple of str
@@ -164,7 +161,6 @@ class _AddedPower(NamedTuple):
 
     Attributes
     ----------
-    acting : _Acting
     factor : ndarray of complex, shape (axis,)
     density : ndarray, shape (axis, block, band)
         For a factor of 1 [degree2 hour-2 Hz-1 per squared unit].
@@ -297,10 +293,6 @@ def expect_known_motion(
 
     None on an axis where most blocks move. The mean of such a block is known, but not the motion
     within it, whose spectrum would be compared with that of noise.
-
-    Parameters
-    ----------
-    blocks, baseline : xarray.Dataset
     """
     return moves_within_blocks(
         baseline["known_mean"].values, baseline["spectrum"].values[..., 0], blocks, settings
@@ -310,12 +302,7 @@ def expect_known_motion(
 def remove_known_motion(
     blocks: xr.Dataset, baseline: xr.Dataset, *, settings: Settings = DEFAULTS
 ) -> xr.Dataset:
-    """Drop powers, kurtosis and cross-spectra of blocks in which a known mean moves.
-
-    Parameters
-    ----------
-    blocks, baseline : xarray.Dataset
-    """
+    """Drop powers, kurtosis and cross-spectra of blocks in which a known mean moves."""
     moving = expect_known_motion(blocks, baseline, settings=settings)
     if not moving.any():
         return blocks
@@ -463,10 +450,6 @@ def remove_known_lines(
 
     The excess over a known line stays if it exceeds the model error of an effect and the scatter of
     the noise.
-
-    Parameters
-    ----------
-    blocks, baseline : xarray.Dataset
     """
     if "lines" not in baseline:
         return blocks

@@ -338,7 +338,6 @@ def noise_posterior(
         Length of a block [s].
     draws : int
         Number of draws from the posterior.
-    rng : numpy.random.Generator
     effects : ndarray, shape (block, column), optional
         Designs of effects in the means, of any size.
     max_disagreement_nats : float

@@ -35,8 +35,6 @@ def rounded_rates(
 
     Parameters
     ----------
-    blocks : xarray.Dataset
-        From `gyrostab.diagnose.reduce.block_statistics.reduce_log`.
     baseline : xarray.Dataset
         From `calibrate_noise`; if it is not calibrated on this record, the record's own noise is
         estimated.

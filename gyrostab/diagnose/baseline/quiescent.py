@@ -91,7 +91,6 @@ def noise_level_excess(
         Power over expected power, minus 1; NaN where missing.
     weight : ndarray, shape (block, band)
         Shape of the gamma distribution.
-    settings : Settings
 
     Returns
     -------
@@ -162,11 +161,8 @@ def find_quiescent_blocks(
 
     Parameters
     ----------
-    blocks : xarray.Dataset
-        From `reduce_log`.
     quiet : array_like of bool (block,), or sequence of (start, end), optional
         Quiescent time given by the user; spans in seconds since the start, or ISO times.
-    settings : Settings
 
     Returns
     -------

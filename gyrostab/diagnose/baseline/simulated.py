@@ -15,12 +15,12 @@ from gyrostab.diagnose.evidence.spectral_lines import (
     local_level,
 )
 from gyrostab.diagnose.predict.linear_model import band_widths, pair_rows, unspread_share
+from gyrostab.diagnose.reduce.schema import BASELINE, label_variables
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
 __all__ = ["ExtraStatistics", "add_extra_statistics", "measure_extra_statistics", "worst_band"]
 
 Array = NDArray[np.float64]
-_POWER_UNIT = "degree2 hour-2 Hz-1"
 _MAX_LINES = 100  # on an axis; limits time
 _SMOOTHING_LINES = 5  # over which a peak is smoothed; design choice
 
@@ -83,13 +83,10 @@ def measure_extra_statistics(
 
     Parameters
     ----------
-    simulated : xarray.Dataset
-        From `reduce_log`.
     expected : ndarray, shape (axis, block, band)
         Power of its noise terms, with their level over time.
     unexplained : ndarray of bool, shape (axis, band)
         Bands that the noise terms do not explain.
-    settings : Settings
     """
     form, known = _spectral_form(simulated, expected)
     # An unexplained band reaches into others.
@@ -203,13 +200,7 @@ def add_extra_statistics(
     latter over the root of the powers of both; and with lines the variables that
     `remove_known_lines` reads.
     """
-    out = baseline.assign(
-        form_shape=(
-            ("axis", "band"),
-            extra.form_shape,
-            {"long_name": "shape of the gamma distribution of the form", "units": "1"},
-        )
-    )
+    arrays: dict[str, Any] = {"form_shape": extra.form_shape}
     if extra.coherency.any():
         axes = [str(axis) for axis in blocks["axis"].values]
         spectrum = baseline["spectrum"].values
@@ -219,16 +210,8 @@ def add_extra_statistics(
                 for one, other in pair_rows(blocks)
             ]
         )
-        out["cross"] = (
-            ("pair", "block", "band"),
-            extra.coherency[:, None] * geometric_mean,
-            {"long_name": "cross-spectrum", "units": _POWER_UNIT},
-        )
-        out["cross_error"] = (
-            ("pair", "band"),
-            extra.coherency_error,
-            {"long_name": "error of the coherency", "units": "1"},
-        )
+        arrays["cross"] = extra.coherency[:, None] * geometric_mean
+        arrays["cross_error"] = extra.coherency_error
     if extra.lines.any() or extra.peaks.any():
         line_power = (
             (extra.lines + extra.peaks)
@@ -236,16 +219,6 @@ def add_extra_statistics(
             * blocks["line_frequency"].values[0]
             / band_widths(blocks)
         )
-        attrs = {"long_name": "power of lines", "units": _POWER_UNIT}
-        out["line_spectrum"] = (
-            ("axis", "band"),
-            line_power * unspread_share(blocks).mean(axis=1)[:, None],
-            attrs,
-        )
-        for name, values in (
-            ("lines", extra.lines),
-            ("lines_most", extra.lines),
-            ("peaks", extra.peaks),
-        ):
-            out[name] = (("axis", "line"), values, attrs)
-    return out
+        arrays["line_spectrum"] = line_power * unspread_share(blocks).mean(axis=1)[:, None]
+        arrays |= {"lines": extra.lines, "lines_most": extra.lines, "peaks": extra.peaks}
+    return baseline.assign(label_variables(arrays, BASELINE))

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.reduce.schema import BASELINE, label_variables
 from gyrostab.physics.prediction import Prediction
 
 __all__ = ["Wandering", "add_up_wandering", "is_described_by_variance", "with_wandering"]
@@ -64,7 +65,6 @@ def add_up_wandering(
     effects : sequence of (mapping of str to ndarray of shape (axis,), Prediction)
         Squared sizes by parameter, 0 on axes without the effect, and its prediction; spectra at
         equally many frequencies in each band.
-    bands, block_count, axes : int
     """
     square, time = [], []
     walk, power = np.zeros((axes, block_count)), np.zeros((axes, block_count))
@@ -92,8 +92,6 @@ def with_wandering(baseline: xr.Dataset, known: Wandering, spectrum: Array) -> x
 
     Parameters
     ----------
-    baseline : xarray.Dataset
-    known : Wandering
     spectrum : ndarray, shape (axis, block, band)
         Expected power with all effects [degree2 hour-2 Hz-1].
     """
@@ -101,8 +99,13 @@ def with_wandering(baseline: xr.Dataset, known: Wandering, spectrum: Array) -> x
         return baseline
     white = baseline["mean_variance"] * (1.0 - known.power / spectrum[..., 0])
     return baseline.assign(
-        mean_variance=white.assign_attrs(baseline["mean_variance"].attrs),
-        wander_square=(("axis", "wander"), known.square, {"units": "degree2 hour-2"}),
-        wander_time=("wander", known.time, {"units": "s"}),
-        wander_walk=(("axis", "block"), known.walk, {"units": "degree2 hour-2 s-1"}),
+        label_variables(
+            {
+                "mean_variance": white.values,
+                "wander_square": known.square,
+                "wander_time": known.time,
+                "wander_walk": known.walk,
+            },
+            BASELINE,
+        )
     )

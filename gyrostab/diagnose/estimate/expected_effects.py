@@ -25,7 +25,6 @@ def expected_baseline(
 
     Parameters
     ----------
-    identifications : Identifications
     baseline : xarray.Dataset
         The baseline that the identification started from.
     known : ndarray of bool, shape (block,), optional
@@ -53,13 +52,7 @@ def fit_expected(identifications: Identifications, baseline: xr.Dataset) -> list
 def without_expected(
     blocks: xr.Dataset, baseline: xr.Dataset, expected: Sequence[Identification]
 ) -> xr.Dataset:
-    """Drop the blocks in which expected effects leave anomalous samples or move the rate.
-
-    Parameters
-    ----------
-    blocks, baseline : xarray.Dataset
-    expected : sequence of Identification
-    """
+    """Drop the blocks in which expected effects leave anomalous samples or move the rate."""
     if not expected:
         return blocks
     state = initial_state(blocks, baseline)

@@ -36,13 +36,7 @@ _PLACE = "frequency"  # of a line: where it is does not depend on what makes it
 
 @dataclass(frozen=True)
 class Estimate:
-    """A parameter with its standard error and the ends of its 95 % interval.
-
-    Attributes
-    ----------
-    value, stderr, low, high : float
-    unit : str
-    """
+    """A parameter with its standard error and the ends of its 95 % interval."""
 
     value: float
     stderr: float
@@ -57,8 +51,6 @@ class Fitted:
 
     Attributes
     ----------
-    identification : Identification
-    axes : tuple of str
     parameters : mapping of str to Estimate
         Keys are ``name``, or ``name.axis`` for a size of each of several axes.
     effect : Effect or None

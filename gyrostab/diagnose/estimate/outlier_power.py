@@ -29,7 +29,6 @@ def add_outlier_power(
     ----------
     baseline : xarray.Dataset
         With the other effects, fitted to the blocks without anomalous samples.
-    blocks : xarray.Dataset
     fitted : sequence of Fitted
         Effects of all kinds; those without anomalous samples are ignored.
     """

@@ -81,7 +81,6 @@ def recalibrate(
 
     Parameters
     ----------
-    identifications : Identifications
     baseline : xarray.Dataset
         The baseline that the identification started from; returned as it is unless it was
         calibrated on the recording.
@@ -152,7 +151,6 @@ def remove_fast_switching(identifications: Identifications, baseline: xr.Dataset
 
     Parameters
     ----------
-    identifications : Identifications
     baseline : xarray.Dataset
         The baseline that the identification started from; returned as it is unless it was
         calibrated on the recording and such a bias is identified.
@@ -383,7 +381,6 @@ def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identi
 
     Parameters
     ----------
-    identifications : Identifications
     baseline : xarray.Dataset
         With the new noise.
     """

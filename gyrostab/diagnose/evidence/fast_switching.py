@@ -101,10 +101,8 @@ def switching_evidence(
         hour-1] and ``sub_block_samples``.
     baseline : xarray.Dataset
         As for `gyrostab.diagnose.evidence.telegraph.telegraph_evidence`.
-    axis : str
     given : ndarray, shape (block, sub_block, column), optional
         Columns of effects in the model in both cases.
-    settings : Settings
 
     Returns
     -------

@@ -117,8 +117,6 @@ def mean_factors(
         Freedom of the noise.
     given : ndarray, shape (block, column), optional
         Columns in the model with and without the design (effects already named).
-    folds : xarray.DataArray, optional
-        From `fold_blocks`.
 
     Returns
     -------
@@ -241,12 +239,6 @@ def with_independent_cells(
 
 def linear_model_factors(model: LinearModel, folds: xr.DataArray) -> Array:
     """Compute factors of designs in independent cells.
-
-    Parameters
-    ----------
-    model : LinearModel
-    folds : xarray.DataArray
-        From `fold_blocks`.
 
     Returns
     -------

@@ -230,7 +230,6 @@ def log_evidence(
 
     Parameters
     ----------
-    products : Products
     designs : sequence of ndarray
         Indices of the columns of each design.
     limits : ndarray, shape (column,)

@@ -20,6 +20,7 @@ __all__ = [
     "expected_counts",
     "has_coarse_grid",
     "kurtosis_evidence",
+    "kurtosis_moments",
     "quiescent_scatter",
     "sample_count_evidence",
 ]
@@ -103,6 +104,22 @@ def excess_extremes(values: NDArray[Any]) -> NDArray[Any]:
     """
     beyond = np.maximum(np.cumsum(values, axis=-1) - _CERTAIN_EXTREMES, 0)
     return np.asarray(np.diff(beyond, axis=-1, prepend=0))
+
+
+def kurtosis_moments(n: Array) -> tuple[Array, Array, Array]:
+    """Return mean, variance, degrees of freedom of the kurtosis of n samples (Anscombe, Glynn).
+
+    Excess kurtosis of Gaussian samples; Biometrika 70 (1983), doi:10.1093/biomet/70.1.227.
+    """
+    mean = -6.0 / (n + 1.0)
+    variance = 24.0 * n * (n - 2.0) * (n - 3.0) / ((n + 1.0) ** 2 * (n + 3.0) * (n + 5.0))
+    skew = (
+        6.0
+        * (n * n - 5.0 * n + 2.0)
+        / ((n + 7.0) * (n + 9.0))
+        * np.sqrt(6.0 * (n + 3.0) * (n + 5.0) / (n * (n - 2.0) * (n - 3.0)))
+    )
+    return mean, variance, 6.0 + 8.0 / skew * (2.0 / skew + np.sqrt(1.0 + 4.0 / skew**2))
 
 
 class ExpectedCounts:

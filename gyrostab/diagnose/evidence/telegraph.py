@@ -335,10 +335,8 @@ def telegraph_evidence(
         [degree hour-1].
     baseline : xarray.Dataset
         As in `gyrostab.diagnose.evidence.held_out.mean_factors`.
-    axis : str
     given : ndarray, shape (block, column), optional
         Columns in the model with and without it (effects already named).
-    settings : Settings
 
     Returns
     -------

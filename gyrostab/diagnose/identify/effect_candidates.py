@@ -45,8 +45,6 @@ def effect_candidates(
 
     Parameters
     ----------
-    blocks : xarray.Dataset
-        From `reduce_log`.
     coefficient : xarray.DataArray
         ``(axis, term)``: noise of the baseline, in units of the noise model.
 

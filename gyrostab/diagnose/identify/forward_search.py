@@ -51,10 +51,6 @@ def name_effects(
 
     Parameters
     ----------
-    blocks : xarray.Dataset
-        From `gyrostab.diagnose.reduce.block_statistics.reduce_log`.
-    baseline : xarray.Dataset
-        From `gyrostab.diagnose.baseline.calibrate`.
     nulls : iterable of xarray.Dataset
         Null records, several at a time with a leading dimension ``record``.
     level : float
@@ -66,11 +62,6 @@ def name_effects(
         the selection begins.
     progress : Stage
         Callback with the number of null records done.
-    settings : Settings
-
-    Returns
-    -------
-    Identifications
     """
     folds = fold_blocks(blocks)
     effects, reasons = effect_candidates(blocks, baseline["coefficient"], settings=settings)

@@ -41,7 +41,6 @@ class Identification:
         Name in the registry.
     driver : tuple of str
         Channels of the log that it follows, in the order of the effect's channels.
-    axes : tuple of str
     components : tuple of Component
         Statistics and rows in which it shows.
     evidence_nats : float
@@ -73,14 +72,12 @@ class Unidentified:
     ----------
     generic : str
         One of `gyrostab.diagnose.identify.nuisance_alternatives.NUISANCE_ALTERNATIVES`.
-    axes : tuple of str
     evidence_nats : float
         Held-out log Bayes factor [nats].
     threshold : float
         Evidence that it needed [nats].
     candidates : tuple of str
         Effects that come nearest, or whose channel is missing.
-    components : tuple of Component
     """
 
     generic: str
@@ -99,7 +96,6 @@ class Identifications:
     ----------
     identified : tuple of Identification
         The strongest first.
-    unknown : tuple of Unidentified
     threshold : float
         Evidence that noise alone exceeds, in any effect, axis and grid point, with the false-alarm
         probability [nats].
@@ -113,7 +109,6 @@ class Identifications:
         With all of the above in the model.
     folds : xarray.DataArray
         Blocks that are held out together.
-    count_evidence : CountEvidence
     expected : tuple of Identification
         Effects that the simulation contains as well, with size and time from the recording; they
         are in `state` too.

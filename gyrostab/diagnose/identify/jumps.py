@@ -43,8 +43,6 @@ def is_sudden(components: Sequence[Component], state: State, *, error: float = 0
 
     Parameters
     ----------
-    components : sequence of Component
-        Components of one effect.
     state : State
         With all other effects in the model.
     error : float
@@ -70,8 +68,6 @@ def is_lasting(components: Sequence[Component], state: State) -> bool:
 
     Parameters
     ----------
-    components : sequence of Component
-        Components of one effect.
     state : State
         With all other effects in the model.
     """
@@ -104,8 +100,6 @@ def lead_to_levels(components: Sequence[Component], state: State) -> bool:
 
     Parameters
     ----------
-    components : sequence of Component
-        Components of one effect.
     state : State
         With all other effects in the model.
     """

@@ -17,7 +17,7 @@ from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import State, unspread_share
 from gyrostab.diagnose.predict.search import compute_evidence
-from gyrostab.diagnose.predict.sizes import component_size
+from gyrostab.diagnose.predict.sizes import component_size, disagreement_nats
 from gyrostab.diagnose.settings import INTERVAL_TAILS
 from gyrostab.noise import NORMAL_95
 from gyrostab.physics.registry import effects
@@ -71,12 +71,8 @@ def fits_all_axes(components: Sequence[Component], state: State) -> bool:
     share, error = np.array(
         [component_size(replace(first, row=(axis,)), state) for axis in state.axes]
     ).T
-    weight = error**-2.0
-    disagreement = 0.5 * float(
-        (weight * (share - (weight * share).sum() / weight.sum()) ** 2).sum()
-    )
     evidence = sum(max(component.evidence_nats, 0.0) for component in shown)
-    return disagreement <= (
+    return disagreement_nats(share, error**-2.0) <= (
         state.settings.reject_nats + state.settings.spectrum_error_share * evidence
     )
 

@@ -33,12 +33,6 @@ _KEPT_STATISTICS = ("mean", "power", "cross")
 def moving_blocks(blocks: xr.Dataset, *, settings: Settings = DEFAULTS) -> NDArray[np.bool_]:
     """Find the blocks in which an axis moves far beyond its scatter at rest.
 
-    Parameters
-    ----------
-    blocks : xarray.Dataset
-        From `reduce_log`.
-    settings : Settings
-
     Returns
     -------
     ndarray of bool, shape (axis, block)
@@ -102,12 +96,6 @@ def unexplained_motion(
 
     An effect on the means must leave next to nothing of the motion. It is not enough that it adds
     evidence: a step or a drifting channel also explains a part of an intermittent rotation.
-
-    Parameters
-    ----------
-    blocks : xarray.Dataset
-    identified : iterable of Identification
-    settings : Settings
 
     Returns
     -------
@@ -175,7 +163,6 @@ def without_motion(
 
     Parameters
     ----------
-    log : xarray.Dataset
     blocks : xarray.Dataset
         The log, from `reduce_log`.
     moving : ndarray of bool, shape (axis, block)

@@ -83,7 +83,6 @@ class Search:
         Evidence [nats] that noise alone exceeds with the false-alarm probability.
     expected : tuple of Identification
         Effects that the simulation contains as well.
-    settings : Settings
     """
 
     candidates: Sequence[Candidate]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.sizes import component_mixture
+from gyrostab.diagnose.predict.sizes import component_mixture, disagreement_nats
 from gyrostab.diagnose.reduce.accumulate import RECORD_PARTS
 
 __all__ = ["is_always_present"]
@@ -26,7 +26,6 @@ def is_always_present(component: Component, state: State) -> bool:
 
     Parameters
     ----------
-    component : Component
     state : State
         With all other effects in the model.
     """
@@ -41,10 +40,7 @@ def is_always_present(component: Component, state: State) -> bool:
     ).T
     weight = np.where(np.isfinite(size) & np.isfinite(error) & (error > 0.0), error, np.inf) ** -2.0
     size = np.where(weight > 0.0, size, 0.0)
-    disagreement = 0.5 * float(
-        (weight * (size - (weight * size).sum() / max(weight.sum(), 1e-300)) ** 2).sum()
-    )
-    return disagreement <= (
+    return disagreement_nats(size, weight) <= (
         state.settings.disagreement_nats
         + state.settings.spectrum_error_share * max(component.evidence_nats, 0.0)
     )

@@ -34,8 +34,6 @@ def passes_time_shift_test(
         Components of the effect.
     state : State
         What is in the model without it.
-    folds : xarray.DataArray
-        From `fold_blocks`.
 
     Returns
     -------

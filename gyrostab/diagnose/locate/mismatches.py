@@ -60,15 +60,12 @@ def locate_mismatches(
 
     Parameters
     ----------
-    blocks : xarray.Dataset
-        From `gyrostab.diagnose.reduce.block_statistics.reduce_log`.
     baseline : xarray.Dataset
         What the simulation predicts.
     nulls : iterable of xarray.Dataset, or NullScores
         Null records from `gyrostab.diagnose.nulls.records.null_records`, or their `null_scores`.
     level : float
         Probability that a recording without missing physics has any mismatch.
-    settings : Settings
 
     Returns
     -------

@@ -25,7 +25,6 @@ def merge_regions(regions: Sequence[Region], *, settings: Settings = DEFAULTS) -
     ----------
     regions : sequence of dict
         With the fields of `gyrostab.diagnose.locate.mismatches.FIELDS`.
-    settings : Settings
 
     Examples
     --------
@@ -129,7 +128,6 @@ def merge_wandering_regions(
     ----------
     regions : sequence of dict
         Regions of the mean, one axis each.
-    settings : Settings
     """
     found = []
     for axes in dict.fromkeys(region["axes"] for region in regions):

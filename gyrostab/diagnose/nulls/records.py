@@ -15,6 +15,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.expected_statistics import line_columns, white_variance
+from gyrostab.diagnose.evidence.sample_counts import kurtosis_moments
 from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.nulls.shared_noise import (
     SharedNoise,
@@ -84,8 +85,6 @@ def null_records(
         The recording, for its blocks, gaps and channels.
     baseline : xarray.Dataset
         From `calibrate_noise`, `baseline_from_model` or `baseline_from_simulation`.
-    count : int
-        Number of records.
     rng : numpy.random.Generator
         Generator; the same state gives the same records for the same `chunk`.
     chunk : int
@@ -231,7 +230,7 @@ def _kurtosis_excess(
     values += np.diff(rounding * rng.random((record_count, size + 1)), axis=1)
     values -= values.mean(axis=1, keepdims=True)
     kurtosis = (values**4).mean(axis=1) / (values**2).mean(axis=1) ** 2 - 3.0
-    mean, variance, _ = _kurtosis_moments(np.array(float(size)))
+    mean, variance, _ = kurtosis_moments(np.array(float(size)))
     return float(kurtosis.mean() - mean), float(kurtosis.std() / np.sqrt(variance))
 
 
@@ -447,22 +446,6 @@ def _scale_shared_cross(
     return np.asarray(cross)
 
 
-def _kurtosis_moments(n: Array) -> tuple[Array, Array, Array]:
-    """Return mean, variance, degrees of freedom of the kurtosis of n samples (Anscombe, Glynn).
-
-    Excess kurtosis of Gaussian samples; Biometrika 70 (1983), doi:10.1093/biomet/70.1.227.
-    """
-    mean = -6.0 / (n + 1.0)
-    variance = 24.0 * n * (n - 2.0) * (n - 3.0) / ((n + 1.0) ** 2 * (n + 3.0) * (n + 5.0))
-    skew = (
-        6.0
-        * (n * n - 5.0 * n + 2.0)
-        / ((n + 7.0) * (n + 9.0))
-        * np.sqrt(6.0 * (n + 3.0) * (n + 5.0) / (n * (n - 2.0) * (n - 3.0)))
-    )
-    return mean, variance, 6.0 + 8.0 / skew * (2.0 / skew + np.sqrt(1.0 + 4.0 / skew**2))
-
-
 def _widen_tails(score: Array, n: Array) -> Array:
     """Add the tails that the kurtosis of n samples has beyond the law of Anscombe and Glynn.
 
@@ -481,7 +464,7 @@ def _draw_kurtosis(setup: _NullSetup, count: int, rng: np.random.Generator) -> A
     blocks = setup.blocks
     recorded = blocks["kurtosis"].values
     samples = np.maximum(blocks["samples"].values.astype(np.float64), 20.0)
-    mean, variance, a = _kurtosis_moments(samples)
+    mean, variance, a = kurtosis_moments(samples)
     root = (
         1.0
         - 2.0 / (9.0 * a)

@@ -100,12 +100,6 @@ def null_scores(
         Expectation of the scores.
     nulls : iterable of xarray.Dataset
         Null records in chunks with a leading dimension ``record``.
-
-    settings : Settings
-
-    Returns
-    -------
-    NullScores
     """
     gathered: dict[str, _ScoreSums] = {}
     records = 0

@@ -33,7 +33,6 @@ def average_sizes(
 
     Parameters
     ----------
-    component : Component
     state : State
         With all other effects in the model.
     candidates : sequence of Candidate

@@ -124,8 +124,6 @@ class Component:
 
     Attributes
     ----------
-    candidate : Candidate
-    variant : Variant
     row : tuple of str
         Axes of the row.
     evidence_nats : float
@@ -157,7 +155,6 @@ class CandidateEvidence:
 
     Attributes
     ----------
-    candidate : Candidate
     rows : list of tuple of str
         Axes of each row.
     evidence_nats : ndarray, shape (record, row)

@@ -25,8 +25,6 @@ def missing_channel_reason(channels: Collection[str], blocks: xr.Dataset) -> str
     ----------
     channels : collection of str
         Channels of the effect.
-    blocks : xarray.Dataset
-        From `reduce_log`.
     """
     unused: Mapping[str, str] = blocks.attrs.get("unused_channels", {})
     for name in channels:

@@ -116,7 +116,6 @@ def drop_changed_tails(
 
     Parameters
     ----------
-    blocks : xarray.Dataset
     expected : ndarray, shape (axis, block, band)
         Expected power.
     """

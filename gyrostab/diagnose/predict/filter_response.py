@@ -69,9 +69,6 @@ def undo_filter(
 
     Parameters
     ----------
-    blocks : xarray.Dataset
-    axis : str
-    effect : str
     values : mapping
         Parameters of the filter at its full size.
     expected : ndarray, shape (line,)

@@ -37,8 +37,6 @@ class Point:
 
     Attributes
     ----------
-    variant : Variant
-    sizes : Mixture
     share : float
         Length of the part of the grid that it represents, in steps.
     unlikely : float
@@ -81,7 +79,6 @@ def refine_grid(component: Component, state: State, points: Sequence[Point]) -> 
 
     Parameters
     ----------
-    component : Component
     state : State
         With all other effects in the model.
     points : sequence of Point

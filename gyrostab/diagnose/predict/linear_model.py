@@ -6,7 +6,7 @@ columns are those of a `State`: the current model of the noise, and the effects 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,6 +15,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.held_out import LinearModel
+from gyrostab.diagnose.predict.candidates import Candidate
 from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.periodogram import taper
@@ -38,6 +39,7 @@ __all__ = [
     "simulate_noise",
     "spread_by_gaps",
     "stack_columns",
+    "stack_designs",
     "unspread_share",
 ]
 
@@ -50,10 +52,6 @@ class State:
 
     Attributes
     ----------
-    blocks : xarray.Dataset
-        Block statistics of the recording.
-    baseline : xarray.Dataset
-        From `gyrostab.diagnose.baseline.calibrate`.
     weight : ndarray, shape (axis, block, band)
         Powers that define the weights of all cells [degree2 hour-2 Hz-1]: expected, plus those of
         the named effects.
@@ -203,6 +201,17 @@ def given_columns(
 def stack_columns(columns: Sequence[Array], shape: tuple[int, ...]) -> Array:
     """Stack columns as (block, cell, column)."""
     return np.stack([np.broadcast_to(one, shape) for one in columns], axis=-1)
+
+
+def stack_designs(
+    candidates: Sequence[Candidate], shape: tuple[int, ...], make_column: Callable[[Array], Array]
+) -> list[Array]:
+    """Return the designs (block, cell, column) of all variants, in order."""
+    return [
+        stack_columns([make_column(one) for one in variant.design], shape)
+        for candidate in candidates
+        for variant in candidate.variants
+    ]
 
 
 def power_column(density: Array, row: int, state: State) -> Array:

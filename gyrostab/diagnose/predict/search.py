@@ -51,13 +51,8 @@ def compute_evidence(
 
     Parameters
     ----------
-    candidates : sequence of Candidate
     data : xarray.Dataset
         The recording, or null records.
-    state : State
-        Current model.
-    folds : xarray.DataArray
-        From `fold_blocks`.
     count_evidence : CountEvidence, optional
         Without it, sample counts are left out.
     rng : numpy.random.Generator, optional

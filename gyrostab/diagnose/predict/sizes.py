@@ -14,7 +14,14 @@ from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
 
-__all__ = ["Mixture", "component_mixture", "component_size", "linear_mixture", "mean_mixture"]
+__all__ = [
+    "Mixture",
+    "component_mixture",
+    "component_size",
+    "disagreement_nats",
+    "linear_mixture",
+    "mean_mixture",
+]
 
 Array = NDArray[np.float64]
 _RIDGE = 1e-12  # of the trace of the Gram matrix, against singular columns
@@ -64,8 +71,6 @@ def mean_mixture(
 
     Parameters
     ----------
-    state : State
-    axis : str
     columns : sequence of ndarray, shape (block,)
     tier : {"free", "calibrated"}
         Freedom of the noise, as in `gyrostab.diagnose.evidence.held_out.mean_factors`.
@@ -160,6 +165,12 @@ def linear_mixture(component: Component, state: State, variant: Variant) -> Mixt
     with np.errstate(over="ignore"):
         own_covariance = covariance[:own_count, :own_count] / np.outer(scale, scale)
     return Mixture(np.array([log_weight]), (mean[:own_count] / scale)[None], own_covariance[None])
+
+
+def disagreement_nats(size: Array, weight: Array) -> float:
+    """Return half the chi-square of sizes of these weights about their mean."""
+    mean = (weight * size).sum() / max(weight.sum(), 1e-300)
+    return 0.5 * float((weight * (size - mean) ** 2).sum())
 
 
 def component_size(component: Component, state: State) -> tuple[float, float]:

@@ -31,7 +31,6 @@ def select_step_times(values: Array, windows: Windows) -> list[float]:
     ----------
     values : ndarray
         Possible times, rising [s].
-    windows : Windows
 
     Examples
     --------

@@ -48,8 +48,6 @@ def make_windows(blocks: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
 
     Parameters
     ----------
-    blocks : xarray.Dataset
-        From `reduce_log`.
     drivers : mapping of str to str
         Channels of the log by channel of the effect.
     """

@@ -378,7 +378,6 @@ def _power_near_order(turned: NDArray[np.complex128], often: Array, harmonic: in
         Samples without the harmonics, demodulated by this harmonic.
     often : ndarray, shape (block,)
         Turns of the tool in the block, negative if it turns back.
-    harmonic : int
     """
     neighbours = np.concatenate([-np.arange(*_NEIGHBOUR_TURNS)[::-1], np.arange(*_NEIGHBOUR_TURNS)])
     power = np.abs(np.fft.fft(turned, axis=-1)[..., neighbours]) ** 2

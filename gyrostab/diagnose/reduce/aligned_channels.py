@@ -122,10 +122,6 @@ def align_channels(log: xr.Dataset) -> Aligned:
     log : xarray.Dataset
         Regular log, in memory or lazy; a lazy log stays lazy.
 
-    Returns
-    -------
-    Aligned
-
     Examples
     --------
     >>> from gyrostab.ingest.make_log import make_log

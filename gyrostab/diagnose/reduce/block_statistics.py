@@ -24,7 +24,7 @@ from gyrostab.diagnose.reduce.log_blocks import (
     read_batches,
 )
 from gyrostab.diagnose.reduce.outliers import count_outliers, quantization_step, zeros_beyond_chance
-from gyrostab.diagnose.reduce.schema import check_block_statistics, label_variables
+from gyrostab.diagnose.reduce.schema import COORDINATES, check_block_statistics, label_variables
 from gyrostab.diagnose.reduce.zero_bin import BINS, bin_widths
 from gyrostab.errors import OptionError
 from gyrostab.kernels.regression.smooth import smooth_curve
@@ -199,8 +199,6 @@ def noise_at_orders(blocks: xr.Dataset, expected: Array) -> Array:
 
     Parameters
     ----------
-    blocks : xarray.Dataset
-        From `reduce_log`.
     expected : ndarray, shape (..., axis, block, harmonic)
         [degree2 hour-2 Hz-1]
     """
@@ -279,7 +277,7 @@ def _label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> 
             variables,
             coords=_make_coordinates(work, log),
             attrs=_make_attributes(work, log, present),
-        ).set_coords(["first", "second"])
+        )
     )
 
 
@@ -366,7 +364,7 @@ def _count_stuck(
 
 def _cross_spectra(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
     """Return cross-spectra of the axes, and of each axis with the channels on the log's time."""
-    axes, names = work.axes, [str(name) for name in log["axis"].values]
+    axes = work.axes
     own = [number for number, (_, other) in enumerate(work.pairs) if other < axes]
     variables = label_variables(
         {
@@ -376,11 +374,6 @@ def _cross_spectra(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
             "cross_samples": work.cross_samples[own],
         }
     )
-    for side, name in enumerate(("first", "second")):
-        variables[name] = (
-            "pair",
-            np.array([names[work.pairs[number][side]] for number in own], dtype=object),
-        )
     if work.channels:
         shape = (axes, len(work.channels), *work.cross.shape[1:])
         with_axes = np.full(shape, np.nan + 0j)
@@ -499,61 +492,28 @@ def _make_coordinates(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
     ends = np.arange(work.block_count + 1) * work.length
     stamps = grid_times(work.start, work.rate, ends)
     step = work.rate / work.length
-    coordinates: dict[str, Any] = {
-        "bin": ("bin", np.array(BINS, dtype=object)),
-        "axis": ("axis", np.array([str(name) for name in log["axis"].values], dtype=object)),
-        "time": (
-            "block",
-            (stamps[:-1] + np.diff(stamps) // 2).view("datetime64[ns]"),
-            {"long_name": "middle of the block"},
-        ),
-        "begin": (
-            "block",
-            ends[:-1] / work.rate,
-            _make_attrs("start of the block, since the start", "s"),
-        ),
-        "end": (
-            "block",
-            ends[1:] / work.rate,
-            _make_attrs("end of the block, since the start", "s"),
-        ),
-        "frequency": (
-            "band",
-            (work.edges[:-1] + work.edges[1:] - 1) / 2.0 * step,
-            _make_attrs("centre of the band", "Hz"),
-        ),
-        "band_low": (
-            "band",
-            (work.edges[:-1] - 0.5) * step,
-            _make_attrs("lower edge of the band", "Hz"),
-        ),
-        "band_high": (
-            "band",
-            (work.edges[1:] - 0.5) * step,
-            _make_attrs("upper edge of the band", "Hz"),
-        ),
-        "line_frequency": (
-            "line",
-            np.arange(1, work.line_sum.shape[-1] + 1) * step,
-            _make_attrs("frequency", "Hz"),
-        ),
+    axes = np.array([str(name) for name in log["axis"].values], dtype=object)
+    pairs = np.array([pair for pair in work.pairs if pair[1] < work.axes], np.int64).reshape(-1, 2)
+    arrays: dict[str, Any] = {
+        "bin": np.array(BINS, dtype=object),
+        "axis": axes,
+        "first": axes[pairs[:, 0]],
+        "second": axes[pairs[:, 1]],
+        "time": (stamps[:-1] + np.diff(stamps) // 2).view("datetime64[ns]"),
+        "begin": ends[:-1] / work.rate,
+        "end": ends[1:] / work.rate,
+        "frequency": (work.edges[:-1] + work.edges[1:] - 1) / 2.0 * step,
+        "band_low": (work.edges[:-1] - 0.5) * step,
+        "band_high": (work.edges[1:] - 0.5) * step,
+        "line_frequency": np.arange(1, work.line_sum.shape[-1] + 1) * step,
     }
     if work.channels:
-        coordinates["reference"] = ("reference", np.array(work.channels, dtype=object))
+        arrays["reference"] = np.array(work.channels, dtype=object)
     if work.order is not None:
-        coordinates["harmonic"] = (
-            "harmonic",
-            np.array(HARMONICS),
-            _make_attrs("multiple of the rotation", "1"),
-        )
+        arrays["harmonic"] = np.array(HARMONICS)
     if work.profile_sums is not None:
-        low, high = work.ramp_range
-        coordinates["phase"] = (
-            "phase",
-            (np.arange(RAMP_PHASE_BINS) + 0.5) / RAMP_PHASE_BINS,
-            _make_attrs(f"phase of the ramp, {low:g} to {high:g}", "1"),
-        )
-    return coordinates
+        arrays["phase"] = (np.arange(RAMP_PHASE_BINS) + 0.5) / RAMP_PHASE_BINS
+    return label_variables(arrays, COORDINATES)
 
 
 def _make_attributes(

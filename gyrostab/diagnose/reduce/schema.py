@@ -1,4 +1,4 @@
-"""Schema of the block statistics: dimensions, unit and meaning of every variable.
+"""Schema of block statistics and baseline: dimensions, unit and meaning of every variable.
 
 The order of the dimensions is fixed. Later steps may therefore compute on plain arrays, and look up
 labels only where they read and write.
@@ -12,9 +12,17 @@ from typing import Any, NamedTuple
 import xarray as xr
 
 from gyrostab.errors import SchemaError
+from gyrostab.noise import LAWS, TERMS
 from gyrostab.units import INNER
 
-__all__ = ["BLOCK_STATISTICS", "Variable", "check_block_statistics", "label_variables"]
+__all__ = [
+    "BASELINE",
+    "BLOCK_STATISTICS",
+    "COORDINATES",
+    "Variable",
+    "check_block_statistics",
+    "label_variables",
+]
 
 
 class Variable(NamedTuple):
@@ -126,13 +134,72 @@ BLOCK_STATISTICS: dict[str, Variable] = {
 }
 
 
-def label_variables(arrays: Mapping[str, Any]) -> dict[str, Any]:
+#: Coordinates of the block statistics.
+COORDINATES: dict[str, Variable] = {
+    "bin": Variable(("bin",), "1", "zero bin, or both of its neighbours"),
+    "axis": Variable(("axis",), "1", "axis of the gyro"),
+    "first": Variable(("pair",), "1", "first axis of the pair"),
+    "second": Variable(("pair",), "1", "second axis of the pair"),
+    "time": Variable(("block",), "", "middle of the block"),
+    "begin": Variable(("block",), "s", "start of the block, since the start"),
+    "end": Variable(("block",), "s", "end of the block, since the start"),
+    "frequency": Variable(("band",), "Hz", "centre of the band"),
+    "band_low": Variable(("band",), "Hz", "lower edge of the band"),
+    "band_high": Variable(("band",), "Hz", "upper edge of the band"),
+    "line_frequency": Variable(("line",), "Hz", "frequency"),
+    "reference": Variable(("reference",), "1", "channel on the time of the log"),
+    "harmonic": Variable(("harmonic",), "1", "multiple of the rotation"),
+    "phase": Variable(("phase",), "1", "phase of the ramp, as a share of its range"),
+}
+
+_NOISE_UNITS = ", ".join(f"{term} in {LAWS[term].label}" for term in TERMS)
+_SQUARES = f"square of {_NOISE_UNITS}"
+_TERM, _SQUARE, _GRID, _LINE = (
+    ("axis", "term"), ("axis", "noise"), ("axis", "grid"), ("axis", "line"),
+)  # fmt: skip
+
+#: Variables of a baseline. Those from `cross` on are there only if model or simulation have them.
+BASELINE: dict[str, Variable] = {
+    "coefficient": Variable(_TERM, _NOISE_UNITS, "noise coefficient"),
+    "stderr": Variable(_TERM, _NOISE_UNITS, "standard error of the coefficient"),
+    "quiet": Variable(_BLOCK, "1", "block is calibrated on"),
+    "spectrum": Variable(_BAND, _POWER, "expected power"),
+    "known_mean": Variable(_BLOCK, _RATE, "mean rate of known effects"),
+    "mean_variance": Variable(_BLOCK, "degree2 hour-2", "white variance of the block mean"),
+    "common": Variable(_BLOCK, "1", "relative variance that the powers of a block have in common"),
+    "shape_alone": Variable(_BAND, "1", "shape of the gamma distribution without the common part"),
+    "columns": Variable((*_BAND, "noise"), _POWER, "expected power per squared coefficient"),
+    "square": Variable(_SQUARE, _SQUARES, "squared coefficient that fits the powers"),
+    "square_stderr": Variable(_SQUARE, _SQUARES, "standard error of it"),
+    "posterior": Variable(("axis", "draw", "noise"), _SQUARES, "draws of the squares in powers"),
+    "posterior_slow": Variable(("axis", "draw", "slow"), _SQUARES, "draws of those in the means"),
+    "grid_K": Variable(_GRID, LAWS["K"].label, "random walk that the means may have"),
+    "grid_B": Variable(_GRID, LAWS["B"].label, "flicker that the means may have"),
+    "grid_prior": Variable(_GRID, "1", "log probability of it before the record"),
+    "grid_calibrated": Variable(_GRID, "1", "log probability of it in the record"),
+    "cross": Variable(_PAIR_BAND, _POWER, "expected cross-spectrum"),
+    "cross_error": Variable(("pair", "band"), "1", "error of the coherency"),
+    "form_shape": Variable(("axis", "band"), "1", "shape of the distribution of the form"),
+    "lines": Variable(_LINE, _POWER, "expected power of steady lines"),
+    "lines_most": Variable(_LINE, _POWER, "largest power of them at any offset of the frequency"),
+    "peaks": Variable(_LINE, _POWER, "expected power of broad peaks"),
+    "line_spectrum": Variable(("axis", "band"), _POWER, "expected power of lines in the bands"),
+    "wander_square": Variable(("axis", "wander"), "degree2 hour-2", "variance of a process"),
+    "wander_time": Variable(("wander",), "s", "correlation time of a process"),
+    "wander_walk": Variable(_BLOCK, "degree2 hour-2 s-1", "variance rate of random walks"),
+}
+
+
+def label_variables(
+    arrays: Mapping[str, Any], schema: Mapping[str, Variable] = BLOCK_STATISTICS
+) -> dict[str, Any]:
     """Return arrays with the dimensions and attributes of the schema, as xarray takes them."""
     return {
         name: (
-            BLOCK_STATISTICS[name].dims,
+            schema[name].dims,
             array,
-            {"long_name": BLOCK_STATISTICS[name].long_name, "units": BLOCK_STATISTICS[name].units},
+            {"long_name": schema[name].long_name}
+            | ({"units": schema[name].units} if schema[name].units else {}),
         )
         for name, array in arrays.items()
     }

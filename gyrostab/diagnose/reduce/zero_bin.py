@@ -125,11 +125,6 @@ def truncated_axes(blocks: xr.Dataset) -> NDArray[np.bool_]:
 
     The axes are judged together, because one logger writes all of them in the same way.
 
-    Parameters
-    ----------
-    blocks : xarray.Dataset
-        From `gyrostab.diagnose.reduce.block_statistics.reduce_log`.
-
     Returns
     -------
     ndarray of bool, shape (axis,)

@@ -127,11 +127,8 @@ def attribute_mismatches(
     ----------
     found : xarray.Dataset
         Mismatches from `gyrostab.diagnose.locate.mismatches.locate_mismatches`.
-    identified : sequence of Identification
     blocks, after : xarray.Dataset
         The recording, and the baseline with the effects.
-    null : NullScores
-        Scores of the null records.
     level : float
         False-alarm level.
     without : callable, optional
@@ -139,7 +136,6 @@ def attribute_mismatches(
         Without it, every effect at the place of a mismatch explains it.
     still : xarray.Dataset, optional
         Line spectra of the recording without the blocks in which an effect moves the rate.
-    settings : Settings
 
     Returns
     -------
@@ -238,12 +234,8 @@ def drop_expected(
     found : xarray.Dataset
         Mismatches located with the expected anomalous samples left out. Effects with such samples
         therefore explain mismatches of the sample distribution only.
-    expected : sequence of Identification
     blocks, before : xarray.Dataset
         The recording, and the baseline with these effects.
-    null : NullScores
-    level : float
-    settings : Settings
     """
     anomalous = [
         one

@@ -170,7 +170,6 @@ def needed_effects(
         statistic.
     left : callable
         Takes effects to leave out; returns the score that is left, and the score of a mismatch.
-    settings : Settings
     """
     weighed = [
         one

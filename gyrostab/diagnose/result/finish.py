@@ -32,14 +32,11 @@ from gyrostab.diagnose.result.surfaces import make_surfaces
 from gyrostab.diagnose.result.tables import (
     baseline_table,
     effect_tables,
-    identification_tables,
     limit_tables,
     mismatch_tables,
     model_tables,
-    motion_tables,
     recording_table,
     surfaces_with_blocks,
-    unidentified_tables,
 )
 from gyrostab.diagnose.result.verdict import decide_verdict
 from gyrostab.diagnose.settings import Settings
@@ -259,12 +256,7 @@ def _attributed_mismatches(
         still=lines,
         settings=task.settings,
     )
-    mismatches = mismatch_tables(found, blocks, explained)
-    mismatches += identification_tables(
-        fit.identifications, blocks, mismatches, settings=task.settings
-    )
-    mismatches += unidentified_tables(fit.identifications, blocks, mismatches)
-    return mismatches + motion_tables(identified, blocks, mismatches)
+    return mismatch_tables(found, explained, fit.identifications, blocks, settings=task.settings)
 
 
 def _make_surfaces_with_outliers(

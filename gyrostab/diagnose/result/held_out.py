@@ -48,8 +48,6 @@ def held_out(
 
     Parameters
     ----------
-    blocks : xarray.Dataset
-        The recording.
     before, after : xarray.Dataset or callable
         Baselines, the second with the effects in its ``spectrum``, ``known_mean`` and, for noise in
         common, ``cross`` (pair, block, band). A callable takes the mask of the blocks that it may

@@ -52,7 +52,6 @@ def keep_supported(
 
     Parameters
     ----------
-    identifications : Identifications
     fitted : sequence of sequence of Fitted
         Fits of each identification, in the same order.
 

@@ -25,8 +25,6 @@ def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> 
 
     Parameters
     ----------
-    blocks : xarray.Dataset
-        The recording.
     before, after : xarray.Dataset
         Baselines without and with the effects.
 

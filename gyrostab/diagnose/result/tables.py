@@ -38,15 +38,15 @@ from gyrostab.simulate.model import Model
 __all__ = [
     "baseline_table",
     "effect_tables",
-    "identification_tables",
+    "identified_mismatches",
     "iso",
     "limit_tables",
     "mismatch_tables",
     "model_tables",
-    "motion_tables",
+    "motion_mismatches",
     "recording_table",
     "surfaces_with_blocks",
-    "unidentified_tables",
+    "unidentified_mismatches",
 ]
 
 Array = NDArray[np.float64]
@@ -117,10 +117,53 @@ def baseline_table(baseline: xr.Dataset, expected: Sequence[Fitted]) -> dict[str
     return {**table, "expected": known} if known else table
 
 
+def _mismatch(
+    blocks: xr.Dataset,
+    view: str,
+    axes: Sequence[str],
+    span: tuple[float, float],
+    taus: tuple[float, float],
+    p_value: float,
+    statement: str,
+    *,
+    ratio: float | None = None,
+    explained_by: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Return a mismatch as a table, without its id; span and averaging times in s."""
+    return {
+        "view": view,
+        "axes": list(axes),
+        "start": iso(blocks, span[0]),
+        "end": iso(blocks, span[1]),
+        "tau_min_s": taus[0],
+        "tau_max_s": taus[1],
+        "ratio": ratio,
+        "p_value": p_value,
+        "explained_by": list(explained_by),
+        "statement": statement,
+    }
+
+
 def mismatch_tables(
+    found: xr.Dataset,
+    explained: Sequence[Sequence[str]],
+    identifications: Identifications,
+    blocks: xr.Dataset,
+    *,
+    settings: Settings = DEFAULTS,
+) -> list[dict[str, Any]]:
+    """Return the mismatches that were located, identified or left out, each with its sentence."""
+    out = _located_mismatches(found, blocks, explained)
+    out += identified_mismatches(identifications, blocks, out, settings=settings)
+    out += unidentified_mismatches(identifications, blocks, out)
+    out += motion_mismatches(identifications.identified, blocks)
+    return [{"id": number, **table} for number, table in enumerate(out, start=1)]
+
+
+def _located_mismatches(
     found: xr.Dataset, blocks: xr.Dataset, explained: Sequence[Sequence[str]]
 ) -> list[dict[str, Any]]:
-    """Return the located mismatches, each with its sentence."""
+    """Return the located mismatches."""
     whole = float(blocks["end"].values[-1])
     out = []
     for number, names in enumerate(explained):
@@ -131,24 +174,22 @@ def mismatch_tables(
         }
         region["axes"] = str(region["axes"]).split()
         out.append(
-            {
-                "id": number + 1,
-                "view": region["view"],
-                "axes": region["axes"],
-                "start": iso(blocks, region["begin"]),
-                "end": iso(blocks, region["end"]),
-                "tau_min_s": region["tau_min_s"],
-                "tau_max_s": region["tau_max_s"],
-                "ratio": region["ratio"],
-                "p_value": region["p_value"],
-                "explained_by": list(names),
-                "statement": mismatch_statement(region, whole),
-            }
+            _mismatch(
+                blocks,
+                region["view"],
+                region["axes"],
+                (region["begin"], region["end"]),
+                (region["tau_min_s"], region["tau_max_s"]),
+                region["p_value"],
+                mismatch_statement(region, whole),
+                ratio=region["ratio"],
+                explained_by=names,
+            )
         )
     return out
 
 
-def identification_tables(
+def identified_mismatches(
     identifications: Identifications,
     blocks: xr.Dataset,
     known: Sequence[Mapping[str, Any]],
@@ -162,95 +203,58 @@ def identification_tables(
     """
     out: list[dict[str, Any]] = []
     begin, end = blocks["begin"].values, blocks["end"].values
-    for identification in identifications.identified:
+    for one in identifications.identified:
         if any(
-            identification.effect in region["explained_by"]
-            and set(region["axes"]) & set(identification.axes)
+            one.effect in region["explained_by"] and set(region["axes"]) & set(one.axes)
             for region in known
         ):
             continue
-        strongest = max(identification.components, key=lambda component: component.evidence_nats)
+        strongest = max(one.components, key=lambda component: component.evidence_nats)
         view = strongest.statistic.view
-        low, high = strongest.statistic.averaging_times(strongest, blocks)
-        p_value = tail_probability(
-            identifications.null_best, identification.evidence_nats, settings=settings
-        )
-        acting = active_blocks(identification, blocks, settings=settings)
-        for first, last in join_blocks(acting, begin, end):
-            when = span_text(first, last, float(end[-1]))
-            out.append(
-                {
-                    "id": len(known) + len(out) + 1,
-                    "view": view,
-                    "axes": list(identification.axes),
-                    "start": iso(blocks, first),
-                    "end": iso(blocks, last),
-                    "tau_min_s": low,
-                    "tau_max_s": high,
-                    "ratio": None,
-                    "p_value": p_value,
-                    "explained_by": [identification.effect],
-                    "statement": named_statement(
-                        view, identification.effect, identification.axes, when, p_value
-                    ),
-                }
+        taus = strongest.statistic.averaging_times(strongest, blocks)
+        p_value = tail_probability(identifications.null_best, one.evidence_nats, settings=settings)
+        for span in join_blocks(active_blocks(one, blocks, settings=settings), begin, end):
+            text = named_statement(
+                view, one.effect, one.axes, span_text(*span, float(end[-1])), p_value
             )
-    return out
-
-
-def unidentified_tables(
-    identifications: Identifications, blocks: xr.Dataset, known: Sequence[Mapping[str, Any]]
-) -> list[dict[str, Any]]:
-    """Return mismatches without an effect, where no other unexplained mismatch covers them."""
-    out: list[dict[str, Any]] = []
-    for one in identifications.unknown:
-        statistic = _NUISANCE_VIEWS.get(one.generic, "davar")
-        is_covered = any(
-            region["view"] == statistic
-            and set(region["axes"]) & set(one.axes)
-            and not region["explained_by"]
-            for region in known
-        )
-        if not is_covered:
             out.append(
-                _unidentified_table(
-                    one, identifications, blocks, len(known) + len(out) + 1, statistic
+                _mismatch(
+                    blocks, view, one.axes, span, taus, p_value, text, explained_by=[one.effect]
                 )
             )
     return out
 
 
-def _unidentified_table(
-    one: Unidentified,
-    identifications: Identifications,
-    blocks: xr.Dataset,
-    number: int,
-    statistic: str,
-) -> dict[str, Any]:
-    p_value = tail_probability(
-        identifications.null_best, one.evidence_nats, settings=identifications.state.settings
-    )
-    candidates = ", ".join(plain_name(name) for name in one.candidates)
-    nearest = f"; the closest candidates are {candidates}" if candidates else ""
-    means, what = statistic == "mean", NUISANCE_ALTERNATIVES.get(one.generic, "something differs")
+def unidentified_mismatches(
+    identifications: Identifications, blocks: xr.Dataset, known: Sequence[Mapping[str, Any]]
+) -> list[dict[str, Any]]:
+    """Return mismatches without an effect, where no other unexplained mismatch covers them."""
+    out: list[dict[str, Any]] = []
     rate, block = float(blocks.attrs["sampling_rate_hz"]), float(blocks.attrs["block_s"])
-    begin, end, when = _find_event(one, blocks)
-    return {
-        "id": number,
-        "view": statistic,
-        "axes": list(one.axes),
-        "start": iso(blocks, begin),
-        "end": iso(blocks, end),
-        "tau_min_s": block if means else 1.0 / rate,
-        "tau_max_s": float(blocks["end"].values[-1]) / 2.0 if means else block,
-        "ratio": None,
-        "p_value": p_value,
-        "explained_by": [],
-        "statement": (
+    longest = float(blocks["end"].values[-1]) / 2.0
+    for one in identifications.unknown:
+        view = _NUISANCE_VIEWS.get(one.generic, "davar")
+        if any(
+            region["view"] == view
+            and set(region["axes"]) & set(one.axes)
+            and not region["explained_by"]
+            for region in known
+        ):
+            continue
+        p_value = tail_probability(
+            identifications.null_best, one.evidence_nats, settings=identifications.state.settings
+        )
+        candidates = ", ".join(plain_name(name) for name in one.candidates)
+        nearest = f"; the closest candidates are {candidates}" if candidates else ""
+        what = NUISANCE_ALTERNATIVES.get(one.generic, "something differs")
+        begin, end, when = _find_event(one, blocks)
+        text = (
             f"On {axes_text(one.axes)} {what}{when}; no known effect explains it{nearest} "
             f"({chance(p_value)})."
-        ),
-    }
+        )
+        taus = (block, longest) if view == "mean" else (1.0 / rate, block)
+        out.append(_mismatch(blocks, view, one.axes, (begin, end), taus, p_value, text))
+    return out
 
 
 def _find_event(one: Unidentified, blocks: xr.Dataset) -> tuple[float, float, str]:
@@ -267,8 +271,8 @@ def _find_event(one: Unidentified, blocks: xr.Dataset) -> tuple[float, float, st
     return begin, end, f", {span_text(begin, end, whole)}"
 
 
-def motion_tables(
-    identified: Sequence[Identification], blocks: xr.Dataset, known: Sequence[Mapping[str, Any]]
+def motion_mismatches(
+    identified: Sequence[Identification], blocks: xr.Dataset
 ) -> list[dict[str, Any]]:
     """Return one mismatch for each axis with moving blocks that the comparison left out.
 
@@ -276,40 +280,23 @@ def motion_tables(
     """
     if "moving" not in blocks:
         return []
-    begin = blocks["begin"].values
-    end = blocks["end"].values
-    block = float(blocks.attrs["block_s"])
+    begin, end = blocks["begin"].values, blocks["end"].values
+    means = measured(blocks, "mean").values
     out: list[dict[str, Any]] = []
-    for axis, moving, mean in zip(
-        map(str, blocks["axis"].values),
-        blocks["moving"].values,
-        measured(blocks, "mean").values,
-        strict=True,
-    ):
+    for row, axis in enumerate(map(str, blocks["axis"].values)):
+        moving, mean = blocks["moving"].values[row], means[row]
         if not moving.any():
             continue
-        first, last = (float(edge) for edge in (begin[moving][0], end[moving][-1]))
+        first, last = float(begin[moving][0]), float(end[moving][-1])
         largest = float(np.nanmax(np.abs(mean - np.nanmedian(mean[~moving]))[moving]))
-        out.append(
-            {
-                "id": len(known) + len(out) + 1,
-                "view": "mean",
-                "axes": [axis],
-                "start": iso(blocks, first),
-                "end": iso(blocks, last),
-                "tau_min_s": 1.0 / float(blocks.attrs["sampling_rate_hz"]),
-                "tau_max_s": max((last - first) / 2.0, block),
-                "ratio": None,
-                "p_value": MIN_P_VALUE,
-                "explained_by": [],
-                "statement": motion_statement(
-                    axis,
-                    span_text(first, last, float(end[-1])),
-                    largest,
-                    _axes_following(axis, identified),
-                ),
-            }
+        followers = _axes_following(axis, identified)
+        when = span_text(first, last, float(end[-1]))
+        text = motion_statement(axis, when, largest, followers)
+        taus = (
+            1.0 / float(blocks.attrs["sampling_rate_hz"]),
+            max((last - first) / 2.0, float(blocks.attrs["block_s"])),
         )
+        out.append(_mismatch(blocks, "mean", [axis], (first, last), taus, MIN_P_VALUE, text))
     return out
 
 

@@ -36,137 +36,6 @@ END_TOLERANCE_SHARE = 0.02
 _CHANCE = "noise alone would show this in {share} such records"
 _CHANCE_PATTERN = re.compile(r" \(noise alone would show this in [^()]*\)(?=\.$)")
 
-#: What each effect is called in a sentence.
-_NAMES = {
-    "temperature_bias": "a bias that follows temperature",
-    "shupe": "a bias that follows the rate of change of temperature (Shupe effect)",
-    "thermal_gradient": "a bias that follows a temperature difference",
-    "warm_up": "warm-up after power-on",
-    "thermal_hysteresis": "a bias with temperature hysteresis",
-    "vibration_rectification": "a bias caused by vibration (vibration rectification)",
-    "g_sensitivity": "a bias that follows acceleration",
-    "scale_factor": "a scale-factor error",
-    "misalignment": "rotation about another axis, coupled in by misalignment",
-    "earth_rate": "earth rate, which varies with the tool face",
-    "dead_zone": "a dead zone near zero rate",
-    "feedback_reset": "an error of the feedback ramp",
-    "fringe_hop": "steps of one fringe",
-    "bias_jump": "a bias jump",
-    "telegraph": "a bias that switches between two levels",
-    "gauss_markov": "a slowly wandering bias (Gauss-Markov process)",
-    "supply_bias": "a bias that follows supply voltage or light power",
-    "magnetic": "a bias that follows the magnetic field",
-    "ageing_bias": "a bias trend in time",
-    "temperature_noise": "white noise that varies with temperature",
-    "light_power_noise": "white noise that varies with light power",
-    "vibration_noise": "noise that rises with vibration",
-    "vibration_random_walk": "a random walk that rises with vibration",
-    "ageing_noise": "white noise with a trend in time",
-    "shared_source": "noise common to the axes (shared light source)",
-    "spectral_line": "a steady spectral line or resonance",
-    "rotation_line": "lines locked to the rotation of the tool",
-    "logger_filter": "a filter in the logger",
-    "aliased_vibration": "vibration aliased by the sampling",
-    "rate_quantization": "quantization of the output",
-    "spikes": "bit errors or outliers",
-    "held_samples": "repeated or zero-filled samples",
-    "clipping": "clipped extremes",
-    "clock_error": "an error of the clock",
-    "real_motion": "real rotation of the tool, not a sensor error",
-}
-
-#: Measurement that separates an effect from the others that look like it.
-_NEXT_MEASUREMENTS = {
-    "temperature_bias": (
-        "heat and cool once with a hold at each end: a bias that follows temperature stays during"
-        " the hold and returns later"
-    ),
-    "shupe": (
-        "hold the temperature after a ramp: a Shupe bias decays, and changes sign when the ramp "
-        "is reversed"
-    ),
-    "thermal_gradient": "log a second temperature at the other end of the coil",
-    "warm_up": (
-        "switch off and on again at a steady outside temperature: warm-up repeats after every start"
-    ),
-    "thermal_hysteresis": (
-        "run a closed temperature cycle twice: with hysteresis heating and cooling differ, and "
-        "the loop repeats"
-    ),
-    "vibration_rectification": (
-        "repeat at twice the vibration: rectification grows fourfold, g-sensitivity twofold; then"
-        " turn the tool over: g-sensitivity changes sign"
-    ),
-    "g_sensitivity": (
-        "turn the tool over, at rest: g-sensitivity changes sign with gravity, rectification does"
-        " not"
-    ),
-    "scale_factor": (
-        "rotate at two known rates in both directions: a scale-factor error is proportional to "
-        "the rate"
-    ),
-    "misalignment": "rotate about one axis at a time and read the others",
-    "earth_rate": (
-        "stop the rotation at four tool faces 90 degrees apart: earth rate follows the tool face"
-    ),
-    "dead_zone": "add a slow known rotation that carries the rate through zero",
-    "feedback_reset": (
-        "log the phase of the feedback ramp, and repeat at another rotation rate: lines of the "
-        "ramp move with it"
-    ),
-    "fringe_hop": "compare the size of the steps with the rate of one fringe of this coil",
-    "bias_jump": (
-        "switch off and on several times with nothing else changed, and compare the bias before "
-        "and after"
-    ),
-    "telegraph": (
-        "record longer, for at least ten switches: the histogram of the means then shows two levels"
-    ),
-    "gauss_markov": "record at rest for at least ten times the correlation time of the bias",
-    "supply_bias": "change the supply voltage in steps at a steady temperature",
-    "magnetic": "turn a magnet, or turn the tool in the earth's field, and log a magnetometer",
-    "ageing_bias": (
-        "reverse the temperature once: a trend in time continues, a bias that follows temperature"
-        " returns"
-    ),
-    "temperature_noise": (
-        "return to the first temperature: noise that follows temperature returns too, noise that "
-        "follows age does not"
-    ),
-    "light_power_noise": "change the light power in steps at a steady temperature, and log it",
-    "vibration_noise": (
-        "log an accelerometer at the full rate: its spectrum and its coherence with the gyro "
-        "separate noise from motion"
-    ),
-    "vibration_random_walk": (
-        "vibrate evenly for at least half an hour: a random walk keeps growing between the edges,"
-        " a step does not"
-    ),
-    "ageing_noise": "repeat the record at the same temperature some days later",
-    "shared_source": "log the light power of the source, or run the axes on separate sources",
-    "spectral_line": (
-        "change the sampling rate: an aliased line moves, a true one stays; change the rotation "
-        "rate to see whether the line follows"
-    ),
-    "rotation_line": "repeat at another rotation rate: lines locked to the tool move with it",
-    "logger_filter": (
-        "read the logger settings, or log at a higher rate: a filter leaves the long averaging "
-        "times unchanged"
-    ),
-    "aliased_vibration": (
-        "log at a higher rate, or with an analogue filter: an aliased band moves or disappears"
-    ),
-    "rate_quantization": "log with one more bit, or in counts",
-    "spikes": "log the raw data words: bit errors change them by powers of two counts",
-    "held_samples": "log a counter with each sample",
-    "clipping": "widen the output range",
-    "clock_error": "log a second clock, or a known line such as the mains",
-    "real_motion": (
-        "log accelerometers and a second gyro on the same block: real motion shows in all of "
-        "them, a sensor error in one"
-    ),
-}
-
 
 def plain_name(name: str) -> str:
     """Return what an effect is called in a sentence.
@@ -176,9 +45,8 @@ def plain_name(name: str) -> str:
     >>> plain_name("shupe"), plain_name("some_new_effect")
     ('a bias that follows the rate of change of temperature (Shupe effect)', 'some new effect')
     """
-    if name in _NAMES:
-        return _NAMES[name]
-    return effects()[name].short if name in effects() else name.strip("~").replace("_", " ")
+    kind = effects().get(name)
+    return (kind.plain or kind.short) if kind else name.strip("~").replace("_", " ")
 
 
 def chance(p_value: float) -> str:
@@ -392,8 +260,8 @@ def next_measurement(name: str, alternatives: Sequence[str]) -> str:
      rectification does not.'
     """
     names = (name, *alternatives)
-    known = _NEXT_MEASUREMENTS
-    steps = list(dict.fromkeys(known[other] for other in names[:3] if other in known))
+    known = {other: effects()[other].next_measurement for other in names if other in effects()}
+    steps = list(dict.fromkeys(filter(None, map(known.get, names[:3]))))
     if not steps:
         return ""
     if {"vibration_rectification", "g_sensitivity"} <= set(names):

@@ -33,7 +33,6 @@ def failed_checks(held: Mapping[str, Any], *, settings: Settings = DEFAULTS) -> 
     ----------
     held : mapping
         The table ``held_out`` of a diagnosis.
-    settings : Settings
 
     Examples
     --------
@@ -76,7 +75,6 @@ def decide_verdict(
         Mismatches that no effect explains.
     held : mapping
         The table ``held_out`` of a diagnosis.
-    settings : Settings
 
     Examples
     --------

@@ -41,8 +41,6 @@ class NullDraw(NamedTuple):
     ----------
     blocks, baseline : xarray.Dataset
         The recording, for its blocks, gaps and channels, and the noise.
-    record_count : int
-    rng : numpy.random.Generator
     expected, power : ndarray, shape (record, axis, block, band)
         Expected and drawn powers [degree2 hour-2 Hz-1].
     sample_sd : ndarray, shape (axis, 2)
@@ -65,8 +63,6 @@ class SizeFit(NamedTuple):
     ----------
     components : sequence of Component
         Of one effect, all in one statistic.
-    axes : tuple of str
-        Axes of the effect.
     state : State
         With all other effects in the model.
     candidates : sequence of Candidate
@@ -258,8 +254,6 @@ class Statistic:
 
         Parameters
         ----------
-        component : Component
-        axis : str
         state : State
             Without any effect.
         weight : ndarray, shape (axis, block, band)

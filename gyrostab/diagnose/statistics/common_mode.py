@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.statistics.base import Statistic
 from gyrostab.diagnose.statistics.cross_spectrum import correlation_score
+from gyrostab.diagnose.statistics.mean import slow_coefficients
 from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
     cube_root_score,
+    cumulative,
     statistic_dataset,
     sum_over_windows,
     window_set,
@@ -115,7 +117,6 @@ def _whiten_means(
     residual: Array, available: NDArray[np.bool_], blocks: xr.Dataset, baseline: xr.Dataset
 ) -> Array:
     """Whiten block means by (record), axis, block; zero where missing."""
-    terms = [str(term) for term in baseline["term"].values]
     white = baseline["mean_variance"].values
     begin = blocks["begin"].values
     end = blocks["end"].values
@@ -123,10 +124,7 @@ def _whiten_means(
     share, times, faster = flicker_states(block, float(end[-1] - begin[0]))
     increments = np.empty_like(residual)
     for axis in range(residual.shape[-2]):
-        b, k = (
-            float(np.nan_to_num(baseline["coefficient"].values[axis, terms.index(term)]))
-            for term in ("B", "K")
-        )
+        b, k = slow_coefficients(baseline, axis)
         present = available[axis] & np.isfinite(white[axis]) & (white[axis] > 0)
         variance = np.where(present, white[axis] + b**2 * faster, 1.0)
         series = residual[..., axis, :].reshape(-1, residual.shape[-1])
@@ -211,7 +209,7 @@ def _blocks_per_value(averages: Array, first: list[int], second: list[int]) -> A
 
 def _moving_sum(values: Array, span: int) -> Array:
     """Return sums over `span` blocks around each."""
-    total = np.pad(np.cumsum(values, axis=-1), [(0, 0)] * (values.ndim - 1) + [(1, 0)])
+    total = cumulative(values)
     place = np.arange(values.shape[-1])
     low, high = np.maximum(place - span // 2, 0), np.minimum(place - span // 2 + span, place.size)
     return np.asarray(total[..., high] - total[..., low])

@@ -23,7 +23,7 @@ from gyrostab.diagnose.predict.linear_model import (
     real_and_imaginary,
     records_last,
     select_row,
-    stack_columns,
+    stack_designs,
     unspread_share,
 )
 from gyrostab.diagnose.statistics.base import SizeFit, Sizes, Statistic
@@ -157,17 +157,11 @@ class CrossSpectrum(Statistic):
         weight = np.where((state.masked[i] | state.masked[j])[:, None], 0.0, weight)
         given, precision = given_columns(state, "cross", pair, weight.shape)
         near, width = unspread_share(state.blocks, "pair")[row], band_widths(state.blocks)
-        designs = [
-            stack_columns(
-                [
-                    real_and_imaginary(mix_with_mean(select_row(one, row) + 0j, near, width))
-                    for one in variant.design
-                ],
-                weight.shape,
-            )
-            for candidate in candidates
-            for variant in candidate.variants
-        ]
+        designs = stack_designs(
+            candidates,
+            weight.shape,
+            lambda one: real_and_imaginary(mix_with_mean(select_row(one, row) + 0j, near, width)),
+        )
         return LinearModel(real_and_imaginary(values, axis=1), weight, designs, given, precision)
 
     def condition(self, state: State, component: Component) -> State:

@@ -16,6 +16,7 @@ from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
     cube_root_score,
+    cumulative,
     exponential_score,
     statistic_dataset,
 )
@@ -165,7 +166,7 @@ def _largest_path_sums(cells: Array, edges: Array) -> tuple[Array, Array]:
     of each part, 0 to 1.
     """
     lines, parts = cells.shape[-1], cells.shape[-2]
-    total = np.concatenate([np.zeros((*cells.shape[:-1], 1)), np.cumsum(cells, axis=-1)], axis=-1)
+    total = cumulative(cells)
     largest = np.full((*cells.shape[:-2], _SPECTRUM_SECTIONS**2), -np.inf)
     path_count = np.zeros(_SPECTRUM_SECTIONS**2)
     for move, bend in _path_shapes(lines):

@@ -204,8 +204,6 @@ def window_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> 
 
     Parameters
     ----------
-    blocks, baseline : xarray.Dataset
-        As for `score`.
     windows : Windows
         Windows other than the whole record, whose constant is free.
 
@@ -245,23 +243,24 @@ def _matched_filter(residual: Array, noise: MeanNoise, windows: Windows) -> tupl
     )
 
 
+def slow_coefficients(baseline: xr.Dataset, axis: int) -> tuple[float, float]:
+    """Return B and K of the means of an axis, 0 where the baseline has none."""
+    terms = [str(term) for term in baseline["term"].values]
+    B, K = baseline["coefficient"].values[axis, [terms.index(term) for term in ("B", "K")]]
+    return float(np.nan_to_num(B)), float(np.nan_to_num(K))
+
+
 def mean_noise(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, present: Array) -> MeanNoise:
     """Return the covariance of the block means of an axis, with all known random processes.
 
     Parameters
     ----------
-    blocks, baseline : xarray.Dataset
-        As for `score`.
     axis : int
         Index of the axis.
     present : ndarray of bool (block,)
         Blocks with a mean.
     """
-    terms = [str(term) for term in baseline["term"].values]
-    b, k = (
-        float(np.nan_to_num(baseline["coefficient"].values[axis, terms.index(term)]))
-        for term in ("B", "K")
-    )
+    b, k = slow_coefficients(baseline, axis)
     begin, end = blocks["begin"].values, blocks["end"].values
     step = np.diff((begin + end) / 2.0, append=end[-1])
     block, span = float(blocks.attrs["block_s"]), float(end[-1] - begin[0])

@@ -33,9 +33,6 @@ def null_counts(
         The recording, for its blocks, gaps and quantization grids.
     sd : ndarray, shape (axis, 2)
         Standard deviations of a sample and of a difference of neighbours [degree hour-1].
-    count : int
-        Number of records.
-    rng : numpy.random.Generator
 
     Returns
     -------

@@ -21,7 +21,7 @@ from gyrostab.diagnose.predict.linear_model import (
     power_column,
     records_last,
     select_row,
-    stack_columns,
+    stack_designs,
     unspread_share,
 )
 from gyrostab.diagnose.statistics.base import Statistic, column_choices
@@ -29,6 +29,7 @@ from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
     cube_root_score,
+    cumulative,
     statistic_dataset,
     sum_over_windows,
     window_set,
@@ -182,14 +183,9 @@ class Power(Statistic):
             state, "power", (axis,), weight.shape, known, np.diagonal(precision)
         )
         near, width = unspread_share(state.blocks)[row], band_widths(state.blocks)
-        designs = [
-            stack_columns(
-                [mix_with_mean(select_row(one, row), near, width) for one in variant.design],
-                weight.shape,
-            )
-            for candidate in candidates
-            for variant in candidate.variants
-        ]
+        designs = stack_designs(
+            candidates, weight.shape, lambda one: mix_with_mean(select_row(one, row), near, width)
+        )
         return with_independent_cells(
             LinearModel(values, weight, designs, given, whole),
             state.baseline["common"].sel(axis=axis).values,
@@ -350,16 +346,8 @@ def _mean_differences(means: Array, k: int) -> Array:
 
     As long as the record.
     """
-    total = np.concatenate(
-        [
-            np.zeros((*means.shape[:-1], 1)),
-            np.cumsum(np.where(np.isfinite(means), means, 0.0), axis=-1),
-        ],
-        axis=-1,
-    )
-    lost = np.concatenate(
-        [np.zeros((*means.shape[:-1], 1)), np.cumsum(~np.isfinite(means), axis=-1)], axis=-1
-    )
+    total = cumulative(np.where(np.isfinite(means), means, 0.0))
+    lost = cumulative(~np.isfinite(means))
     difference = (total[..., 2 * k :] - 2.0 * total[..., k:-k] + total[..., : -2 * k]) / k
     difference[lost[..., 2 * k :] > lost[..., : -2 * k]] = np.nan
     return _pad_end(difference, means.shape[-1])
@@ -367,13 +355,7 @@ def _mean_differences(means: Array, k: int) -> Array:
 
 def _pair_variance(white: Array, k: int) -> Array:
     """Return the white variance of the differences of means of k blocks."""
-    total = np.concatenate(
-        [
-            np.zeros((*white.shape[:-1], 1)),
-            np.cumsum(np.where(np.isfinite(white), white, 0.0), axis=-1),
-        ],
-        axis=-1,
-    )
+    total = cumulative(np.where(np.isfinite(white), white, 0.0))
     return _pad_end((total[..., 2 * k :] - total[..., : -2 * k]) / k**2, white.shape[-1])
 
 

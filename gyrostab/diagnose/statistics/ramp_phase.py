@@ -14,7 +14,7 @@ from gyrostab.diagnose.evidence.held_out import LinearModel
 from gyrostab.diagnose.evidence.spectral_lines import LEAK_LINES
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect, Variant
 from gyrostab.diagnose.predict.condition import free_shape
-from gyrostab.diagnose.predict.linear_model import State, given_columns, records_last, stack_columns
+from gyrostab.diagnose.predict.linear_model import State, given_columns, records_last, stack_designs
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.statistics.base import NullDraw, Statistic, column_choices
 from gyrostab.diagnose.statistics.rotation_order import score_orders, turns_per_second
@@ -130,11 +130,7 @@ class RampPhase(Statistic):
             [np.ones(weight.shape[1])],
             [-1.0],
         )
-        designs = [
-            stack_columns(list(variant.design), weight.shape)
-            for candidate in candidates
-            for variant in candidate.variants
-        ]
+        designs = stack_designs(candidates, weight.shape, np.asarray)
         return LinearModel(values, weight, designs, given, precision)
 
     def condition(self, state: State, component: Component) -> State:

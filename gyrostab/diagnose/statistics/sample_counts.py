@@ -17,6 +17,7 @@ from gyrostab.diagnose.evidence.sample_counts import (
     excess_extremes,
     has_coarse_grid,
     kurtosis_evidence,
+    kurtosis_moments,
     sample_count_evidence,
 )
 from gyrostab.diagnose.predict.candidates import (
@@ -169,10 +170,8 @@ class SampleCounts(Statistic):
         """Leave out blocks with anomalous samples; if too many, free the shape of the spectrum."""
         if _is_everywhere(component):
             return state
-        axis, anomalous = (
-            component.row[0],
-            find_anomalous_blocks(component, state.blocks, state.settings),
-        )
+        axis = component.row[0]
+        anomalous = find_anomalous_blocks(component, state.blocks, state.settings)
         if not anomalous.any():
             return free_shape(state, axis)
         keep = xr.DataArray(~anomalous, dims="block")
@@ -229,15 +228,7 @@ def kurtosis_score(excess: Array, samples: Array) -> tuple[Array, Array]:
     array([0.1, 3.8])
     """
     n = np.maximum(samples, 4.0)
-    mean = -6.0 / (n + 1.0)
-    variance = 24.0 * n * (n - 2.0) * (n - 3.0) / ((n + 1.0) ** 2 * (n + 3.0) * (n + 5.0))
-    skew = (
-        6.0
-        * (n * n - 5.0 * n + 2.0)
-        / ((n + 7.0) * (n + 9.0))
-        * np.sqrt(6.0 * (n + 3.0) * (n + 5.0) / (n * (n - 2.0) * (n - 3.0)))
-    )
-    a = 6.0 + 8.0 / skew * (2.0 / skew + np.sqrt(1.0 + 4.0 / skew**2))
+    mean, variance, a = kurtosis_moments(n)
     used = np.isfinite(excess) & (samples >= 20)
     with np.errstate(invalid="ignore"):
         x = np.where(used, (excess - mean) / np.sqrt(variance), 0.0)

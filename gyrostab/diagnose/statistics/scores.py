@@ -14,6 +14,7 @@ __all__ = [
     "Array",
     "Windows",
     "cube_root_score",
+    "cumulative",
     "exponential_score",
     "statistic_dataset",
     "sum_over_windows",
@@ -78,6 +79,11 @@ def window_set(block_count: int, lengths: Sequence[int], *, whole: bool = True) 
         length.append(np.full(1, block_count))
     begin = np.concatenate(first)
     return Windows(begin, begin + np.concatenate(length))
+
+
+def cumulative(values: Array) -> Array:
+    """Return cumulative sums over the last dimension, from 0."""
+    return np.pad(np.cumsum(values, axis=-1), [(0, 0)] * (values.ndim - 1) + [(1, 0)])
 
 
 def sum_over_windows(values: Any, windows: Windows) -> Any:

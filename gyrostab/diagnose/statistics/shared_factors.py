@@ -44,8 +44,6 @@ def estimate_shared_factors(
     ----------
     components : sequence of Component
         Of cross-spectra.
-    axes : tuple of str
-        Axes of the effect.
     state : State
         With all other effects in the model.
 

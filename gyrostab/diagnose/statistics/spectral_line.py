@@ -33,6 +33,7 @@ from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
     cube_root_score,
+    cumulative,
     statistic_dataset,
     sum_over_windows,
 )
@@ -241,7 +242,7 @@ def _equal_block_share(blocks: xr.Dataset, windows: Windows) -> Array:
 def _sum_leakage(excess: Array) -> Array:
     """Sum over a line and its leakage; for a sine, a quarter of squared amplitude times block."""
     n = excess.shape[-1]
-    total = np.concatenate([np.zeros((*excess.shape[:-1], 1)), np.cumsum(excess, axis=-1)], axis=-1)
+    total = cumulative(excess)
     place = np.arange(n)
     return np.asarray(
         total[..., np.minimum(place + _LEAK_LINES + 1, n)]
@@ -252,7 +253,7 @@ def _sum_leakage(excess: Array) -> Array:
 def _mean_around(flat: Array) -> Array:
     """Return the mean of the lines around each, without its leakage; one-sided near the ends."""
     n = flat.shape[-1]
-    total = np.concatenate([np.zeros((*flat.shape[:-1], 1)), np.cumsum(flat, axis=-1)], axis=-1)
+    total = cumulative(flat)
     place = np.arange(n)
     width = min(2 * _AROUND_LINES + 2 * _LEAK_LINES + 1, n)
     low = np.clip(place - width // 2, 0, n - width)

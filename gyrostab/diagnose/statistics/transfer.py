@@ -22,7 +22,7 @@ from gyrostab.diagnose.predict.linear_model import (
     real_and_imaginary,
     records_last,
     reference_channel_power,
-    stack_columns,
+    stack_designs,
 )
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.predict.windows import distinct_variants
@@ -131,13 +131,9 @@ class Transfer(Statistic):
         with np.errstate(invalid="ignore"):
             values = real_and_imaginary(cross / root[..., None], axis=1)
         given, precision = given_columns(state, "transfer", (state.axes[row],), weight.shape)
-        designs = [
-            stack_columns(
-                [real_and_imaginary(one * root * share) for one in variant.design], weight.shape
-            )
-            for candidate in candidates
-            for variant in candidate.variants
-        ]
+        designs = stack_designs(
+            candidates, weight.shape, lambda one: real_and_imaginary(one * root * share)
+        )
         return LinearModel(values, weight, designs, given, precision)
 
     def condition(self, state: State, component: Component) -> State:

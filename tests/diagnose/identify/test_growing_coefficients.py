@@ -15,7 +15,7 @@ from gyrostab.diagnose.identify.identification import Identification, Identifica
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import drop_changed_tails
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.result.tables import identification_tables
+from gyrostab.diagnose.result.tables import identified_mismatches
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.ingest.make_log import make_log
 from tests.conftest import ROOT
@@ -157,7 +157,7 @@ def blocks() -> xr.Dataset:
 def test_effect_without_a_mismatch_gets_one_where_it_acts(
     statistic: str, told: str, taus: tuple[float, float]
 ) -> None:
-    (region,) = identification_tables(
+    (region,) = identified_mismatches(
         identifications(statistic, place=9 if statistic == "spectral_line" else -1), blocks(), []
     )
     assert (region["view"], region["axes"], region["explained_by"]) == (told, ["y"], ["shupe"])
@@ -172,13 +172,9 @@ def test_effect_without_a_mismatch_gets_one_where_it_acts(
 
 def test_effect_with_a_mismatch_gets_no_other() -> None:
     known = [{"explained_by": ["shupe"], "axes": ["x", "y"]}]
-    assert identification_tables(identifications("mean"), blocks(), known) == []
-    assert [
-        region["id"]
-        for region in identification_tables(
-            identifications("mean"), blocks(), [known[0] | {"axes": ["x"]}]
-        )
-    ] == [2]
+    assert identified_mismatches(identifications("mean"), blocks(), known) == []
+    elsewhere = [known[0] | {"axes": ["x"]}]
+    assert len(identified_mismatches(identifications("mean"), blocks(), elsewhere)) == 1
 
 
 # --------------------------------------------------------------------------------

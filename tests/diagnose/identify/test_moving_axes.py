@@ -13,7 +13,7 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.identify.moving_axes import moving_blocks, unexplained_motion, without_motion
 from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.diagnose.reduce.block_statistics import measured, reduce_log
-from gyrostab.diagnose.result.tables import motion_tables
+from gyrostab.diagnose.result.tables import motion_mismatches
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.errors import SchemaError
 from gyrostab.simulate import simulate
@@ -158,12 +158,12 @@ def test_rest_is_found_in_less_than_half_of_the_time(at_rest):
 
 def test_motion_is_one_mismatch_with_the_axes_that_sense_it(reduced):
     whole, rest = reduced
-    assert motion_tables([], whole, []) == []
-    (alone,) = motion_tables([], rest, [{}])
-    assert (alone["id"], alone["axes"], alone["explained_by"]) == (2, ["z"], [])
+    assert motion_mismatches([], whole) == []
+    (alone,) = motion_mismatches([], rest)
+    assert (alone["axes"], alone["explained_by"]) == (["z"], [])
     assert "scale-factor" in alone["statement"]
     assert "40" in alone["statement"] or "39" in alone["statement"]
-    (witnessed,) = motion_tables([identification("misalignment", "mean", "x")], rest, [])
+    (witnessed,) = motion_mismatches([identification("misalignment", "mean", "x")], rest)
     assert "Axis x senses part of it" in witnessed["statement"]
     assert "real rotation" in witnessed["statement"]
 

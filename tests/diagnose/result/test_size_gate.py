@@ -23,7 +23,7 @@ from gyrostab.diagnose.identify.identification import Identification, Identifica
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.result import finish as conclude
 from gyrostab.diagnose.result.size_gate import keep_supported, supported_axes
-from gyrostab.diagnose.result.tables import effect_tables, unidentified_tables
+from gyrostab.diagnose.result.tables import effect_tables, unidentified_mismatches
 from gyrostab.diagnose.result.text import summary
 from gyrostab.diagnose.result.verdict import decide_verdict, failed_checks
 from gyrostab.diagnose.statistics import find_statistic
@@ -141,7 +141,7 @@ def test_effect_of_possibly_zero_size_becomes_unidentified():
     kept, first, fit = conclude.fit_supported(identifications, baseline)
     assert (kept.identified, first, fit.fitted) == ((), [], [])
     assert effect_tables(fit.fitted, blocks) == []
-    (region,) = unidentified_tables(fit.identifications, blocks, [])
+    (region,) = unidentified_mismatches(fit.identifications, blocks, [])
     assert region["explained_by"] == []
     assert "a bias caused by vibration" in region["statement"]
 
