@@ -317,6 +317,12 @@ class Settings:
         "Quiescent blocks that must be found; below it the quietest are taken.",
         "choice: drift is known up to 16 blocks",
     )
+    steady_share: float = _setting(
+        0.3,
+        "1",
+        "Share of the blocks at rest that must be left without the noisy ones; below it all stay.",
+        "choice: the noise of a third of the record or more is not an event",
+    )
     min_information_share: float = _setting(
         1e-4,
         "1",

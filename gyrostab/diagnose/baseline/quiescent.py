@@ -145,8 +145,7 @@ def _drop_noisy_blocks(
             )
             kept = start & (deviation < settings.noisy_sigma)
             if (
-                kept.sum()
-                < max(settings.min_quiescent_blocks, settings.quiescent_share * start.sum())
+                kept.sum() < max(settings.min_quiescent_blocks, settings.steady_share * start.sum())
                 or (kept == quiescent[row]).all()
             ):
                 break

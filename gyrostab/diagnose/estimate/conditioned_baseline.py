@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.identify.identification import Identification, Identifications
+from gyrostab.diagnose.identify.identification import Identification, Identifications, components_of
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import MIN_POWER_RATIO, condition_on, power_shares
 from gyrostab.diagnose.predict.linear_model import (
@@ -93,10 +93,7 @@ def predict_baseline(
         if not any(identification is one for one in left_out)
     ]
     shared = [
-        component
-        for identification in remaining
-        for component in identification.components
-        if component.statistic.is_pairwise
+        component for component in components_of(remaining) if component.statistic.is_pairwise
     ]
     if not shared:
         return after

@@ -27,7 +27,7 @@ from gyrostab.diagnose.baseline.posterior import (
     noise_posterior,
 )
 from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_identifications
-from gyrostab.diagnose.identify.identification import Identifications
+from gyrostab.diagnose.identify.identification import Identifications, components_of
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.filter_response import band_response
@@ -386,11 +386,7 @@ def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identi
     """
     blocks = identifications.state.blocks
     swapped = {}
-    for component in (
-        component
-        for identification in identifications.identified
-        for component in identification.components
-    ):
+    for component in components_of(identifications.identified):
         one = component.candidate
         if one.statistic.is_power and id(one) not in swapped:
             made = [

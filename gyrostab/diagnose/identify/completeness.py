@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.baseline.posterior import visible_coefficients
 from gyrostab.diagnose.evidence.held_out import mean_factors
 from gyrostab.diagnose.evidence.products import mean_products
-from gyrostab.diagnose.identify.identification import Identification
+from gyrostab.diagnose.identify.identification import Identification, components_of
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import mean_mixture
@@ -32,12 +32,9 @@ def with_neighbouring_variants(
     A time constant lies between two points of its grid.
     """
     row = state.axes.index(axis)
-    for component in (
-        component
-        for one in identified
-        for component in one.components
-        if component.statistic.is_linear_in_means and component.row == (axis,)
-    ):
+    for component in components_of(identified):
+        if not (component.statistic.is_linear_in_means and component.row == (axis,)):
+            continue
         family = [
             one for one in component.candidate.variants if one.columns == component.variant.columns
         ]
@@ -53,9 +50,8 @@ def excess_low_frequency_noise(state: State, axis: str, folds: xr.DataArray) -> 
     All identified effects are in the model. It is zero where the free noise is the weaker: a
     calibration on blocks with an effect takes the effect for noise.
     """
-    given = state.given.get(("mean", axis))
-    columns_given = np.stack(given, axis=-1) if given else None
-    columns = [np.linspace(-1.0, 1.0, state.blocks.sizes["block"])] if not given else []
+    given = state.given_to("mean", axis)
+    columns = [np.linspace(-1.0, 1.0, state.blocks.sizes["block"])] if given is None else []
     evidence, strength = [], []
     span = state.blocks.sizes["block"] * float(state.blocks.attrs["block_s"])
     slow = (
@@ -65,13 +61,7 @@ def excess_low_frequency_noise(state: State, axis: str, folds: xr.DataArray) -> 
     for tier in ("free", "calibrated"):
         evidence.append(
             mean_factors(
-                state.blocks,
-                state.baseline,
-                [],
-                axis=axis,
-                tier=tier,
-                given=columns_given,
-                folds=folds,
+                state.blocks, state.baseline, [], axis=axis, tier=tier, given=given, folds=folds
             )[0, 0, 0]
         )
         strength.append(float(mean_mixture(state, axis, columns, tier=tier).weights() @ slow))

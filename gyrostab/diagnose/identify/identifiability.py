@@ -10,7 +10,7 @@ import numpy as np
 
 from gyrostab.diagnose.evidence.telegraph import telegraph_evidence
 from gyrostab.diagnose.identify.effect_candidates import largest_size
-from gyrostab.diagnose.identify.identification import Identification, Unidentified
+from gyrostab.diagnose.identify.identification import Identification, Unidentified, components_of
 from gyrostab.diagnose.identify.jumps import is_lasting, is_sudden, lead_to_levels
 from gyrostab.diagnose.identify.logger_filters import fits_all_axes
 from gyrostab.diagnose.identify.steady import is_always_present
@@ -50,7 +50,7 @@ def without_pulses(
     lines.
     """
     lines: Counter[str] = Counter()
-    for component in (component for one in chosen for component in one.components):
+    for component in components_of(chosen):
         has_profile = component.statistic.is_phase_locked and not component.statistic.is_rotation
         weight = settings.min_comb_lines if has_profile else int(component.statistic.is_line)
         lines.update(dict.fromkeys(component.row, weight))

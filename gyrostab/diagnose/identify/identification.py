@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,8 +21,10 @@ __all__ = [
     "Identifications",
     "Unidentified",
     "add_identification",
+    "components_of",
     "find_unidentified",
     "form_error",
+    "remove_phase_locked",
     "with_axes_of",
 ]
 
@@ -133,6 +135,29 @@ class Identifications:
         return "partly explained" if self.unknown else "explained"
 
 
+def components_of(chosen: Iterable[Identification | Unidentified]) -> list[Component]:
+    """Return the components of several selections, in order."""
+    return [component for one in chosen for component in one.components]
+
+
+def remove_phase_locked(identifications: Identifications) -> tuple[Identifications, float]:
+    """Drop phase-locked components, and return their held-out evidence [nats].
+
+    The band powers show how large such a component is, but not its phase. In them it would gain a
+    small part of its evidence, and lose in every band that it leaves. Therefore its own statistic
+    alone counts, and the powers of both models are without it.
+    """
+    kept, evidence_nats = [], 0.0
+    for one in identifications.identified:
+        rest = tuple(part for part in one.components if not part.statistic.is_phase_locked)
+        evidence_nats += sum(
+            part.evidence_nats for part in one.components if part.statistic.is_phase_locked
+        )
+        if rest:
+            kept.append(replace(one, components=rest) if len(rest) < len(one.components) else one)
+    return replace(identifications, identified=tuple(kept)), evidence_nats
+
+
 def add_identification(
     chosen: Sequence[Identification | Unidentified], one: Identification | Unidentified
 ) -> list[Identification | Unidentified]:
@@ -189,10 +214,7 @@ def with_axes_of(
 
 def _is_same_effect(one: Identification, other: Identification) -> bool:
     lines = {
-        component.place
-        for identification in (one, other)
-        for component in identification.components
-        if component.statistic.is_line
+        component.place for component in components_of((one, other)) if component.statistic.is_line
     }
     return (one.effect, one.driver) == (other.effect, other.driver) and len(lines) < 2
 

@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.identify.identification import Identification
+from gyrostab.diagnose.identify.identification import Identification, components_of
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.settings import DEFAULTS, Settings
@@ -101,9 +101,7 @@ def unexplained_motion(
     -------
     ndarray of bool, shape (axis, block)
     """
-    components = [
-        component for identification in identified for component in identification.components
-    ]
+    components = components_of(identified)
     explained_axes = {
         axis
         for component in components

@@ -34,6 +34,7 @@ from gyrostab.diagnose.identify.identification import (
     Identification,
     Unidentified,
     add_identification,
+    components_of,
     find_unidentified,
     form_error,
     with_axes_of,
@@ -476,8 +477,7 @@ class Search:
         ]
         lines = {
             component.place
-            for other in chosen
-            for component in other.components
+            for component in components_of(chosen)
             if component.candidate.effect == PLAIN_LINE
         }
         rivals += find_equivalent_effects(
@@ -539,8 +539,7 @@ class Search:
         )
         has_shape = any(
             component.candidate.effect in _SPECTRAL_SHAPES and axis in component.row
-            for one in kept
-            for component in one.components
+            for component in components_of(kept)
         )
         if has_alternative or has_shape:
             return kept, []

@@ -13,7 +13,12 @@ import numpy as np
 
 from gyrostab.diagnose.evidence.telegraph import telegraph_evidence
 from gyrostab.diagnose.identify.components import axes_of, evidence_of
-from gyrostab.diagnose.identify.identification import Identification, Identifications, Unidentified
+from gyrostab.diagnose.identify.identification import (
+    Identification,
+    Identifications,
+    Unidentified,
+    components_of,
+)
 from gyrostab.diagnose.identify.jumps import is_free_jump
 from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
 from gyrostab.diagnose.predict.condition import mean_columns
@@ -118,12 +123,7 @@ def drop_explained_jumps(
         Evidence that jumps must add to the telegraph bias [nats].
     """
     out = list(chosen)
-    for component in [
-        component
-        for one in chosen
-        for component in one.components
-        if component.statistic.is_switching
-    ]:
+    for component in [one for one in components_of(chosen) if one.statistic.is_switching]:
         jumps = _jumps_on_axis(component, out, state_with([]))
         for some in [jumps, *([one] for one in jumps if len(jumps) > 1)]:
             if not some or not _contains_all(out, some):
@@ -152,12 +152,11 @@ def _block_evidence(component: Component, state: State) -> float:
 
     It can be compared; that of sub-blocks knows more, and is not always available.
     """
-    given = state.given.get(("mean", component.row[0]))
     evidence_nats, _ = telegraph_evidence(
         state.blocks,
         state.baseline,
         axis=component.row[0],
-        given=np.stack(given, axis=-1) if given else None,
+        given=state.given_to("mean", component.row[0]),
         settings=state.settings,
     )
     return float(evidence_nats[0])
@@ -166,10 +165,8 @@ def _block_evidence(component: Component, state: State) -> float:
 def _contains_all(
     chosen: Sequence[Identification | Unidentified], components: Sequence[Component]
 ) -> bool:
-    return all(
-        any(component is own for one in chosen for own in one.components)
-        for component in components
-    )
+    known = components_of(chosen)
+    return all(any(component is own for own in known) for component in components)
 
 
 def _replace_component(
@@ -186,8 +183,7 @@ def _jumps_on_axis(
 ) -> list[Component]:
     return [
         one
-        for identification in chosen
-        for one in identification.components
+        for one in components_of(chosen)
         if one.row == component.row and is_free_jump(one, state)
     ]
 

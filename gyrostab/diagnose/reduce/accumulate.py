@@ -75,9 +75,9 @@ class Accumulator:
         self.edges = kernel.band_edges(length)
         self.weights = kernel.taper(length)
         whole = np.ones((1, length), bool)
-        self.full = kernel.gap_spectra(whole, self.weights)
+        self.full, mask, squared = kernel.gap_spectra(whole, self.weights)
         self.full_shape = kernel.shape_of_bands(
-            *_reorder_spectra(self.full), np.array([length]), self.edges, length
+            mask, squared, self.full, np.array([length]), self.edges, length
         )[0]
         self.full_neighbours = _neighbour_share(whole, self.weights)[0]
         bands = self.edges.size - 1
@@ -260,7 +260,7 @@ class Accumulator:
         gappy = used & (counts < self.length)
         place = np.zeros(counts.size, np.int64)
         place[gappy] = 1 + np.arange(np.count_nonzero(gappy))
-        table = self.full[0]
+        table = self.full
         if gappy.any():
             expected, mask, squared = kernel.gap_spectra(present[gappy], self.weights)
             table = np.concatenate([table, expected])
@@ -386,12 +386,6 @@ def _power_near_order(turned: NDArray[np.complex128], often: Array, harmonic: in
     free = (np.abs(place[..., None] - taken) >= _MIN_TURNS_APART).all(axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray((power * free).sum(axis=-1) / free.sum(axis=-1))
-
-
-def _reorder_spectra(found: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
-    """Return the result of `gap_spectra` in the order of the arguments of `shape_of_bands`."""
-    expected, mask, squared = found
-    return mask, squared, expected
 
 
 def _neighbour_share(present: NDArray[np.bool_], weights: Array) -> Array:

@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.known_effects import remove_known_motion
-from gyrostab.diagnose.identify.identification import Identification
+from gyrostab.diagnose.identify.identification import Identification, components_of
 from gyrostab.diagnose.nulls.scores import NullScores, standardise
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import drop_changed_tails
@@ -44,11 +44,7 @@ def statistic_scores(
     out = []
     blocks = remove_known_motion(blocks, after, settings=settings)
     after = _with_shared_lines(blocks, after, identified := list(identified))
-    seen = mask_anomalous_blocks(
-        blocks,
-        [component for identification in identified for component in identification.components],
-        settings,
-    )
+    seen = mask_anomalous_blocks(blocks, components_of(identified), settings)
     turns_left_out = drop_changed_tails(blocks, after["spectrum"].values, settings)
     lines = seen
     if still is not None:
@@ -79,8 +75,7 @@ def _with_shared_lines(
     """
     lines = [
         (component.place, component.row[0])
-        for identification in identified
-        for component in identification.components
+        for component in components_of(identified)
         if component.statistic.is_line and component.place >= 0
     ]
     if "cross" not in blocks or len(lines) < 2:

@@ -18,10 +18,13 @@ from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_identifications
 from gyrostab.diagnose.estimate.outlier_power import add_outlier_power
 from gyrostab.diagnose.estimate.recalibrate import recalibrate, with_noise
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
-from gyrostab.diagnose.identify.identification import Identification, Identifications
-from gyrostab.diagnose.identify.phase_locked import remove_phase_locked
+from gyrostab.diagnose.identify.identification import (
+    Identification,
+    Identifications,
+    components_of,
+    remove_phase_locked,
+)
 from gyrostab.diagnose.identify.switching import remove_telegraph_bias
-from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.channel_use import unused_channels
 from gyrostab.diagnose.result.attribution import active_blocks, attribute_mismatches
 from gyrostab.diagnose.result.content import HELD_OUT, SCHEMA, check_diagnosis
@@ -172,12 +175,12 @@ def measure_evidence(
     identified = without_telegraph.identified
     count_nats = sum(
         component.evidence_nats
-        for component in _components(identified)
+        for component in components_of(identified)
         if component.statistic.is_count
     )
     clean = mask_anomalous_blocks(
         blocks,
-        [*_components(identified), *_components(without_telegraph.expected)],
+        [*components_of(identified), *components_of(without_telegraph.expected)],
         identifications.state.settings,
     )
 
@@ -208,10 +211,6 @@ def measure_evidence(
     if identified and not lasting:
         evidence["forecast_gain"] = np.nan  # no effect can be forecast
     return evidence
-
-
-def _components(identified: Sequence[Identification]) -> list[Component]:
-    return [component for identification in identified for component in identification.components]
 
 
 def _can_be_forecast(

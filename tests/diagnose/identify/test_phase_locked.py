@@ -9,8 +9,11 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.core import diagnose
-from gyrostab.diagnose.identify.identification import Identification, Identifications
-from gyrostab.diagnose.identify.phase_locked import remove_phase_locked
+from gyrostab.diagnose.identify.identification import (
+    Identification,
+    Identifications,
+    remove_phase_locked,
+)
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.simulate import simulate
