@@ -20,8 +20,10 @@ from gyrostab.diagnose.identify.components import (
     axes_of,
     candidates_of,
     find_components,
+    find_layers_again,
     group_components,
     merge_lines,
+    split_layers,
     sum_evidence,
 )
 from gyrostab.diagnose.identify.identifiability import (
@@ -40,7 +42,6 @@ from gyrostab.diagnose.identify.identification import (
     with_axes_of,
 )
 from gyrostab.diagnose.identify.logger_filters import without_slopes
-from gyrostab.diagnose.identify.overlapping import find_layers_again, split_layers
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.identify.switching import (
     drop_explained_jumps,

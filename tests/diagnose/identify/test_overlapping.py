@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
-from gyrostab.diagnose.identify.components import evidence_of
+from gyrostab.diagnose.identify.components import evidence_of, split_layers
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identification import Identification, with_axes_of
-from gyrostab.diagnose.identify.overlapping import split_layers
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
