@@ -139,6 +139,19 @@ def test_several_drivers_on_the_command_line(tmp_path, capsys):
     assert capsys.readouterr().out == together
 
 
+def test_losses_that_follow_a_channel_are_found():
+    product = coupled.product(noises="white", terms=False, axes="x", gap=False)
+    shaking = np.clip(product["temperature"].values - 40, 0, None) / 10
+    product["vibration"] = ("time", shaking, {"units": "9.80665 m s-2"})
+    lost = 0.1 * shaking + 0.02 * np.random.default_rng(1).random(120)
+    product["window_coverage"][:] = 1 - lost
+    found = gyrostab.correlate(product, channel="vibration", variables="window_coverage", max_lag=0)
+    assert verdict(found, axis="x", variable="window_coverage", driver="vibration") == "coupled"
+    slope = float(found["window_coverage_per_vibration"].item())
+    assert slope == pytest.approx(-0.1, rel=0.1)
+    assert found["window_coverage_per_vibration"].attrs["unit_label"] == "1/g"
+
+
 def test_combinations_that_cannot_be_judged_take_one_line():
     few = gyrostab.correlate(coupled.product(windows=16))
     table = format_correlation(few)
