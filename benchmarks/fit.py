@@ -24,7 +24,7 @@ from page import machine, renew
 from gyrostab import davar, fit_noise, make_log
 from gyrostab.allan import fit
 from gyrostab.kernels.fit.covariance import diagonal_products
-from gyrostab.kernels.fit.least_squares import fit_windows, identify_noise
+from gyrostab.kernels.fit.least_squares import identify_noise
 from tests.support.noise_records import lose, quantization, random_walk, white
 
 RATE, SAMPLES = 400.0, 6_000_000
@@ -56,15 +56,17 @@ def measure(x: np.ndarray, taus: int, repeats: int) -> tuple[int, list[float]]:
     """
     surface = davar(make_log(x, rate=RATE, unit="deg/h"), window="5min", step="15s", taus=taus)
     cells, ks, rate, window = fit._fit_inputs(surface)
-    flat = [np.ascontiguousarray(cell.reshape(-1, ks.size), dtype=np.float64) for cell in cells]
+    flat = [np.ascontiguousarray(cell.reshape(-1, ks.size), dtype=np.float64) for cell in cells[:5]]
+    trends = [cell.reshape(-1) for cell in cells[5:]]
     shifts = np.zeros_like(ks)
     tables = fit._cached_tables(tuple(ks.tolist()), tuple(shifts.tolist()), rate, window)
     diagonals = diagonal_products(window, ks, shifts)
-    arguments = (tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, 31)
     quick = (tables.columns, tables.weight, tables.to_samples, *diagonals)
     whole = best(lambda: fit_noise(surface), repeats)
-    kernel = best(lambda: fit_windows(*flat, *arguments), repeats)
-    block = best(lambda: fit._fit_block(flat, tables, 31, True), repeats)
+    kernel = best(lambda: fit._run_kernel(flat, *trends, tables, 31), repeats)
+    block = best(
+        lambda: fit._fit_block(flat, *trends, tables, allowed=31, observed_only=True), repeats
+    )
     seconds = [
         whole,
         kernel,

@@ -115,6 +115,15 @@ VARIABLES: dict[str, dict[str, Any]] = {
         "units": "1",
     },
     "window_mean": {"long_name": "mean rotation rate of the window", "units": INNER["rate"]},
+    "window_trend": {
+        "long_name": "slope of the least-squares line through the rate of the window",
+        "units": "degree hour-2",
+    },
+    "trend_response": {
+        "long_name": "variance of window_trend under white noise, as a share of that of a window "
+        "without gaps",
+        "units": "1",
+    },
     "outlier_count": {
         "long_name": "single samples of the window that are far from both neighbours",
         "units": "1",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -104,21 +105,26 @@ def fit_window_plainly(
     quantization: NDArray[np.float64],
     ramp: NDArray[np.float64],
     factor: NDArray[np.float64],
+    trend: NDArray[np.float64],
     tables: Any,
-) -> dict[str, NDArray[np.float64]]:
+) -> dict[str, Any]:
     """Iterated non-negative generalised least squares of one window, with numpy and scipy.
 
-    Per term the squared coefficient, its standard error, its estimate free of sign, and the
-    variance of that without the term, its growth with the term and with the square of the term;
-    chi-square; the share by which the variances had to be widened at last for a covariance that is
-    positive definite. `tables` are those of `gyrostab.allan.fit`.
+    Squared coefficients, that of a ramp from the trend; chi-square; the share by which the
+    variances had to be widened at last for a covariance that is positive definite; data and normal
+    matrix in four sums of the cells, and their covariance as a function of the squares. `tables`
+    are those of `gyrostab.allan.fit`.
     """
     ok = np.isfinite(y) & (y > 0) & (factor > 0)
     y, white, quantization, ramp, factor = y[ok], white[ok], quantization[ok], ramp[ok], factor[ok]
     bare, weight = tables.columns[ok], tables.weight[ok] * factor
-    pairs, ramps = tables.pairs[:, :, ok][..., ok], tables.ramps[:, ok][..., ok]
-    design = bare * np.stack([quantization, white, *np.ones((2, y.size)), ramp], axis=1)
+    pairs = tables.trend.pairs[:, :, ok][..., ok]
+    ramps = tables.trend.ramps[:, ok][..., ok]
+    part = (bare[:, 4] * ramp)[:, None]
+    design = bare[:, :4] * np.stack([quantization, white, *np.ones((2, y.size))], axis=1)
+    design -= part * trend[:4]
     excess = np.maximum(quantization - 1, 0) * bare[:, 0] / bare[:, 1]
+    z = y - part[:, 0] * trend[4]
 
     def covariance(s: NDArray[np.float64]) -> NDArray[np.float64]:
         ones = np.ones(y.size)
@@ -144,7 +150,8 @@ def fit_window_plainly(
     def solve(whitener: NDArray[np.float64]) -> NDArray[np.float64]:
         columns = whitener @ design
         scale = np.linalg.norm(columns, axis=0)
-        return nnls(columns / scale, whitener @ y, maxiter=1000)[0] / scale
+        squares = nnls(columns / scale, whitener @ z, maxiter=1000)[0] / scale
+        return np.append(squares, max(trend[4] - trend[:4] @ squares, 0.0))
 
     squares = solve(
         np.diag(np.sqrt(weight) / (np.maximum.accumulate(y / design[:, 0]) * design[:, 0]))
@@ -162,39 +169,90 @@ def fit_window_plainly(
         squares = solve(whitener)
         if (abs(squares - previous) <= 1e-4 * previous).all():
             break
-    rows = np.empty((5, 6))
-    for a in range(5):
-        members = np.flatnonzero((squares > 0) | (np.arange(5) == a))
-        columns = whitener @ design[:, members]
-        scale = np.linalg.norm(columns, axis=0)
-        estimator = (np.linalg.pinv(columns / scale) / scale[:, None] @ whitener)[
-            list(members).index(a)
-        ]
-        trial = np.where(np.arange(5) == a, 0.0, squares)
-        cell, stand_in = {0: (0, 1), 2: (-1, 3), 4: (-1, 3)}.get(a, (0, None))
-        if stand_in is not None:
-            trial[stand_in] += squares[a] * design[cell, a] / design[cell, stand_in]
-        unit = np.eye(5)[a]
-        null, both, own = (
-            estimator @ covariance(s) @ estimator for s in (trial, trial + unit, unit)
-        )
-        place = list(members).index(a)
-        error = (
-            np.sqrt(np.linalg.inv((columns / scale).T @ (columns / scale))[place, place])
-            / scale[place]
-        )
-        rows[a] = squares[a], error, estimator @ y, null, both - null - own, own
-    names = (
-        "square",
-        "square_stderr",
-        "free",
-        "variance_null",
-        "variance_linear",
-        "variance_square",
-    )
-    out = dict(zip(names, rows.T, strict=True))
+    reduced = whitener.T @ whitener @ design
     return {
-        **out,
-        "chi2": np.asarray(np.sum((whitener @ (y - design @ squares)) ** 2)),
+        "square": squares,
+        "data": reduced.T @ z,
+        "normal": reduced.T @ design,
+        "products": lambda s: reduced.T @ covariance(s) @ reduced,
+        "chi2": np.asarray(np.sum((whitener @ (z - design @ squares[:4])) ** 2)),
         "jitter": np.asarray(jitter),
     }
+
+
+def average_plainly(plain: dict[str, Any]) -> dict[str, NDArray[np.float64]]:
+    """Average a window of `fit_window_plainly` over the submodels of four terms, with numpy."""
+    data, normal = plain["data"], plain["normal"]
+    spread = 1.0 / np.sqrt(np.diag(normal))
+    fits = []
+    for members in (
+        list(chosen) for size in range(1, 5) for chosen in combinations(range(4), size)
+    ):
+        squares = np.where(np.isin(np.arange(4), members), plain["square"][:4], 0.0)
+        squares[members] = np.where(squares[members] > 0, squares[members], 0.1 * spread[members])
+        for _ in range(3):
+            covariance = plain["products"](np.append(np.maximum(squares, 0), plain["square"][4]))
+            if not covariance.any():
+                break
+            scaled = covariance * np.outer(spread, spread)
+            inverse = np.linalg.inv(scaled + 1e-9 * np.diag(np.diag(scaled)))
+            inverse *= np.outer(spread, spread)
+            columns = normal[:, members] * spread[members]
+            rows = np.linalg.solve(columns.T @ inverse @ columns, columns.T @ inverse)
+            rows *= spread[members][:, None]
+            squares = np.zeros(4)
+            squares[members] = rows @ data
+        misfit = data - normal @ squares
+        likelihood = -0.5 * (np.linalg.slogdet(scaled)[1] + misfit @ inverse @ misfit)
+        if covariance.any():
+            fits.append((members, squares, rows, likelihood))
+
+    def weigh(some: list[Any]) -> Any:
+        likelihood = np.array([fit[3] for fit in some])
+        return np.exp(likelihood - likelihood.max())
+
+    feasible = [fit for fit in fits if (fit[1][fit[0]] > 0).all()]
+    weights = weigh(feasible)
+    average = np.average([fit[1] for fit in feasible], axis=0, weights=weights)
+    out = np.full((4, 6), np.nan)
+    for a in range(4):
+        able = [fit for fit in fits if a in fit[0] and all(fit[1][b] > 0 for b in fit[0] if b != a)]
+        weights = weigh(able)
+        free = np.array([fit[1][a] for fit in able])
+        mean = np.average(free, weights=weights)
+        best = [
+            max((fit[3] for fit in feasible if (a in fit[0]) == there), default=-np.inf)
+            for there in (True, False)
+        ]
+
+        def variance(squares: NDArray[np.float64], a: int = a, able: Any = able) -> Any:
+            covariance = plain["products"](squares)
+            rows = [fit[2][fit[0].index(a)] for fit in able]
+            return np.average([row @ covariance @ row for row in rows], weights=weigh(able))
+
+        noise = np.append(average, plain["square"][4])
+        noise[a] = 0.0
+        unit = np.eye(5)[a] * spread[a]
+        null, both, own = variance(noise), variance(noise + unit), variance(unit)
+        out[a] = (
+            average[a],
+            mean,
+            2 * (best[0] - best[1]),
+            null + np.average((free - mean) ** 2, weights=weights),
+            (both - null - own) / spread[a],
+            own / spread[a] ** 2,
+        )
+    return dict(
+        zip(
+            (
+                "square",
+                "free",
+                "likelihood_ratio",
+                "variance_null",
+                "variance_linear",
+                "variance_square",
+            ),
+            out.T,
+            strict=True,
+        )
+    )

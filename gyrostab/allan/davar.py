@@ -23,6 +23,7 @@ from gyrostab.kernels.allan.outlier_count import count_outliers
 from gyrostab.kernels.allan.pairs import white_pair_sum
 from gyrostab.kernels.allan.reference import direct_sums, recursive_sums, reference_theta
 from gyrostab.kernels.allan.surface import CELL_FIELDS, STRICT, Unit, surface_unit, window_means
+from gyrostab.kernels.allan.trend import window_trends
 from gyrostab.kernels.fit.covariance import diagonal_products
 from gyrostab.kernels.fit.least_squares import identify_noise
 from gyrostab.kernels.workspace import Workspace
@@ -34,7 +35,14 @@ from gyrostab.time.grid import first_stamp, grid_times
 __all__ = ["davar", "davar_part", "davar_parts"]
 
 #: Variables by axis and window, in the order in which `_compute_unit` returns them.
-_PLANE_FIELDS = ("window_mean", "window_coverage", "outlier_count", "gap_edge_ratio")
+_PLANE_FIELDS = (
+    "window_mean",
+    "window_coverage",
+    "window_trend",
+    "trend_response",
+    "outlier_count",
+    "gap_edge_ratio",
+)
 #: Largest number of samples of a part of which all axes are read together.
 _MAX_SAMPLES_READ_AT_ONCE = 2**21
 #: Smallest number of parts for the threads to share, if there are as many units of work.
@@ -112,10 +120,10 @@ def davar(
     -------
     xarray.Dataset
         ``avar, count, coverage, edf, estimator, white_response, quantization_response,
-        ramp_response (axis, time, tau)``, ``window_mean, window_coverage, outlier_count,
-        gap_edge_ratio (axis, time)``, and every channel of the log averaged over each window;
-        ``time`` is the centre of the window, with ``time_bounds``; ``tau`` [s]. Units are
-        attributes of the variables.
+        ramp_response (axis, time, tau)``, ``window_mean, window_coverage, window_trend,
+        trend_response, outlier_count, gap_edge_ratio (axis, time)``, and every channel of the log
+        averaged over each window; ``time`` is the centre of the window, with ``time_bounds``;
+        ``tau`` [s]. Units are attributes of the variables.
 
     Raises
     ------
@@ -307,7 +315,7 @@ def _read_spans(
 def _compute_unit(
     x: NDArray[np.generic], unit: Unit, tables: tuple[Any, ...], space: Workspace | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Compute one unit: cells (9, n_windows, n_tau) and plane fields (4, n_windows).
+    """Compute one unit: cells (9, n_windows, n_tau) and plane fields (6, n_windows).
 
     The last field of the cells holds the degrees of freedom.
     """
@@ -316,16 +324,25 @@ def _compute_unit(
         cells, means = (part.copy() for part in _empty_surface(_with_tuples(unit), x.size))
     else:
         cells, means = surface_unit(x, unit, space)
-    first = np.arange(means.shape[1]) * unit.step
-    outliers = count_outliers(x, first, unit.window)
-    edges = gap_edge_ratio(x, first, unit.window)
     scale = (
         HOUR if unit.angle else 1.0
     )  # angles are in degree, so their slopes in degree per second
     cells[0] *= scale**2
     dof = identify_noise(cells[0], cells[5], cells[6], cells[7], cells[3], *tables)
     means[0] *= scale
-    return np.concatenate([cells, dof[None]]), np.concatenate([means, outliers[None], edges[None]])
+    return np.concatenate([cells, dof[None]]), np.concatenate([means, _describe_windows(x, unit)])
+
+
+def _describe_windows(
+    x: NDArray[np.generic], unit: Unit, windows: int | None = None
+) -> NDArray[np.float64]:
+    """Compute the plane fields from the trend on, (4, n_windows)."""
+    count = (x.size - unit.window - unit.angle) // unit.step + 1 if windows is None else windows
+    first = np.arange(count) * unit.step
+    trends = window_trends(x, angle=unit.angle, window=unit.window, step=unit.step, n_windows=count)
+    trends[0] *= HOUR / unit.interval * (HOUR / unit.interval if unit.angle else 1.0)
+    outliers = count_outliers(x, first, unit.window)
+    return np.vstack([trends, outliers, gap_edge_ratio(x, first, unit.window)])
 
 
 def _cached_tables_of(plan: Plan) -> tuple[Any, ...]:
@@ -367,7 +384,7 @@ def _noise_tables(unit: Unit, rate: float) -> tuple[Any, ...]:
 
 
 def _run_units(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:
-    """Run the units of work: cells (9, axis, time, tau), plane fields (4, axis, time).
+    """Run the units of work: cells (9, axis, time, tau), plane fields (6, axis, time).
 
     The results are dask arrays if `data` is one.
     """
@@ -401,7 +418,7 @@ def _run_units(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:
 def _run_published_method(
     signal: xr.DataArray, unit: Unit, rate: float, method: str, *, paper: bool
 ) -> tuple[Any, Any]:
-    """Run a published algorithm in memory: cells (9, axis, time, tau), plane (4, axis, time)."""
+    """Run a published algorithm in memory: cells (9, axis, time, tau), plane (6, axis, time)."""
     points = unit.window + (0 if paper and not unit.angle else 1)
     all_points = signal.sizes["time"] + (0 if unit.angle or paper else 1)
     n_windows = (all_points - points) // unit.step + (0 if paper else 1)
@@ -435,9 +452,7 @@ def _run_published_method(
             cells[0, row], cells[5, row], cells[6, row], cells[7, row], cells[3, row], *tables
         )
         means[:2, row] = window_means(x, unit)[:, :n_windows]
-        first = np.arange(n_windows) * unit.step
-        means[2, row] = count_outliers(x, first, unit.window)
-        means[3, row] = gap_edge_ratio(x, first, unit.window)
+        means[2:, row] = _describe_windows(x, unit, n_windows)
         means[0, row] *= HOUR if unit.angle else 1.0
     return cells, means
 

@@ -15,9 +15,10 @@ from scipy.special import gammaincc, gammaincinv
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.allan.pairs import white_pair_sum
 from gyrostab.kernels.fit.covariance import STOCHASTIC, product_tables
-from gyrostab.kernels.fit.least_squares import FIT_FIELDS, fit_windows
+from gyrostab.kernels.fit.least_squares import FIT_FIELDS, combine_diagonal, fit_windows
 from gyrostab.kernels.fit.limits import cell_limits, interpolate_quantile
-from gyrostab.noise import LAWS, TERMS, avar_columns, sample_squares
+from gyrostab.kernels.fit.trend import detrend_tables
+from gyrostab.noise import HOUR, LAWS, NORMAL_95, TERMS, avar_columns, sample_squares
 from gyrostab.schema import attributes, check_surface
 from gyrostab.time.durations import duration_seconds, thin
 
@@ -26,8 +27,9 @@ __all__ = ["fit_noise", "fit_part", "is_described", "refit"]
 #: Largest number of averaging times in a fit; more add no information and cost the cube of their
 #: number.
 MOST_TAUS = 48
-#: One-sided normal quantiles: 95 % for limits, 99 % for an observed term.
-_LIMIT_SIGMA, _OBSERVED_SIGMA = 1.6449, 2.3263
+#: One-sided normal quantiles: 95 % for limits, 99 % for an observed term; two-sided 99 %, for the
+#: sign of a ramp is unknown.
+_LIMIT_SIGMA, _OBSERVED_SIGMA, _RAMP_SIGMA = 1.6449, 2.3263, 2.5758
 #: Probability of a misfit by chance below which the model does not fit a window.
 _MISFIT_PROBABILITY = 1e-3
 #: Ratio of the averaging times, from the longest down, that bound the terms (except Q) of a window
@@ -54,9 +56,11 @@ def fit_noise(
 
         avar(tau) = 3 Q^2 / tau^2 + N^2 / tau + (2 ln 2 / pi) B^2 + K^2 tau / 3 + R^2 tau^2 / 2,
 
-    so they follow from non-negative generalised least squares. The covariance between averaging
-    times (overlapping estimates share data) is that of the fitted noise, found by iteration. Where
-    gaps required weighted cluster means, the columns of Q, N and R are predicted from the mask.
+    so they follow from non-negative generalised least squares, averaged over the submodels of Q,
+    N, B and K with their likelihoods as weights. R is the trend of the window. The covariance
+    between averaging times (overlapping estimates share data) is that of the fitted noise, found by
+    iteration. Where gaps required weighted cluster means, the columns of Q, N and R are predicted
+    from the mask.
 
     Parameters
     ----------
@@ -73,8 +77,8 @@ def fit_noise(
         filter, a spectral line, resets of the feedback.
     observed_only : bool
         Give a coefficient and its standard error only where the term is observed, and NaN
-        elsewhere. With False they are the non-negative least-squares estimates of every window, for
-        the fitted curve or to study the estimator.
+        elsewhere. With False they are given for every window, for the fitted curve or to study the
+        estimator; a submodel without the term counts as zero where the term is not observed.
 
     Returns
     -------
@@ -82,9 +86,9 @@ def fit_noise(
         The surface, and per ``(axis, time)``: ``Q`` [urad], ``N`` [deg/sqrt(h)], ``B`` [deg/h],
         ``K`` [deg/h^1.5], ``R`` [deg/h^2], ``*_stderr``, ``*_upper`` (95 % upper limit where the
         term is not observed), ``N_squared, K_squared``, ``fit_chi2``, ``fit_dof``;
-        ``observable(axis, time, term)``: 0 not observable, 1 upper limit only, 2 observed (99 %
-        one-sided). No term is observed in a window that the five terms do not describe: see
-        `is_described`. ``edf`` is that of the fitted noise.
+        ``observable(axis, time, term)``: 0 not observable, 1 upper limit only, 2 observed (noise
+        without the term would do that in 1 % of windows). No term is observed in a window that the
+        five terms do not describe: see `is_described`. ``edf`` is that of the fitted noise.
 
     Raises
     ------
@@ -253,7 +257,10 @@ def _select_taus(tau: NDArray[np.float64], tau_min: Any, tau_max: Any) -> NDArra
 
 
 def _fit_inputs(surface: xr.Dataset) -> tuple[list[Any], NDArray[np.int64], float, int]:
-    """Collect the cells as (axis, time, tau) arrays, averaging factors, rate and window length."""
+    """Collect the cells as (axis, time, tau) arrays, averaging factors, rate and window length.
+
+    The last two arrays are the trend and its response, (axis, time, 1).
+    """
     try:
         rate, window = (
             float(surface.attrs["sampling_rate_hz"]),
@@ -267,13 +274,15 @@ def _fit_inputs(surface: xr.Dataset) -> tuple[list[Any], NDArray[np.int64], floa
     if "ramp_response" not in surface:  # written by a version that took it as 1
         surface = surface.assign(ramp_response=xr.ones_like(surface["white_response"]))
     names = ("avar", "white_response", "quantization_response", "ramp_response", "gap_factor")
-    absent = [name for name in names if name not in surface]
+    planes = ("window_trend", "trend_response")
+    absent = [name for name in (*names, *planes) if name not in surface]
     if absent:
         raise SchemaError(
-            f"the surface lacks {absent}, which the fit needs to account for gaps; make it with "
-            "gyrostab.davar"
+            f"the surface lacks {absent}, which the fit needs to account for gaps and ramps; make "
+            "it with gyrostab.davar"
         )
-    return [surface[name].data for name in names], ks, rate, window
+    cells = [surface[name].data for name in names]
+    return [*cells, *(surface[name].data[..., None] for name in planes)], ks, rate, window
 
 
 def _fit_gls(
@@ -292,11 +301,12 @@ def _fit_gls(
     def block(*arrays: NDArray[np.float64]) -> NDArray[np.float64]:
         flat = [
             np.ascontiguousarray(a[..., chosen].reshape(-1, chosen.size), dtype=np.float64)
-            for a in arrays
+            for a in arrays[:5]
         ]
-        return _fit_block(flat, tables, allowed, observed_only).reshape(
-            arrays[0].shape[0], arrays[0].shape[1], -1
-        )
+        trend, response = (np.asarray(a, dtype=np.float64).reshape(-1) for a in arrays[5:])
+        return _fit_block(
+            flat, trend, response, tables, allowed=allowed, observed_only=observed_only
+        ).reshape(arrays[0].shape[0], arrays[0].shape[1], -1)
 
     if immediate:
         fitted = block(*cells)
@@ -332,6 +342,14 @@ class _Tables:
         self.columns = avar_columns(ks / rate)
         self.to_samples = sample_squares(rate)
         self.pairs, self.ramps = product_tables(window, ks, shifts)
+        self.diagonal = combine_diagonal(
+            np.einsum("abii->abi", self.pairs), np.einsum("aii->ai", self.ramps)
+        )
+        self.trend = detrend_tables(window, ks, self.pairs, self.ramps)
+        #: Variance of the trend of a window per squared coefficient [degree2 hour-4].
+        self.trend_variance = (
+            self.trend.variance * self.to_samples[:STOCHASTIC] * (rate * HOUR) ** 2
+        )
         terms = window - 2 * ks + 1
         self.weight = np.array(
             [n**2 / white_pair_sum(int(n), int(k)) for n, k in zip(terms, ks, strict=True)]
@@ -381,42 +399,112 @@ def _thin_factors(ks: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _fit_block(
-    flat: list[NDArray[np.float64]], tables: _Tables, allowed: int, observed_only: bool
+    flat: list[NDArray[np.float64]],
+    trend: NDArray[np.float64],
+    response: NDArray[np.float64],
+    tables: _Tables,
+    *,
+    allowed: int,
+    observed_only: bool,
 ) -> NDArray[np.float64]:
     """Fit windows: coefficients, errors, limits, observability, chi2, dof and edf as columns."""
-    result, misfit, dof = fit_windows(
-        *flat, tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, allowed
-    )
+    result, misfit, dof = _run_kernel(flat, trend, response, tables, allowed)
     field = {name: result[:, i] for i, name in enumerate(FIT_FIELDS)}
-    square, error = field["square"], field["square_stderr"]
     fails = _widen_misfits(field, misfit)
+    square = field["square"]
     with np.errstate(invalid="ignore", divide="ignore"):
-        value = np.sqrt(square)
+        visible = np.isfinite(square) & (field["separation"] > _MIN_SEPARATION)
+        observed = visible & (field["free"] > 0) & _exceed_chance(field) & ~fails[:, None]
+        estimate = np.where(observed, field["free"], square)
+        value, error = np.sqrt(estimate), np.sqrt(_variance_of_estimate(field, estimate))
         # d(sqrt s) = ds / (2 sqrt s); near zero, the root of the error of the square is the scale
         stderr = np.where(
-            square > error,
+            estimate > error,
             error / (2.0 * value),
-            np.sqrt(np.maximum(error, 0.0)) / np.where(square > error, 1.0, 2.0),
+            np.sqrt(error) / np.where(estimate > error, 1.0, 2.0),
         )
-        visible = np.isfinite(square) & (field["separation"] > _MIN_SEPARATION)
-        observed = (
-            visible
-            & (square > 0)
-            & (field["free"] > _OBSERVED_SIGMA * np.sqrt(np.maximum(field["variance_null"], 0.0)))
-        )
-        limit = np.minimum(
-            _limit_of_estimate(field, tables), _limit_of_cell(flat, square, dof, tables)
-        )
+        stderr[:, 4] = _trend_error(field, NORMAL_95)
+        limit = _limit_of_estimate(field, tables)
         limit[fails] = _limit_of_curve(
             [cell[fails] for cell in flat], square[fails], dof[fails], tables
         )
-        observed &= ~fails[:, None]
         upper = np.where(visible & ~observed, np.sqrt(limit), np.nan)
     reported = observed if observed_only else visible
     stderr = np.where(reported, stderr, np.nan)
     value = np.where(reported, value, np.nan)
     observable = np.where(observed, 2.0, np.where(visible & np.isfinite(upper), 1.0, 0.0))
     return np.concatenate([value, stderr, upper, observable, misfit, dof], axis=1)
+
+
+def _run_kernel(
+    flat: list[NDArray[np.float64]],
+    trend: NDArray[np.float64],
+    response: NDArray[np.float64],
+    tables: _Tables,
+    allowed: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Run `fit_windows`, less the trend if a ramp is allowed; other terms are NaN."""
+    trends = np.zeros((trend.size, STOCHASTIC + 1))
+    pairs, ramps = tables.pairs, tables.ramps
+    if allowed >> STOCHASTIC & 1:
+        pairs, ramps = tables.trend.pairs, tables.trend.ramps
+        trends[:, :STOCHASTIC] = tables.trend_variance
+        trends[:, TERMS.index("N")] *= response
+        trends[:, STOCHASTIC] = trend**2
+        trends = np.nan_to_num(trends)
+    noise = allowed if allowed & 15 else allowed | 1 << TERMS.index("N")  # for a ramp alone
+    result, misfit, dof = fit_windows(
+        *flat,
+        trends,
+        tables.columns,
+        tables.to_samples,
+        pairs,
+        ramps,
+        tables.diagonal,
+        tables.weight,
+        noise,
+    )
+    result[..., [not allowed >> a & 1 for a in range(len(TERMS))]] = np.nan
+    return result, misfit, dof
+
+
+def _exceed_chance(field: dict[str, NDArray[np.float64]]) -> NDArray[np.bool_]:
+    """Find the terms that noise without them exceeds in 1 % of windows.
+
+    The likelihood ratio of the best submodels with and without the term must exceed chance, for a
+    ramp the trend of the window.
+    """
+    exceeds = field["likelihood_ratio"] > _OBSERVED_SIGMA**2
+    exceeds[:, 4] = np.sqrt(field["free"][:, 4]) > _RAMP_SIGMA * _trend_error(field, _RAMP_SIGMA)
+    return np.asarray(exceeds)
+
+
+def _trend_error(field: dict[str, NDArray[np.float64]], sigma: float) -> NDArray[np.float64]:
+    """Compute the standard error of the trend, of which `sigma` give an interval.
+
+    The variance v of the trend follows from the fitted noise, with a standard error w. To first
+    order in ``(w / v)^2``, the quantile of a normal variable of such a variance is that of
+    Student's t: ``sigma^2 v (1 + (sigma^2 + 1) / 4 (w / v)^2)``. Where the noise is hardly known,
+    the 95 % upper limit ``v + 1.64 w`` is lower, and sufficient.
+    """
+    variance = field["variance_null"][:, 4]
+    spread = np.sqrt(field["variance_linear"][:, 4])
+    ratio = np.where(variance > 0, spread / variance, 0.0)
+    wider = np.minimum(0.25 * (sigma**2 + 1.0) * ratio**2, _LIMIT_SIGMA * ratio)
+    return np.sqrt(variance * (1.0 + wider))
+
+
+def _variance_of_estimate(
+    field: dict[str, NDArray[np.float64]], square: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Compute the variance of an estimate where the squared coefficient is `square`."""
+    a, b, c = _variance_growth(field)
+    return np.asarray(a + b * square + c * square**2)
+
+
+def _variance_growth(field: dict[str, NDArray[np.float64]]) -> list[NDArray[np.float64]]:
+    names = ("variance_null", "variance_linear", "variance_square")
+    return [np.maximum(field[name], 0.0) for name in names]
 
 
 def _widen_misfits(
@@ -426,7 +514,6 @@ def _widen_misfits(
     chi2, dof = misfit.T
     fails = ~is_described(chi2, dof)
     wider = np.where(fails, chi2 / np.maximum(dof, 1.0), 1.0)[:, None]
-    field["square_stderr"] *= np.sqrt(wider)
     for name in ("variance_null", "variance_linear", "variance_square"):
         field[name] *= wider
     return np.asarray(fails)
@@ -443,41 +530,17 @@ def _limit_of_estimate(
     s at which the estimate is at its 5 % quantile: ``(s - e)^2 = (1 - q)^2 s^2 + z^2 (a + b s)``.
     """
     estimate = np.maximum(field["free"], 0.0)
-    a, b, c = (
-        np.maximum(field[name], 0.0)
-        for name in ("variance_null", "variance_linear", "variance_square")
-    )
+    a, b, c = _variance_growth(field)
     lower = interpolate_quantile(2.0 / np.maximum(c, 1e-12), *tables.quantile)
     curve = 1.0 - (1.0 - lower) ** 2
     half = estimate + 0.5 * _LIMIT_SIGMA**2 * b
-    return np.asarray(
+    limit = np.asarray(
         (half + np.sqrt(np.maximum(half**2 - curve * (estimate**2 - _LIMIT_SIGMA**2 * a), 0.0)))
         / curve
     )
-
-
-def _limit_of_cell(
-    flat: list[NDArray[np.float64]],
-    square: NDArray[np.float64],
-    dof: NDArray[np.float64],
-    tables: _Tables,
-) -> NDArray[np.float64]:
-    """Find the 95 % upper limit of a squared coefficient from the cell that bounds it best."""
-    span = np.full(len(TERMS), np.inf)
-    square = np.ascontiguousarray(square)
-    return np.asarray(
-        cell_limits(
-            *flat,
-            square,
-            dof,
-            tables.columns,
-            tables.own_dof,
-            tables.ks,
-            span,
-            _MAX_FREEDOM,
-            *tables.quantile,
-        )
-    )
+    error = _trend_error(field, _LIMIT_SIGMA)
+    limit[:, 4] = (np.sqrt(estimate[:, 4]) + _LIMIT_SIGMA * error) ** 2
+    return limit
 
 
 def _limit_of_curve(

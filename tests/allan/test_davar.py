@@ -501,3 +501,31 @@ def test_published_wavelet_variances_are_reproduced(recordings):
         )
         compared += ours.size
     assert compared > 40
+
+
+@pytest.mark.parametrize("kind", ["rate", "angle"])
+@pytest.mark.parametrize("method", ["blocks", "direct"])
+def test_trend_is_that_of_a_straight_line_through_the_present_samples(kind, method):
+    rng = np.random.default_rng(71)
+    x = 1000.0 + 3.0 * rng.standard_normal(5000) + 0.02 * np.arange(5000)
+    x[rng.random(5000) < 0.3] = np.nan
+    x[2000:3100] = np.nan
+    values = x if kind == "rate" else np.concatenate([[0.0], np.nancumsum(x)]) / 100.0 / 3600
+    if kind == "angle":
+        values[2000:3100] = np.nan
+        x = np.diff(values) * 100.0 * 3600
+    unit = "deg/h" if kind == "rate" else "deg"
+    log = make_log(values, rate=100.0, unit=unit, kind=kind)
+    surface = davar(log, window="1000samples", step="300samples", taus=[0.01], method=method)
+    hours = np.arange(1000) / 100.0 / 3600
+    spread = np.sum((hours - hours.mean()) ** 2)
+    for j in range(surface.sizes["time"]):
+        part = x[300 * j : 300 * j + 1000]
+        there = np.isfinite(part)
+        if there.sum() < 2:
+            assert np.isnan(surface.window_trend[0, j])
+            continue
+        slope = np.polyfit(hours[there], part[there], 1)[0]
+        assert float(surface.window_trend[0, j]) == pytest.approx(slope, rel=1e-6, abs=1e-3)
+        share = spread / np.sum((hours[there] - hours[there].mean()) ** 2)
+        assert float(surface.trend_response[0, j]) == pytest.approx(share, rel=1e-9)

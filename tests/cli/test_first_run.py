@@ -36,8 +36,10 @@ whole = np.ones((windows, n))
 near = 0.6 ** np.abs(np.subtract.outer(np.arange(n), np.arange(n))) / 20.0
 pairs, ramps = np.tile(near, (4, 4, 1, 1)), np.tile(near / 2.0, (4, 1, 1))
 avar = rng.gamma(8.0, truth / 8.0, (windows, n))
+trend, diagonal = np.zeros((windows, 5)), np.full((n, 14), 0.05)
 found = fit_windows(
-    avar, whole, whole, whole, whole, columns, np.ones(5), pairs, ramps, np.full(n, 20.0), 31
+    avar, whole, whole, whole, whole, trend, columns, np.ones(5), pairs, ramps, diagonal,
+    np.full(n, 20.0), 31,
 )
 assert np.isfinite(found[0]).any()
 print(hashlib.sha256(b"".join(part.tobytes() for part in found)).hexdigest())

@@ -62,6 +62,8 @@ def product(*, windows: int = 40, taus: int = 12, axes: str = "xyz", seed: int =
     }
     data |= _coefficients(true, gap, rng)
     data["window_mean"] = (names[:2], rng.normal(7.0, 0.1, shape[:2]))
+    data["window_trend"] = (names[:2], rng.normal(0.0, 0.1, shape[:2]))
+    data["trend_response"] = (names[:2], np.ones(shape[:2]))
     data["window_coverage"] = (names[:2], coverage[..., 0])
     result = xr.Dataset(
         {name: (dims, values, attributes(name)) for name, (dims, values) in data.items()}

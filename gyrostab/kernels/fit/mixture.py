@@ -18,12 +18,12 @@ __all__ = [
     "PRODUCTS",
     "WIDTH",
     "combine_products",
+    "compress_products",
     "covariance_rows",
     "degrees_of_freedom",
     "observe",
     "root_squares",
     "root_units",
-    "variance_parts",
 ]
 
 #: Products of the four stochastic terms with each other and with a ramp, which does not scatter
@@ -35,14 +35,12 @@ DATA = 5
 WIDTH = 6
 #: Row of `seen` that holds the unit of each term.
 _SEEN = (0, 1, 3, 4, 5)
-#: Number of the product of two terms among the tables; that of a ramp with itself, which there is
-#: not, gives any.
+#: Number of the product of two terms among the tables.
 _TABLE = (
     (0, 1, 2, 3, 4),
     (1, 5, 6, 7, 8),
     (2, 6, 9, 10, 11),
     (3, 7, 10, 12, 13),
-    (4, 8, 11, 13, 13),
 )
 
 
@@ -67,30 +65,30 @@ def observe(  # type: ignore[no-untyped-def]
     quantization,
     ramp,
     factor,
+    trend_square,
+    trend,
     columns,
     to_samples,
     place,
-    system,
-    seen,
-    inverse,
-    facts,
+    cells,
 ):
     """Describe the cells of a window in one place; returns how many are valid.
 
-    Design matrix and data go to `system` (row ``6 cell + column``); what a unit of each squared
-    coefficient is in sample units, as the cell sees it through the gaps, to `seen` (``6 cell +
-    row``); the reciprocal of `factor` to `inverse`. What the gaps add to quantization noise comes
-    from the ends of many runs spread over each cluster, so it scatters like white noise and is
-    counted there (row 2). To `facts` go the columns of Q over N at the shortest valid averaging
-    time (row 0), of B over K (2) and of R over K (4) at the longest, and the most that gaps add to
-    quantization noise (5).
+    Design matrix and data, both less the part of the squared trend of the window, go to
+    ``cells.system`` (row ``6 cell + column``). `trend` is the variance of the trend per squared
+    coefficient. What a unit of each squared coefficient is in sample units, as the cell sees it
+    through the gaps, goes to ``cells.seen`` (``6 cell + row``), the Allan variance to
+    ``cells.avar``, the reciprocal of `factor` to ``cells.inverse``. What the gaps add to
+    quantization noise comes from the ends of many runs spread over each cluster, so it scatters
+    like white noise and is counted there (row 2), the most of it in ``cells.excess``.
     """
-    n, last = 0, 0
-    for fact in range(6):
-        facts[fact, place] = 0.0
-    for i in range(inverse.shape[0]):
+    system, seen = cells.system, cells.seen
+    n = 0
+    cells.excess[0, place] = 0.0
+    for i in range(cells.inverse.shape[0]):
         here = i < avar.size and np.isfinite(avar[i]) and avar[i] > 0.0 and factor[i] > 0.0
-        inverse[i, place] = 1.0
+        cells.inverse[i, place] = 1.0
+        cells.avar[i, place] = 0.0
         for row in range(WIDTH * i, WIDTH * i + WIDTH):
             system[row, place] = seen[row, place] = 0.0
         if not here:
@@ -101,7 +99,10 @@ def observe(  # type: ignore[no-untyped-def]
         system[at, place] *= quantization[i]
         system[at + 1, place] *= white[i]
         system[at + 4, place] *= ramp[i]
-        system[at + DATA, place] = avar[i]
+        for a in range(4):
+            system[at + a, place] -= system[at + 4, place] * trend[a]
+        system[at + DATA, place] = avar[i] - system[at + 4, place] * trend_square
+        cells.avar[i, place] = avar[i]
         seen[at, place] = min(quantization[i], 1.0) * to_samples[0]
         seen[at + 1, place] = white[i] * to_samples[1]
         seen[at + 2, place] = (
@@ -110,14 +111,9 @@ def observe(  # type: ignore[no-untyped-def]
         seen[at + 3, place] = to_samples[2]
         seen[at + 4, place] = to_samples[3]
         seen[at + 5, place] = ramp[i] * to_samples[4]
-        inverse[i, place] = 1.0 / factor[i]
-        facts[5, place] = max(facts[5, place], seen[at + 2, place])
-        if n == 0:
-            facts[0, place] = system[at, place] / system[at + 1, place]
-        n, last = n + 1, at
-    if n > 0:
-        facts[2, place] = system[last + 2, place] / system[last + 3, place]
-        facts[4, place] = system[last + 4, place] / system[last + 3, place]
+        cells.inverse[i, place] = 1.0 / factor[i]
+        cells.excess[0, place] = max(cells.excess[0, place], seen[at + 2, place])
+        n += 1
     return n
 
 
@@ -199,41 +195,84 @@ def covariance_rows(roots, inverse, tables, out, width):  # type: ignore[no-unty
 
 
 @njit(**INNER)
-def variance_parts(roots, term, units, inverse, tables, weights, out):  # type: ignore[no-untyped-def]
-    """Expand the variance of a weighted sum of cells in the squared coefficient of `term`.
+def _add_products(rows, first, second, inverse, tables, table, factor, scaled, out, at):  # type: ignore[no-untyped-def]
+    """Add ``factor A C A^T`` to ten rows of `out`, for the part C of one product of two terms.
 
-    `roots` are those of the noise without the term, `units` those of `root_units`. To the rows of
-    `out` go the variance without the term, its growth per unit, and per unit squared.
+    `rows` holds the four rows of A (row ``4 cell + row``), `first` and `second` the roots of the
+    two terms (row ``cell``).
     """
-    n, table = inverse.shape[0], _TABLE[term]
-    t0, t1, t2, t3, t4, itself = table[0], table[1], table[2], table[3], table[4], table[term]
-    null = take(weights, 0) * 0.0
-    linear, square = null, null
+    n = inverse.shape[0]
     for i in range(n):
-        unit, factor = take(units, 5 * i + term), take(weights, i)
-        for j in range(i, n):
-            at = PRODUCTS * (i * n + j)
-            a0, a1, a2, a3, a4 = _multiply_roots(roots, i, j)
-            weight = (
-                factor * take(weights, j) * _find_share(inverse, i, j) * (1.0 if i == j else 2.0)
-            )
-            null = null + _sum_products(tables, at, a0, a1, a2, a3, a4) * weight
-            step = unit * take(units, 5 * j + term)
-            line = (
-                a0 * number(tables, at + t0)
-                + a1 * number(tables, at + t1)
-                + a2 * number(tables, at + t2)
-            )
-            linear = (
-                linear
-                + (line + a3 * number(tables, at + t3) + a4 * number(tables, at + t4))
-                * step
-                * weight
-            )
-            square = square + step * step * number(tables, at + itself) * weight
-    put(out, 0, null)
-    put(out, 1, linear)
-    put(out, 2, square * (0.0 if term == 4 else 1.0))
+        both = take(first, i) * take(second, i)
+        for c in range(4):
+            put(scaled, 4 * i + c, take(rows, 4 * i + c) * both)
+    for i in range(n):
+        own = 0.5 * number(tables, PRODUCTS * (i * n + i) + table) * take(inverse, i)
+        s0, s1, s2, s3 = (
+            take(scaled, 4 * i),
+            take(scaled, 4 * i + 1),
+            take(scaled, 4 * i + 2),
+            take(scaled, 4 * i + 3),
+        )
+        a0, a1, a2, a3 = own * s0, own * s1, own * s2, own * s3
+        for j in range(i + 1, n):
+            share = number(tables, PRODUCTS * (i * n + j) + table) * _find_share(inverse, i, j)
+            a0 = a0 + share * take(scaled, 4 * j)
+            a1 = a1 + share * take(scaled, 4 * j + 1)
+            a2 = a2 + share * take(scaled, 4 * j + 2)
+            a3 = a3 + share * take(scaled, 4 * j + 3)
+        s0, s1, s2, s3 = factor * s0, factor * s1, factor * s2, factor * s3
+        put(out, at, take(out, at) + 2.0 * s0 * a0)
+        put(out, at + 1, take(out, at + 1) + s0 * a1 + s1 * a0)
+        put(out, at + 2, take(out, at + 2) + s0 * a2 + s2 * a0)
+        put(out, at + 3, take(out, at + 3) + s0 * a3 + s3 * a0)
+        put(out, at + 4, take(out, at + 4) + 2.0 * s1 * a1)
+        put(out, at + 5, take(out, at + 5) + s1 * a2 + s2 * a1)
+        put(out, at + 6, take(out, at + 6) + s1 * a3 + s3 * a1)
+        put(out, at + 7, take(out, at + 7) + 2.0 * s2 * a2)
+        put(out, at + 8, take(out, at + 8) + s2 * a3 + s3 * a2)
+        put(out, at + 9, take(out, at + 9) + 2.0 * s3 * a3)
+
+
+@njit(**INNER)
+def compress_products(rows, units, seen, inverse, tables, roots, scaled, has_excess, out):  # type: ignore[no-untyped-def]
+    """Compute ``A C_ab A^T`` for every product (a, b) of terms of the covariance C of the cells.
+
+    Parameters
+    ----------
+    rows : eights (4 * n,)
+        A, four weighted sums of the cells (row ``4 cell + row``).
+    units : eights (5 * n,)
+        `root_units`.
+    seen, inverse, tables
+        As elsewhere.
+    roots, scaled : eights (6 * n,), eights (4 * n,)
+        Scratch.
+    has_excess : bool
+        Whether gaps add to quantization noise what counts as white, see `observe`.
+    out : eights (10 * `PRODUCTS`,)
+        Overwritten; row ``10 product + entry``, entries in the order of the upper triangle.
+    """
+    n = inverse.shape[0]
+    for i in range(n):
+        for a in range(5):
+            put(roots, n * a + i, take(units, 5 * i + a))
+        put(roots, n * 5 + i, root(take(seen, WIDTH * i + 2)))
+    for row in range(10 * PRODUCTS):
+        put(out, row, 0.0)
+    for a in range(4):
+        for b in range(a, 5):
+            table = _TABLE[a][b]
+            first, second = roots[n * a : n * a + n], roots[n * b : n * b + n]
+            _add_products(rows, first, second, inverse, tables, table, 1.0, scaled, out, 10 * table)
+    if not has_excess:
+        return
+    excess = roots[n * 5 : n * 6]
+    _add_products(rows, excess, excess, inverse, tables, 5, 1.0, scaled, out, 0)
+    for b in range(5):
+        table, factor = _TABLE[1][b], 2.0 if b == 1 else 1.0
+        second = roots[n * b : n * b + n]
+        _add_products(rows, excess, second, inverse, tables, table, factor, scaled, out, 10 * b)
 
 
 @njit(**INNER)

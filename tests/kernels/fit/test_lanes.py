@@ -11,7 +11,7 @@ import pytest
 
 from gyrostab.kernels.fit import lanes
 from gyrostab.kernels.fit.covariance import product_tables
-from gyrostab.kernels.fit.least_squares import fit_windows
+from gyrostab.kernels.fit.least_squares import combine_diagonal, fit_windows
 from gyrostab.noise import avar_columns, sample_squares
 
 FIT = """
@@ -21,7 +21,7 @@ import numpy as np
 from gyrostab.kernels.fit import lanes
 from gyrostab.kernels.fit.least_squares import fit_windows
 given = np.load(sys.argv[1])
-found = fit_windows(*[given[f"arr_{i}"] for i in range(10)], 31)
+found = fit_windows(*[given[f"arr_{i}"] for i in range(12)], 31)
 np.savez(sys.argv[2], *found, places=lanes.PLACES)
 """
 
@@ -37,7 +37,12 @@ def test_plain_numba_gives_the_fit_of_the_vectors(tmp_path):
     avar[2, 5:] = avar[4] = np.nan
     gaps = [rng.uniform(0.9, 1.1, avar.shape) for _ in range(4)]
     pairs, ramps = product_tables(window, ks, np.zeros_like(ks))
-    given = [avar, *gaps, columns, sample_squares(rate), pairs, ramps, freedom]
+    diagonal = combine_diagonal(
+        np.einsum("abii->abi", pairs).copy(), np.einsum("aii->ai", ramps).copy()
+    )
+    trend = rng.uniform(0.0, 1e-3, (11, 5))
+    squares = sample_squares(rate)
+    given = [avar, *gaps, trend, columns, squares, pairs, ramps, diagonal, freedom]
     np.savez(tmp_path / "given.npz", *given)
     subprocess.run(
         [sys.executable, "-c", FIT, tmp_path / "given.npz", tmp_path / "found.npz"],

@@ -1,0 +1,442 @@
+"""Average over the submodels of one window: estimates and the law of their scatter.
+
+The window is reduced to ``u = A z``, four sums of its cells with ``A = X^T C^-1`` at the fitted
+noise. Under squared coefficients s their mean is ``M s`` with ``M = A X``, and their covariance,
+``sum_ab s_a s_b T_ab``, is known exactly. Each submodel is a set of the terms Q, N, B and K, fitted
+by least squares with its own covariance; its weight is its Gaussian likelihood, zero if one of its
+estimates is not positive.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from gyrostab.kernels.compiled import INNER
+from gyrostab.kernels.fit.mixture import PRODUCTS
+
+__all__ = ["FIT_FIELDS", "Submodels", "average_submodels", "make_submodels"]
+
+#: Rows of the per-term result of a fit.
+FIT_FIELDS = (
+    "square",
+    "free",
+    "likelihood_ratio",
+    "variance_null",
+    "variance_linear",
+    "variance_square",
+    "separation",
+)
+#: Sets of four terms.
+_SETS = 16
+#: Passes in which the covariance of a submodel is updated to that of its estimates.
+_PASSES = 3
+
+
+class Submodels(NamedTuple):
+    """The reduced window, in units in which M has a unit diagonal, and scratch."""
+
+    data: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    products: NDArray[np.float64]
+    scale: NDArray[np.float64]
+    trend: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    whitener: NDArray[np.float64]
+    design: NDArray[np.float64]
+    inner: NDArray[np.float64]
+    #: Estimates, their weights on the data, log-likelihood, and mean and variance of the trend's
+    #: variance, of each set.
+    estimates: NDArray[np.float64]
+    rows: NDArray[np.float64]
+    likelihood: NDArray[np.float64]
+    slope: NDArray[np.float64]
+    squares: NDArray[np.float64]
+
+
+@njit(**INNER)
+def make_submodels():  # type: ignore[no-untyped-def]
+    """Make the arrays of `Submodels`."""
+    return Submodels(
+        np.zeros(4),
+        np.zeros((4, 4)),
+        np.zeros((PRODUCTS, 10)),
+        np.zeros(4),
+        np.zeros(5),
+        np.zeros(10),
+        np.zeros((4, 4)),
+        np.zeros((4, 5)),
+        np.zeros((4, 4)),
+        np.zeros((_SETS, 4)),
+        np.zeros((_SETS, 4, 4)),
+        np.zeros(_SETS),
+        np.zeros((_SETS, 2)),
+        np.zeros(5),
+    )
+
+
+@njit(**INNER)
+def _mix_products(products, squares, out):  # type: ignore[no-untyped-def]
+    """Compute the covariance of the data under `squares` (5,): the upper triangle (10,)."""
+    for entry in range(10):
+        out[entry] = 0.0
+    table = 0
+    for a in range(4):
+        for b in range(a, 5):
+            amount = squares[a] * squares[b]
+            if amount > 0.0:
+                for entry in range(10):
+                    out[entry] += amount * products[table, entry]
+            table += 1
+
+
+@njit(**INNER)
+def _invert_factor(matrix, n):  # type: ignore[no-untyped-def]
+    """Replace a matrix by the inverse of its lower Cholesky factor; returns half its log det.
+
+    Infinite where it is not positive definite.
+    """
+    half = 0.0
+    for i in range(n):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for p in range(j):
+                total -= matrix[i, p] * matrix[j, p]
+            if i == j:
+                if not total > 0.0:
+                    return np.inf
+                matrix[i, i] = math.sqrt(total)
+                half += 0.5 * math.log(total)
+            else:
+                matrix[i, j] = total / matrix[j, j]
+    for i in range(n):
+        matrix[i, i] = 1.0 / matrix[i, i]
+        for j in range(i):
+            total = 0.0
+            for p in range(j, i):
+                total -= matrix[i, p] * matrix[p, j]
+            matrix[i, j] = total * matrix[i, i]
+    return half
+
+
+@njit(**INNER)
+def _factor_data(room):  # type: ignore[no-untyped-def]
+    """Whiten the data: ``room.whitener`` from ``room.covariance``; returns half the log det.
+
+    Infinite without any noise.
+    """
+    largest = 0.0
+    entry = 0
+    for i in range(4):
+        for j in range(i, 4):
+            room.whitener[j, i] = room.covariance[entry]
+            entry += 1
+        own = room.whitener[i, i]
+        largest = max(largest, own)
+        room.whitener[i, i] = own * (1.0 + 1e-9) if own > 0.0 else 1.0
+    return _invert_factor(room.whitener, 4) if largest > 0.0 else np.inf
+
+
+@njit(**INNER)
+def _inverse_entry(factor, p, q, size):  # type: ignore[no-untyped-def]
+    """Compute entry (p, q) of an inverse matrix from the inverse of its Cholesky factor."""
+    total = 0.0
+    for r in range(max(p, q), size):
+        total += factor[r, p] * factor[r, q]
+    return total
+
+
+@njit(**INNER)
+def _whiten_columns(members, size, room):  # type: ignore[no-untyped-def]
+    """Write the whitened columns of a set to ``room.design``, with the data in the last one."""
+    for i in range(4):
+        for p in range(5):
+            room.design[i, p] = 0.0
+        for c in range(i + 1):
+            share = room.whitener[i, c]
+            for p in range(size):
+                room.design[i, p] += share * room.normal[c, members[p]]
+            room.design[i, 4] += share * room.data[c]
+
+
+@njit(**INNER)
+def _solve_set(members, size, index, room):  # type: ignore[no-untyped-def]
+    """Solve for the estimates of a set, with their rows on the whitened data; whether solvable."""
+    design, inner = room.design, room.inner
+    for p in range(size):
+        for q in range(p + 1):
+            total = 0.0
+            for i in range(4):
+                total += design[i, p] * design[i, q]
+            inner[p, q] = total
+        inner[p, p] *= 1.0 + 1e-12
+    if not _invert_factor(inner, size) < np.inf:
+        return False
+    for p in range(size):
+        estimate = 0.0
+        for i in range(4):
+            total = 0.0
+            for q in range(size):
+                total += _inverse_entry(inner, p, q, size) * design[i, q]
+            room.rows[index, members[p], i] = total
+            estimate += total * design[i, 4]
+        room.estimates[index, members[p]] = estimate
+        room.squares[members[p]] = max(estimate, 0.0)
+    return True
+
+
+@njit(**INNER)
+def _describe_set(members, size, index, half, room):  # type: ignore[no-untyped-def]
+    """Write likelihood, variance of the trend, and rows on the data of a set."""
+    square = mean = variance = 0.0
+    for i in range(4):
+        misfit = room.design[i, 4]
+        for p in range(size):
+            misfit -= room.design[i, p] * room.estimates[index, members[p]]
+        square += misfit * misfit
+    for p in range(size):
+        trend, row = room.trend[members[p]], room.rows[index, members[p]]
+        mean += trend * room.estimates[index, members[p]]
+        for q in range(size):
+            variance += trend * room.trend[members[q]] * _inverse_entry(room.inner, p, q, size)
+        for c in range(4):
+            total = 0.0
+            for i in range(c, 4):
+                total += row[i] * room.whitener[i, c]
+            row[c] = total
+    room.likelihood[index] = -half - 0.5 * square
+    room.slope[index, 0], room.slope[index, 1] = mean, variance
+
+
+@njit(**INNER)
+def _fit_set(members, index, start, ramp, room):  # type: ignore[no-untyped-def]
+    """Fit the set of terms with number `index`; its likelihood is zero where that fails."""
+    size = 0
+    room.squares[4] = ramp
+    for a in range(4):
+        room.squares[a] = room.estimates[index, a] = 0.0
+        if index >> a & 1:
+            members[size] = a
+            room.squares[a] = start[a] if start[a] > 0.0 else 0.1
+            size += 1
+    room.likelihood[index] = -np.inf
+    half = 0.0
+    for _ in range(_PASSES):
+        _mix_products(room.products, room.squares, room.covariance)
+        half = _factor_data(room)
+        if not half < np.inf:
+            return
+        _whiten_columns(members, size, room)
+        if not _solve_set(members, size, index, room):
+            return
+    _describe_set(members, size, index, half, room)
+
+
+@njit(**INNER)
+def _is_feasible(index, free, room):  # type: ignore[no-untyped-def]
+    """Whether a set was fitted with positive estimates, except perhaps that of the term `free`."""
+    if not room.likelihood[index] > -np.inf:
+        return False
+    for a in range(4):
+        if index >> a & 1 and a != free and not room.estimates[index, a] > 0.0:
+            return False
+    return True
+
+
+@njit(**INNER)
+def _quadratic_form(form, products, table):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for entry in range(10):
+        total += form[entry] * products[table, entry]
+    return total
+
+
+@njit(**INNER)
+def _best_likelihood(a, wanted, free, room):  # type: ignore[no-untyped-def]
+    """Find the largest likelihood of the feasible sets with the term `a`, or without it."""
+    best = -np.inf
+    for index in range(1, _SETS):
+        if (index >> a & 1) == wanted and _is_feasible(index, free, room):
+            best = max(best, room.likelihood[index])
+    return best
+
+
+@njit(**INNER)
+def _average_term(a, best, room, form):  # type: ignore[no-untyped-def]
+    """Average a term over the sets that have it: mean, and variance between the sets.
+
+    Its own estimate may be negative, those of the others may not. To `form` goes the quadratic form
+    that turns a covariance of the data into the mean variance of the estimate.
+    """
+    total = mean = square = 0.0
+    for entry in range(10):
+        form[entry] = 0.0
+    for index in range(1, _SETS):
+        if not (index >> a & 1 and _is_feasible(index, a, room)):
+            continue
+        weight = math.exp(room.likelihood[index] - best)
+        estimate, row = room.estimates[index, a], room.rows[index, a]
+        total += weight
+        mean += weight * estimate
+        square += weight * estimate * estimate
+        entry = 0
+        for c in range(4):
+            for d in range(c, 4):
+                form[entry] += weight * row[c] * row[d] * (1.0 if c == d else 2.0)
+                entry += 1
+    mean /= total
+    for entry in range(10):
+        form[entry] /= total
+    return mean, max(square / total - mean * mean, 0.0)
+
+
+@njit(**INNER)
+def _judge_term(a, base, room, form, result):  # type: ignore[no-untyped-def]
+    """Write estimate, likelihood ratio and variance of a term under the squares `base` (5,)."""
+    best = _best_likelihood(a, 1, a, room)
+    if not best > -np.inf:
+        return
+    mean, null = _average_term(a, best, room, form)
+    linear = quadratic = 0.0
+    table = 0
+    for b in range(4):
+        for c in range(b, 5):
+            value = _quadratic_form(form, room.products, table)
+            if b == a and c == a:
+                quadratic = value
+            elif b == a or c == a:
+                linear += value * base[c if b == a else b]
+            else:
+                null += value * base[b] * base[c]
+            table += 1
+    present = _best_likelihood(a, 1, -1, room)
+    scale = room.scale[a]
+    result[1, a] = mean / scale
+    result[2, a] = 2.0 * (present - _best_likelihood(a, 0, -1, room)) if present > -np.inf else 0.0
+    result[3, a] = null / scale**2
+    result[4, a] = linear / scale
+    result[5, a] = quadratic
+
+
+@njit(**INNER)
+def _average_sets(room, base, result):  # type: ignore[no-untyped-def]
+    """Average squares and variance of the trend over the feasible sets."""
+    best = -np.inf
+    for index in range(1, _SETS):
+        if _is_feasible(index, -1, room):
+            best = max(best, room.likelihood[index])
+    total = mean = square = 0.0
+    for index in range(1, _SETS):
+        if _is_feasible(index, -1, room):
+            weight = math.exp(room.likelihood[index] - best)
+            total += weight
+            for a in range(4):
+                base[a] += weight * room.estimates[index, a]
+            slope, variance = room.slope[index, 0], room.slope[index, 1]
+            mean += weight * slope
+            square += weight * (slope * slope + variance)
+    if total > 0.0:
+        for a in range(4):
+            base[a] /= total
+        mean /= total
+        result[3, 4], result[4, 4] = mean, max(square / total - mean * mean, 0.0)
+    else:
+        result[3, 4] = result[4, 4] = 0.0
+
+
+@njit(**INNER)
+def _find_separations(allowed, members, room, result):  # type: ignore[no-untyped-def]
+    """Find the share of the column of each term that the other terms cannot reproduce."""
+    inner, size = room.inner, 0
+    for a in range(4):
+        if allowed >> a & 1:
+            members[size] = a
+            size += 1
+    for p in range(size):
+        for q in range(p + 1):
+            inner[p, q] = room.normal[members[p], members[q]]
+        inner[p, p] *= 1.0 + 1e-12
+    solvable = _invert_factor(inner, size) < np.inf
+    for p in range(size):
+        share = _inverse_entry(inner, p, p, size)
+        result[6, members[p]] = 1.0 / max(share, 1.0) if solvable else 0.0
+
+
+@njit(**INNER)
+def _scale_window(allowed, room):  # type: ignore[no-untyped-def]
+    """Scale the window to a normal matrix with a unit diagonal; returns the terms with a column.
+
+    What belongs to other terms becomes zero.
+    """
+    for a in range(4):
+        own = room.normal[a, a]
+        if not own > 0.0:
+            allowed &= ~(1 << a)
+        room.scale[a] = math.sqrt(own) if allowed >> a & 1 else np.inf
+    table = 0
+    for a in range(4):
+        room.data[a] /= room.scale[a]
+        for b in range(4):
+            room.normal[a, b] /= room.scale[a] * room.scale[b]
+        room.trend[a] /= room.scale[a]
+        for b in range(a, 5):
+            share = room.scale[a] * (room.scale[b] if b < 4 else 1.0)
+            entry = 0
+            for c in range(4):
+                for d in range(c, 4):
+                    room.products[table, entry] /= share * room.scale[c] * room.scale[d]
+                    entry += 1
+            table += 1
+    return allowed
+
+
+@njit(**INNER)
+def average_submodels(allowed, start, trend_square, room, form, result):  # type: ignore[no-untyped-def]
+    """Average one window over the submodels.
+
+    Parameters
+    ----------
+    allowed : int
+        Bit set of the terms; bit 4 is the ramp.
+    start : float64 (4,)
+        Squared coefficients of the non-negative fit, where the iterations begin; overwritten.
+    trend_square : float64
+        Squared trend of the window.
+    room : Submodels
+        With ``data``, ``normal``, ``products`` and ``trend`` of the window, which are scaled here.
+    form : float64 (10,)
+        Scratch.
+    result : float64 (7, 5)
+        Rows as `FIT_FIELDS`: squared coefficient, averaged over all submodels; its average over
+        those with the term, where it may be negative; twice the log of the likelihood ratio of the
+        best submodels with and without the term; variance of the second number without the term,
+        its growth per unit of the square, per unit of its square; share of the column that the
+        other terms cannot reproduce. For a ramp, rows 3 and 4 are the variance of the trend under
+        the other terms and the variance of that.
+    """
+    allowed = _scale_window(allowed, room)
+    base, members = np.zeros(5), np.empty(4, np.int64)
+    base[4] = trend_square
+    for a in range(4):
+        start[a] = start[a] * room.scale[a] if allowed >> a & 1 else 0.0
+        base[4] -= room.trend[a] * start[a]
+    base[4] = max(base[4], 0.0)
+    for index in range(1, _SETS):
+        room.likelihood[index] = -np.inf
+        if not index & ~allowed:
+            _fit_set(members, index, start, base[4], room)
+    _average_sets(room, base, result)
+    for a in range(4):
+        if allowed >> a & 1:
+            result[0, a] = base[a] / room.scale[a]
+            _judge_term(a, base, room, form, result)
+    _find_separations(allowed, members, room, result)
+    if allowed >> 4 & 1:
+        result[0, 4] = max(trend_square - result[3, 4], 0.0)
+        result[1, 4] = trend_square
+        result[2, 4] = result[5, 4] = 0.0
+        result[6, 4] = 1.0

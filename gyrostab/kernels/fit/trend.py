@@ -1,0 +1,90 @@
+"""Allan variances less the part of a trend: tables of their covariance.
+
+The square b^2 of the least-squares slope of a window estimates R^2 plus the variance v of the slope
+under the other terms. ``z = avar - b^2 tau^2 / 2`` therefore has no part of a ramp; its mean per
+squared coefficient is that of the Allan variance less ``v tau^2 / 2``. All quantities are exact for
+windows without gaps, in units of one sample, from the autocovariances of
+`gyrostab.kernels.fit.covariance`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.kernels.fit.covariance import STOCHASTIC
+
+__all__ = ["TrendTables", "detrend_tables"]
+
+#: Second differences are taken at steps of this share of k, and at this many places at least.
+_STEPS, _PLACES = 32, 2**16
+
+
+class TrendTables(NamedTuple):
+    """Variance of the slope per squared coefficient (4,), and `product_tables` of z."""
+
+    variance: NDArray[np.float64]
+    pairs: NDArray[np.float64]
+    ramps: NDArray[np.float64]
+
+
+def _autocovariances(lags: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Compute the generalised autocovariance of the angle under Q, N, B and K."""
+    square = lags * lags
+    flicker = square * np.log(np.maximum(lags, 1.0)) / (2.0 * math.pi)
+    return [np.where(lags == 0, 1.0, 0.0), -0.5 * lags, flicker, square * lags / 12.0]
+
+
+def _slope_covariances(window: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Compute the covariance of each angle with the slope (4, window + 1), and that of the slope.
+
+    The slope weights the angles by -1/S, and by (W - 1) / 2S at both ends, S = W (W^2 - 1) / 12.
+    """
+    spread = window * (window**2 - 1.0) / 12.0
+    end = 0.5 * (window - 1.0) / spread
+    angle = np.arange(window + 1)
+    out = np.empty((STOCHASTIC, window + 1))
+    for term, covariance in enumerate(_autocovariances(np.arange(window + 1.0))):
+        sums = np.concatenate([[0.0], np.cumsum(covariance)])
+        inner = sums[angle] + sums[window - angle] - covariance[0]
+        out[term] = end * (covariance + covariance[::-1]) - inner / spread
+    variance = end * (out[:, 0] + out[:, -1]) - out[:, 1:-1].sum(axis=1) / spread
+    return out, variance
+
+
+def detrend_tables(
+    window: int, ks: NDArray[np.int64], pairs: NDArray[np.float64], ramps: NDArray[np.float64]
+) -> TrendTables:
+    """Turn the tables of Allan variances into those of Allan variances less their trend.
+
+    Parameters
+    ----------
+    window : int
+        Samples of the window.
+    ks : int64 (n_tau,)
+        Averaging factors.
+    pairs : float64 (4, 4, n_tau, n_tau); ramps : float64 (4, n_tau, n_tau)
+        `gyrostab.kernels.fit.covariance.product_tables`.
+    """
+    angles, variance = _slope_covariances(window)
+    products = np.empty((STOCHASTIC, STOCHASTIC, ks.size))
+    means = np.empty((STOCHASTIC, ks.size))
+    for i, k in enumerate(ks):
+        step = max(1, int(k) // _STEPS, window // _PLACES)
+        count = window - 2 * int(k) + 1
+        near, middle, far = (angles[:, j * k : j * k + count : step] for j in range(3))
+        covariance = (near - 2.0 * middle + far) / k
+        products[..., i] = covariance @ covariance.T / covariance.shape[1]
+        means[:, i] = covariance.mean(axis=1) / k
+    half = 0.5 * ks.astype(np.float64) ** 2
+    shared = products[:, :, None, :] * half[:, None]
+    outer = np.outer(half, half)
+    square = 2.0 * outer * np.multiply.outer(variance, variance)[..., None, None]
+    lines = ramps - 4.0 * outer * (means[:, :, None] + means[:, None, :] - variance[:, None, None])
+    for term in range(STOCHASTIC):  # sums in steps leave small negative eigenvalues
+        values, vectors = np.linalg.eigh(lines[term] / outer)
+        lines[term] = (vectors * np.maximum(values, 0.0)) @ vectors.T * outer
+    return TrendTables(variance, pairs - shared - shared.swapaxes(2, 3) + square, lines)
