@@ -15,6 +15,8 @@ distribution.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -47,9 +49,11 @@ def taper(size: int, share: float = 0.2) -> Array:
     >>> taper(10, 0.4).round(2)
     array([0.15, 0.85, 1.  , 1.  , 1.  , 1.  , 1.  , 1.  , 0.85, 0.15])
     """
-    from scipy.signal.windows import tukey
-
-    return np.asarray(tukey(2 * size + 1, share)[1::2])  # at the middle of each sample
+    middle = (np.arange(size) + 0.5) / size
+    inside = np.minimum(middle, 1.0 - middle) / (share / 2.0)
+    return np.asarray(
+        np.where(inside < 1.0, 0.5 - 0.5 * np.cos(math.pi * np.minimum(inside, 1.0)), 1.0)
+    )
 
 
 def ordinates(size: int) -> int:
