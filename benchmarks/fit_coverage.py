@@ -1,0 +1,150 @@
+"""Measure how often the reported interval or limit of each coefficient holds the truth.
+
+    python benchmarks/fit_coverage.py --output docs/statistics.md      # about four minutes
+
+Each term is absent, marginal or strong: its squared coefficient is 2.5 or 8 standard errors of a
+fit of white noise and that term alone (for a ramp: its slope exceeds that of the other noise 2.5 or
+8 times). Unit records of Q, N, B, K and R are simulated outside the package. Their Allan variances
+and cross terms are added for every mixture, because `davar` is quadratic in the record.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import numpy as np
+import xarray as xr
+from page import renew
+from scipy.optimize import brentq
+
+from gyrostab import davar, fit_noise, make_log
+from gyrostab.allan import fit
+from gyrostab.noise import NORMAL_95, TERMS
+from tests.support.noise_records import flicker, lose, quantization, random_walk, white
+
+RATE, N = 100.0, 0.01
+PAIRS = list(itertools.combinations_with_replacement(range(5), 2))
+MIXTURES = ("", "Qm", "Qs", "Bm", "Bs", "Km", "Ks", "Rm", "Rs", "QmBmKmRm", "QsBsKsRs", "KsRm")
+
+
+def surface_of(x: np.ndarray) -> xr.Dataset:
+    length = f"{x.shape[1]}samples"
+    return davar(make_log(x.reshape(-1), rate=RATE, unit="deg/h"), window=length, step=length)
+
+
+def simulate_units(rng: np.random.Generator, trials: int, n: int, share: float):  # type: ignore[no-untyped-def]
+    """Return unit records of similar size and their surfaces, alone and in pairs."""
+    hours = (np.arange(n) / RATE - n / RATE / 2) / 3600
+    units = np.array([120.0, N, 20.0, 60 / np.sqrt(n / RATE / 3600), 200 / (n / RATE / 3600)])
+    records = [
+        quantization(rng, trials, n, Q=units[0], rate=RATE),
+        white(rng, trials, n, N=units[1], rate=RATE),
+        flicker(rng, trials, n, B=units[2]),
+        random_walk(rng, trials, n, K=units[3], rate=RATE),
+        np.tile(units[4] * hours, (trials, 1)),
+    ]
+    lost = lose(rng, np.zeros((trials, n)), share, 50.0)
+    alone = [surface_of(record + lost) for record in records]
+    parts = {}
+    for a, b in PAIRS:
+        if a == b:
+            parts[a, b] = alone[a].avar / units[a] ** 2
+        else:
+            both = surface_of(records[a] + records[b] + lost).avar
+            cross = 0.5 * (both - alone[a].avar - alone[b].avar)
+            parts[a, b] = cross / (units[a] * units[b])
+    trends = [surface.window_trend / unit for surface, unit in zip(alone, units, strict=True)]
+    return alone[1], parts, trends
+
+
+def mix(white_surface: xr.Dataset, parts, trends, squares: np.ndarray) -> xr.Dataset:  # type: ignore[no-untyped-def]
+    roots = np.sqrt(squares)
+    avar = sum((1 if a == b else 2) * roots[a] * roots[b] * parts[a, b] for a, b in PAIRS)
+    trend = sum(root * part for root, part in zip(roots, trends, strict=True))
+    return white_surface.assign(
+        avar=white_surface.avar.copy(data=avar.data),
+        window_trend=white_surface.window_trend.copy(data=trend.data),
+    )
+
+
+def choose_squares(tables: fit._Tables, mixture: str) -> np.ndarray:
+    """Find the squared coefficients of a mixture such as ``QmKs`` on white noise."""
+
+    def excess(log_square: float, term: int, wanted: float) -> float:
+        squares = np.array([0.0, N**2, 0.0, 0.0])
+        squares[term] = np.exp(log_square)
+        amounts = squares * tables.to_samples[:4]
+        covariance = np.einsum("a,b,abij->ij", amounts, amounts, tables.pairs)
+        covariance += 1e-9 * np.diag(np.diag(covariance))
+        columns = tables.columns[:, [1, term]]
+        normal = columns.T @ np.linalg.solve(covariance, columns)
+        return float(np.exp(log_square) / np.sqrt(np.linalg.inv(normal)[1, 1]) - wanted)
+
+    squares = np.array([0.0, N**2, 0.0, 0.0, 0.0])
+    for symbol, level in zip(mixture[::2], mixture[1::2], strict=True):
+        term, wanted = TERMS.index(symbol), 2.5 if level == "m" else 8.0
+        if term < 4:
+            squares[term] = np.exp(brentq(excess, -40, 40, args=(term, wanted)))
+        else:
+            squares[4] = wanted**2 * (squares[:4] @ tables.trend_variance)
+    return squares
+
+
+def judge(product: xr.Dataset, squares: np.ndarray) -> list[str]:
+    """Describe each term: share of windows that observe it, and that hold its true value."""
+    cells = []
+    for term, true in zip(TERMS, np.sqrt(squares), strict=True):
+        seen = (product.observable.sel(term=term) == 2).values
+        value, error = product[term].values, product[f"{term}_stderr"].values
+        holds = np.where(
+            seen, abs(value - true) <= NORMAL_95 * error, product[f"{term}_upper"].values >= true
+        )
+        if true == 0:
+            cells.append(f"claimed {seen.mean():.3f}")
+        else:
+            ratio, scatter = value.mean() / true, value.std()
+            cells.append(
+                f"{ratio:.2f} ({(value.mean() - true) / scatter:+.2f}); seen {seen.mean():.2f}; "
+                f"holds {holds.mean():.3f}"
+            )
+    return cells
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--output", type=Path, help="document whose part between the marks is renewed"
+    )
+    parser.add_argument("--seconds", type=float, nargs="+", default=[40.0, 600.0])
+    parser.add_argument("--trials", type=int, nargs="+", default=[1000, 150])
+    options = parser.parse_args()
+    lines = [
+        "| window | missing | terms on N | Q | N | B | K | R |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for seconds, trials in zip(options.seconds, options.trials, strict=True):
+        n = int(seconds * RATE)
+        for share in (0.0, 0.3):
+            rng = np.random.default_rng([n, int(10 * share)])
+            whole, parts, trends = simulate_units(rng, trials, n, share)
+            ks = np.round(whole.tau.values * RATE).astype(np.int64)
+            tables = fit._cached_tables(tuple(ks.tolist()), (0,) * ks.size, RATE, n)
+            for mixture in MIXTURES:
+                squares = choose_squares(tables, mixture)
+                product = fit_noise(mix(whole, parts, trends, squares), observed_only=False)
+                cells = " | ".join(judge(product, squares))
+                lines.append(f"| {seconds:g} s | {share:.0%} | {mixture or 'none'} | {cells} |")
+                print(lines[-1], flush=True)
+    if options.output:
+        renew(options.output, "coverage", "\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
