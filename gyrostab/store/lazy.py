@@ -13,6 +13,7 @@ from __future__ import annotations
 import uuid
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,7 @@ __all__ = [
     "read_slice",
     "select_part",
     "stack_rows",
+    "take_samples",
     "transpose_lazy",
 ]
 
@@ -341,6 +343,29 @@ def select_part(array: Any, row: int | None, begin: int = 0, end: int | None = N
     if find_source(array) is None:
         return part
     return make_dask(_Selected(array, row, begin, part.shape), part.chunks)
+
+
+class _Taken(RowSource):
+    """Samples of an array of one dimension at some places."""
+
+    def __init__(self, array: Any, places: NDArray[np.int64]):
+        self.parts, self.dtype, self.shape = (array,), array.dtype, places.shape
+        self.places = places
+
+    def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
+        """Read samples from `begin` on into `out`, each run of neighbours at once."""
+        places = self.places[begin : begin + out.size]
+        edges = [0, *(np.flatnonzero(np.diff(places) != 1) + 1).tolist(), out.size]
+        for first, end in pairwise(edges):
+            if end > first:
+                read_into(self.parts[0], 0, int(places[first]), out[first:end])
+
+
+def take_samples(array: Any, places: NDArray[np.int64], chunk: int) -> Any:
+    """Select the samples at `places` of an array of one dimension; a source can still be read."""
+    if find_source(array) is None:
+        return array[places]
+    return make_dask(_Taken(array, places), chunk)
 
 
 class _Transposed(Source):

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import UnitError
 from gyrostab.ingest.concat.grid import PlacedLog
-from gyrostab.ingest.concat.lazy import PlacedArray, place_on_grid
+from gyrostab.ingest.concat.lazy import PlacedArray, chunk_of, place_on_grid
 from gyrostab.schema import log_channels
+from gyrostab.store.lazy import concatenate_columns, take_samples
 from gyrostab.time.grid import grid_index, grid_times
 
 __all__ = ["concatenate_channels"]
@@ -148,13 +149,5 @@ def _own_time(
         return np.empty(0, dtype=np.int64), np.empty(0)
     stamps, places = (np.concatenate(column) for column in zip(*done, strict=True))
     done.clear()  # saves one copy of a long channel
-    return stamps, _select_values(arrays, places)
-
-
-def _select_values(arrays: Sequence[Any], places: NDArray[np.int64]) -> Any:
-    """Select the values at `places` of the concatenated arrays; lazily if one of them is lazy."""
-    if all(isinstance(array, np.ndarray) for array in arrays):
-        return np.concatenate(arrays)[places]
-    import dask.array as da
-
-    return da.concatenate([da.asarray(array) for array in arrays])[places]
+    chunk = chunk_of(arrays)
+    return stamps, take_samples(concatenate_columns(arrays, chunk), places, chunk)
