@@ -234,8 +234,9 @@ def test_no_room_for_the_columns_of_a_long_log(monkeypatch):
     monkeypatch.setattr(
         "gyrostab.ingest.columns.pieces.tempfile.TemporaryFile", lambda **options: full
     )
+    monkeypatch.setattr("gyrostab.ingest.columns.pieces.SPILL_BYTES", 100)
     with pytest.raises(OutputError, match=r"cannot be written.*TMPDIR"):
-        Buffers({0: np.float64}, limit=100).add({0: np.zeros(1000)})
+        Buffers({0: np.float64}).add({0: np.zeros(1000)})
 
 
 def test_the_reading_options_stand_in_the_history(log, tmp_path):

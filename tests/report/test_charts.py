@@ -66,12 +66,12 @@ def test_the_map_shows_the_first_axis_by_time_and_averaging_time():
 
 def test_the_record_is_the_mean_of_the_windows_and_its_fit_follows():
     product = synthetic.product(axes="x").load()
-    terms = {"Q": 0.0, "N": 0.01, "B": 0.0, "K": 0.2, "R": 0.0}
+    terms = {"Q": 0.0, "N": 0.01, "B": 0.0, "K": 5.0, "R": 0.0}
     tau = product.tau.values
     product["avar"] = product.avar * 0 + model_avar(tau, terms)
     measured, fitted = _figures(product)["record"]["data"]
     np.testing.assert_allclose(_numbers(measured["y"]), np.sqrt(model_avar(tau, terms)), rtol=1e-6)
-    np.testing.assert_allclose(_numbers(fitted["y"]), np.sqrt(model_avar(tau, terms)), rtol=0.02)
+    np.testing.assert_allclose(_numbers(fitted["y"]), np.sqrt(model_avar(tau, terms)), rtol=0.12)
 
 
 def test_coefficients_are_estimates_or_limits_on_one_time_axis():
