@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from gyrostab.ingest.columns.headers import AXIS_PATTERN, TIME_PATTERN, is_time_unit, is_unit_of
 from gyrostab.ingest.guess_unit import given_unit, guess_unit, name_unit
 from gyrostab.ingest.inspect import ColumnInspection, FileInspection
+from gyrostab.time.grid import MAX_RATE_HZ
 
 __all__ = ["Guess", "guess_columns"]
 
@@ -176,7 +177,7 @@ def _guess_time(
             or column.rows < 0.5 * inspection.rows
             or column.rising < 0.5
             or column.rising + column.held < 0.95
-            or column.pace <= 0
+            or not column.pace * max(_SECONDS.values()) * MAX_RATE_HZ >= 1  # too fast in any unit
         ):
             continue
         low = column.key.lower()
