@@ -201,7 +201,8 @@ def _average_windows(product: xr.Dataset) -> xr.Dataset:
     independent = 1.0 + span / float(product.attrs.get("window_s", np.inf))
     middle = part.isel(time=[part.sizes["time"] // 2])
     return middle.assign({name: mean[name].transpose(*part[name].dims) for name in surface}).assign(
-        edf=(part["edf"].dims, mean["edf"].values * independent)
+        edf=(part["edf"].dims, mean["edf"].values * independent),
+        window_trend=part["window_trend"].mean("time", keep_attrs=True).expand_dims(time=1, axis=1),
     )
 
 
