@@ -53,6 +53,7 @@ ESTIMATORS = ("none", "strict_runs", "weighted_clusters")
 
 #: Flag values of ``observable(axis, time, term)``.
 OBSERVABLE = ("not_observable", "upper_limit_only", "observed")
+NOT_OBSERVABLE, UPPER_LIMIT_ONLY, OBSERVED = range(len(OBSERVABLE))
 
 #: What tau may differ from a whole number of samples, as a share: the rounding of stored numbers,
 #: far below a sample in any window.

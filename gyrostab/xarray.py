@@ -57,7 +57,7 @@ class GyroAccessor:
         Compute the surface first if this is a log or signal; the options then are those of
         `gyrostab.davar`.
         """
-        if self._holds("avar"):
+        if self._holds_variable("avar"):
             return gyrostab.fit_noise(self._data, **options)
         return gyrostab.fit_noise(self.davar(**options))
 
@@ -67,18 +67,18 @@ class GyroAccessor:
         The options are those of `gyrostab.plot_signal`, `gyrostab.plot_davar` and
         `gyrostab.plot_coefficients`.
         """
-        if self._holds("observable"):
+        if self._holds_variable("observable"):
             return gyrostab.plot_coefficients(self._data, **options)
-        if self._holds("avar"):
+        if self._holds_variable("avar"):
             return gyrostab.plot_davar(self._data, **options)
         return gyrostab.plot_signal(self._data, **options)
 
-    def _holds(self, name: str) -> bool:
+    def _holds_variable(self, name: str) -> bool:
         return isinstance(self._data, xr.Dataset) and name in self._data.variables
 
     def __repr__(self) -> str:
-        kind = "surface" if self._holds("avar") else "log"
-        kind = "product" if self._holds("observable") else kind
+        kind = "surface" if self._holds_variable("avar") else "log"
+        kind = "product" if self._holds_variable("observable") else kind
         sizes = ", ".join(f"{dim} {size}" for dim, size in self._data.sizes.items())
         return f"<gyrostab {kind}: {sizes}>"
 
@@ -144,10 +144,10 @@ class _FileArray(BackendArray):
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
         """Read the values of an indexer of xarray."""
         return indexing.explicit_indexing_adapter(
-            key, self.shape, indexing.IndexingSupport.BASIC, self._read
+            key, self.shape, indexing.IndexingSupport.BASIC, self._read_key
         )
 
-    def _read(self, key: tuple[Any, ...]) -> NDArray[Any]:
+    def _read_key(self, key: tuple[Any, ...]) -> NDArray[Any]:
         from gyrostab.store.lazy import read_box
 
         single = [not isinstance(part, slice) for part in key]

@@ -129,7 +129,8 @@ def refit(product: xr.Dataset, **options: Any) -> xr.Dataset:
     product : xarray.Dataset
         Product of `fit_noise`, or some of its windows.
     **options
-        Options of `fit_noise` that differ from those of the product.
+        Options of `fit_noise` that differ from those of the product. A product without the trend
+        of each window, as earlier versions wrote them, is fitted without R.
 
     Returns
     -------
@@ -156,6 +157,10 @@ def refit(product: xr.Dataset, **options: Any) -> xr.Dataset:
         for name, attribute in option_attributes.items()
         if attribute in product.attrs
     }
+    if "window_trend" not in product:  # of an earlier version: without the ramp
+        none = xr.zeros_like(product["window_mean"])
+        product = product.assign(window_trend=none, trend_response=none)
+        own["terms"] = str(own.get("terms", "QNBK")).replace("R", "")
     return fit_noise(product, **{**own, "observed_only": False, **options})
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gyrostab.allan.fit import is_described, refit
 from gyrostab.noise import LAWS
-from gyrostab.schema import OBSERVABLE, check_product
+from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY, check_product
 
 __all__ = [
     "FitSummary",
@@ -23,7 +23,6 @@ __all__ = [
     "summarise_terms",
 ]
 
-_LIMIT, _SEEN = OBSERVABLE.index("upper_limit_only"), OBSERVABLE.index("observed")
 #: Largest number of windows that are fitted again to find the averaging time from which the terms
 #: describe the record.
 _MAX_TRIED_WINDOWS = 24
@@ -143,8 +142,8 @@ def summarise_terms(product: xr.Dataset) -> list[TermSummary]:
 
 def _summarise_term(part: xr.Dataset, axis: str, symbol: str) -> TermSummary:
     state = part["observable"].sel(term=symbol).values
-    values = _drop_nans(part[symbol].values[state == _SEEN])
-    limits = _drop_nans(part[f"{symbol}_upper"].values[state == _LIMIT])
+    values = _drop_nans(part[symbol].values[state == OBSERVED])
+    limits = _drop_nans(part[f"{symbol}_upper"].values[state == UPPER_LIMIT_ONLY])
     status: Literal["observed", "upper_limit_only", "not_observable"] = "not_observable"
     if values.size >= max(limits.size, 1):
         status = "observed"

@@ -29,7 +29,7 @@ from gyrostab.kernels.regression.coupling import (
 )
 from gyrostab.kernels.regression.windows import average_windows
 from gyrostab.noise import TERMS
-from gyrostab.schema import OBSERVABLE, check_product
+from gyrostab.schema import OBSERVED, check_product
 from gyrostab.time.durations import duration_seconds
 
 __all__ = ["correlate"]
@@ -172,9 +172,7 @@ def correlate(
 def _select_variables(product: xr.Dataset, variables: str | Sequence[str] | None) -> list[str]:
     if variables is None:
         seen = [
-            term
-            for term in TERMS
-            if bool((product["observable"].sel(term=term) == OBSERVABLE.index("observed")).any())
+            term for term in TERMS if bool((product["observable"].sel(term=term) == OBSERVED).any())
         ]
         return ["window_mean", *seen]
     names = [variables] if isinstance(variables, str) else list(variables)
@@ -233,7 +231,7 @@ def _usable_windows(
     for v, name in enumerate(names):
         good = np.isfinite(product[name].values) & (product["window_coverage"].values > 0.05)
         if name in TERMS:
-            good &= product["observable"].sel(term=name).values == OBSERVABLE.index("observed")
+            good &= product["observable"].sel(term=name).values == OBSERVED
         for a in range(product.sizes["axis"]):
             masks[a, v] = good[a] & known[most]
     return masks, lags, drivers

@@ -19,7 +19,7 @@ __all__ = ["DEFAULTS", "INTERVAL_TAILS", "Settings", "stored_settings"]
 INTERVAL_TAILS = (0.025, 0.975)
 
 
-def _setting(value: float, unit: str, meaning: str, source: str) -> Any:
+def _make_setting(value: float, unit: str, meaning: str, source: str) -> Any:
     """Declare a setting."""
     return field(default=value, metadata={"unit": unit, "meaning": meaning, "source": source})
 
@@ -43,7 +43,7 @@ class Settings:
     (4.6, 6.0)
     """
 
-    majority_share: float = _setting(
+    majority_share: float = _make_setting(
         0.5,
         "1",
         "Share that makes a part the larger one: common time of two regions that are one, "
@@ -51,13 +51,13 @@ class Settings:
         "a switching course that another effect explains, Q^2 of an angle counter.",
         "nearer to the whole than to nothing; no other value separates two alternatives equally",
     )
-    component_nats: float = _setting(
+    component_nats: float = _make_setting(
         2.0,
         "nat",
         "Evidence that an axis must add to be named with the others.",
         "odds of 7 to 1: positive evidence is 1 to 3 nats (Kass and Raftery, 1995)",
     )
-    ambiguous_nats: float = _setting(
+    ambiguous_nats: float = _make_setting(
         3.0,
         "nat",
         "Difference of evidence within which two effects are alternatives, and by which another "
@@ -65,39 +65,39 @@ class Settings:
         "odds of 20 to 1, ln 20 = 3.0 (strong evidence: Kass and Raftery, 1995, "
         "doi:10.1080/01621459.1995.10476572)",
     )
-    reject_nats: float = _setting(
+    reject_nats: float = _make_setting(
         6.0,
         "nat",
         "Evidence that rejects the simpler of two forms: one term in place of two, one filter for "
         "all axes.",
         "odds of 400 to 1 (ln 400 = 6.0), the square of the odds of `ambiguous_nats`",
     )
-    disagreement_nats: float = _setting(
+    disagreement_nats: float = _make_setting(
         8.0,
         "nat",
         "Half of the chi-square by which the eighths of a record may differ, or spectrum and means "
         "about B and K.",
         "chi-square of 16: P = 0.025 with 7 and 0.0003 with 2 degrees of freedom",
     )
-    form_error_share: float = _setting(
+    form_error_share: float = _make_setting(
         0.01,
         "1",
         "Share of the evidence of an effect that an error of its form may leave to others.",
         "choice: square of a size error of 10 %, as evidence grows with the square of the size",
     )
-    spectrum_error_share: float = _setting(
+    spectrum_error_share: float = _make_setting(
         0.1,
         "1",
         "Share of the evidence that an error of the spectrum, or of the course in time, may leave.",
         "choice: square of a size error of 32 %; 0.08 occurs in simulated strong vibration",
     )
-    size_error_share: float = _setting(
+    size_error_share: float = _make_setting(
         0.04,
         "1",
         "Error of the form of an effect as a share of its size, added to its standard error.",
         "coverage of the intervals with wrong forms: docs/diagnosis.md, benchmarks/intervals.py",
     )
-    clear_sigma: float = _setting(
+    clear_sigma: float = _make_setting(
         3.0,
         "standard error",
         "Distance from its allowed range at which a size is impossible, from the earlier level at "
@@ -105,165 +105,165 @@ class Settings:
         "the mismatch next to it.",
         "two-sided P = 0.0027 for a normal error",
     )
-    visible_sigma: float = _setting(
+    visible_sigma: float = _make_setting(
         2.0,
         "standard error",
         "Size of a harmonic of the rotation below which it is dropped, and score of a short window "
         "that belongs to a mismatch of a long one.",
         "two-sided P = 0.046 for a normal error",
     )
-    min_switches: float = _setting(
+    min_switches: float = _make_setting(
         5.0,
         "switch",
         "Expected switches below which a bias has no two levels.",
         "choice: one or two switches are jumps",
     )
-    two_level_nats: float = _setting(
+    two_level_nats: float = _make_setting(
         10.0,
         "nat",
         "Evidence by which two levels within blocks must exceed normal noise of any spectrum.",
         "twice the 5 nats of very strong evidence (Kass and Raftery, 1995), as an "
         "autoregression fits the spectrum of the rival, normal noise",
     )
-    refuting_nats: float = _setting(
+    refuting_nats: float = _make_setting(
         20.0,
         "nat",
         "Evidence of means within blocks, not those of two levels, that refutes a telegraph bias.",
         "choice: twice `two_level_nats`",
     )
-    surrogate_share: float = _setting(
+    surrogate_share: float = _make_setting(
         0.01,
         "1",
         "Share of the time-shifted surrogates that may explain as much as the channel.",
         "the default false-alarm probability; two of the 200 surrogates",
     )
-    surrogate_correlation: float = _setting(
+    surrogate_correlation: float = _make_setting(
         0.5,
         "1",
         "Correlation with the channel above which a time-shifted surrogate is not a control.",
         "choice: such a surrogate has 0.25 of the evidence of the channel, the correlation squared",
     )
-    term_correlation: float = _setting(
+    term_correlation: float = _make_setting(
         0.999,
         "1",
         "Correlation of the errors of two terms above which the data do not separate them.",
         "standard errors grow by 1 / sqrt(1 - r^2) = 22 over those of one term",
     )
-    level_correlation: float = _setting(
+    level_correlation: float = _make_setting(
         0.97,
         "1",
         "Correlation of g and g^2 above which the vibration has one level.",
         "that of g uniform from 1.5 % of its largest value up; sqrt(15) / 4 = 0.968 from zero "
         "(benchmarks/settings_derivations.py)",
     )
-    moving_power_ratio: float = _setting(
+    moving_power_ratio: float = _make_setting(
         1.5,
         "1",
         "Power over expected power, in any band, above which an axis moves.",
         "P = 0.06 that any of 13 bands exceeds it by chance in the shortest record, 24 blocks; "
         "none in long ones (benchmarks/settings_derivations.py)",
     )
-    fast_blocks: float = _setting(
+    fast_blocks: float = _make_setting(
         2.0,
         "block",
         "Mean time on a level up to which sub-blocks show two levels better than block means.",
         "choice: a course of shorter stays is rarely on one level for a whole block",
     )
-    refuted_blocks: float = _setting(
+    refuted_blocks: float = _make_setting(
         3.0,
         "block",
         "Mean time on a level up to which sub-blocks can refute a telegraph bias.",
         "choice: sub-blocks show every switch, blocks of one level only from there",
     )
-    misfit_nats: float = _setting(
+    misfit_nats: float = _make_setting(
         0.2,
         "nat",
         "Model error of two levels that each switch may have.",
         "choice: with five switches 1 nat, a factor of e in the odds",
     )
-    max_level_sigma: float = _setting(
+    max_level_sigma: float = _make_setting(
         8.0,
         "standard deviation",
         "Deviation of the noise level of a block beyond which it is clipped.",
         "choice: one block adds 32 nats at most to the evidence of a level that wanders",
     )
-    max_event_share: float = _setting(
+    max_event_share: float = _make_setting(
         0.1,
         "1",
         "Share of the record that an event between two equal levels lasts at most.",
         "choice: longer ones are two jumps",
     )
-    reweight_thresholds: float = _setting(
+    reweight_thresholds: float = _make_setting(
         3.0,
         "threshold",
         "Evidence of the strongest power, from which all powers are weighted with it.",
         "choice: an effect of three thresholds raises some powers several times",
     )
-    min_surrogates: int = _setting(
+    min_surrogates: int = _make_setting(
         20,
         "surrogate",
         "Time-shifted surrogates without which a channel is not tested.",
         "choice: a tenth of the 200 surrogates",
     )
-    max_earth_rate: float = _setting(
+    max_earth_rate: float = _make_setting(
         20.0,
         "degree hour-1",
         "Largest earth rate on an axis.",
         "choice: 15.04 deg/h and a third for the error of the scale",
     )
-    min_comb_lines: int = _setting(
+    min_comb_lines: int = _make_setting(
         3, "1", "Lines that may be one comb.", "two lines define a spacing; the third tests it"
     )
-    min_fringe_step: float = _setting(
+    min_fringe_step: float = _make_setting(
         6e4,
         "degree hour-1",
         "Smallest step that may be a fringe hop.",
         "one fringe, lambda c / (L D), of 5 km of fibre on a coil of 30 cm at 1.55 um",
     )
-    min_rotation_share: float = _setting(
+    min_rotation_share: float = _make_setting(
         1e-5,
         "1",
         "Share of the rotation that an axis must sense for real motion.",
         "choice: alignment of 10 urad (2 arcsec), beyond that of any mounting",
     )
-    max_misalignment_share: float = _setting(
+    max_misalignment_share: float = _make_setting(
         0.02,
         "1",
         "Share of the rotation that an axis across it may sense; a larger one is along it.",
         "choice: sine of 1.1 degrees, a coarse mounting error",
     )
-    step_power_ratio: float = _setting(
+    step_power_ratio: float = _make_setting(
         5.0,
         "1",
         "Squared step of the mean times the length of a block, over the noise density of its "
         "lowest band, above which the mean moves within the block.",
         "a step of D within T seconds adds D^2 T / pi^2 to the density at 1 / T: half of the noise",
     )
-    rest_sigma: float = _setting(
+    rest_sigma: float = _make_setting(
         6.0,
         "standard deviation",
         "Distance from the level at rest within which the mean of a block is at rest.",
         "choice: P = 2e-9 for normal noise; means that wander scatter more",
     )
-    motion_sigma: float = _setting(
+    motion_sigma: float = _make_setting(
         100.0,
         "standard deviation",
         "Distance from the level at rest that an unexplained motion must reach to be left out.",
         "choice: smaller motion is left to the effects; a rotation of the tool exceeds it by far",
     )
-    max_moving_share: float = _setting(
+    max_moving_share: float = _make_setting(
         2.0 / 3.0,
         "1",
         "Largest share of the blocks that an axis may move.",
         "choice: the level at rest is that of the closest quarter of the means; a third is safe",
     )
-    motion_margin_blocks: int = _setting(
+    motion_margin_blocks: int = _make_setting(
         2,
         "block",
         "Blocks on either side of a motion that belong to it.",
         "choice: a ramp at its begin and end",
     )
-    min_rest_blocks: int = _setting(
+    min_rest_blocks: int = _make_setting(
         12,
         "block",
         "Blocks at rest that determine level and scatter.",
@@ -271,33 +271,33 @@ class Settings:
     )
 
     # calibration of the noise
-    calm_share: float = _setting(
+    calm_share: float = _make_setting(
         0.2,
         "1",
         "Quantile of vibration and rotation over the blocks that is their level at rest.",
         "choice: below `quiescent_share`, so that a quarter at rest suffices",
     )
-    calm_ratio: float = _setting(
+    calm_ratio: float = _make_setting(
         2.0,
         "1",
         "Vibration or rotation over its level at rest, up to which a block is quiescent.",
         "choice: noise by rectification is then 4 times that at rest",
     )
-    calm_slope_share: float = _setting(
+    calm_slope_share: float = _make_setting(
         0.3,
         "1",
         "Rate of change of temperature up to which a block is quiescent, as a share of the "
         "largest.",
         "choice: a Shupe bias is then below a third of its largest",
     )
-    noisy_sigma: float = _setting(
+    noisy_sigma: float = _make_setting(
         4.5,
         "standard deviation",
         "Excess of the noise level of a block above which it is not quiescent.",
         "P = 8e-6 a block of 1000 lines, 0.05 of 6000 blocks; 6e-5 with 49 lines "
         "(benchmarks/settings_derivations.py)",
     )
-    excess_sigma: float = _setting(
+    excess_sigma: float = _make_setting(
         4.0,
         "standard deviation",
         "Excess above which the noise of the mean of a block is raised, and difference from the "
@@ -305,31 +305,31 @@ class Settings:
         "P = 6e-5 a block of 1000 lines, 0.4 of 6000 blocks, and then by the excess itself "
         "(benchmarks/settings_derivations.py)",
     )
-    quiescent_share: float = _setting(
+    quiescent_share: float = _make_setting(
         0.25,
         "1",
         "Share of the blocks that must be quiescent; below it the quietest are taken.",
         "choice: N from a quarter of a record is known twice as badly as from the whole",
     )
-    min_quiescent_blocks: int = _setting(
+    min_quiescent_blocks: int = _make_setting(
         16,
         "block",
         "Quiescent blocks that must be found; below it the quietest are taken.",
         "choice: drift is known up to 16 blocks",
     )
-    steady_share: float = _setting(
+    steady_share: float = _make_setting(
         0.3,
         "1",
         "Share of the blocks at rest that must be left without the noisy ones; below it all stay.",
         "choice: the noise of a third of the record or more is not an event",
     )
-    min_information_share: float = _setting(
+    min_information_share: float = _make_setting(
         1e-4,
         "1",
         "Share of its information that N must keep with the effects in the model.",
         "the standard error of N is then 100 times that without effects, above N itself",
     )
-    max_level_step: float = _setting(
+    max_level_step: float = _make_setting(
         0.2,
         "1",
         "Relative change of the noise level from block to block, above which kurtosis and "
@@ -337,26 +337,26 @@ class Settings:
         "excess kurtosis 3 var(s^2) / mean(s^2)^2 = 0.01 for a linear change of 0.2 within a "
         "block, the error sqrt(24 / n) of n = 240 000 samples",
     )
-    after_restart_s: float = _setting(
+    after_restart_s: float = _make_setting(
         900.0,
         "s",
         "Time after a restart that is not quiescent, at most a tenth of the record.",
         "choice: warm-up of a fibre-optic gyro without temperature control, some minutes",
     )
-    coherency_probability: float = _setting(
+    coherency_probability: float = _make_setting(
         1e-4,
         "1",
         "Chance probability of the coherency of two axes of a simulation below which it is real.",
         "three pairs of axes add 3e-4, 3 % of the default false-alarm probability",
     )
-    known_line_sigma: float = _setting(
+    known_line_sigma: float = _make_setting(
         5.0,
         "standard error",
         "Excess over a known line above which it is another line.",
         "P = 7e-4 a line and part of the shortest record, 1e-6 of the longest "
         "(benchmarks/settings_derivations.py)",
     )
-    line_nats: float = _setting(
+    line_nats: float = _make_setting(
         12.0,
         "nat",
         "Evidence of a line of a simulation above which it is known.",
@@ -364,102 +364,102 @@ class Settings:
         "and 1.0 of 6000 blocks (benchmarks/settings_derivations.py)",
     )
     # thresholds from null records
-    tail_share: float = _setting(
+    tail_share: float = _make_setting(
         0.25,
         "1",
         "Share of the null records, the largest, to which an exponential tail is fitted.",
         "a hundred of the 400 null records: the scale of the tail is known to 10 %",
     )
-    pooled_records: float = _setting(
+    pooled_records: float = _make_setting(
         100.0,
         "null record",
         "Weight of the variance over windows of one length in the variance of a cell.",
         "choice: from as many records the own variance of a cell is known to sqrt(2 / n) = 14 %",
     )
     # regions of mismatches
-    window_sum_share: float = _setting(
+    window_sum_share: float = _make_setting(
         0.8,
         "1",
         "Share of the score of a window that its short windows must reach to set its ends.",
         "choice: the share is 1 for a constant deviation; moves the ends of regions",
     )
-    whole_record_sigma: float = _setting(
+    whole_record_sigma: float = _make_setting(
         0.7,
         "standard deviation",
         "Score by which a part of the record must exceed the whole to be the region.",
         "choice; moves the ends of regions",
     )
-    region_excess_share: float = _setting(
+    region_excess_share: float = _make_setting(
         0.25,
         "1",
         "Share of the largest excess that the other averaging times of a region must have.",
         "choice: half of the largest deviation in amplitude; moves the averaging times of regions",
     )
-    gap_time_share: float = _setting(
+    gap_time_share: float = _make_setting(
         0.25,
         "1",
         "Gap between two regions that are one, as a share of the longer.",
         "choice; moves the ends of regions",
     )
-    line_tau_ratio: float = _setting(
+    line_tau_ratio: float = _make_setting(
         4.0,
         "1",
         "Averaging time over that at which the Allan variance of a line is largest, up to "
         "which the line shows.",
         "that of a sine, sin(x)^4 / x^2, falls to 0.09 of its largest value above, to 0.15 below",
     )
-    line_width_share: float = _setting(
+    line_width_share: float = _make_setting(
         0.02,
         "1",
         "Difference of two frequencies that are one line, as a share of the frequency.",
         "choice: slow changes of the speed of a pump or a tool",
     )
-    max_mean_regions: int = _setting(
+    max_mean_regions: int = _make_setting(
         3,
         "region",
         "Regions of the mean of an axis beyond which its mean wanders.",
         "choice; one mismatch that wanders takes the place of many",
     )
     # attribution of mismatches to effects, and verdict
-    active_share: float = _setting(
+    active_share: float = _make_setting(
         0.1,
         "1",
         "Share of the largest contribution of an effect above which it acts, and of its largest "
         "step above which it moves the rate within a block.",
         "choice: 1 % of the largest power",
     )
-    rest_share: float = _setting(
+    rest_share: float = _make_setting(
         0.05,
         "1",
         "Share of the largest contribution below which an effect rests, and share of the blocks at "
         "rest that makes zero its level at rest.",
         "choice: half of `active_share`",
     )
-    overlap_share: float = _setting(
+    overlap_share: float = _make_setting(
         0.3,
         "1",
         "Share of the shorter of effect and mismatch that must overlap for them to coincide.",
         "choice: the ends of a region are known to one of its short windows",
     )
-    outlier_law_error: float = _setting(
+    outlier_law_error: float = _make_setting(
         0.1,
         "1",
         "Relative error of number and size of outliers, as the law of their sizes is unknown.",
         "choice; at least half of the share of outliers that is not seen",
     )
-    score_error_share: float = _setting(
+    score_error_share: float = _make_setting(
         0.3,
         "1",
         "Share of the score of a mismatch that an error of the form of its effect may leave.",
         "root of `spectrum_error_share`: evidence is the square of a score",
     )
-    needed_share: float = _setting(
+    needed_share: float = _make_setting(
         0.5,
         "1",
         "Share of an equal contribution from which an effect is needed to explain a mismatch.",
         "choice: with two effects, a quarter of what they explain together",
     )
-    coverage_tolerance: float = _setting(
+    coverage_tolerance: float = _make_setting(
         0.013,
         "1",
         "Fall of the share of cells within their 95 % band that counts as worse.",

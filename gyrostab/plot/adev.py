@@ -18,7 +18,7 @@ from gyrostab.plot.style import (
     new_figure,
     stack_panels,
 )
-from gyrostab.schema import OBSERVABLE, check_surface
+from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY, check_surface
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 __all__ = ["band", "plot_adev"]
 
-_LIMIT, _SEEN = OBSERVABLE.index("upper_limit_only"), OBSERVABLE.index("observed")
 _DASHES = ("--", "-.", ":", (0, (6, 2, 1, 2, 1, 2)), (0, (8, 3)))
 
 
@@ -173,7 +172,7 @@ def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours:
         seen = window[responses[symbol]].values if responses.get(symbol) in window else 1.0
         term = term * np.where(np.isfinite(seen), seen, 1.0)
         total += term
-        if state == _SEEN:
+        if state == OBSERVED:
             label = f"{symbol} = {value:.3g} ± {error:.1g} {law.label} ({law.name})"
             panel.plot(
                 tau,
@@ -183,7 +182,7 @@ def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours:
                 linewidth=1.3,
                 label=label,
             )
-        elif state == _LIMIT:
+        elif state == UPPER_LIMIT_ONLY:
             panel.plot(
                 [], [], linestyle="none", label=f"{symbol} < {upper:.3g} {law.label} ({law.name})"
             )

@@ -22,17 +22,13 @@ from gyrostab.plot.style import (
     time_axis,
     window_text,
 )
-from gyrostab.schema import OBSERVABLE
+from gyrostab.schema import NOT_OBSERVABLE, OBSERVED, UPPER_LIMIT_ONLY
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["plot_coefficients"]
-
-_NOT, _LIMIT, _SEEN = (
-    OBSERVABLE.index(name) for name in ("not_observable", "upper_limit_only", "observed")
-)
 
 
 @literal_text
@@ -67,7 +63,7 @@ def plot_coefficients(product: xr.Dataset, *, axis: str | None = None) -> Figure
     for panel, (symbol, law) in zip(panels, LAWS.items(), strict=True):
         for name in names:
             _draw_axis(panel, product.sel(axis=name), symbol, name, axis_style(product, name))
-            hidden = product["observable"].sel(axis=name, term=symbol).values == _NOT
+            hidden = product["observable"].sel(axis=name, term=symbol).values == NOT_OBSERVABLE
             if hidden.any():
                 first, last = _find_runs(hidden)
                 shade_spans(panel, edges[first], edges[last], alpha=0.6 / len(names))
@@ -96,9 +92,9 @@ def _draw_axis(
 ) -> None:
     time = part["time"].values
     state = part["observable"].sel(term=symbol).values
-    value = np.where(state == _SEEN, part[symbol].values, np.nan)
-    error = np.where(state == _SEEN, part[f"{symbol}_stderr"].values, np.nan)
-    upper = np.where(state == _LIMIT, part[f"{symbol}_upper"].values, np.nan)
+    value = np.where(state == OBSERVED, part[symbol].values, np.nan)
+    error = np.where(state == OBSERVED, part[f"{symbol}_stderr"].values, np.nan)
+    upper = np.where(state == UPPER_LIMIT_ONLY, part[f"{symbol}_upper"].values, np.nan)
     few = time.size <= 80
     marks = style | {"markersize": 3.5 if few else 2.5, "linewidth": 1.0}
     panel.plot(time, value, **(marks if few else marks | {"marker": ""}), label=name)
@@ -139,8 +135,8 @@ def _set_scale(panel: Axes, product: xr.Dataset, symbol: str, names: list[str]) 
     chosen = product.sel(axis=names)
     state = chosen["observable"].sel(term=symbol).values
     shown = (
-        chosen[symbol].values[state == _SEEN],
-        chosen[f"{symbol}_upper"].values[state == _LIMIT],
+        chosen[symbol].values[state == OBSERVED],
+        chosen[f"{symbol}_upper"].values[state == UPPER_LIMIT_ONLY],
     )
     numbers = np.concatenate(shown)
     numbers = numbers[np.isfinite(numbers) & (numbers > 0)]

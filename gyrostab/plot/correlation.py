@@ -11,7 +11,7 @@ from gyrostab.correlate.judge import VERDICTS, format_p_value
 from gyrostab.errors import SchemaError
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import COLOURS, axis_names, literal_text, new_figure, unit_label
-from gyrostab.schema import OBSERVABLE
+from gyrostab.schema import OBSERVED
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -106,7 +106,7 @@ def _draw_panel(panel: Axes, part: xr.Dataset, variable: str, driver: str) -> No
     y = part[variable].values
     good = np.isfinite(x) & np.isfinite(y)
     if variable in LAWS and "observable" in part:
-        good &= part["observable"].sel(term=variable).values == OBSERVABLE.index("observed")
+        good &= part["observable"].sel(term=variable).values == OBSERVED
     every = max(1, int(good.sum()) // _MAX_POINTS)
     styles: list[tuple[Any, dict[str, Any]]] = [
         (rising, {"marker": "^", "color": _UP}),

@@ -64,7 +64,7 @@ def diagnosis_charts(surfaces: xr.Dataset, content: Mapping[str, Any]) -> list[C
     ]
 
 
-def _stamps(
+def _centre_stamps(
     surfaces: xr.Dataset, content: Mapping[str, Any], kind: str = ""
 ) -> NDArray[np.float64]:
     """Return the centres of windows, or with "block_" of blocks [ms since 1970]."""
@@ -99,7 +99,7 @@ def _draw_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
             colour = np.log2(ratio) * np.where(usual, INSIDE_BAND_OPACITY, 1.0)
         for row in range(len(names)):
             frame.add_heatmap(
-                x=_stamps(surfaces, content), y=tau, z=single(colour[row]),
+                x=_centre_stamps(surfaces, content), y=tau, z=single(colour[row]),
                 customdata=single(ratio[row]), coloraxis="coloraxis", row=row + 1, col=column,
                 hovertemplate="%{x}<br>%{y:.3g} s: %{customdata:.2f}<extra></extra>",
             )  # fmt: skip
@@ -150,7 +150,7 @@ def _draw_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
     """Draw the mean rate of each axis with both simulations, and the channels below."""
     names, channels = _axis_names(surfaces), select_channels(surfaces, content)
     figure = stacked_panels(len(names) + len(channels), height=170)
-    window, block = _stamps(surfaces, content), _stamps(surfaces, content, "block_")
+    window, block = _centre_stamps(surfaces, content), _centre_stamps(surfaces, content, "block_")
     for row, name in enumerate(names):
         panel, one = f"y{row + 1 if row else ''}", surfaces.sel(axis=name)
         label_panel(figure, panel, f"axis {plain_text(name)}, mean rate [deg/h]")

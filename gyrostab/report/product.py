@@ -14,7 +14,7 @@ from gyrostab.noise import LAWS
 from gyrostab.plot.style import duration, embedded
 from gyrostab.report.page import page_text
 from gyrostab.report.product_charts import product_charts, window_data
-from gyrostab.schema import GAP_CAUSES, OBSERVABLE, check_product, texts
+from gyrostab.schema import GAP_CAUSES, OBSERVED, check_product, texts
 from gyrostab.store.output import new_output
 
 if TYPE_CHECKING:
@@ -176,7 +176,7 @@ def _describe_findings(
 
 def _describe_change(part: xr.Dataset) -> str:
     """Say in one sentence how much N varies over the record, and when it is highest."""
-    seen = part["observable"].sel(term="N").values == OBSERVABLE.index("observed")
+    seen = part["observable"].sel(term="N").values == OBSERVED
     values = part["N"].values[seen]
     if values.size < 5:
         return ""

@@ -30,14 +30,13 @@ from gyrostab.report.charts import (
     single,
     stacked_panels,
 )
-from gyrostab.schema import OBSERVABLE
+from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
 
 __all__ = ["product_charts", "window_data"]
 
-_LIMIT, _SEEN = OBSERVABLE.index("upper_limit_only"), OBSERVABLE.index("observed")
 #: Largest numbers of windows that are drawn over time, and of windows and averaging times of which
 #: the whole surface is in the page: a page of three axes then has about 7 MB, 4.8 of them plotly.
 _MAX_WINDOWS, _MAX_SURFACE_WINDOWS, _MAX_TAUS = 1000, 200, 60
@@ -62,8 +61,8 @@ def product_charts(product: xr.Dataset, log: xr.Dataset | None = None) -> list[C
         others.
     """
     gaps = gap_shapes(log)
-    surface = _thin(product, _MAX_SURFACE_WINDOWS, _MAX_TAUS)
-    times = _thin(product, _MAX_WINDOWS, product.sizes["tau"])
+    surface = _thin_product(product, _MAX_SURFACE_WINDOWS, _MAX_TAUS)
+    times = _thin_product(product, _MAX_WINDOWS, product.sizes["tau"])
     charts = [
         ("record", "Allan deviation of the whole record", _draw_record(product)),
         ("coefficients", "Noise coefficients over time", _draw_coefficients(times, gaps)),
@@ -100,7 +99,7 @@ def window_data(product: xr.Dataset) -> str:
         ``low``, ``high`` and ``fitted`` [degree hour-1], 32-bit floats in base 64, window by
         window. It can stand in a script element.
     """
-    part = _thin(product, _MAX_SURFACE_WINDOWS, _MAX_TAUS)
+    part = _thin_product(product, _MAX_SURFACE_WINDOWS, _MAX_TAUS)
     low, high = band(part["avar"].values, part["edf"].values)
     squares = {
         "measured": part["avar"].values,
@@ -126,7 +125,7 @@ def _encode(values: NDArray[np.float64]) -> str:
     return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode("ascii")
 
 
-def _thin(product: xr.Dataset, windows: int, taus: int) -> xr.Dataset:
+def _thin_product(product: xr.Dataset, windows: int, taus: int) -> xr.Dataset:
     """Select at most so many windows and averaging times, evenly spaced."""
     chosen = {
         dim: np.unique(np.linspace(0, product.sizes[dim] - 1, most).round().astype(int))
@@ -193,17 +192,21 @@ def _draw_record(product: xr.Dataset) -> go.Figure:
 
 def _average_windows(product: xr.Dataset) -> xr.Dataset:
     """Average the surface over all windows, as one window with the terms of all of them."""
-    part = _thin(product, _MAX_WINDOWS, _MAX_TAUS)
+    part = _thin_product(product, _MAX_WINDOWS, _MAX_TAUS)
     surface = part[[name for name in part.data_vars if part[name].dims[-1:] == ("tau",)]]
     weight = part["count"].where(part["avar"].notnull(), 0.0)
     mean = surface.weighted(weight).mean("time", keep_attrs=True).expand_dims(time=1, axis=1)
     span = (part["time"].values[-1] - part["time"].values[0]) / np.timedelta64(1, "s")
     independent = 1.0 + span / float(product.attrs.get("window_s", np.inf))
-    middle = part.isel(time=[part.sizes["time"] // 2])
-    return middle.assign({name: mean[name].transpose(*part[name].dims) for name in surface}).assign(
-        edf=(part["edf"].dims, mean["edf"].values * independent),
-        window_trend=part["window_trend"].mean("time", keep_attrs=True).expand_dims(time=1, axis=1),
-    )
+    record = part.isel(time=[part.sizes["time"] // 2])
+    record = record.assign({name: mean[name].transpose(*part[name].dims) for name in surface})
+    record["edf"] = record["edf"] * independent
+    if "window_trend" in part:
+        record["window_trend"] = (
+            ("axis", "time"),
+            part["window_trend"].mean("time").values[:, None],
+        )
+    return record
 
 
 def _draw_coefficients(product: xr.Dataset, gaps: list[dict[str, Any]]) -> go.Figure:
@@ -243,7 +246,9 @@ def _add_coefficient(
     for row, name in enumerate(map(str, product["axis"].values)):
         colour = axis_style(product, name)["color"]
         shared = {"x": milliseconds(product), "yaxis": panel, "legendgroup": name}
-        limits = np.where(state[row] == _LIMIT, product[f"{symbol}_upper"].values[row], np.nan)
+        limits = np.where(
+            state[row] == UPPER_LIMIT_ONLY, product[f"{symbol}_upper"].values[row], np.nan
+        )
         if np.isfinite(limits).any():
             figure.add_scatter(
                 **shared,
@@ -254,7 +259,7 @@ def _add_coefficient(
                 hovertemplate=f"< %{{y:.3g}} {label}",
                 showlegend=False,
             )
-        values = np.where(state[row] == _SEEN, product[symbol].values[row], np.nan)
+        values = np.where(state[row] == OBSERVED, product[symbol].values[row], np.nan)
         figure.add_scatter(
             **shared,
             y=single(values),
@@ -277,8 +282,8 @@ def _scale_of(product: xr.Dataset, symbol: str, state: NDArray[np.int8]) -> dict
     """Choose a logarithmic scale for numbers over more than a decade, else one from zero."""
     shown = np.concatenate(
         [
-            product[symbol].values[state == _SEEN],
-            product[f"{symbol}_upper"].values[state == _LIMIT],
+            product[symbol].values[state == OBSERVED],
+            product[f"{symbol}_upper"].values[state == UPPER_LIMIT_ONLY],
         ]
     )
     shown = shown[np.isfinite(shown) & (shown > 0)]

@@ -27,7 +27,7 @@ def _figures(product, log=None):
     return {chart.name: json.loads(chart.figure) for chart in product_charts(product, log)}
 
 
-def _numbers(packed):
+def _decode_numbers(packed):
     """Decode a typed array as plotly writes it."""
     if isinstance(packed, list):
         return np.array(packed, dtype=float)
@@ -58,10 +58,10 @@ def test_the_map_shows_the_first_axis_by_time_and_averaging_time():
     product = synthetic.product()
     trace = _figures(product)["map"]["data"][0]
     milliseconds = product.time.values.astype("M8[ms]").astype(float)
-    np.testing.assert_allclose(_numbers(trace["x"]), milliseconds, atol=1)
-    np.testing.assert_allclose(_numbers(trace["y"]), product.tau.values)
+    np.testing.assert_allclose(_decode_numbers(trace["x"]), milliseconds, atol=1)
+    np.testing.assert_allclose(_decode_numbers(trace["y"]), product.tau.values)
     expected = 0.5 * np.log10(product.avar.isel(axis=0).values.T)
-    np.testing.assert_allclose(_numbers(trace["z"]), expected, rtol=1e-5)
+    np.testing.assert_allclose(_decode_numbers(trace["z"]), expected, rtol=1e-5)
 
 
 def test_the_record_is_the_mean_of_the_windows_and_its_fit_follows():
@@ -70,8 +70,12 @@ def test_the_record_is_the_mean_of_the_windows_and_its_fit_follows():
     tau = product.tau.values
     product["avar"] = product.avar * 0 + model_avar(tau, terms)
     measured, fitted = _figures(product)["record"]["data"]
-    np.testing.assert_allclose(_numbers(measured["y"]), np.sqrt(model_avar(tau, terms)), rtol=1e-6)
-    np.testing.assert_allclose(_numbers(fitted["y"]), np.sqrt(model_avar(tau, terms)), rtol=0.12)
+    np.testing.assert_allclose(
+        _decode_numbers(measured["y"]), np.sqrt(model_avar(tau, terms)), rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        _decode_numbers(fitted["y"]), np.sqrt(model_avar(tau, terms)), rtol=0.12
+    )
 
 
 def test_coefficients_are_estimates_or_limits_on_one_time_axis():
@@ -82,7 +86,7 @@ def test_coefficients_are_estimates_or_limits_on_one_time_axis():
     ]
     seen = product.observable.sel(axis="y", term="N").values == 2
     expected = np.where(seen, product.N.sel(axis="y").values, np.nan)
-    np.testing.assert_allclose(_numbers(n_of_y[0]["y"]), expected, rtol=1e-6)
+    np.testing.assert_allclose(_decode_numbers(n_of_y[0]["y"]), expected, rtol=1e-6)
     limits = [trace for trace in figure["data"] if trace["name"] == "axis z, upper limit"]
     assert limits
     assert all(trace["marker"]["symbol"] == "triangle-down-open" for trace in limits)
@@ -94,7 +98,7 @@ def test_a_long_product_is_thinned_and_says_so(tmp_path):
     charts = {chart.name: chart for chart in product_charts(product)}
     assert "One window in 2.5 is drawn." in charts["coefficients"].caption
     assert "One window in 12.5 is drawn." in charts["map"].caption
-    times = _numbers(json.loads(charts["map"].figure)["data"][0]["x"])
+    times = _decode_numbers(json.loads(charts["map"].figure)["data"][0]["x"])
     assert times.size == 200
     stamps = product.time.values.astype("M8[ms]").astype(float)
     assert times[[0, -1]] == pytest.approx(stamps[[0, -1]], abs=1)
@@ -185,7 +189,7 @@ def test_change_is_the_ratio_of_recording_and_simulation():
     avar = stored["avar"].isel(axis=0).transpose("case", "tau", "window")
     for trace, case in zip(traces[:: stored.sizes["axis"]], ("before", "after"), strict=True):
         expected = np.sqrt(avar.sel(case="recording") / avar.sel(case=case)).values
-        np.testing.assert_allclose(_numbers(trace["customdata"]), expected, rtol=1e-6)
+        np.testing.assert_allclose(_decode_numbers(trace["customdata"]), expected, rtol=1e-6)
     shapes = json.loads(figure)["layout"]["shapes"]
     framed = {shape["label"]["text"] for shape in shapes if shape.get("label", {}).get("text")}
     assert framed == {
@@ -201,10 +205,10 @@ def test_a_narrow_line_survives_the_thinning_of_the_spectrum():
     stored["line_density"] = (("axis", "line"), density)
     figure = {chart.name: chart.figure for chart in diagnosis_charts(stored, content())}["spectra"]
     trace = json.loads(figure)["data"][0]
-    values = _numbers(trace["y"])
+    values = _decode_numbers(trace["y"])
     assert values.size <= 4000
     assert values.max() == 50.0
-    assert _numbers(trace["x"])[values.argmax()] == 77_778
+    assert _decode_numbers(trace["x"])[values.argmax()] == 77_778
 
 
 @pytest.mark.slow

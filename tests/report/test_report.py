@@ -9,6 +9,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from gyrostab.allan.fit import fit_noise
 from gyrostab.errors import OutputError, SchemaError
 from gyrostab.io.datasets import open_log, open_product, to_netcdf
 from gyrostab.report import write_report
@@ -158,3 +159,11 @@ def test_existing_report_and_wrong_input_are_refused(tmp_path):
     with pytest.raises(SchemaError):
         write_report(synthetic.product(), path, log=synthetic.surface(), overwrite=True)
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_product_of_an_earlier_version_has_a_report(tmp_path):
+    old = synthetic.product(axes="x").drop_vars(["window_trend", "trend_response"])
+    page = read(write_report(old, tmp_path / "report.html"))
+    assert "record" in page.ids
+    with pytest.raises(SchemaError, match="window_trend"):
+        fit_noise(old)

@@ -14,7 +14,7 @@ from gyrostab.store.hdf5_heaps import check_global_heaps
 _FREE = struct.Struct("<HHIQ")
 
 
-def _write(path, *, userblock=0, texts=30):
+def _write_file(path, *, userblock=0, texts=30):
     with h5py.File(path, "w", userblock_size=userblock) as file:
         file["words"] = [f"word {number}" * (number + 1) for number in range(texts)]
         file["words"].attrs["remark"] = "text of variable length"
@@ -35,7 +35,7 @@ def _free_space(data):
 @pytest.mark.parametrize("userblock", [0, 512, 2048])
 def test_intact_files_pass(tmp_path, userblock):
     path = tmp_path / "log.h5"
-    _write(path, userblock=userblock)
+    _write_file(path, userblock=userblock)
     check_global_heaps(path)
 
 
@@ -43,7 +43,7 @@ def test_intact_files_pass(tmp_path, userblock):
 @pytest.mark.parametrize("size", [0, 8, 2**63, 2**64 - 8])
 def test_free_space_that_does_not_advance_is_an_error(tmp_path, size, userblock):
     path = tmp_path / "log.h5"
-    _write(path, userblock=userblock)
+    _write_file(path, userblock=userblock)
     data = bytearray(path.read_bytes())
     _FREE.pack_into(data, _free_space(data), 0, 0, 0, size)
     path.write_bytes(data)
@@ -53,7 +53,7 @@ def test_free_space_that_does_not_advance_is_an_error(tmp_path, size, userblock)
 
 def test_an_object_of_the_largest_size_is_an_error(tmp_path):
     path = tmp_path / "log.h5"
-    _write(path)
+    _write_file(path)
     data = bytearray(path.read_bytes())
     _FREE.pack_into(data, data.index(b"GCOL") + 16, 1, 1, 0, 2**64 - 16)
     path.write_bytes(data)
