@@ -7,6 +7,7 @@ a damaged or absurd file ends in one message.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 from gyrostab.errors import FormatError, OptionError
 
@@ -23,6 +25,7 @@ __all__ = [
     "bytes_present",
     "check_chunk",
     "check_columns",
+    "check_declared",
     "check_limits",
     "check_stored",
     "describe_limit",
@@ -208,6 +211,21 @@ def check_stored(
             "were never written. Copy it again, or cut it to what was recorded; "
             f"{describe_limit('stored_samples', claimed, given)}"
         )
+
+
+def check_declared(
+    path: Path, stored: xr.Dataset, *, given: Mapping[str, float] | None = None
+) -> None:
+    """Refuse a dataset whose largest variable is out of proportion to the bytes of its file.
+
+    Raises
+    ------
+    FormatError
+        As in `check_stored`.
+    """
+    shape = max((item.shape for item in stored.variables.values()), key=math.prod, default=())
+    rows = max(shape, default=0)
+    check_stored(path, rows, math.prod(shape) // max(rows, 1), given)
 
 
 def check_columns(path: Path, columns: int, given: Mapping[str, float] | None = None) -> None:

@@ -20,6 +20,7 @@ import xarray as xr
 
 from gyrostab.errors import FormatError, OptionError, SchemaError, TimeError, reading_of
 from gyrostab.ingest.convert import as_log
+from gyrostab.ingest.limits import check_declared
 from gyrostab.schema import SIGNAL_UNITS, check_log, check_product, check_surface
 from gyrostab.store.cf import GRID, find_kind, from_disk, index_dim, to_disk
 from gyrostab.store.netcdf_compression import append_compressed, large_variables
@@ -407,7 +408,7 @@ def open_dataset(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Da
     gyrostab.errors.FormatError: nothing.nc: there is no such file
     """
     with reading_of(path):
-        return from_disk(open_stored(Path(path), strict=strict), str(path))
+        return from_disk(open_stored(Path(path), strict=strict, check=check_declared), str(path))
 
 
 def open_product(path: str | os.PathLike[str]) -> xr.Dataset:

@@ -9,6 +9,7 @@ import sys
 import threading
 import uuid
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -36,7 +37,12 @@ MIN_LAZY_VALUES = 2**17
 _CACHE_BYTES = 2**24
 
 
-def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
+def open_stored(
+    path: Path,
+    *,
+    strict: bool = False,
+    check: Callable[[Path, xr.Dataset], None] | None = None,
+) -> xr.Dataset:
     """Open a dataset as it is on disk: times not decoded, data lazy, chunks checked when read.
 
     Parameters
@@ -45,6 +51,9 @@ def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
         A NetCDF file or a Zarr directory.
     strict : bool
         Raise `FormatError` for a damaged chunk of a log instead of leaving a gap.
+    check : callable, optional
+        Called with the path and the dataset before any of its values is read; it raises
+        `FormatError` when the declared sizes are out of proportion.
 
     Raises
     ------
@@ -54,10 +63,12 @@ def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
     if not path.exists():
         raise FormatError(f"{path}: there is no such file")
     with reading_of(path):
-        return _open_dataset(path, strict=strict)
+        return _open_dataset(path, strict=strict, check=check)
 
 
-def _open_dataset(path: Path, *, strict: bool) -> xr.Dataset:
+def _open_dataset(
+    path: Path, *, strict: bool, check: Callable[[Path, xr.Dataset], None] | None
+) -> xr.Dataset:
     engine: Any = "zarr" if path.is_dir() else "netcdf4"
     name = "Zarr" if path.is_dir() else "NetCDF"
     if path.is_file():
@@ -70,6 +81,8 @@ def _open_dataset(path: Path, *, strict: bool) -> xr.Dataset:
         raise FormatError(
             f"{path}: is not {name}, or is damaged or cut short ({error}); make or copy it again"
         ) from error
+    if check is not None:
+        check(path, stored)
     close = close_function(stored)
     stored = replace_stamps(stored, path)
     stored.set_close(close)

@@ -15,7 +15,7 @@ import pytest
 import xarray as xr
 import zarr
 
-from gyrostab import davar, make_log, read_log, regularise, scan, to_netcdf, to_zarr
+from gyrostab import davar, make_log, open_log, read_log, regularise, scan, to_netcdf, to_zarr
 from gyrostab.allan.davar import davar_part
 from gyrostab.errors import FormatError, OptionError, TimeError
 from gyrostab.ingest import ReadOptions
@@ -285,16 +285,19 @@ def test_file_of_unwritten_variables_is_refused(suffix: str, tmp_path: Path) -> 
         read_log(path)
 
 
-def test_own_log_that_declares_unwritten_samples_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("stamps", [False, True])
+@pytest.mark.parametrize("opened", [read_log, open_log])
+def test_own_log_that_declares_unwritten_samples_is_refused(
+    opened: Callable[[Path], object], stamps: bool, tmp_path: Path
+) -> None:
     path = tmp_path / "log.zarr"
-    to_zarr(make_log(np.arange(200_000.0) % 7, rate=100.0, unit="deg/h"), path, stamps=False)
-    for name in (".zmetadata", "rate/.zarray"):
-        file = path / name
+    to_zarr(make_log(np.arange(200_000.0) % 7, rate=100.0, unit="deg/h"), path, stamps=stamps)
+    for file in (*path.glob("*/.zarray"), path / ".zmetadata"):
         file.write_text(file.read_text().replace("200000", "100000000000"))
     with pytest.raises(
         FormatError, match=r"log\.zarr: it declares 1e\+11 samples .*--limit stored_samples"
     ):
-        read_log(path)
+        opened(path)
 
 
 @pytest.mark.parametrize("name", ["log.zarr", "log.nc", "log.h5"])

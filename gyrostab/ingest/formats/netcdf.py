@@ -29,7 +29,7 @@ from gyrostab.ingest.formats.netcdf_variables import (
 )
 from gyrostab.ingest.formats.packing import decode_variables
 from gyrostab.ingest.formats.stored import StoredColumn, StoredTable, plan_stored
-from gyrostab.ingest.limits import check_stored
+from gyrostab.ingest.limits import check_declared, check_stored
 from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
 from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name
@@ -199,10 +199,10 @@ def _content_kind(path: Path) -> str:
 
 def _open_own(path: Path, options: ReadOptions) -> xr.Dataset:
     """Open a log that gyrostab wrote."""
-    log = from_disk(open_stored(path, strict=options.strict), path.name)
+    check = partial(check_declared, given=options.limits)
+    log = from_disk(open_stored(path, strict=options.strict, check=check), path.name)
     try:
         log = as_uniform(log)
-        check_stored(path, log.sizes["time"], log.sizes["axis"], options.limits)
     except SchemaError as error:
         log.close()
         raise SchemaError(f"{path.name}: {error}") from error
