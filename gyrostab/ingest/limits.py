@@ -12,12 +12,14 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
 from gyrostab.errors import FormatError, OptionError
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 __all__ = [
     "LIMITS",
