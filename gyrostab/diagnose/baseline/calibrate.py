@@ -6,6 +6,7 @@ B and K. The posterior is kept as draws, so that null records include the calibr
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -32,8 +33,10 @@ from gyrostab.diagnose.baseline.posterior import (
     visible_coefficients,
 )
 from gyrostab.diagnose.baseline.quiescent import (
+    GIVEN,
     find_quiescent_blocks,
     find_quiescent_spans,
+    given_quiescent_blocks,
     noise_level_excess,
 )
 from gyrostab.diagnose.baseline.simulated import (
@@ -124,7 +127,7 @@ def calibrate_noise(
     Raises
     ------
     OptionError
-        If `quiet` holds fewer than 100 samples in whole blocks.
+        If `quiet` lies outside the record.
     SchemaError
         If an axis has no spectra to calibrate on.
 
@@ -318,8 +321,8 @@ def baseline_from_model(
         As `gyrostab.simulate` takes it.
     quiet : array_like of bool (block,), or (start, end) or several of these, optional
         Quiescent time of the recording. One factor for each axis then fits the noise of the model
-        to it; the noise terms keep their proportions, and the effects their sizes. By default the
-        noise is taken unchanged.
+        to it; the noise terms keep their proportions, and the effects their sizes. By default, and
+        with a warning where `quiet` is too short, the noise is taken unchanged.
 
     Returns
     -------
@@ -354,8 +357,9 @@ def baseline_from_model(
         )
     chosen = np.ones((len(axes), blocks.sizes["block"]), np.bool_)
     attrs: dict[str, Any] = {"source": "model", "calibrated_on": [], "model": parsed.source}
-    if quiet is not None:
-        chosen, attrs["quiet_by"] = find_quiescent_blocks(blocks, quiet, settings=settings)
+    given = given_quiescent_blocks(blocks, quiet, settings=settings)
+    if given is not None:
+        chosen, attrs["quiet_by"] = given, GIVEN
         attrs["calibrated_on"] = find_quiescent_spans(blocks, chosen)
         posteriors = _scale_to_quiescent(blocks, parsed, posteriors, chosen)
     known = expect_known_effects(
@@ -380,7 +384,7 @@ def baseline_from_model(
         noise = np.stack([line_columns(blocks) @ posterior.square for posterior in posteriors])
         out["shape_alone"] *= independent_line_share(noise + known.lines["peaks"], blocks)[:, None]
     out["coefficient"].loc[{"term": "R"}] = ramp
-    out["stderr"].loc[{"term": list(TERMS) if quiet is None else ["R"]}] = 0.0
+    out["stderr"].loc[{"term": list(TERMS) if given is None else ["R"]}] = 0.0
     return out
 
 
@@ -392,11 +396,21 @@ def _scale_to_quiescent(
     whole, added = (
         expect_known_effects(blocks, model, values).spectrum for values in (square, 0.0 * square)
     )
-    return _scale_axes(posteriors, *quiescent_level(blocks, whole - added, added, quiet))
+    return _scale_axes(blocks, posteriors, *quiescent_level(blocks, whole - added, added, quiet))
 
 
-def _scale_axes(posteriors: list[Posterior], factor: Array, error: Array) -> list[Posterior]:
-    """Scale the noise of all axes, with the errors of the factors."""
+def _scale_axes(
+    blocks: xr.Dataset, posteriors: list[Posterior], factor: Array, error: Array
+) -> list[Posterior]:
+    """Scale the noise of all axes, with the errors of the factors, and say so."""
+    sizes = ", ".join(
+        f"{root:.3g} on axis {axis}"
+        for axis, root in zip(blocks["axis"].values, np.sqrt(factor), strict=True)
+    )
+    warnings.warn(
+        f"the noise of the simulation is multiplied by {sizes}: its level in the quiet time given",
+        stacklevel=2,
+    )
     scalings = zip(posteriors, factor.tolist(), error.tolist(), strict=True)
     return [
         scale_noise(posterior, by, relative_error, np.random.default_rng(row))
@@ -466,11 +480,12 @@ def baseline_from_simulation(
         "quiet_by": reason,
     }
     spectrum = noise * level[..., None] * shown.form[:, None]
-    if quiet is not None:
-        chosen, attrs["quiet_by"] = find_quiescent_blocks(blocks, quiet, settings=settings)
+    given = given_quiescent_blocks(blocks, quiet, settings=settings)
+    if given is not None:
+        chosen, attrs["quiet_by"] = given, GIVEN
         attrs["calibrated_on"] = find_quiescent_spans(blocks, chosen)
         factor, error = quiescent_level(blocks, spectrum, 0.0 * spectrum, chosen)
-        posteriors = _scale_axes(posteriors, factor, error)
+        posteriors = _scale_axes(blocks, posteriors, factor, error)
         spectrum = spectrum * factor[:, None, None]
     return add_extra_statistics(
         assemble_baseline(

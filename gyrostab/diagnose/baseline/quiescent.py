@@ -14,12 +14,22 @@ from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.errors import OptionError
 from gyrostab.time.grid import stamp_ns
 
-__all__ = ["LEVEL_SPANS", "find_quiescent_blocks", "find_quiescent_spans", "noise_level_excess"]
+__all__ = [
+    "GIVEN",
+    "LEVEL_SPANS",
+    "find_quiescent_blocks",
+    "find_quiescent_spans",
+    "given_quiescent_blocks",
+    "noise_level_excess",
+]
 
 Array = NDArray[np.float64]
+#: Criterion of blocks that the user gave.
+GIVEN = "the time given as quiet"
 #: Blocks over which the noise level is averaged. Design choice.
 LEVEL_SPANS = (1, 5, 15)
 _MIN_GIVEN_SAMPLES = 100  # as in the shortest default block; they give N to 7 %
+_MIN_GIVEN_BANDS = 4  # with a spectrum: as many as noise terms are fitted to them
 
 
 def _running_sum(values: Array, count: int) -> Array:
@@ -172,12 +182,12 @@ def find_quiescent_blocks(
     Raises
     ------
     OptionError
-        If the given quiescent time holds fewer than 100 samples in whole blocks.
+        As `given_quiescent_blocks`.
     """
-    n, axes = blocks.sizes["block"], blocks.sizes["axis"]
-    if quiet is not None:
-        given = _given_blocks(blocks, quiet, settings)
-        return np.broadcast_to(given, (axes, n)).copy(), "the time given as quiet"
+    n = blocks.sizes["block"]
+    given = given_quiescent_blocks(blocks, quiet, settings=settings)
+    if given is not None:
+        return given, GIVEN
     distances = _distance_from_rest(blocks, settings)
     worst = np.max([*distances.values(), np.zeros(n)], axis=0)
     start = worst <= 1.0
@@ -191,8 +201,29 @@ def find_quiescent_blocks(
     return _drop_noisy_blocks(blocks, start, settings), reason
 
 
-def _given_blocks(blocks: xr.Dataset, quiet: Any, settings: Settings) -> NDArray[np.bool_]:
-    """Return the blocks given as quiescent by the user."""
+def given_quiescent_blocks(
+    blocks: xr.Dataset, quiet: Any, *, settings: Settings = DEFAULTS
+) -> NDArray[np.bool_] | None:
+    """Return the blocks (axis, block) given as quiescent by the user, if they can be used.
+
+    Parameters
+    ----------
+    quiet : array_like of bool (block,), or sequence of (start, end), or None
+        As `find_quiescent_blocks` takes it.
+
+    Returns
+    -------
+    ndarray of bool, or None
+        None without `quiet`, and, with a warning, where its whole blocks hold fewer than 100
+        samples or no spectrum: the diagnosis then continues without it.
+
+    Raises
+    ------
+    OptionError
+        If a span lies outside the record or ends before it begins.
+    """
+    if quiet is None:
+        return None
     n = blocks.sizes["block"]
     array = np.asarray(quiet)
     if array.dtype == np.bool_:
@@ -208,30 +239,45 @@ def _given_blocks(blocks: xr.Dataset, quiet: Any, settings: Settings) -> NDArray
         pairs = [quiet] if array.ndim == 1 else list(quiet)
         for pair in pairs:
             low, high = (_seconds_since_start(blocks, edge) for edge in pair)
+            if not (low < high and high > begin[0] and low < end[-1]):
+                raise OptionError(
+                    f"quiet: {low:g} s to {high:g} s after the start is outside of the "
+                    f"{_record_length(blocks):g} s of the record, or ends before it starts"
+                )
             chosen |= (begin >= low - 1e-6) & (end <= high + 1e-6)
-    _check_size(blocks, int(chosen.sum()), settings.min_quiescent_blocks)
-    return np.asarray(chosen)
+    if not _is_usable(blocks, chosen, settings.min_quiescent_blocks):
+        return None
+    return np.broadcast_to(chosen, (blocks.sizes["axis"], n)).copy()
 
 
-def _check_size(blocks: xr.Dataset, count: int, better_count: int) -> None:
-    """Refuse quiescent blocks with too few samples; warn if they are too few for slow noise."""
+def _is_usable(blocks: xr.Dataset, chosen: NDArray[np.bool_], better_count: int) -> bool:
+    """Return whether given blocks hold enough to calibrate on; warn where that is little."""
     step, size = float(blocks.attrs["block_s"]), int(blocks.attrs["block_samples"])
-    if count * size < _MIN_GIVEN_SAMPLES:
-        least = -(-_MIN_GIVEN_SAMPLES // size)
-        raise OptionError(
-            f"quiet holds {count} whole blocks of {step:g} s, {count * size} samples; "
-            f"calibration needs {_MIN_GIVEN_SAMPLES} samples, from which N is known to "
-            f"{_white_error(_MIN_GIVEN_SAMPLES):.0%}: name {(least + 1) * step:g} s or more within "
-            f"the {_record_length(blocks):g} s of the record, or give a shorter block"
-        )
-    if count < better_count:
-        warnings.warn(
-            f"the quiet time holds {count} block{'' if count == 1 else 's'} of {step:g} s: "
+    count = int(chosen.sum())
+    spectra = np.isfinite(blocks["power"].values[:, chosen]).any(axis=1).sum(axis=1)
+    enough = count * size >= _MIN_GIVEN_SAMPLES
+    if enough and spectra.min() >= _MIN_GIVEN_BANDS:
+        lack = (
             f"N is known to {_white_error(count * size):.1%} at best, and drift slower than "
             f"{count * step:g} s not at all, so that slow mismatches may be missed; "
-            f"{better_count * step:g} s or more are better",
+            f"{better_count * step:g} s or more are better"
+        )
+        usable = True
+    else:
+        lack = (
+            "too few samples without losses for a spectrum"
+            if enough
+            else f"{count * size} samples, and calibration needs {_MIN_GIVEN_SAMPLES}"
+        )
+        lack += f"; it is ignored. Name {better_count * step:g} s or more, or give a shorter block"
+        usable = False
+    if count < better_count or not usable:
+        warnings.warn(
+            f"the quiet time holds {count} whole block{'' if count == 1 else 's'} of {step:g} s: "
+            + lack,
             stacklevel=2,
         )
+    return usable
 
 
 def _white_error(samples: int) -> float:

@@ -12,6 +12,7 @@ from gyrostab.diagnose.baseline.calibrate import (
     calibrate_noise,
 )
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.errors import OptionError
 from tests.diagnose.baseline.test_calibrate import NOISE, SHAKEN, log
 
 SHAKE_NOISE = {"name": "vibration_noise", "white": 0.002, "axes": ["x"]}
@@ -28,7 +29,7 @@ def test_a_short_quiet_time_calibrates_with_a_warning(block_count):
     blocks = reduce_log(log({"N": 0.003}, duration="30min"))
     step = blocks.attrs["block_s"]
     with pytest.warns(
-        UserWarning, match=rf"holds {block_count} blocks? of {step:g} s: N is known to \d"
+        UserWarning, match=rf"holds {block_count} whole blocks? of {step:g} s: N is known to \d"
     ):
         baseline = calibrate_noise(blocks, quiet=(0.0, block_count * step + 1.0))
     value, error = value_of(baseline, "N")
@@ -108,10 +109,42 @@ def test_a_simulated_log_is_scaled_to_quiet_time():
 
 def test_a_simulation_and_quiet_time_can_be_combined():
     recording = log({"N": 0.003}, duration="15min")
-    found = gyrostab.diagnose(
-        recording, simulation={"noise": {"N": 0.002}}, quiet=(0.0, 200.0), nulls=100
-    )
+    with pytest.warns(UserWarning, match=r"simulation is multiplied by 1\.[45]\d* on axis x"):
+        found = gyrostab.diagnose(
+            recording, simulation={"noise": {"N": 0.002}}, quiet=(0.0, 200.0), nulls=100
+        )
     assert found.verdict == "no mismatch"
     assert found.content["baseline"]["source"] == "model"
     assert found.content["baseline"]["calibrated_on"]
     assert found.model["noise"]["x"]["N"] == pytest.approx(0.003, rel=0.1)
+
+
+@pytest.mark.parametrize("simulation", [None, "model", "log"])
+def test_a_quiet_time_too_short_to_use_is_ignored_with_a_note(simulation):
+    recording = log({"N": 0.003}, duration="15min")
+    expected = {
+        None: None,
+        "model": {"noise": {"N": 0.002}},
+        "log": log({"N": 0.002}, duration="15min", seed=5),
+    }[simulation]
+    alone = gyrostab.diagnose(recording, simulation=expected, nulls=100)
+    with pytest.warns(UserWarning, match=r"holds 0 whole blocks of 10 s: 0 samples.*is ignored"):
+        found = gyrostab.diagnose(recording, simulation=expected, quiet=(3.0, 9.0), nulls=100)
+    assert found.content["baseline"] == alone.content["baseline"]
+    assert found.verdict == alone.verdict
+
+
+def test_a_quiet_time_that_is_lost_is_ignored_with_a_note():
+    recording = log({"N": 0.003}, duration="30min").copy(deep=True)
+    recording["rate"][:, : int(60 * recording.attrs["sampling_rate_hz"])] = np.nan
+    blocks = reduce_log(recording)
+    with pytest.warns(UserWarning, match="too few samples without losses for a spectrum.*ignored"):
+        baseline = calibrate_noise(blocks, quiet=(0.0, 60.0))
+    assert baseline.attrs["quiet_by"] == calibrate_noise(blocks).attrs["quiet_by"]
+
+
+@pytest.mark.parametrize("quiet", [(4000.0, 5000.0), (-50.0, -10.0), (700.0, 100.0)])
+def test_a_quiet_time_outside_the_record_is_refused(quiet):
+    blocks = reduce_log(log({"N": 0.003}, duration="30min"))
+    with pytest.raises(OptionError, match="outside of the 1800 s of the record"):
+        calibrate_noise(blocks, quiet=quiet)
