@@ -24,7 +24,7 @@ from page import machine, renew
 from gyrostab import davar, fit_noise, make_log
 from gyrostab.allan import fit
 from gyrostab.kernels.fit.covariance import diagonal_products
-from gyrostab.kernels.fit.least_squares import identify_noise
+from gyrostab.kernels.fit.least_squares import cell_freedoms, combine_diagonal, identify_noise
 from tests.support.noise_records import lose, quantization, random_walk, white
 
 RATE, SAMPLES = 400.0, 6_000_000
@@ -60,8 +60,8 @@ def measure(x: np.ndarray, taus: int, repeats: int) -> tuple[int, list[float]]:
     trends = [cell.reshape(-1) for cell in cells[5:]]
     shifts = np.zeros_like(ks)
     tables = fit._cached_tables(tuple(ks.tolist()), tuple(shifts.tolist()), rate, window)
-    diagonals = diagonal_products(window, ks, shifts)
-    quick = (tables.columns, tables.weight, tables.to_samples, *diagonals)
+    seen = (tables.columns, tables.weight, tables.to_samples)
+    diagonal = combine_diagonal(*diagonal_products(window, ks, shifts))
     whole = best(lambda: fit_noise(surface), repeats)
     kernel = best(lambda: fit._run_kernel(flat, *trends, tables, 31), repeats)
     block = best(
@@ -72,7 +72,12 @@ def measure(x: np.ndarray, taus: int, repeats: int) -> tuple[int, list[float]]:
         kernel,
         max(block - kernel, 0.0),
         max(whole - block, 0.0),
-        best(lambda: identify_noise(*flat, *quick), repeats),
+        best(
+            lambda: cell_freedoms(
+                identify_noise(*flat, *seen), *flat, tables.columns, tables.to_samples, diagonal
+            ),
+            repeats,
+        ),
     ]
     once = best(lambda: fit._Tables(ks, shifts, rate, window), 1)
     return ks.size, [1e6 * s / flat[0].shape[0] for s in seconds] + [once]

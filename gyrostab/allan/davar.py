@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import dask
 import dask.array as da
@@ -15,17 +15,24 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.allan.channels import window_channels
-from gyrostab.allan.plan import MOST_CELLS, Plan, last_sample, make_plan, units_of_work
+from gyrostab.allan.plan import (
+    MOST_CELLS,
+    Plan,
+    last_sample,
+    make_plan,
+    thin_factors,
+    units_of_work,
+)
 from gyrostab.errors import OptionError
 from gyrostab.ingest.convert import as_log
 from gyrostab.kernels.allan.gap_edges import gap_edge_ratio
 from gyrostab.kernels.allan.outlier_count import count_outliers
 from gyrostab.kernels.allan.pairs import white_pair_sum
 from gyrostab.kernels.allan.reference import direct_sums, recursive_sums, reference_theta
-from gyrostab.kernels.allan.surface import CELL_FIELDS, STRICT, Unit, surface_unit, window_means
+from gyrostab.kernels.allan.surface import STRICT, Cells, Unit, surface_unit, window_means
 from gyrostab.kernels.allan.trend import window_trends
 from gyrostab.kernels.fit.covariance import diagonal_products
-from gyrostab.kernels.fit.least_squares import identify_noise
+from gyrostab.kernels.fit.least_squares import cell_freedoms, combine_diagonal, identify_noise
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.noise import HOUR, avar_columns, sample_squares
 from gyrostab.schema import attributes
@@ -34,6 +41,12 @@ from gyrostab.time.grid import first_stamp, grid_times
 
 __all__ = ["davar", "davar_part", "davar_parts"]
 
+Floats = NDArray[np.float64]
+
+#: Variables by axis, window and averaging time, in the order in which `_compute_unit` returns them.
+_CELL_FIELDS = (*Cells._fields, "edf")
+#: Types of the variables that are not float64.
+_TYPES = {"count": np.int64, "estimator": np.int8, "outlier_count": np.int64}
 #: Variables by axis and window, in the order in which `_compute_unit` returns them.
 _PLANE_FIELDS = (
     "window_mean",
@@ -157,11 +170,9 @@ def davar(
         convention=convention,
     )  # fmt: skip
     if method == "blocks":
-        cells, means = _run_units(plan.signal.data, plan.unit, plan.rate)
+        cells, means = _run_units(plan.signal.data, plan)
     else:
-        cells, means = _run_published_method(
-            plan.signal, plan.unit, plan.rate, method, paper=convention == "paper"
-        )
+        cells, means = _run_published_method(plan, method, paper=convention == "paper")
     return _attach_labels(cells, means, log, plan)
 
 
@@ -258,7 +269,7 @@ def davar_part(
             "method='blocks'"
         )
     data, unit = plan.signal.data, plan.unit
-    tables = _cached_tables_of(plan)
+    tables = _noise_tables(plan)
     units = [
         windows
         for windows in units_of_work(data.shape[1], unit)
@@ -267,21 +278,10 @@ def davar_part(
     spans = [(windows.start * unit.step, last_sample(windows, unit)) for windows in units]
     space = space or Workspace()
     results = [_compute_unit(x, unit, tables, space) for x in _read_spans(data, spans, space)]
-    rows = range(0, len(results), len(units))
-    cells, means = (
-        [
-            np.concatenate([arrays[i] for arrays in results[row : row + len(units)]], axis=1)
-            for row in rows
-        ]
-        for i in range(2)
-    )
+    cells, means = _join_units(results, data.shape[0])
     selected = slice(part.start - units[0].start, part.stop - units[0].start)
     return _attach_labels(
-        np.stack(cells, axis=1)[:, :, selected],
-        np.stack(means, axis=1)[:, :, selected],
-        log,
-        plan,
-        part=part,
+        [field[:, selected] for field in cells], means[:, :, selected], log, plan, part=part
     )
 
 
@@ -313,24 +313,52 @@ def _read_spans(
 
 
 def _compute_unit(
-    x: NDArray[np.generic], unit: Unit, tables: tuple[Any, ...], space: Workspace | None = None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Compute one unit: cells (9, n_windows, n_tau) and plane fields (6, n_windows).
-
-    The last field of the cells holds the degrees of freedom.
-    """
+    x: NDArray[np.generic], unit: Unit, tables: _NoiseTables, space: Workspace | None = None
+) -> tuple[list[Floats], Floats]:
+    """Compute one unit: the fields of the cells, see `Cells`, and plane fields (6, n_windows)."""
     x = np.ascontiguousarray(x)
-    if x.dtype.kind == "f" and np.isnan(x[[0, x.size // 2, -1]]).all() and np.isnan(x).all():
-        cells, means = (part.copy() for part in _empty_surface(_with_tuples(unit), x.size))
-    else:
-        cells, means = surface_unit(x, unit, space)
+    cells, means = surface_unit(x, unit, space)
     scale = (
         HOUR if unit.angle else 1.0
     )  # angles are in degree, so their slopes in degree per second
-    cells[0] *= scale**2
-    dof = identify_noise(cells[0], cells[5], cells[6], cells[7], cells[3], *tables)
+    if unit.angle:
+        cells.avar[:] *= scale**2
     means[0] *= scale
-    return np.concatenate([cells, dof[None]]), np.concatenate([means, _describe_windows(x, unit)])
+    fields = [*cells, _cell_freedoms(cells, tables)]
+    return fields, np.concatenate([means, _describe_windows(x, unit)])
+
+
+def _stack_unit(x: NDArray[np.generic], unit: Unit, tables: _NoiseTables) -> tuple[Floats, Floats]:
+    """`_compute_unit` with all fields in one array (9, n_windows, n_tau)."""
+    fields, means = _compute_unit(x, unit, tables)
+    return np.stack(np.broadcast_arrays(*fields)), means
+
+
+def _join_units(
+    results: Sequence[tuple[list[Floats], Floats]], n_axes: int
+) -> tuple[list[NDArray[Any]], Floats]:
+    """Join units, axis by axis: fields (axis, time, tau), plane fields (6, axis, time).
+
+    A field that is the same in all windows is stored once, and repeated as a view.
+    """
+    sizes = [plane.shape[1] for _, plane in results]
+    fields = [
+        _join_field([unit[i] for unit, _ in results], sizes, n_axes, _TYPES.get(name, np.float64))
+        for i, name in enumerate(_CELL_FIELDS)
+    ]
+    means = np.concatenate([plane for _, plane in results], axis=1)
+    return fields, means.reshape(len(_PLANE_FIELDS), n_axes, -1)
+
+
+def _join_field(parts: list[Floats], sizes: list[int], n_axes: int, kind: Any) -> NDArray[Any]:
+    shape = n_axes, sum(sizes) // n_axes, parts[0].shape[1]
+    parts = [part.astype(kind, copy=False) for part in parts]
+    if all(part.shape[0] == 1 and np.array_equal(part, parts[0]) for part in parts):
+        return np.broadcast_to(parts[0], shape)
+    if len(parts) > 1:
+        rows = zip(parts, sizes, strict=True)
+        parts = [np.concatenate([np.broadcast_to(part, (n, shape[2])) for part, n in rows])]
+    return parts[0].reshape(shape)
 
 
 def _describe_windows(
@@ -345,80 +373,86 @@ def _describe_windows(
     return np.vstack([trends, outliers, gap_edge_ratio(x, first, unit.window)])
 
 
-def _cached_tables_of(plan: Plan) -> tuple[Any, ...]:
-    """Make `_noise_tables` once for all parts of a log."""
-    return _cached_noise_tables(_with_tuples(plan.unit), plan.rate)
+class _NoiseTables(NamedTuple):
+    """Arguments of `identify_noise` and `cell_freedoms` that all windows share."""
+
+    chosen: NDArray[np.int64]
+    columns: Floats
+    weight: Floats
+    to_samples: Floats
+    diagonal: Floats
+
+
+def _noise_tables(plan: Plan) -> _NoiseTables:
+    unit = plan.unit
+    return _cached_noise_tables(unit.window, tuple(unit.ks), tuple(unit.shifts), plan.rate)
 
 
 @lru_cache(maxsize=4)
-def _cached_noise_tables(unit: Unit, rate: float) -> tuple[Any, ...]:
-    return _noise_tables(_with_arrays(unit), rate)
-
-
-@lru_cache(maxsize=4)
-def _empty_surface(unit: Unit, size: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Cache the surface of a unit without any sample, because a long gap has many of them."""
-    return surface_unit(np.full(size, np.nan), _with_arrays(unit), None)
-
-
-def _with_tuples(unit: Unit) -> Unit:
-    return unit._replace(ks=tuple(unit.ks.tolist()), shifts=tuple(unit.shifts.tolist()))  # type: ignore[arg-type]
-
-
-def _with_arrays(unit: Unit) -> Unit:
-    return unit._replace(
-        ks=np.array(unit.ks, dtype=np.int64), shifts=np.array(unit.shifts, dtype=np.int64)
+def _cached_noise_tables(
+    window: int, factors: tuple[int, ...], thinning: tuple[int, ...], rate: float
+) -> _NoiseTables:
+    """Make the tables once for all parts of a log."""
+    ks, shifts = np.array(factors, dtype=np.int64), np.array(thinning, dtype=np.int64)
+    n = window - 2 * ks + 1
+    weight = [count**2 / white_pair_sum(count, k) for count, k in zip(n, ks, strict=True)]
+    diagonal = combine_diagonal(*diagonal_products(window, ks, shifts))
+    return _NoiseTables(
+        thin_factors(ks), avar_columns(ks / rate), np.array(weight), sample_squares(rate), diagonal
     )
 
 
-def _noise_tables(unit: Unit, rate: float) -> tuple[Any, ...]:
-    """Make the tables of `identify_noise`: columns, weights, sample units, sums over pairs."""
-    columns = avar_columns(unit.ks / rate)
-    to_samples = sample_squares(rate)
-    n = [int(unit.window - 2 * k + 1) for k in unit.ks]
-    weight = np.array(
-        [count**2 / white_pair_sum(count, int(k)) for count, k in zip(n, unit.ks, strict=True)]
-    )
-    pairs, ramps = diagonal_products(unit.window, unit.ks, unit.shifts)
-    return columns, weight, to_samples, pairs, ramps
+def _cell_freedoms(cells: Cells, tables: _NoiseTables) -> Floats:
+    """Compute the degrees of freedom of cells (n_windows, n_tau) from a quick fit of the noise."""
+    chosen, columns, weight, to_samples, diagonal = tables
+    seen = (cells.avar, *cells[5:], cells.gap_factor)
+    few = [np.ascontiguousarray(field[:, chosen]) for field in seen]
+    squares = identify_noise(*few, columns[chosen], weight[chosen], to_samples)
+    return np.asarray(cell_freedoms(squares, *seen, columns, to_samples, diagonal))
 
 
-def _run_units(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:
-    """Run the units of work: cells (9, axis, time, tau), plane fields (6, axis, time).
+def _run_units(data: Any, plan: Plan) -> tuple[Any, Any]:
+    """Run the units of work: fields (axis, time, tau), plane fields (6, axis, time).
 
     The results are dask arrays if `data` is one.
     """
-    lazy = isinstance(data, da.Array)
-    tables = _noise_tables(unit, rate)
-    shared = dask.delayed(tables, pure=True, traverse=False) if lazy else tables
-    work = dask.delayed(_compute_unit, nout=2, pure=False)
+    lazy, unit, tables = isinstance(data, da.Array), plan.unit, _noise_tables(plan)
+    units = units_of_work(data.shape[1], unit)
+    spans = [slice(part.start * unit.step, last_sample(part, unit)) for part in units]
+    if not lazy:
+        tasks = [
+            partial(_compute_unit, data[row, span], unit, tables)
+            for row in range(data.shape[0])
+            for span in spans
+        ]
+        if len(tasks) == 1:  # a short call does not wait for a graph
+            return _join_units([tasks[0]()], 1)
+        run = dask.compute(*(dask.delayed(task, pure=False)() for task in tasks))
+        return _join_units(run, data.shape[0])
+    shared = dask.delayed(tables, pure=True, traverse=False)
+    work = dask.delayed(_stack_unit, nout=2, pure=False)
     rows_cells, rows_means = [], []
     for row in range(data.shape[0]):
         cells, means = [], []
-        for windows in units_of_work(data.shape[1], unit):
-            n = windows.stop - windows.start
-            unit_cells, unit_means = work(
-                data[row, windows.start * unit.step : last_sample(windows, unit)], unit, shared
-            )
-            cells.append(
-                da.from_delayed(
-                    unit_cells, (len(CELL_FIELDS) + 1, n, unit.ks.size), dtype=np.float64
-                )
-            )
+        for part, span in zip(units, spans, strict=True):
+            n = part.stop - part.start
+            unit_cells, unit_means = work(data[row, span], unit, shared)
+            shape = len(_CELL_FIELDS), n, unit.ks.size
+            cells.append(da.from_delayed(unit_cells, shape, dtype=np.float64))
             means.append(da.from_delayed(unit_means, (len(_PLANE_FIELDS), n), dtype=np.float64))
         rows_cells.append(da.concatenate(cells, axis=1))
         rows_means.append(da.concatenate(means, axis=1))
     stacked = da.stack(rows_cells, axis=1), da.stack(rows_means, axis=1)
-    cells_array, means_array = stacked if lazy else dask.compute(*stacked)
-    if lazy:
-        cells_array, means_array = (keep_sources(data, part) for part in stacked)
-    return cells_array, means_array
+    cells_array, means_array = (keep_sources(data, part) for part in stacked)
+    kinds = [_TYPES.get(name, np.float64) for name in _CELL_FIELDS]
+    return [cells_array[i].astype(kind) for i, kind in enumerate(kinds)], means_array
 
 
 def _run_published_method(
-    signal: xr.DataArray, unit: Unit, rate: float, method: str, *, paper: bool
-) -> tuple[Any, Any]:
-    """Run a published algorithm in memory: cells (9, axis, time, tau), plane (6, axis, time)."""
+    plan: Plan, method: str, *, paper: bool
+) -> tuple[list[NDArray[Any]], Floats]:
+    """Run a published algorithm in memory: fields (axis, time, tau), plane (6, axis, time)."""
+    signal, unit, _, _ = plan
     points = unit.window + (0 if paper and not unit.angle else 1)
     all_points = signal.sizes["time"] + (0 if unit.angle or paper else 1)
     n_windows = (all_points - points) // unit.step + (0 if paper else 1)
@@ -428,33 +462,28 @@ def _run_published_method(
             "record"
         )
     run = direct_sums if method == "direct" else recursive_sums
-    tables = _noise_tables(unit, rate)
+    tables = _noise_tables(plan)
     full = (points - 2 * unit.ks).astype(np.float64)
-    cells = np.zeros((len(CELL_FIELDS) + 1, signal.sizes["axis"], n_windows, unit.ks.size))
-    means = np.zeros((len(_PLANE_FIELDS), signal.sizes["axis"], n_windows))
+    results = []
     for row in range(signal.sizes["axis"]):
         x = np.asarray(signal.isel(axis=row).data)
         theta, present, missing = reference_theta(x, angle=unit.angle, paper=paper)
         sums, counts = run(theta, present, missing, points, unit.step, n_windows, unit.ks)
-        divisor = full if unit.zero_fill else counts
-        interval = unit.interval if unit.angle else 1.0
+        interval = unit.interval / HOUR if unit.angle else 1.0
         with np.errstate(invalid="ignore", divide="ignore"):
-            cells[0, row] = (
-                sums
-                / (2.0 * (unit.ks * interval) ** 2 * divisor)
-                * (HOUR**2 if unit.angle else 1.0)
-            )
-        cells[1, row], cells[2, row] = counts, counts / full
-        cells[3, row], cells[4, row], cells[5:8, row] = counts / full, STRICT, 1.0
+            avar = sums / (2.0 * (unit.ks * interval) ** 2 * (full if unit.zero_fill else counts))
+        coverage = counts / full
         if not unit.zero_fill:
-            cells[0, row][cells[2, row] < unit.min_coverage] = np.nan
-        cells[8, row] = identify_noise(
-            cells[0, row], cells[5, row], cells[6, row], cells[7, row], cells[3, row], *tables
+            avar[coverage < unit.min_coverage] = np.nan
+        one = np.ones_like(avar)
+        cells = Cells(
+            avar, counts.astype(np.float64), coverage, coverage, STRICT * one, one, one, one
         )
-        means[:2, row] = window_means(x, unit)[:, :n_windows]
-        means[2:, row] = _describe_windows(x, unit, n_windows)
-        means[0, row] *= HOUR if unit.angle else 1.0
-    return cells, means
+        means = window_means(x, unit)[:, :n_windows]
+        means[0] *= HOUR if unit.angle else 1.0
+        plane = np.concatenate([means, _describe_windows(x, unit, n_windows)])
+        results.append(([*cells, _cell_freedoms(cells, tables)], plane))
+    return _join_units(results, len(results))
 
 
 def _attach_labels(
@@ -463,30 +492,21 @@ def _attach_labels(
     cube, plane = ("axis", "time", "tau"), ("axis", "time")
     signal, unit, rate, _ = plan
     start, begin = first_stamp(log), 0 if part is None else part.start
-    first = (begin + np.arange(cells.shape[2])) * unit.step
+    first = (begin + np.arange(means.shape[2])) * unit.step
     bounds = np.stack(
         [grid_times(start, rate, first), grid_times(start, rate, first + unit.window)], axis=-1
     )
     centre = bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) // 2
-    names = (*CELL_FIELDS, "edf")
-    integers = {"count": np.int64, "estimator": np.int8, "outlier_count": np.int64}
     variables: dict[str, Any] = {
-        name: (
-            cube,
-            cells[i].astype(integers[name]) if name in integers else cells[i],
-            attributes(name),
-        )
-        for i, name in enumerate(names)
-        if name != "gap_factor"
+        name: (cube, values, attributes(name))
+        for name, values in zip(_CELL_FIELDS, cells, strict=True)
     }
-    for name, values in zip(_PLANE_FIELDS, means, strict=True):
-        variables[name] = (plane, values.astype(integers.get(name, np.float64)), attributes(name))
     # In addition to the responses, the fit needs the share of degrees of freedom left by the gaps.
-    variables["gap_factor"] = (
-        cube,
-        cells[CELL_FIELDS.index("gap_factor")],
-        attributes("gap_factor"),
-    )
+    gap_factor = variables.pop("gap_factor")
+    for name, values in zip(_PLANE_FIELDS, means, strict=True):
+        kind = _TYPES.get(name, np.float64)
+        variables[name] = (plane, values.astype(kind), attributes(name))
+    variables["gap_factor"] = gap_factor
     groups = units_of_work(signal.sizes["time"], unit)
     if part is None:  # convention "paper" omits the last window
         groups = [

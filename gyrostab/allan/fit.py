@@ -12,6 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import gammaincc, gammaincinv
 
+from gyrostab.allan.plan import thin_factors
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.allan.pairs import white_pair_sum
 from gyrostab.kernels.fit.covariance import STOCHASTIC, product_tables
@@ -24,9 +25,6 @@ from gyrostab.time.durations import duration_seconds, thin
 
 __all__ = ["fit_noise", "fit_part", "is_described", "refit"]
 
-#: Largest number of averaging times in a fit; more add no information and cost the cube of their
-#: number.
-MOST_TAUS = 48
 #: One-sided normal quantiles: 95 % for limits, 99 % for an observed term; two-sided 99 %, for the
 #: sign of a ramp is unknown.
 _LIMIT_SIGMA, _OBSERVED_SIGMA, _RAMP_SIGMA = 1.6449, 2.3263, 2.5758
@@ -299,7 +297,7 @@ def _fit_gls(
     observed_only: bool,
 ) -> xr.Dataset:
     cells, ks, rate, window = _fit_inputs(surface)
-    chosen = within[_thin_factors(ks[within])]
+    chosen = within[thin_factors(ks[within])]
     shifts = thin(ks[chosen]) if surface.attrs.get("overlap") == "octave" else np.zeros_like(chosen)
     tables = _cached_tables(tuple(ks[chosen].tolist()), tuple(shifts.tolist()), rate, window)
 
@@ -393,14 +391,6 @@ def _cached_tables(
 ) -> _Tables:
     """Make the tables once for all parts of a record."""
     return _Tables(np.array(ks, dtype=np.int64), np.array(shifts, dtype=np.int64), rate, window)
-
-
-def _thin_factors(ks: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Choose the averaging factors to fit: all, or `MOST_TAUS` of them, evenly spaced in log."""
-    if ks.size <= MOST_TAUS:
-        return np.arange(ks.size)
-    wanted = np.geomspace(ks[0], ks[-1], MOST_TAUS)
-    return np.unique(np.abs(np.log(ks)[:, None] - np.log(wanted)[None, :]).argmin(axis=0))
 
 
 def _fit_block(

@@ -351,7 +351,7 @@ class TestGaps:
         assert np.diff(bridged).max() > 20
         for j in bridged:
             alone, _ = surface_unit(x[j * 300 : j * 300 + 1000], unit)
-            np.testing.assert_allclose(cells[:, j], alone[:, 0], rtol=1e-9)
+            np.testing.assert_allclose(np.stack(cells)[:, j], np.stack(alone)[:, 0], rtol=1e-9)
 
     @pytest.mark.parametrize("block", [5, 60])
     def test_responses_predict_what_gaps_do_to_white_and_quantization_noise(self, block):

@@ -283,10 +283,10 @@ def windows_from_blocks(heads, tails, whole, out):  # type: ignore[no-untyped-de
 def full_counts(
     window: int, step: int, n_windows: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Count the terms of each window without gaps, (n_windows, n_tau)."""
+    """Count the terms of each window without gaps, (n_windows, n_tau), or of all, (1, n_tau)."""
     lengths = window - 2 * ks + 1
     if not shifts.any():
-        return np.tile(lengths.astype(np.float64), (n_windows, 1))
+        return lengths.astype(np.float64)[None]
     up = (1 << shifts) - 1
     first = step * np.arange(n_windows)[:, None] + up
     return (((first + lengths) >> shifts) - (first >> shifts)).astype(np.float64)

@@ -37,21 +37,9 @@ from gyrostab.kernels.allan.pairs import strict_gap_factors
 from gyrostab.kernels.compiled import KERNEL
 from gyrostab.kernels.workspace import Workspace
 
-__all__ = ["CELL_FIELDS", "NONE", "STRICT", "WEIGHTED", "Unit", "surface_unit", "window_means"]
+__all__ = ["NONE", "STRICT", "WEIGHTED", "Cells", "Unit", "surface_unit", "window_means"]
 
 NONE, STRICT, WEIGHTED = 0, 1, 2
-#: Order of the fields of a cell in the array that `surface_unit` returns.
-CELL_FIELDS = (
-    "avar",
-    "count",
-    "coverage",
-    "gap_factor",
-    "estimator",
-    "white_response",
-    "quantization_response",
-    "ramp_response",
-)
-
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
@@ -90,22 +78,17 @@ class Unit(NamedTuple):
     min_coverage: float
 
 
-@njit(**KERNEL)
-def _fill_cells(sums, counts, full, zero_fill, ks, interval, cells):  # type: ignore[no-untyped-def]
-    """Compute cells from sums of squares; `counts` is empty without gaps. No term gives NaN."""
-    scale = 2.0 * (ks * interval) * (ks * interval)
-    for j in range(sums.shape[0]):
-        used = counts[j] if counts.size > 0 else full[j]
-        divisor = full[j] if zero_fill else used
-        for i in range(ks.size):
-            cells[0, j, i] = sums[j, i] / (scale[i] * divisor[i])
-        for i in range(ks.size):
-            cells[1, j, i] = used[i]
-        for i in range(ks.size):
-            cells[2, j, i] = used[i] / full[j, i]
-        cells[3, j] = 1.0
-        cells[4, j] = STRICT
-        cells[5:8, j] = 1.0
+class Cells(NamedTuple):
+    """Fields of the cells: (n_windows, n_tau), or (1, n_tau) where all windows have the same."""
+
+    avar: Floats
+    count: Floats  # type: ignore[assignment]  # not that of a tuple
+    coverage: Floats
+    gap_factor: Floats
+    estimator: Floats
+    white_response: Floats
+    quantization_response: Floats
+    ramp_response: Floats
 
 
 @njit(**KERNEL)
@@ -266,7 +249,7 @@ def _to_native(x: NDArray[np.generic]) -> NDArray[np.generic]:
 
 def surface_unit(
     x: NDArray[np.generic], unit: Unit, space: Workspace | None = None
-) -> tuple[Floats, Floats]:
+) -> tuple[Cells, Floats]:
     """Compute cells and means of the windows in a span of samples of one axis.
 
     Parameters
@@ -281,23 +264,19 @@ def surface_unit(
 
     Returns
     -------
-    cells : ndarray (8, n_windows, n_tau)
-        The fields of `CELL_FIELDS`, in the memory of `space`; the variance is in the square of the
-        rate's unit (for angles: of angle per second).
+    cells : Cells
+        The variance is in the square of the rate's unit (for angles: of angle per second). Without
+        gaps only the variance differs between the windows.
     means : ndarray (2, n_windows)
         As `window_means`.
     """
     counts_only = np.issubdtype(x.dtype, np.integer)
     x, space = _to_native(x), space or Workspace()
     n_windows = _number_of_windows(x, unit)
-    cells = space.array("cells", len(CELL_FIELDS), n_windows, unit.ks.size)
+    if np.isnan(first_present(x)):
+        return _empty_cells(n_windows, unit.ks.size)
     means, mean, known = _average_windows(x, unit, n_windows)
-    present = int(known.sum())
-    if present == 0:
-        cells[:] = 0.0
-        cells[0], cells[5:] = np.nan, np.nan
-        return cells, means
-    gaps = present < x.size
+    gaps = int(known.sum()) < x.size
     starts, stops = (
         present_runs(x, unit.step if known.size > 1 else x.size, known)
         if gaps
@@ -306,39 +285,54 @@ def surface_unit(
     offset = (
         float(np.rint(mean)) if counts_only else mean
     )  # integers less an integer: every sum is exact
-    sums, counts = _strict_sums(x, unit, _Present(starts, stops, offset), n_windows, gaps, space)
+    present = _Present(starts, stops, offset)
+    sums, counts = _strict_sums(x, unit, present, n_windows, gaps, space)
     full = full_counts(unit.window, unit.step, n_windows, unit.ks, unit.shifts)
-    _fill_cells(
-        sums, counts, full, unit.zero_fill, unit.ks, unit.interval if unit.angle else 1.0, cells
-    )
+    scale = 2.0 * (unit.ks * (unit.interval if unit.angle else 1.0)) ** 2
     if gaps:
-        _share_gaps(
-            starts,
-            stops,
-            unit.angle,
-            unit.window,
-            unit.step,
-            unit.ks,
-            unit.shifts,
-            counts,
-            full,
-            cells,
-        )
-        poor = counts < unit.min_strict * full
-        if not unit.zero_fill and not unit.angle and poor.any():
-            strides = cluster_strides(unit.window, unit.ks, unit.shifts)
-            angle = _angle_of(
-                x, _Present(starts, stops, offset), np.flatnonzero(poor.any(axis=1)), unit, space
-            )
-            _bridge_gaps(
-                angle, starts, stops, unit.window, unit.step, unit.ks, strides, poor, cells
-            )
-    if gaps and not unit.zero_fill:
+        full = np.ascontiguousarray(np.broadcast_to(full, counts.shape))
+        return _cells_with_gaps(x, unit, present, sums / scale, counts, full, space), means
+    one = np.ones((1, unit.ks.size))
+    return Cells(sums / (scale * full), full, one, one, STRICT * one, one, one, one), means
+
+
+def _empty_cells(n_windows: int, n_tau: int) -> tuple[Cells, Floats]:
+    """Cells and means of windows without any sample."""
+    none, zero = np.full((1, n_tau), np.nan), np.zeros((1, n_tau))
+    avar = np.full((n_windows, n_tau), np.nan)
+    means = np.stack([np.full(n_windows, np.nan), np.zeros(n_windows)])
+    return Cells(avar, zero, zero, zero, NONE + zero, none, none, none), means
+
+
+def _cells_with_gaps(
+    x: NDArray[np.generic],
+    unit: Unit,
+    present: _Present,
+    sums: Floats,
+    counts: Floats,
+    full: Floats,
+    space: Workspace,
+) -> Cells:
+    """Compute the cells from the scaled sums of squares in unbroken runs, and their counts."""
+    starts, stops, _ = present
+    cells = np.ones((len(Cells._fields), *counts.shape))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        np.divide(sums, full if unit.zero_fill else counts, out=cells[0])
+    cells[1], cells[2], cells[4] = counts, counts / full, STRICT
+    _share_gaps(
+        starts, stops, unit.angle, unit.window, unit.step, unit.ks, unit.shifts, counts, full, cells
+    )
+    poor = counts < unit.min_strict * full
+    if not unit.zero_fill and not unit.angle and poor.any():
+        strides = cluster_strides(unit.window, unit.ks, unit.shifts)
+        angle = _angle_of(x, present, np.flatnonzero(poor.any(axis=1)), unit, space)
+        _bridge_gaps(angle, starts, stops, unit.window, unit.step, unit.ks, strides, poor, cells)
+    if not unit.zero_fill:
         blank = ~(cells[2] >= unit.min_coverage)
         cells[0][blank] = cells[5][blank] = cells[6][blank] = cells[7][blank] = np.nan
         cells[4][blank] = NONE
         cells[3][blank] = 0.0
-    return cells, means
+    return Cells(*cells)
 
 
 def _number_of_windows(x: NDArray[np.generic], unit: Unit) -> int:
@@ -352,8 +346,6 @@ def _average_windows(
     if unit.angle:
         return _angle_means(x, unit, n_windows), np.nan, np.array([float(np.isfinite(x).sum())])
     base = first_present(x)
-    if np.isnan(base):
-        return np.stack([np.full(n_windows, np.nan), np.zeros(n_windows)]), np.nan, np.zeros(1)
     heads, tails = block_sums(
         x, base, unit.window, unit.step, n_windows
     )  # less the first sample: small on a tool that turns
@@ -362,7 +354,7 @@ def _average_windows(
     windows_from_blocks(heads, tails, np.full(2, unit.window // unit.step), windows)
     with np.errstate(invalid="ignore", divide="ignore"):
         means = np.stack([base + windows[:, 0] / windows[:, 1], windows[:, 1] / unit.window])
-    return means, base + total / present, heads[:, 1] + tails[:, 1]
+        return means, base + total / present, heads[:, 1] + tails[:, 1]
 
 
 def _angle_means(x: NDArray[np.generic], unit: Unit, n_windows: int) -> Floats:

@@ -34,10 +34,11 @@ from gyrostab.kernels.fit.mixture import (
     observe,
     root_squares,
     root_units,
+    whole_degrees_of_freedom,
 )
 from gyrostab.kernels.fit.submodels import FIT_FIELDS, average_submodels, make_submodels
 
-__all__ = ["FIT_FIELDS", "combine_diagonal", "fit_windows", "identify_noise"]
+__all__ = ["FIT_FIELDS", "cell_freedoms", "combine_diagonal", "fit_windows", "identify_noise"]
 
 
 class _Cells(NamedTuple):
@@ -166,66 +167,86 @@ def combine_diagonal(pairs, ramps):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def identify_noise(  # type: ignore[no-untyped-def]
-    avar, white, quantization, ramp, factor, columns, weight, to_samples, pairs, ramps
-):
-    """Compute the degrees of freedom of each cell from a quick fit of the noise of the window.
+def identify_noise(avar, white, quantization, ramp, factor, columns, weight, to_samples):  # type: ignore[no-untyped-def]
+    """Fit the noise of each window quickly, with a diagonal covariance.
 
     Parameters
     ----------
-    avar, white, quantization, ramp, factor : float64 (n_windows, n_tau)
-        Cells and what the gaps do to them.
+    avar : float64 (n_windows, n_tau)
+        Allan variance.
+    white, quantization, ramp, factor : float64 (n_windows, n_tau) or (1, n_tau)
+        What the gaps do to it.
     columns : float64 (n_tau, 5)
         Allan variance per squared coefficient.
     weight : float64 (n_tau,)
-        Degrees of freedom for white noise, the weights of the quick fit.
+        Degrees of freedom for white noise, the weights of the fit.
     to_samples : float64 (5,)
         Squared coefficient to sample units (rate per sample, interval 1).
-    pairs : float64 (4, 4, n_tau); ramps : float64 (4, n_tau)
-        `diagonal_products`.
 
     Returns
     -------
-    float64 (n_windows, n_tau)
+    float64 (n_windows, 5)
+        Squared coefficients.
     """
     n_windows, n_tau = avar.shape
-    out = np.full(avar.shape, np.nan)
-    diagonal = combine_diagonal(pairs, ramps)
+    out = np.empty((n_windows, 5))
     cells, fit = _make_cells(n_tau), _Fit(eights(5), eights(5), eights(5), eights(4))
-    normal, right, scratch, squares = eights(25), eights(5), eights(75), np.empty(5)
+    normal, right, scratch = eights(25), eights(5), eights(75)
+    trend, valid = np.zeros((n_windows, 5)), np.empty(PLACES, np.int64)
     for start in range(0, n_windows, PLACES):
         _observe_eight(
-            start,
-            avar,
-            white,
-            quantization,
-            ramp,
-            factor,
-            columns,
-            to_samples,
-            cells,
-            np.zeros((n_windows, 5)),
-            np.empty(PLACES, np.int64),
+            start, avar, white, quantization, ramp, factor, columns, to_samples, cells, trend, valid
         )
         _fit_diagonal(cells, weight, np.int64(31), normal, right, fit, scratch)
         for w in range(start, min(start + PLACES, n_windows)):
             for a in range(5):
-                squares[a] = fit.squares[a, w - start]
+                out[w, a] = fit.squares[a, w - start]
+    return out
+
+
+@njit(**KERNEL)
+def cell_freedoms(  # type: ignore[no-untyped-def]
+    squares, avar, white, quantization, ramp, factor, columns, to_samples, diagonal
+):
+    """Compute the degrees of freedom of each cell from the squared coefficients of its window.
+
+    Parameters
+    ----------
+    squares : float64 (n_windows, 5)
+        Squared coefficients.
+    avar, white, quantization, ramp, factor, columns, to_samples
+        As for `identify_noise`.
+    diagonal : float64 (n_tau, 14)
+        Result of `combine_diagonal`.
+
+    Returns
+    -------
+    float64 (n_windows, n_tau)
+        NaN without a variance above zero.
+    """
+    n_windows, n_tau = avar.shape
+    out = np.empty(avar.shape)
+    if white.shape[0] == n_windows:
+        for w in range(n_windows):
             degrees_of_freedom(
-                squares,
-                avar[w],
-                white[w],
-                quantization[w],
-                ramp[w],
-                factor[w],
-                columns,
-                to_samples,
-                diagonal,
-                out[w],
+                squares[w], avar[w], white[w], quantization[w], ramp[w], factor[w], columns,
+                to_samples, diagonal, out[w],
+            )  # fmt: skip
+    else:
+        own, lanes, columns, diagonal = eights(5), eights(1), columns.ravel(), diagonal.ravel()
+        for start in range(0, n_windows, PLACES):
+            count = min(PLACES, n_windows - start)
+            for place in range(count):
+                for a in range(5):
+                    own[a, place] = squares[start + place, a]
+            whole_degrees_of_freedom(
+                own, columns, to_samples, diagonal, lanes, out[start : start + count]
             )
-            for i in range(n_tau):
-                if cells.avar[i, w - start] == 0.0:
-                    out[w, i] = np.nan
+    for w in range(n_windows):
+        shares = factor[min(w, factor.shape[0] - 1)]
+        for i in range(n_tau):
+            if not (avar[w, i] > 0.0 and avar[w, i] < np.inf and shares[i] > 0.0):
+                out[w, i] = np.nan
     return out
 
 
@@ -241,10 +262,10 @@ def _observe_eight(  # type: ignore[no-untyped-def]
             cells.trend[row, place] = trend[w, row]
         valid[place] = observe(
             avar[w, :end],
-            white[w],
-            quantization[w],
-            ramp[w],
-            factor[w],
+            white[min(w, white.shape[0] - 1)],
+            quantization[min(w, white.shape[0] - 1)],
+            ramp[min(w, white.shape[0] - 1)],
+            factor[min(w, white.shape[0] - 1)],
             trend[w, 4],
             trend[w],
             columns,

@@ -24,6 +24,7 @@ __all__ = [
     "observe",
     "root_squares",
     "root_units",
+    "whole_degrees_of_freedom",
 ]
 
 #: Products of the four stochastic terms with each other and with a ramp, which does not scatter
@@ -299,3 +300,38 @@ def degrees_of_freedom(  # type: ignore[no-untyped-def]
                 variance += amounts[a] * amounts[b] * diagonal[i, table]
                 table += 1
         out[i] = 2.0 * mean * mean / variance * factor[i] if variance > 0.0 else 0.0
+
+
+@njit(**INNER)
+def whole_degrees_of_freedom(squares, columns, to_samples, diagonal, freedom, out):  # type: ignore[no-untyped-def]
+    """Compute the degrees of freedom of the cells of up to eight windows without gaps.
+
+    `squares` holds their squared coefficients (row ``term``), `freedom` is scratch; tables are
+    flat.
+    """
+    s0, s1, s2, s3, s4 = (
+        take(squares, 0),
+        take(squares, 1),
+        take(squares, 2),
+        take(squares, 3),
+        take(squares, 4),
+    )
+    a0, a1, a2, a3, a4 = (
+        s0 * number(to_samples, 0),
+        s1 * number(to_samples, 1),
+        s2 * number(to_samples, 2),
+        s3 * number(to_samples, 3),
+        s4 * number(to_samples, 4),
+    )
+    for i in range(out.shape[1]):
+        mean = (
+            s0 * number(columns, 5 * i)
+            + s1 * number(columns, 5 * i + 1)
+            + s2 * number(columns, 5 * i + 2)
+            + s3 * number(columns, 5 * i + 3)
+            + s4 * number(columns, 5 * i + 4)
+        )
+        variance = _sum_products(diagonal, PRODUCTS * i, a0, a1, a2, a3, a4)
+        put(freedom, 0, where_above(variance, 0.0, 2.0 * mean * mean / variance, 0.0))
+        for place in range(out.shape[0]):
+            out[place, i] = freedom[0, place]
