@@ -101,13 +101,17 @@ class _SpooledArray:
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:
         out = np.empty(rows.stop - rows.start, self.dtype)
-        begin, view, done = self.begin + self.dtype.itemsize * rows.start, out.data.cast("B"), 0
+        self.read_into(rows.start, out)
+        return out
+
+    def read_into(self, first: int, out: NDArray[Any]) -> None:
+        """Read the values from row `first` on into `out`, which is contiguous."""
+        begin, view, done = self.begin + self.dtype.itemsize * first, out.data.cast("B"), 0
         while done < view.nbytes:
             got = read_at(self.spool.handle, view[done:], begin + done)
             if got < 1:
                 raise OSError("the temporary file of a long log is shorter than it was")
             done += got
-        return out
 
 
 class Piece:
@@ -147,7 +151,11 @@ class PlainPiece(Piece):
 
     def read_into(self, first: int, out: NDArray[Any]) -> None:
         """Read the values from row `first` on into `out`."""
-        out.view(np.int64)[:] = self.kept[first : first + out.size]
+        bits = out.view(np.int64)
+        if isinstance(self.kept, _SpooledArray) and bits.flags.c_contiguous:
+            self.kept.read_into(first, bits)
+        else:
+            bits[:] = self.kept[first : first + out.size]
 
     def to_spool(self, spool: Spool) -> Piece:
         """Return the piece with its values moved to a spool."""

@@ -56,7 +56,8 @@ def to_floats(values: Any) -> tuple[NDArray[np.float64], int]:
     array = np.asarray(values)
     if array.dtype.kind in "biuf":
         with np.errstate(invalid="ignore"):  # damaged bytes may be a signalling NaN
-            return array.astype(np.float64), 0
+            fresh = array.flags.owndata and array.flags.writeable
+            return array.astype(np.float64, copy=not fresh), 0
     out = np.full(array.shape, np.nan)
     words = 0
     for index, value in enumerate(array.ravel()):
