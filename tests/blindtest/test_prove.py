@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import ClassVar
 
 import pandas as pd
 import pytest
@@ -120,6 +121,10 @@ def test_every_case_is_scored(finished):
     assert [name for name, _ in json.loads(line["identifications"])] == [
         effect["name"] for effect in found["effects"]
     ]
+    check = json.loads(line["model_check"])
+    assert check["runs"]
+    assert check["nats"] > 0.0
+    assert proof.table.set_index("quantity").filter(like="without refit", axis=0)["n"].item() == 1
     assert {"Allan plot", "correlation with channels"} == set(
         json.loads(line["baseline_detectors"])
     )
@@ -223,6 +228,8 @@ def test_failed_diagnosis_is_reported_and_retried(small, tmp_path, monkeypatch):
     assert (detected["n"], detected["value"]) == (1, 0.0)
 
     class Found:
+        model: ClassVar = {"noise": {"x": {"N": 0.003}}}
+
         def to_json(self) -> str:
             return json.dumps(
                 {

@@ -349,6 +349,23 @@ def test_table_of_known_scores():
     assert "| driver withheld or substituted: wrong name | 1 |" in markdown(score_table(rows))
 
 
+def test_models_of_named_cases_are_counted_once():
+    checks = [{"runs": True, "nats": 3.0}, {"runs": True, "nats": -1.0}, {"runs": False}, None]
+    rows = [
+        row
+        for i, check in enumerate(checks)
+        for row in score_case(
+            diagnosis(identification("shupe")) | {"model_check": check}, truth("shupe", index=i)
+        )
+    ]
+    table = score_table([*rows, rows[0]]).set_index("quantity")
+    runs = table.loc["models that can be simulated, of those with an effect"]
+    nearer = table.loc["simulated records nearer to the recording with the effects, without refit"]
+    assert (runs["value"], runs["n"]) == (pytest.approx(2 / 3), 3)
+    assert (nearer["value"], nearer["n"]) == (pytest.approx(1 / 3), 3)
+    assert nearer["target"] == ">= 95 %"
+
+
 def test_curves_and_reliability():
     rows = []
     for strength, hits in ((0.5, 1), (1.5, 8)):

@@ -45,13 +45,19 @@ def draw_case(directory: Path, name: str, plan: dict[str, Any], real: Path | Non
 
 
 def diagnose_case(recording: Path, target: Path, failed: Path, nulls: int) -> bool:
-    """Diagnose a recording; return whether that succeeded, else write the reason to `failed`."""
+    """Diagnose a recording; return whether that succeeded, else write the reason to `failed`.
+
+    The diagnosis is written with the check of its model, if that has an effect.
+    """
     from gyrostab import diagnose
+    from gyrostab.blindtest.scoring.resimulation import check_model
     from gyrostab.jobs import load_log
 
     try:
-        found = diagnose(load_log([recording]), nulls=nulls, seed=int(recording.stem[:7], 16))
-        write_text(target, found.to_json())
+        log = load_log([recording])
+        found = diagnose(log, nulls=nulls, seed=int(recording.stem[:7], 16))
+        checked = check_model(log.compute(), found.model) if found.model.get("effect") else None
+        write_json(target, json.loads(found.to_json()) | {"model_check": checked})
     except Exception as error:  # a case that breaks the diagnosis is reported as a result
         lines = traceback.format_exc() if not isinstance(error, GyrostabError) else ""
         write_text(failed, f"{type(error).__name__}: {error}\n{lines}")

@@ -196,8 +196,8 @@ def score_case(
         ``strength``, ``detected``, ``named`` (ambiguity sets merged), ``named_exactly``,
         ``in_set``, ``set_size``, ``wrong`` (number of wrong names), ``unidentified``, ``iou``,
         ``tau_hit``, ``parameter_scores``, ``gain``, ``oracle``, ``learned`` (the oracle's with
-        fitted noise), ``seconds``, ``identifications`` and more. A name counts once, on however
-        many axes it is identified.
+        fitted noise), ``model_check`` (of `check_model`), ``seconds``, ``identifications`` and
+        more. A name counts once, on however many axes it is identified.
 
     Raises
     ------
@@ -242,6 +242,7 @@ def score_case(
         "oracle": float(sum(effect["expected_nats"] for effect in truth["effects"])),
         "learned": float(sum(effect.get("learned_nats", np.nan) for effect in truth["effects"])),
         "coverage_after": (diagnosis["held_out"] or {}).get("coverage95_after"),
+        "model_check": diagnosis.get("model_check"),
         "seconds": float(diagnosis.get("seconds") or 0.0),
         "baseline_detectors": dict(baseline_hits or {}),
     }

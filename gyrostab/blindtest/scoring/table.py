@@ -50,6 +50,7 @@ def score_table(rows: Sequence[Row]) -> pd.DataFrame:
         _out_of_catalogue_lines,
         _degraded_driver_lines,
         _parameter_lines,
+        _model_lines,
         _baseline_lines,
     )
     return pd.DataFrame([line for group in groups for line in group(rows)])
@@ -262,6 +263,22 @@ def _all_named(row: Row, rows: Sequence[Row]) -> bool:
     return not row["wrong"] and all(
         other["named"] for other in rows if other["index"] == row["index"]
     )
+
+
+def _model_lines(rows: Sequence[Row]) -> list[Line]:
+    """Make the lines of the models that the diagnoses wrote, if they have an effect."""
+    checks = [row["model_check"] for row in first_rows(rows) if row.get("model_check")]
+    return [
+        share(
+            "models that can be simulated, of those with an effect",
+            (check["runs"] for check in checks),
+        ),
+        share(
+            "simulated records nearer to the recording with the effects, without refit",
+            (check["runs"] and check["nats"] > 0.0 for check in checks),
+            Target(">= 95 %", least=0.95),
+        ),
+    ]
 
 
 def _baseline_lines(rows: Sequence[Row]) -> list[Line]:

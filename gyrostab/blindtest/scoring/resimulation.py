@@ -1,0 +1,216 @@
+"""Compare a recording with records simulated from the model of its diagnosis, without any refit.
+
+The model is simulated several times on the stamps and channels of the recording, with and without
+its effects. Statistics of these records have a mean and a scatter in either ensemble, and the
+recording has a likelihood under both (a synthetic likelihood: Wood 2010, Nature 466, 1102,
+doi:10.1038/nature09319, here with independent statistics). With and without effects, records have
+the same seeds and thus the same noise: statistics that no effect changes cancel.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import GyrostabError
+
+__all__ = ["check_model", "likelihood_ratio", "record_statistics"]
+
+Array = NDArray[np.float64]
+_RECORDS = 8  # simulated with and without effects; limits time
+_SEGMENTS = 32  # of a record, for statistics that change over time
+_MEANS = 1024  # of a record, from which differences of all lengths are taken
+_BANDS, _LINES = 10, 512  # octaves below half of the rate; frequencies of the mean spectrum
+_RAMP_BINS = 36
+_TAIL_FREEDOM = 5.0  # of Student's law, which bounds what a single statistic decides
+_OUTLIER_SIGMA = 6.0
+#: Least scatter of roots of counts: that of a Poisson count is 1/2.
+_MIN_SCATTER = {"count": 0.5, "ramp": 1e-6, "levels": 0.02}
+
+
+def check_model(log: xr.Dataset, model: Mapping[str, Any]) -> dict[str, Any]:
+    """Simulate the model of a diagnosis like its recording, and compare both.
+
+    Parameters
+    ----------
+    log : xarray.Dataset
+        The recording, in memory.
+    model : mapping
+        Tables of the model with effects.
+
+    Returns
+    -------
+    dict
+        ``runs``: whether the model can be simulated; ``nats``: log-likelihood ratio of the
+        recording under the model with its effects over that without them; or ``reason``.
+    """
+    from gyrostab import read_model, simulate
+
+    models = [read_model(dict(model) | change) for change in ({}, {"effect": []})]
+    lost = ~np.isfinite(log["rate"].values)
+    ensembles: list[list[dict[str, Array]]] = [[], []]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            for seed in range(1, _RECORDS + 1):
+                for one, ensemble in zip(models, ensembles, strict=True):
+                    rate = simulate(one, like=log, seed=seed)["rate"].values
+                    ensemble.append(record_statistics(np.where(lost, np.nan, rate), log))
+        except GyrostabError as error:
+            return {"runs": False, "reason": str(error)}
+        recorded = record_statistics(log["rate"].values, log)
+    return {"runs": True, "nats": likelihood_ratio(recorded, *ensembles)}
+
+
+def likelihood_ratio(
+    recorded: Mapping[str, Array],
+    with_effects: list[dict[str, Array]],
+    without: list[dict[str, Array]],
+) -> float:
+    """Return the log-likelihood ratio of statistics under two ensembles of simulated records.
+
+    Statistics of one group have a common scatter and Student's distribution.
+    """
+    total = 0.0
+    for name, values in recorded.items():
+        logs = []
+        for ensemble in (with_effects, without):
+            drawn = np.stack([record[name] for record in ensemble])
+            good = np.isfinite(drawn).all(axis=0) & np.isfinite(values)
+            if not good.any():
+                break
+            scatter = np.sqrt(drawn[:, good].var(axis=0, ddof=1).mean() * (1.0 + 1.0 / len(drawn)))
+            scatter = max(float(scatter), _MIN_SCATTER.get(name.split("/")[0], 1e-12))
+            z = np.where(good, (values - drawn.mean(axis=0)) / scatter, np.nan)
+            logs.append(-np.log(scatter) - (_TAIL_FREEDOM + 1) / 2 * np.log1p(z**2 / _TAIL_FREEDOM))
+        if len(logs) == 2:
+            total += float(np.nansum(logs[0] - logs[1]))
+    return total
+
+
+def record_statistics(rate: Array, log: xr.Dataset) -> dict[str, Array]:
+    """Compute the statistics of a record (axis, time), in groups of equal scatter.
+
+    Differences of means at all lengths, powers in octaves over time, the mean spectrum, coherencies
+    of axes, sample counts, and the coupling to the phase of a ramp, to rotation and to channels.
+    """
+    out: dict[str, Array] = {}
+    hertz = float(log.attrs["sampling_rate_hz"])
+    for row, values in enumerate(rate):
+        for group, numbers in {
+            **_mean_differences(values),
+            **_octave_powers(values),
+            **_sample_counts(values),
+            **_channel_couplings(values, log, hertz),
+        }.items():
+            out[f"{group}/{row}"] = numbers
+    spectra = [_segment_spectra(values, 8) for values in rate]
+    for row, spectrum in enumerate(spectra):
+        lines = np.array_split((np.abs(spectrum[:, 1:]) ** 2).mean(axis=0), _LINES)
+        with np.errstate(divide="ignore"):
+            out[f"lines/{row}"] = np.log([np.mean(line) for line in lines if line.size])
+            out[f"peaks/{row}"] = np.log([np.max(line) for line in lines if line.size])
+    for one, other in combinations(range(len(rate)), 2):
+        out[f"coherency/{one}{other}"] = _coherencies(spectra[one], spectra[other])
+    return out
+
+
+def _segments(values: Array, count: int) -> Array:
+    """Return (segment, sample), without the last samples."""
+    size = max(values.size // count, 1)
+    return values[: size * (values.size // size)][: size * count].reshape(-1, size)
+
+
+def _mean_differences(values: Array) -> dict[str, Array]:
+    """Return differences of adjacent means, by the length of the means."""
+    means = np.nanmean(_segments(values, min(_MEANS, max(values.size // 16, 2))), axis=1)
+    out = {}
+    while means.size >= 2:
+        pairs = means[: means.size // 2 * 2].reshape(-1, 2)
+        out[f"means {means.size}"] = pairs[:, 1] - pairs[:, 0]
+        means = np.nanmean(pairs, axis=1)
+    return out
+
+
+def _segment_spectra(values: Array, count: int) -> NDArray[np.complex128]:
+    """Return the spectra of tapered segments (segment, frequency); missing samples are 0."""
+    segments = _segments(values, count)
+    centred = np.nan_to_num(segments - np.nanmean(segments, axis=1, keepdims=True))
+    return np.asarray(np.fft.rfft(centred * np.hanning(segments.shape[1]), axis=1))
+
+
+def _octave_powers(values: Array) -> dict[str, Array]:
+    """Return log powers of segments, by octave."""
+    power = np.abs(_segment_spectra(values, _SEGMENTS)) ** 2
+    edges = np.unique(power.shape[1] // 2 ** np.arange(_BANDS + 1))
+    with np.errstate(divide="ignore"):
+        return {
+            f"octave {low}": np.log(power[:, low:high].mean(axis=1))
+            for low, high in zip(edges[edges > 0][:-1], edges[edges > 0][1:], strict=True)
+        }
+
+
+def _coherencies(one: NDArray[Any], other: NDArray[Any]) -> Array:
+    """Return real and imaginary coherency of two axes by octave, in standard deviations."""
+    edges = np.unique(one.shape[1] // 2 ** np.arange(_BANDS + 1))
+    out = []
+    for low, high in zip(edges[edges > 0][:-1], edges[edges > 0][1:], strict=True):
+        first, second = one[:, low:high], other[:, low:high]
+        size = np.sqrt((np.abs(first) ** 2).sum() * (np.abs(second) ** 2).sum())
+        out.append((first * second.conj()).sum() / size * np.sqrt(2.0 * first.size))
+    return np.array([part for number in out for part in (number.real, number.imag)])
+
+
+def _sample_counts(values: Array) -> dict[str, Array]:
+    """Return roots of counts of zeros, repeats, range ends and outliers; log number of levels."""
+    steps = np.diff(values, append=np.nan)
+    good = values[np.isfinite(values)]
+    scatter = 1.4826 * np.nanmedian(np.abs(values - np.nanmedian(values))) + 1e-300
+    odd = [
+        values == 0.0,
+        (steps == 0.0) & (values != 0.0),
+        (values == good.min()) | (values == good.max()),
+        np.abs(steps) > _OUTLIER_SIGMA * np.nanmedian(np.abs(steps)) + _OUTLIER_SIGMA * scatter,
+    ]
+    counts = [_segments(one, _SEGMENTS).sum(axis=1) for one in odd]
+    return {
+        "count": np.sqrt(np.concatenate(counts) + 0.375),
+        "levels": np.array([np.log(np.unique(good[:20_000]).size)]),
+    }
+
+
+def _channel_couplings(values: Array, log: xr.Dataset, hertz: float) -> dict[str, Array]:
+    """Return the coupling to ramp, rotation, and sample by sample to other channels."""
+    from gyrostab.schema import log_channels
+
+    out = {}
+    centred = values - np.nanmean(values)
+    for name in log_channels(log):
+        if log[name].dims != ("time",):
+            continue
+        channel = log[name].values.astype(np.float64)
+        if name == "ramp":
+            low, high = np.nanmin(channel), np.nanmax(channel)
+            place = np.nan_to_num((channel - low) / max(high - low, 1e-300) * _RAMP_BINS)
+            bins = np.clip(place.astype(np.int64), 0, _RAMP_BINS - 1)
+            good = np.isfinite(channel) & np.isfinite(values)
+            count = np.bincount(bins[good], minlength=_RAMP_BINS)
+            total = np.bincount(bins[good], weights=centred[good], minlength=_RAMP_BINS)
+            out["ramp"] = total / np.maximum(count, 1)
+        elif name == "rotation_rate":
+            turned = np.cumsum(np.nan_to_num(channel)) / hertz / 360.0
+            for order in (1, 2, 3):
+                wave = np.exp(-2j * np.pi * order * turned) * np.nan_to_num(centred)
+                sums = _segments(wave, _SEGMENTS).mean(axis=1)
+                out[f"order {order}"] = np.concatenate([sums.real, sums.imag])
+        else:
+            products = np.diff(channel) * np.diff(values)
+            sums = np.nanmean(_segments(products, _SEGMENTS), axis=1)
+            out[f"coupling {name}"] = sums
+    return out
