@@ -19,7 +19,7 @@ TUTORIAL_CELL = re.compile(
     r"^```\{code-cell\} python\n(?::[^\n]*\n)*(.*?)^```$", re.MULTILINE | re.DOTALL
 )
 #: A model of the noise, for the command of the README that compares with a simulation.
-MODEL = '[noise]\nN = 0.006\nB = 0.03\nK = 0.05\n'
+MODEL = "[noise]\nN = 0.006\nB = 0.03\nK = 0.05\n"
 
 
 def call(command: str | list[str], folder: Path, bin_folder: Path | None = None) -> str:
