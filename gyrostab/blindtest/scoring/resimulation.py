@@ -52,7 +52,7 @@ def check_model(log: xr.Dataset, model: Mapping[str, Any]) -> dict[str, Any]:
     """
     from gyrostab import read_model, simulate
 
-    models = [read_model(dict(model) | change) for change in ({}, {"effect": []})]
+    models = [read_model(dict(model)), read_model({**model, "effect": []})]
     lost = ~np.isfinite(log["rate"].values)
     ensembles: list[list[dict[str, Array]]] = [[], []]
     with warnings.catch_warnings():
