@@ -10,6 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.allan.fit import is_described, refit
+from gyrostab.allan.judgement import judge_product
 from gyrostab.noise import LAWS
 from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY, check_product
 
@@ -253,7 +254,7 @@ def format_product(product: xr.Dataset) -> str:
     Returns
     -------
     str
-        A table of the terms, and one line each on misfit, outliers and motion.
+        A table of the terms, one line each on misfit, outliers and motion, and two of judgement.
     """
     windows = product.sizes["time"]
     lines = [
@@ -284,7 +285,7 @@ def format_product(product: xr.Dataset) -> str:
         "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True))
         for row in rows
     ]
-    return "\n".join([*lines, "", *describe_record(product)])
+    return "\n".join([*lines, "", *describe_record(product), *judge_product(product)])
 
 
 def describe_record(product: xr.Dataset) -> list[str]:

@@ -1,4 +1,4 @@
-"""The whole analysis on the shipped simulated log: a gyro at rest, vibrating, and at rest again."""
+"""The whole analysis of a simulated day: a gyro warms up, rests, is shaken, and rests again."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ import pandas as pd
 import xarray as xr
 
 from gyrostab.allan.summary import TermSummary, summarise_terms
-from gyrostab.errors import OutputError, SchemaError
-from gyrostab.jobs.run import count_samples, load_log
+from gyrostab.errors import OutputError
+from gyrostab.jobs.run import count_samples
 from gyrostab.progress import Stage, no_stage
 
-__all__ = ["find_parts", "format_summary", "run_demo", "sample_log", "summarise"]
+__all__ = ["PARTS", "format_summary", "run_demo", "sample_log", "summarise"]
 
-WINDOW, STEP = "60s", "10s"
+WINDOW, STEP = "4h", "30min"
+#: Parts of the record, which ``data/models/demo.toml`` describes: begin and end [h].
+PARTS = {"warming up": (0, 6), "at rest": (6, 12), "shaken": (12, 18), "at rest again": (18, 24)}
 FILES = (
     "product.nc",
     "log.nc",
@@ -35,70 +37,25 @@ def sample_log() -> Path:
     >>> sample_log().name
     'mwd_sample.csv.gz'
     """
+    return _find_data("mwd_sample.csv.gz")
+
+
+def _find_data(name: str) -> Path:
     here = Path(__file__).resolve().parents[1]
     for folder in (here / "data", here.parent / "data"):
-        path = folder / "mwd_sample.csv.gz"
+        path = folder / name
         if path.exists():
             return path
-    raise OutputError(
-        f"the shipped log mwd_sample.csv.gz is missing from {here / 'data'}; install gyrostab again"
-    )
+    raise OutputError(f"the file {name} is missing from {here / 'data'}; install gyrostab again")
 
 
-def find_parts(vibration: xr.DataArray) -> dict[str, tuple[pd.Timestamp, pd.Timestamp]]:
-    """Find the parts of an on/off vibration test from the vibration channel.
-
-    Parameters
-    ----------
-    vibration : xarray.DataArray
-        Rms acceleration [g] on its own time coordinate.
-
-    Returns
-    -------
-    dict
-        ``still``, ``vibrating`` and ``after``: first and last stamp [UTC] within the part.
-
-    Raises
-    ------
-    SchemaError
-        When the channel never rises, or rises before its first or after its last sample.
-
-    Examples
-    --------
-    >>> time = pd.date_range("2026-03-14", periods=9, freq="1s")
-    >>> parts = find_parts(xr.DataArray([0, 0, 0, 9, np.nan, 9, 0, 0, 0], {"t": time}, ["t"]))
-    >>> [str(stamp.time()) for stamp in parts["vibrating"]]
-    ['00:00:03', '00:00:05']
-    """
-    (dim,) = vibration.dims
-    known = vibration[np.isfinite(vibration.values)]
-    stamps, level = pd.DatetimeIndex(known[dim].values), known.values
-    shaken = np.flatnonzero(level > 0.5 * level.max()) if level.size else np.array([], dtype=int)
-    if shaken.size == 0 or shaken[0] == 0 or shaken[-1] == level.size - 1:
-        raise SchemaError(
-            "the channel 'vibration' does not rise and fall again within the log; "
-            "no parts can be told apart"
-        )
-    first, last = int(shaken[0]), int(shaken[-1])
-    return {
-        "still": (stamps[0], stamps[first - 1]),
-        "vibrating": (stamps[first], stamps[last]),
-        "after": (stamps[last + 1], stamps[-1]),
-    }
-
-
-def summarise(
-    product: xr.Dataset, parts: dict[str, tuple[pd.Timestamp, pd.Timestamp]]
-) -> pd.DataFrame:
+def summarise(product: xr.Dataset) -> pd.DataFrame:
     """Tabulate the coefficients of each part, over the windows inside it.
 
     Parameters
     ----------
     product : xarray.Dataset
-        Product of `gyrostab.fit_noise`, with the length of its windows in the attribute
-        ``window_s``.
-    parts : dict
-        First and last stamp by name, from `find_parts`.
+        Product of the demonstration.
 
     Returns
     -------
@@ -106,11 +63,14 @@ def summarise(
         One row per axis and term: axis, term, unit, and one column of text per part. The text is
         the median if most windows observe the term, else ``< x`` with the median upper limit.
     """
-    half = pd.Timedelta(seconds=float(product.attrs["window_s"])) / 2
-    centre = pd.DatetimeIndex(product["time"].values)
+    begin, end = (
+        (product["time_bounds"].values[:, side] - product["time_bounds"].values.min())
+        / np.timedelta64(1, "h")
+        for side in (0, 1)
+    )
     rows: dict[tuple[str, str], dict[str, str]] = {}
-    for name, (start, end) in parts.items():
-        inside = np.flatnonzero((centre - half >= start) & (centre + half <= end))
+    for name, (first, last) in PARTS.items():
+        inside = np.flatnonzero((begin >= first) & (end <= last))
         for term in summarise_terms(product.isel(time=inside)):
             row = rows.setdefault(
                 (term.axis, term.symbol),
@@ -126,19 +86,21 @@ def _format_term(term: TermSummary) -> str:
     return f"{term.value:.3g}" if term.status == "observed" else f"< {term.value:.2g}"
 
 
-def format_summary(summary: pd.DataFrame) -> str:
-    """Format the table of `summarise` as text."""
+def format_summary(product: xr.Dataset) -> str:
+    """Format the table of `summarise` as text, with sentences of judgement below."""
+    from gyrostab.allan.judgement import judge_product
+
+    table = summarise(product).to_string(index=False, justify="right")
     return (
         f"Noise coefficients, medians over the windows of {WINDOW} wholly in each part "
-        "(< x: not observable, 95 % upper limit)\n\n"
-        + summary.to_string(index=False, justify="right")
+        f"(< x: upper limit, 95 %)\n\n{table}\n\n" + "\n".join(judge_product(product))
     )
 
 
 def run_demo(
     folder: str | Path, *, overwrite: bool = False, stage: Stage = no_stage
-) -> tuple[pd.DataFrame, list[Path]]:
-    """Run the whole analysis on the shipped log.
+) -> tuple[xr.Dataset, list[Path]]:
+    """Simulate a day of a gyro, and run the whole analysis on it.
 
     Parameters
     ----------
@@ -151,8 +113,8 @@ def run_demo(
 
     Returns
     -------
-    pandas.DataFrame, list of Path
-        The table of `summarise` and the files written.
+    xarray.Dataset, list of Path
+        The product, and the files written.
 
     Raises
     ------
@@ -164,26 +126,29 @@ def run_demo(
     from gyrostab.allan.fit import fit_noise
     from gyrostab.io.datasets import to_netcdf
     from gyrostab.report import write_report
-    from gyrostab.store.output import check_folder, new_folder, protect_inputs
+    from gyrostab.simulate import simulate
+    from gyrostab.store.output import check_folder, new_folder
 
     folder = Path(folder)
-    with protect_inputs([sample_log()]):
-        check_folder(folder, FILES, overwrite=overwrite)
-        with new_folder(folder, overwrite=overwrite) as temporary:
-            stage("reading", 0)
-            log = load_log([sample_log()])
-            parts = find_parts(log["vibration"])
-            to_netcdf(log, temporary / "log.nc")
-            stage("computing", count_samples(log))
-            product = fit_noise(davar(log, window=WINDOW, step=STEP)).compute()
-            to_netcdf(product, temporary / "product.nc")
-            stage("drawing", 0)
-            _write_outputs(log, product, temporary)
-            write_report(product, temporary / "report.html", log=log)
-    return summarise(product, parts), [folder / name for name in FILES]
+    check_folder(folder, FILES, overwrite=overwrite)
+    with new_folder(folder, overwrite=overwrite) as temporary:
+        log = simulate(_find_data("models/demo.toml"))
+        stage("simulating", count_samples(log))
+        log = log.load()
+        stage("writing the log", count_samples(log))
+        to_netcdf(log, temporary / "log.nc")
+        stage("computing", count_samples(log))
+        surface = davar(log, window=WINDOW, step=STEP).compute()
+        stage("fitting")
+        product = fit_noise(surface).compute()
+        to_netcdf(product, temporary / "product.nc")
+        stage("drawing")
+        _draw_figures(log, product, temporary)
+        write_report(product, temporary / "report.html", log=log)
+    return product, [folder / name for name in FILES]
 
 
-def _write_outputs(log: xr.Dataset, product: xr.Dataset, folder: Path) -> None:
+def _draw_figures(log: xr.Dataset, product: xr.Dataset, folder: Path) -> None:
     from gyrostab.plot import plot_coefficients, plot_davar, plot_davar_3d, plot_signal
     from gyrostab.plot.style import save_png
 
@@ -195,4 +160,4 @@ def _write_outputs(log: xr.Dataset, product: xr.Dataset, folder: Path) -> None:
         "coefficients.png": plot_coefficients(product),
     }
     for name, figure in figures.items():
-        save_png(figure, folder / name, dpi=120)
+        save_png(figure, folder / name, dpi=200)

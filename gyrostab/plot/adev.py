@@ -12,11 +12,17 @@ from gyrostab.errors import OptionError
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import (
     COLOURS,
+    INCH_MM,
+    PAGE_MM,
     axis_names,
     axis_style,
-    literal_text,
+    draws_figure,
+    is_narrow,
+    label_log_axis,
     new_figure,
     stack_panels,
+    title_figure,
+    unit_symbol,
 )
 from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY, check_surface
 
@@ -29,8 +35,10 @@ __all__ = ["band", "plot_adev"]
 _DASHES = ("--", "-.", ":", (0, (6, 2, 1, 2, 1, 2)), (0, (8, 3)))
 
 
-@literal_text
-def plot_adev(product: xr.Dataset, axis: str, *, when: Any = None) -> Figure:
+@draws_figure
+def plot_adev(
+    product: xr.Dataset, axis: str, *, when: Any = None, width: float = PAGE_MM
+) -> Figure:
     """Draw the Allan deviation of one window, with its 95 % band and the fitted noise terms.
 
     Parameters
@@ -42,6 +50,8 @@ def plot_adev(product: xr.Dataset, axis: str, *, when: Any = None) -> Figure:
     when : datetime-like, optional
         Time of the window (the nearest window centre); by default, of the windows with the best
         coverage, the one nearest to the middle of the record.
+    width : float
+        Width of the figure [mm]: 180 for a page, 85 for a column.
 
     Returns
     -------
@@ -59,7 +69,7 @@ def plot_adev(product: xr.Dataset, axis: str, *, when: Any = None) -> Figure:
     )
     window = windows.isel(axis=0, time=0)
     tau = window["tau"].values
-    figure = new_figure(8.0, 5.8, stacked=True)
+    figure = new_figure(width / INCH_MM, 4.4, stacked=True)
     panel = figure.subplots()
     colour = axis_style(product, name)["color"]
     low, high = band(window["avar"].values, window["edf"].values)
@@ -97,13 +107,18 @@ def plot_adev(product: xr.Dataset, axis: str, *, when: Any = None) -> Figure:
         )
     else:
         panel.set_ylim(shown.min() / 4.0, np.nanmax(np.sqrt(high)) * 1.5)
+    label_log_axis(panel.xaxis, *panel.get_xlim())
+    label_log_axis(panel.yaxis, *panel.get_ylim())
     panel.set_xlabel("averaging time τ [s]")
     panel.set_ylabel("Allan deviation σ(τ) [deg/h]")
-    panel.grid(which="both", alpha=0.25)
-    stack_panels([panel])
-    panel.legend(fontsize="small")
+    panel.grid(alpha=0.3)
+    if is_narrow(figure):
+        figure.legend(loc="lower left", frameon=False)
+    else:
+        panel.legend()
     stamp = str(np.datetime_as_string(window["time"].values, unit="s")).replace("T", " ")
-    figure.suptitle(f"Allan deviation of axis {name}, window centred on {stamp} UTC")
+    title_figure(figure, f"Allan deviation of axis {name}", f"window centred on {stamp} UTC")
+    stack_panels([panel])
     return figure
 
 
@@ -173,7 +188,7 @@ def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours:
         term = term * np.where(np.isfinite(seen), seen, 1.0)
         total += term
         if state == OBSERVED:
-            label = f"{symbol} = {value:.3g} ± {error:.1g} {law.label} ({law.name})"
+            label = f"{symbol} = {value:.3g} ± {error:.1g} {unit_symbol(law.label)} ({law.name})"
             panel.plot(
                 tau,
                 np.sqrt(term),
@@ -183,9 +198,8 @@ def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours:
                 label=label,
             )
         elif state == UPPER_LIMIT_ONLY:
-            panel.plot(
-                [], [], linestyle="none", label=f"{symbol} < {upper:.3g} {law.label} ({law.name})"
-            )
+            label = f"{symbol} < {upper:.3g} {unit_symbol(law.label)} ({law.name})"
+            panel.plot([], [], linestyle="none", label=label)
     if total.any():
         panel.plot(tau, np.sqrt(total), color="black", linewidth=1.6, label=_name_curve(window))
 

@@ -11,15 +11,21 @@ from numpy.typing import NDArray
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import (
     GREY,
+    INCH_MM,
+    PAGE_MM,
     axis_names,
     axis_style,
+    draws_figure,
+    is_narrow,
     label_log_axis,
-    literal_text,
     new_figure,
     require_coefficients,
     shade_spans,
     stack_panels,
     time_axis,
+    title_figure,
+    unit_label,
+    upper_limit_marker,
     window_text,
 )
 from gyrostab.schema import NOT_OBSERVABLE, OBSERVED, UPPER_LIMIT_ONLY
@@ -31,11 +37,13 @@ if TYPE_CHECKING:
 __all__ = ["plot_coefficients"]
 
 
-@literal_text
-def plot_coefficients(product: xr.Dataset, *, axis: str | None = None) -> Figure:
+@draws_figure
+def plot_coefficients(
+    product: xr.Dataset, *, axis: str | None = None, width: float = PAGE_MM
+) -> Figure:
     """Draw Q, N, B, K and R over time, one panel per coefficient.
 
-    Bands or bars are standard errors, triangles pointing down are 95 % upper limits. Grey spans are
+    Bands or bars are standard errors, arrows pointing down are 95 % upper limits. Grey spans are
     those where the coefficient is not observable; darker grey, on more axes.
 
     Parameters
@@ -44,6 +52,8 @@ def plot_coefficients(product: xr.Dataset, *, axis: str | None = None) -> Figure
         Product with coefficients by ``(axis, time)``.
     axis : str, optional
         Draw this axis only.
+    width : float
+        Width of the figure [mm]: 180 for a page, 85 for a column.
 
     Returns
     -------
@@ -56,7 +66,7 @@ def plot_coefficients(product: xr.Dataset, *, axis: str | None = None) -> Figure
     """
     require_coefficients(product)
     names = axis_names(product, axis)
-    figure = new_figure(10.0, 10.5, stacked=True)
+    figure = new_figure(width / INCH_MM, 7.6, stacked=True)
     panels = figure.subplots(len(LAWS), 1, sharex=True)
     time = product["time"].values
     edges = _time_edges(time)
@@ -68,23 +78,27 @@ def plot_coefficients(product: xr.Dataset, *, axis: str | None = None) -> Figure
                 first, last = _find_runs(hidden)
                 shade_spans(panel, edges[first], edges[last], alpha=0.6 / len(names))
         _set_scale(panel, product, symbol, names)
-        panel.set_ylabel(f"{symbol} [{law.label}]")
-        panel.set_title(law.name, loc="left", fontsize="medium", pad=3, y=1.0)
+        panel.set_ylabel(f"{symbol} {unit_label(law.label)}")
+        panel.set_title(_title_panel(product, symbol, names), loc="left", pad=3, y=1.0)
         panel.grid(alpha=0.3)
     figure.legend(
         handles=_legend_handles(product, names),
         loc="lower center",
-        ncols=len(names) + 3,
-        fontsize="small",
+        ncols=3 if is_narrow(figure) else len(names) + 3,
         frameon=False,
     )
     whose = f" of axis {names[0]}" if len(names) == 1 else ""
-    figure.suptitle(
-        ", ".join(filter(None, [f"Noise coefficients{whose} over time", window_text(product)]))
-    )
+    title_figure(figure, f"Noise coefficients{whose} over time", window_text(product))
     time_axis(panels[-1], edges)
-    stack_panels(panels, between=0.32, below=0.3)
+    stack_panels(panels, between=0.25)
     return figure
+
+
+def _title_panel(product: xr.Dataset, symbol: str, names: list[str]) -> str:
+    """Name the term, and say so if no window of any axis observes it."""
+    state = product["observable"].sel(axis=names, term=symbol).values
+    only = UPPER_LIMIT_ONLY in state and OBSERVED not in state
+    return f"{LAWS[symbol].name}: upper limits only" if only else LAWS[symbol].name
 
 
 def _draw_axis(
@@ -121,11 +135,11 @@ def _draw_axis(
     limits = panel.scatter(
         time[marked],
         upper[marked],
-        marker="v",
-        s=14,
+        marker=upper_limit_marker(),
+        s=55,
         facecolors="none",
         edgecolors=style["color"],
-        linewidths=0.8,
+        linewidths=0.7,
     )
     limits.set_gid(f"upper {symbol} {name}")
 
@@ -182,15 +196,14 @@ def _legend_handles(product: xr.Dataset, names: list[str]) -> list[Any]:
             [],
             [],
             color="black",
-            marker="v",
+            marker=upper_limit_marker(),
             markerfacecolor="none",
             linestyle="none",
-            markersize=5.0,
+            markersize=9.0,
             label="95 % upper limit",
         )
     )
-    more = " (darker: on more axes)" if len(names) > 1 else ""
-    keys.append(Patch(facecolor=GREY, alpha=0.5, label=f"not observable{more}"))
+    keys.append(Patch(facecolor=GREY, alpha=0.5, label="not observable"))
     return keys
 
 

@@ -13,7 +13,18 @@ from gyrostab.errors import OptionError
 from gyrostab.ingest.convert import as_log
 from gyrostab.ingest.make_log import make_log
 from gyrostab.plot.signal import thin
-from gyrostab.plot.style import COLOURS, GREY, label_log_axis, literal_text, new_figure, unit_label
+from gyrostab.plot.style import (
+    COLOURS,
+    GREY,
+    INCH_MM,
+    NARROW_MM,
+    PAGE_MM,
+    draws_figure,
+    is_narrow,
+    label_log_axis,
+    new_figure,
+    unit_label,
+)
 from gyrostab.plot.surface import CHANGE_CMAP
 from gyrostab.schema import signal_name
 from gyrostab.time.durations import duration_seconds
@@ -32,7 +43,7 @@ _STYLES: tuple[dict[str, Any], dict[str, Any]] = (
 )
 
 
-@literal_text
+@draws_figure
 def plot_comparison(
     without: xr.Dataset,
     with_it: xr.Dataset,
@@ -43,6 +54,7 @@ def plot_comparison(
     driver: str = "",
     difference: bool = False,
     coherency: bool = False,
+    width: float = PAGE_MM,
 ) -> Figure:
     """Draw what an effect changes: DAVAR, window means, spectrum, and correlation of two axes.
 
@@ -66,6 +78,8 @@ def plot_comparison(
         Draw the coherency of the two axes over frequency, in phase and in quadrature. By default,
         draw their Allan correlation over averaging time, ``(avar(x + y) - avar(x - y)) / 4``
         divided by the root of the product of their variances, with its 95 % range by chance.
+    width : float
+        Width of the figure [mm]: 180 for a page, 85 for a column.
 
     Returns
     -------
@@ -98,8 +112,8 @@ def plot_comparison(
         raise OptionError(
             f"driver {driver!r} is not in the log; it has {', '.join(map(str, with_it.data_vars))}"
         )
-    figure = new_figure(7.6, 4.9)
-    panels = figure.subplots(2, 2)
+    figure = new_figure(width / INCH_MM, 7.6 if width < NARROW_MM else 4.4)
+    panels = figure.subplots(*((4, 1) if is_narrow(figure) else (2, 2))).reshape(2, 2)
     pair = tuple(
         davar(log, window=window, step=step, taus=30, axis=[str(log["axis"].values[0])])
         .isel(axis=0)
@@ -128,7 +142,6 @@ def plot_comparison(
     _draw_spectra(panels[1, 0], logs)
     (_draw_coherency if coherency else _draw_allan_correlation)(panels[1, 1], logs)
     for panel in panels.flat:
-        panel.title.set_size("medium")
         panel.grid(visible=True, lw=0.3, alpha=0.6)
     return figure
 
@@ -155,7 +168,7 @@ def _draw_curves(panel: Axes, logs: Any, pair: Any, moments: list[float]) -> Non
         curve = np.sqrt(pair[1]["avar"].values[np.abs(centres - when).argmin()])
         panel.loglog(tau, curve, dashes, color=colour, lw=1.3, label=f"with, at {when:g} {word}")
     label_log_axis(panel.yaxis, *panel.get_ylim())
-    panel.legend(fontsize="x-small", frameon=False, loc="lower left")
+    panel.legend(frameon=False, loc="lower left")
     panel.set(xlabel="averaging time [s]", ylabel="[deg/h]")
 
 
@@ -213,7 +226,7 @@ def _draw_means(panel: Axes, logs: Any, pair: Any, *, difference: bool) -> None:
         xlabel=f"time [{word}]",
         ylabel="[deg/h]",
     )
-    panel.legend(fontsize="x-small", frameon=False)
+    panel.legend(frameon=False)
 
 
 def _draw_channel(panel: Axes, log: xr.Dataset, driver: str) -> None:
@@ -273,7 +286,7 @@ def _draw_coherency(panel: Axes, logs: Any) -> None:
         ratio = cross / np.sqrt(welch(x, **how)[1] * welch(y, **how)[1])
         panel.semilogx(f[1:], ratio.imag[1:], "--", color=quadrature, lw=0.9, label="in quadrature")
         panel.semilogx(f[1:], ratio.real[1:], **style | {"lw": style["lw"] * 0.8}, label="in phase")
-    panel.legend(handles=panel.get_lines()[:1:-1], fontsize="x-small", frameon=False)
+    panel.legend(handles=panel.get_lines()[:1:-1], frameon=False)
     panel.set(
         title=f"Coherency of {_join_axis_names(logs[0])}", xlabel="frequency [Hz]", ylim=(-1.1, 1.1)
     )

@@ -10,7 +10,16 @@ import xarray as xr
 from gyrostab.correlate.judge import VERDICTS, format_p_value
 from gyrostab.errors import SchemaError
 from gyrostab.noise import LAWS
-from gyrostab.plot.style import COLOURS, axis_names, literal_text, new_figure, unit_label
+from gyrostab.plot.style import (
+    COLOURS,
+    INCH_MM,
+    PAGE_MM,
+    axis_names,
+    draws_figure,
+    is_narrow,
+    new_figure,
+    unit_label,
+)
 from gyrostab.schema import OBSERVED
 
 if TYPE_CHECKING:
@@ -23,9 +32,13 @@ _UP, _DOWN = COLOURS[1], COLOURS[0]
 _MAX_POINTS = 3000
 
 
-@literal_text
+@draws_figure
 def plot_correlation(
-    result: xr.Dataset, *, axis: str | None = None, driver: str | None = None
+    result: xr.Dataset,
+    *,
+    axis: str | None = None,
+    driver: str | None = None,
+    width: float = PAGE_MM,
 ) -> Figure:
     """Draw every variable against the channel at its lag, by variable (rows) and axis (columns).
 
@@ -41,6 +54,8 @@ def plot_correlation(
         Draw this axis only.
     driver : str, optional
         Channel or its rate of change; the channel by default.
+    width : float
+        Width of the figure [mm]: 180 for a page, 85 for a column.
 
     Returns
     -------
@@ -64,16 +79,14 @@ def plot_correlation(
             f"{', '.join(map(str, result['driver'].values))}"
         )
     variables = [str(name) for name in result["variable"].values]
-    figure = new_figure(1.0 + 3.4 * len(names), 1.2 + 2.5 * len(variables))
+    figure = new_figure(width / INCH_MM, 0.9 + 1.55 * len(variables))
     panels = figure.subplots(len(variables), len(names), sharex="col", squeeze=False)
     for row, variable in zip(panels, variables, strict=True):
         for panel, name in zip(row, names, strict=True):
             _draw_panel(panel, result.sel(axis=name), variable, driver)
             panel.grid(alpha=0.3)
-        units = (
-            f"[{LAWS[variable].label}]"
-            if variable in LAWS
-            else unit_label(result[variable].attrs.get("units"))
+        units = unit_label(
+            LAWS[variable].label if variable in LAWS else result[variable].attrs.get("units")
         )
         row[0].set_ylabel(f"{variable.replace('_', ' ')} {units}".strip())
     label = f"{driver.replace('_', ' ')} {unit_label(result[driver].attrs.get('units'))}".strip()
@@ -87,13 +100,11 @@ def plot_correlation(
             ha="center",
             fontweight="bold",
         )
-    for panel in panels[-1]:
-        panel.set_xlabel(label)
+    figure.supxlabel(label)
     figure.legend(
         handles=_legend_handles(driver, float(result.attrs.get("interval_level", 0.95))),
         loc="outside lower center",
-        ncols=3,
-        fontsize="small",
+        ncols=1 if is_narrow(figure) else 3,
         frameon=False,
     )
     return figure
@@ -124,7 +135,8 @@ def _draw_panel(panel: Axes, part: xr.Dataset, variable: str, driver: str) -> No
             **style,
         )
     verdict = VERDICTS[int(cell["coupling_verdict"])]
-    panel.set_title(_verdict_text(verdict, lag, float(cell["p_value_adjusted"])), fontsize="small")
+    title = _verdict_text(verdict, lag, float(cell["p_value_adjusted"]))
+    panel.set_title(title.replace(", ", "\n") if is_narrow(panel.figure) else title, size="small")
     if not good.any():
         panel.text(
             0.5,

@@ -13,8 +13,11 @@ from gyrostab.noise import NORMAL_95
 from gyrostab.plot.style import (
     COLOURS,
     GREY,
+    INCH_MM,
+    PAGE_MM,
+    draws_figure,
+    is_narrow,
     label_log_axis,
-    literal_text,
     log_edges,
     new_figure,
     unit_label,
@@ -108,7 +111,7 @@ def _frame_mismatches(
                 textcoords="offset points",
                 va="top",
                 ha="left",
-                fontsize=9,
+                fontsize="small",
                 color="white",
                 weight="bold",
                 bbox={"facecolor": _RED, "edgecolor": "none", "pad": 1.2},
@@ -122,8 +125,9 @@ def _draw_maps(
     norm: Any,
     cmap: str,
     label: str,
+    width: float,
 ) -> Figure:
-    """Draw one row of maps per axis.
+    """Draw one row of maps per axis; on a narrow figure, one map per row.
 
     `columns` are titles, values by (axis, window, tau), and the opacity of each cell, or None.
     """
@@ -132,17 +136,14 @@ def _draw_maps(
     names, tau = [str(name) for name in surfaces["axis"].values], surfaces["tau"].values
     begin, end = surfaces["begin"].values, surfaces["end"].values
     size, unit = unit_of_time(float(end[-1]))
-    height = 1.1 + 2.3 * len(names)
-    figure = new_figure(12.0, height, stacked=True)
-    figure.subplots_adjust(
-        left=0.075,
-        right=0.9,
-        top=1.0 - 0.35 / height,
-        bottom=0.6 / height,
-        wspace=0.06,
-        hspace=0.08,
-    )
-    panels = figure.subplots(len(names), len(columns), sharex=True, sharey=True, squeeze=False)
+    figure = new_figure(width / INCH_MM, 0.5 + 1.6 * len(names))
+    shape = (len(names), len(columns))
+    if is_narrow(figure):
+        figure.set_figheight(0.5 + 1.2 * len(names) * len(columns))
+        panels = figure.subplots(len(names) * len(columns), 1, sharex=True, sharey=True)
+    else:
+        panels = figure.subplots(*shape, sharex=True, sharey=True)
+    panels = np.reshape(panels, shape)
     for row, name in enumerate(names):
         for column, (title, values, opacity) in enumerate(columns):
             panel = panels[row, column]
@@ -158,23 +159,25 @@ def _draw_maps(
             panel.set_xlim(begin[0] / size, end[-1] / size)
             panel.set_ylim(*log_edges(tau)[[0, -1]])
             _frame_mismatches(panel, name, content, size, taus=tau, faint=column > 0)
-            if row == 0:
+            if is_narrow(figure):
+                panel.set_title(f"Axis {name}: {title[:1].lower()}{title[1:]}", loc="left")
+            elif row == 0:
                 panel.set_title(title)
-            if column == 0:
-                panel.set_ylabel(f"axis {name}\naveraging time [s]")
-            if row == len(names) - 1:
-                panel.set_xlabel(f"time since the start [{unit}]")
+            if column == 0 and not is_narrow(figure):
+                panel.set_ylabel(f"axis {name}")
     label_log_axis(panels[0, 0].yaxis, tau[0], tau[-1])
     bar = ScalarMappable(norm, cmap)  # the maps may be partly transparent
-    scale = figure.colorbar(
-        bar, cax=figure.add_axes((0.912, 0.6 / height, 0.013, 1.0 - 0.95 / height)), label=label
-    )
+    scale = figure.colorbar(bar, ax=panels, label=label, aspect=12 * panels.size, pad=0.02)
+    figure.supylabel("averaging time τ [s]")
+    figure.supxlabel(f"time since the start [{unit}]")
     label_log_axis(scale.ax.yaxis, norm.vmin, norm.vmax)
     return figure
 
 
-@literal_text
-def plot_surfaces(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
+@draws_figure
+def plot_surfaces(
+    surfaces: xr.Dataset, content: Mapping[str, Any], *, width: float = PAGE_MM
+) -> Figure:
     """Draw the Allan deviation over time and averaging time, of the recording and both simulations.
 
     Parameters
@@ -184,6 +187,8 @@ def plot_surfaces(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
         [degree2 hour-2].
     content : mapping
         Contents of `diagnosis.json`; its mismatches are framed.
+    width : float
+        Width of the figure [mm]: 180 for a page, 85 for a column.
 
     Returns
     -------
@@ -198,11 +203,15 @@ def plot_surfaces(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     columns = [
         (_TITLES.get(name, name), deviation[place], None) for place, name in enumerate(cases)
     ]
-    return _draw_maps(surfaces, content, columns, norm, "viridis", "Allan deviation [deg/h]")
+    return _draw_maps(
+        surfaces, content, columns, norm, "viridis", "Allan deviation σ(τ) [deg/h]", width
+    )
 
 
-@literal_text
-def plot_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
+@draws_figure
+def plot_change(
+    surfaces: xr.Dataset, content: Mapping[str, Any], *, width: float = PAGE_MM
+) -> Figure:
     """Draw the Allan deviation of the recording over that of the simulations before and after."""
     from matplotlib.colors import LogNorm
     from matplotlib.ticker import FixedLocator, NullFormatter
@@ -227,7 +236,7 @@ def plot_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
             )
         )
     figure = _draw_maps(
-        surfaces, content, columns, LogNorm(0.5, 2.0), "PuOr_r", "ratio of Allan deviations"
+        surfaces, content, columns, LogNorm(0.5, 2.0), "PuOr_r", "ratio of Allan deviations", width
     )
     bar = figure.axes[-1]
     bar.yaxis.set_major_locator(FixedLocator([0.5, 0.7, 1.0, 1.4, 2.0]))
@@ -236,8 +245,10 @@ def plot_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     return figure
 
 
-@literal_text
-def plot_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
+@draws_figure
+def plot_means(
+    surfaces: xr.Dataset, content: Mapping[str, Any], *, width: float = PAGE_MM
+) -> Figure:
     """Draw the mean rate over time with the simulations, and the channels below.
 
     Parameters
@@ -247,6 +258,8 @@ def plot_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
         and the ``channel_<name>(block)``.
     content : mapping
         Contents of `diagnosis.json`.
+    width : float
+        Width of the figure [mm]: 180 for a page, 85 for a column.
     """
     names = [str(name) for name in surfaces["axis"].values]
     channels = select_channels(surfaces, content)
@@ -254,7 +267,7 @@ def plot_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     time = (surfaces["begin"].values + surfaces["end"].values) / (2.0 * size)
     block = (surfaces["block_begin"].values + surfaces["block_end"].values) / (2.0 * size)
     ratios = [1.9] * len(names) + [1.3] * len(channels)
-    figure = new_figure(12.0, 1.0 + sum(ratios))
+    figure = new_figure(width / INCH_MM, 0.7 + 0.75 * sum(ratios))
     panels = figure.subplots(
         len(ratios), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": ratios}
     )[:, 0]
@@ -294,7 +307,11 @@ def plot_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     panels[-1].set_xlabel(f"time since the start [{unit}]")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(
-        handles, labels, loc="outside upper center", ncols=4, fontsize="small", frameon=False
+        handles,
+        labels,
+        loc="outside upper center",
+        ncols=2 if is_narrow(figure) else 4,
+        frameon=False,
     )
     return figure
 
@@ -344,19 +361,26 @@ def _mark_spans(panel: Axes, axis: str, content: Mapping[str, Any], size: float)
                 xycoords=panel.get_xaxis_transform(),
                 textcoords="offset points",
                 va="top",
-                fontsize=9,
+                fontsize="small",
                 color="white",
                 weight="bold",
                 bbox={"facecolor": _RED, "edgecolor": "none", "pad": 1.2},
             )
 
 
-@literal_text
-def plot_deviations(surfaces: xr.Dataset) -> Figure:
+def _make_row(names: list[str], width: float) -> tuple[Figure, Array]:
+    """Make a figure with one panel per axis, side by side, or in a column if it is narrow."""
+    figure = new_figure(width / INCH_MM, 2.6)
+    shape = (len(names), 1) if is_narrow(figure) else (1, len(names))
+    figure.set_figheight(0.8 + 1.8 * shape[0])
+    return figure, np.ravel(figure.subplots(*shape, sharex=True, sharey=True))
+
+
+@draws_figure
+def plot_deviations(surfaces: xr.Dataset, *, width: float = PAGE_MM) -> Figure:
     """Draw the Allan deviation of the whole record, one panel per axis."""
     names, tau = [str(name) for name in surfaces["axis"].values], surfaces["tau"].values
-    figure = new_figure(min(4.2 * len(names), 12.0) if len(names) > 1 else 6.0, 3.8)
-    panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
+    figure, panels = _make_row(names, width)
     with np.errstate(invalid="ignore"):
         whole = surfaces["avar"].mean("window", skipna=True) ** 0.5
     for panel, name in zip(panels, names, strict=True):
@@ -367,16 +391,18 @@ def plot_deviations(surfaces: xr.Dataset) -> Figure:
                 **_STYLES[case],
                 label=_TITLES[case].lower(),
             )
-        panel.set(xscale="log", yscale="log", xlabel="averaging time [s]", title=f"axis {name}")
+        panel.set(xscale="log", yscale="log", title=f"axis {name}")
         panel.grid(True, which="major", alpha=0.4)
-    panels[0].set_ylabel("Allan deviation [deg/h]")
-    panels[0].legend(fontsize="small", frameon=False)
+        label_log_axis(panel.xaxis, *panel.get_xlim())
+    figure.supxlabel("averaging time τ [s]")
+    figure.supylabel("Allan deviation σ(τ) [deg/h]")
+    panels[0].legend(frameon=False)
     label_log_axis(panels[0].yaxis, *panels[0].get_ylim())
     return figure
 
 
-@literal_text
-def plot_spectra(surfaces: xr.Dataset) -> Figure:
+@draws_figure
+def plot_spectra(surfaces: xr.Dataset, *, width: float = PAGE_MM) -> Figure:
     """Draw the power spectrum of the whole record, one panel per axis.
 
     Parameters
@@ -386,8 +412,7 @@ def plot_spectra(surfaces: xr.Dataset) -> Figure:
         ``line_frequency``, two-sided [degree2 hour-2 Hz-1].
     """
     names = [str(name) for name in surfaces["axis"].values]
-    figure = new_figure(min(4.2 * len(names), 12.0) if len(names) > 1 else 6.0, 3.8)
-    panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
+    figure, panels = _make_row(names, width)
     for panel, name in zip(panels, names, strict=True):
         panel.plot(
             surfaces["line_frequency"].values,
@@ -401,9 +426,11 @@ def plot_spectra(surfaces: xr.Dataset) -> Figure:
             panel.plot(
                 surfaces["frequency"].values, values, **_STYLES[case], label=_TITLES[case].lower()
             )
-        panel.set(xscale="log", yscale="log", xlabel="frequency [Hz]", title=f"axis {name}")
+        panel.set(xscale="log", yscale="log", title=f"axis {name}")
         panel.grid(True, which="major", alpha=0.4)
-    panels[0].set_ylabel("power density [(deg/h)²/Hz]")
-    panels[0].legend(fontsize="small", frameon=False)
+        label_log_axis(panel.xaxis, *panel.get_xlim())
+    figure.supxlabel("frequency [Hz]")
+    figure.supylabel("power density [(deg/h)²/Hz]")
+    panels[0].legend(frameon=False)
     label_log_axis(panels[0].yaxis, *panels[0].get_ylim())
     return figure

@@ -14,7 +14,7 @@ from gyrostab.correlate import correlate
 from gyrostab.plot.adev import plot_adev
 from gyrostab.plot.coefficients import plot_coefficients
 from gyrostab.plot.correlation import plot_correlation
-from gyrostab.plot.style import save_png
+from gyrostab.plot.style import PAGE_MM, save_png
 from gyrostab.plot.surface import plot_davar, plot_davar_3d
 from gyrostab.schema import check_product
 from gyrostab.store.output import check_folder, new_folder
@@ -25,13 +25,17 @@ if TYPE_CHECKING:
 __all__ = ["product_figures", "save_figures"]
 
 
-def product_figures(product: xr.Dataset) -> dict[str, Callable[[], Figure]]:
+def product_figures(
+    product: xr.Dataset, *, width: float = PAGE_MM
+) -> dict[str, Callable[[], Figure]]:
     """List the figures of a product by name, as functions that draw them.
 
     Parameters
     ----------
     product : xarray.Dataset
         What `gyrostab.fit_noise` returns or `gyrostab.open_product` opens.
+    width : float
+        Width of the figures [mm]: 180 for a page, 85 for a column.
 
     Returns
     -------
@@ -47,23 +51,30 @@ def product_figures(product: xr.Dataset) -> dict[str, Callable[[], Figure]]:
     """
     check_product(product)
     figures: dict[str, Callable[[], Figure]] = {
-        "coefficients": lambda: plot_coefficients(product),
-        "davar": lambda: plot_davar(product),
-        "davar_change": lambda: plot_davar(product, relative=True),
+        "coefficients": lambda: plot_coefficients(product, width=width),
+        "davar": lambda: plot_davar(product, width=width),
+        "davar_change": lambda: plot_davar(product, relative=True, width=width),
     }
     if "temperature" in product and product["temperature"].dims == ("time",):
         figures["temperature"] = lambda: plot_correlation(
-            product if "coupling_verdict" in product else correlate(product)
+            product if "coupling_verdict" in product else correlate(product), width=width
         )
     for axis in map(str, product["axis"].values):
-        figures[f"adev_{axis}"] = lambda axis=axis: plot_adev(product, axis)  # type: ignore[misc]
+        figures[f"adev_{axis}"] = lambda axis=axis: plot_adev(product, axis, width=width)  # type: ignore[misc]
         if min(product.sizes["time"], product.sizes["tau"]) > 1:
-            figures[f"davar_3d_{axis}"] = lambda axis=axis: plot_davar_3d(product, axis=axis)  # type: ignore[misc]
+            figures[f"davar_3d_{axis}"] = lambda axis=axis: plot_davar_3d(
+                product, axis=axis, width=width
+            )  # type: ignore[misc]
     return figures
 
 
 def save_figures(
-    product: xr.Dataset, folder: str | os.PathLike[str], *, dpi: int = 150, overwrite: bool = False
+    product: xr.Dataset,
+    folder: str | os.PathLike[str],
+    *,
+    width: float = PAGE_MM,
+    dpi: int = 300,
+    overwrite: bool = False,
 ) -> list[Path]:
     """Write all figures of a product into a folder, as PNG files.
 
@@ -73,8 +84,10 @@ def save_figures(
         What `gyrostab.fit_noise` returns or `gyrostab.open_product` opens.
     folder : path-like
         Folder to write to; created if it does not exist.
+    width : float
+        Width of the figures [mm]: 180 for a page, 85 for a column.
     dpi : int
-        Pixels per inch; 150 suffices for print.
+        Pixels per inch.
     overwrite : bool
         Replace figures that exist.
 
@@ -94,7 +107,7 @@ def save_figures(
     folder = Path(folder)
     figures = {
         re.sub(r"[^\w.-]", "_", name) + ".png": draw
-        for name, draw in product_figures(product).items()
+        for name, draw in product_figures(product, width=width).items()
     }
     check_folder(folder, figures, overwrite=overwrite)
     with new_folder(folder, overwrite=overwrite) as temporary:

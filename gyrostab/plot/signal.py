@@ -12,13 +12,16 @@ from numpy.typing import NDArray
 from gyrostab.errors import OptionError
 from gyrostab.ingest.convert import as_log
 from gyrostab.plot.style import (
+    INCH_MM,
+    PAGE_MM,
     axis_names,
     axis_style,
-    literal_text,
+    draws_figure,
     new_figure,
     shade_spans,
     stack_panels,
     time_axis,
+    title_figure,
     unit_label,
 )
 from gyrostab.schema import log_channels, signal_name
@@ -32,13 +35,14 @@ __all__ = ["plot_signal", "thin"]
 _BLOCK_SAMPLES = 2**22  # samples read at a time: 32 MiB
 
 
-@literal_text
+@draws_figure
 def plot_signal(
     log: xr.Dataset,
     *,
     axis: str | None = None,
     channels: Sequence[str] | None = None,
     columns: int = 1500,
+    width: float = PAGE_MM,
 ) -> Figure:
     """Draw the gyro signal of all axes, with the channels below and gaps in grey.
 
@@ -55,6 +59,8 @@ def plot_signal(
         Channels to draw; all by default.
     columns : int
         Number of columns to which a long record is reduced.
+    width : float
+        Width of the figure [mm]: 180 for a page, 85 for a column.
 
     Returns
     -------
@@ -81,7 +87,8 @@ def plot_signal(
         raise OptionError(
             f"channel {', '.join(missing)} is not in the log; it has {', '.join(known) or 'none'}"
         )
-    figure = new_figure(10.0, 1.2 + 1.7 * len(axes) + 1.4 * len(shown), stacked=True)
+    height = 0.9 + 1.2 * len(axes) + 1.0 * len(shown)
+    figure = new_figure(width / INCH_MM, height, stacked=True)
     ratios = [1.2] * len(axes) + [1.0] * len(shown)
     panels = figure.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0]
     for panel, axis_name in zip(panels, axes, strict=False):
@@ -97,7 +104,7 @@ def plot_signal(
     _shade_gaps(list(panels), log, columns)
     signal_text = "Rotation rate" if name == "rate" else "Rotation angle"
     rate = log.attrs.get("sampling_rate_hz")
-    figure.suptitle(f"{signal_text} as recorded" + (f", {float(rate):g} Hz" if rate else ""))
+    title_figure(figure, f"{signal_text} as recorded", f"{float(rate):g} Hz" if rate else "")
     time_axis(panels[-1], log["time"][[0, -1]].values)
     stack_panels(panels)
     return figure
@@ -158,7 +165,7 @@ def _shade_gaps(panels: list[Axes], log: xr.Dataset, columns: int) -> None:
         return
     for panel in panels:
         shade_spans(panel, starts, ends, label="gap: no samples")
-    panels[0].legend(loc="upper right", fontsize="small", framealpha=0.9)
+    panels[0].legend(loc="upper right", framealpha=0.9)
 
 
 def _find_gaps(log: xr.Dataset, columns: int) -> tuple[NDArray[Any], NDArray[Any]]:

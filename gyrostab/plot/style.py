@@ -7,13 +7,14 @@ import functools
 import io
 import os
 from collections.abc import Callable, Sequence
-from typing import IO, TYPE_CHECKING, Any, ParamSpec
+from typing import IO, TYPE_CHECKING, Any, ParamSpec, cast
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError, SchemaError
+from gyrostab.time.durations import format_duration
 from gyrostab.units import DAY, HOUR, INNER
 
 if TYPE_CHECKING:
@@ -23,21 +24,28 @@ if TYPE_CHECKING:
 
 __all__ = [
     "COLOURS",
+    "INCH_MM",
     "MARKERS",
+    "NARROW_MM",
+    "PAGE_MM",
     "axis_names",
     "axis_style",
+    "draws_figure",
     "duration",
     "embedded",
+    "is_narrow",
     "label_log_axis",
-    "literal_text",
     "log_edges",
     "new_figure",
     "save_png",
     "shade_spans",
     "stack_panels",
     "time_axis",
+    "title_figure",
     "unit_label",
     "unit_of_time",
+    "unit_symbol",
+    "upper_limit_marker",
     "window_text",
 ]
 
@@ -47,7 +55,29 @@ P = ParamSpec("P")
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MARKERS = ("o", "s", "D", "P", "X", "*")
 GREY = "#8c8c8c"
-_DPI = 110
+#: Width of the text of a printed page [mm], the default of every figure. A column has 85 mm.
+PAGE_MM = 180.0
+INCH_MM = 25.4
+NARROW_MM = 120.0
+_DPI = 155
+_FONT_POINTS = 8.0
+#: Sizes relative to `_FONT_POINTS`, and line widths [points].
+_STYLE: dict[Any, Any] = {
+    "axes.titlesize": "medium",
+    "axes.labelsize": "medium",
+    "figure.titlesize": "large",
+    "figure.labelsize": "medium",
+    "xtick.labelsize": 0.94 * _FONT_POINTS,
+    "ytick.labelsize": 0.94 * _FONT_POINTS,
+    "legend.fontsize": 0.88 * _FONT_POINTS,
+    "axes.linewidth": 0.6,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "xtick.minor.width": 0.4,
+    "ytick.minor.width": 0.4,
+    "grid.linewidth": 0.5,
+    "hatch.linewidth": 0.5,
+}
 
 _LABELS = {
     INNER["rate"]: "deg/h",
@@ -57,19 +87,35 @@ _LABELS = {
     INNER["magnetic"]: "µT",
     "degree_Celsius hour-1": "°C/h",
     "K hour-1": "°C/h",
+    "urad": "µrad",
+    "deg/sqrt(h)": "deg/√h",
+    "deg/h^1.5": "deg/h/√h",
+    "deg/h^2": "deg/h²",
 }
 
 
+def unit_symbol(units: Any) -> str:
+    """Write a unit with symbols, for figures; empty for a dimensionless number.
+
+    Examples
+    --------
+    >>> unit_symbol("degree hour-1"), unit_symbol("deg/sqrt(h)")
+    ('deg/h', 'deg/√h')
+    """
+    text = str(units if units is not None else "1")
+    return "" if text == "1" else _LABELS.get(text, text)
+
+
 def unit_label(units: Any) -> str:
-    """Spell a unit in the customary way, in brackets; empty for a dimensionless number.
+    """Write a unit with symbols and in brackets; empty for a dimensionless number.
 
     Examples
     --------
     >>> unit_label("degree hour-1")
     '[deg/h]'
     """
-    text = str(units if units is not None else "1")
-    return "" if text == "1" else f"[{_LABELS.get(text, text)}]"
+    text = unit_symbol(units)
+    return f"[{text}]" if text else ""
 
 
 def duration(seconds: float) -> str:
@@ -80,10 +126,7 @@ def duration(seconds: float) -> str:
     >>> duration(90.0), duration(0.25), duration(7200)
     ('1.5 min', '0.25 s', '2 h')
     """
-    for size, name in ((DAY, "d"), (HOUR, "h"), (60.0, "min")):
-        if seconds >= size:
-            return f"{seconds / size:.4g} {name}"
-    return f"{seconds:.3g} s"
+    return format_duration(seconds, " ")
 
 
 def unit_of_time(seconds: float) -> tuple[float, str]:
@@ -133,8 +176,9 @@ def axis_names(dataset: xr.Dataset, axis: str | None) -> list[str]:
 
 
 def axis_style(dataset: xr.Dataset, axis: str) -> dict[str, Any]:
-    """Choose colour and marker of an axis, the same in every figure."""
-    number = [str(name) for name in dataset["axis"].values].index(axis)
+    """Choose colour and marker of an axis: by its name for x, y and z, else by its place."""
+    places = [str(name) for name in dataset["axis"].values]
+    number = "xyz".index(axis) if axis in ("x", "y", "z") else places.index(axis)
     return {"color": COLOURS[number % len(COLOURS)], "marker": MARKERS[number % len(MARKERS)]}
 
 
@@ -151,19 +195,49 @@ def new_figure(width: float, height: float, *, stacked: bool = False) -> Figure:
     return figure
 
 
-def literal_text(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Decorate a drawing function so that no text of its figure is parsed as mathtext.
+def draws_figure(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+    """Decorate a drawing function: fonts and lines for print, and no text parsed as mathtext.
 
-    Names and units of a log may hold dollar signs.
+    Names and units of a log may hold dollar signs. Figures narrower than 120 mm, by the option
+    `width` [mm] of the function, have a font of 7 instead of 8 points.
     """
 
     @functools.wraps(draw)
-    def draw_literally(*arguments: P.args, **options: P.kwargs) -> Figure:
-        figure = draw(*arguments, **options)
-        _keep_literal(figure)
+    def draw_styled(*arguments: P.args, **options: P.kwargs) -> Figure:
+        import matplotlib as mpl
+
+        width = cast(float, options.get("width", PAGE_MM))
+        points = _FONT_POINTS if width >= NARROW_MM else _FONT_POINTS - 1.0
+        sizes = {
+            name: size * points / _FONT_POINTS if name.endswith("size") else size
+            for name, size in _STYLE.items()
+            if not isinstance(size, str)
+        }
+        with mpl.rc_context({**_STYLE, **sizes, "font.size": points}):
+            figure = draw(*arguments, **options)
+            _keep_literal(figure)
         return figure
 
-    return draw_literally
+    return draw_styled
+
+
+def is_narrow(figure: Any) -> bool:
+    """Return whether a figure is made for a column of a page rather than for its whole width."""
+    return bool(figure.get_figwidth() < NARROW_MM / INCH_MM)
+
+
+def title_figure(figure: Figure, *parts: str) -> None:
+    """Give a figure its title; a narrow figure has one line per part."""
+    figure.suptitle(("\n" if is_narrow(figure) else ", ").join(filter(None, parts)))
+
+
+def upper_limit_marker() -> Any:
+    """Make the marker of an upper limit: a bar with an arrow that points down."""
+    from matplotlib.path import Path
+
+    corners = [(-1, 0), (1, 0), (0, 0), (0, -2.2), (-0.6, -1.5), (0, -2.2), (0.6, -1.5)]
+    move, line = Path.MOVETO, Path.LINETO
+    return Path(corners, [move, line, move, line, move, line, line])
 
 
 def _keep_literal(artist: Any) -> None:
@@ -181,16 +255,12 @@ def _keep_literal(artist: Any) -> None:
 
 
 def stack_panels(
-    panels: Sequence[Axes] | NDArray[Any],
-    *,
-    between: float = 0.13,
-    below: float = 0.0,
-    right: float = 0.2,
+    panels: Sequence[Axes] | NDArray[Any], *, between: float = 0.1, right: float = 0.15
 ) -> None:
-    """Lay out panels in one column, with aligned y labels.
+    """Lay out panels in one column, with aligned y labels, below the title and above the legend.
 
-    The margins are known, so only the tick labels are measured; the layout engine of matplotlib
-    measures every artist, twice.
+    Only tick labels, title and legends are measured; the layout engine of matplotlib measures every
+    artist, twice.
 
     Parameters
     ----------
@@ -198,8 +268,6 @@ def stack_panels(
         All panels of a figure made with ``stacked=True``, with their labels set.
     between : float
         Distance between panels [inches].
-    below : float
-        Space for a legend under the label of the time axis [inches].
     right : float
         Space to the right of the panels [inches].
     """
@@ -208,7 +276,15 @@ def stack_panels(
     figure: Any = panels[0].figure
     _keep_literal(figure)  # before the labels are measured
     width, height = figure.get_size_inches()
-    top, bottom = 0.3 + between, 0.55 + below
+    renderer = figure.canvas.get_renderer()
+
+    def inches(artist: Any, side: str) -> float:
+        return float(getattr(artist.get_window_extent(renderer), side) / figure.dpi)
+
+    title = figure._suptitle
+    top = between + 0.05 + (inches(title, "height") + 0.08 if title else 0.0)
+    below = max((inches(legend, "height") for legend in figure.legends), default=0.0)
+    bottom = 0.42 + below
     average = (height - top - bottom - between * (len(panels) - 1)) / len(panels)
     figure.subplots_adjust(
         top=1 - top / height,
@@ -216,32 +292,42 @@ def stack_panels(
         right=1 - right / width,
         hspace=between / average,
     )
-    renderer = figure.canvas.get_renderer()
     ticks = [
-        label.get_window_extent(renderer).width
+        inches(label, "width")
         for panel in panels
         for label in panel.get_yticklabels(which="both")
         if label.get_text()
     ]
-    labels = [panel.yaxis.label.get_window_extent(renderer).width for panel in panels]
-    inches = max(ticks, default=0.0) / figure.dpi + 0.14
-    figure.subplots_adjust(left=(inches + max(labels) / figure.dpi + 0.1) / width)
+    to_label = max(ticks, default=0.0) + 0.1
+    labels = max(inches(panel.yaxis.label, "width") for panel in panels)
+    figure.subplots_adjust(left=(to_label + labels + 0.06) / width)
+    if title:
+        title.set_y(1 - 0.06 / height)
     for panel in panels:
         panel.yaxis.set_label_coords(
             0.0,
             0.5,
-            transform=panel.transAxes + ScaledTranslation(-inches, 0.0, figure.dpi_scale_trans),
+            transform=panel.transAxes + ScaledTranslation(-to_label, 0.0, figure.dpi_scale_trans),
         )
 
 
 def label_log_axis(axis: Axis, low: float, high: float) -> None:
-    """Label a logarithmic axis from `low` to `high` by powers of ten; 1, 2, 5 over a short span."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+    """Label a logarithmic axis from `low` to `high` with numbers: powers of ten, or also 2 and 5.
 
-    axis.set_minor_formatter(NullFormatter())
-    if high < 100.0 * low:
+    Numbers below 0.001 and above 10 000 are written as powers of ten.
+    """
+    from matplotlib.ticker import FuncFormatter, LogFormatterMathtext, LogLocator, NullFormatter
+
+    powers = LogFormatterMathtext()
+    powers.set_axis(axis)
+    short = high < 100.0 * low
+    if short:
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.set_major_formatter(FuncFormatter(lambda number, _: f"{number:g}"))
+    plain = short or (low > 5e-4 and high < 2e4)
+    axis.set_major_formatter(
+        FuncFormatter(lambda number, place: f"{number:g}" if plain else powers(number, place))
+    )
+    axis.set_minor_formatter(NullFormatter())
 
 
 def save_png(
@@ -290,7 +376,7 @@ def time_axis(ax: Axes, times: NDArray[Any]) -> None:
     """Label the time axis with dates and times, as short as is unambiguous."""
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
-    locator = AutoDateLocator(minticks=4, maxticks=9)  # type: ignore[no-untyped-call]
+    locator = AutoDateLocator(minticks=3, maxticks=5 if is_narrow(ax.figure) else 9)  # type: ignore[no-untyped-call]
     ax.xaxis.set_major_locator(locator)
     ax.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
     ax.set_xlabel("time (UTC)")

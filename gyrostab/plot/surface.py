@@ -10,13 +10,17 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
 from gyrostab.plot.style import (
+    INCH_MM,
+    PAGE_MM,
     axis_names,
+    draws_figure,
+    is_narrow,
     label_log_axis,
-    literal_text,
     log_edges,
     new_figure,
     stack_panels,
     time_axis,
+    title_figure,
     unit_of_time,
     window_text,
 )
@@ -33,9 +37,14 @@ CHANGE_CMAP = "PuOr_r"  # safe for colour-blind readers, white where nothing cha
 _WEIGHTED = ESTIMATORS.index("weighted_clusters")
 
 
-@literal_text
+@draws_figure
 def plot_davar(
-    product: xr.Dataset, *, axis: str | None = None, relative: bool = False, columns: int = 1500
+    product: xr.Dataset,
+    *,
+    axis: str | None = None,
+    relative: bool = False,
+    columns: int = 1500,
+    width: float = PAGE_MM,
 ) -> Figure:
     """Draw the Allan deviation as colour over time and averaging time, one panel per axis.
 
@@ -53,6 +62,8 @@ def plot_davar(
     columns : int
         Largest number of columns; if there are more windows, neighbouring windows are averaged in
         Allan variance.
+    width : float
+        Width of the figure [mm]: 180 for a page, 85 for a column.
 
     Returns
     -------
@@ -68,7 +79,7 @@ def plot_davar(
     from matplotlib.patches import Patch
 
     names = axis_names(product, axis)
-    figure = new_figure(10.0, 1.3 + 2.7 * len(names), stacked=True)
+    figure = new_figure(width / INCH_MM, 1.1 + 1.9 * len(names), stacked=True)
     panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     time, tau = product["time"].values, product["tau"].values
     cells, merged = _merge_windows(product, names, columns)
@@ -107,26 +118,29 @@ def plot_davar(
     if any(weighted.any() for _, weighted in cells):
         handles.append(_dot_handle())
     if handles:
-        figure.legend(handles=handles, loc="lower left", ncols=2, fontsize="small", frameon=False)
-    text = ", ".join(
-        filter(
-            None,
-            [
-                "Change of the dynamic Allan deviation" if relative else "Dynamic Allan deviation",
-                window_text(product),
-                f"{merged} windows averaged per column" if merged > 1 else "",
-            ],
+        figure.legend(
+            handles=handles, loc="lower left", ncols=1 if is_narrow(figure) else 2, frameon=False
         )
+    title_figure(
+        figure,
+        "Change of the dynamic Allan deviation" if relative else "Dynamic Allan deviation",
+        window_text(product),
+        f"{merged} windows averaged per column" if merged > 1 else "",
     )
-    figure.suptitle(text)
     time_axis(panels[-1], time_edges)
-    stack_panels(panels, below=0.3 if handles else 0.0, right=1.3)
+    stack_panels(panels, right=0.8)
     _colour_bar(figure, mesh, label, relative=relative)
     return figure
 
 
-@literal_text
-def plot_davar_3d(product: xr.Dataset, *, axis: str | None = None, columns: int = 120) -> Figure:
+@draws_figure
+def plot_davar_3d(
+    product: xr.Dataset,
+    *,
+    axis: str | None = None,
+    columns: int = 120,
+    width: float = PAGE_MM,
+) -> Figure:
     """Draw the Allan deviation of one axis as a surface over time and log averaging time.
 
     Parameters
@@ -137,6 +151,8 @@ def plot_davar_3d(product: xr.Dataset, *, axis: str | None = None, columns: int 
         Axis to draw; the first by default.
     columns : int
         Largest number of windows to draw; more are averaged in Allan variance.
+    width : float
+        Width of the figure [mm]: 180 for a page, 85 for a column.
 
     Returns
     -------
@@ -160,7 +176,7 @@ def plot_davar_3d(product: xr.Dataset, *, axis: str | None = None, columns: int 
     time = product["time"].values
     seconds = (time[::merged] - time[0]) / np.timedelta64(1, "s")
     size, unit = unit_of_time(seconds[-1])
-    figure = new_figure(9.0, 6.5)
+    figure = new_figure(width / INCH_MM, 0.8 + 0.6 * width / INCH_MM)
     panel: Any = figure.add_subplot(projection="3d")
     x, y = np.meshgrid(seconds / size, np.log10(product["tau"].values), indexing="ij")
     with np.errstate(divide="ignore"):
@@ -176,22 +192,20 @@ def plot_davar_3d(product: xr.Dataset, *, axis: str | None = None, columns: int 
         edgecolor="#222222",
         antialiased=True,
     )
-    panel.set_xlabel(
-        f"time since {str(np.datetime_as_string(time[0], unit='s')).replace('T', ' ')} [{unit}]",
-        labelpad=8,
-    )
-    panel.set_ylabel("averaging time τ [s]", labelpad=8)
-    panel.set_zlabel("Allan deviation σ [deg/h]", labelpad=6)
+    begin = str(np.datetime_as_string(time[0], unit="s")).replace("T", " ")
+    narrow = is_narrow(figure)
+    panel.set_xlabel(f"time [{unit}]" if narrow else f"time since {begin} [{unit}]")
+    panel.set_ylabel("τ [s]" if narrow else "averaging time τ [s]")
+    panel.set_zlabel("σ [deg/h]" if narrow else "Allan deviation σ [deg/h]")
     for scale in (panel.yaxis, panel.zaxis):
-        scale.set_major_locator(MaxNLocator(nbins=6, integer=True))
+        scale.set_major_locator(MaxNLocator(nbins=3 if narrow else 6, integer=True))
         scale.set_major_formatter(FuncFormatter(lambda power, _: f"$10^{{{power:.0f}}}$"))
     # the steep side of short averaging times goes to the back, where it hides nothing
     panel.invert_yaxis()
     panel.view_init(elev=30, azim=-62)
-    panel.set_box_aspect((1.5, 1.15, 0.85), zoom=1.0)
-    figure.suptitle(
-        ", ".join(filter(None, [f"Dynamic Allan deviation of axis {name}", window_text(product)]))
-    )
+    panel.set_box_aspect((1.5, 1.15, 0.85), zoom=0.9 if narrow else 1.0)
+    panel.tick_params(pad=-2 if narrow else 2)
+    title_figure(figure, f"Dynamic Allan deviation of axis {name}", window_text(product))
     return figure
 
 
@@ -246,10 +260,12 @@ def _colour_limits(values: list[NDArray[Any]], *, relative: bool) -> tuple[float
 def _colour_bar(figure: Figure, mesh: Any, label: str, *, relative: bool) -> None:
     """Draw the colour bar to the right of the panels."""
     margins = figure.subplotpars
-    area = (margins.right + 0.012, margins.bottom, 0.025, margins.top - margins.bottom)
+    gap, breadth = 0.08 / figure.get_figwidth(), 0.16 / figure.get_figwidth()
+    area = (margins.right + gap, margins.bottom, breadth, margins.top - margins.bottom)
     bar = figure.colorbar(mesh, cax=figure.add_axes(area), label=label, extend="both")
+    low, high = mesh.get_clim()
+    label_log_axis(bar.ax.yaxis, low, high)
     if relative:
-        low, high = mesh.get_clim()
         ticks = [
             tick
             for tick in (0.1, 0.2, 0.33, 0.5, 0.67, 0.8, 1.0, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0)
@@ -279,8 +295,9 @@ def _mark_weighted(
     panel: Axes, time_edges: NDArray[Any], tau: NDArray[Any], weighted: NDArray[Any]
 ) -> None:
     """Mark weighted cells with dots, thinned so that they stay distinguishable."""
-    columns = np.arange(0, weighted.shape[0], max(1, weighted.shape[0] // 120))
-    rows = np.arange(0, weighted.shape[1], max(1, weighted.shape[1] // 25))
+    most = 30 if is_narrow(panel.figure) else 60
+    columns = np.arange(0, weighted.shape[0], -(-weighted.shape[0] // most))
+    rows = np.arange(0, weighted.shape[1], max(1, weighted.shape[1] // 12))
     chosen = np.zeros_like(weighted)
     chosen[np.ix_(columns, rows)] = True
     where = np.argwhere(weighted & chosen)
@@ -291,7 +308,7 @@ def _mark_weighted(
         dots = panel.scatter(
             centres[where[:, 0]],
             tau[where[:, 1]],
-            s=5,
+            s=4,
             color="white",
             edgecolors="black",
             linewidths=0.3,

@@ -11,10 +11,10 @@ import xarray as xr
 
 from gyrostab.ingest.convert import as_log
 from gyrostab.noise import LAWS
-from gyrostab.plot.style import duration, embedded
+from gyrostab.plot.style import duration, embedded, unit_symbol
 from gyrostab.report.page import page_text
 from gyrostab.report.product_charts import product_charts, window_data
-from gyrostab.schema import GAP_CAUSES, OBSERVED, check_product, texts
+from gyrostab.schema import GAP_CAUSES, check_product, texts
 from gyrostab.store.output import new_output
 
 if TYPE_CHECKING:
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 __all__ = ["write_report"]
 
 _MAX_GAPS_LISTED = 20
-_MIN_CHANGE_RATIO = 1.5  # of the 95 % to the 5 % quantile of N, below which no sentence is written
 
 
 def write_report(
@@ -61,6 +60,7 @@ def write_report(
     check_product(product)
     if log is not None:
         log = as_log(log)
+    from gyrostab.allan.judgement import judge_product
     from gyrostab.allan.summary import summarise_terms
 
     terms = summarise_terms(product)
@@ -74,6 +74,7 @@ def write_report(
             "product.html.jinja",
             title="Gyro stability report",
             summary=_summarise_record(product),
+            judgement=judge_product(product),
             findings=_describe_findings(product, table),
             facts=_list_facts(product),
             table=table,
@@ -161,7 +162,7 @@ def _describe_findings(
             if seen
             else f"Axis {axis}: no coefficient is observed in any window."
         )
-        lines.append(text + _describe_change(product.sel(axis=axis)))
+        lines.append(text)
     missing = {axis: share for axis, share in _missing_shares(product).items() if share > 0.0}
     if missing:
         lines.append(
@@ -172,22 +173,6 @@ def _describe_findings(
     else:
         lines.append("No sample is missing in any window.")
     return [*lines, *describe_record(product)]
-
-
-def _describe_change(part: xr.Dataset) -> str:
-    """Say in one sentence how much N varies over the record, and when it is highest."""
-    seen = part["observable"].sel(term="N").values == OBSERVED
-    values = part["N"].values[seen]
-    if values.size < 5:
-        return ""
-    low, high = np.quantile(values, [0.05, 0.95])
-    if low <= 0.0 or high < _MIN_CHANGE_RATIO * low:
-        return ""
-    when = _stamp_text(part["time"].values[seen][np.argmax(values)])
-    return (
-        f" Angle random walk varies from {_number_text(low)} to {_number_text(high)} deg/sqrt(h) "
-        f"and is highest around {when}."
-    )
 
 
 def _list_facts(product: xr.Dataset) -> list[tuple[str, str]]:
@@ -246,7 +231,7 @@ def _coefficient_rows(terms: list[TermSummary]) -> list[dict[str, Any]]:
             "symbol": term.symbol,
             "value": _value_text(term),
             "name": LAWS[term.symbol].name,
-            "unit": term.unit,
+            "unit": unit_symbol(term.unit),
             "median": _number_text(term.median),
             "range": f"{_number_text(term.low)} to {_number_text(term.high)}"
             if np.isfinite(term.median)
@@ -338,9 +323,9 @@ _CAPTIONS = {
     "coefficients": (
         "A level line means that the noise of the gyro does not change. N is the short-term noise "
         "that averaging reduces, B the floor that averaging cannot reduce further, K and R the "
-        "slow drift, Q the resolution of the output. Bars or bands are standard errors. A triangle "
-        "is a 95 % upper limit of the true value. In grey windows the coefficient is not "
-        "observable."
+        "slow drift, Q the resolution of the output. Bars or bands are standard errors. An arrow "
+        "that points down is a 95 % upper limit of the true value. In grey windows the coefficient "
+        "is not observable."
     ),
     "davar": (
         "Colour is the Allan deviation: how much the rate, averaged over the time on the vertical "

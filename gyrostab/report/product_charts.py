@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gyrostab.noise import LAWS
 from gyrostab.plot.adev import band
-from gyrostab.plot.style import axis_style, unit_label, unit_of_time
+from gyrostab.plot.style import axis_style, unit_label, unit_of_time, unit_symbol
 from gyrostab.report.charts import (
     DEVIATION_LABEL,
     SYMBOLS,
@@ -220,7 +220,7 @@ def _draw_coefficients(product: xr.Dataset, gaps: list[dict[str, Any]]) -> go.Fi
     figure.update_layout(shapes=gaps)
     for row, symbol in enumerate(LAWS):
         panel = f"y{row + 1 if row else ''}"
-        label = LAWS[symbol].label.replace("sqrt(h)", "√h")
+        label = unit_symbol(LAWS[symbol].label)
         label_panel(figure, panel, f"{symbol}, {LAWS[symbol].name} [{label}]")
         _add_coefficient(figure, product, symbol, panel, label)
     for row, name in enumerate(channels, start=len(LAWS)):
@@ -255,7 +255,7 @@ def _add_coefficient(
                 y=single(limits),
                 mode="markers",
                 name=f"axis {plain_text(name)}, upper limit",
-                marker={"color": colour, "symbol": "triangle-down-open", "size": 7},
+                marker={"color": colour, "symbol": "arrow-bar-down-open", "size": 8},
                 hovertemplate=f"< %{{y:.3g}} {label}",
                 showlegend=False,
             )

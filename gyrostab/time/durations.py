@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
 
-__all__ = ["TAUS", "averaging_factors", "duration_seconds", "is_bare_number", "samples", "thin"]
+__all__ = [
+    "TAUS",
+    "averaging_factors",
+    "duration_seconds",
+    "format_duration",
+    "is_bare_number",
+    "samples",
+    "thin",
+]
 
 #: Examples of averaging times, for messages.
 TAUS = "--taus 40 (how many), octave, all or 0.1s,1s,10s"
@@ -54,6 +62,20 @@ def duration_seconds(value: Any, option: str, *, example: str = "10min, 30s or 2
     if not (np.isfinite(seconds) and seconds > 0):
         raise OptionError(f"{option} {value!r} must be longer than zero")
     return float(seconds)
+
+
+def format_duration(seconds: float, space: str = "") -> str:
+    """Format a length of time in its largest unit, as options take it.
+
+    Examples
+    --------
+    >>> format_duration(90.0), format_duration(0.25), format_duration(7200, " ")
+    ('1.5min', '0.25s', '2 h')
+    """
+    for size, name in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")):
+        if seconds >= size:
+            return f"{seconds / size:.4g}{space}{name}"
+    return f"{seconds:.3g}{space}s"
 
 
 def samples(value: Any, rate: float, option: str) -> int:

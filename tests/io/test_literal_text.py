@@ -10,14 +10,14 @@ from matplotlib.text import Text
 
 from gyrostab import correlate, davar, fit_noise, make_log, open_log, plot, to_netcdf, to_zarr
 from gyrostab.plot.figures import product_figures
-from gyrostab.plot.style import literal_text, new_figure, save_png
+from gyrostab.plot.style import draws_figure, new_figure, save_png
 from gyrostab.report import write_report
 from tests.support.command_line import WINDOW, call, write_log
 
 FORMULA = r"$\frac{$"
 
 
-@literal_text
+@draws_figure
 def draw_text(text: str) -> Figure:
     figure = new_figure(2.0, 2.0)
     figure.suptitle(text)

@@ -180,13 +180,16 @@ def test_davar_3d_is_logarithmic_with_units(product):
 def test_coefficients_have_five_panels_in_customary_units(product):
     figure = plot_coefficients(product)
     assert [ax.get_ylabel() for ax in figure.axes] == [
-        "Q [urad]",
-        "N [deg/sqrt(h)]",
+        "Q [µrad]",
+        "N [deg/√h]",
         "B [deg/h]",
-        "K [deg/h^1.5]",
-        "R [deg/h^2]",
+        "K [deg/h/√h]",
+        "R [deg/h²]",
     ]
-    assert [ax.get_title(loc="left") for ax in figure.axes] == [law.name for law in LAWS.values()]
+    assert [ax.get_title(loc="left") for ax in figure.axes] == [
+        *(law.name for law in list(LAWS.values())[:4]),
+        "rate ramp: upper limits only",
+    ]
     colours = {line.get_color() for line in figure.axes[1].lines if line.get_label() in "xyz"}
     assert len(colours) == 3
     assert len(plot_coefficients(product, axis="x").axes) == 5
@@ -281,8 +284,8 @@ def test_adev_draws_the_requested_window(product):
     )
     np.testing.assert_allclose(curve.get_ydata(), np.sqrt(model_avar(window.tau.values, fitted)))
     words = [text.get_text() for text in ax.get_legend().get_texts()]
-    assert any(word.startswith("N = ") and "deg/sqrt(h)" in word for word in words)
-    assert any(word.startswith("R < ") and "deg/h^2" in word for word in words)
+    assert any(word.startswith("N = ") and "deg/√h" in word for word in words)
+    assert any(word.startswith("R < ") and "deg/h²" in word for word in words)
     assert str(when)[:19].replace("T", " ") in figure.get_suptitle()
 
 

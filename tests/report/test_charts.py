@@ -89,7 +89,7 @@ def test_coefficients_are_estimates_or_limits_on_one_time_axis():
     np.testing.assert_allclose(_decode_numbers(n_of_y[0]["y"]), expected, rtol=1e-6)
     limits = [trace for trace in figure["data"] if trace["name"] == "axis z, upper limit"]
     assert limits
-    assert all(trace["marker"]["symbol"] == "triangle-down-open" for trace in limits)
+    assert all(trace["marker"]["symbol"] == "arrow-bar-down-open" for trace in limits)
     assert {trace.get("xaxis", "x") for trace in figure["data"]} == {"x"}
 
 

@@ -12,10 +12,10 @@ __all__ = ["demo"]
 
 @app.command(sort_key=0, help_epilogue="")
 def demo(*, output: Output = Path("gyrostab-demo"), common: Common = Common()) -> None:
-    """Run the whole analysis on the simulated log shipped with gyrostab.
+    """Simulate a day of a gyro, and run the whole analysis on it.
 
     Writes the product, the log, a report and figures to a folder, and prints the noise coefficients
-    before, during and after vibration.
+    while the gyro warms up, rests, is shaken, and rests again.
 
     Example: gyrostab demo -o demo-output
 
@@ -24,9 +24,10 @@ def demo(*, output: Output = Path("gyrostab-demo"), common: Common = Common()) -
     output
         Folder to write to.
     """
-    from gyrostab.jobs.demo import format_summary, run_demo
-
     with show_stages(common) as stage:
-        summary, files = run_demo(output, overwrite=common.overwrite, stage=stage)
-    print(format_summary(summary))
-    print("\nwritten:", *(f"  {file}" for file in files), sep="\n")
+        stage("loading the libraries")
+        from gyrostab.jobs.demo import format_summary, run_demo
+
+        product, files = run_demo(output, overwrite=common.overwrite, stage=stage)
+    print("written:", *(f"  {file}" for file in files), sep="\n", end="\n\n")
+    print(format_summary(product))

@@ -134,6 +134,7 @@ def plot(
     /,
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"], metavar="DIR")],
+    width: Annotated[float, Parameter(metavar="MM")] = 180.0,
     common: Common = Common(),
 ) -> None:
     """Draw the figures of a product as PNG files.
@@ -149,13 +150,15 @@ def plot(
         File written by gyrostab run or gyrostab fit.
     output
         Folder to write to.
+    width
+        Width of the figures in millimetres: 180 for a page, 85 for a column.
     """
     from gyrostab.io.datasets import open_product
     from gyrostab.plot.figures import save_figures
 
     with show_stages(common) as stage:
         stage("drawing", 0)
-        files = save_figures(open_product(product), output, overwrite=common.overwrite)
+        files = save_figures(open_product(product), output, width=width, overwrite=common.overwrite)
     print(*files, sep="\n")
 
 

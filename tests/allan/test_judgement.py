@@ -1,0 +1,85 @@
+"""Sentences of judgement follow from the product; suggested windows observe what they claim."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gyrostab import davar, fit_noise
+from gyrostab.allan.judgement import judge_product, smallest_observable, suggest_windows
+from gyrostab.noise import LAWS
+from gyrostab.schema import NOT_OBSERVABLE, OBSERVED, UPPER_LIMIT_ONLY
+from gyrostab.simulate import simulate
+from tests.support import synthetic
+
+WHITE = 0.01
+
+
+@pytest.mark.parametrize("term", ["B", "K", "R"])
+def test_half_of_the_windows_observe_the_smallest_observable_coefficient(term):
+    """The size that half of 42 windows observe is within a factor of 1.5 of the claim."""
+    window = 600.0
+    size = smallest_observable(window, WHITE)[term]
+    shares = []
+    for factor in (1.0 / 1.5, 1.5):
+        log = simulate(
+            {"noise": {"N": WHITE, term: factor * size}}, duration=14 * window, rate=10.0, seed=3
+        )
+        product = fit_noise(davar(log.load(), window="600s", step="600s"))
+        seen = product["observable"].sel(term=term) == OBSERVED
+        shares.append(float(seen.mean()))
+    assert shares[0] < 0.5 < shares[1]
+
+
+def _product(states: dict[str, int], vibration: list[float] | None = None):
+    """A product of three axes with steady coefficients, and a state of each term."""
+    product = synthetic.product()
+    product["observable"] = product["observable"].copy()
+    for term in LAWS:
+        product[term] = (product["window_mean"] * 0.0).fillna(0.0) + 1.0
+        product["observable"].loc[{"term": term}] = states.get(term, OBSERVED)
+    if vibration is not None:
+        product["vibration"] = ("time", np.resize(vibration, product.sizes["time"]))
+    return product.drop_vars(["temperature", "temperature_rate"], errors="ignore")
+
+
+def test_a_steady_product_is_called_steady():
+    steady, terms = judge_product(_product({}))
+    assert steady.startswith("N is steady: it varies by 0% on x, 0% on y, 0% on z")
+    assert terms.startswith("All five terms are observed")
+
+
+def test_a_change_names_its_channel_axis_and_size():
+    product = _product({}, vibration=[0.0, 8.0])
+    product["N"].loc[{"axis": "x"}] = np.resize([1.0, 5.0], product.sizes["time"])
+    assert judge_product(product)[0] == (
+        "N is larger by a factor of 5 on x while vibration is high."
+    )
+
+
+def test_a_term_that_one_state_hides_is_named():
+    product = _product({"B": UPPER_LIMIT_ONLY}, vibration=[0.0, 8.0])
+    product["observable"].loc[{"term": "B", "time": product["time"][::2]}] = OBSERVED
+    assert "B only while vibration is low" in judge_product(product)[1]
+
+
+def test_unobserved_terms_come_with_a_longer_window_or_a_longer_record():
+    product = _product({"B": UPPER_LIMIT_ONLY, "K": NOT_OBSERVABLE})
+    text = judge_product(product)[1]
+    assert text.startswith("B and K are not observed in windows of 6s: use --window ")
+    assert "only a longer record" in judge_product(product.isel(time=slice(0, 4)))[1]
+    assert "sampling rate" in judge_product(_product({"Q": UPPER_LIMIT_ONLY}))[1]
+
+
+def test_suggested_windows_fit_the_record():
+    lines = suggest_windows(86400.0, WHITE)
+    assert [line.split()[1].rstrip(":") for line in lines[1:-1]] == [
+        "1min",
+        "5min",
+        "20min",
+        "1h",
+        "4h",
+    ]
+    assert "--window 4h --step 24min" in lines[-1]
+    assert suggest_windows(100.0, WHITE) == []
+    assert suggest_windows(1e5, float("nan")) == []
