@@ -15,6 +15,7 @@ from gyrostab.diagnose.result.text import (
     chance_share,
     next_measurement,
     plain_name,
+    rejection_text,
     summary,
     without_chance,
 )
@@ -255,6 +256,10 @@ def _evidence_rows(content: Mapping[str, Any]) -> list[tuple[str, str, str, str]
 
 def _limit_rows(content: Mapping[str, Any]) -> list[dict[str, str]]:
     rows = []
+    rejected = {
+        one["name"]: rejection_text(one["beaten_by"], one["nats"])
+        for one in content.get("rejected", [])
+    }
     for name, entry in content["not_found"].items():
         unit = "" if entry["unit"] in (None, "1") else f" {entry['unit']}"
         limit = (
@@ -267,7 +272,15 @@ def _limit_rows(content: Mapping[str, Any]) -> list[dict[str, str]]:
                 "name": name,
                 "plain": plain_name(name),
                 "limit": limit,
-                "reason": _REASON_TEXT.get(entry["reason"], entry["reason"]),
+                "reason": "; ".join(
+                    filter(
+                        None,
+                        (
+                            _REASON_TEXT.get(entry["reason"], entry["reason"]),
+                            rejected.get(name, ""),
+                        ),
+                    )
+                ),
             }
         )
     return sorted(rows, key=lambda row: (row["limit"] == "–", row["name"]))

@@ -145,6 +145,10 @@ def content() -> dict[str, Any]:
         "mismatches": mismatches,
         "effects": effects,
         "unexplained": [],
+        "rejected": [
+            {"name": "shupe", "axes": ["x"], "beaten_by": "vibration_rectification", "nats": 4.25},
+            {"name": "spectral_line", "axes": ["y"], "beaten_by": "noise", "nats": 6.0},
+        ],
         "unused_channels": [{"name": "humidity",
         "reason": "no effect follows a channel of this name"}],
         "not_found": {

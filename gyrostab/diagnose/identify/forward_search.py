@@ -90,7 +90,7 @@ def name_effects(
         tuple(expected),
         settings,
     )
-    identified, unidentified, state = search.run(start)
+    identified, unidentified, rejected, state = search.run(start)
     return Identifications(
         tuple(identified),
         tuple(unidentified),
@@ -102,6 +102,7 @@ def name_effects(
         folds,
         count_evidence,
         tuple(expected),
+        tuple(rejected),
     )
 
 

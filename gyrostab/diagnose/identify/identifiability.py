@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,9 +12,9 @@ import numpy as np
 from gyrostab.diagnose.evidence.telegraph import telegraph_evidence
 from gyrostab.diagnose.identify.effect_candidates import largest_size
 from gyrostab.diagnose.identify.identification import Identification, Unidentified, components_of
-from gyrostab.diagnose.identify.jumps import is_lasting, is_sudden, lead_to_levels
-from gyrostab.diagnose.identify.logger_filters import fits_all_axes
-from gyrostab.diagnose.identify.steady import is_always_present
+from gyrostab.diagnose.identify.jumps import event_nats, gradual_nats, scatter_nats
+from gyrostab.diagnose.identify.logger_filters import separate_axes_nats
+from gyrostab.diagnose.identify.steady import intermittent_nats
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.reduce.block_statistics import measured
@@ -25,6 +26,7 @@ from gyrostab.physics.registry import effects
 __all__ = [
     "EQUIVALENTS",
     "OBSERVATIONALLY_EQUIVALENT",
+    "find_better_form",
     "find_equivalent_effects",
     "find_plainer_effect",
     "is_physical",
@@ -75,22 +77,46 @@ def without_pulses(
 def is_physical(
     components: Sequence[Component], state: State, *, error: float = 0.0
 ) -> list[Component]:
-    """Return the components of an effect whose sizes are possible.
+    """Return the components of an effect that no other form explains better, of possible sizes.
 
     Without an effect on an axis, chance may fit an impossible size. `error` is what errors of the
     form of all other effects may leave to this one [nats].
     """
-    whole = (
-        fits_all_axes(components, state)
-        and is_sudden(components, state, error=error)
-        and is_lasting(components, state)
-        and lead_to_levels(components, state)
+    if _find_other_course(components, state, error):
+        return []
+    return [component for component in components if not _find_other_form(component, state)]
+
+
+def find_better_form(
+    components: Sequence[Component], state: State, *, error: float = 0.0
+) -> tuple[str, float] | None:
+    """Return the form that excludes an effect, and by how much it explains more [nats].
+
+    NaN for sizes that physics excludes; None where some component is left.
+
+    Parameters
+    ----------
+    components : sequence of Component
+        Components of the effect, the strongest first.
+    state, error : State, float
+        As for `is_physical`.
+    """
+    other = _find_other_course(components, state, error)
+    forms = [_find_other_form(component, state) for component in components] if not other else []
+    return other or (forms[0] if forms and all(forms) else None)
+
+
+def _find_other_course(
+    components: Sequence[Component], state: State, error: float
+) -> tuple[str, float] | None:
+    """Return another course on all axes that explains more, and by how much [nats]."""
+    forms: tuple[tuple[str, Callable[[], float]], ...] = (
+        ("a filter on each axis", lambda: separate_axes_nats(components, state)),
+        ("a gradual change", lambda: gradual_nats(components, state, error=error)),
+        ("an event that ends", lambda: event_nats(components, state)),
+        ("means that scatter for a while", lambda: scatter_nats(components, state)),
     )
-    return (
-        [component for component in components if _is_component_physical(component, state)]
-        if whole
-        else []
-    )
+    return next(((name, nats) for name, find in forms if (nats := find())), None)
 
 
 def find_plainer_effect(components: Sequence[Component], state: State) -> str | None:
@@ -124,7 +150,19 @@ def _rotation_share(component: Component, state: State) -> float:
     return abs(component_size(component, state)[0])
 
 
-def _is_component_physical(component: Component, state: State) -> bool:
+def _find_other_form(component: Component, state: State) -> tuple[str, float] | None:
+    """Return what excludes a component, and by how much it explains more [nats]."""
+    if not _is_possible(component, state):
+        return "an impossible size", math.nan
+    forms: tuple[tuple[str, Callable[[Component, State], float]], ...] = (
+        ("more than two levels", _further_level_nats),
+        ("an effect in a part of the record", intermittent_nats),
+    )
+    return next(((name, nats) for name, find in forms if (nats := find(component, state))), None)
+
+
+def _is_possible(component: Component, state: State) -> bool:
+    """Return whether physics allows the size of a component, and its cause is present."""
     from gyrostab.diagnose.predict.sizes import component_mixture, component_size
 
     effect, statistic = component.candidate.effect, component.statistic
@@ -151,10 +189,6 @@ def _is_component_physical(component: Component, state: State) -> bool:
     if statistic.is_linear_in_means and not _is_in_range(component, state):
         return False
     if statistic.is_power and not _is_above_least(component, state):
-        return False
-    if statistic.is_switching and _has_more_levels(component, state):
-        return False
-    if not is_always_present(component, state):
         return False
     return not (
         component.variant.squared
@@ -197,20 +231,26 @@ def _is_above_least(component: Component, state: State) -> bool:
     return size >= least - state.settings.clear_sigma * error
 
 
-def _has_more_levels(component: Component, state: State) -> bool:
-    """Return whether the bias still switches with two levels in the model: it has three or more."""
+def _further_level_nats(component: Component, state: State) -> float:
+    """Return the evidence that the bias still switches with two levels in the model [nats].
+
+    Zero unless it is clear. The bias then has three levels or more.
+    """
+    if not component.statistic.is_switching:
+        return 0.0
     axis, settings = component.row[0], state.settings
     allowed = settings.ambiguous_nats + settings.form_error_share * component.evidence_nats
     if component.variant.inside.size:
         within = fast_switching_evidence(state.blocks, add_fast_switching(state, component), axis)
-        return within is not None and within.evidence_nats > allowed
+        nats = within.evidence_nats if within is not None else 0.0
+        return nats if nats > allowed else 0.0
     given = np.stack(
         [*state.given.get(("mean", axis), []), component.variant.design[0, 0]], axis=-1
     )
     evidence_nats, _ = telegraph_evidence(
         state.blocks, state.baseline, axis=axis, given=given, settings=settings
     )
-    return bool(evidence_nats[0] > allowed)
+    return float(evidence_nats[0]) if evidence_nats[0] > allowed else 0.0
 
 
 def _is_moving(axis: str, state: State) -> bool:

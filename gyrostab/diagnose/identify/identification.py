@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -19,6 +20,7 @@ from gyrostab.diagnose.settings import DEFAULTS, Settings
 __all__ = [
     "Identification",
     "Identifications",
+    "Rejection",
     "Unidentified",
     "add_identification",
     "components_of",
@@ -54,6 +56,8 @@ class Identification:
     surrogate_p : float
         Share of the time-shifted surrogates of its channel that explain as much; NaN without
         channel.
+    instead : mapping of str to float
+        Key of each candidate that could take its place -> evidence there [nats].
     """
 
     effect: str
@@ -64,6 +68,7 @@ class Identification:
     threshold: float
     alternatives: tuple[str, ...] = ()
     surrogate_p: float = math.nan
+    instead: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -80,6 +85,8 @@ class Unidentified:
         Evidence that it needed [nats].
     candidates : tuple of str
         Effects that come nearest, or whose channel is missing.
+    instead : mapping of str to float
+        As for an `Identification`.
     """
 
     generic: str
@@ -88,6 +95,27 @@ class Unidentified:
     threshold: float
     candidates: tuple[str, ...] = ()
     components: tuple[Component, ...] = ()
+    instead: Mapping[str, float] = field(default_factory=dict)
+
+
+class Rejection(NamedTuple):
+    """An effect that was examined and not named.
+
+    Attributes
+    ----------
+    effect : str
+        Name in the registry.
+    beaten_by : str
+        What explains more: an effect, "noise", or another form in words.
+    nats : float
+        By how much it explains more; NaN where physics excludes the effect. Below zero, an order
+        decides: anomalous samples and real motion come before their consequences.
+    """
+
+    effect: str
+    axes: tuple[str, ...]
+    beaten_by: str
+    nats: float
 
 
 @dataclass(frozen=True)
@@ -114,6 +142,8 @@ class Identifications:
     expected : tuple of Identification
         Effects that the simulation contains as well, with size and time from the recording; they
         are in `state` too.
+    rejected : tuple of Rejection
+        What beats each effect that was examined and not identified.
     """
 
     identified: tuple[Identification, ...]
@@ -126,6 +156,7 @@ class Identifications:
     folds: xr.DataArray
     count_evidence: CountEvidence = field(default_factory=lambda: CountEvidence({}))
     expected: tuple[Identification, ...] = ()
+    rejected: tuple[Rejection, ...] = ()
 
     @property
     def verdict(self) -> str:

@@ -12,7 +12,7 @@ from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import Mixture, component_mixture, mean_mixture
 
-__all__ = ["is_free_jump", "is_lasting", "is_sudden", "lead_to_levels"]
+__all__ = ["event_nats", "gradual_nats", "is_free_jump", "scatter_nats"]
 
 Array = NDArray[np.float64]
 _JUMP, _INSTANT = "bias_jump", "at"
@@ -35,11 +35,11 @@ def is_free_jump(component: Component, state: State) -> bool:
     return not np.isclose(ends, float(component.variant.values[_INSTANT])).any()
 
 
-def is_sudden(components: Sequence[Component], state: State, *, error: float = 0.0) -> bool:
-    """Return whether jumps are steps rather than gradual changes over some blocks.
+def gradual_nats(components: Sequence[Component], state: State, *, error: float = 0.0) -> float:
+    """Return by how much a gradual change explains more than jumps [nats], 0 unless clearly.
 
-    They are not if a straight transition over four or eight blocks about the same instant explains
-    more on all axes together.
+    A straight transition over four or eight blocks about the same instant competes on all axes
+    together.
 
     Parameters
     ----------
@@ -50,21 +50,20 @@ def is_sudden(components: Sequence[Component], state: State, *, error: float = 0
     """
     jumps = [component for component in components if is_free_jump(component, state)]
     if not jumps:
-        return True
+        return 0.0
     step = sum(_transition_evidence(component, state, 0) for component in jumps)
     gradual = max(
         sum(_transition_evidence(component, state, length) for component in jumps)
         for length in _TRANSITION_BLOCKS
     )
-    return gradual - step <= error + _allowed_nats(jumps, state)
+    return gradual - step if gradual - step > error + _allowed_nats(jumps, state) else 0.0
 
 
-def is_lasting(components: Sequence[Component], state: State) -> bool:
-    """Return whether the means stay at another level after jumps.
+def event_nats(components: Sequence[Component], state: State) -> float:
+    """Return by how much an event that ends explains more than jumps [nats], 0 unless clearly.
 
-    An event that lasts for two blocks to a tenth of the record, before or after the instant, and
-    explains more on all axes than a lasting level, ends again. It is two jumps if the level after
-    it differs from that before.
+    It lasts for two blocks to a tenth of the record, before or after the instant, on all axes. It
+    is two jumps if the level after it differs from that before.
 
     Parameters
     ----------
@@ -73,11 +72,11 @@ def is_lasting(components: Sequence[Component], state: State) -> bool:
     """
     jumps = [component for component in components if is_free_jump(component, state)]
     if not jumps:
-        return True
+        return 0.0
     step = sum(_transition_evidence(component, state, 0) for component in jumps)
     spans = _event_spans(jumps[0], state)
     if not spans:
-        return True
+        return 0.0
     events = [
         sum(
             float(np.logaddexp.reduce(_fit_event(component, state, span)[0].log_weight))
@@ -87,12 +86,13 @@ def is_lasting(components: Sequence[Component], state: State) -> bool:
     ]
     best = int(np.argmax(events))
     if events[best] - step <= np.log(len(spans)) + _allowed_nats(jumps, state):
-        return True
-    return any(_is_other_level(component, state, spans[best]) for component in jumps)
+        return 0.0
+    is_other_level = any(_is_other_level(component, state, spans[best]) for component in jumps)
+    return 0.0 if is_other_level else events[best] - step
 
 
-def lead_to_levels(components: Sequence[Component], state: State) -> bool:
-    """Return whether jumps lead to levels, rather than being extremes of noisy means.
+def scatter_nats(components: Sequence[Component], state: State) -> float:
+    """Return by how much noisy means explain more than jumps to levels [nats], 0 unless clearly.
 
     Waves slower than a block make the means scatter, and any two such neighbours look like a jump.
     Therefore jumps must keep their evidence, but for 3 nats of chance, when the white noise of the
@@ -104,11 +104,8 @@ def lead_to_levels(components: Sequence[Component], state: State) -> bool:
         With all other effects in the model.
     """
     jumps = [component for component in components if is_free_jump(component, state)]
-    return (
-        not jumps
-        or sum(_evidence_in_scatter(component, state) for component in jumps)
-        > -state.settings.ambiguous_nats
-    )
+    scatter = -sum(_evidence_in_scatter(component, state) for component in jumps)
+    return scatter if scatter >= state.settings.ambiguous_nats else 0.0
 
 
 def _allowed_nats(jumps: Sequence[Component], state: State) -> float:

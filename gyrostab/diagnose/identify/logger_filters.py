@@ -22,7 +22,7 @@ from gyrostab.diagnose.settings import INTERVAL_TAILS
 from gyrostab.noise import NORMAL_95
 from gyrostab.physics.registry import effects
 
-__all__ = ["fit_filter_sizes", "fits_all_axes", "without_slopes"]
+__all__ = ["fit_filter_sizes", "separate_axes_nats", "without_slopes"]
 
 Array = NDArray[np.float64]
 ZOOM_POINTS, ZOOM_STEPS = 21, 4  # of the refinement of a cutoff on its grid
@@ -58,23 +58,24 @@ def without_slopes(
     ]
 
 
-def fits_all_axes(components: Sequence[Component], state: State) -> bool:
-    """Return whether one filter fits all axes.
+def separate_axes_nats(components: Sequence[Component], state: State) -> float:
+    """Return by how much a filter for each axis explains more than one for all [nats].
 
-    They pass the same logger, which takes the same share of the noise of each. The share of the
-    strongest component is fitted on every axis, and once for all of them.
+    Zero unless it does so clearly. All axes pass the same logger, which takes the same share of the
+    noise of each. The share of the strongest component is fitted on every axis, and once for all of
+    them.
     """
     shown = [component for component in components if component.is_filter]
     if not shown:
-        return True
+        return 0.0
     first = max(shown, key=lambda component: component.evidence_nats)
     share, error = np.array(
         [component_size(replace(first, row=(axis,)), state) for axis in state.axes]
     ).T
     evidence = sum(max(component.evidence_nats, 0.0) for component in shown)
-    return disagreement_nats(share, error**-2.0) <= (
-        state.settings.reject_nats + state.settings.spectrum_error_share * evidence
-    )
+    nats = disagreement_nats(share, error**-2.0)
+    most = state.settings.reject_nats + state.settings.spectrum_error_share * evidence
+    return nats if nats > most else 0.0
 
 
 def _candidates_of(

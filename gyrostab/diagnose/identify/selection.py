@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,6 +34,7 @@ from gyrostab.diagnose.identify.identifiability import (
 )
 from gyrostab.diagnose.identify.identification import (
     Identification,
+    Rejection,
     Unidentified,
     add_identification,
     components_of,
@@ -42,6 +43,7 @@ from gyrostab.diagnose.identify.identification import (
     with_axes_of,
 )
 from gyrostab.diagnose.identify.logger_filters import without_slopes
+from gyrostab.diagnose.identify.rejected import find_rejections
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.identify.switching import (
     drop_explained_jumps,
@@ -94,7 +96,9 @@ class Search:
     expected: tuple[Identification, ...] = ()
     settings: Settings = DEFAULTS
 
-    def run(self, start: State) -> tuple[list[Identification], list[Unidentified], State]:
+    def run(
+        self, start: State
+    ) -> tuple[list[Identification], list[Unidentified], list[Rejection], State]:
         """Select effects until none passes, then test each again with the others.
 
         Parameters
@@ -107,12 +111,14 @@ class Search:
         identified : list of Identification
             The strongest first.
         unidentified : list of Unidentified
+        rejected : list of Rejection
+            What beats each of the other effects.
         state : State
             With all of these in the model.
         """
-        chosen = self._select_all(start)
+        selected, found = self._select_all(start)
         chosen = drop_explained_jumps(
-            chosen, lambda some: self._condition(start, some), self._evidence, self.threshold
+            selected, lambda some: self._condition(start, some), self._evidence, self.threshold
         )
         chosen = self._prune(start, without_pulses(chosen, settings=self.settings))
         chosen, identified = self._settle(start, chosen)
@@ -122,10 +128,18 @@ class Search:
         unidentified += withdrawn
         if len(kept) < len(identified) or withdrawn:
             state = self._condition(start, [*kept, *unidentified])
-        return sorted(kept, key=lambda one: -one.evidence_nats), unidentified, state
+        kept = sorted(kept, key=lambda one: -one.evidence_nats)
+        is_unchanged = _variants_by_row(selected) == _variants_by_row([*kept, *unidentified])
+        rejected = self._reject_others(
+            start, kept, unidentified, state, found if is_unchanged else ()
+        )
+        return kept, unidentified, rejected, state
 
-    def _select_all(self, start: State) -> list[Selection]:
-        """Select the best candidate, put it into the model, and repeat while one passes."""
+    def _select_all(self, start: State) -> tuple[list[Selection], list[CandidateEvidence]]:
+        """Select the best candidate, put it into the model, and repeat while one passes.
+
+        The second result is the evidence of the others, with all of these in the model.
+        """
         chosen: list[Selection] = []
         state = before = start
         barred = {
@@ -140,7 +154,7 @@ class Search:
             found, before = self._score_candidates(state, barred, known), state
             selected = self._select_next(found, state, chosen)
             if selected is None:
-                break
+                return chosen, found
             selection, rejected = selected
             barred |= rejected
             if selection is not None and are_lines(selection.components):
@@ -151,7 +165,7 @@ class Search:
                 chosen = add_identification(chosen, selection)
                 barred |= self._explained_count_keys(selection)
                 state = condition_on(state, list(selection.components))
-        return chosen
+        return chosen, []
 
     def _explained_count_keys(self, selection: Selection) -> set[str]:
         """Return the keys of candidates for sample counts that a selection explains.
@@ -241,8 +255,8 @@ class Search:
         rivals = self._order_rivals(passing, components, state)
         rejected: set[str] = set()
         for key in rivals:
-            passed, p_value = passes_time_shift_test(components[key], state, self.folds)
-            if passed:
+            shifts = passes_time_shift_test(components[key], state, self.folds)
+            if shifts.passed:
                 least = sum_evidence(components[key]) - self.settings.ambiguous_nats
                 close = [
                     components[other][0].candidate.effect
@@ -251,7 +265,9 @@ class Search:
                     and other not in rejected
                     and sum_evidence(components[other]) >= least
                 ]
-                return self._identify(components[key], required[key], close, p_value), rejected
+                return self._identify(
+                    components[key], required[key], close, shifts.p_value
+                ), rejected
             rejected.add(key)
         if rejected:
             return None, rejected
@@ -446,20 +462,8 @@ class Search:
     ) -> Identification:
         """Return an identification with its evidence and its rivals, all others in the model."""
         state = self._condition(start, chosen, identification)
-        weight = condition_on(state, list(identification.components)).weight
-        weighted = replace(state, weight=weight)
-        statistics = {component.statistic for component in identification.components}
-        near = [one for one in self.candidates if one.statistic in statistics]
-        axes, key = set(identification.axes), identification.components[0].candidate.key
-        on_axes = {
-            other: [component for component in components if set(component.row) & axes]
-            for other, components in group_components(
-                compute_evidence(
-                    near, state.blocks, weighted, self.folds, count_evidence=self.count_evidence
-                ),
-                settings=self.settings,
-            ).items()
-        }
+        key = identification.components[0].candidate.key
+        on_axes, weighted = self._find_instead(identification, state)
         again = find_layers_again(
             identification.components, on_axes.get(key, []), weighted, self._evidence
         )
@@ -496,6 +500,63 @@ class Search:
             evidence_nats=evidence_nats,
             alternatives=tuple(alternatives),
             components=components,
+            instead=_sum_by_key(on_axes),
+        )
+
+    def _find_instead(
+        self, selection: Selection, state: State
+    ) -> tuple[dict[str, list[Component]], State]:
+        """Return the components of candidates that could take the place of a selection.
+
+        They are in its statistics and on its axes. `state` has all others in the model; it is
+        returned with the weights that it has with the selection.
+        """
+        weighted = replace(state, weight=condition_on(state, list(selection.components)).weight)
+        statistics = {component.statistic for component in selection.components}
+        near = [one for one in self.candidates if one.statistic in statistics]
+        axes = set(selection.axes)
+        found = group_components(self._evidence(near, weighted), settings=self.settings)
+        return {
+            key: [component for component in components if set(component.row) & axes]
+            for key, components in found.items()
+        }, weighted
+
+    def _reject_others(
+        self,
+        start: State,
+        identified: Sequence[Identification],
+        unidentified: Sequence[Unidentified],
+        state: State,
+        known: Sequence[CandidateEvidence],
+    ) -> list[Rejection]:
+        """Return what beats each effect that is not among the identified.
+
+        `state` has all of them in the model, and `known` is evidence in it.
+        """
+        chosen: list[Selection] = [
+            *identified,
+            *(
+                replace(
+                    one,
+                    instead=_sum_by_key(
+                        self._find_instead(
+                            one, self._condition(start, [*identified, *unidentified], one)
+                        )[0]
+                    ),
+                )
+                if one.components
+                else one
+                for one in unidentified
+            ),
+        ]
+        found = self._score_candidates(state, set(), known)
+        return find_rejections(
+            merge_lines(group_components(found, settings=self.settings)),
+            chosen,
+            self.expected,
+            self.threshold,
+            state,
+            self.folds,
         )
 
     def _withdraw_incomplete(
@@ -579,6 +640,18 @@ class Search:
         ]
         names = [one.effect for one in weak]
         return [find_unidentified("~N(t)", components, self.threshold, names)] if components else []
+
+
+def _variants_by_row(chosen: Sequence[Selection]) -> set[tuple[str, tuple[str, ...], int]]:
+    """Return what the selections put into the model: rows and identities of the variants."""
+    return {
+        (component.candidate.key, component.row, id(component.variant))
+        for component in components_of(chosen)
+    }
+
+
+def _sum_by_key(components: Mapping[str, Sequence[Component]]) -> dict[str, float]:
+    return {key: sum_evidence(several) for key, several in components.items() if several}
 
 
 def _positive_evidence(found: CandidateEvidence) -> float:

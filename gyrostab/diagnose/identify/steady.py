@@ -13,16 +13,17 @@ from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture, disagreement_nats
 from gyrostab.diagnose.reduce.accumulate import RECORD_PARTS
 
-__all__ = ["is_always_present"]
+__all__ = ["intermittent_nats"]
 
 _STEADY = ("gauss_markov", "telegraph", "logger_filter")
 
 
-def is_always_present(component: Component, state: State) -> bool:
-    """Return whether a steady component has the same size in all eighths of a record.
+def intermittent_nats(component: Component, state: State) -> float:
+    """Return by how much other sizes in the eighths of a record explain more than one [nats].
 
-    Noise that is present only while the tool rotates has a broad spectrum too, but is neither a
-    filter nor a wandering bias. True for effects that may be intermittent.
+    Zero unless they do so clearly, and for effects that may be intermittent. Noise that is present
+    only while the tool rotates has a broad spectrum too, but is neither a filter nor a wandering
+    bias.
 
     Parameters
     ----------
@@ -30,7 +31,7 @@ def is_always_present(component: Component, state: State) -> bool:
         With all other effects in the model.
     """
     if component.candidate.effect not in _STEADY or not component.statistic.is_power:
-        return True
+        return 0.0
     state = replace(state, weight=condition_on(state, [component]).weight)
     size, error = np.array(
         [
@@ -40,10 +41,11 @@ def is_always_present(component: Component, state: State) -> bool:
     ).T
     weight = np.where(np.isfinite(size) & np.isfinite(error) & (error > 0.0), error, np.inf) ** -2.0
     size = np.where(weight > 0.0, size, 0.0)
-    return disagreement_nats(size, weight) <= (
-        state.settings.disagreement_nats
-        + state.settings.spectrum_error_share * max(component.evidence_nats, 0.0)
+    nats = disagreement_nats(size, weight)
+    most = state.settings.disagreement_nats + state.settings.spectrum_error_share * max(
+        component.evidence_nats, 0.0
     )
+    return nats if nats > most else 0.0
 
 
 def _fit_part(component: Component, state: State, inside: NDArray[np.int64]) -> tuple[float, float]:

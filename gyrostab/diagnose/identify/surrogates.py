@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -15,7 +15,7 @@ from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.predict.windows import rebuild_variant
 
-__all__ = ["TIME_SHIFTS", "passes_time_shift_test"]
+__all__ = ["TIME_SHIFTS", "TimeShifts", "passes_time_shift_test"]
 
 #: Number of time-shifted surrogates: two of them make the allowed share of 1 %.
 TIME_SHIFTS = 200
@@ -23,10 +23,29 @@ SHIFT_RANGE = (0.05, 0.95)  # of the record
 _FOLLOWING_AXES = ("misalignment",)  # effects that follow the means of other axes
 
 
+class TimeShifts(NamedTuple):
+    """Result of the time-shift test.
+
+    Attributes
+    ----------
+    passed : bool
+        Also true where no surrogate can be made.
+    p_value : float
+        Share of the surrogates that explain as much; NaN where too few of them differ from the
+        channel.
+    nats : float
+        By how much the best of them explains more than the channel [nats]; NaN as above.
+    """
+
+    passed: bool
+    p_value: float = np.nan
+    nats: float = np.nan
+
+
 def passes_time_shift_test(
     components: Sequence[Component], state: State, folds: xr.DataArray
-) -> tuple[bool, float]:
-    """Return whether an effect explains more than time-shifted surrogates of its channel.
+) -> TimeShifts:
+    """Test whether an effect explains more than time-shifted surrogates of its channel.
 
     Parameters
     ----------
@@ -34,18 +53,10 @@ def passes_time_shift_test(
         Components of the effect.
     state : State
         What is in the model without it.
-
-    Returns
-    -------
-    passed : bool
-        Also true where no surrogate can be made.
-    p_value : float
-        Share of the surrogates that explained as much; NaN where too few of them differ from the
-        channel.
     """
     own = [component for component in components if _follows_channel(component, state)]
     if not own:
-        return True, np.nan
+        return TimeShifts(True)
     block_count = state.blocks.sizes["block"]
     shifts = np.unique(
         np.linspace(block_count * SHIFT_RANGE[0], block_count * SHIFT_RANGE[1], TIME_SHIFTS).astype(
@@ -78,9 +89,10 @@ def passes_time_shift_test(
         real += float(values[0])
         shifted += values[1:]
     if valid.sum() < state.settings.min_surrogates:
-        return True, np.nan
+        return TimeShifts(True)
     p_value = float(np.mean(shifted[valid] >= real))
-    return p_value <= state.settings.surrogate_share, p_value
+    passed = p_value <= state.settings.surrogate_share
+    return TimeShifts(passed, p_value, float(shifted[valid].max() - real))
 
 
 def _follows_channel(component: Component, state: State) -> bool:

@@ -142,6 +142,15 @@ class NotFound(_Table):
     reason: str
 
 
+class Rejected(_Table):
+    """An effect that was examined and not named."""
+
+    name: str
+    axes: list[str]
+    beaten_by: str
+    nats: float | None
+
+
 class UnusedChannel(_Table):
     """A channel that was not used."""
 
@@ -175,6 +184,7 @@ class Content(_Table):
     effects: list[NamedEffect]
     unexplained: list[int]
     not_found: dict[str, NotFound]
+    rejected: list[Rejected] = []
     unused_channels: list[UnusedChannel] = []
     held_out: HeldOut
     seconds: float

@@ -39,6 +39,7 @@ from gyrostab.diagnose.result.tables import (
     mismatch_tables,
     model_tables,
     recording_table,
+    rejected_tables,
     surfaces_with_blocks,
 )
 from gyrostab.diagnose.result.verdict import decide_verdict
@@ -93,6 +94,7 @@ def finish_diagnosis(task: Task, comparison: Comparison, started: float) -> Diag
         "effects": effect_tables(fit.fitted, blocks, settings=task.settings),
         "unexplained": unexplained,
         "not_found": limit_tables(find_upper_limits(fit.identifications)),
+        "rejected": rejected_tables(fit.identifications),
         "unused_channels": unused_channels(blocks, _used_channels(fit.identifications)),
         "held_out": {name: held[name] for name in HELD_OUT},
         "seconds": round(time.perf_counter() - started, 3),

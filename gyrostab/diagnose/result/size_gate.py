@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 from gyrostab.diagnose.estimate.joint_fit import Estimate, Fitted
 from gyrostab.diagnose.identify.components import sum_evidence
-from gyrostab.diagnose.identify.identification import Identification, Identifications, Unidentified
+from gyrostab.diagnose.identify.identification import (
+    Identification,
+    Identifications,
+    Rejection,
+    Unidentified,
+)
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.physics.registry import effects
 
@@ -62,6 +68,7 @@ def keep_supported(
     """
     identified: list[Identification] = []
     unknown: list[Unidentified] = []
+    rejected: list[Rejection] = []
     changed = False
     for identification, numbers in zip(identifications.identified, fitted, strict=True):
         good = {axis for one in numbers for axis in supported_axes(one)}
@@ -80,13 +87,19 @@ def keep_supported(
             )
         else:
             lost = identification.components
+            rejected.append(
+                Rejection(identification.effect, identification.axes, "a size of zero", math.nan)
+            )
         if sum_evidence(lost) > identification.threshold:
             unknown.append(_make_unidentified(identification, lost))
         changed = True
     if not changed:
         return identifications
     return replace(
-        identifications, identified=tuple(identified), unknown=(*identifications.unknown, *unknown)
+        identifications,
+        identified=tuple(identified),
+        unknown=(*identifications.unknown, *unknown),
+        rejected=(*identifications.rejected, *rejected),
     )
 
 

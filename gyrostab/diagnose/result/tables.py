@@ -45,6 +45,7 @@ __all__ = [
     "model_tables",
     "motion_mismatches",
     "recording_table",
+    "rejected_tables",
     "surfaces_with_blocks",
     "unidentified_mismatches",
 ]
@@ -365,6 +366,16 @@ def limit_tables(found: Mapping[str, UpperLimit]) -> dict[str, Any]:
         name: {"upper_limit": one.upper_limit, "unit": one.unit, "reason": one.reason}
         for name, one in found.items()
     }
+
+
+def rejected_tables(identifications: Identifications) -> list[dict[str, Any]]:
+    """Return what beats each effect that was examined and not named, the closest first."""
+    named = {one.effect for one in identifications.identified}
+    return [
+        {"name": one.effect, "axes": list(one.axes), "beaten_by": one.beaten_by, "nats": one.nats}
+        for one in sorted(identifications.rejected, key=lambda one: (one.nats, one.effect))
+        if one.effect not in named
+    ]
 
 
 def model_tables(

@@ -23,6 +23,7 @@ __all__ = [
     "named_statement",
     "next_measurement",
     "plain_name",
+    "rejection_text",
     "span_text",
     "summary",
     "unsized_statement",
@@ -248,6 +249,27 @@ def effect_statement(
         names = ", or ".join(plain_name(name) for name in alternatives)
         sentences.append(f"This record cannot distinguish it from {names}.")
     return " ".join(sentences)
+
+
+def rejection_text(beaten_by: str, nats: float | None) -> str:
+    """Say what beats an effect that was examined and not named, and by how much.
+
+    Examples
+    --------
+    >>> rejection_text("supply_bias", 12.34)
+    'a bias that follows supply voltage or light power explains 12.3 nats more'
+    >>> rejection_text("noise", 5.0), rejection_text("an impossible size", None)
+    ('5.0 nats short of the evidence that noise cannot have', 'it would need an impossible size')
+    """
+    if beaten_by == "noise":
+        short = "nats short of the evidence that noise cannot have"
+        return "" if nats is None else f"{nats:.1f} {short}"
+    if nats is None:
+        return f"it would need {beaten_by}"
+    other = plain_name(beaten_by) if beaten_by in effects() else beaten_by
+    if nats < 0.0:
+        return f"{other} comes first, although it explains {-nats:.1f} nats less"
+    return f"{other} explains {nats:.1f} nats more"
 
 
 def next_measurement(name: str, alternatives: Sequence[str]) -> str:

@@ -196,7 +196,7 @@ def test_leak_must_exceed_time_shifted_surrogates(leak: float) -> None:
     )
     one = candidate(state, "misalignment", "mean")
     variant = next(each for each in one.variants if each.columns == ("y",))
-    beats, p_value = passes_time_shift_test(
+    beats, p_value, _ = passes_time_shift_test(
         [Component(one, variant, ("x",), 20.0)], state, fold_blocks(state.blocks)
     )
     assert np.isfinite(p_value)

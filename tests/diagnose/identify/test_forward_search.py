@@ -59,6 +59,17 @@ def test_vibration_noise_is_identified_on_its_axis(shaken):
     assert shaken.verdict == "explained"
 
 
+def test_every_other_effect_is_rejected_for_a_competitor(shaken):
+    rejected = {one.effect: one for one in shaken.rejected}
+    assert "vibration_noise" not in rejected
+    noise = rejected["temperature_bias"]
+    assert noise.beaten_by == "noise"
+    assert 0.0 < noise.nats < shaken.threshold + 2.0
+    # the same noise, of vibration beyond half the sampling rate: its alternative, of equal evidence
+    assert rejected["aliased_vibration"].beaten_by == "vibration_noise"
+    assert abs(rejected["aliased_vibration"].nats) < 3.0
+
+
 def test_chance_on_another_axis_does_not_veto_an_effect(shaken, monkeypatch):
     """Only the component of negative size, on an axis without the effect, is dropped."""
     state, (identification,) = shaken.state, shaken.identified
@@ -157,7 +168,7 @@ def test_two_effects_are_both_identified():
 def test_time_shifted_channels_explain_less(shaken):
     (identification,) = shaken.identified
     start = replace(shaken.state, given={})
-    beats, p_value = passes_time_shift_test(identification.components, start, shaken.folds)
+    beats, p_value, _ = passes_time_shift_test(identification.components, start, shaken.folds)
     assert beats
     assert p_value <= 0.01
     elsewhere = [replace(component, row=("z",)) for component in identification.components]

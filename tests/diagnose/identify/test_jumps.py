@@ -10,7 +10,7 @@ from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.components import group_components, sum_evidence
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identifiability import is_physical
-from gyrostab.diagnose.identify.jumps import is_free_jump, is_sudden
+from gyrostab.diagnose.identify.jumps import gradual_nats, is_free_jump
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
@@ -45,7 +45,7 @@ def test_gradual_change_is_not_a_jump(way: float, size: float, jump: bool) -> No
     assert sum_evidence(components) > 10.0
     assert abs(float(components[0].variant.values["at"]) - MIDDLE) <= 30.0
     assert all(is_free_jump(component, state) for component in components)
-    assert is_sudden(components, state) == jump
+    assert (gradual_nats(components, state) == 0.0) == jump
     assert bool(is_physical(components, state)) == jump
 
 
@@ -69,4 +69,7 @@ def test_jump_at_a_restart_may_settle() -> None:
         for instant in (960.0, 1010.0)
     }
     assert [is_free_jump(component, state) for component in components.values()] == [False, True]
-    assert [is_sudden([component], state) for component in components.values()] == [True, False]
+    assert [gradual_nats([component], state) > 0.0 for component in components.values()] == [
+        False,
+        True,
+    ]

@@ -12,7 +12,7 @@ from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.components import group_components, sum_evidence
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identifiability import is_physical
-from gyrostab.diagnose.identify.logger_filters import fit_filter_sizes, fits_all_axes
+from gyrostab.diagnose.identify.logger_filters import fit_filter_sizes, separate_axes_nats
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
@@ -47,7 +47,7 @@ def test_filter_must_fit_all_axes(late, one_filter):
         "logger_filter"
     ]
     assert sum_evidence(components) > 10.0
-    assert fits_all_axes(components, state) == one_filter
+    assert (separate_axes_nats(components, state) == 0.0) == one_filter
     assert is_physical(components, state) == (components if one_filter else [])
 
 

@@ -11,7 +11,7 @@ from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.components import group_components
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identifiability import is_physical
-from gyrostab.diagnose.identify.steady import is_always_present
+from gyrostab.diagnose.identify.steady import intermittent_nats
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
@@ -48,12 +48,12 @@ def _simulate_wander(size: float, share: float, seed: int) -> tuple[list[Compone
 def test_intermittent_wander_is_rejected(size: float, share: float, steady: bool) -> None:
     components, state = _simulate_wander(size / np.sqrt(share), share, seed=3)
     assert components[0].evidence_nats > 10.0
-    assert is_always_present(components[0], state) == steady
+    assert (intermittent_nats(components[0], state) == 0.0) == steady
     assert bool(is_physical(components, state)) == steady
 
 
 def test_chance_does_not_reject_steady_wander() -> None:
     assert all(
-        is_always_present(components[0], state)
+        intermittent_nats(components[0], state) == 0.0
         for components, state in (_simulate_wander(0.2, 1.0, seed) for seed in range(8))
     )

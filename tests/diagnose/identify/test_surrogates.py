@@ -50,12 +50,12 @@ def _run_time_shift_test(sensitivity: float, period: float) -> tuple[bool, float
 def test_periodic_channel_is_not_rejected_for_its_mirror_image():
     """Half a period later it is the same channel with the other sign, which a negative size follows
     as well."""
-    beats, p_value = _run_time_shift_test(0.02, 600.0)
+    beats, p_value, _ = _run_time_shift_test(0.02, 600.0)
     assert beats
     assert p_value == 0.0
 
 
 def test_unrelated_channel_fails():
-    beats, p_value = _run_time_shift_test(0.0, 1300.0)
+    beats, p_value, _ = _run_time_shift_test(0.0, 1300.0)
     assert not beats
     assert p_value > 0.01

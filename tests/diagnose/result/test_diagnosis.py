@@ -25,6 +25,7 @@ from gyrostab.diagnose.result.text import (
     mismatch_statement,
     next_measurement,
     plain_name,
+    rejection_text,
     summary,
     unsized_statement,
 )
@@ -95,7 +96,7 @@ def _places(value: Any, place: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 @pytest.mark.parametrize("place", _places(content()), ids=lambda place: ".".join(map(str, place)))
 def test_missing_keys_and_wrong_types_are_errors(place: tuple[Any, ...]):
-    optional = place == ("unused_channels",)  # files of earlier versions have none
+    optional = place in (("unused_channels",), ("rejected",))  # files of earlier versions have none
     for spoil in ("other kind",) if optional else ("leave out", "other kind"):
         spoiled = content()
         table: Any = spoiled
@@ -176,6 +177,27 @@ def test_models_are_valid_toml_with_the_same_numbers(noise: dict[str, float], ax
     }
     assert tomllib.loads(model_text(tables, heading="made\nby hand")) == tables
     assert "environment" not in model_text({**tables, "environment": []})
+
+
+@plain_pages
+def test_page_says_why_other_effects_were_not_named(tmp_path: Path):
+    page = write_diagnosis_report(diagnosis(), tmp_path / "d.html").read_text(encoding="utf-8")
+    assert "Why not?" in page
+    assert "(vibration rectification) explains 4.2 nats more" in page
+    assert "looked for, not seen; 6.0 nats short of the evidence that noise cannot have" in page
+
+
+@pytest.mark.parametrize(
+    ("beaten_by", "nats", "text"),
+    [
+        ("noise", None, ""),
+        ("an impossible size", None, "it would need an impossible size"),
+        ("an event that ends", 5.0, "an event that ends explains 5.0 nats more"),
+        ("spikes", -5.0, "comes first, although it explains 5.0 nats less"),
+    ],
+)
+def test_rejection_names_the_competitor(beaten_by: str, nats: float | None, text: str):
+    assert rejection_text(beaten_by, nats).endswith(text)
 
 
 @plain_pages

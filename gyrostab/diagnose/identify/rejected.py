@@ -1,0 +1,113 @@
+"""Say for each effect that was examined and not named what explains the record better."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import xarray as xr
+
+from gyrostab.diagnose.identify.components import axes_of, sum_evidence
+from gyrostab.diagnose.identify.identifiability import find_better_form
+from gyrostab.diagnose.identify.identification import (
+    Identification,
+    Rejection,
+    Unidentified,
+    form_error,
+)
+from gyrostab.diagnose.identify.nuisance_alternatives import NUISANCE_ALTERNATIVES
+from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
+from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.linear_model import State
+
+__all__ = ["find_rejections"]
+
+_NOISE = "noise"
+
+
+def find_rejections(
+    components: Mapping[str, Sequence[Component]],
+    chosen: Sequence[Identification | Unidentified],
+    expected: Sequence[Identification],
+    threshold: float,
+    state: State,
+    folds: xr.DataArray,
+) -> list[Rejection]:
+    """Return for each effect that was not named what beats it, and by how much.
+
+    The noise beats an effect that lacks evidence both with all selections in the model and in
+    place of any of them. A selection beats it if the effect has enough evidence in its place;
+    among several, it is the one in whose place the evidence is largest. If the effect has enough
+    evidence although all selections are in the model, another form of it or a time-shifted channel
+    beats it.
+
+    Parameters
+    ----------
+    components : mapping of str to sequence of Component
+        Components of every candidate by its key, with all selections in the model.
+    chosen : sequence of Identification or Unidentified
+        All selections, with the evidence of others `instead`.
+    expected : sequence of Identification
+        Effects that the simulation contains as well.
+    threshold : float
+        Evidence that any effect needs [nats].
+    state : State
+        With all selections in the model.
+    folds : xarray.DataArray
+        Blocks that are held out together.
+    """
+    given = [*expected, *chosen]
+    named = {one.effect for one in given if isinstance(one, Identification)}
+    out: dict[str, tuple[float, Rejection]] = {}
+    for key, several in components.items():
+        effect = several[0].candidate.effect
+        if key.startswith("~") or effect in named:
+            continue
+        beside = sum_evidence(several)
+        error = form_error(several, given, settings=state.settings)
+        winner = max(chosen, key=lambda one: one.instead.get(key, -math.inf), default=None)
+        instead = winner.instead.get(key, -math.inf) if winner else -math.inf
+        if beside > threshold + error:
+            name, nats = _find_veto(several, chosen, state, folds, error)
+        elif winner and instead > threshold:
+            name, nats = _name_of(winner), winner.evidence_nats - instead
+        else:
+            name, nats = _NOISE, threshold + error - beside
+        best = max(beside, instead)
+        if effect not in out or best > out[effect][0]:
+            out[effect] = best, Rejection(effect, axes_of(several, state.axes), name, nats)
+    return [rejection for _, rejection in out.values()]
+
+
+def _find_veto(
+    components: Sequence[Component],
+    chosen: Sequence[Identification | Unidentified],
+    state: State,
+    folds: xr.DataArray,
+    error: float,
+) -> tuple[str, float]:
+    """Return what beats an effect with enough evidence, and by how much."""
+    effect = components[0].candidate.effect
+    for one in chosen:  # withdrawn: with the effect in the model, the noise still changes
+        if isinstance(one, Unidentified) and not one.instead and effect in one.candidates:
+            return NUISANCE_ALTERNATIVES[one.generic], one.evidence_nats
+    other = find_better_form(components, state, error=error)
+    if other:
+        return other
+    shifts = passes_time_shift_test(components, state, folds)
+    if not shifts.passed:
+        return "a time-shifted channel", shifts.nats
+    statistics = {component.statistic for component in components}
+    rivals = [
+        one for one in chosen if statistics & {component.statistic for component in one.components}
+    ]
+    strongest = max(rivals, key=lambda one: one.evidence_nats, default=None)
+    if strongest is None:
+        return _NOISE, math.nan
+    return _name_of(strongest), strongest.evidence_nats - sum_evidence(components)
+
+
+def _name_of(selection: Identification | Unidentified) -> str:
+    if isinstance(selection, Identification):
+        return selection.effect
+    return NUISANCE_ALTERNATIVES[selection.generic]
