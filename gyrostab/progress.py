@@ -1,14 +1,16 @@
-"""Progress of long commands on stderr: a bar on a terminal, one plain line elsewhere."""
+"""Progress of long commands on stderr: bars on a terminal, a plain line per stage elsewhere."""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Protocol
 
 __all__ = ["Stage", "no_stage", "show_progress"]
+
+_COMPILING = "compiling, once after installation"
 
 
 class Stage(Protocol):
@@ -57,12 +59,51 @@ def show_progress(*, quiet: bool = False) -> Iterator[Stage]:
     """
     if quiet:
         yield no_stage
-    elif sys.stderr.isatty():
-        with _show_bar() as stage:
-            yield stage
     else:
-        with _show_line() as stage:
+        with _show_bar() if sys.stderr.isatty() else _show_lines() as stage:
             yield stage
+
+
+@contextmanager
+def _watch_compiler(show: Callable[[bool], None]) -> Iterator[Callable[[], None]]:
+    """Call `show` when numba starts to compile, and when it ends.
+
+    Yields
+    ------
+    callable
+        Function to call at every stage; it begins to watch once numba is imported, which takes too
+        long for commands that do not need it.
+    """
+    installed: list[Any] = []
+
+    def watch() -> None:
+        if installed or "numba.core.event" not in sys.modules:
+            return
+        from numba.core import event
+
+        class Compiler(event.Listener):  # type: ignore[misc]
+            depth = 0
+
+            def on_start(self, _: Any) -> None:
+                self.depth += 1
+                if self.depth == 1:
+                    show(True)
+
+            def on_end(self, _: Any) -> None:
+                self.depth -= 1
+                if self.depth == 0:
+                    show(False)
+
+        installed.append(Compiler())
+        event.register("numba:compile", installed[0])
+
+    try:
+        yield watch
+    finally:
+        if installed:
+            from numba.core import event
+
+            event.unregister("numba:compile", installed[0])
 
 
 def _format_speed(amount: float, seconds: float, unit: str) -> str:
@@ -71,15 +112,25 @@ def _format_speed(amount: float, seconds: float, unit: str) -> str:
 
 
 @contextmanager
-def _show_line() -> Iterator[Stage]:
-    """Show one line at the end."""
+def _show_lines() -> Iterator[Stage]:
+    """Show a line at the beginning of each stage, and one at the end."""
     begun = since = time.perf_counter()
     current, first, amount, worked = "", 0, 0, ""
+    announced = False
+
+    def announce(begins: bool) -> None:
+        nonlocal announced
+        if begins and not announced:
+            announced = True
+            print(f"{_COMPILING} ...", file=sys.stderr, flush=True)
 
     def stage(label: str, total: int = 0, done: int | None = None, unit: str = "samples") -> None:
         nonlocal since, current, first, amount, worked
         now = time.perf_counter()
+        watch()
         if label != current:
+            if label:
+                print(f"{label} ...", file=sys.stderr, flush=True)
             if amount:
                 seconds = max(now - since, 1e-9)
                 speed = _format_speed(amount, seconds, "samples")
@@ -88,7 +139,8 @@ def _show_line() -> Iterator[Stage]:
         if unit == "samples":
             amount = total - first  # without what an earlier run has done
 
-    yield stage
+    with _watch_compiler(announce) as watch:
+        yield stage
     stage("", 0)
     print(f"done in {time.perf_counter() - begun:.1f} s{worked}", file=sys.stderr)
 
@@ -132,9 +184,13 @@ def _show_bar() -> Iterator[Stage]:
             speed = _format_speed(amount, time.perf_counter() - now["begun"], unit)
             progress.update(now["task"], total=1.0, completed=share, speed=speed)
 
+        def announce(begins: bool) -> None:
+            progress.update(now["task"] or 0, speed=_COMPILING if begins else "")
+
         def stage(
             label: str, total: int = 0, done: int | None = None, unit: str = "samples"
         ) -> None:
+            watch()
             if label != now["label"]:
                 finish()
                 task = progress.add_task(f"{label:<10}", total=None, speed="") if label else None
@@ -162,6 +218,6 @@ def _show_bar() -> Iterator[Stage]:
                 share = min(now["ended"] / now["tasks"], 1.0)
                 show(share, share * now["total"], "samples")
 
-        with Callback(start_state=start, posttask=after):
+        with Callback(start_state=start, posttask=after), _watch_compiler(announce) as watch:
             yield stage
         finish()

@@ -78,8 +78,7 @@ def suggest_windows(span: float, white: float) -> list[str]:
     if not lengths or not white > 0:
         return []
     lines = [
-        f"For N = {white:.2g} deg/sqrt(h), the noise from sample to sample, half of the windows "
-        "observe (more where B, K or R hide each other):"
+        f"N is about {white:.2g} deg/sqrt(h). With that noise alone, half of the windows observe:"
     ]
     for window in lengths:
         lines.append(
@@ -88,7 +87,7 @@ def suggest_windows(span: float, white: float) -> list[str]:
         )
     short, long = (format_duration(window) for window in (lengths[0], lengths[-1]))
     step = format_duration(lengths[-1] / 10)
-    text = f"To observe B, K and R: --window {long} --step {step}"
+    text = f"Suggested for B, K and R: --window {long} --step {step}"
     return [*lines, text + f"; to follow changes of N: --window {short}" * (long != short)]
 
 

@@ -17,6 +17,10 @@ from gyrostab.jobs.run import load_log
 
 __all__ = ["estimate_run"]
 
+#: Longest time of loading compiled kernels [s]. What takes longer is compiling, which the run that
+#: follows does not repeat.
+_MAX_LOADING_S = 2.0
+
 
 def estimate_run(
     paths: Sequence[str | Path],
@@ -28,8 +32,8 @@ def estimate_run(
 ) -> str:
     """Describe what a run would do, without writing its output.
 
-    The first part is computed on one core; the time and the size of the rest are taken to be in
-    proportion to the number of windows.
+    The first part is computed on one core; the processor time and the size of the rest are taken to
+    be in proportion to the number of windows. Cores that are busy with other programs need longer.
 
     Parameters
     ----------
@@ -45,17 +49,18 @@ def estimate_run(
     str
         Lines to print.
     """
-    begun = time.perf_counter()
     log = load_log(paths, **reading)
+    opened = time.process_time()  # of the process, with its start
     parts = davar_parts(log, **windows)
     total, first = parts[-1].stop, parts[0]
-    _, base = _measure_part(log, slice(0, 1), windows, fitting)  # also loads the kernels
-    opened = time.perf_counter() - begun
-    begun = time.perf_counter()
+    _, base = _measure_part(log, slice(0, 1), windows, fitting)  # compiles or loads the kernels
+    opened += min(time.process_time() - opened, _MAX_LOADING_S)
+    begun = time.process_time()
     part, size = _measure_part(log, first, windows, fitting)
     share = total / first.stop
     cores = workers or os.cpu_count() or 1
-    seconds = opened + (time.perf_counter() - begun) * share / min(cores, len(parts))
+    worked = (time.process_time() - begun) * share
+    seconds = opened + worked / min(cores, len(parts))
     tau = part["tau"].values
     return "\n".join(
         [
@@ -64,7 +69,8 @@ def estimate_run(
             f"windows    {total} of {part.attrs['window_s']:g} s, one every "
             f"{part.attrs['step_s']:g} s, in {len(parts)} parts",
             f"averaging  {tau.size} times from {tau[0]:.4g} to {tau[-1]:.4g} s",
-            f"time       about {seconds:.2g} s on {cores} cores",
+            f"time       about {seconds:.2g} s on {cores} idle cores ({opened + worked:.2g} s of "
+            "processor time)",
             f"memory     {_peak_mb():.0f} MB with one core",
             f"output     about {(base + (size - base) * share) / 1e6:.2g} MB",
         ]

@@ -73,6 +73,7 @@ def test_unobserved_terms_come_with_a_longer_window_or_a_longer_record():
 
 def test_suggested_windows_fit_the_record():
     lines = suggest_windows(86400.0, WHITE)
+    assert "N is about 0.01 deg/sqrt(h)" in lines[0]
     assert [line.split()[1].rstrip(":") for line in lines[1:-1]] == [
         "1min",
         "5min",

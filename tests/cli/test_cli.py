@@ -99,6 +99,21 @@ def test_the_stages_one_by_one_give_the_same_product(log, product, tmp_path):
         xr.testing.assert_allclose(staged[name], whole[name], rtol=1e-9)
 
 
+def test_scan_suggests_windows_for_the_noise_it_finds(tmp_path, capsys):
+    """The estimate of N is within 10 % of the simulated noise, also below quantization noise."""
+    from gyrostab.simulate import simulate
+
+    long = simulate({"noise": {"N": 0.01, "Q": 0.5}}, duration="30min", rate=50.0)
+    path = to_netcdf(long, tmp_path / "long.nc")
+    assert call("scan", path) == 0
+    shown = capsys.readouterr()
+    found = re.search(r"N is about ([\d.]+) deg/sqrt\(h\)", shown.err)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(0.01, rel=0.1)
+    assert "--window 5min: B from 0.2" in shown.err
+    assert "N is about" not in shown.out
+
+
 def test_a_dry_run_describes_the_product_and_writes_nothing(log, product, tmp_path, capsys):
     assert call("run", log, "-o", tmp_path / "product.nc", *WINDOW, "--dry-run") == 0
     assert not list(tmp_path.iterdir())
@@ -352,11 +367,14 @@ def test_a_fault_of_ours_is_exit_code_1_without_traceback(log, tmp_path, monkeyp
         call("run", log, "-o", tmp_path / "out.nc", *WINDOW, "--debug")
 
 
-def test_progress_is_one_plain_line_away_from_a_terminal(log, tmp_path, capfd):
+def test_progress_is_a_plain_line_per_stage_away_from_a_terminal(log, tmp_path, capfd):
     assert call("run", log, "-o", tmp_path / "a.nc", *WINDOW) == 0
-    plain = [line for line in capfd.readouterr().err.splitlines() if not line.startswith("note: ")]
-    assert len(plain) == 1
-    assert re.search(r"computing: 12,000 samples in \d+\.\d s, \d+\.\d\d Msamples/s", plain[0])
+    *stages, last = [
+        line for line in capfd.readouterr().err.splitlines() if not line.startswith("note: ")
+    ]
+    assert stages[0] == "reading ..."
+    assert "computing ..." in stages
+    assert re.search(r"computing: 12,000 samples in \d+\.\d s, \d+\.\d\d Msamples/s", last)
     assert call("run", log, "-o", tmp_path / "b.nc", *WINDOW, "--quiet-progress") == 0
     assert "done in" not in capfd.readouterr().err
 

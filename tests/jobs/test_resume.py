@@ -115,7 +115,11 @@ def stop() -> None:
 
 
 def one_message(captured) -> str:
-    lines = [line for line in captured.err.splitlines() if not line.startswith("note: ")]
+    lines = [
+        line
+        for line in captured.err.splitlines()
+        if not (line.startswith("note: ") or line.endswith(" ..."))
+    ]
     assert len(lines) == 1, captured.err
     assert "Traceback" not in captured.err
     return lines[0]

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Literal
+import sys
+from typing import TYPE_CHECKING, Literal
 
 from gyrostab.cli.frame import Logs, Output, app, show_stages
 from gyrostab.cli.options import Common, Reading
 from gyrostab.errors import FormatError, OptionError
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 __all__ = ["ingest", "scan"]
 
@@ -15,8 +19,9 @@ __all__ = ["ingest", "scan"]
 def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common()) -> None:
     """Summarise logs: time span, sampling rate, axes, channels, gaps and anomalies.
 
-    Prints a table and the command to run next. A file that cannot be read without further options
-    is shown too: every column, with a guess at the gyro axes, their unit and the time column.
+    Prints a table, the command to run next, and what windows of each length can observe. A file
+    that cannot be read without further options is shown too: every column, with a guess at the gyro
+    axes, their unit and the time column.
 
     Example: gyrostab scan run7/*.csv
 
@@ -38,6 +43,7 @@ def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common
     readable = table[table["rate_hz"].notna()]
     if len(readable):
         print_next(next_command(list(readable["file"]), options), apart=True)
+        _print_suggestions(readable, examined.white_noise)
     for found in examined.inspected:
         print_inspection(found)
         if found.row is not None:
@@ -49,6 +55,16 @@ def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common
             f"{len(lost)} of {len(table)} files cannot be read: {', '.join(lost['file'])}; "
             "the table says why"
         )
+
+
+def _print_suggestions(readable: pd.DataFrame, noise: list[dict[str, float]]) -> None:
+    """Print on stderr what windows of each length can observe on the axis with the least noise."""
+    from gyrostab.allan.judgement import suggest_windows
+
+    levels = [level for axes in noise for level in axes.values() if level > 0]
+    span = (readable["end"].max() - readable["start"].min()).total_seconds()
+    if levels:
+        print(*suggest_windows(span, min(levels)), sep="\n", file=sys.stderr)
 
 
 @app.command(sort_key=2, help_epilogue="")
