@@ -153,6 +153,7 @@ def _show_bar() -> Iterator[Stage]:
     from rich.progress import (
         BarColumn,
         Progress,
+        TaskID,
         TextColumn,
         TimeElapsedColumn,
         TimeRemainingColumn,
@@ -185,7 +186,7 @@ def _show_bar() -> Iterator[Stage]:
             progress.update(now["task"], total=1.0, completed=share, speed=speed)
 
         def announce(begins: bool) -> None:
-            progress.update(now["task"] or 0, speed=_COMPILING if begins else "")
+            progress.update(now["task"] or TaskID(0), speed=_COMPILING if begins else "")
 
         def stage(
             label: str, total: int = 0, done: int | None = None, unit: str = "samples"

@@ -219,7 +219,7 @@ def integrate(x, offset, starts, stops, theta):  # type: ignore[no-untyped-def]
     theta[0] = 0.0
     total = 0.0
     largest = 0.0
-    run = 0
+    run = np.int64(0)
     for a in range(0, x.size, TILE):
         b = min(a + TILE, x.size)
         total, reached, run = integrate_tile(

@@ -9,10 +9,13 @@ is 3e-19: never in a record.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-from gyrostab.kernels.compiled import INNER, KERNEL
+from gyrostab.kernels.compiled import KERNEL
 
 __all__ = ["LIMIT_SIGMA", "count_outliers"]
 
@@ -29,32 +32,88 @@ _AROUND_SAMPLES = 128
 _TO_DIFFERENCE = 0.8560
 
 
-@njit(**INNER)
-def _measure_noise(x, first, last, apart, room):  # type: ignore[no-untyped-def]
-    """Estimate the standard deviation of first differences from second differences; 0 without."""
-    count = 0
-    for i in range(max(first, 1), min(last, x.size - 1), apart):
-        second = abs(np.float64(x[i - 1]) - 2.0 * np.float64(x[i]) + np.float64(x[i + 1]))
-        if second == second and second > 0.0 and count < room.size:
-            room[count] = second
-            count += 1
-    return _TO_DIFFERENCE * np.median(room[:count]) if count else 0.0
+def _measure_noise(x: NDArray[Any], places: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Estimate the standard deviation of first differences from second differences; 0 without.
 
+    Parameters
+    ----------
+    x : ndarray, shape (n_samples,)
+        Samples.
+    places : ndarray of int64, shape (n, m)
+        Numbers of samples; the first `_MEDIAN_OF` with a second difference are used.
 
-@njit(**INNER)
-def _count_beyond(x, limit):  # type: ignore[no-untyped-def]
-    """Count samples beyond both neighbours, in a separate loop over slices that vectorises."""
-    found = 0
-    before, here, after = x[:-2], x[1:-1], x[2:]
-    for i in range(here.size):
-        rise = np.float64(here[i]) - np.float64(before[i])
-        fall = np.float64(here[i]) - np.float64(after[i])
-        found += 1 if (rise * fall > 0.0) & (min(abs(rise), abs(fall)) > limit) else 0
-    return found
+    Returns
+    -------
+    ndarray of float64, shape (n,)
+    """
+    inside = (places >= 1) & (places < x.size - 1)
+    place = np.where(inside, places, 1)
+    before, here, after = (x[place + shift].astype(np.float64) for shift in (-1, 0, 1))
+    second = np.abs(before - 2.0 * here + after)
+    known = inside & (second > 0.0)
+    known &= np.cumsum(known, axis=1) <= _MEDIAN_OF
+    count = known.sum(axis=1)
+    second = np.sort(np.where(known, second, np.nan), axis=1)
+    row, last = np.arange(count.size), np.maximum(count - 1, 0)
+    median = (second[row, last // 2] + second[row, count // 2 * (count > 1)]) / 2.0
+    return np.where(count > 0, _TO_DIFFERENCE * median, 0.0)
 
 
 @njit(**KERNEL)
-def count_outliers(x, starts, length):  # type: ignore[no-untyped-def]
+def _find_candidates(x, limits, places):  # type: ignore[no-untyped-def]
+    """Write the samples beyond both neighbours to `places`; returns how many there are."""
+    count = np.int64(0)
+    for segment in range(limits.size):
+        begin, limit = np.int64(1 + segment * _SEGMENT_SAMPLES), limits[segment]
+        end = min(begin + _SEGMENT_SAMPLES, x.size - 1)
+        # A loop over slices that only counts, because it vectorises.
+        found = 0
+        first, middle, last = x[begin - 1 : end - 1], x[begin:end], x[begin + 1 : end + 1]
+        for i in range(middle.size):
+            rise = np.float64(middle[i]) - np.float64(first[i])
+            fall = np.float64(middle[i]) - np.float64(last[i])
+            found += 1 if (rise * fall > 0.0) & (min(abs(rise), abs(fall)) > limit) else 0
+        if found == 0 or limit == 0.0:
+            continue
+        for i in range(middle.size):
+            rise = np.float64(middle[i]) - np.float64(first[i])
+            fall = np.float64(middle[i]) - np.float64(last[i])
+            if (rise > limit and fall > limit) or (rise < -limit and fall < -limit):
+                if count < places.size:
+                    places[count] = begin + i
+                count += 1
+    return count
+
+
+def _find_outliers(x: NDArray[Any]) -> NDArray[np.int64]:
+    """Find the numbers of the outliers, rising."""
+    begins = np.arange(1, max(x.size - 1, 1), _SEGMENT_SAMPLES)
+    lengths = np.minimum(begins + _SEGMENT_SAMPLES, x.size - 1) - begins
+    if x.size < 3:
+        return np.empty(0, np.int64)
+    apart = np.maximum(1, lengths // _MEDIAN_OF)[:, None]
+    steps = apart * np.arange(2 * _MEDIAN_OF)
+    noise = _measure_noise(x, np.where(steps < lengths[:, None], begins[:, None] + steps, -1))
+    places = np.empty(1024, np.int64)
+    count = _find_candidates(x, LIMIT_SIGMA * noise, places)
+    if count > places.size:
+        places = np.empty(count, np.int64)
+        _find_candidates(x, LIMIT_SIGMA * noise, places)
+    around = np.arange(2, _AROUND_SAMPLES + 2)
+    kept = []
+    for chunk in range(0, count, 4096):
+        place = places[chunk : min(chunk + 4096, count)]
+        level = np.maximum(
+            _measure_noise(x, place[:, None] - around[:-1]),
+            _measure_noise(x, place[:, None] + around),
+        )
+        before, here, after = (x[place + shift].astype(np.float64) for shift in (-1, 0, 1))
+        nearest = np.minimum(np.abs(here - before), np.abs(here - after))
+        kept.append(place[nearest > LIMIT_SIGMA * level])
+    return np.concatenate([np.empty(0, np.int64), *kept])
+
+
+def count_outliers(x: NDArray[Any], starts: NDArray[np.int64], length: int) -> NDArray[np.float64]:
     """Count the outliers of each window.
 
     Parameters
@@ -71,33 +130,6 @@ def count_outliers(x, starts, length):  # type: ignore[no-untyped-def]
     ndarray of float64, shape (n_windows,)
         Outliers of each window.
     """
-    places = np.empty(16, np.int64)
-    room, near = np.empty(_MEDIAN_OF), np.empty(_AROUND_SAMPLES)
-    total = 0
-    for begin in range(1, x.size - 1, _SEGMENT_SAMPLES):
-        end = min(begin + _SEGMENT_SAMPLES, x.size - 1)
-        limit = LIMIT_SIGMA * _measure_noise(
-            x, begin, end, max(1, (end - begin) // _MEDIAN_OF), room
-        )
-        if limit == 0.0 or _count_beyond(x[begin - 1 : end + 1], limit) == 0:
-            continue
-        for i in range(begin, end):
-            before = np.float64(x[i]) - np.float64(x[i - 1])
-            after = np.float64(x[i]) - np.float64(x[i + 1])
-            if (before > limit and after > limit) or (before < -limit and after < -limit):
-                noise = max(
-                    _measure_noise(x, i - _AROUND_SAMPLES, i - 1, 1, near),
-                    _measure_noise(x, i + 2, i + 2 + _AROUND_SAMPLES, 1, near),
-                )
-                if min(abs(before), abs(after)) > LIMIT_SIGMA * noise:
-                    if total == places.size:
-                        larger = np.empty(2 * total, np.int64)
-                        larger[:total] = places
-                        places = larger
-                    places[total] = i
-                    total += 1
-    counts = np.empty(starts.size)
-    for window in range(starts.size):
-        low = np.searchsorted(places[:total], starts[window])
-        counts[window] = np.searchsorted(places[:total], starts[window] + length) - low
-    return counts
+    places = _find_outliers(x)
+    counts = np.searchsorted(places, starts + length) - np.searchsorted(places, starts)
+    return np.asarray(counts, dtype=np.float64)

@@ -138,7 +138,7 @@ def _factor_data(room):  # type: ignore[no-untyped-def]
         own = room.whitener[i, i]
         largest = max(largest, own)
         room.whitener[i, i] = own * (1.0 + 1e-9) if own > 0.0 else 1.0
-    return _invert_factor(room.whitener, 4) if largest > 0.0 else np.inf
+    return _invert_factor(room.whitener, np.int64(4)) if largest > 0.0 else np.inf
 
 
 @njit(**INNER)
@@ -215,7 +215,7 @@ def _describe_set(members, size, index, half, room):  # type: ignore[no-untyped-
 @njit(**INNER)
 def _fit_set(members, index, start, ramp, room):  # type: ignore[no-untyped-def]
     """Fit the set of terms with number `index`; its likelihood is zero where that fails."""
-    size = 0
+    size = np.int64(0)
     room.squares[4] = ramp
     for a in range(4):
         room.squares[a] = room.estimates[index, a] = 0.0
