@@ -177,9 +177,11 @@ def _add_coefficients() -> None:
 _add_coefficients()
 
 
-def attributes(name: str) -> dict[str, Any]:
-    """A fresh copy of the attributes of a product variable."""
-    return dict(VARIABLES[name])
+def attributes(name: str, *, variance: str = "Allan") -> dict[str, Any]:
+    """A fresh copy of the attributes of a product variable, for the variance of that name."""
+    found = dict(VARIABLES[name])
+    found["long_name"] = found["long_name"].replace("Allan variance", f"{variance} variance")
+    return found
 
 
 def signal_name(log: xr.Dataset) -> str:

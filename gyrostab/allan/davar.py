@@ -23,18 +23,20 @@ from gyrostab.allan.plan import (
     thin_factors,
     units_of_work,
 )
+from gyrostab.allan.variance import variance_columns, white_freedoms
 from gyrostab.errors import OptionError
 from gyrostab.ingest.convert import as_log
 from gyrostab.kernels.allan.gap_edges import gap_edge_ratio
 from gyrostab.kernels.allan.outlier_count import count_outliers
-from gyrostab.kernels.allan.pairs import white_pair_sum
 from gyrostab.kernels.allan.reference import direct_sums, recursive_sums, reference_theta
 from gyrostab.kernels.allan.surface import STRICT, Cells, Unit, surface_unit, window_means
 from gyrostab.kernels.allan.trend import window_trends
+from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.fit.covariance import diagonal_products
 from gyrostab.kernels.fit.least_squares import cell_freedoms, combine_diagonal, identify_noise
+from gyrostab.kernels.fit.third_differences import third_diagonals
 from gyrostab.kernels.workspace import Workspace
-from gyrostab.noise import HOUR, avar_columns, sample_squares
+from gyrostab.noise import HOUR, sample_squares
 from gyrostab.schema import attributes
 from gyrostab.store.lazy import find_source, keep_sources, read_into, read_slice
 from gyrostab.time.grid import first_stamp, grid_times
@@ -79,6 +81,7 @@ def davar(
     min_coverage: float = 0.1,
     method: str = "blocks",
     convention: str = "all",
+    variance: str = "avar",
 ) -> xr.Dataset:
     """Compute the dynamic overlapping Allan variance of a gyro log (improved fast DAVAR).
 
@@ -128,6 +131,13 @@ def davar(
     convention : {"all", "paper"}
         With ``"paper"`` the reference methods count ``window - 2k`` terms and omit the last window,
         as P16 does.
+    variance : {"avar", "hadamard", "modified"}
+        The overlapping Allan variance; the overlapping Hadamard variance, which a constant drift
+        of the rate does not change; or the modified Allan variance, in which quantization noise
+        falls as tau^-3 and white noise as tau^-1. The last two use terms of three averaging times,
+        so `tau_max` is at most a third of the window (2/9 by default), and no cluster means in
+        gaps. Their values are in ``avar``, too; its ``long_name`` and the attribute ``variance``
+        of the surface say which variance it is.
 
     Returns
     -------
@@ -167,7 +177,7 @@ def davar(
     plan = make_plan(
         log, window=window, step=step, taus=taus, tau_max=tau_max, axis=axis, overlap=overlap,
         gaps=gaps, min_strict=min_strict, min_coverage=min_coverage, method=method,
-        convention=convention,
+        convention=convention, variance=variance,
     )  # fmt: skip
     if method == "blocks":
         cells, means = _run_units(plan.signal.data, plan)
@@ -385,21 +395,24 @@ class _NoiseTables(NamedTuple):
 
 def _noise_tables(plan: Plan) -> _NoiseTables:
     unit = plan.unit
-    return _cached_noise_tables(unit.window, tuple(unit.ks), tuple(unit.shifts), plan.rate)
+    factors, thinning = tuple(unit.ks.tolist()), tuple(unit.shifts.tolist())
+    return _cached_noise_tables(unit.window, factors, thinning, plan.rate, unit.variance)
 
 
 @lru_cache(maxsize=4)
 def _cached_noise_tables(
-    window: int, factors: tuple[int, ...], thinning: tuple[int, ...], rate: float
+    window: int, factors: tuple[int, ...], thinning: tuple[int, ...], rate: float, variance: str
 ) -> _NoiseTables:
     """Make the tables once for all parts of a log."""
     ks, shifts = np.array(factors, dtype=np.int64), np.array(thinning, dtype=np.int64)
-    n = window - 2 * ks + 1
-    weight = [count**2 / white_pair_sum(count, k) for count, k in zip(n, ks, strict=True)]
-    diagonal = combine_diagonal(*diagonal_products(window, ks, shifts))
-    return _NoiseTables(
-        thin_factors(ks), avar_columns(ks / rate), np.array(weight), sample_squares(rate), diagonal
-    )
+    columns = variance_columns(variance, ks, rate)
+    if variance == "avar":
+        pairs, ramps = diagonal_products(window, ks, shifts)
+    else:
+        pairs, ramps = third_diagonals(variance, window, ks, shifts)
+    weight = white_freedoms(variance, window, ks, pairs)
+    diagonal = combine_diagonal(pairs, ramps)
+    return _NoiseTables(thin_factors(ks), columns, weight, sample_squares(rate), diagonal)
 
 
 def _cell_freedoms(cells: Cells, tables: _NoiseTables) -> Floats:
@@ -498,7 +511,7 @@ def _attach_labels(
     )
     centre = bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) // 2
     variables: dict[str, Any] = {
-        name: (cube, values, attributes(name))
+        name: (cube, values, attributes(name, variance=VARIANCES[unit.variance].text))
         for name, values in zip(_CELL_FIELDS, cells, strict=True)
     }
     # In addition to the responses, the fit needs the share of degrees of freedom left by the gaps.

@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 from scipy.special import gammaincc, gammaincinv
 
 from gyrostab.allan.plan import thin_factors
+from gyrostab.allan.variance import variance_columns, white_freedoms
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.kernels.allan.pairs import white_pair_sum
+from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.fit.covariance import STOCHASTIC, product_tables
 from gyrostab.kernels.fit.least_squares import FIT_FIELDS, combine_diagonal, fit_windows
 from gyrostab.kernels.fit.limits import cell_limits, interpolate_quantile
+from gyrostab.kernels.fit.third_differences import third_tables
 from gyrostab.kernels.fit.trend import detrend_tables
 from gyrostab.noise import HOUR, LAWS, NORMAL_95, TERMS, avar_columns, sample_squares
 from gyrostab.schema import attributes, check_surface
@@ -232,6 +234,13 @@ def _fit_checked(
         raise OptionError(f"terms {unknown or wanted}: choose among {', '.join(TERMS)}")
     if method not in ("gls", "adev"):
         raise OptionError(f"method={method!r}: give 'gls' or 'adev'")
+    variance = surface.attrs.get("variance", "avar")
+    if method == "adev" and variance != "avar":
+        raise OptionError(
+            f"method='adev' is for Allan variances; the surface has variance={variance!r}"
+        )
+    if variance == "hadamard" and wanted == ["R"]:
+        raise OptionError("terms 'R': the Hadamard variance does not see a ramp")
     allowed = sum(1 << TERMS.index(term) for term in wanted)
     chosen = _select_taus(surface["tau"].values, tau_min, tau_max)
     if method == "gls":
@@ -299,7 +308,12 @@ def _fit_gls(
     cells, ks, rate, window = _fit_inputs(surface)
     chosen = within[thin_factors(ks[within])]
     shifts = thin(ks[chosen]) if surface.attrs.get("overlap") == "octave" else np.zeros_like(chosen)
-    tables = _cached_tables(tuple(ks[chosen].tolist()), tuple(shifts.tolist()), rate, window)
+    variance = surface.attrs.get("variance", "avar")
+    if variance == "hadamard":  # which does not see a ramp
+        allowed &= ~(1 << STOCHASTIC)
+    tables = _cached_tables(
+        tuple(ks[chosen].tolist()), tuple(shifts.tolist()), rate, window, variance
+    )
 
     def block(*arrays: NDArray[np.float64]) -> NDArray[np.float64]:
         flat = [
@@ -334,29 +348,32 @@ def _fit_gls(
     if (
         chosen.size == surface.sizes["tau"]
     ):  # otherwise that of davar, for every averaging time, is kept
-        extra["edf"] = (("axis", "time", "tau"), fitted[..., 4 * n + 2 :], attributes("edf"))
+        extra["edf"] = (("axis", "time", "tau"), fitted[..., 4 * n + 2 :], surface["edf"].attrs)
     return _assemble_product(surface, *(parts[i * n : (i + 1) * n] for i in range(4)), extra=extra)
 
 
 class _Tables:
     """Tables that all windows of a surface share."""
 
-    def __init__(self, ks: NDArray[np.int64], shifts: NDArray[np.int64], rate: float, window: int):
-        self.columns = avar_columns(ks / rate)
+    def __init__(
+        self, ks: NDArray[np.int64], shifts: NDArray[np.int64], rate: float, window: int,
+        variance: str = "avar",
+    ):  # fmt: skip
+        self.columns = variance_columns(variance, ks, rate)
         self.to_samples = sample_squares(rate)
-        self.pairs, self.ramps = product_tables(window, ks, shifts)
-        self.diagonal = combine_diagonal(
-            np.einsum("abii->abi", self.pairs), np.einsum("aii->ai", self.ramps)
-        )
-        self.trend = detrend_tables(window, ks, self.pairs, self.ramps)
+        if variance == "avar":
+            self.pairs, self.ramps = product_tables(window, ks, shifts)
+        else:
+            self.pairs, self.ramps = third_tables(variance, window, ks, shifts)
+        diagonal = np.einsum("abii->abi", self.pairs)
+        self.diagonal = combine_diagonal(diagonal, np.einsum("aii->ai", self.ramps))
+        summed = VARIANCES[variance].summed
+        self.trend = detrend_tables(window, ks, self.pairs, self.ramps, summed=summed)
         #: Variance of the trend of a window per squared coefficient [degree2 hour-4].
         self.trend_variance = (
             self.trend.variance * self.to_samples[:STOCHASTIC] * (rate * HOUR) ** 2
         )
-        terms = window - 2 * ks + 1
-        self.weight = np.array(
-            [n**2 / white_pair_sum(int(n), int(k)) for n, k in zip(terms, ks, strict=True)]
-        )
+        self.weight = white_freedoms(variance, window, ks, diagonal)
         own = np.einsum("aaii,a->ai", self.pairs, self.to_samples[:STOCHASTIC] ** 2)
         #: Degrees of freedom of a cell in which a term is alone, (term, tau); a ramp alone does not
         #: scatter.
@@ -387,10 +404,15 @@ def _quantile_curve(level: float) -> tuple[float, float, NDArray[np.float64]]:
 
 @lru_cache(maxsize=4)
 def _cached_tables(
-    ks: tuple[int, ...], shifts: tuple[int, ...], rate: float, window: int
+    ks: tuple[int, ...],
+    shifts: tuple[int, ...],
+    rate: float,
+    window: int,
+    variance: str = "avar",
 ) -> _Tables:
     """Make the tables once for all parts of a record."""
-    return _Tables(np.array(ks, dtype=np.int64), np.array(shifts, dtype=np.int64), rate, window)
+    factors, thinning = (np.array(values, dtype=np.int64) for values in (ks, shifts))
+    return _Tables(factors, thinning, rate, window, variance)
 
 
 def _fit_block(

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
 from gyrostab.kernels.allan.surface import Unit
+from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.schema import signal_name
 from gyrostab.time.durations import averaging_factors, samples, thin
 
@@ -52,10 +53,12 @@ def make_plan(
     log: xr.Dataset, *, window: Any = None, step: Any = None, taus: Any = 40, tau_max: Any = None,
     axis: str | Sequence[str] | None = None, overlap: str = "full", gaps: str = "bridge",
     min_strict: float = 0.3, min_coverage: float = 0.1, method: str = "blocks",
-    convention: str = "all",
+    convention: str = "all", variance: str = "avar",
 ) -> Plan:  # fmt: skip
     """Check the options of `davar` against a log of `gyrostab.ingest.convert.as_log`."""
-    _check_choices(method=method, gaps=gaps, overlap=overlap, convention=convention)
+    _check_choices(
+        method=method, gaps=gaps, overlap=overlap, convention=convention, variance=variance
+    )
     name = signal_name(log)
     signal = log[name] if axis is None else _select_axes(log[name], axis)
     rate = float(log.attrs["sampling_rate_hz"])
@@ -63,7 +66,8 @@ def make_plan(
     length, hop = _window_and_step(
         choose_window(log) if window is None else window, step, rate, intervals
     )
-    ks = averaging_factors(taus, rate=rate, window=length, tau_max=tau_max)
+    order = VARIANCES[variance].order
+    ks = averaging_factors(taus, rate=rate, window=length, tau_max=tau_max, order=order)
     shifts = thin(ks) if overlap == "octave" else np.zeros_like(ks)
     ks = np.unique(ks >> shifts << shifts)
     shifts = thin(ks) if overlap == "octave" else np.zeros_like(ks)
@@ -77,12 +81,13 @@ def make_plan(
         gaps == "zero",
         min_strict,
         min_coverage,
+        variance,
     )
     attrs = {
         "window_s": length / rate, "step_s": hop / rate,
         "window_samples": length, "step_samples": hop,
         "method": method, "overlap": overlap, "gaps": gaps, "convention": convention,
-        "min_strict": min_strict, "min_coverage": min_coverage,
+        "min_strict": min_strict, "min_coverage": min_coverage, "variance": variance,
     }  # fmt: skip
     return Plan(signal, unit, rate, attrs)
 
@@ -114,12 +119,13 @@ def choose_window(log: xr.Dataset) -> str:
     return f"{seconds}s" if seconds < 60 else f"{seconds // 60}min"
 
 
-def _check_choices(*, method: str, gaps: str, overlap: str, convention: str) -> None:
+def _check_choices(*, method: str, gaps: str, overlap: str, convention: str, variance: str) -> None:
     for option, value, choices in (
         ("method", method, _METHODS),
         ("gaps", gaps, _GAPS),
         ("overlap", overlap, _OVERLAPS),
         ("convention", convention, _CONVENTIONS),
+        ("variance", variance, tuple(VARIANCES)),
     ):
         if value not in choices:
             raise OptionError(f"{option}={value!r}: give one of {', '.join(choices)}")
@@ -127,6 +133,11 @@ def _check_choices(*, method: str, gaps: str, overlap: str, convention: str) -> 
         raise OptionError(
             "convention='paper' is for method='direct' and method='recursive'; the block sums use "
             "all terms"
+        )
+    if variance != "avar" and method != "blocks":
+        raise OptionError(
+            f"variance={variance!r} is for method='blocks'; method={method!r} is that of the "
+            "published Allan variance"
         )
     if overlap == "octave" and method != "blocks":
         raise OptionError(

@@ -165,6 +165,9 @@ class Windows:
         number, as some papers do, which biases the variance low at every gap.
     axis
         Analyse this gyro axis only: x. Repeat for more.
+    variance
+        avar, the Allan variance. hadamard is not changed by a constant drift of the rate. modified,
+        the modified Allan variance, tells white noise from quantization noise.
     """
 
     window: Annotated[str | None, Parameter(metavar="DURATION")] = None
@@ -174,6 +177,7 @@ class Windows:
     overlap: Literal["full", "octave"] = "full"
     gaps: Literal["bridge", "zero"] = "bridge"
     axis: Annotated[list[str] | None, Parameter(metavar="NAME", negative=())] = None
+    variance: Literal["avar", "hadamard", "modified"] = "avar"
 
     def options(self) -> dict[str, Any]:
         """Return the keyword arguments of `gyrostab.allan.davar.davar`."""

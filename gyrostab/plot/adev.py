@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.allan.variance import surface_columns, variance_name
 from gyrostab.errors import OptionError
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import (
@@ -110,14 +111,18 @@ def plot_adev(
     label_log_axis(panel.xaxis, *panel.get_xlim())
     label_log_axis(panel.yaxis, *panel.get_ylim())
     panel.set_xlabel("averaging time τ [s]")
-    panel.set_ylabel("Allan deviation σ(τ) [deg/h]")
+    panel.set_ylabel(f"{variance_name(product)} deviation σ(τ) [deg/h]")
     panel.grid(alpha=0.3)
     if is_narrow(figure):
         figure.legend(loc="lower left", frameon=False)
     else:
         panel.legend()
     stamp = str(np.datetime_as_string(window["time"].values, unit="s")).replace("T", " ")
-    title_figure(figure, f"Allan deviation of axis {name}", f"window centred on {stamp} UTC")
+    title_figure(
+        figure,
+        f"{variance_name(product)} deviation of axis {name}",
+        f"window centred on {stamp} UTC",
+    )
     stack_panels([panel])
     return figure
 
@@ -180,10 +185,11 @@ def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours:
     tau = window["tau"].values
     total = np.zeros(tau.size)
     responses = {"N": "white_response", "Q": "quantization_response", "R": "ramp_response"}
+    columns = surface_columns(window)
     for number, (symbol, law) in enumerate(LAWS.items()):
         state = int(window["observable"].sel(term=symbol))
         value, error, upper = (float(window[f"{symbol}{end}"]) for end in ("", "_stderr", "_upper"))
-        term = law.avar(tau, np.nan_to_num(float(estimates[symbol])))
+        term = columns[:, number] * np.nan_to_num(float(estimates[symbol])) ** 2
         seen = window[responses[symbol]].values if responses.get(symbol) in window else 1.0
         term = term * np.where(np.isfinite(seen), seen, 1.0)
         total += term

@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.allan.variance import variance_name
 from gyrostab.errors import OptionError
 from gyrostab.plot.style import (
     INCH_MM,
@@ -104,7 +105,8 @@ def plot_davar(
         panel.set_yscale("log", subs=(2, 5))
         label_log_axis(panel.yaxis, tau[0], tau[-1])
         panel.set_ylabel(f"axis {name}\naveraging time τ [s]")
-    label = "σ(τ) / its median over time" if relative else "Allan deviation σ(τ) [deg/h]"
+    kind = f"{variance_name(product)} deviation"
+    label = "σ(τ) / its median over time" if relative else f"{kind} σ(τ) [deg/h]"
     handles: list[Any] = []
     if any(not (deviation > 0).all() for deviation, _ in cells):
         handles.append(
@@ -123,7 +125,7 @@ def plot_davar(
         )
     title_figure(
         figure,
-        "Change of the dynamic Allan deviation" if relative else "Dynamic Allan deviation",
+        f"{'Change of the dynamic' if relative else 'Dynamic'} {kind}",
         window_text(product),
         f"{merged} windows averaged per column" if merged > 1 else "",
     )
@@ -196,7 +198,7 @@ def plot_davar_3d(
     narrow = is_narrow(figure)
     panel.set_xlabel(f"time [{unit}]" if narrow else f"time since {begin} [{unit}]")
     panel.set_ylabel("τ [s]" if narrow else "averaging time τ [s]")
-    panel.set_zlabel("σ [deg/h]" if narrow else "Allan deviation σ [deg/h]")
+    panel.set_zlabel("σ [deg/h]" if narrow else f"{variance_name(product)} deviation σ [deg/h]")
     for scale in (panel.yaxis, panel.zaxis):
         scale.set_major_locator(MaxNLocator(nbins=3 if narrow else 6, integer=True))
         scale.set_major_formatter(FuncFormatter(lambda power, _: f"$10^{{{power:.0f}}}$"))
@@ -205,7 +207,9 @@ def plot_davar_3d(
     panel.view_init(elev=30, azim=-62)
     panel.set_box_aspect((1.5, 1.15, 0.85), zoom=0.9 if narrow else 1.0)
     panel.tick_params(pad=-2 if narrow else 2)
-    title_figure(figure, f"Dynamic Allan deviation of axis {name}", window_text(product))
+    title_figure(
+        figure, f"Dynamic {variance_name(product)} deviation of axis {name}", window_text(product)
+    )
     return figure
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from gyrostab.allan.variance import variance_name
 from gyrostab.ingest.convert import as_log
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import duration, embedded, unit_symbol
@@ -285,28 +286,31 @@ def _summarise_gaps(log: xr.Dataset, gaps: list[dict[str, Any]]) -> str:
 def _make_figures(product: xr.Dataset, log: xr.Dataset | None) -> list[dict[str, str]]:
     from gyrostab.plot import plot_adev, plot_coefficients, plot_davar, plot_signal
 
-    figures = []
+    figures, variance = [], variance_name(product)
+    captions = {name: text.replace("Allan", variance) for name, text in _CAPTIONS.items()}
     if log is not None:
-        figures.append(embedded(plot_signal(log), "Signal as recorded", _CAPTIONS["signal"]))
+        figures.append(embedded(plot_signal(log), "Signal as recorded", captions["signal"]))
     figures.append(
         embedded(
-            plot_coefficients(product), "Noise coefficients over time", _CAPTIONS["coefficients"]
+            plot_coefficients(product), "Noise coefficients over time", captions["coefficients"]
         )
     )
-    figures.append(embedded(plot_davar(product), "Dynamic Allan deviation", _CAPTIONS["davar"]))
+    figures.append(
+        embedded(plot_davar(product), f"Dynamic {variance} deviation", captions["davar"])
+    )
     figures.append(
         embedded(
             plot_davar(product, relative=True),
-            "Change of the dynamic Allan deviation",
-            _CAPTIONS["change"],
+            f"Change of the dynamic {variance} deviation",
+            captions["change"],
         )
     )
     for name in product["axis"].values:
         figures.append(
             embedded(
                 plot_adev(product, str(name)),
-                f"Allan deviation of one window, axis {name}",
-                _CAPTIONS["adev"],
+                f"{variance} deviation of one window, axis {name}",
+                captions["adev"],
             )
         )
     return figures

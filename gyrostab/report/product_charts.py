@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.allan.variance import surface_columns, variance_name
 from gyrostab.noise import LAWS
 from gyrostab.plot.adev import band
 from gyrostab.plot.style import axis_style, unit_label, unit_of_time, unit_symbol
@@ -60,24 +61,25 @@ def product_charts(product: xr.Dataset, log: xr.Dataset | None = None) -> list[C
         averaging times, ``surface``. The last three show the first axis; `window_data` holds the
         others.
     """
-    gaps = gap_shapes(log)
+    gaps, variance = gap_shapes(log), variance_name(product)
     surface = _thin_product(product, _MAX_SURFACE_WINDOWS, _MAX_TAUS)
     times = _thin_product(product, _MAX_WINDOWS, product.sizes["tau"])
     charts = [
-        ("record", "Allan deviation of the whole record", _draw_record(product)),
+        ("record", f"{variance} deviation of the whole record", _draw_record(product)),
         ("coefficients", "Noise coefficients over time", _draw_coefficients(times, gaps)),
-        ("map", "Dynamic Allan deviation", _draw_map(surface, gaps)),
-        ("window", "Allan deviation of one window", _draw_window(surface)),
+        ("map", f"Dynamic {variance} deviation", _draw_map(surface, gaps)),
+        ("window", f"{variance} deviation of one window", _draw_window(surface)),
     ]
     if min(surface.sizes["time"], surface.sizes["tau"]) > 1:
-        title = "Dynamic Allan deviation as a surface"
+        title = f"Dynamic {variance} deviation as a surface"
         charts.append(("surface", title, _draw_surface(surface)))
     thinned = {"coefficients": times, "map": surface, "surface": surface}
     return [
         Chart(
             name,
             title,
-            _CAPTIONS[name] + _describe_thinning(product, thinned.get(name, product)),
+            _CAPTIONS[name].replace("Allan", variance)
+            + _describe_thinning(product, thinned.get(name, product)),
             embeddable(figure.to_json()),
         )
         for name, title, figure in charts
@@ -139,6 +141,10 @@ def _thin_product(product: xr.Dataset, windows: int, taus: int) -> xr.Dataset:
     return product.isel(chosen).compute()
 
 
+def _deviation_label(product: xr.Dataset) -> str:
+    return DEVIATION_LABEL.replace("Allan", variance_name(product))
+
+
 def _describe_thinning(product: xr.Dataset, part: xr.Dataset) -> str:
     every = product.sizes["time"] / part.sizes["time"]
     return f" One window in {every:.3g} is drawn." if every > 1 else ""
@@ -148,9 +154,9 @@ def _fitted_avar(part: xr.Dataset) -> NDArray[np.float64]:
     """Return the Allan variance of the fitted terms (axis, time, tau) [degree2 hour-2]."""
     from gyrostab.allan.fit import refit
 
-    estimates, tau = refit(part), part["tau"].values
+    estimates = refit(part)
     squares = np.stack([estimates[symbol].values ** 2 for symbol in LAWS], axis=-1)
-    unit = np.array([law.avar(tau) for law in LAWS.values()])
+    unit = surface_columns(part).T
     fitted = np.isfinite(squares).any(axis=-1, keepdims=True)
     return np.where(fitted, np.nan_to_num(squares) @ unit, np.nan)
 
@@ -163,7 +169,7 @@ def _draw_record(product: xr.Dataset) -> go.Figure:
     )
     figure = new_chart(
         xaxis=log_axis(TAU_LABEL, record["tau"].values),
-        yaxis=log_axis(DEVIATION_LABEL, measured),
+        yaxis=log_axis(_deviation_label(product), measured),
         height=460,
     )
     for row, name in enumerate(map(str, record["axis"].values)):
@@ -325,7 +331,7 @@ def _draw_window(product: xr.Dataset) -> go.Figure:
     limits = (shown.min() / 2, shown.max() * 2) if shown.size else (0.1, 10.0)
     figure = new_chart(
         xaxis=log_axis(TAU_LABEL, tau),
-        yaxis=log_axis(DEVIATION_LABEL, shown, range=np.log10(limits), autorange=False),
+        yaxis=log_axis(_deviation_label(product), shown, range=np.log10(limits), autorange=False),
         height=400,
     )
     empty = np.full(tau.size, np.nan)

@@ -22,6 +22,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, SchemaError
+from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.schema import (
     SIGNAL_LONG_NAMES,
     VARIABLES,
@@ -333,8 +334,10 @@ def _make_global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[s
     given["history"] = "\n".join(
         [*filter(None, lines), f"{now} gyrostab {version}: {verb}, {kind}"]
     )
-    if given.get("title") in (None, *TITLES.values()):  # also a title of an earlier stage
-        given["title"] = TITLES[kind]
+    variance = VARIANCES.get(str(given.get("variance")), VARIANCES["avar"]).text
+    titles = {name: text.replace("Allan", variance) for name, text in TITLES.items()}
+    if given.get("title") in (None, *titles.values()):  # also a title of an earlier stage
+        given["title"] = titles[kind]
     names = texts(dataset, "source_files")
     source = "gyro log: " + ", ".join(names) if names else "gyro log"
     given.setdefault("source", source.encode("ascii", "backslashreplace").decode())

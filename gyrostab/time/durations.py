@@ -136,7 +136,7 @@ def is_bare_number(value: Any) -> bool:
 
 
 def averaging_factors(
-    taus: Any, *, rate: float, window: int, tau_max: Any = None
+    taus: Any, *, rate: float, window: int, tau_max: Any = None, order: int = 2
 ) -> NDArray[np.int64]:
     """Find the averaging factors k of the requested averaging times ``k / rate``, in rising order.
 
@@ -149,12 +149,14 @@ def averaging_factors(
     window : int
         Window [samples].
     tau_max : float or str, optional
-        Longest averaging time; a third of the window by default.
+        Longest averaging time; by default a third of the terms of the window is left.
+    order : int
+        Order of the differences: a term spans ``order * k`` samples.
 
     Raises
     ------
     OptionError
-        When an averaging time is longer than half of the window, or there is none.
+        When a term is longer than the window, or there is no averaging time.
 
     Examples
     --------
@@ -163,14 +165,14 @@ def averaging_factors(
     >>> averaging_factors(["0.1s", "1s"], rate=100.0, window=1000)
     array([ 10, 100])
     """
-    longest = window // 2
-    limit = window // 3
+    longest, part = window // order, {2: "half", 3: "a third"}[order]
+    limit = 2 * window // (3 * order)
     if tau_max is not None:
         limit = int(duration_seconds(tau_max, "tau_max") * rate + 1e-6)
         if limit > longest or limit < 1:
             raise OptionError(
                 f"tau_max of {limit / rate:g} s does not fit the window of {window / rate:g} s; "
-                f"give {1 / rate:g} s to {longest / rate:g} s (half of the window)"
+                f"give {1 / rate:g} s to {longest / rate:g} s ({part} of the window)"
             )
     limit = max(1, limit)
     if isinstance(taus, str):
@@ -198,8 +200,8 @@ def averaging_factors(
             )
         if k > longest:
             raise OptionError(
-                f"tau {tau!r} is longer than half of the window ({longest / rate:g} s), "
-                "so no second difference fits; "
+                f"tau {tau!r} is longer than {part} of the window ({longest / rate:g} s), "
+                f"so no {'second' if order == 2 else 'third'} difference fits; "
                 "give a longer --window or shorter --taus"
             )
         ks.append(k)

@@ -281,10 +281,9 @@ def windows_from_blocks(heads, tails, whole, out):  # type: ignore[no-untyped-de
 
 
 def full_counts(
-    window: int, step: int, n_windows: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
+    lengths: NDArray[np.int64], step: int, n_windows: int, shifts: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """Count the terms of each window without gaps, (n_windows, n_tau), or of all, (1, n_tau)."""
-    lengths = window - 2 * ks + 1
     if not shifts.any():
         return lengths.astype(np.float64)[None]
     up = (1 << shifts) - 1

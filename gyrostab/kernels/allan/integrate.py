@@ -23,6 +23,7 @@ __all__ = [
     "needs_two_doubles",
     "present_runs",
     "pyramid_places",
+    "sum_two",
     "thin_pyramid",
 ]
 
@@ -251,6 +252,20 @@ def integrate_two(x, offset, starts, stops, high, low):  # type: ignore[no-untyp
         done = stops[r]
     high[done + 1 :] = total
     low[done + 1 :] = rest
+
+
+@njit(**KERNEL)
+def sum_two(high, low):  # type: ignore[no-untyped-def]
+    """Replace numbers of two doubles by the sums of those before them, the last by that of all."""
+    total = 0.0
+    rest = 0.0
+    for i in range(high.size):
+        value, small = high[i], low[i]
+        high[i], low[i] = total, rest
+        new = total + value
+        part = new - total
+        rest += ((total - (new - part)) + (value - part)) + small
+        total = new
 
 
 def needs_two_doubles(largest: float, x: NDArray[np.generic]) -> bool:

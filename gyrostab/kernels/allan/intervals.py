@@ -18,61 +18,67 @@ _FAST = {"reassoc", "contract", "nsz", "arcp"}
 
 
 @njit(**INNER)
-def _valid_rate(starts, stops, k):  # type: ignore[no-untyped-def]
-    """List intervals of m whose 2k samples are present; a run of samples [s, e) has angles s..e."""
+def _valid_runs(starts, stops, span):  # type: ignore[no-untyped-def]
+    """List the intervals of m whose `span` samples from m on are present."""
     keep = 0
     begin = np.empty(starts.size, np.int64)
     end = np.empty(starts.size, np.int64)
     for r in range(starts.size):
-        if stops[r] - starts[r] >= 2 * k:
+        if stops[r] - starts[r] >= span:
             begin[keep] = starts[r]
-            end[keep] = stops[r] - 2 * k + 1
+            end[keep] = stops[r] - span + 1
             keep += 1
     return begin[:keep], end[:keep]
 
 
 @njit(**INNER)
-def _valid_angle(starts, stops, k):  # type: ignore[no-untyped-def]
-    """Intervals of m whose three angles m, m + k, m + 2k are all present (the paper's test)."""
-    begin = np.empty(3 * starts.size + 1, np.int64)
-    end = np.empty(3 * starts.size + 1, np.int64)
-    keep = 0
-    i = j = h = 0
-    m = 0
-    while i < starts.size and j < starts.size and h < starts.size:
-        low = max(m, starts[i], starts[j] - k, starts[h] - 2 * k, 0)
-        high = min(stops[i], stops[j] - k, stops[h] - 2 * k)
-        if low < high:
-            begin[keep] = low
-            end[keep] = high
+def _intersect(begin, end, starts, stops, shift):  # type: ignore[no-untyped-def]
+    """Intersect intervals with runs that are moved down by `shift`."""
+    low = np.empty(begin.size + starts.size, np.int64)
+    high = np.empty(begin.size + starts.size, np.int64)
+    i = j = keep = 0
+    while i < begin.size and j < starts.size:
+        first, last = max(begin[i], starts[j] - shift), min(end[i], stops[j] - shift)
+        if first < last:
+            low[keep], high[keep] = first, last
             keep += 1
-        m = max(m, high)
-        if stops[i] <= m:
+        if end[i] < stops[j] - shift:
             i += 1
-        if j < starts.size and stops[j] - k <= m:
+        else:
             j += 1
-        if h < starts.size and stops[h] - 2 * k <= m:
-            h += 1
-    return begin[:keep], end[:keep]
+    return low[:keep], high[:keep]
 
 
 @njit(**INNER)
-def valid_intervals(starts, stops, k, angle):  # type: ignore[no-untyped-def]
-    """List the intervals [begin, end) of m of the valid second differences, from runs."""
-    if angle:
-        return _valid_angle(starts, stops, k)
-    return _valid_rate(starts, stops, k)
+def valid_intervals(starts, stops, k, span, points):  # type: ignore[no-untyped-def]
+    """List the intervals [begin, end) of m of the valid differences, from runs of samples.
+
+    Either `span` samples from m on must be present or, with `points`, only that many at distances
+    of k: the angles of an angle log (the paper's test).
+    """
+    if points == 0:
+        return _valid_runs(starts, stops, span)
+    begin, end = starts.copy(), stops.copy()
+    for i in range(1, points):
+        begin, end = _intersect(begin, end, starts, stops, i * k)
+    return begin, end
 
 
 @njit(fastmath=_FAST, **INNER)
-def _sum_squares(theta, a, b, k):  # type: ignore[no-untyped-def]
-    """Sum of squared second differences over ``a <= m < b``."""
+def _sum_squares(theta, a, b, k, order):  # type: ignore[no-untyped-def]
+    """Sum of squared second or third differences over ``a <= m < b``."""
     # Three slices: with theta[m + k] the signed index costs a wraparound test that blocks
     # vectorisation.
     first = theta[a:b]
     middle = theta[a + k : b + k]
     last = theta[a + 2 * k : b + 2 * k]
     total = 0.0
+    if order == 3:
+        beyond = theta[a + 3 * k : b + 3 * k]
+        for i in range(first.size):
+            d = (beyond[i] - first[i]) - 3.0 * (last[i] - middle[i])
+            total += d * d
+        return total
     for i in range(first.size):
         d = last[i] - 2.0 * middle[i] + first[i]
         total += d * d
@@ -88,6 +94,27 @@ def _differences_two(high, low, a, b, k, out):  # type: ignore[no-untyped-def]
         out[i] = ((h2[i] - h1[i]) - (h1[i] - h0[i])) + ((l2[i] - l1[i]) - (l1[i] - l0[i]))
 
 
+@njit(**INNER)
+def _third_differences_two(high, low, a, b, k, out):  # type: ignore[no-untyped-def]
+    """Compute third differences of an angle held as two doubles, without reassociation."""
+    h0, h1, h2, h3 = (
+        high[a:b],
+        high[a + k : b + k],
+        high[a + 2 * k : b + 2 * k],
+        high[a + 3 * k : b + 3 * k],
+    )
+    l0, l1, l2, l3 = (
+        low[a:b],
+        low[a + k : b + k],
+        low[a + 2 * k : b + 2 * k],
+        low[a + 3 * k : b + 3 * k],
+    )
+    for i in range(h0.size):
+        middle = h2[i] - h1[i]
+        whole = ((h3[i] - h2[i]) - middle) - (middle - (h1[i] - h0[i]))
+        out[i] = whole + ((l3[i] - l0[i]) - 3.0 * (l2[i] - l1[i]))
+
+
 @njit(fastmath=_FAST, **INNER)
 def _square_sum(values):  # type: ignore[no-untyped-def]
     """Sum of squares."""
@@ -98,19 +125,22 @@ def _square_sum(values):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _energy_two(high, low, a, b, k):  # type: ignore[no-untyped-def]
+def _energy_two(high, low, a, b, k, order):  # type: ignore[no-untyped-def]
     """`_sum_squares` for an angle held as two doubles."""
     buffer = np.empty(min(b - a, 2048))
     total = 0.0
     for begin in range(a, b, 2048):
         part = buffer[: min(2048, b - begin)]
-        _differences_two(high, low, begin, begin + part.size, k, part)
+        if order == 3:
+            _third_differences_two(high, low, begin, begin + part.size, k, part)
+        else:
+            _differences_two(high, low, begin, begin + part.size, k, part)
         total += _square_sum(part)
     return total
 
 
 @njit(**INNER)
-def _add_part(high, low, begin, end, near, a, b, k, shift, sums, counts):  # type: ignore[no-untyped-def]
+def _add_part(high, low, begin, end, near, a, b, k, shift, order, sums, counts):  # type: ignore[no-untyped-def]
     """Add the valid terms in ``a <= m < b``; interval `near` is the first that ends after a."""
     up = (1 << shift) - 1
     for v in range(near, begin.size):
@@ -121,21 +151,25 @@ def _add_part(high, low, begin, end, near, a, b, k, shift, sums, counts):  # typ
         if last > first:
             counts[0] += last - first
             if low.size > 0:
-                sums[0] += _energy_two(high, low, first, last, k >> shift)
+                sums[0] += _energy_two(high, low, first, last, k >> shift, order)
             else:
-                sums[0] += _sum_squares(high, first, last, k >> shift)
+                sums[0] += _sum_squares(high, first, last, k >> shift, order)
 
 
 @njit(**KERNEL)
 def single_blocks(  # type: ignore[no-untyped-def]
-    high, low, places, starts, stops, angle, step, ks, shifts, head_lengths, whole, n_windows
-):
-    """Sum heads and tails as `grouped_blocks`; `low` is the remainder of `high`, or empty."""
+    high, low, places, starts, stops, order, spans, points, step, ks, shifts, head_lengths, whole,
+    n_windows
+):  # fmt: skip
+    """Sum heads and tails as `grouped_blocks`; `low` is the remainder of `high`, or empty.
+
+    `order` is that of the differences; `spans` (n_tau,) and `points` as for `valid_intervals`.
+    """
     n_blocks = n_windows + whole[0]
     heads, tails = np.zeros((n_blocks, ks.size)), np.zeros((n_blocks, ks.size))
     head_counts, tail_counts = np.zeros((n_blocks, ks.size)), np.zeros((n_blocks, ks.size))
     for i in range(ks.size):
-        begin, end = valid_intervals(starts, stops, ks[i], angle)
+        begin, end = valid_intervals(starts, stops, ks[i], spans[i], points)
         theta, rest = high[places[i] :], low[places[i] :]
         last = n_windows + whole[i] - 1
         near = 0
@@ -154,6 +188,7 @@ def single_blocks(  # type: ignore[no-untyped-def]
                 b,
                 ks[i],
                 shifts[i],
+                order,
                 heads[block, i : i + 1],
                 head_counts[block, i : i + 1],
             )
@@ -168,6 +203,7 @@ def single_blocks(  # type: ignore[no-untyped-def]
                     a + step,
                     ks[i],
                     shifts[i],
+                    order,
                     tails[block, i : i + 1],
                     tail_counts[block, i : i + 1],
                 )

@@ -39,8 +39,43 @@ def white_pair_sum(n, k):  # type: ignore[no-untyped-def]
     return n + 2.0 * (near + far)
 
 
+#: Products of the weights of a third difference with themselves, moved by -3 k to 3 k.
+_THIRD_WEIGHTS = (-1.0, 6.0, -15.0, 20.0, -15.0, 6.0, -1.0)
+
+
 @njit(**INNER)
-def strict_gap_factors(begin, end, counts, full, k, shift, window, step):  # type: ignore[no-untyped-def]
+def _third_pair_moments(k, summed):  # type: ignore[no-untyped-def]
+    """Sum ``rho(l)^2`` and ``l rho(l)^2`` over the lags 1 to l, for third differences, (2, 3 k).
+
+    The angle has the generalised autocovariance -|l| / 2, its running sum (|l|^3 - |l|) / 12.
+    """
+    out = np.zeros((2, 3 * k + 1))
+    whole = 1.0
+    for lag in range(out.shape[1]):
+        total = 0.0
+        for i in range(7):
+            t = float(abs(lag + (i - 3) * k))
+            total += _THIRD_WEIGHTS[i] * (t * (t * t - 1.0) / 12.0 if summed else -0.5 * t)
+        if lag == 0:
+            whole = total
+        else:
+            square = (total / whole) ** 2
+            out[0, lag] = out[0, lag - 1] + square
+            out[1, lag] = out[1, lag - 1] + lag * square
+    return out
+
+
+@njit(**INNER)
+def _pair_sum(n, k, moments):  # type: ignore[no-untyped-def]
+    """`white_pair_sum`, or that of third differences with `_third_pair_moments`."""
+    if moments.size == 0:
+        return white_pair_sum(n, k)
+    last = min(max(n - 1, 0), moments.shape[1] - 1)
+    return n + 2.0 * (n * moments[0, last] - moments[1, last])
+
+
+@njit(**INNER)
+def strict_gap_factors(begin, end, counts, full, k, shift, length, step, order, summed):  # type: ignore[no-untyped-def]
     """Degrees of freedom of each window with gaps, as a share of the gap-free window's.
 
     Parameters
@@ -49,15 +84,18 @@ def strict_gap_factors(begin, end, counts, full, k, shift, window, step):  # typ
         Valid intervals of m of a rate log.
     counts, full : int64 (n_windows,)
         Terms used and terms without gaps.
-    k, shift, window, step : int
-        Averaging factor, thinning of the terms (every ``2**shift``-th), window and step in samples.
+    k, shift, length, step : int
+        Averaging factor, thinning of the terms (every ``2**shift``-th), terms of a window without
+        thinning, and step [samples].
+    order, summed : int, bool
+        Order of the differences; whether they are those of the running sum of the angle.
 
     Returns
     -------
     float64 (n_windows,)
         1 where nothing is missing, 0 where nothing is left.
     """
-    length = window - 2 * k + 1
+    moments = np.empty((2, 0)) if order == 2 else _third_pair_moments(k >> shift, summed)
     up = (1 << shift) - 1
     out = np.ones(counts.size)
     v = 0
@@ -76,7 +114,7 @@ def strict_gap_factors(begin, end, counts, full, k, shift, window, step):  # typ
                 break
             a = (max(begin[u], first) + up) >> shift
             b = (min(end[u], first + length) + up) >> shift
-            pairs += white_pair_sum(b - a, k >> shift)
+            pairs += _pair_sum(b - a, k >> shift, moments)
         ratio = counts[j] / full[j]
-        out[j] = ratio * ratio * white_pair_sum(int(full[j]), k >> shift) / pairs
+        out[j] = ratio * ratio * _pair_sum(int(full[j]), k >> shift, moments) / pairs
     return out

@@ -30,10 +30,12 @@ from gyrostab.kernels.allan.integrate import (
     needs_two_doubles,
     present_runs,
     pyramid_places,
+    sum_two,
     thin_pyramid,
 )
 from gyrostab.kernels.allan.intervals import single_blocks, valid_intervals
 from gyrostab.kernels.allan.pairs import strict_gap_factors
+from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.compiled import KERNEL
 from gyrostab.kernels.workspace import Workspace
 
@@ -65,6 +67,8 @@ class Unit(NamedTuple):
         Divide by the number of terms without gaps, as the paper does, instead of the number used.
     min_strict, min_coverage : float
         Smallest share of terms in unbroken runs; smallest coverage of a reported cell.
+    variance : str
+        One of `VARIANCES`. Only those of second differences bridge gaps by cluster means.
     """
 
     window: int
@@ -76,6 +80,27 @@ class Unit(NamedTuple):
     zero_fill: bool
     min_strict: float
     min_coverage: float
+    variance: str = "avar"
+
+    @property
+    def order(self) -> int:
+        """Order of the differences."""
+        return VARIANCES[self.variance].order
+
+    @property
+    def spans(self) -> Integers:
+        """Samples that a term uses, (n_tau,)."""
+        return VARIANCES[self.variance].spans(self.ks)
+
+    @property
+    def lengths(self) -> Integers:
+        """Terms of a window without gaps, (n_tau,)."""
+        return self.window - self.spans + 1
+
+    @property
+    def points(self) -> int:
+        """Angles of a term that must be present; 0 if all samples of its span must be."""
+        return self.order + 1 if self.angle and not VARIANCES[self.variance].summed else 0
 
 
 class Cells(NamedTuple):
@@ -92,16 +117,19 @@ class Cells(NamedTuple):
 
 
 @njit(**KERNEL)
-def _share_gaps(starts, stops, angle, window, step, ks, shifts, counts, full, cells):  # type: ignore[no-untyped-def]
+def _share_gaps(  # type: ignore[no-untyped-def]
+    starts, stops, angle, window, step, ks, shifts, spans, order, summed, counts, full, cells
+):
     """Degrees of freedom of the strict cells, as a share of the gap-free ones."""
     for i in range(ks.size):
         if angle:
             for j in range(counts.shape[0]):
                 cells[3, j, i] = counts[j, i] / full[j, i]
             continue
-        begin, end = valid_intervals(starts, stops, ks[i], angle)
+        begin, end = valid_intervals(starts, stops, ks[i], spans[i], np.int64(0))
+        length = window - spans[i] + 1
         factors = strict_gap_factors(
-            begin, end, counts[:, i], full[:, i], ks[i], shifts[i], window, step
+            begin, end, counts[:, i], full[:, i], ks[i], shifts[i], length, step, order, summed
         )
         for j in range(factors.size):
             cells[3, j, i] = factors[j]
@@ -161,11 +189,13 @@ def _strict_sums(
     space: Workspace,
 ) -> tuple[Floats, Floats]:
     """Sum squared second differences of every window and factor, and count terms if any miss."""
-    lengths = unit.window - 2 * unit.ks + 1
+    lengths = unit.lengths
     whole = lengths // unit.step
     rest = lengths - whole * unit.step
     blocks = space.array("blocks", 4 if gaps else 2, n_windows + int(whole[0]), unit.ks.size)
     add = _angle_blocks if unit.angle else _rate_blocks
+    if unit.order == 3:
+        add = _third_blocks
     add(x, unit, present, (rest, whole, n_windows), blocks, space)
     sums = space.array("sums", len(blocks) // 2, n_windows, unit.ks.size)
     for heads_and_tails, out in zip((blocks[:2], blocks[2:]), sums, strict=False):
@@ -199,7 +229,7 @@ def _rate_blocks(
     for part in (high, low):
         thin_pyramid(part, x.size + 1, int(shifts[-1]), 0, x.size + 1)
     blocks[:] = single_blocks(
-        high, low, places, starts, stops, unit.angle, unit.step, ks, shifts, *cut
+        high, low, places, starts, stops, 2, unit.spans, unit.points, unit.step, ks, shifts, *cut
     )[: len(blocks)]
 
 
@@ -234,13 +264,57 @@ def _angle_blocks(
     thin_pyramid(flat, x.size, int(shifts[-1]), 0, x.size)
     if starts.size > 1:
         blocks[:] = single_blocks(
-            flat, flat[:0], places, starts, stops, unit.angle, unit.step, ks, shifts, *cut
+            flat,
+            flat[:0],
+            places,
+            starts,
+            stops,
+            2,
+            unit.spans,
+            unit.points,
+            unit.step,
+            ks,
+            shifts,
+            *cut,
         )[: len(blocks)]
     else:
         order = (ks, shifts, group_factors(ks, shifts))
         grouped_blocks(
             np.empty(0), 0.0, flat, x.size, places, starts, stops, unit.step, *order, *cut, blocks
         )
+
+
+def _third_blocks(
+    x: NDArray[np.generic],
+    unit: Unit,
+    present: _Present,
+    cut: tuple[Any, ...],
+    blocks: Floats,
+    space: Workspace,
+) -> None:
+    """Heads and tails of third differences; the sum of the angle is held as two doubles."""
+    starts, stops, offset = present
+    ks, shifts, summed = unit.ks, unit.shifts, VARIANCES[unit.variance].summed
+    angles = x.size if unit.angle else x.size + 1
+    places, size = pyramid_places(angles + summed, ks, shifts)
+    high, low = space.array("angle", size), space.array("rest of the angle", size)
+    precise = summed
+    if unit.angle:
+        high[:angles], low[:angles] = _line_removed(x, starts, stops), 0.0
+    else:
+        largest = integrate(x, offset, starts, stops, high[:angles])
+        precise = summed or needs_two_doubles(largest, x)
+        if precise:
+            integrate_two(x, offset, starts, stops, high[:angles], low[:angles])
+    if summed:
+        high[angles] = low[angles] = 0.0
+        sum_two(high[: angles + 1], low[: angles + 1])
+    for part in (high, low) if precise else (high,):
+        thin_pyramid(part, angles + summed, int(shifts[-1]), 0, angles + summed)
+    spans = unit.spans + unit.angle  # of angles instead of samples
+    order = (unit.order, spans, unit.points, unit.step, ks, shifts)
+    low = low if precise else low[:0]
+    blocks[:] = single_blocks(high, low, places, starts, stops, *order, *cut)[: len(blocks)]
 
 
 def _to_native(x: NDArray[np.generic]) -> NDArray[np.generic]:
@@ -287,8 +361,8 @@ def surface_unit(
     )  # integers less an integer: every sum is exact
     present = _Present(starts, stops, offset)
     sums, counts = _strict_sums(x, unit, present, n_windows, gaps, space)
-    full = full_counts(unit.window, unit.step, n_windows, unit.ks, unit.shifts)
-    scale = 2.0 * (unit.ks * (unit.interval if unit.angle else 1.0)) ** 2
+    full = full_counts(unit.lengths, unit.step, n_windows, unit.shifts)
+    scale = VARIANCES[unit.variance].divisors(unit.ks) * (unit.interval if unit.angle else 1.0) ** 2
     if gaps:
         full = np.ascontiguousarray(np.broadcast_to(full, counts.shape))
         return _cells_with_gaps(x, unit, present, sums / scale, counts, full, space), means
@@ -319,11 +393,14 @@ def _cells_with_gaps(
     with np.errstate(invalid="ignore", divide="ignore"):
         np.divide(sums, full if unit.zero_fill else counts, out=cells[0])
     cells[1], cells[2], cells[4] = counts, counts / full, STRICT
+    order = (unit.spans, unit.order, VARIANCES[unit.variance].summed)
     _share_gaps(
-        starts, stops, unit.angle, unit.window, unit.step, unit.ks, unit.shifts, counts, full, cells
-    )
+        starts, stops, unit.angle, unit.window, unit.step, unit.ks, unit.shifts, *order, counts,
+        full, cells,
+    )  # fmt: skip
     poor = counts < unit.min_strict * full
-    if not unit.zero_fill and not unit.angle and poor.any():
+    bridge = unit.order == 2 and not unit.zero_fill and not unit.angle
+    if bridge and poor.any():
         strides = cluster_strides(unit.window, unit.ks, unit.shifts)
         angle = _angle_of(x, present, np.flatnonzero(poor.any(axis=1)), unit, space)
         _bridge_gaps(angle, starts, stops, unit.window, unit.step, unit.ks, strides, poor, cells)

@@ -56,7 +56,12 @@ def _slope_covariances(window: int) -> tuple[NDArray[np.float64], NDArray[np.flo
 
 
 def detrend_tables(
-    window: int, ks: NDArray[np.int64], pairs: NDArray[np.float64], ramps: NDArray[np.float64]
+    window: int,
+    ks: NDArray[np.int64],
+    pairs: NDArray[np.float64],
+    ramps: NDArray[np.float64],
+    *,
+    summed: bool = False,
 ) -> TrendTables:
     """Turn the tables of Allan variances into those of Allan variances less their trend.
 
@@ -68,15 +73,22 @@ def detrend_tables(
         Averaging factors.
     pairs : float64 (4, 4, n_tau, n_tau); ramps : float64 (4, n_tau, n_tau)
         `gyrostab.kernels.fit.covariance.product_tables`.
+    summed : bool
+        The variances are modified Allan variances, of third differences of the sum of the angle.
     """
     angles, variance = _slope_covariances(window)
+    sums = np.pad(angles.cumsum(axis=1), ((0, 0), (1, 0))) if summed else angles
     products = np.empty((STOCHASTIC, STOCHASTIC, ks.size))
     means = np.empty((STOCHASTIC, ks.size))
     for i, k in enumerate(ks):
         step = max(1, int(k) // _STEPS, window // _PLACES)
-        count = window - 2 * int(k) + 1
-        near, middle, far = (angles[:, j * k : j * k + count : step] for j in range(3))
-        covariance = (near - 2.0 * middle + far) / k
+        count = window - (3 * int(k) - 1 if summed else 2 * int(k)) + 1
+        points = [sums[:, j * k : j * k + count : step] for j in range(4 if summed else 3)]
+        covariance = (
+            (points[3] - 3.0 * (points[2] - points[1]) - points[0]) / float(k) ** 2
+            if summed
+            else (points[0] - 2.0 * points[1] + points[2]) / k
+        )
         products[..., i] = covariance @ covariance.T / covariance.shape[1]
         means[:, i] = covariance.mean(axis=1) / k
     half = 0.5 * ks.astype(np.float64) ** 2
