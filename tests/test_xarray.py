@@ -6,6 +6,7 @@ import pickle
 import subprocess
 import sys
 import tomllib
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -246,3 +247,22 @@ def test_looking_for_an_engine_loads_no_other_module():
         check=True,
     )
     assert done.stdout == "['gyrostab', 'gyrostab.xarray']\n"
+
+
+def test_log_and_product_in_an_object_store(tmp_path: Path) -> None:
+    fsspec = pytest.importorskip("fsspec")
+    draw = np.random.default_rng(5)
+    log = gyrostab.make_log(draw.standard_normal((2, 60_000)), rate=100.0, unit="deg/h")
+    store = fsspec.filesystem("memory")
+    store.put(str(to_zarr(log, tmp_path / "log.zarr")), "/archive/log.zarr", recursive=True)
+    remote = xr.open_zarr("memory://archive/log.zarr")
+    assert remote.rate.chunks is not None
+    options = {"window": "60s", "step": "30s"}
+    product = gyrostab.fit_noise(gyrostab.davar(remote, **options))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # zarr: strings and consolidated metadata in format 3
+        product.to_zarr("memory://archive/product.zarr")
+    expected = gyrostab.fit_noise(gyrostab.davar(log, **options))
+    stored = xr.open_zarr("memory://archive/product.zarr")
+    for name in ("avar", "N", "N_stderr"):
+        np.testing.assert_array_equal(stored[name], expected[name])
