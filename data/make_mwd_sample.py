@@ -274,7 +274,11 @@ def readme(rows: int) -> str:
     slopes = ", ".join(f"{axis} {TRUTH[axis]['a_T']:g}" for axis in AXES)
     places = [f"{start:g} s ({length:g} s)" for start, length in DROPOUTS]
     dropouts = ", ".join(places[:4]) + ",\n  " + ", ".join(places[4:])
-    return f"""# The shipped log
+    return f"""# The shipped logs
+
+`mwd_day.csv.gz` is the log of `gyrostab demo`, **simulated**: a day of three axes at 2 Hz, with
+warm-up, rest, vibration and lost telemetry. `make_day_log.py` writes it from `models/demo.toml`,
+which states what is true. The rest of this page describes the other log.
 
 `mwd_sample.csv.gz` is **simulated**: three axes of a fiber-optic gyro of the 0.03 deg/h class on a
 shaker, {RATE} Hz, {DURATION} s, {rows} rows. `make_mwd_sample.py` (seed {SEED}) writes it and this

@@ -1,4 +1,4 @@
-"""The whole analysis of a simulated day: a gyro warms up, rests, is shaken, and rests again."""
+"""The whole analysis of the shipped log: a gyro warms up, rests, is shaken, and rests again."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import xarray as xr
 
 from gyrostab.allan.summary import TermSummary, summarise_terms
 from gyrostab.errors import OutputError
-from gyrostab.jobs.run import count_samples
+from gyrostab.jobs.run import count_samples, load_log
 from gyrostab.progress import Stage, no_stage
 
 __all__ = ["PARTS", "format_summary", "run_demo", "sample_log", "summarise"]
@@ -29,18 +29,19 @@ FILES = (
 )
 
 
-def sample_log() -> Path:
-    """Find the shipped log: inside an installed package, or in ``data/`` of a source tree.
+def sample_log(name: str = "mwd_sample.csv.gz") -> Path:
+    """Find a shipped log: inside an installed package, or in ``data/`` of a source tree.
+
+    Parameters
+    ----------
+    name : {"mwd_sample.csv.gz", "mwd_day.csv.gz"}
+        A quarter of an hour on a shaker at 100 Hz, or the day of the demo at 2 Hz.
 
     Examples
     --------
     >>> sample_log().name
     'mwd_sample.csv.gz'
     """
-    return _find_data("mwd_sample.csv.gz")
-
-
-def _find_data(name: str) -> Path:
     here = Path(__file__).resolve().parents[1]
     for folder in (here / "data", here.parent / "data"):
         path = folder / name
@@ -100,7 +101,7 @@ def format_summary(product: xr.Dataset) -> str:
 def run_demo(
     folder: str | Path, *, overwrite: bool = False, stage: Stage = no_stage
 ) -> tuple[xr.Dataset, list[Path]]:
-    """Simulate a day of a gyro, and run the whole analysis on it.
+    """Run the whole analysis on the shipped log.
 
     Parameters
     ----------
@@ -126,25 +127,23 @@ def run_demo(
     from gyrostab.allan.fit import fit_noise
     from gyrostab.io.datasets import to_netcdf
     from gyrostab.report import write_report
-    from gyrostab.simulate import simulate
-    from gyrostab.store.output import check_folder, new_folder
+    from gyrostab.store.output import check_folder, new_folder, protect_inputs
 
-    folder = Path(folder)
-    check_folder(folder, FILES, overwrite=overwrite)
-    with new_folder(folder, overwrite=overwrite) as temporary:
-        log = simulate(_find_data("models/demo.toml"))
-        stage("simulating", count_samples(log))
-        log = log.load()
-        stage("writing the log", count_samples(log))
-        to_netcdf(log, temporary / "log.nc")
-        stage("computing", count_samples(log))
-        surface = davar(log, window=WINDOW, step=STEP).compute()
-        stage("fitting")
-        product = fit_noise(surface).compute()
-        to_netcdf(product, temporary / "product.nc")
-        stage("drawing")
-        _draw_figures(log, product, temporary)
-        write_report(product, temporary / "report.html", log=log)
+    folder, path = Path(folder), sample_log("mwd_day.csv.gz")
+    with protect_inputs([path]):
+        check_folder(folder, FILES, overwrite=overwrite)
+        with new_folder(folder, overwrite=overwrite) as temporary:
+            stage("reading")
+            log = load_log([path])
+            to_netcdf(log, temporary / "log.nc")
+            stage("computing", count_samples(log))
+            surface = davar(log, window=WINDOW, step=STEP).compute()
+            stage("fitting")
+            product = fit_noise(surface).compute()
+            to_netcdf(product, temporary / "product.nc")
+            stage("drawing")
+            _draw_figures(log, product, temporary)
+            write_report(product, temporary / "report.html", log=log)
     return product, [folder / name for name in FILES]
 
 

@@ -46,6 +46,14 @@ def test_the_shipped_log_is_what_its_script_writes(tmp_path):
     assert (DATA / "README.md").read_text() == (tmp_path / "README.md").read_text()
 
 
+def test_the_day_is_what_its_script_writes():
+    rows = runpy.run_path(str(DATA / "make_day_log.py"))["format_rows"]()
+    shipped = gzip.decompress(sample_log("mwd_day.csv.gz").read_bytes()).decode().splitlines()
+    # other versions of numpy or numba may round a few values the other way
+    assert len(rows) == len(shipped)
+    assert sum(ours != own for ours, own in zip(rows, shipped, strict=True)) < len(rows) / 1000
+
+
 def test_the_shipped_log_is_found_and_small():
     assert sample_log().stat().st_size < 15e6
 
@@ -63,7 +71,7 @@ def test_demo_shows_each_term_and_what_raises_it(demo):
     assert len(rows) == 15
     for axis, white, shaken in (("x", 0.006, 0.0302), ("y", 0.006, 0.0127), ("z", 0.008, 0.0138)):
         assert rows[axis, "N"] == pytest.approx([white, white, shaken, white], rel=0.1)
-        assert rows[axis, "Q"] == pytest.approx([2.0] * 4, rel=0.05)
+        assert rows[axis, "Q"] == pytest.approx([2.0] * 4, rel=0.1)
         assert rows[axis, "R"][0] == pytest.approx(3.0, rel=0.2)
         assert np.isnan(rows[axis, "R"][1:]).all()
         for term, size in (("B", 0.05), ("K", 0.2 if axis == "z" else 0.3)):

@@ -108,7 +108,7 @@ def test_wheel_in_a_bare_environment(checkout: Path, tmp_path: Path) -> None:
         assert not [name for name in archive.getnames() if "/.venv" in name or "/run7" in name]
     names = zipfile.ZipFile(wheel).namelist()
     assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {"gyrostab"}
-    for name in ("py.typed", "data/mwd_sample.csv.gz", "report/charts.js"):
+    for name in ("py.typed", "data/mwd_day.csv.gz", "report/charts.js"):
         assert f"gyrostab/{name}" in names
     venv.create(tmp_path / "bare", with_pip=True)
     tools = tmp_path / "bare" / "bin"

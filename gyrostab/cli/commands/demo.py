@@ -12,7 +12,7 @@ __all__ = ["demo"]
 
 @app.command(sort_key=0, help_epilogue="")
 def demo(*, output: Output = Path("gyrostab-demo"), common: Common = Common()) -> None:
-    """Simulate a day of a gyro, and run the whole analysis on it.
+    """Run the whole analysis on the log shipped with gyrostab, a simulated day.
 
     Writes the product, the log, a report and figures to a folder, and prints the noise coefficients
     while the gyro warms up, rests, is shaken, and rests again.
