@@ -23,7 +23,7 @@ from gyrostab.blindtest.scoring.visibility import find_visibility
 from gyrostab.errors import OptionError
 from gyrostab.time.grid import grid_times
 
-__all__ = ["WAVEFORM_BLOCK_S", "describe_truth", "draw_effects", "make_case"]
+__all__ = ["WAVEFORM_BLOCK_S", "describe_truth", "draw_effects", "draw_suitable", "make_case"]
 
 #: Length of the block means of a waveform in the truth [s].
 WAVEFORM_BLOCK_S = 10.0
@@ -41,7 +41,8 @@ def _is_suitable(scenario: Scenario, entries: Sequence[Entry]) -> bool:
     return bool(warm and turns)
 
 
-def _draw_suitable(plan: dict[str, Any], entries: Sequence[Entry], attempt: int) -> Scenario:
+def draw_suitable(plan: dict[str, Any], entries: Sequence[Entry], attempt: int) -> Scenario:
+    """Draw the environment of a plan until it contains what all of its effects need."""
     cuts = max([plan["cuts"], *(entry.cuts for entry in entries)])
     for trial in range(_MAX_TRIES):
         rng = stream(plan["seed"], "scenario", plan["index"], attempt, trial)
@@ -146,7 +147,7 @@ def make_case(plan: dict[str, Any]) -> tuple[xr.Dataset, dict[str, Any]]:
     seed = int(stream(plan["seed"], "case", plan["index"]).integers(2**40))
     for attempt in range(_MAX_TRIES):
         plan = _weaken_plan(plan, attempt)
-        scenario = _draw_suitable(plan, entries, attempt)
+        scenario = draw_suitable(plan, entries, attempt)
         effects = draw_effects(plan, scenario, attempt=attempt)
         record = make_record(scenario, effects, seed=seed + attempt)
         visibility = (

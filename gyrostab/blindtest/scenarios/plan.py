@@ -10,7 +10,7 @@ from gyrostab.blindtest.generator.catalogue import CATALOGUE, OUT_OF_CATALOGUE
 from gyrostab.blindtest.generator.scenario import stream
 from gyrostab.errors import OptionError
 
-__all__ = ["DEGRADATIONS", "KINDS", "STRENGTHS", "plan_case", "plan_cases"]
+__all__ = ["DEGRADATIONS", "INCOMPATIBLE", "KINDS", "STRENGTHS", "plan_case", "plan_cases"]
 
 #: Kind of case -> its number in 20 cases. "single", "sub_threshold", "out_of_catalogue" and
 #: "degraded_driver" hold one effect.
@@ -31,7 +31,7 @@ STRENGTHS = (0.5, 1.0, 1.5, 2.5, 4.0, 8.0)
 DEGRADATIONS = ("withheld", "substituted", "lagged", "confounded", "noisy", "clipped")
 
 #: Effects that never share a record, because one makes the limit of the other meaningless.
-_INCOMPATIBLE = (
+INCOMPATIBLE = (
     {"logger_filter", "spikes"},
     {"rate_quantization", "dead_zone"},
     {"rate_quantization", "clipping"},
@@ -126,7 +126,7 @@ def plan_case(index: int, *, seed: int) -> dict[str, Any]:
         others = [
             other
             for other in CATALOGUE
-            if other not in names and not any({other, name} in _INCOMPATIBLE for name in names)
+            if other not in names and not any({other, name} in INCOMPATIBLE for name in names)
         ]
         names.append(str(rng.choice(others)))
         strengths.append(float(rng.choice(STRENGTHS)))
