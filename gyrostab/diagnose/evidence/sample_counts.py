@@ -19,6 +19,7 @@ __all__ = [
     "excess_extremes",
     "expected_counts",
     "has_coarse_grid",
+    "hidden_by_grid",
     "kurtosis_evidence",
     "kurtosis_moments",
     "quiescent_scatter",
@@ -30,6 +31,12 @@ Array = NDArray[Any]
 COUNTS = ("outliers", "repeats", "extremes", "stuck", "filled")
 #: Statistics of the distribution that a coarse quantization grid changes.
 GRID_COUNTS = ("repeats", "extremes", "zeros", "stuck", "filled", "kurtosis")
+#: Counts of `GRID_COUNTS` whose number by chance follows from the scatter of normal noise.
+_PREDICTED_COUNTS = ("repeats", "zeros", "stuck", "filled")
+_MAX_PREDICTED_SCATTERS = 1.5  # quantization step over the scatter of these samples; design choice
+#: Excess kurtosis below which 90 % of the blocks of normal noise are: 0.6 with the fewest samples,
+#: more on grids. Design choice.
+_MAX_NORMAL_KURTOSIS, _NORMAL_SHARE = 1.0, 0.9
 _MIN_COARSE_SCATTERS = 0.2  # quantization step over the scatter of the samples; design choice
 _QUIESCENT_QUANTILE = 0.1  # of the block variances, taken as that at rest; design choice
 _CERTAIN_EXTREMES = 2  # the smallest and the largest sample of any record
@@ -63,6 +70,27 @@ def has_coarse_grid(blocks: xr.Dataset) -> NDArray[np.bool_]:
         return np.zeros(blocks.sizes["axis"], np.bool_)
     return np.asarray(
         blocks["quantization_step"].values > _MIN_COARSE_SCATTERS * quiescent_scatter(blocks)
+    )
+
+
+def hidden_by_grid(blocks: xr.Dataset, name: str) -> NDArray[np.bool_]:
+    """Find the axes on which a coarse quantization grid alone causes a count or the kurtosis.
+
+    Repeats and zeros remain usable where noise is normal: null records then have as many.
+
+    Returns
+    -------
+    ndarray of bool, shape (axis,)
+    """
+    coarse = has_coarse_grid(blocks)
+    if name not in _PREDICTED_COUNTS or not coarse.any():
+        return coarse & (name in GRID_COUNTS)
+    by_axis = np.moveaxis(blocks["kurtosis"].values, -2, 0).reshape(coarse.size, -1)
+    known = np.where(np.isfinite(by_axis).any(axis=1, keepdims=True), by_axis, np.inf)
+    is_normal = np.nanquantile(known, _NORMAL_SHARE, axis=1) < _MAX_NORMAL_KURTOSIS
+    step = blocks["quantization_step"].values
+    return np.asarray(
+        coarse & ~(is_normal & (step < _MAX_PREDICTED_SCATTERS * quiescent_scatter(blocks)))
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.evidence.sample_counts import GRID_COUNTS, has_coarse_grid
+from gyrostab.diagnose.evidence.sample_counts import hidden_by_grid
 from gyrostab.diagnose.predict.candidates import Candidate
 from gyrostab.diagnose.predict.channel_use import MIN_BLOCK_SHARE, missing_channel_reason
 from gyrostab.diagnose.predict.step_times import select_step_times
@@ -92,10 +92,10 @@ def effect_candidates(
 
 def _is_hidden_by_grid(kind: type[Effect], blocks: xr.Dataset) -> bool:
     """Return whether a coarse quantization grid hides every statistic of the effect on all axes."""
-    if kind.channels or not has_coarse_grid(blocks).all():
+    if kind.channels:
         return False
     marks = kind.example().explain(make_windows(blocks, {})).marks
-    return bool(marks) and set(marks) <= set(GRID_COUNTS)
+    return bool(marks) and all(hidden_by_grid(blocks, mark).all() for mark in marks)
 
 
 # -------------------------------------------------------------------------------

@@ -47,7 +47,7 @@ __all__ = [
 Array = NDArray[np.float64]
 _BLOCK_S = 20.0  # default block; design choice
 _MIN_DEFAULT_BLOCKS = 90  # shorter blocks in shorter records; design choice
-_MAX_BLOCKS = 6000  # longer blocks in longer records; limits memory and time
+_MAX_BLOCKS = 1000  # longer blocks in records above 5.6 h; bounds memory and time
 _MIN_BLOCK_SAMPLES = 100  # of a default block; design choice
 MIN_BLOCKS = 24  # fewer are refused: held-out stretches and calibration need them
 _MAX_SMOOTHING_BLOCKS = 2.0  # longest time scale of the smoothing of a channel; design choice
@@ -58,7 +58,7 @@ _MIN_NEIGHBOUR_RATIO = 2.0  # times expected density from which noise near an or
 
 
 def block_samples(size: int, rate: float, block: Any = None) -> int:
-    """Choose the block length: 20 s, less in short records, more beyond 33 h; in samples.
+    """Choose the block length: 20 s, less in short records, more beyond 5.6 h; in samples.
 
     The length is a product of small primes.
 

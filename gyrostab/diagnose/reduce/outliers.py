@@ -357,13 +357,15 @@ def quantization_step(values: Array) -> float:
     size = float(np.abs(levels).max())
     kept = [_frequent_levels(levels, times, rare) for rare in (_MAX_OFF_GRID_SHARE, _SPIKE_SHARE)]
     for kept_levels in (one for one in kept if one.size) if kept[0].size else (levels,):
-        for resolution in (2.0**-23, 2.0**-52):  # as written in single and in double precision
+        # as written in single and in double precision; numbers of the former repeat on any grid
+        # that is coarser than their last digit, and those of the latter are that precise
+        for resolution, least in ((2.0**-23, 0.0), (2.0**-52, 2.0**-20)):
             fine = 8.0 * resolution * size
             distances = np.diff(kept_levels)
             distances = distances[distances > fine]
-            if 0 < distances.size <= 0.8 * finite.size:
+            if distances.size and (least or distances.size <= 0.8 * finite.size):
                 step = _common_divisor(distances, fine)
-                if step > 0.0 and (
+                if step > least * size and (
                     kept_levels is levels
                     or _off_grid_share(levels, times, step, fine) <= _MAX_OFF_GRID_SHARE
                 ):

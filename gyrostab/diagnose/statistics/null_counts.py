@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
@@ -20,12 +22,32 @@ Array = NDArray[np.float64]
 _ITERATIONS = 20  # of an iteration that halves its error
 #: Standard deviations in a quantization step from which the values have few levels. Design choice.
 COARSE_STEP_SIGMA = 1.5
+_FINE_STEP = 0.3  # over the scatter of differences; the next term is 3e-5 of the probability there
+_QUADRATURE_NODES = 12  # over a bin: exact to 1e-6 up to 4 standard deviations of a step
+_MAX_LEVELS = 400  # on either side of the mean; more than any step above `_FINE_STEP` needs
+_MAX_CORRELATION = 0.9999
+#: Error of the expected share of repeats and zeros: noise is not exactly normal, and its scatter
+#: varies within a block. Design choice.
+_CHANCE_ERROR_SHARE = 0.03
+
+
+class _GridChance(NamedTuple):
+    """Probabilities of a sample on the quantization grid, by block."""
+
+    zero: Array
+    # Given a zero, that the sample before is zero, too.
+    zero_again: Array
+    # That a sample repeats the one before, at another value than zero.
+    repeat: Array
 
 
 def null_counts(
     blocks: xr.Dataset, sd: Array, count: int, rng: np.random.Generator
 ) -> dict[str, NDArray[np.int64]]:
     """Draw outliers, repeats, extremes and zeros of Gaussian noise on the quantization grid.
+
+    Repeats and zeros follow from the scatter of each block, and from the correlation of
+    neighbouring samples that its band powers give.
 
     Parameters
     ----------
@@ -41,20 +63,22 @@ def null_counts(
     samples = blocks["samples"].values.astype(np.int64)
     adjacent = blocks["adjacent"].values.astype(np.int64)
     mean = _interpolate_means(blocks["mean"].values)
-    repeat, zero = np.zeros(samples.shape), np.zeros(samples.shape)
+    scatter, correlation = neighbour_statistics(blocks, sd)
     truncated = truncated_axes(blocks)
-    for axis, step in enumerate(blocks["quantization_step"].values):
-        if step > 0.0:
-            repeat[axis], zero[axis] = _grid_probabilities(
-                mean[axis], float(step), sd[axis], truncated=bool(truncated[axis])
-            )
-        if not blocks["zeros"].values[axis].any():
-            zero[axis] = 0.0
-        both_zero = zero[axis] ** 2 / (2.0 if truncated[axis] else 1.0)  # the bin holds two steps
-        repeat[axis] = np.maximum(repeat[axis] - both_zero, 0.0)
+    nothing = np.zeros(samples.shape[1])
+    chances = [
+        _grid_chance(mean[axis], float(step), scatter[axis], correlation[axis], truncated[axis])
+        if step > 0.0
+        else _GridChance(nothing, nothing, nothing)
+        for axis, step in enumerate(blocks["quantization_step"].values)
+    ]
+    has_zeros = blocks["zeros"].values.any(axis=1, keepdims=True)
+    zero, again, repeat = (np.stack(part) for part in zip(*chances, strict=True))
     size = (count, *samples.shape)
-    zeros = rng.binomial(samples, np.broadcast_to(zero, size))
-    filled = _filled_zeros(blocks, zeros, samples, rng)
+    # an error of the probabilities is common to all blocks of an axis
+    error = 1.0 + _CHANCE_ERROR_SHARE * rng.standard_normal((count, len(samples), 1))
+    zeros = rng.binomial(samples, np.clip(np.where(has_zeros, zero, 0.0) * error, 0.0, 1.0))
+    filled = _filled_zeros(blocks, zeros, samples, again, rng)
     return {
         "outliers": rng.poisson(
             np.broadcast_to(
@@ -64,7 +88,7 @@ def null_counts(
                 size,
             )
         ),
-        "repeats": rng.binomial(adjacent, np.broadcast_to(repeat, size)),
+        "repeats": rng.binomial(adjacent, np.clip(repeat * error, 0.0, 1.0)),
         "zeros": zeros,
         "stuck": zeros - filled,
         "filled": filled,
@@ -72,18 +96,68 @@ def null_counts(
     }
 
 
+def neighbour_statistics(blocks: xr.Dataset, sd: Array) -> tuple[Array, Array]:
+    """Measure the scatter of the samples of each block, and the correlation of neighbours.
+
+    Parameters
+    ----------
+    blocks : xarray.Dataset
+        Recording, from `reduce_log`.
+    sd : ndarray, shape (axis, 2)
+        Standard deviations of a sample and of a difference of neighbours [degree hour-1], for axes
+        without measured powers.
+
+    Returns
+    -------
+    scatter, correlation : ndarray, shape (axis, block)
+        Interpolated over blocks with losses or outliers.
+    """
+    rate = float(blocks.attrs["sampling_rate_hz"])
+    low, high = blocks["band_low"].values, blocks["band_high"].values
+    cosine = np.cos(2.0 * np.pi * blocks["line_frequency"].values / rate)
+    lines = np.nan_to_num(blocks["line_power"].values).mean(axis=1)
+    band = np.searchsorted(high, blocks["line_frequency"].values).clip(0, high.size - 1)
+    scatter, correlation = np.empty((2, *blocks["power"].shape[:2]))
+    for axis, power in enumerate(blocks["power"].values):
+        total = np.bincount(band, weights=lines[axis], minlength=high.size)
+        shape = np.bincount(band, weights=lines[axis] * cosine, minlength=high.size)
+        centre = np.cos(np.pi * (low + high) / rate)
+        in_band = np.divide(shape, total, out=centre, where=total > 0.0)
+        variance = 2.0 * power @ (high - low)
+        lagged = 2.0 * power @ ((high - low) * in_band)
+        good = np.isfinite(variance) & (variance > 0.0)
+        typical = good & (blocks["outliers"].values[axis] == 0)
+        good = typical if typical.any() else good
+        place = np.arange(good.size)
+        if good.any():
+            scatter[axis] = np.sqrt(np.interp(place, place[good], variance[good]))
+            correlation[axis] = np.interp(place, place[good], lagged[good] / variance[good])
+        else:
+            scatter[axis] = sd[axis, 0]
+            correlation[axis] = 1.0 - 0.5 * (sd[axis, 1] / sd[axis, 0]) ** 2
+    return scatter, np.clip(correlation, -_MAX_CORRELATION, _MAX_CORRELATION)
+
+
 def _filled_zeros(
     blocks: xr.Dataset,
     zeros: NDArray[np.int64],
     samples: NDArray[np.int64],
+    again: Array,
     rng: np.random.Generator,
 ) -> NDArray[np.int64]:
-    """Return the zeros (record, axis, block) that look filled because they coincide by chance."""
+    """Return the zeros (record, axis, block) that look filled because they coincide by chance.
+
+    On a single axis these are zeros next to another one, whose probability is `again`.
+    """
     subset = blocks["axes_at_once"].values.astype(bool)
     number = blocks["at_once"].values.astype(np.int64)
     share = zeros / np.maximum(samples, 1)
     if len(samples) == 1:
-        coinciding = rng.binomial(zeros, 1.0 - (1.0 - share) ** 2)  # zeros next to another one
+        # rare ones come in pairs, and rare zeros alone exclude each other: variance 2 z p (1 - p)^2
+        chance = 1.0 - (1.0 - again) ** 2
+        scatter = np.sqrt(2.0 * zeros * chance) * (1.0 - chance)
+        drawn = np.rint(zeros * chance + scatter * rng.standard_normal(zeros.shape))
+        coinciding = np.clip(drawn, 0, zeros).astype(np.int64)
     elif not zeros.any():
         coinciding = np.zeros_like(zeros)
     else:
@@ -102,30 +176,66 @@ def _interpolate_means(mean: Array) -> Array:
     return out
 
 
-def _grid_probabilities(
-    mean: Array, step: float, sd: Array, *, truncated: bool = False
+def _grid_chance(
+    mean: Array, step: float, scatter: Array, correlation: Array, truncated: bool
+) -> _GridChance:
+    """Return the probabilities of zeros and repeats of correlated normal noise on a grid.
+
+    The values before rounding are normal, and so are pairs of neighbours. A pair is in one bin with
+    the integral of its normal density over the square of that bin: by Gauss-Legendre quadrature,
+    bin by bin. Fine grids have many bins; the difference of neighbours then decides, with a
+    triangular weight, P = s / (sqrt(2 pi) d) (1 - s^2 / (12 d^2)) for the step s and the standard
+    deviation d of differences.
+    """
+    variance = np.maximum(scatter**2 - step**2 / 12.0, (0.05 * step) ** 2)
+    # rounding errors of coarse grids are independent: the correlation is that before rounding
+    inner = np.sqrt(variance)
+    rho = np.clip(correlation * scatter**2 / variance, -_MAX_CORRELATION, _MAX_CORRELATION)
+    centre = _before_truncation(mean, step, inner) if truncated else mean
+    half_zero = step if truncated else 0.5 * step
+    zero, both_zero = _chance_in_bin(-centre, half_zero, inner, rho)
+    again = np.divide(both_zero, zero, out=np.zeros_like(zero), where=zero > 0.0)
+    difference = inner * np.sqrt(2.0 - 2.0 * rho)
+    ratio = step / difference
+    if (ratio < _FINE_STEP).all():
+        any_bin = ratio / np.sqrt(2.0 * np.pi) * (1.0 - ratio**2 / 12.0)
+        plain_zero = _chance_in_bin(-centre, 0.5 * step, inner, rho)[1]
+        repeat = any_bin - plain_zero
+    else:
+        reach = int(min(np.ceil(6.0 * inner.max() / step) + 1, _MAX_LEVELS))
+        nearest = np.round(centre / step)
+        repeat = np.zeros(mean.size)
+        for level in range(-reach, reach + 1):
+            place = nearest + level
+            both = _chance_in_bin(place * step - centre, 0.5 * step, inner, rho)[1]
+            repeat += np.where(np.abs(place * step) < half_zero, 0.0, both)
+    return _GridChance(zero, again, np.clip(repeat, 0.0, 1.0))
+
+
+def _chance_in_bin(
+    middle: Array, half: float, scatter: Array, correlation: Array
 ) -> tuple[Array, Array]:
-    """Return the probabilities of a repeat (in any bin) and of a zero, by block."""
-    inner = float(np.sqrt(max(sd[0] ** 2 - step**2 / 12.0, (0.05 * step) ** 2)))
-    centre = (_before_truncation(mean, step, inner) if truncated else mean)[:, None]
-    reach = int(np.ceil(6.0 * inner / step)) + 1
+    """Return the probabilities that a sample, and a pair of neighbours, are in a bin.
 
-    def chance(level: Array) -> Array:
-        return np.asarray(
-            ndtr((level + step / 2.0 - centre) / inner)
-            - ndtr((level - step / 2.0 - centre) / inner)
-        )
+    Parameters
+    ----------
+    middle : ndarray
+        Middle of the bin, relative to the mean of the samples.
+    half : float
+        Half of its width.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_NODES)
+    value = middle[:, None] + half * nodes
+    density = np.exp(-0.5 * (value / scatter[:, None]) ** 2) / np.sqrt(2.0 * np.pi)
+    density *= half * weights / scatter[:, None]
+    rest = (scatter * np.sqrt(1.0 - correlation**2))[:, None]
+    shift = middle[:, None] - correlation[:, None] * value
+    both = density * (ndtr((shift + half) / rest) - ndtr((shift - half) / rest))
+    one = ndtr((middle + half) / scatter) - ndtr((middle - half) / scatter)
+    return np.asarray(one), np.asarray(both.sum(axis=1))
 
-    zero = (
-        chance(np.array([-0.5, 0.5]) * step).sum(axis=1) if truncated else chance(np.zeros(1))[:, 0]
-    )
-    if step < COARSE_STEP_SIGMA * inner:
-        return np.full(mean.size, min(step / (np.sqrt(2.0 * np.pi) * float(sd[1])), 1.0)), zero
-    levels = (np.round(centre / step) + np.arange(-reach, reach + 1)) * step
-    return np.asarray((chance(levels) ** 2).sum(axis=1)), zero
 
-
-def _before_truncation(mean: Array, step: float, scatter: float) -> Array:
+def _before_truncation(mean: Array, step: float, scatter: Array) -> Array:
     """Return means before truncation, which shifts them by up to half a step towards zero."""
     out = mean
     for _ in range(_ITERATIONS):

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.folds import fold_subsets
 from gyrostab.diagnose.evidence.sample_counts import (
-    GRID_COUNTS,
     CountEvidence,
     excess_extremes,
-    has_coarse_grid,
+    hidden_by_grid,
     kurtosis_evidence,
     kurtosis_moments,
     sample_count_evidence,
@@ -117,8 +116,8 @@ class SampleCounts(Statistic):
         rate = float(blocks.attrs["sampling_rate_hz"])
         number = np.concatenate([counts, np.broadcast_to(mean, tails.shape)], axis=-1)
         z = np.concatenate([2.0 * np.sqrt(counts + 0.375), tails], axis=-1)
-        is_grid_count = np.array([name in GRID_COUNTS for name in (*COUNTS, "kurtosis")])
-        z = np.where(has_coarse_grid(blocks)[:, None, None] & is_grid_count, np.nan, z)
+        hidden = np.stack([hidden_by_grid(blocks, name) for name in (*COUNTS, "kurtosis")], axis=-1)
+        z = np.where(hidden[:, None, :], np.nan, z)
         return statistic_dataset(
             "distribution",
             blocks,
@@ -145,14 +144,13 @@ class SampleCounts(Statistic):
             return []
         subsets = fold_subsets(trial.folds)
         rows: list[tuple[str, ...]] = [(axis,) for axis in trial.state.axes]
-        coarse = has_coarse_grid(trial.state.blocks)
         out = []
         for candidate in group:
             evidence_nats, best = [], []
             for variant in candidate.variants:
                 by_name = [
                     np.where(
-                        coarse & (name in GRID_COUNTS),
+                        hidden_by_grid(trial.state.blocks, name),
                         0.0,
                         _count_evidence(name, trial.data, trial.state, subsets, trial.counts),
                     )
