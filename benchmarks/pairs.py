@@ -76,7 +76,7 @@ def main() -> None:
             kept.write_bytes(pickle.dumps(prepare_searches(plan)))
         effects = zip(plan["names"], plan["strengths"], strict=True)
         print(f"{index}:", " + ".join(f"{name} {size:g}" for name, size in effects), flush=True)
-        counts += count_draw(pickle.loads(kept.read_bytes()))
+        counts.update(count_draw(pickle.loads(kept.read_bytes())))
     print(", ".join(f"{key} {value}" for key, value in counts.items()))
 
 
