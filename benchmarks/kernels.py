@@ -180,7 +180,10 @@ def allantools_loop(x: np.ndarray, window: int, step: int, taus: np.ndarray) -> 
 
 @numba.njit(fastmath=True)
 def recompute(x: np.ndarray, window: int, step: int, ks: np.ndarray) -> np.ndarray:
-    """Compute every window anew: a loop over its second differences that the compiler unrolls."""
+    """Compute every window anew: a loop over its second differences that the compiler unrolls.
+
+    This is how SigmaTau.jl computes an Allan deviation.
+    """
     theta = np.zeros(x.size + 1)
     theta[1:] = np.cumsum(x)
     sums = np.zeros(((x.size - window) // step + 1, ks.size))
@@ -188,6 +191,32 @@ def recompute(x: np.ndarray, window: int, step: int, ks: np.ndarray) -> np.ndarr
         part = theta[j * step : j * step + window + 1]
         for i, k in enumerate(ks):
             sums[j, i] = energy(part[: -2 * k], part[k:-k], part[2 * k :])
+    return sums
+
+
+@numba.njit(fastmath=True)
+def double_means(near: np.ndarray, far: np.ndarray, longer: np.ndarray) -> float:
+    """Sum the squared changes from mean to mean, and write the means of twice the length."""
+    total = 0.0
+    for i in range(near.size):
+        change = far[i] - near[i]
+        total += change * change
+        longer[i] = 0.5 * (near[i] + far[i])
+    return total
+
+
+@numba.njit
+def favar(x: np.ndarray, window: int, step: int, octaves: int) -> np.ndarray:
+    """FAVAR in every window: means of 2m samples follow from means of m, octave by octave."""
+    sums = np.zeros(((x.size - window) // step + 1, octaves))
+    room = np.empty((octaves, window))
+    for j in range(sums.shape[0]):
+        means = x[j * step : j * step + window]
+        for i in range(octaves):
+            size = means.size - (1 << i)
+            longer = room[i, :size]
+            sums[j, i] = double_means(means[:size], means[1 << i :], longer)
+            means = longer
     return sums
 
 
@@ -199,7 +228,7 @@ def shape(name: str, taus: str, repeats: int, quick: bool) -> Iterator[str]:
     length = {"window": f"{window}samples", "step": f"{step}samples"}
     options = {
         **length,
-        "taus": "all" if taus == "all" else 32,
+        "taus": 32 if taus == "32" else taus,
         "tau_max": (window // 2 - 1) / RATE,
     }
     tau = np.asarray(davar(log, **options).tau)
@@ -217,6 +246,8 @@ def shape(name: str, taus: str, repeats: int, quick: bool) -> Iterator[str]:
         "block sums, `davar`": lambda: davar(log, **options),
         "bare loop, as many terms": bare(number_of_terms(parts, unit)),
     }
+    if taus == "octave":
+        fast = {"FAVAR, every window": lambda: favar(x, window, step, tau.size), **fast}
     yield f"\n**{name}**, {n} samples, window {window}, step {step}, {tau.size} averaging times\n"
     yield (
         "| one thread | seconds | times as fast as allantools | as the recursion "
@@ -337,7 +368,7 @@ def report(quick: bool) -> Iterator[str]:
         + "."
     )
     for name in SHAPES:
-        for taus in ("32", "all"):
+        for taus in ("32", "octave", "all"):
             yield from shape(name, taus, repeats, quick)
     yield from archive(repeats, quick)
     yield (
