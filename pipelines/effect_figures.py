@@ -44,7 +44,7 @@ def draw(name, folder):
     options = {key: PLAN[name][key] for key in OPTIONS if key in PLAN[name]}
     folder.mkdir(parents=True, exist_ok=True)
     save_png(
-        plot_comparison(*simulate_pair(name), **options),
+        plot_comparison(*simulate_pair(name), width=193.04, **options),
         folder / f"{name}.png",
         dpi=120,
         colours=256,

@@ -112,7 +112,7 @@ def plot_comparison(
         raise OptionError(
             f"driver {driver!r} is not in the log; it has {', '.join(map(str, with_it.data_vars))}"
         )
-    figure = new_figure(width / INCH_MM, 7.6 if width < NARROW_MM else 4.4)
+    figure = new_figure(width / INCH_MM, 7.6 if width < NARROW_MM else 4.9)
     panels = figure.subplots(*((4, 1) if is_narrow(figure) else (2, 2))).reshape(2, 2)
     pair = tuple(
         davar(log, window=window, step=step, taus=30, axis=[str(log["axis"].values[0])])
@@ -143,6 +143,9 @@ def plot_comparison(
     (_draw_coherency if coherency else _draw_allan_correlation)(panels[1, 1], logs)
     for panel in panels.flat:
         panel.grid(visible=True, lw=0.3, alpha=0.6)
+        for scale, limits in ((panel.xaxis, panel.get_xlim()), (panel.yaxis, panel.get_ylim())):
+            if scale.get_scale() == "log":
+                label_log_axis(scale, *limits)
     return figure
 
 
