@@ -146,6 +146,12 @@ VARIABLES: dict[str, dict[str, Any]] = {
         "units": "1",
     },
     "fit_dof": {"long_name": "degrees of freedom of the misfit", "units": "1"},
+    "fit_tau_min": {"long_name": "shortest averaging time of the fit", "units": "s"},
+    "filter_time_constant": {
+        "long_name": "time constant of the first-order low-pass with the effect of the filter of "
+        "the sensor on the averaging times of the fit, 0 without a filter",
+        "units": "s",
+    },
 }
 
 

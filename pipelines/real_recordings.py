@@ -38,8 +38,11 @@ def pick(value, log, product):
         **log,
         **product,
         "adev": np.sqrt(product["avar"].sel(tau=value.get("tau", 1.0), method="nearest")),
+        "misfit": product["fit_chi2"] / product["fit_dof"],
     }[value["of"]]
     numbers = numbers.sel(axis=value["axis"]) if "axis" in value else numbers
+    if "time" not in numbers.dims:
+        return numbers
     seconds = (numbers["time"] - log["time"][0]) / np.timedelta64(1, "s")
     numbers = numbers[(seconds >= value.get("from", 0)) & (seconds <= value.get("to", np.inf))]
     return (

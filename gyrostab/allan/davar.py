@@ -37,7 +37,7 @@ from gyrostab.kernels.fit.least_squares import cell_freedoms, combine_diagonal, 
 from gyrostab.kernels.fit.third_differences import third_diagonals
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.noise import HOUR, sample_squares
-from gyrostab.schema import attributes
+from gyrostab.schema import attributes, log_channels
 from gyrostab.store.lazy import find_source, keep_sources, read_into, read_slice
 from gyrostab.time.grid import first_stamp, grid_times
 
@@ -233,13 +233,18 @@ def davar_parts(log: xr.Dataset, *, samples: int = 2**24, **options: Any) -> lis
 
 
 def davar_part(
-    log: xr.Dataset, *, part: slice, space: Workspace | None = None, **options: Any
+    log: xr.Dataset,
+    *,
+    part: slice,
+    space: Workspace | None = None,
+    alone: bool = False,
+    **options: Any,
 ) -> xr.Dataset:
     """Compute some windows of the surface of `davar`, immediately and in the calling thread.
 
     Only the samples of these windows are read, and dask computes nothing else, so that many parts
     can be computed in parallel, in threads, processes or on other machines. The numbers are those
-    of `davar`, bit for bit.
+    of `davar`, bit for bit, unless `alone` is set.
 
     Parameters
     ----------
@@ -250,6 +255,9 @@ def davar_part(
         without a step.
     space : gyrostab.kernels.workspace.Workspace, optional
         Working memory, reused by parts that one thread computes one after the other.
+    alone : bool
+        Read no sample outside these windows, nor channels; rounding may differ from that of
+        `davar`.
     **options
         Options of `davar`, with ``method="blocks"``.
 
@@ -273,6 +281,8 @@ def davar_part(
     """
     log = as_log(log)
     plan = make_plan(log, **options)
+    if alone:
+        log = log.drop_vars(log_channels(log))
     if plan.attrs["method"] != "blocks":
         raise OptionError(
             f"method={plan.attrs['method']!r} is for whole logs; parts are computed with "
@@ -280,10 +290,9 @@ def davar_part(
         )
     data, unit = plan.signal.data, plan.unit
     tables = _noise_tables(plan)
+    units = [part] if alone else units_of_work(data.shape[1], unit)
     units = [
-        windows
-        for windows in units_of_work(data.shape[1], unit)
-        if windows.start < part.stop and windows.stop > part.start
+        windows for windows in units if windows.start < part.stop and windows.stop > part.start
     ]
     spans = [(windows.start * unit.step, last_sample(windows, unit)) for windows in units]
     space = space or Workspace()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -12,6 +12,12 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import gammaincc, gammaincinv
 
+from gyrostab.allan.band_limit import (
+    BandLimit,
+    choose_windows,
+    filter_response,
+    find_band_limit,
+)
 from gyrostab.allan.plan import thin_factors
 from gyrostab.allan.variance import variance_columns, white_freedoms
 from gyrostab.errors import OptionError, SchemaError
@@ -25,7 +31,10 @@ from gyrostab.noise import HOUR, LAWS, NORMAL_95, TERMS, avar_columns, sample_sq
 from gyrostab.schema import attributes, check_surface
 from gyrostab.time.durations import duration_seconds, thin
 
-__all__ = ["fit_noise", "fit_part", "is_described", "refit"]
+__all__ = ["Bands", "find_bands", "fit_noise", "fit_part", "is_described", "refit"]
+
+#: Band limit of each axis, by its name.
+Bands = Mapping[str, tuple[float, float]]
 
 #: One-sided normal quantiles: 95 % for limits, 99 % for an observed term; two-sided 99 %, for the
 #: sign of a ramp is unknown.
@@ -73,8 +82,11 @@ def fit_noise(
         ``sigma = sum C_n tau^(n/2)``. The latter adds deviations although variances add, gives no
         errors, and is provided for comparison.
     tau_min, tau_max : float or str, optional
-        Averaging times to fit [s], all by default. Start above effects that are not noise: a
-        filter, a spectral line, resets of the feedback.
+        Averaging times to fit [s]. By default all, but of a sensor with a filter those that are
+        longer than the memory of the filter, whose effect on white noise is taken into account; up
+        to 24 windows are computed at once to find it (`gyrostab.allan.band_limit`). With a number,
+        or ``"all"``, no filter is sought: start above effects that are not noise, such as a
+        spectral line or resets of the feedback.
     observed_only : bool
         Give a coefficient and its standard error only where the term is observed, and NaN
         elsewhere. With False they are given for every window, for the fitted curve or to study the
@@ -88,7 +100,9 @@ def fit_noise(
         term is not observed), ``N_squared, K_squared``, ``fit_chi2``, ``fit_dof``;
         ``observable(axis, time, term)``: 0 not observable, 1 upper limit only, 2 observed (noise
         without the term would do that in 1 % of windows). No term is observed in a window that the
-        five terms do not describe: see `is_described`. ``edf`` is that of the fitted noise.
+        five terms do not describe: see `is_described`. ``edf`` is that of the fitted noise. Per
+        axis: ``fit_tau_min``, the shortest averaging time of the fit [s], and
+        ``filter_time_constant`` [s], 0 if no filter was found; with a filter, Q is not observable.
 
     Raises
     ------
@@ -157,11 +171,18 @@ def refit(product: xr.Dataset, **options: Any) -> xr.Dataset:
         for name, attribute in option_attributes.items()
         if attribute in product.attrs
     }
+    if "fit_tau_min" in product and "tau_min" not in options:
+        own.update(tau_min=None, bands=_stored_bands(product))
     if "window_trend" not in product:  # of an earlier version: without the ramp
         none = xr.zeros_like(product["window_mean"])
         product = product.assign(window_trend=none, trend_response=none)
         own["terms"] = str(own.get("terms", "QNBK")).replace("R", "")
-    return fit_noise(product, **{**own, "observed_only": False, **options})
+    return _fit_checked(product, **{**own, "observed_only": False, **options})
+
+
+def _stored_bands(product: xr.Dataset) -> Bands:
+    pairs = zip(*(product[name].values for name in _BAND_VARIABLES), strict=True)
+    return dict(zip(map(str, product["axis"].values), pairs, strict=True))
 
 
 def is_described(chi2: Any, dof: Any) -> Any:
@@ -198,7 +219,8 @@ def fit_part(surface: xr.Dataset, **options: Any) -> xr.Dataset:
     surface : xarray.Dataset
         Surface of `gyrostab.allan.davar.davar_part`.
     **options
-        Options of `fit_noise`.
+        Options of `fit_noise`, and ``bands`` as from `find_bands`; without it, the filter is sought
+        in this part.
 
     Returns
     -------
@@ -226,7 +248,107 @@ def _fit_checked(
     tau_max: Any = None,
     observed_only: bool = True,
     immediate: bool = False,
+    bands: Bands | None = None,
 ) -> xr.Dataset:
+    wanted, chosen = _check_options(surface, terms, method, tau_min, tau_max)
+    if bands is None:
+        bands = find_bands(surface, terms=terms, method=method, tau_min=tau_min, tau_max=tau_max)
+    limits = [BandLimit(*bands[str(axis)]) for axis in surface["axis"].values]
+    if method == "gls":
+        product = _fit_gls(
+            surface, _bits(wanted), chosen, limits, immediate=immediate, observed_only=observed_only
+        )
+    else:
+        product = _fit_adev(surface, wanted, chosen)
+    own = {
+        name: ("axis", np.array(values), attributes(name))
+        for name, values in zip(_BAND_VARIABLES, zip(*limits, strict=True), strict=True)
+    }
+    return product.assign(own).assign_attrs(
+        fit_method=method,
+        fit_terms="".join(wanted),
+        fit_tau_min_s=min(limit.tau_min for limit in limits),
+        fit_tau_max_s=surface["tau"].values[chosen[-1]],
+    )
+
+
+#: Product variables of the fields of a `BandLimit`.
+_BAND_VARIABLES = ("fit_tau_min", "filter_time_constant")
+
+
+def find_bands(
+    surface: xr.Dataset,
+    *,
+    terms: str | Iterable[str] = "QNBKR",
+    method: str = "gls",
+    tau_min: Any = None,
+    tau_max: Any = None,
+) -> Bands:
+    """Find the band limit of each axis of a surface, as `fit_noise` does.
+
+    Parameters
+    ----------
+    surface : xarray.Dataset
+        Surface of `gyrostab.davar`, or windows of it that are spread over the record.
+    terms, method, tau_min, tau_max
+        Options of `fit_noise`. With `tau_min`, that is the shortest averaging time, without a
+        filter, which is also not sought in Hadamard and modified Allan variances.
+
+    Returns
+    -------
+    dict
+        Axis to shortest averaging time to fit [s] and time constant of the filter [s].
+
+    Examples
+    --------
+    >>> from gyrostab.allan.davar import davar
+    >>> from gyrostab.ingest.make_log import make_log
+    >>> noise = np.random.default_rng(1).standard_normal(60_000)
+    >>> smooth = np.convolve(noise, np.ones(9) / 9, mode="valid")  # time constant 80 / 27 samples
+    >>> find_bands(davar(make_log(smooth, rate=100.0, unit="deg/h"), window="1min"))
+    {'x': BandLimit(tau_min=0.07, time_constant=0.0286)}
+    """
+    wanted, chosen = _check_options(surface, terms, method, tau_min, tau_max)
+    tau, axes = surface["tau"].values, list(map(str, surface["axis"].values))
+    allan = surface.attrs.get("variance", "avar") == "avar"
+    if tau_min is not None or method != "gls" or not allan:
+        return {axis: BandLimit(float(tau[chosen[0]]), 0.0) for axis in axes}
+    window = int(surface.attrs.get("window_samples", 1))
+    step = int(surface.attrs.get("step_samples", window))
+    part = surface[[name for name in _FIT_VARIABLES if name in surface]]
+    part = part.isel(time=choose_windows(part.sizes["time"], window, step)).compute()
+    cells, tables, chosen = _prepare_fit(part, chosen)
+
+    def fit(
+        rows: list[NDArray[np.float64]],
+        trend: NDArray[np.float64],
+        response: NDArray[np.float64],
+        allowed: int,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        result, misfit, _ = _run_kernel(rows, trend, response, tables, allowed)
+        return result[:, FIT_FIELDS.index("square")], misfit
+
+    return {
+        axis: find_band_limit(
+            tau[chosen],
+            [cell[row][:, chosen] for cell in cells[:5]],
+            *(cell[row, :, 0] for cell in cells[5:]),
+            allowed=_bits(wanted),
+            columns=tables.columns,
+            fit=fit,
+        )
+        for row, axis in enumerate(axes)
+    }
+
+
+def _bits(terms: Iterable[str]) -> int:
+    return sum(1 << TERMS.index(term) for term in terms)
+
+
+def _check_options(
+    surface: xr.Dataset, terms: str | Iterable[str], method: str, tau_min: Any, tau_max: Any
+) -> tuple[list[str], NDArray[np.int64]]:
+    """Check the options of a fit; return the terms, and the positions of the averaging times."""
     check_surface(surface)
     wanted = list(terms)
     unknown = [term for term in wanted if term not in TERMS]
@@ -241,23 +363,12 @@ def _fit_checked(
         )
     if variance == "hadamard" and wanted == ["R"]:
         raise OptionError("terms 'R': the Hadamard variance does not see a ramp")
-    allowed = sum(1 << TERMS.index(term) for term in wanted)
-    chosen = _select_taus(surface["tau"].values, tau_min, tau_max)
-    if method == "gls":
-        product = _fit_gls(
-            surface, allowed, chosen, immediate=immediate, observed_only=observed_only
-        )
-    else:
-        product = _fit_adev(surface, wanted, chosen)
-    tau = surface["tau"].values[chosen]
-    return product.assign_attrs(
-        fit_method=method, fit_terms="".join(wanted), fit_tau_min_s=tau[0], fit_tau_max_s=tau[-1]
-    )
+    return wanted, _select_taus(surface["tau"].values, tau_min, tau_max)
 
 
 def _select_taus(tau: NDArray[np.float64], tau_min: Any, tau_max: Any) -> NDArray[np.int64]:
     """Find the positions of the averaging times to fit."""
-    low = 0.0 if tau_min is None else duration_seconds(tau_min, "tau_min")
+    low = 0.0 if tau_min in (None, "all") else duration_seconds(tau_min, "tau_min")
     high = np.inf if tau_max is None else duration_seconds(tau_max, "tau_max")
     chosen = np.flatnonzero((tau >= low * (1 - 1e-9)) & (tau <= high * (1 + 1e-9)))
     if chosen.size == 0:
@@ -285,55 +396,94 @@ def _fit_inputs(surface: xr.Dataset) -> tuple[list[Any], NDArray[np.int64], floa
     ks = np.round(np.asarray(surface["tau"].values) * rate).astype(np.int64)
     if "ramp_response" not in surface:  # written by a version that took it as 1
         surface = surface.assign(ramp_response=xr.ones_like(surface["white_response"]))
-    names = ("avar", "white_response", "quantization_response", "ramp_response", "gap_factor")
-    planes = ("window_trend", "trend_response")
-    absent = [name for name in (*names, *planes) if name not in surface]
+    absent = [name for name in _FIT_VARIABLES if name not in surface]
     if absent:
         raise SchemaError(
             f"the surface lacks {absent}, which the fit needs to account for gaps and ramps; make "
             "it with gyrostab.davar"
         )
-    cells = [surface[name].data for name in names]
-    return [*cells, *(surface[name].data[..., None] for name in planes)], ks, rate, window
+    cells = [surface[name].data for name in _FIT_VARIABLES]
+    return [*cells[:5], *(plane[..., None] for plane in cells[5:])], ks, rate, window
+
+
+#: Variables of a surface that a fit uses: by averaging time, and the last two by window.
+_FIT_VARIABLES = (
+    "avar",
+    "white_response",
+    "quantization_response",
+    "ramp_response",
+    "gap_factor",
+    "window_trend",
+    "trend_response",
+)
+
+
+def _prepare_fit(
+    surface: xr.Dataset, within: NDArray[np.int64]
+) -> tuple[list[Any], _Tables, NDArray[np.int64]]:
+    """Return the cells of a surface, and tables and positions of the averaging times to fit."""
+    cells, ks, rate, window = _fit_inputs(surface)
+    chosen = within[thin_factors(ks[within])]
+    shifts = thin(ks[chosen]) if surface.attrs.get("overlap") == "octave" else np.zeros_like(chosen)
+    variance = surface.attrs.get("variance", "avar")
+    tables = _cached_tables(
+        tuple(ks[chosen].tolist()), tuple(shifts.tolist()), rate, window, variance
+    )
+    return cells, tables, chosen
 
 
 def _fit_gls(
     surface: xr.Dataset,
     allowed: int,
     within: NDArray[np.int64],
+    limits: list[BandLimit],
     *,
     immediate: bool,
     observed_only: bool,
 ) -> xr.Dataset:
-    cells, ks, rate, window = _fit_inputs(surface)
-    chosen = within[thin_factors(ks[within])]
-    shifts = thin(ks[chosen]) if surface.attrs.get("overlap") == "octave" else np.zeros_like(chosen)
-    variance = surface.attrs.get("variance", "avar")
-    if variance == "hadamard":  # which does not see a ramp
+    if surface.attrs.get("variance") == "hadamard":  # which does not see a ramp
         allowed &= ~(1 << STOCHASTIC)
-    tables = _cached_tables(
-        tuple(ks[chosen].tolist()), tuple(shifts.tolist()), rate, window, variance
-    )
+    cells, tables, chosen = _prepare_fit(surface, within)
+    tau = surface["tau"].values
+    tau_min, constant = (np.array(values)[:, None, None] for values in zip(*limits, strict=True))
+    below = tau < tau_min * (1 - 1e-9)
+    if (constant > 0).any():
+        cells[0] = np.where(below, np.nan, cells[0])
+        cells[1] = cells[1] * filter_response(tau, constant)
+    cells.append(np.broadcast_to(constant, cells[-1].shape))
 
     def block(*arrays: NDArray[np.float64]) -> NDArray[np.float64]:
         flat = [
             np.ascontiguousarray(a[..., chosen].reshape(-1, chosen.size), dtype=np.float64)
             for a in arrays[:5]
         ]
-        trend, response = (np.asarray(a, dtype=np.float64).reshape(-1) for a in arrays[5:])
-        return _fit_block(
-            flat, trend, response, tables, allowed=allowed, observed_only=observed_only
-        ).reshape(arrays[0].shape[0], arrays[0].shape[1], -1)
+        trend, response, filtered = (
+            np.asarray(a, dtype=np.float64).reshape(-1) for a in arrays[5:]
+        )
+        fitted = np.empty((trend.size, width))
+        for rows, terms in ((filtered == 0, allowed), (filtered > 0, allowed & ~_bits("Q"))):
+            if rows.any():
+                fitted[rows] = _fit_block(
+                    [a[rows] for a in flat],
+                    trend[rows],
+                    response[rows],
+                    tables,
+                    allowed=terms,
+                    observed_only=observed_only,
+                )
+        return fitted.reshape(*arrays[0].shape[:2], width)
+
+    width = len(TERMS) * 4 + 2 + chosen.size
 
     if immediate:
         fitted = block(*cells)
     else:
-        width = len(TERMS) * 4 + 2 + chosen.size
         lazy = isinstance(cells[0], da.Array)
         whole = [
             cell.rechunk({2: -1}) if lazy else da.from_array(cell, chunks=(1, 256, -1))
-            for cell in cells
+            for cell in cells[:-1]
         ]
+        whole.append(da.from_array(cells[-1], chunks=(*whole[-1].chunks[:2], -1)))
         fitted = da.map_blocks(
             block, *whole, chunks=(*whole[0].chunks[:2], (width,)), dtype=np.float64
         )
@@ -348,7 +498,8 @@ def _fit_gls(
     if (
         chosen.size == surface.sizes["tau"]
     ):  # otherwise that of davar, for every averaging time, is kept
-        extra["edf"] = (("axis", "time", "tau"), fitted[..., 4 * n + 2 :], surface["edf"].attrs)
+        edf = np.where(below, surface["edf"].data, fitted[..., 4 * n + 2 :])
+        extra["edf"] = (("axis", "time", "tau"), edf, surface["edf"].attrs)
     return _assemble_product(surface, *(parts[i * n : (i + 1) * n] for i in range(4)), extra=extra)
 
 

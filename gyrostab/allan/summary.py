@@ -93,12 +93,17 @@ class FitSummary:
         Median of ``fit_chi2 / fit_dof`` [1]; NaN without a fit.
     failing_share : float
         Share of the windows that the terms do not describe [1].
+    tau_min, filter_time_constant : float
+        Shortest averaging time of the fit and time constant of the filter of the sensor [s]; the
+        latter is 0 without a filter.
     """
 
     axis: str
     windows: int
     chi2_per_dof: float
     failing_share: float
+    tau_min: float
+    filter_time_constant: float
 
     @property
     def fails(self) -> bool:
@@ -197,12 +202,13 @@ def summarise_fit(product: xr.Dataset) -> list[FitSummary]:
         chi2, dof = (product[name].sel(axis=axis).values for name in ("fit_chi2", "fit_dof"))
         fitted = np.isfinite(chi2) & (dof > 0)
         count = int(np.count_nonzero(fitted))
-        if count == 0:
-            summaries.append(FitSummary(str(axis), 0, np.nan, 0.0))
-            continue
-        ratio = float(np.median(chi2[fitted] / dof[fitted]))
-        failing = float(np.mean(~is_described(chi2[fitted], dof[fitted])))
-        summaries.append(FitSummary(str(axis), count, ratio, failing))
+        ratio = float(np.median(chi2[fitted] / dof[fitted])) if count else np.nan
+        failing = float(np.mean(~is_described(chi2[fitted], dof[fitted]))) if count else 0.0
+        band = (
+            float(product[name].sel(axis=axis)) if name in product else 0.0
+            for name in ("fit_tau_min", "filter_time_constant")
+        )
+        summaries.append(FitSummary(str(axis), count, ratio, failing, *band))
     return summaries
 
 
@@ -299,11 +305,12 @@ def describe_record(product: xr.Dataset) -> list[str]:
     Returns
     -------
     list of str
-        One sentence on the misfit, and one each on outliers, losses of noisy samples and motion if
-        there are any.
+        One sentence on the misfit, and one each on a filter of the sensor, outliers, losses of
+        noisy samples and motion if there are any.
     """
     return [
         *_describe_misfit(product),
+        *_describe_filter(product),
         *_describe_outliers(product),
         *_describe_losses(product),
         *_describe_motion(product),
@@ -342,6 +349,21 @@ def _describe_misfit(product: xr.Dataset) -> list[str]:
         )
         lines.append(f"{line}; {remedy}.")
     return lines
+
+
+def _describe_filter(product: xr.Dataset) -> list[str]:
+    filtered = [
+        f"{fit.axis} below {_number_text(fit.tau_min)} s (as by a low-pass with a time constant of "
+        f"{_number_text(fit.filter_time_constant)} s)"
+        for fit in summarise_fit(product)
+        if fit.filter_time_constant > 0
+    ]
+    if not filtered:
+        return []
+    return [
+        f"Averaging times are left out where a filter shapes the noise: {', '.join(filtered)}. "
+        "N, B and K are those of the noise without the filter; Q is not observable."
+    ]
 
 
 def _describe_outliers(product: xr.Dataset) -> list[str]:

@@ -197,8 +197,8 @@ class Fitting:
         gls fits variances by generalised least squares, with their covariance. adev fits
         deviations, as some papers do, for comparison.
     fit_from
-        Shortest averaging time to fit; a longer one leaves out the effect of a filter or a spectral
-        line (default: all).
+        Shortest averaging time to fit, or all; a longer one leaves out the effect of a spectral
+        line (default: all but those that a filter of the sensor shapes).
     fit_to
         Longest averaging time to fit (default: all).
     """

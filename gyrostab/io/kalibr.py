@@ -165,6 +165,11 @@ def _describe_fit(fit: FitSummary) -> str:
     if not fit.windows:
         return f"# axis {fit.axis}: no window has a misfit to judge the fit by"
     text = f"# axis {fit.axis}: median chi2/dof {fit.chi2_per_dof:.3g} over {fit.windows} windows"
+    if fit.filter_time_constant > 0:
+        text += (
+            f", fitted from {fit.tau_min:.3g} s on because a filter shapes the noise below; values "
+            "are those without the filter"
+        )
     if fit.fails:
         text += (
             f"; the noise terms do NOT describe {fit.failing_share:.0%} of them: "

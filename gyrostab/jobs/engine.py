@@ -14,15 +14,24 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from gyrostab.allan.band_limit import choose_windows
 from gyrostab.allan.davar import davar_part
-from gyrostab.allan.fit import fit_part
+from gyrostab.allan.fit import find_bands, fit_part
+from gyrostab.allan.plan import make_plan, units_of_work
 from gyrostab.io.datasets import to_netcdf
 from gyrostab.jobs.checkpoint import Block, assemble, write_block
 from gyrostab.jobs.schedule import Pool, run_calls
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.progress import Stage
 
-__all__ = ["Blocks", "compute_blocks", "compute_part", "find_constant_shares", "write_blocks"]
+__all__ = [
+    "Blocks",
+    "compute_blocks",
+    "compute_part",
+    "find_constant_shares",
+    "find_record_bands",
+    "write_blocks",
+]
 
 #: Finished parts by their number.
 Blocks = dict[int, Block]
@@ -44,6 +53,22 @@ def compute_part(
     if fitting is None:
         return surface
     return fit_part(surface, **fitting)
+
+
+def find_record_bands(
+    log: xr.Dataset, windows: Mapping[str, Any], fitting: Mapping[str, Any] | None
+) -> Mapping[str, Any] | None:
+    """Add to the options of a fit the band limit of each axis, from windows of the whole record."""
+    if fitting is None:
+        return None
+    unit = make_plan(log, **windows).unit
+    count = units_of_work(log.sizes["time"], unit)[-1].stop
+    sample = [
+        davar_part(log, part=slice(number, number + 1), alone=True, **windows)
+        for number in choose_windows(count, unit.window, unit.step).tolist()
+    ]
+    surface = xr.concat(sample, "time", data_vars="all").assign_attrs(step_samples=unit.window)
+    return {**fitting, "bands": find_bands(surface, **fitting)}
 
 
 def compute_blocks(

@@ -21,6 +21,7 @@ from gyrostab.jobs.engine import (
     compute_blocks,
     compute_part,
     find_constant_shares,
+    find_record_bands,
     write_blocks,
 )
 from gyrostab.jobs.job import (
@@ -377,6 +378,8 @@ def _compute_missing(
             // parts[-1].stop,
         )
 
+    if len(blocks) < len(parts):
+        fitting = find_record_bands(log, windows, fitting)
     call: tuple[Any, ...] = (_compute_part_of_log, log, Workspaces(), windows, fitting)
     if pool.remote and len(blocks) < len(parts):
         source = {

@@ -182,6 +182,8 @@ def _select_window(part: xr.Dataset, when: Any) -> int:
 
 def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours: list[str]) -> None:
     """Draw the fitted curve in black and observed terms dashed; list limits in the legend."""
+    from gyrostab.allan.band_limit import limit_response
+
     tau = window["tau"].values
     total = np.zeros(tau.size)
     responses = {"N": "white_response", "Q": "quantization_response", "R": "ramp_response"}
@@ -192,7 +194,7 @@ def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours:
         term = columns[:, number] * np.nan_to_num(float(estimates[symbol])) ** 2
         seen = window[responses[symbol]].values if responses.get(symbol) in window else 1.0
         term = term * np.where(np.isfinite(seen), seen, 1.0)
-        total += term
+        total += term * (limit_response(window, tau) if symbol == "N" else 1.0)
         if state == OBSERVED:
             label = f"{symbol} = {value:.3g} ± {error:.1g} {unit_symbol(law.label)} ({law.name})"
             panel.plot(
@@ -206,7 +208,7 @@ def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours:
         elif state == UPPER_LIMIT_ONLY:
             label = f"{symbol} < {upper:.3g} {unit_symbol(law.label)} ({law.name})"
             panel.plot([], [], linestyle="none", label=label)
-    if total.any():
+    if np.nansum(total) > 0:
         panel.plot(tau, np.sqrt(total), color="black", linewidth=1.6, label=_name_curve(window))
 
 

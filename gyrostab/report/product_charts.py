@@ -152,13 +152,18 @@ def _describe_thinning(product: xr.Dataset, part: xr.Dataset) -> str:
 
 def _fitted_avar(part: xr.Dataset) -> NDArray[np.float64]:
     """Return the Allan variance of the fitted terms (axis, time, tau) [degree2 hour-2]."""
+    from gyrostab.allan.band_limit import limit_response
     from gyrostab.allan.fit import refit
 
     estimates = refit(part)
     squares = np.stack([estimates[symbol].values ** 2 for symbol in LAWS], axis=-1)
     unit = surface_columns(part).T
     fitted = np.isfinite(squares).any(axis=-1, keepdims=True)
-    return np.where(fitted, np.nan_to_num(squares) @ unit, np.nan)
+    white = list(LAWS).index("N")
+    filtered = (limit_response(part, part["tau"].values) - 1.0) * unit[white]
+    curve = np.nan_to_num(squares)
+    curve = curve @ unit + curve[..., white, None] * np.atleast_2d(filtered)[:, None]
+    return np.where(fitted, curve, np.nan)
 
 
 def _draw_record(product: xr.Dataset) -> go.Figure:

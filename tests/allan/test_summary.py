@@ -56,7 +56,7 @@ def test_white_noise_is_described_and_a_filter_is_not():
     assert not fit.fails
     assert 0.6 < fit.chi2_per_dof < 1.4
     assert find_fit_from(product) is None
-    product = make_product(filtered(120_000, 2))
+    product = make_product(filtered(120_000, 2), tau_min="all")
     (fit,) = summarise_fit(product)
     assert fit.fails
     assert fit.chi2_per_dof > 5
@@ -64,7 +64,7 @@ def test_white_noise_is_described_and_a_filter_is_not():
 
 
 def test_fit_from_the_proposed_averaging_time_describes_the_record():
-    product = make_product(filtered(240_000, 3), window="2min")
+    product = make_product(filtered(240_000, 3), window="2min", tau_min="all")
     start = find_fit_from(product)
     assert 0.05 < start < 1.0
     text = format_product(product)

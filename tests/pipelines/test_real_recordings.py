@@ -116,7 +116,10 @@ def test_the_page_compares_all_scales(examine):
 
 def test_adis16405_is_stationary(examine):
     found = examine("adis16405-static-2h47")[2]
-    assert found["n_x"] == pytest.approx(found["n_1"], rel=0.05)  # the slope at 1 s is -1/2
+    slope = (found["n_035"] + found["n_075"]) / 2  # the slope is -1/2 between them
+    assert found["n_x"] == pytest.approx(slope, rel=0.02)
+    assert 0.7 < found["chi_x"] < 1.4
+    assert found["chi_z"] > 100
     assert found["n_low"] > 0.93 * found["n_x"]
     assert found["n_high"] < 1.07 * found["n_x"]
 
@@ -292,7 +295,7 @@ def test_restarts_of_the_hybrid_unit(examine, name, rows):
 
 def test_fibre_optic_axis_of_the_hybrid_unit(examine):
     found = examine("fog-hybrid-warmup-static")[2]
-    assert 15 < found["quieter"] < 25
+    assert 20 < found["quieter"] < 30
     assert found["n_z"] == pytest.approx(0.013, rel=0.2)
     assert examine("fog-hybrid-warmup-turn")[2]["turn"] == pytest.approx(123, abs=1)
 

@@ -1,0 +1,249 @@
+"""Band limit of a sensor: the effect of its filters on the Allan variance of white noise.
+
+The angle of white noise behind a filter is a random walk with short memory. For averaging times
+longer than the memory of the filter, the variance of its increments is ``N^2 (tau - c)``, and the
+Allan variance
+
+    avar(tau) = N^2 / tau (1 - 3 c / (2 tau)),   c = sum |t| r(t) / sum r(t),
+
+where r is the autocorrelation of the filtered noise. This holds for any filter; c is the time
+constant of a first-order low-pass, and a third of the length of a moving average. The squared
+coefficient N^2 is that of the noise without the filter. It follows from the Allan variance as a sum
+over increments, ``(4 D(tau) - D(2 tau)) / (2 tau^2)``.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.special import gammaincc
+
+__all__ = ["BandLimit", "choose_windows", "filter_response", "find_band_limit", "limit_response"]
+
+Array = NDArray[np.float64]
+#: Fit of rows: (avar, responses of N, Q and R, gap factor), trend, its response, set of terms ->
+#: squared coefficients (row, term), chi-square and degrees of freedom (row, 2).
+Fit = Callable[[list[Array], Array, Array, int], tuple[Array, Array]]
+
+#: Largest number of windows that are averaged. More of them would find departures from the five
+#: terms that no window shows.
+_MAX_WINDOWS = 24
+#: Probability of the misfit of unfiltered noise below which a filter is sought, and of that of
+#: filtered noise from which on the averaging times are described.
+_NULL_PROBABILITY, _MIN_PROBABILITY = 1e-3, 1e-2
+#: Smallest ratio of longest to shortest averaging time: over a decade, the Allan variances of
+#: neighbouring terms diverge by a factor of ten.
+_MIN_TAU_RATIO = 10.0
+#: Shortest averaging time to fit over the first that is described: what remains of the memory there
+#: hides in the scatter, but biases N by up to 4 % (docs/statistics.md).
+_MEMORY_MARGIN = 1.5
+#: Largest time constant over the shortest averaging time: 1/2 for the mean of two samples, the
+#: shortest moving average, and less for longer ones.
+_MAX_TIME_CONSTANT = 0.6
+#: Steps of the search for the time constant; each goes on around the best of these values.
+_GRID_POINTS, _GRID_STEPS = 25, 3
+#: A filter removes power at every frequency. Measured over unfiltered Allan variance at the
+#: shortest averaging time, at most, and anywhere below the band limit, at most: a spectral line or
+#: resets of a feedback loop exceed the latter.
+_MAX_SHORTEST_RATIO, _MAX_RATIO = 0.9, 1.05
+#: Largest Allan variance of a window over the median at any averaging time: a window above it holds
+#: motion.
+_MAX_WINDOW_RATIO = 10.0
+_N_BIT, _Q_BIT = 2, 1
+
+
+class BandLimit(NamedTuple):
+    """Averaging times that a fit uses, and the filter that it takes into account.
+
+    Attributes
+    ----------
+    tau_min : float
+        Shortest averaging time to fit [s].
+    time_constant : float
+        Time constant of the first-order low-pass with the same effect on longer averaging times
+        [s]; 0 without a filter.
+    """
+
+    tau_min: float
+    time_constant: float
+
+
+def choose_windows(count: int, window: int, step: int) -> NDArray[np.int64]:
+    """Choose windows that do not overlap, at most 24, spread over the record.
+
+    Examples
+    --------
+    >>> choose_windows(31, window=100, step=10)
+    array([ 0, 10, 20, 30])
+    """
+    apart = 1 + (count - 1) // -(-window // step)
+    number = min(_MAX_WINDOWS, apart)
+    return np.unique(np.linspace(0, count - 1, number).round().astype(np.int64))
+
+
+def filter_response(tau: Array, time_constant: float | Array) -> Array:
+    """Compute the share of the Allan variance of white noise that a filter leaves.
+
+    Examples
+    --------
+    >>> filter_response(np.array([0.1, 1.0]), 0.02)
+    array([0.7 , 0.97])
+    """
+    return np.asarray(1.0 - 1.5 * time_constant / tau)
+
+
+def limit_response(product: xr.Dataset, tau: Array) -> Array:
+    """Compute the share of the Allan variance of white noise that the filter leaves, of a product.
+
+    Parameters
+    ----------
+    product : xarray.Dataset
+        Product of `gyrostab.fit_noise`, or one of its axes.
+    tau : ndarray (n_tau,)
+        Averaging times [s].
+
+    Returns
+    -------
+    ndarray (axis, n_tau) or (n_tau,)
+        NaN below the band limit; 1 for a product of an earlier version.
+    """
+    if "fit_tau_min" not in product:
+        return np.ones(tau.shape)
+    tau_min, constant = (
+        product[name].values[..., None] for name in ("fit_tau_min", "filter_time_constant")
+    )
+    hidden = (tau < tau_min * (1 - 1e-9)) & (constant > 0)
+    return np.where(hidden, np.nan, filter_response(tau, constant))
+
+
+def find_band_limit(
+    tau: Array,
+    cells: Sequence[Array],
+    trend: Array,
+    trend_response: Array,
+    *,
+    allowed: int,
+    columns: Array,
+    fit: Fit,
+) -> BandLimit:
+    """Find the band limit of an axis from windows that do not overlap.
+
+    The windows, each over its variance at the shortest averaging time, are averaged: a sum of the
+    five terms stays one. Where the terms describe this average, there is no limit. Otherwise the
+    shortest averaging time is sought from which N (behind a filter), B and K describe it. It is the
+    band limit if the Allan variance below lacks power against that without the filter, and nowhere
+    exceeds it.
+
+    Parameters
+    ----------
+    tau : ndarray (n_tau,)
+        Averaging times [s].
+    cells : sequence of ndarray (n_windows, n_tau)
+        Allan variance, NaN where missing, responses of N, Q and R, and gap factor.
+    trend, trend_response : ndarray (n_windows,)
+        Trend of the windows and its response to gaps.
+    allowed : int
+        Set of the terms to fit; without N there is no limit.
+    columns : ndarray (n_tau, 5)
+        Allan variance per squared coefficient.
+    fit : callable
+        Fit of rows.
+
+    Returns
+    -------
+    BandLimit
+        The time constant is rounded to three digits.
+    """
+    unlimited = BandLimit(float(tau[0]), 0.0)
+    mean = _average_windows(cells, trend, trend_response) if allowed & _N_BIT else None
+    if mean is None:
+        return unlimited
+    if not _judge(tau, mean, 0, np.zeros(1), allowed, fit)[2] < _NULL_PROBABILITY:
+        return unlimited
+    last = tau[-1] / _MIN_TAU_RATIO
+    for shortest in tau[tau * _MEMORY_MARGIN <= last]:
+        start = int(np.searchsorted(tau, shortest * _MEMORY_MARGIN * (1 - 1e-9)))
+        first = int(np.searchsorted(tau, shortest))
+        if not _fit_constant(tau, mean, first, allowed, fit)[2] >= _MIN_PROBABILITY:
+            continue
+        constant, squares, probability = _fit_constant(tau, mean, start, allowed, fit)
+        if probability >= _MIN_PROBABILITY:
+            unfiltered = columns[:start, 1:4] @ squares[1:4] * mean.rows[1][:start]
+            ratio = mean.rows[0][:start] / unfiltered
+            lacks_power = ratio[0] < _MAX_SHORTEST_RATIO and np.nanmax(ratio) < _MAX_RATIO
+            return BandLimit(float(tau[start]), _round(constant)) if lacks_power else unlimited
+    return unlimited
+
+
+def _round(constant: float) -> float:
+    return float(f"{constant:.3g}")
+
+
+class _Mean(NamedTuple):
+    """Average of windows: rows as of a window, trend and its response, number of windows."""
+
+    rows: list[Array]
+    trend: float
+    response: float
+    windows: int
+
+
+def _average_windows(cells: Sequence[Array], trend: Array, response: Array) -> _Mean | None:
+    """Average the windows without motion, each over its variance at the shortest averaging time."""
+    level = cells[0][:, 0]
+    used = np.flatnonzero(np.isfinite(level) & (level > 0))
+    shape = cells[0][used] / level[used, None]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # averaging times without any cell
+        usual = np.nanmedian(shape, axis=0) if used.size else shape
+    still = ~(shape > _MAX_WINDOW_RATIO * usual).any(axis=1)
+    used, shape = used[still], shape[still]
+    if not used.size:
+        return None
+    present = np.isfinite(shape)
+    count = present.sum(axis=0)
+    rows = [
+        np.where(present, values, 0.0).sum(axis=0) / np.maximum(count, 1)
+        for values in (shape, *(values[used] for values in cells[1:]))
+    ]
+    rows[0][count == 0] = np.nan
+    rows[4] *= count / used.size
+    slope = np.sqrt(np.mean(trend[used] ** 2 / level[used]))
+    return _Mean(rows, float(slope), float(np.mean(response[used])), used.size)
+
+
+def _judge(
+    tau: Array, mean: _Mean, start: int, constants: Array, terms: int, fit: Fit
+) -> tuple[int, Array, float]:
+    """Fit the average from a position on: best constant, squares, probability of its misfit.
+
+    The probability is NaN without degrees of freedom.
+    """
+    rows = [np.tile(values, (constants.size, 1)) for values in mean.rows]
+    rows[0][:, :start] = np.nan
+    rows[1] *= filter_response(tau, constants[:, None])
+    every = np.ones(constants.size)
+    squares, misfit = fit(rows, mean.trend * every, mean.response * every, terms)
+    chi2, dof = misfit[:, 0] * mean.windows, misfit[:, 1]
+    best = int(np.argmin(np.where(np.isfinite(chi2) & (dof > 0), chi2, np.inf)))
+    probability = gammaincc(dof[best] / 2.0, chi2[best] / 2.0) if dof[best] > 0 else np.nan
+    return best, np.nan_to_num(squares[best]), float(probability)
+
+
+def _fit_constant(
+    tau: Array, mean: _Mean, start: int, allowed: int, fit: Fit
+) -> tuple[float, Array, float]:
+    """Fit the time constant of a filter from a position on, without Q."""
+    low, highest = 0.0, _MAX_TIME_CONSTANT * tau[start]
+    high = highest
+    for _ in range(_GRID_STEPS):
+        constants = np.linspace(low, high, _GRID_POINTS)
+        best, squares, probability = _judge(tau, mean, start, constants, allowed & ~_Q_BIT, fit)
+        reach = 2.0 * (constants[1] - constants[0])
+        low, high = max(constants[best] - reach, 0.0), min(constants[best] + reach, highest)
+    return float(constants[best]), squares, probability
