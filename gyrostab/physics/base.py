@@ -304,9 +304,8 @@ class Effect:
         """Format a parameter with its error and unit: ``"0.4 ± 0.1 deg/h"``."""
         unit = next(known.unit for known in self.parameters() if known.name == name)
         value = getattr(self, name)
-        text = (
-            ", ".join(f"{one:.4g}" for one in value) if isinstance(value, tuple) else f"{value:.4g}"
-        )
+        numbers = [f"{one:.4g}" for one in (value if isinstance(value, tuple) else (value,))]
+        text = " and ".join([", ".join(numbers[:-1]), numbers[-1]] if numbers[1:] else numbers)
         if errors and name in errors:
             text += f" ± {errors[name]:.2g}"
         return text if unit in ("1", "text") else f"{text} {unit}"

@@ -394,8 +394,8 @@ class SharedSource(Effect):
 
     Examples
     --------
-    >>> SharedSource(N=[0.001, 0.001, -0.0008], axes=["x", "y", "z"]).say()
-    'The light source adds the same noise on axes x, y and z, 0.001, 0.001, -0.0008 deg/sqrt(h).'
+    >>> SharedSource(N=[0.002, 0.001, -0.001], axes=["x", "y", "z"]).say()
+    'The light source adds the same noise on axes x, y and z, 0.002, 0.001 and -0.001 deg/sqrt(h).'
     """
 
     name: ClassVar[str] = "shared_source"

@@ -398,8 +398,8 @@ class RealMotion(Effect):
 
     Examples
     --------
-    >>> RealMotion(sway=10, direction=[0.6, 0.8, 0.0], axes=["x", "y", "z"]).say()
-    'The tool really rotates on axes x, y and z, with shares 0.6, 0.8, 0: sway 10 deg/h at 0.3 Hz.'
+    >>> RealMotion(sway=9, direction=[1.0, 0.5, 0.0], axes=["x", "y", "z"]).say()
+    'The tool really rotates on axes x, y and z, with shares 1, 0.5 and 0: sway 9 deg/h at 0.3 Hz.'
     """
 
     name: ClassVar[str] = "real_motion"

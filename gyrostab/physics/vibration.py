@@ -224,8 +224,8 @@ class AliasedVibration(Effect):
     Examples
     --------
     >>> print(AliasedVibration(sensitivity=4.0, low=700, high=800).say())
-    Vibration at 700 to 800 Hz folds into the samples on all axes, with 4 deg/h/g; each sample is a
-    point of it.
+    Vibration at 700 to 800 Hz folds into the samples on all axes, with a sensitivity of 4 deg/h/g;
+    each sample is a point of it.
     """
 
     name: ClassVar[str] = "aliased_vibration"
@@ -342,7 +342,7 @@ class AliasedVibration(Effect):
         size = self.quantity("sensitivity", errors)
         band = f"{self.low:.4g} to {self.high:.4g} Hz"
         folds = f"Vibration at {band} folds into the samples {self.on_axes()}"
-        return f"{folds}, with {size}{mount}; each sample is {taken}."
+        return f"{folds}, with a sensitivity of {size}{mount}; each sample is {taken}."
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from gyrostab.allan.davar import davar
 from gyrostab.errors import OptionError
 from gyrostab.kernels.random.coloured import band, band_psd, folded_psd, oscillator, oscillator_psd
 from gyrostab.physics.base import Windows
-from gyrostab.physics.registry import make_effect
+from gyrostab.physics.registry import effects, make_effect
 from gyrostab.simulate import simulate
 from tests.support.effect_bench import allan_of_samples, run, sigma
 
@@ -264,3 +264,10 @@ def test_gravity_in_a_turning_tool_is_a_line_of_its_amplitude():
     assert sigma(log.rate.sel(axis="y").values, 50, [top])[0, 0] == pytest.approx(
         0.7246 * 0.4 * 0.5, rel=0.01
     )
+
+
+def test_sizes_of_several_axes_read_as_a_list():
+    effect = effects()["aliased_vibration"](
+        sensitivity=(0.3766, 0.371), low=700.0, high=800.0, axes=("x", "y")
+    )
+    assert "with a sensitivity of 0.3766 and 0.371 deg/h/g; each" in effect.say()
