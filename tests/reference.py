@@ -205,11 +205,15 @@ def average_plainly(plain: dict[str, Any]) -> dict[str, NDArray[np.float64]]:
         misfit = data - normal @ squares
         likelihood = -0.5 * (np.linalg.slogdet(scaled)[1] + misfit @ inverse @ misfit)
         if covariance.any():
-            fits.append((members, squares, rows, likelihood))
+            below = np.minimum(squares[members], 0.0) ** 2
+            costs = np.zeros(4)
+            costs[members] = below / np.einsum("pi,ij,pj->p", rows, covariance, rows)
+            fits.append((members, squares, rows, likelihood, costs))
 
-    def weigh(some: list[Any]) -> Any:
-        likelihood = np.array([fit[3] for fit in some])
-        return np.exp(likelihood - likelihood.max())
+    def weigh(some: list[Any], a: int | None = None) -> Any:
+        costs = [0.0 if a is None else fit[4].sum() - fit[4][a] for fit in some]
+        logs = np.array([fit[3] for fit in some]) - costs
+        return np.exp(logs - logs.max())
 
     feasible = [fit for fit in fits if (fit[1][fit[0]] > 0).all()]
     weights = weigh(feasible)
@@ -217,9 +221,9 @@ def average_plainly(plain: dict[str, Any]) -> dict[str, NDArray[np.float64]]:
     out = np.full((4, 6), np.nan)
     for a in range(4):
         able = [fit for fit in fits if a in fit[0] and all(fit[1][b] > 0 for b in fit[0] if b != a)]
-        weights = weigh(able)
-        free = np.array([fit[1][a] for fit in able])
-        mean = np.average(free, weights=weights)
+        having = [fit for fit in fits if a in fit[0]]
+        free, penalised = np.array([fit[1][a] for fit in having]), weigh(having, a)
+        mean = np.average(free, weights=penalised)
         best = [
             max((fit[3] for fit in feasible if (a in fit[0]) == there), default=-np.inf)
             for there in (True, False)
@@ -238,7 +242,7 @@ def average_plainly(plain: dict[str, Any]) -> dict[str, NDArray[np.float64]]:
             average[a],
             mean,
             2 * (best[0] - best[1]),
-            null + np.average((free - mean) ** 2, weights=weights),
+            null + np.average((free - mean) ** 2, weights=penalised),
             (both - null - own) / spread[a],
             own / spread[a] ** 2,
         )

@@ -24,7 +24,7 @@ from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.fit.covariance import STOCHASTIC, product_tables
 from gyrostab.kernels.fit.least_squares import FIT_FIELDS, combine_diagonal, fit_windows
-from gyrostab.kernels.fit.limits import cell_limits, interpolate_quantile
+from gyrostab.kernels.fit.limits import cell_limits, estimate_bounds
 from gyrostab.kernels.fit.third_differences import third_tables
 from gyrostab.kernels.fit.trend import detrend_tables
 from gyrostab.noise import HOUR, LAWS, NORMAL_95, TERMS, avar_columns, sample_squares
@@ -88,9 +88,10 @@ def fit_noise(
         or ``"all"``, no filter is sought: start above effects that are not noise, such as a
         spectral line or resets of the feedback.
     observed_only : bool
-        Give a coefficient and its standard error only where the term is observed, and NaN
-        elsewhere. With False they are given for every window, for the fitted curve or to study the
-        estimator; a submodel without the term counts as zero where the term is not observed.
+        Give a coefficient and its standard error only where the term is observed, a limit only
+        where it is not, and NaN elsewhere. With False they are given for every window, for the
+        fitted curve or to study the estimator; a submodel without the term counts as zero where
+        the term is not observed.
 
     Returns
     -------
@@ -99,9 +100,9 @@ def fit_noise(
         ``K`` [deg/h^1.5], ``R`` [deg/h^2], ``*_stderr``, ``*_upper`` (95 % upper limit where the
         term is not observed), ``N_squared, K_squared``, ``fit_chi2``, ``fit_dof``;
         ``observable(axis, time, term)``: 0 not observable, 1 upper limit only, 2 observed (noise
-        without the term would do that in 1 % of windows). No term is observed in a window that the
-        five terms do not describe: see `is_described`. ``edf`` is that of the fitted noise. Per
-        axis: ``fit_tau_min``, the shortest averaging time of the fit [s], and
+        without the term would do that in 1 % of windows, at most 3 %). No term is observed in a
+        window that the five terms do not describe: see `is_described`. ``edf`` is that of the
+        fitted noise. Per axis: ``fit_tau_min``, the shortest averaging time of the fit [s], and
         ``filter_time_constant`` [s], 0 if no filter was found; with a filter, Q is not observable.
 
     Raises
@@ -538,7 +539,7 @@ class _Tables:
 def _quantile_curve(level: float) -> tuple[float, float, NDArray[np.float64]]:
     """Tabulate the quantile q at `level` of chi-square over its degrees of freedom nu.
 
-    Returns start, step and ``nu ln q`` for `interpolate_quantile`. A step of 0.02 in ln nu leaves a
+    Returns start, step and ``nu ln q`` for `chi_square_quantile`. A step of 0.02 in ln nu leaves a
     relative error of q below 1e-9.
     """
     start, step = (
@@ -583,20 +584,12 @@ def _fit_block(
     with np.errstate(invalid="ignore", divide="ignore"):
         visible = np.isfinite(square) & (field["separation"] > _MIN_SEPARATION)
         observed = visible & (field["free"] > 0) & _exceed_chance(field) & ~fails[:, None]
-        estimate = np.where(observed, field["free"], square)
-        value, error = np.sqrt(estimate), np.sqrt(_variance_of_estimate(field, estimate))
-        # d(sqrt s) = ds / (2 sqrt s); near zero, the root of the error of the square is the scale
-        stderr = np.where(
-            estimate > error,
-            error / (2.0 * value),
-            np.sqrt(error) / np.where(estimate > error, 1.0, 2.0),
-        )
-        stderr[:, 4] = _trend_error(field, NORMAL_95)
-        limit = _limit_of_estimate(field, tables)
+        value = np.sqrt(np.where(observed, field["free"], square))
+        stderr, limit = _bound_estimates(field, value)
         limit[fails] = _limit_of_curve(
             [cell[fails] for cell in flat], square[fails], dof[fails], tables
         )
-        upper = np.where(visible & ~observed, np.sqrt(limit), np.nan)
+        upper = np.where(visible & ~(observed & observed_only), np.sqrt(limit), np.nan)
     reported = observed if observed_only else visible
     stderr = np.where(reported, stderr, np.nan)
     value = np.where(reported, value, np.nan)
@@ -637,7 +630,7 @@ def _run_kernel(
 
 
 def _exceed_chance(field: dict[str, NDArray[np.float64]]) -> NDArray[np.bool_]:
-    """Find the terms that noise without them exceeds in 1 % of windows.
+    """Find the terms that noise without them exceeds in 1 % of windows, at most 3 %.
 
     The likelihood ratio of the best submodels with and without the term must exceed chance, for a
     ramp the trend of the window.
@@ -662,19 +655,6 @@ def _trend_error(field: dict[str, NDArray[np.float64]], sigma: float) -> NDArray
     return np.sqrt(variance * (1.0 + wider))
 
 
-def _variance_of_estimate(
-    field: dict[str, NDArray[np.float64]], square: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Compute the variance of an estimate where the squared coefficient is `square`."""
-    a, b, c = _variance_growth(field)
-    return np.asarray(a + b * square + c * square**2)
-
-
-def _variance_growth(field: dict[str, NDArray[np.float64]]) -> list[NDArray[np.float64]]:
-    names = ("variance_null", "variance_linear", "variance_square")
-    return [np.maximum(field[name], 0.0) for name in names]
-
-
 def _widen_misfits(
     field: dict[str, NDArray[np.float64]], misfit: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
@@ -687,28 +667,25 @@ def _widen_misfits(
     return np.asarray(fails)
 
 
-def _limit_of_estimate(
-    field: dict[str, NDArray[np.float64]], tables: _Tables
-) -> NDArray[np.float64]:
-    """Find the 95 % upper limit of a squared coefficient from its estimate.
+def _bound_estimates(
+    field: dict[str, NDArray[np.float64]], value: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Find standard errors of coefficients, and 95 % upper limits of their squares.
 
-    Without the non-negativity constraint, the estimate e has the variance ``a + b s + c s^2`` if
-    the truth is s. The part in ``s^2`` is that of the term alone, a chi-square with ``2 / c``
-    degrees of freedom whose 5 % quantile is ``q s``; the rest is taken as normal. The limit is the
-    s at which the estimate is at its 5 % quantile: ``(s - e)^2 = (1 - q)^2 s^2 + z^2 (a + b s)``.
+    Interval and limit follow from `estimate_bounds`. 1.96 standard errors are half of the 95 %
+    interval; where it begins at zero, they reach its upper end at least.
     """
-    estimate = np.maximum(field["free"], 0.0)
-    a, b, c = _variance_growth(field)
-    lower = interpolate_quantile(2.0 / np.maximum(c, 1e-12), *tables.quantile)
-    curve = 1.0 - (1.0 - lower) ** 2
-    half = estimate + 0.5 * _LIMIT_SIGMA**2 * b
-    limit = np.asarray(
-        (half + np.sqrt(np.maximum(half**2 - curve * (estimate**2 - _LIMIT_SIGMA**2 * a), 0.0)))
-        / curve
-    )
-    error = _trend_error(field, _LIMIT_SIGMA)
-    limit[:, 4] = (np.sqrt(estimate[:, 4]) + _LIMIT_SIGMA * error) ** 2
-    return limit
+    names = ("free", "variance_null", "variance_linear", "variance_square")
+    scores = np.array([NORMAL_95, -NORMAL_95, -_LIMIT_SIGMA])
+    bounds = estimate_bounds(*(np.ravel(field[name]) for name in names), scores)
+    low, high, limit = bounds.reshape(3, *value.shape)
+    half = 0.5 * (np.sqrt(high) - np.sqrt(low))
+    half = np.where(low > 0, half, np.maximum(half, np.sqrt(high) - value))
+    trend = np.sqrt(field["free"][:, 4])
+    limit[:, 4] = (trend + _LIMIT_SIGMA * _trend_error(field, _LIMIT_SIGMA)) ** 2
+    stderr = half / NORMAL_95
+    stderr[:, 4] = _trend_error(field, NORMAL_95)
+    return stderr, limit
 
 
 def _limit_of_curve(

@@ -1,18 +1,100 @@
-"""Upper limits of squared coefficients from single cells, and quantiles of chi-square."""
+"""Bounds of squared coefficients, from their estimates or from single cells."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numba import njit
 
 from gyrostab.kernels.compiled import INNER, KERNEL
 
-__all__ = ["cell_limits", "interpolate_quantile"]
+__all__ = ["cell_limits", "chi_square_quantile", "estimate_bounds"]
+
+#: Largest number of Newton steps to a bound, and the change of the score that ends them.
+_STEPS, _TOLERANCE = 20, 1e-6
 
 
 @njit(**INNER)
-def _chi_square_quantile(freedom, start, step, curve):  # type: ignore[no-untyped-def]
-    """Interpolate the quantile of chi-square over its degrees of freedom, by a cubic."""
+def _stabilise(square, root, b, c):  # type: ignore[no-untyped-def]
+    """Integrate 1 / sigma from zero to `square`, sigma^2 = root^2 + b square + c square^2."""
+    if square <= 0.0:
+        return square / root
+    sigma = math.sqrt(root * root + b * square + c * square * square)
+    rate = math.sqrt(c)
+    share = 2.0 * (rate * (sigma - root) + c * square) / (2.0 * rate * root + b)
+    return math.log1p(share) / rate
+
+
+@njit(**INNER)
+def _bound_square(estimate, a, b, c, score):  # type: ignore[no-untyped-def]
+    """Find the square under which the estimate has the given normal score; zero if there is none.
+
+    Newton steps in the integral of 1 / sigma, of which square and sigma are hyperbolic functions.
+    """
+    root, rate = math.sqrt(a), math.sqrt(c)
+    most = _stabilise(estimate, root, b, c)
+    if (estimate / root + 2.0 * most) / 3.0 <= score:
+        return 0.0
+    place = max(most - score, 0.0)
+    square = 0.0
+    for _ in range(_STEPS):
+        half = math.sinh(0.5 * rate * place)
+        other = math.sqrt(1.0 + half * half)
+        square = 2.0 * root * half * other / rate + b * half * half / c
+        sigma = root * (1.0 + 2.0 * half * half) + b * half * other / rate
+        away = (estimate - square) / sigma
+        value = (away + 2.0 * (most - place)) / 3.0 - score
+        slope = 1.0 + away * (b + 2.0 * c * square) / (6.0 * sigma)
+        step = min(max(value / max(slope, 0.5), -place), 3.0)
+        place += step
+        if abs(step) < _TOLERANCE:
+            break
+    return square
+
+
+@njit(**KERNEL)
+def estimate_bounds(estimate, null, linear, square, scores):  # type: ignore[no-untyped-def]
+    """Find the squared coefficients under which estimates have given normal scores.
+
+    An estimate e is a weighted sum of squares, and scatters with ``sigma(s)^2 = a + b s + c s^2``
+    around the truth s. It is therefore skewed, ever more with s. A third of ``(e - s) / sigma(s)``
+    and two thirds of the integral of 1 / sigma from s to e is close to a normal variable; for a
+    chi-square (a = b = 0) that is the cube root of Wilson and Hilferty to second order.
+
+    Parameters
+    ----------
+    estimate, null, linear, square : float64 (n,)
+        Estimates, and a, b and c. Estimates below ``-sqrt(a)`` are raised to that.
+    scores : float64 (n_scores,)
+        Normal scores: 1.645 for a 95 % lower limit, -1.645 for an upper limit.
+
+    Returns
+    -------
+    float64 (n_scores, n)
+        Zero if no positive square has the score; NaN without an estimate or its variance.
+
+    References
+    ----------
+    Wilson and Hilferty, PNAS 17 (1931) 684.
+    """
+    out = np.full((scores.size, estimate.size), np.nan)
+    for i in range(estimate.size):
+        e, b, c = estimate[i], max(linear[i], 0.0), max(square[i], 1e-12)
+        a = max(null[i], 1e-12 * (b * e + c * e * e))
+        if a > 0.0:
+            for j in range(scores.size):
+                out[j, i] = _bound_square(max(e, -math.sqrt(a)), a, b, c, scores[j])
+    return out
+
+
+@njit(**INNER)
+def chi_square_quantile(freedom, start, step, curve):  # type: ignore[no-untyped-def]
+    """Interpolate the quantile of chi-square over its degrees of freedom nu, by a cubic.
+
+    `curve` has ``nu ln q(nu)``, which is smooth from few degrees of freedom to many, at steps of
+    `step` in ln nu from `start` on; nu must not be above the last node but two.
+    """
     if not freedom > 0.0:
         return 0.0
     position = (np.log(freedom) - start) / step
@@ -27,26 +109,6 @@ def _chi_square_quantile(freedom, start, step, curve):  # type: ignore[no-untype
     )
     value += -(t + 1.0) * t * (t - 2.0) / 2.0 * after + (t + 1.0) * t * (t - 1.0) / 6.0 * beyond
     return np.exp(value / freedom)
-
-
-@njit(**KERNEL)
-def interpolate_quantile(freedom, start, step, curve):  # type: ignore[no-untyped-def]
-    """Interpolate the quantile of chi-square over its degrees of freedom.
-
-    Parameters
-    ----------
-    freedom : float64, any shape
-        Degrees of freedom; not above the last node but two.
-    start, step : float
-        Logarithm of the freedom of the first node, and the distance between nodes.
-    curve : float64 (n_nodes,)
-        ``nu ln q(nu)``, which is smooth from few degrees of freedom to many.
-    """
-    out = np.empty(freedom.shape)
-    flat, values = freedom.ravel(), out.reshape(-1)
-    for i in range(flat.size):
-        values[i] = _chi_square_quantile(flat[i], start, step, curve)
-    return out
 
 
 @njit(**INNER)
@@ -69,8 +131,8 @@ def _cell_quantile(a, whole, own_dof, share, dof, most, start, step, curve):  # 
     For a ramp, the degrees of freedom of the cell are used.
     """
     if a == 4:
-        return _chi_square_quantile(min(own_dof, most, dof), start, step, curve)
-    return whole if share == 1.0 else _chi_square_quantile(min(own_dof, most), start, step, curve)
+        return chi_square_quantile(min(own_dof, most, dof), start, step, curve)
+    return whole if share == 1.0 else chi_square_quantile(min(own_dof, most), start, step, curve)
 
 
 @njit(**KERNEL)
@@ -115,7 +177,7 @@ def cell_limits(  # type: ignore[no-untyped-def]
     most : float
         Degrees of freedom are not taken above this.
     start, step, curve
-        As in `interpolate_quantile`.
+        As in `chi_square_quantile`.
 
     Returns
     -------
@@ -127,7 +189,7 @@ def cell_limits(  # type: ignore[no-untyped-def]
     whole, seen, lowest = np.empty((n_tau, 5)), np.empty(5), np.empty(5)
     for i in range(n_tau):
         for a in range(5):
-            whole[i, a] = _chi_square_quantile(min(own_dof[a, i], most), start, step, curve)
+            whole[i, a] = chi_square_quantile(min(own_dof[a, i], most), start, step, curve)
     for w in range(n_windows):
         lowest[:] = np.inf
         last = n_tau - 1

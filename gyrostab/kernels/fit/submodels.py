@@ -4,7 +4,10 @@ The window is reduced to ``u = A z``, four sums of its cells with ``A = X^T C^-1
 noise. Under squared coefficients s their mean is ``M s`` with ``M = A X``, and their covariance,
 ``sum_ab s_a s_b T_ab``, is known exactly. Each submodel is a set of the terms Q, N, B and K, fitted
 by least squares with its own covariance; its weight is its Gaussian likelihood, zero if one of its
-estimates is not positive.
+estimates is not positive. For the estimate of one term, its own sign is free, and a negative
+estimate of another, z standard errors below zero, only costs a factor exp(-z^2): others that are
+never too low would bias it. To the variance between sets comes the mean of those whose other
+estimates are positive.
 """
 
 from __future__ import annotations
@@ -49,12 +52,14 @@ class Submodels(NamedTuple):
     whitener: NDArray[np.float64]
     design: NDArray[np.float64]
     inner: NDArray[np.float64]
-    #: Estimates, their weights on the data, log-likelihood, and mean and variance of the trend's
-    #: variance, of each set.
+    #: Estimates, what negative ones cost, their weights on the data, log-likelihood, and mean and
+    #: variance of the trend's variance, of each set; its weights in a mean and a variance.
     estimates: NDArray[np.float64]
+    penalties: NDArray[np.float64]
     rows: NDArray[np.float64]
     likelihood: NDArray[np.float64]
     slope: NDArray[np.float64]
+    weights: NDArray[np.float64]
     squares: NDArray[np.float64]
 
 
@@ -72,8 +77,10 @@ def make_submodels():  # type: ignore[no-untyped-def]
         np.zeros((4, 5)),
         np.zeros((4, 4)),
         np.zeros((_SETS, 4)),
+        np.zeros((_SETS, 4)),
         np.zeros((_SETS, 4, 4)),
         np.zeros(_SETS),
+        np.zeros((_SETS, 2)),
         np.zeros((_SETS, 2)),
         np.zeros(5),
     )
@@ -191,7 +198,7 @@ def _solve_set(members, size, index, room):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _describe_set(members, size, index, half, room):  # type: ignore[no-untyped-def]
-    """Write likelihood, variance of the trend, and rows on the data of a set."""
+    """Write likelihood, penalties, variance of the trend, and rows on the data of a set."""
     square = mean = variance = 0.0
     for i in range(4):
         misfit = room.design[i, 4]
@@ -199,6 +206,8 @@ def _describe_set(members, size, index, half, room):  # type: ignore[no-untyped-
             misfit -= room.design[i, p] * room.estimates[index, members[p]]
         square += misfit * misfit
     for p in range(size):
+        below = min(room.estimates[index, members[p]], 0.0)
+        room.penalties[index, members[p]] = below * below / _inverse_entry(room.inner, p, p, size)
         trend, row = room.trend[members[p]], room.rows[index, members[p]]
         mean += trend * room.estimates[index, members[p]]
         for q in range(size):
@@ -237,14 +246,35 @@ def _fit_set(members, index, start, ramp, room):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _is_feasible(index, free, room):  # type: ignore[no-untyped-def]
-    """Whether a set was fitted with positive estimates, except perhaps that of the term `free`."""
-    if not room.likelihood[index] > -np.inf:
-        return False
+def _is_feasible(index, room):  # type: ignore[no-untyped-def]
+    """Whether a set was fitted with positive estimates."""
+    feasible = room.likelihood[index] > -np.inf
     for a in range(4):
-        if index >> a & 1 and a != free and not room.estimates[index, a] > 0.0:
-            return False
-    return True
+        feasible &= not index >> a & 1 or room.estimates[index, a] > 0.0
+    return feasible
+
+
+@njit(**INNER)
+def _weigh_sets(a, room):  # type: ignore[no-untyped-def]
+    """Write the weights of the sets in the mean and in the variance of a term; whether any has one.
+
+    Zero without the term.
+    """
+    best = positive = -np.inf
+    for index in range(1, _SETS):
+        cost = 0.0
+        weight = room.likelihood[index] if index >> a & 1 else -np.inf
+        for b in range(4):
+            if index >> b & 1 and b != a:
+                cost += room.penalties[index, b]
+        room.weights[index, 0] = weight - cost
+        room.weights[index, 1] = weight if cost == 0.0 else -np.inf
+        best = max(best, room.weights[index, 0])
+        positive = max(positive, room.weights[index, 1])
+    for index in range(1, _SETS):
+        room.weights[index, 0] = math.exp(room.weights[index, 0] - best)
+        room.weights[index, 1] = math.exp(room.weights[index, 1] - positive)
+    return positive > -np.inf
 
 
 @njit(**INNER)
@@ -256,51 +286,52 @@ def _quadratic_form(form, products, table):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _best_likelihood(a, wanted, free, room):  # type: ignore[no-untyped-def]
+def _best_likelihood(a, wanted, room):  # type: ignore[no-untyped-def]
     """Find the largest likelihood of the feasible sets with the term `a`, or without it."""
     best = -np.inf
     for index in range(1, _SETS):
-        if (index >> a & 1) == wanted and _is_feasible(index, free, room):
+        if (index >> a & 1) == wanted and _is_feasible(index, room):
             best = max(best, room.likelihood[index])
     return best
 
 
 @njit(**INNER)
-def _average_term(a, best, room, form):  # type: ignore[no-untyped-def]
+def _average_term(a, room, form):  # type: ignore[no-untyped-def]
     """Average a term over the sets that have it: mean, and variance between the sets.
 
-    Its own estimate may be negative, those of the others may not. To `form` goes the quadratic form
-    that turns a covariance of the data into the mean variance of the estimate.
+    To `form` goes the quadratic form that turns a covariance of the data into the mean variance of
+    the estimate.
     """
-    total = mean = square = 0.0
+    total = mean = square = whole = 0.0
     for entry in range(10):
         form[entry] = 0.0
     for index in range(1, _SETS):
-        if not (index >> a & 1 and _is_feasible(index, a, room)):
-            continue
-        weight = math.exp(room.likelihood[index] - best)
         estimate, row = room.estimates[index, a], room.rows[index, a]
-        total += weight
-        mean += weight * estimate
-        square += weight * estimate * estimate
+        if room.weights[index, 0] > 0.0:
+            total += room.weights[index, 0]
+            mean += room.weights[index, 0] * estimate
+            square += room.weights[index, 0] * estimate * estimate
+        weight = room.weights[index, 1]
+        if not weight > 0.0:
+            continue
+        whole += weight
         entry = 0
         for c in range(4):
             for d in range(c, 4):
                 form[entry] += weight * row[c] * row[d] * (1.0 if c == d else 2.0)
                 entry += 1
-    mean /= total
     for entry in range(10):
-        form[entry] /= total
+        form[entry] /= whole
+    mean /= total
     return mean, max(square / total - mean * mean, 0.0)
 
 
 @njit(**INNER)
 def _judge_term(a, base, room, form, result):  # type: ignore[no-untyped-def]
     """Write estimate, likelihood ratio and variance of a term under the squares `base` (5,)."""
-    best = _best_likelihood(a, 1, a, room)
-    if not best > -np.inf:
+    if not _weigh_sets(a, room):
         return
-    mean, null = _average_term(a, best, room, form)
+    mean, null = _average_term(a, room, form)
     linear = quadratic = 0.0
     table = 0
     for b in range(4):
@@ -313,10 +344,10 @@ def _judge_term(a, base, room, form, result):  # type: ignore[no-untyped-def]
             else:
                 null += value * base[b] * base[c]
             table += 1
-    present = _best_likelihood(a, 1, -1, room)
+    present = _best_likelihood(a, 1, room)
     scale = room.scale[a]
     result[1, a] = mean / scale
-    result[2, a] = 2.0 * (present - _best_likelihood(a, 0, -1, room)) if present > -np.inf else 0.0
+    result[2, a] = 2.0 * (present - _best_likelihood(a, 0, room)) if present > -np.inf else 0.0
     result[3, a] = null / scale**2
     result[4, a] = linear / scale
     result[5, a] = quadratic
@@ -327,11 +358,11 @@ def _average_sets(room, base, result):  # type: ignore[no-untyped-def]
     """Average squares and variance of the trend over the feasible sets."""
     best = -np.inf
     for index in range(1, _SETS):
-        if _is_feasible(index, -1, room):
+        if _is_feasible(index, room):
             best = max(best, room.likelihood[index])
     total = mean = square = 0.0
     for index in range(1, _SETS):
-        if _is_feasible(index, -1, room):
+        if _is_feasible(index, room):
             weight = math.exp(room.likelihood[index] - best)
             total += weight
             for a in range(4):
