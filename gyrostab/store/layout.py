@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, reading_of
 from gyrostab.kernels.encoding.checksum import fletcher32
+from gyrostab.store.blosc_chunks import is_blosc_cut
 from gyrostab.store.private import library_lock
 
 __all__ = [
@@ -278,13 +279,13 @@ class _Fletcher32:
 
 
 class _Blosc:
-    """Blosc, with a check of the length (bytes 12 to 16): it reads beyond a cut chunk."""
+    """Blosc, which reads beyond a cut chunk, with a check of the length."""
 
     def decode(self, data: Any) -> Any:
         """Check the length and decompress the bytes."""
         from numcodecs import blosc
 
-        if len(data) < max(int.from_bytes(data[12:16], "little"), 16):
+        if is_blosc_cut(data[:16], len(data)):
             raise RuntimeError("it is cut short")
         return blosc.decompress(data)
 

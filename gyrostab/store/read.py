@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, reading_of
 from gyrostab.kernels.encoding.counts import from_counts
+from gyrostab.store.blosc_chunks import check_blosc_chunks
 from gyrostab.store.cf import decode_stamps, index_dim, parse_time_grids, replace_stamps
 from gyrostab.store.chunk_cache import ChunkCache
 from gyrostab.store.hdf5_heaps import check_global_heaps
@@ -83,11 +84,16 @@ def _open_dataset(
         ) from error
     if check is not None:
         check(path, stored)
+    is_log = stored.attrs.get("gyrostab_content") == "log"
+    own = {name for name in stored.data_vars if is_log and _is_sampled(stored.variables[name])}
+    if path.is_dir():
+        check_blosc_chunks(path, skip=own)
     close = close_function(stored)
     stored = replace_stamps(stored, path)
     stored.set_close(close)
-    is_log = stored.attrs.get("gyrostab_content") == "log"
     long = _find_long_variables(stored, path, strict=strict) if is_log else {}
+    if path.is_dir() and own.difference(long):
+        check_blosc_chunks(path, skip=list(long))
     opened = _make_variables_lazy(stored, long, path, small=MIN_LAZY_VALUES if is_log else 0)
     if is_log:
         # opened again when needed: an archive of any length keeps only a few files open
@@ -135,16 +141,11 @@ def _find_long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dic
     long: dict[Any, xr.Variable] = {}
     for name in stored.data_vars:
         variable = stored.variables[name]
-        dim = str(variable.dims[-1]) if variable.dims else ""
         disk = variable.encoding
         chunks = disk.get("chunks" if path.is_dir() else "chunksizes")
-        if (
-            not dim.startswith("time")
-            or variable.dtype.kind != "f"
-            or not variable.size
-            or chunks is None
-        ):
+        if not _is_sampled(variable) or chunks is None:
             continue
+        dim = str(variable.dims[-1])
         is_known = all(size == 1 for size in chunks[:-1]) and is_readable(path, str(name), disk)
         if not is_known or ("scale_factor" in disk and "_FillValue" not in disk):
             continue  # some other program has laid it out anew
@@ -173,6 +174,12 @@ def _find_long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dic
             variable.dims, make_dask(array, tuple(chunks)), variable.attrs, packing
         )
     return long
+
+
+def _is_sampled(variable: xr.Variable) -> bool:
+    """Whether a variable of a log has a value for each sample."""
+    dim = str(variable.dims[-1]) if variable.dims else ""
+    return dim.startswith("time") and variable.dtype.kind == "f" and variable.size > 0
 
 
 def _find_chunk_spans(

@@ -33,6 +33,7 @@ from gyrostab.ingest.limits import check_declared, check_stored
 from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
 from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name
+from gyrostab.store.blosc_chunks import check_blosc_chunks
 from gyrostab.store.cf import from_disk
 from gyrostab.store.hdf5_heaps import check_global_heaps
 from gyrostab.store.layout import read_attribute
@@ -94,6 +95,8 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
             f"{path.name}: is {_OTHER_CONTENT[content]} that gyrostab wrote, not a log; give the "
             "log that it was made from"
         )
+    if path.is_dir():
+        check_blosc_chunks(path)
     stored = _open_regular(path)
     if stored is None:
         return None
