@@ -110,7 +110,7 @@ def describe(name, entry, folder):
     )
     if "figure" in entry:
         gyrostab.plot_davar(product, axis=entry["figure"]).savefig(
-            ROOT / "docs" / "figures" / f"{name}.png", dpi=70
+            ROOT / "docs" / "figures" / f"{name}.png", dpi=110
         )
     about = {
         **entry,

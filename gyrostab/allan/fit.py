@@ -307,7 +307,7 @@ def find_bands(
     >>> noise = np.random.default_rng(1).standard_normal(60_000)
     >>> smooth = np.convolve(noise, np.ones(9) / 9, mode="valid")  # time constant 80 / 27 samples
     >>> find_bands(davar(make_log(smooth, rate=100.0, unit="deg/h"), window="1min"))
-    {'x': BandLimit(tau_min=0.07, time_constant=0.0286)}
+    {'x': BandLimit(tau_min=0.13, time_constant=0.0292)}
     """
     wanted, chosen = _check_options(surface, terms, method, tau_min, tau_max)
     tau, axes = surface["tau"].values, list(map(str, surface["axis"].values))

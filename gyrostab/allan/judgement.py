@@ -15,7 +15,7 @@ from gyrostab.time.durations import format_duration
 __all__ = ["SUGGESTED_WINDOWS_S", "judge_product", "smallest_observable", "suggest_windows"]
 
 #: Lengths of windows to suggest [s].
-SUGGESTED_WINDOWS_S = (60, 300, 1200, 3600, 4 * 3600, 24 * 3600)
+SUGGESTED_WINDOWS_S = (60, 300, 1200, *(int(hours * HOUR) for hours in (1, 4, 24)))
 #: Coefficient that half of the windows observe, for N = 1 deg/sqrt(h) and windows of one hour; it
 #: falls with the window to the powers 1/2, 1 and 3/2. Measured with 42 simulated windows for each
 #: of twelve sizes, for windows of 10 min at 10 Hz and of 2 h at 2 Hz, which agree within 10 %.

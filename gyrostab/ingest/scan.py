@@ -294,6 +294,7 @@ def _measure_white_noise(log: xr.Dataset) -> dict[str, float]:
     hundredth of the samples.
     """
     from gyrostab.schema import signal_name
+    from gyrostab.units import HOUR
 
     signal = log[signal_name(log)]
     rate, size = float(log.attrs["sampling_rate_hz"]), signal.sizes["time"]
@@ -301,14 +302,14 @@ def _measure_white_noise(log: xr.Dataset) -> dict[str, float]:
     part = signal.isel(time=slice(begin, begin + _MAX_NOISE_SAMPLES)).transpose("axis", "time")
     values = np.asarray(part.values, dtype=np.float64)
     if signal.name == "angle":
-        values = np.diff(values) * rate * 3600.0
+        values = np.diff(values) * rate * HOUR
     found = {}
     for axis, means in zip(signal["axis"].values, values, strict=True):
         levels, factor = [], 1
         while means.size >= 100:
             squares = np.diff(means) ** 2
             if np.isfinite(squares).any():
-                levels.append(float(np.nanmean(squares)) / 2.0 * factor / rate / 3600.0)
+                levels.append(float(np.nanmean(squares)) / 2.0 * factor / rate / HOUR)
             means = means[: means.size // 2 * 2].reshape(-1, 2).mean(axis=1)
             factor *= 2
         found[str(axis)] = math.sqrt(min(levels, default=math.nan))

@@ -72,7 +72,7 @@ def format_duration(seconds: float, space: str = "") -> str:
     >>> format_duration(90.0), format_duration(0.25), format_duration(7200, " ")
     ('1.5min', '0.25s', '2 h')
     """
-    for size, name in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")):
+    for size, name in ((86400, "d"), (3600, "h"), (60, "min")):
         if seconds >= size:
             return f"{seconds / size:.4g}{space}{name}"
     return f"{seconds:.3g}{space}s"

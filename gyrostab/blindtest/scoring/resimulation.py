@@ -79,18 +79,16 @@ def likelihood_ratio(
     """
     total = 0.0
     for name, values in recorded.items():
+        drawn = np.stack([[record[name] for record in one] for one in (with_effects, without)])
+        good = np.isfinite(drawn).all(axis=(0, 1)) & np.isfinite(values)
         logs = []
-        for ensemble in (with_effects, without):
-            drawn = np.stack([record[name] for record in ensemble])
-            good = np.isfinite(drawn).all(axis=0) & np.isfinite(values)
-            if not good.any():
-                break
-            scatter = np.sqrt(drawn[:, good].var(axis=0, ddof=1).mean() * (1.0 + 1.0 / len(drawn)))
-            scatter = max(float(scatter), _MIN_SCATTER.get(name.split("/")[0], 1e-12))
-            z = np.where(good, (values - drawn.mean(axis=0)) / scatter, np.nan)
+        for ensemble in drawn[..., good] if good.any() else ():
+            variance = ensemble.var(axis=0, ddof=1).mean() * (1.0 + 1.0 / len(ensemble))
+            scatter = max(float(np.sqrt(variance)), _MIN_SCATTER.get(name.split("/")[0], 1e-12))
+            z = (values[good] - ensemble.mean(axis=0)) / scatter
             logs.append(-np.log(scatter) - (_TAIL_FREEDOM + 1) / 2 * np.log1p(z**2 / _TAIL_FREEDOM))
-        if len(logs) == 2:
-            total += float(np.nansum(logs[0] - logs[1]))
+        if logs:
+            total += float((logs[0] - logs[1]).sum())
     return total
 
 
