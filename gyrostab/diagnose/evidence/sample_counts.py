@@ -34,9 +34,9 @@ GRID_COUNTS = ("repeats", "extremes", "zeros", "stuck", "filled", "kurtosis")
 #: Counts of `GRID_COUNTS` whose number by chance follows from the scatter of normal noise.
 _PREDICTED_COUNTS = ("repeats", "zeros", "stuck", "filled")
 _MAX_PREDICTED_SCATTERS = 1.5  # quantization step over the scatter of these samples; design choice
-#: Excess kurtosis below which 90 % of the blocks of normal noise are: 0.6 with the fewest samples,
-#: more on grids. Design choice.
-_MAX_NORMAL_KURTOSIS, _NORMAL_SHARE = 1.0, 0.9
+#: Excess kurtosis below which 90 % of the blocks of normal noise are, in standard deviations of that
+#: of independent normal samples, sqrt(24 / n): 1.3, more with correlated ones. Design choice.
+_MAX_NORMAL_KURTOSIS, _NORMAL_SHARE = 2.0, 0.9
 _MIN_COARSE_SCATTERS = 0.2  # quantization step over the scatter of the samples; design choice
 _QUIESCENT_QUANTILE = 0.1  # of the block variances, taken as that at rest; design choice
 _CERTAIN_EXTREMES = 2  # the smallest and the largest sample of any record
@@ -87,7 +87,8 @@ def hidden_by_grid(blocks: xr.Dataset, name: str) -> NDArray[np.bool_]:
         return coarse & (name in GRID_COUNTS)
     by_axis = np.moveaxis(blocks["kurtosis"].values, -2, 0).reshape(coarse.size, -1)
     known = np.where(np.isfinite(by_axis).any(axis=1, keepdims=True), by_axis, np.inf)
-    is_normal = np.nanquantile(known, _NORMAL_SHARE, axis=1) < _MAX_NORMAL_KURTOSIS
+    scatter = np.sqrt(24.0 / np.maximum(np.median(blocks["samples"].values, axis=-1), 1.0))
+    is_normal = np.nanquantile(known, _NORMAL_SHARE, axis=1) < _MAX_NORMAL_KURTOSIS * scatter
     step = blocks["quantization_step"].values
     return np.asarray(
         coarse & ~(is_normal & (step < _MAX_PREDICTED_SCATTERS * quiescent_scatter(blocks)))
