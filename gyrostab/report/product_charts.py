@@ -205,8 +205,7 @@ def _average_windows(product: xr.Dataset) -> xr.Dataset:
     """Average the surface over all windows, as one window with the terms of all of them."""
     part = _thin_product(product, _MAX_WINDOWS, _MAX_TAUS)
     surface = part[[name for name in part.data_vars if part[name].dims[-1:] == ("tau",)]]
-    weight = part["count"].where(part["avar"].notnull(), 0.0)
-    mean = surface.weighted(weight).mean("time", keep_attrs=True).expand_dims(time=1, axis=1)
+    mean = surface.mean("time", keep_attrs=True).expand_dims(time=1, axis=1)
     span = (part["time"].values[-1] - part["time"].values[0]) / np.timedelta64(1, "s")
     independent = 1.0 + span / float(product.attrs.get("window_s", np.inf))
     record = part.isel(time=[part.sizes["time"] // 2])
