@@ -15,6 +15,7 @@ import json
 import math
 import re
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,7 @@ from gyrostab.schema import (
     check_surface,
     texts,
 )
+from gyrostab.store.blosc_chunks import check_blosc_chunks
 from gyrostab.store.lazy import RowSource, make_dask, transpose_lazy
 from gyrostab.store.private import close_function, is_in_memory
 from gyrostab.store.safe_names import (
@@ -460,7 +462,7 @@ def replace_stamps(stored: xr.Dataset, where: object) -> xr.Dataset:
         stamps = stored.variables[name]
         if not stamps.ndim:
             continue
-        if _has_stamps_of(rule, stamps):
+        if _has_stamps_of(rule, stamps, Path(str(where)) / name):
             start = xr.Variable((), 0, stamps.attrs)
             stored = stored.drop_vars(name).assign({f"{name}_start": start})
         else:
@@ -472,13 +474,17 @@ def replace_stamps(stored: xr.Dataset, where: object) -> xr.Dataset:
     return stored
 
 
-def _has_stamps_of(rule: dict[str, Any], stamps: xr.Variable) -> bool:
-    """Whether stamps on disk agree in number and at both ends with a rule."""
+def _has_stamps_of(rule: dict[str, Any], stamps: xr.Variable, folder: Path) -> bool:
+    """Whether stamps on disk agree in number and at both ends with a rule, or are damaged.
+
+    `folder` holds the chunks of the stamps of a Zarr store.
+    """
     if stamps.shape != (rule["size"],):
         return False
     ends = np.unique([0, max(rule["size"] - 1, 0)])[: rule["size"]]
     samples = rule["first"] + rule["stride"] * ends
     try:
+        check_blosc_chunks(folder)
         found = _as_nanoseconds(decode_stamps(stamps[ends], stamps.attrs).values)
     except Exception:  # damaged stamps, for which the libraries raise errors of many kinds
         return True

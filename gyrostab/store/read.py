@@ -87,7 +87,7 @@ def _open_dataset(
     is_log = stored.attrs.get("gyrostab_content") == "log"
     own = {name for name in stored.data_vars if is_log and _is_sampled(stored.variables[name])}
     if path.is_dir():
-        check_blosc_chunks(path, skip=own)
+        check_blosc_chunks(path, skip=own | set(parse_time_grids(stored, path)))
     close = close_function(stored)
     stored = replace_stamps(stored, path)
     stored.set_close(close)
