@@ -163,7 +163,7 @@ def find_band_limit(
     mean = _average_windows(cells, trend, trend_response) if allowed & _N_BIT else None
     if mean is None:
         return unlimited
-    if not _judge(tau, mean, 0, np.zeros(1), allowed, fit)[2] < _NULL_PROBABILITY:
+    if not _fit_from(tau, mean, 0, np.zeros(1), allowed, fit)[2] < _NULL_PROBABILITY:
         return unlimited
     last = tau[-1] / _MIN_TAU_RATIO
     for shortest in tau[tau * _MEMORY_MARGIN <= last]:
@@ -176,11 +176,15 @@ def find_band_limit(
             unfiltered = columns[:start, 1:4] @ squares[1:4] * mean.rows[1][:start]
             ratio = mean.rows[0][:start] / unfiltered
             lacks_power = ratio[0] < _MAX_SHORTEST_RATIO and np.nanmax(ratio) < _MAX_RATIO
-            return BandLimit(float(tau[start]), _round(constant)) if lacks_power else unlimited
+            return (
+                BandLimit(float(tau[start]), _round_constant(constant))
+                if lacks_power
+                else unlimited
+            )
     return unlimited
 
 
-def _round(constant: float) -> float:
+def _round_constant(constant: float) -> float:
     return float(f"{constant:.3g}")
 
 
@@ -217,7 +221,7 @@ def _average_windows(cells: Sequence[Array], trend: Array, response: Array) -> _
     return _Mean(rows, float(slope), float(np.mean(response[used])), used.size)
 
 
-def _judge(
+def _fit_from(
     tau: Array, mean: _Mean, start: int, constants: Array, terms: int, fit: Fit
 ) -> tuple[int, Array, float]:
     """Fit the average from a position on: best constant, squares, probability of its misfit.
@@ -243,7 +247,7 @@ def _fit_constant(
     high = highest
     for _ in range(_GRID_STEPS):
         constants = np.linspace(low, high, _GRID_POINTS)
-        best, squares, probability = _judge(tau, mean, start, constants, allowed & ~_Q_BIT, fit)
+        best, squares, probability = _fit_from(tau, mean, start, constants, allowed & ~_Q_BIT, fit)
         reach = 2.0 * (constants[1] - constants[0])
         low, high = max(constants[best] - reach, 0.0), min(constants[best] + reach, highest)
     return float(constants[best]), squares, probability

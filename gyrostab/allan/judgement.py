@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from gyrostab.noise import HOUR, LAWS
 from gyrostab.schema import OBSERVED, check_product
 from gyrostab.time.durations import format_duration
+from gyrostab.wording import join_words
 
 __all__ = ["SUGGESTED_WINDOWS_S", "judge_product", "smallest_observable", "suggest_windows"]
 
@@ -156,7 +157,7 @@ def _judge_changes(product: xr.Dataset, changes: dict[tuple[str, str], dict[str,
     (channel, term), ratios = max(
         changes.items(), key=lambda item: max(abs(np.log(ratio)) for ratio in item[1].values())
     )
-    sizes = _join([f"{ratio:.2g} on {axis}" for axis, ratio in ratios.items()])
+    sizes = join_words([f"{ratio:.2g} on {axis}" for axis, ratio in ratios.items()])
     return f"{term} is larger by a factor of {sizes} while {_name_channel(channel)} is high."
 
 
@@ -239,7 +240,7 @@ def _judge_terms(product: xr.Dataset, absences: dict[tuple[str, str], list[str]]
     if not hidden:
         return f"All five terms are observed {where}{_list_absences(product, absences)}."
     verb = "is" if len(hidden) == 1 else "are"
-    text = f"{_join(hidden)} {verb} not observed {where}"
+    text = f"{join_words(hidden)} {verb} not observed {where}"
     white = float(product["N"].where(product["observable"].sel(term="N") == OBSERVED).median())
     if hidden == ["Q"]:
         return f"{text}: N hides it; a higher sampling rate would show it."
@@ -255,7 +256,7 @@ def _judge_terms(product: xr.Dataset, absences: dict[tuple[str, str], list[str]]
         if term in limits and np.isfinite(white)
     ]
     text += f": use --window {format_duration(longer[-1])}"
-    return text + (f", which observes {_join(sizes)}." if sizes else ".")
+    return text + (f", which observes {join_words(sizes)}." if sizes else ".")
 
 
 def _list_absences(product: xr.Dataset, absences: dict[tuple[str, str], list[str]]) -> str:
@@ -264,10 +265,6 @@ def _list_absences(product: xr.Dataset, absences: dict[tuple[str, str], list[str
     count = product.sizes["axis"]
     for (term, state), axes in sorted(absences.items(), key=lambda item: item[0][1][-4:] != "high"):
         if 2 * len(axes) > count:
-            which = "" if len(axes) == count else f" on {_join(axes)}"
+            which = "" if len(axes) == count else f" on {join_words(axes)}"
             parts.setdefault(term, f"{term}{which} only {state}")
-    return ": " + _join(list(parts.values())) if parts else ""
-
-
-def _join(words: list[str]) -> str:
-    return " and ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
+    return ": " + join_words(list(parts.values())) if parts else ""

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.physics.parameters import Parameter, parameter
 from gyrostab.physics.prediction import Array, Prediction, Windows
+from gyrostab.wording import join_words
 
 __all__ = [
     "STAGES",
@@ -297,15 +298,14 @@ class Effect:
         """Format the axes: ``"on axis x"``, ``"on axes x and y"`` or ``"on all axes"``."""
         if not self.axes:
             return "on all axes"
-        names = " and ".join(filter(None, [", ".join(self.axes[:-1]), self.axes[-1]]))
-        return f"on ax{'i' if len(self.axes) == 1 else 'e'}s {names}"
+        return f"on ax{'i' if len(self.axes) == 1 else 'e'}s {join_words(self.axes)}"
 
     def quantity(self, name: str, errors: Mapping[str, float] | None = None) -> str:
         """Format a parameter with its error and unit: ``"0.4 ± 0.1 deg/h"``."""
         unit = next(known.unit for known in self.parameters() if known.name == name)
         value = getattr(self, name)
         numbers = [f"{one:.4g}" for one in (value if isinstance(value, tuple) else (value,))]
-        text = " and ".join([", ".join(numbers[:-1]), numbers[-1]] if numbers[1:] else numbers)
+        text = join_words(numbers)
         if errors and name in errors:
             text += f" ± {errors[name]:.2g}"
         return text if unit in ("1", "text") else f"{text} {unit}"

@@ -31,7 +31,7 @@ def test_half_of_the_windows_observe_the_smallest_observable_coefficient(term):
     assert shares[0] < 0.5 < shares[1]
 
 
-def _product(states: dict[str, int], vibration: list[float] | None = None):
+def _make_product(states: dict[str, int], vibration: list[float] | None = None):
     """A product of three axes with steady coefficients, and a state of each term."""
     product = synthetic.product()
     product["observable"] = product["observable"].copy()
@@ -44,13 +44,13 @@ def _product(states: dict[str, int], vibration: list[float] | None = None):
 
 
 def test_a_steady_product_is_called_steady():
-    steady, terms = judge_product(_product({}))
+    steady, terms = judge_product(_make_product({}))
     assert steady.startswith("N is steady: it varies by 0% on x, 0% on y, 0% on z")
     assert terms.startswith("All five terms are observed")
 
 
 def test_a_change_names_its_channel_axis_and_size():
-    product = _product({}, vibration=[0.0, 8.0])
+    product = _make_product({}, vibration=[0.0, 8.0])
     product["N"].loc[{"axis": "x"}] = np.resize([1.0, 5.0], product.sizes["time"])
     assert judge_product(product)[0] == (
         "N is larger by a factor of 5 on x while vibration is high."
@@ -58,17 +58,17 @@ def test_a_change_names_its_channel_axis_and_size():
 
 
 def test_a_term_that_one_state_hides_is_named():
-    product = _product({"B": UPPER_LIMIT_ONLY}, vibration=[0.0, 8.0])
+    product = _make_product({"B": UPPER_LIMIT_ONLY}, vibration=[0.0, 8.0])
     product["observable"].loc[{"term": "B", "time": product["time"][::2]}] = OBSERVED
     assert "B only while vibration is low" in judge_product(product)[1]
 
 
 def test_unobserved_terms_come_with_a_longer_window_or_a_longer_record():
-    product = _product({"B": UPPER_LIMIT_ONLY, "K": NOT_OBSERVABLE})
+    product = _make_product({"B": UPPER_LIMIT_ONLY, "K": NOT_OBSERVABLE})
     text = judge_product(product)[1]
     assert text.startswith("B and K are not observed in windows of 6s: use --window ")
     assert "only a longer record" in judge_product(product.isel(time=slice(0, 4)))[1]
-    assert "sampling rate" in judge_product(_product({"Q": UPPER_LIMIT_ONLY}))[1]
+    assert "sampling rate" in judge_product(_make_product({"Q": UPPER_LIMIT_ONLY}))[1]
 
 
 def test_suggested_windows_fit_the_record():

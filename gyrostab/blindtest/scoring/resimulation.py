@@ -119,7 +119,7 @@ def record_statistics(rate: Array, log: xr.Dataset) -> dict[str, Array]:
     return out
 
 
-def _segments(values: Array, count: int) -> Array:
+def _cut_segments(values: Array, count: int) -> Array:
     """Return (segment, sample), without the last samples."""
     size = max(values.size // count, 1)
     return values[: size * (values.size // size)][: size * count].reshape(-1, size)
@@ -127,7 +127,7 @@ def _segments(values: Array, count: int) -> Array:
 
 def _mean_differences(values: Array) -> dict[str, Array]:
     """Return differences of adjacent means, by the length of the means."""
-    means = np.nanmean(_segments(values, min(_MEANS, max(values.size // 16, 2))), axis=1)
+    means = np.nanmean(_cut_segments(values, min(_MEANS, max(values.size // 16, 2))), axis=1)
     out = {}
     while means.size >= 2:
         pairs = means[: means.size // 2 * 2].reshape(-1, 2)
@@ -138,7 +138,7 @@ def _mean_differences(values: Array) -> dict[str, Array]:
 
 def _segment_spectra(values: Array, count: int) -> NDArray[np.complex128]:
     """Return the spectra of tapered segments (segment, frequency); missing samples are 0."""
-    segments = _segments(values, count)
+    segments = _cut_segments(values, count)
     centred = np.nan_to_num(segments - np.nanmean(segments, axis=1, keepdims=True))
     return np.asarray(np.fft.rfft(centred * np.hanning(segments.shape[1]), axis=1))
 
@@ -176,7 +176,7 @@ def _sample_counts(values: Array) -> dict[str, Array]:
         (values == good.min()) | (values == good.max()),
         np.abs(steps) > _OUTLIER_SIGMA * np.nanmedian(np.abs(steps)) + _OUTLIER_SIGMA * scatter,
     ]
-    counts = [_segments(one, _SEGMENTS).sum(axis=1) for one in odd]
+    counts = [_cut_segments(one, _SEGMENTS).sum(axis=1) for one in odd]
     return {
         "count": np.sqrt(np.concatenate(counts) + 0.375),
         "levels": np.array([np.log(np.unique(good[:20_000]).size)]),
@@ -205,10 +205,10 @@ def _channel_couplings(values: Array, log: xr.Dataset, hertz: float) -> dict[str
             turned = np.cumsum(np.nan_to_num(channel)) / hertz / 360.0
             for order in (1, 2, 3):
                 wave = np.exp(-2j * np.pi * order * turned) * np.nan_to_num(centred)
-                sums = _segments(wave, _SEGMENTS).mean(axis=1)
+                sums = _cut_segments(wave, _SEGMENTS).mean(axis=1)
                 out[f"order {order}"] = np.concatenate([sums.real, sums.imag])
         else:
             products = np.diff(channel) * np.diff(values)
-            sums = np.nanmean(_segments(products, _SEGMENTS), axis=1)
+            sums = np.nanmean(_cut_segments(products, _SEGMENTS), axis=1)
             out[f"coupling {name}"] = sums
     return out

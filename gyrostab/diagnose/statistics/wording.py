@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gyrostab.units import DAY, HOUR
+from gyrostab.wording import join_words
 
 __all__ = ["axes_text", "is_higher", "length_text", "subject", "taus_text"]
 
@@ -14,8 +15,7 @@ def axes_text(axes: Sequence[str]) -> str:
     """Return ``"axis x"`` or ``"axes x and y"``."""
     if not axes:
         return "the record"
-    names = " and ".join(filter(None, [", ".join(axes[:-1]), axes[-1]]))
-    return f"ax{'i' if len(axes) == 1 else 'e'}s {names}"
+    return f"ax{'i' if len(axes) == 1 else 'e'}s {join_words(axes)}"
 
 
 def length_text(seconds: float) -> str:

@@ -32,7 +32,7 @@ def _valid_runs(starts, stops, span):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _intersect(begin, end, starts, stops, shift):  # type: ignore[no-untyped-def]
+def _intersect_runs(begin, end, starts, stops, shift):  # type: ignore[no-untyped-def]
     """Intersect intervals with runs that are moved down by `shift`."""
     low = np.empty(begin.size + starts.size, np.int64)
     high = np.empty(begin.size + starts.size, np.int64)
@@ -60,7 +60,7 @@ def valid_intervals(starts, stops, k, span, points):  # type: ignore[no-untyped-
         return _valid_runs(starts, stops, span)
     begin, end = starts.copy(), stops.copy()
     for i in range(1, points):
-        begin, end = _intersect(begin, end, starts, stops, i * k)
+        begin, end = _intersect_runs(begin, end, starts, stops, i * k)
     return begin, end
 
 

@@ -16,7 +16,7 @@ _STEPS, _TOLERANCE = 20, 1e-6
 
 
 @njit(**INNER)
-def _stabilise(square, root, b, c):  # type: ignore[no-untyped-def]
+def _integrate_scatter(square, root, b, c):  # type: ignore[no-untyped-def]
     """Integrate 1 / sigma from zero to `square`, sigma^2 = root^2 + b square + c square^2."""
     if square <= 0.0:
         return square / root
@@ -33,7 +33,7 @@ def _bound_square(estimate, a, b, c, score):  # type: ignore[no-untyped-def]
     Newton steps in the integral of 1 / sigma, of which square and sigma are hyperbolic functions.
     """
     root, rate = math.sqrt(a), math.sqrt(c)
-    most = _stabilise(estimate, root, b, c)
+    most = _integrate_scatter(estimate, root, b, c)
     if (estimate / root + 2.0 * most) / 3.0 <= score:
         return 0.0
     place = max(most - score, 0.0)

@@ -136,7 +136,7 @@ def _fill_tables(window, ks, shifts, summed, diagonal, table):  # type: ignore[n
     return products, means
 
 
-def _run(
+def _tabulate_covariance(
     variance: str,
     window: int,
     ks: NDArray[np.int64],
@@ -165,14 +165,14 @@ def third_tables(
     window, ks, shifts
         As for `product_tables`; averaging factors are at most ``(window + 1) // 3``.
     """
-    return _run(variance, window, ks, shifts, diagonal=False)
+    return _tabulate_covariance(variance, window, ks, shifts, diagonal=False)
 
 
 def third_diagonals(
     variance: str, window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Compute only the diagonals of `third_tables`: (4, 4, n_tau) and (4, n_tau)."""
-    products, means = _run(variance, window, ks, shifts, diagonal=True)
+    products, means = _tabulate_covariance(variance, window, ks, shifts, diagonal=True)
     return products[..., 0], means[..., 0]
 
 
