@@ -11,8 +11,10 @@ import numpy as np
 
 from gyrostab.diagnose.result.content import check_diagnosis
 from gyrostab.diagnose.result.diagnosis import Diagnosis
+from gyrostab.diagnose.result.families import group_families
 from gyrostab.diagnose.result.text import (
     chance_share,
+    family_text,
     next_measurement,
     plain_name,
     rejection_text,
@@ -75,7 +77,10 @@ def write_diagnosis_report(
     content = diagnosis.content
     check_diagnosis(content)
     rows = [_mismatch_row(region, content) for region in content["mismatches"]]
-    cards = [_effect_card(effect, content, rows) for effect in content["effects"]]
+    cards = [
+        _effect_card(effect, others, content, rows)
+        for effect, *others in group_families(content["effects"])
+    ]
     with new_output(path, overwrite=overwrite) as temporary:
         text = page_text(
             "diagnosis.html.jinja",
@@ -169,14 +174,20 @@ def _source_text(baseline: Mapping[str, Any]) -> str:
 
 
 def _effect_card(
-    effect: Mapping[str, Any], content: Mapping[str, Any], rows: list[dict[str, Any]]
+    effect: Mapping[str, Any],
+    others: list[Mapping[str, Any]],
+    content: Mapping[str, Any],
+    rows: list[dict[str, Any]],
 ) -> dict[str, Any]:
+    """Return the card of an effect, and of the others of its family."""
     evidence, title = effect["held_out_gain"], plain_name(effect["name"])
+    axes = set(effect["axes"]).union(*(other["axes"] for other in others))
     return {
         "title": f"{title[0].upper()}{title[1:]}, {axes_text(effect['axes'])}",
         "name": effect["name"],
         "driver": effect["driver"] or "",
         "statement": effect["statement"],
+        "family": family_text(effect, others) if others else "",
         "rows": [
             {
                 "name": name.replace("_", " "),
@@ -197,8 +208,7 @@ def _effect_card(
         "mismatches": [
             row
             for row, region in zip(rows, content["mismatches"], strict=True)
-            if effect["name"] in region["explained_by"]
-            and set(effect["axes"]) & set(region["axes"])
+            if effect["name"] in region["explained_by"] and axes & set(region["axes"])
         ],
     }
 

@@ -131,6 +131,7 @@ class NamedEffect(_Table):
     parameters: dict[str, Size]
     held_out_gain: HeldOutGain
     alternatives: list[str]
+    family: str | None = None
     statement: str
 
 

@@ -11,7 +11,14 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.result.text import chance_share, next_measurement, summary, without_chance
+from gyrostab.diagnose.result.families import group_families
+from gyrostab.diagnose.result.text import (
+    chance_share,
+    family_text,
+    next_measurement,
+    summary,
+    without_chance,
+)
 from gyrostab.diagnose.settings import Settings, stored_settings
 from gyrostab.physics.base import Effect
 
@@ -65,9 +72,11 @@ class Diagnosis:
     def __str__(self) -> str:
         """Return the verdict with a sentence for each effect and each unexplained mismatch."""
         lines = [f"{self.verdict}: {summary(self.content)}"]
-        for effect in self.effects:
+        for effect, *others in group_families(self.effects):
             evidence = effect["held_out_gain"]
             lines.append(f"- {effect['name']}: {effect['statement']}")
+            if others:
+                lines.append(f"  {family_text(effect, others)}")
             lines.append(
                 f"  evidence: held-out data are predicted better by {evidence['nats']:.3g} nats "
                 f"(threshold against chance: {evidence['threshold']:.2g} nats)"

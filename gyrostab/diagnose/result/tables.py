@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.estimate.upper_limits import UpperLimit
+from gyrostab.diagnose.identify.components import are_lines
 from gyrostab.diagnose.identify.forward_search import MIN_P_VALUE, tail_probability
 from gyrostab.diagnose.identify.identification import Identification, Identifications, Unidentified
 from gyrostab.diagnose.identify.nuisance_alternatives import NUISANCE_ALTERNATIVES
 from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
 from gyrostab.diagnose.result.diagnosis import effect_table
+from gyrostab.diagnose.result.families import find_families
 from gyrostab.diagnose.result.text import (
     chance,
     effect_statement,
@@ -330,7 +332,7 @@ def effect_tables(
     """
     begin, end = blocks["begin"].values, blocks["end"].values
     out = []
-    for one in fitted:
+    for one, family in zip(fitted, _families_of(fitted, blocks), strict=True):
         identification = one.identification
         acting = active_blocks(identification, blocks, settings=settings)
         when = join_blocks(acting, begin, end)
@@ -348,6 +350,7 @@ def effect_tables(
                     "threshold": identification.threshold,
                 },
                 "alternatives": list(identification.alternatives),
+                "family": family,
                 "statement": effect_statement(
                     one.say() or unsized_statement(identification.effect, one.axes),
                     alternatives=identification.alternatives,
@@ -358,6 +361,26 @@ def effect_tables(
             }
         )
     return sorted(out, key=lambda table: -table["held_out_gain"]["nats"])
+
+
+def _families_of(fitted: Sequence[Fitted], blocks: xr.Dataset) -> list[str | None]:
+    """Return the family of each effect that is a line at a frequency; None for others."""
+    lines = [
+        number
+        for number, one in enumerate(fitted)
+        if are_lines(one.identification.components) and "frequency" in one.parameters
+    ]
+    families: list[str | None] = [None] * len(fitted)
+    if len(lines) > 1:
+        frequencies = [fitted[number].parameters["frequency"].value for number in lines]
+        found = find_families(
+            frequencies,
+            resolution=float(np.diff(blocks["line_frequency"].values[:2])[0]),
+            bandwidth=0.5 * float(blocks.attrs["sampling_rate_hz"]),
+        )
+        for number, family in zip(lines, found, strict=True):
+            families[number] = family
+    return families
 
 
 def limit_tables(found: Mapping[str, UpperLimit]) -> dict[str, Any]:

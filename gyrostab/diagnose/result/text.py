@@ -7,17 +7,20 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from gyrostab.diagnose.result.families import group_families
 from gyrostab.diagnose.result.verdict import failed_checks
 from gyrostab.diagnose.settings import stored_settings
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.diagnose.statistics.wording import axes_text, subject
 from gyrostab.physics.registry import effects
+from gyrostab.wording import join_words
 
 __all__ = [
     "chance",
     "chance_share",
     "clock",
     "effect_statement",
+    "family_text",
     "mismatch_statement",
     "motion_statement",
     "named_statement",
@@ -251,6 +254,20 @@ def effect_statement(
     return " ".join(sentences)
 
 
+def family_text(strongest: Mapping[str, Any], others: Sequence[Mapping[str, Any]]) -> str:
+    """Say what family the strongest line belongs to, and where the other lines are.
+
+    Examples
+    --------
+    >>> lines = [{"parameters": {"frequency": {"value": f}}} for f in (37.5, 25.0)]
+    >>> family_text({"family": "harmonics of 12.5 Hz"}, lines)
+    'It is the strongest of the harmonics of 12.5 Hz; the others are at 25 and 37.5 Hz.'
+    """
+    at = sorted({f"{one['parameters']['frequency']['value']:.4g}" for one in others}, key=float)
+    are = "other is" if len(at) == 1 else "others are"
+    return f"It is the strongest of the {strongest['family']}; the {are} at {join_words(at)} Hz."
+
+
 def rejection_text(beaten_by: str, nats: float | None) -> str:
     """Say what beats an effect that was examined and not named, and by how much.
 
@@ -326,8 +343,12 @@ def summary(content: Mapping[str, Any]) -> str:
 
 
 def _list_effects(named: Sequence[Mapping[str, Any]]) -> str:
-    """List the effects, each once for the axes that it acts on."""
-    texts = [f"{plain_name(effect['name'])}, on {axes_text(effect['axes'])}" for effect in named]
+    """List the effects, each once for the axes that it acts on, and each family once."""
+    texts = [
+        f"{plain_name(effect['name'])}, on {axes_text(effect['axes'])}"
+        + (f" ({effect['family']}, {len(others) + 1} lines)" if others else "")
+        for effect, *others in group_families(named)
+    ]
     counts = {text: texts.count(text) for text in texts}
     return "; ".join(
         text if count == 1 else f"{text} ({count} times)" for text, count in counts.items()

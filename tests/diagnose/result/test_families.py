@@ -1,0 +1,64 @@
+"""Families of spectral lines: harmonics, side bands, and one finding for each family."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gyrostab.diagnose.result.families import MAX_CHANCE, find_families
+from gyrostab.report import write_diagnosis_report
+from tests.support.diagnosed import content, diagnosis
+
+SPECTRUM = {"resolution": 0.05, "bandwidth": 50.0}
+
+
+@pytest.mark.parametrize("missing", [0, 2])
+def test_harmonics_are_one_family_also_without_the_fundamental(missing: int):
+    rng = np.random.default_rng(missing)
+    comb = 4.1696 * np.arange(1 + missing, 12) + 0.02 * rng.uniform(-1.0, 1.0, 11 - missing)
+    others = [7.013, 23.31, 39.77]
+    families = find_families([*comb, *others], **SPECTRUM)
+    assert set(families[: comb.size]) <= {"harmonics of 4.169 Hz", "harmonics of 4.17 Hz"}
+    assert len(set(families)) == 2
+    assert families[comb.size :] == [None] * 3
+
+
+def test_side_bands_belong_to_their_line():
+    families = find_families([20.01, 18.76, 21.26, 33.9], **SPECTRUM)
+    assert families == ["side bands of 20.01 Hz, 1.25 Hz apart"] * 3 + [None]
+
+
+def test_unrelated_lines_are_rarely_a_family():
+    """The bound counts each spacing as independent, so that the true share is lower."""
+    rng = np.random.default_rng(1)
+    wrong = sum(any(find_families(rng.uniform(0.1, 50.0, 5), **SPECTRUM)) for _ in range(200))
+    assert wrong <= 200 * MAX_CHANCE
+
+
+def test_a_family_is_one_finding_in_text_and_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("gyrostab.report.diagnosis._make_figures", lambda _: [])
+    lines = [
+        {
+            **content()["effects"][0],
+            "name": "spectral_line",
+            "driver": None,
+            "family": "harmonics of 10 Hz",
+            "parameters": {
+                "frequency": {"value": f, "stderr": 0.1, "low": f, "high": f, "unit": "Hz"}
+            },
+        }
+        for f in (20.0, 10.0, 40.0)
+    ]
+    one = replace(diagnosis(), content=diagnosis().content | {"effects": lines, "mismatches": []})
+    told = "It is the strongest of the harmonics of 10 Hz; the others are at 10 and 40 Hz."
+    page = write_diagnosis_report(one, tmp_path / "page.html").read_text(encoding="utf-8")
+    assert str(one).count("- spectral_line:") == 1
+    assert page.count('<div class="card">') == 1
+    assert told in str(one)
+    assert told in page
+    assert "(harmonics of 10 Hz, 3 lines)" in str(one)
