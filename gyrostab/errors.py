@@ -86,11 +86,6 @@ def reading_of(path: str | PathLike[str]) -> Iterator[None]:
     Format libraries raise exceptions of any type on damaged bytes. Opening a file and every later
     read of lazy data run in this context, so that callers need not know those types.
 
-    Parameters
-    ----------
-    path : path-like
-        File or directory that is read.
-
     Raises
     ------
     DamageError

@@ -23,14 +23,10 @@ class Stage(Protocol):
 
         Parameters
         ----------
-        label : str
-            Name of the stage.
         total : int
             Amount of work: samples over all axes, files, ...; 0 when unknown.
         done : int, optional
             Amount that is done. Without it, the stage follows the finished tasks of dask.
-        unit : str
-            Unit of the amounts.
         """
 
 
@@ -41,11 +37,6 @@ def no_stage(label: str, total: int = 0, done: int | None = None, unit: str = "s
 @contextmanager
 def show_progress(*, quiet: bool = False) -> Iterator[Stage]:
     """Show the stages of the work inside the ``with`` block.
-
-    Parameters
-    ----------
-    quiet : bool
-        Show nothing at all.
 
     Yields
     ------

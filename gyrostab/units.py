@@ -68,7 +68,7 @@ _WORDS = {
 }
 
 
-def _normalize(text: str) -> str:
+def _normalize_text(text: str) -> str:
     """Unify ``rad s^-1``, ``rad*s**-1``, ``rad s⁻¹`` and ``rad s-1``; letters keep their case."""
     text = re.sub(
         "[º˚]", "°", text.strip()
@@ -80,7 +80,9 @@ def _normalize(text: str) -> str:
 
 def _fold_spelling(text: str) -> str:
     """Remove the differences of case, blanks and words such as `seconds` from a spelling."""
-    text = _normalize(text).casefold().replace("°", "deg ").replace(" per ", "/").replace("^", "")
+    text = (
+        _normalize_text(text).casefold().replace("°", "deg ").replace(" per ", "/").replace("^", "")
+    )
     text = re.sub(r"[a-zμ]+", lambda word: _WORDS.get(word[0], word[0]), text.replace("_", " "))
     text = re.sub(r"\s*/\s*", "/", text)
     text = re.sub(
@@ -92,7 +94,7 @@ def _fold_spelling(text: str) -> str:
 def _add_unit(quantity: str, factor: float, *spellings: str, offset: float = 0.0) -> None:
     known = (quantity, factor, offset)
     for spelling in spellings:
-        _SPELLINGS[_normalize(spelling)] = known
+        _SPELLINGS[_normalize_text(spelling)] = known
         key = quantity, _fold_spelling(spelling)
         _PLAIN[key] = known if _PLAIN.get(key, known) == known else None
 
@@ -225,7 +227,7 @@ def parse_unit(text: str, quantity: str | None = None) -> Unit:
     found = _find_unit(text, quantity)
     if found is not None:
         return Unit(text, *found)
-    match = _NUMBER.match(_normalize(text))
+    match = _NUMBER.match(_normalize_text(text))
     found = _find_unit(match.group(2), quantity) if match else None
     if match and found is not None:
         kind, factor, offset = found
@@ -267,7 +269,7 @@ def _parse_base(name: str) -> tuple[str, float, float] | None:
 
 def _parse_product(text: str) -> tuple[str, float, float] | None:
     """Parse a product of powers as UDUNITS writes it (``rad.s-1``, ``degree per second``)."""
-    text = re.sub(r"\s*[.⋅×]\s*(?=[^\s\d])", " ", _normalize(text).replace("^", ""))
+    text = re.sub(r"\s*[.⋅×]\s*(?=[^\s\d])", " ", _normalize_text(text).replace("^", ""))
     text = re.sub(r"_?\bper\b_?|_per_", "/", text, flags=re.IGNORECASE)
     powers = {"angle": 0, "time": 0, "length": 0}
     up = down = 1.0
@@ -290,7 +292,7 @@ def _parse_product(text: str) -> tuple[str, float, float] | None:
 
 def _find_unit(text: str, quantity: str | None) -> tuple[str, float, float] | None:
     """Find quantity, factor and offset of a spelling, as written or without case and blanks."""
-    exact = _SPELLINGS.get(_normalize(text)) or _parse_product(text)
+    exact = _SPELLINGS.get(_normalize_text(text)) or _parse_product(text)
     if exact is not None and quantity in (None, exact[0]):
         return exact
     plain = _fold_spelling(text)

@@ -58,18 +58,11 @@ _N_BIT, _Q_BIT = 2, 1
 
 
 class BandLimit(NamedTuple):
-    """Averaging times that a fit uses, and the filter that it takes into account.
+    """Averaging times that a fit uses, and the filter that it takes into account."""
 
-    Attributes
-    ----------
-    tau_min : float
-        Shortest averaging time to fit [s].
-    time_constant : float
-        Time constant of the first-order low-pass with the same effect on longer averaging times
-        [s]; 0 without a filter.
-    """
-
-    tau_min: float
+    tau_min: float  # shortest averaging time to fit [s]
+    #: Time constant of the first-order low-pass with the same effect on longer averaging times [s];
+    #: 0 without a filter.
     time_constant: float
 
 

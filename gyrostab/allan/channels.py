@@ -16,6 +16,7 @@ from gyrostab.noise import HOUR
 from gyrostab.schema import log_channels
 from gyrostab.store.lazy import read_slice
 from gyrostab.time.grid import first_stamp, grid_times
+from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import INNER
 
 __all__ = ["window_channels"]
@@ -56,11 +57,7 @@ def window_channels(
             continue
         stamps = None
         if channel.dims != ("time",):
-            stamps = (
-                log.variables[f"time_{name}"]
-                .values.astype("datetime64[ns]", copy=False)
-                .view(np.int64)
-            )
+            stamps = to_nanoseconds(log.variables[f"time_{name}"].values)
 
         def ends(
             group: slice, stamps: NDArray[np.int64] | None = stamps

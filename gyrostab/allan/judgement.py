@@ -100,11 +100,6 @@ def _describe_limits(window: float, white: float) -> str:
 def judge_product(product: xr.Dataset) -> list[str]:
     """Judge a product in plain sentences: what changes the noise, and what cannot be observed.
 
-    Parameters
-    ----------
-    product : xarray.Dataset
-        Product of `gyrostab.fit_noise`.
-
     Returns
     -------
     list of str

@@ -43,33 +43,24 @@ _MAX_EDGE_RATIO = 1.25
 
 @dataclass(frozen=True)
 class TermSummary:
-    """One noise term of one axis over all windows.
+    """One noise term of one axis over all windows."""
 
-    Attributes
-    ----------
-    axis, symbol, unit : str
-        Axis, symbol of IEEE Std 952, unit of the coefficient.
-    status : str
-        ``observed`` if at least as many windows observe the term as give only an upper limit, else
-        ``upper_limit_only``; ``not_observable`` if no window gives either.
-    median, low, high : float
-        Median, 5 % and 95 % quantiles over the windows that observe the term [unit]; NaN without
-        such windows.
-    limit : float
-        Median of the upper limits over the windows with an upper limit only [unit]; NaN without
-        such windows.
-    observed_share, limited_share : float
-        Shares of the windows [1].
-    """
-
+    #: Axis, symbol of IEEE Std 952, unit of the coefficient.
     axis: str
     symbol: str
     unit: str
+    #: ``observed`` if at least as many windows observe the term as give only an upper limit, else
+    #: ``upper_limit_only``; ``not_observable`` if no window gives either.
     status: Literal["observed", "upper_limit_only", "not_observable"]
+    #: Median, 5 % and 95 % quantiles over the windows that observe the term [unit]; NaN without
+    #: such windows.
     median: float
     low: float
     high: float
+    #: Median of the upper limits over the windows with an upper limit only [unit]; NaN without such
+    #: windows.
     limit: float
+    #: Shares of the windows [1].
     observed_share: float
     limited_share: float
 
@@ -81,27 +72,14 @@ class TermSummary:
 
 @dataclass(frozen=True)
 class FitSummary:
-    """How well the fitted terms describe the windows of one axis.
+    """How well the fitted terms describe the windows of one axis."""
 
-    Attributes
-    ----------
-    axis : str
-        Axis.
-    windows : int
-        Windows with a fit.
-    chi2_per_dof : float
-        Median of ``fit_chi2 / fit_dof`` [1]; NaN without a fit.
-    failing_share : float
-        Share of the windows that the terms do not describe [1].
-    tau_min, filter_time_constant : float
-        Shortest averaging time of the fit and time constant of the filter of the sensor [s]; the
-        latter is 0 without a filter.
-    """
-
-    axis: str
-    windows: int
-    chi2_per_dof: float
-    failing_share: float
+    axis: str  # axis
+    windows: int  # windows with a fit
+    chi2_per_dof: float  # median of ``fit_chi2 / fit_dof`` [1]; NaN without a fit
+    failing_share: float  # share of the windows that the terms do not describe [1]
+    #: Shortest averaging time of the fit and time constant of the filter of the sensor [s]; the
+    #: latter is 0 without a filter.
     tau_min: float
     filter_time_constant: float
 
@@ -113,11 +91,6 @@ class FitSummary:
 
 def summarise_terms(product: xr.Dataset) -> list[TermSummary]:
     """Summarise each noise term of each axis over the windows of a product.
-
-    Parameters
-    ----------
-    product : xarray.Dataset
-        Product of `gyrostab.fit_noise`, or some of its windows.
 
     Returns
     -------
@@ -178,16 +151,6 @@ def _drop_nans(values: NDArray[np.float64]) -> NDArray[np.float64]:
 def summarise_fit(product: xr.Dataset) -> list[FitSummary]:
     """Summarise for each axis of a product how well the fitted terms describe its windows.
 
-    Parameters
-    ----------
-    product : xarray.Dataset
-        Product of `gyrostab.fit_noise`, or some of its windows.
-
-    Returns
-    -------
-    list of FitSummary
-        One per axis.
-
     Examples
     --------
     >>> from gyrostab import davar, fit_noise, make_log
@@ -218,11 +181,6 @@ def find_fit_from(product: xr.Dataset) -> float | None:
     A filter, a spectral line or motion bends the curve at short averaging times. Up to 24 windows,
     spread over the record, are fitted again from averaging times a factor of two apart.
 
-    Parameters
-    ----------
-    product : xarray.Dataset
-        Product of `gyrostab.fit_noise`, with its surface.
-
     Returns
     -------
     float or None
@@ -251,11 +209,6 @@ def find_fit_from(product: xr.Dataset) -> float | None:
 
 def format_product(product: xr.Dataset) -> str:
     """Format a product as the text that ``gyrostab run`` prints.
-
-    Parameters
-    ----------
-    product : xarray.Dataset
-        Product of `gyrostab.fit_noise`.
 
     Returns
     -------
@@ -296,11 +249,6 @@ def format_product(product: xr.Dataset) -> str:
 
 def describe_record(product: xr.Dataset) -> list[str]:
     """Describe in a few sentences the misfit of a product, its outliers and motion.
-
-    Parameters
-    ----------
-    product : xarray.Dataset
-        Product of `gyrostab.fit_noise`.
 
     Returns
     -------

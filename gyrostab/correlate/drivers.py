@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import OptionError, SchemaError, TimeError
 from gyrostab.kernels.regression.trend import window_trend
 from gyrostab.noise import HOUR
+from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import INNER
 
 __all__ = ["Driver", "align_drivers", "other_channels", "slope_units"]
@@ -129,12 +130,8 @@ def _name_channel(channel: xr.DataArray, product: xr.Dataset) -> str:
     return f"{name}_of_file" if name in product.variables else name
 
 
-def _to_nanoseconds(stamps: Any) -> NDArray[np.int64]:
-    return np.asarray(stamps).astype("datetime64[ns]").astype(np.int64)
-
-
 def _grid_positions(product: xr.Dataset, step: float) -> NDArray[np.int64]:
-    time = _to_nanoseconds(product["time"].values)
+    time = to_nanoseconds(product["time"].values)
     return np.asarray(np.rint((time - time[0]) / 1e9 / step), dtype=np.int64)
 
 
@@ -158,7 +155,7 @@ def _bridge_gaps(whole: Array, most: float) -> Array:
 
 def _window_length_ns(product: xr.Dataset) -> int:
     """Find the length of a window [ns]."""
-    bounds = _to_nanoseconds(product["time_bounds"].values)
+    bounds = to_nanoseconds(product["time_bounds"].values)
     return int(np.median(bounds[:, 1] - bounds[:, 0]))
 
 
@@ -203,8 +200,8 @@ def _align_file_channel(
     values, stamps = _check_channel(channel, product)
     place, before = _grid_positions(product, step), int(lags[-1])
     start = np.rint(np.arange(-before, place[-1] + 1) * step * 1e9).astype(np.int64)
-    start += _to_nanoseconds(product["time_bounds"].values[0, 0])
-    start[before + place] = _to_nanoseconds(product["time_bounds"].values[:, 0])
+    start += to_nanoseconds(product["time_bounds"].values[0, 0])
+    start[before + place] = to_nanoseconds(product["time_bounds"].values[:, 0])
     length = _window_length_ns(product)
     first, last = np.searchsorted(stamps, start), np.searchsorted(stamps, start + length)
     held = last - first
@@ -245,10 +242,10 @@ def _check_channel(channel: xr.DataArray, product: xr.Dataset) -> tuple[Array, N
     if dim not in channel.coords or channel[dim].dtype.kind != "M":
         raise SchemaError(f"channel {channel.name!r} has no datetime coordinate {dim!r}; add one")
     good = np.isfinite(channel.values) & ~np.isnat(channel[dim].values)
-    stamps = _to_nanoseconds(channel[dim].values[good])
+    stamps = to_nanoseconds(channel[dim].values[good])
     order = np.argsort(stamps, kind="stable")
     stamps, values = stamps[order], channel.values[good][order].astype(np.float64)
-    bounds = _to_nanoseconds(product["time_bounds"].values)
+    bounds = to_nanoseconds(product["time_bounds"].values)
     if not stamps.size or stamps[-1] < bounds[0, 0] or stamps[0] >= bounds[-1, 1]:
         extent = (
             "holds no value"

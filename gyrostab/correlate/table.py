@@ -75,16 +75,6 @@ def format_correlation(result: xr.Dataset) -> str:
     """Format the result as a table, with a sentence on each coupling that is or may be there.
 
     Couplings that the record cannot show are counted in one line.
-
-    Parameters
-    ----------
-    result : xarray.Dataset
-        Result of `gyrostab.correlate`.
-
-    Returns
-    -------
-    str
-        Text of several lines.
     """
     rows = correlation_rows(result)
     told = [row for row in rows if row["verdict"] != "cannot tell"]

@@ -20,7 +20,7 @@ from gyrostab.ingest.columns.pieces import (
     pieces_of,
 )
 from gyrostab.ingest.columns.stamps import NAT, read_stamps
-from gyrostab.ingest.concat import group_axes, merge_notes, name_some, split_axes
+from gyrostab.ingest.concat import absence_notes, group_axes, merge_notes, name_some, split_axes
 from gyrostab.ingest.overlap import drop_repeats, stamp_span
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store.lazy import concatenate_columns, select_part, stack_rows
@@ -31,16 +31,20 @@ __all__ = ["attach_channels", "concatenate", "memory_bytes", "move_to_disk", "wi
 
 def memory_bytes(part: xr.Dataset) -> int:
     """Return the size of the columns of a raw log that are in memory [bytes]; 0 for other logs."""
-    arrays = sum(variable.nbytes for variable in _columns(part).values() if variable.chunks is None)
+    arrays = sum(
+        variable.nbytes for variable in _list_columns(part).values() if variable.chunks is None
+    )
     return arrays + sum(pieces.memory_bytes for pieces in _columns_in_pieces(part))
 
 
-def _columns(part: xr.Dataset) -> dict[Any, xr.Variable]:
+def _list_columns(part: xr.Dataset) -> dict[Any, xr.Variable]:
     return {name: variable for name, variable in part.variables.items() if "row" in variable.dims}
 
 
 def _columns_in_pieces(part: xr.Dataset) -> list[PiecewiseColumn]:
-    return [pieces for variable in _columns(part).values() for pieces in pieces_of(variable.data)]
+    return [
+        pieces for variable in _list_columns(part).values() for pieces in pieces_of(variable.data)
+    ]
 
 
 def move_to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
@@ -56,7 +60,9 @@ def move_to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
 
     for pieces in _columns_in_pieces(part):
         pieces.move_to(spool)
-    long = {name: variable for name, variable in _columns(part).items() if variable.chunks is None}
+    long = {
+        name: variable for name, variable in _list_columns(part).items() if variable.chunks is None
+    }
     return part.assign({name: (v.dims, moved(v), v.attrs, v.encoding) for name, v in long.items()})
 
 
@@ -201,17 +207,12 @@ def _concatenate_parts(
             groups, {id(part) for part in parts if channel in part}
         )
     joined = xr.Dataset(data, coords=coords, attrs=dict(parts[0].attrs))
-    gaps = [
-        f"{what} is not in {name_some(files)} and is missing there"
-        for what, files in absent.items()
-        if files
-    ]
     joined.attrs.update(
         source_files=names,
         row_start=[int(start) for start in np.cumsum([0, *sizes[:-1]])],
         notes=[
             *merge_notes((part.attrs["source_files"][0], part.attrs["notes"]) for part in parts),
-            *gaps,
+            *absence_notes(absent),
         ],
         unreadable_rows=sum(part.attrs["unreadable_rows"] for part in parts),
         unreadable_cells=sum(part.attrs["unreadable_cells"] for part in parts),

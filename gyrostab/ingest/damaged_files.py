@@ -9,12 +9,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import xarray as xr
 
 from gyrostab.errors import FormatError, GyrostabError
 from gyrostab.ingest.options import FileSummary
 from gyrostab.schema import texts
+from gyrostab.time.stamps import format_stamp, to_nanoseconds
 
 __all__ = ["LostFile", "add_lost_notes", "check_share", "find_lost_spans", "is_damage"]
 
@@ -56,13 +56,7 @@ def reason_of(path: Path, error: Exception) -> str:
 
 
 def check_share(lost: Sequence[LostFile], total: int) -> None:
-    """Refuse to go on when more than half of the files cannot be read.
-
-    Raises
-    ------
-    FormatError
-        With the reason of the first.
-    """
+    """Refuse to go on when more than half of the files cannot be read."""
     if len(lost) > MAX_LOST_SHARE * total:
         what = "that is more than damage: check the names and the reading options"
         raise FormatError(f"{lost[0].reason}; {len(lost)} of {total} files cannot be read, {what}")
@@ -87,8 +81,6 @@ def find_lost_spans(
 
     Parameters
     ----------
-    lost : sequence of LostFile
-        Files that could not be read.
     spans : mapping of Path to (int, int)
         First and last stamp [ns since 1970] of the files that were read.
     scan : callable
@@ -125,12 +117,8 @@ def _span_of_stamps(path: Path, scan: Callable[[Path], FileSummary]) -> Span | N
     with contextlib.suppress(GyrostabError, OSError, RuntimeError, ValueError):
         summary = scan(path)
         if summary.first is not None and summary.last is not None and summary.first < summary.last:
-            return _to_ns(summary.first), _to_ns(summary.last)
+            return int(to_nanoseconds(summary.first)), int(to_nanoseconds(summary.last))
     return None
-
-
-def _to_ns(stamp: np.datetime64) -> int:
-    return int(stamp.astype("datetime64[ns]").astype(np.int64))
 
 
 def add_lost_notes(
@@ -143,10 +131,7 @@ def add_lost_notes(
     for file in lost:
         where = "where no other file has its time, there is a gap"
         if file.path in spans:
-            first, last = (
-                str(np.datetime64(stamp, "ns").astype("datetime64[ms]"))
-                for stamp in spans[file.path]
-            )
+            first, last = map(format_stamp, spans[file.path])
             where = (
                 f"its time is between {first} and {last}, which is a gap unless another file "
                 "covers it"

@@ -125,8 +125,6 @@ def scan_file(path: str | Path, options: ReadOptions | None = None) -> FileSumma
 
     Parameters
     ----------
-    path : path
-        The file.
     options : ReadOptions, optional
         Reading options; what remains unclear is in the notes.
 

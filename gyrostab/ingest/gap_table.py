@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import SchemaError
 from gyrostab.schema import GAP_CAUSES
 from gyrostab.time.grid import grid_index, grid_times
+from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import HOUR
 
 __all__ = [
@@ -24,7 +25,6 @@ __all__ = [
     "SAMPLES",
     "clip_table",
     "format_duration",
-    "format_stamp",
     "gap_variables",
     "merge_neighbours",
     "name_lost",
@@ -54,15 +54,6 @@ def format_duration(seconds: float) -> str:
     if abs(seconds) < 1.0:
         return f"{seconds * 1e3:.3g} ms"
     return f"{seconds:.1f} s" if abs(seconds) < 7200 else f"{seconds / HOUR:.1f} h"
-
-
-def format_stamp(stamp: int) -> str:
-    """Format a stamp [ns since 1970] as ISO 8601, to the millisecond."""
-    return (
-        "no stamp"
-        if stamp == np.iinfo(np.int64).min
-        else str(np.datetime64(int(stamp), "ns").astype("datetime64[ms]"))
-    )
 
 
 def merge_neighbours(table: NDArray[np.int64], most: int = MAX_TABLE_ROWS) -> NDArray[np.int64]:
@@ -113,12 +104,8 @@ def name_lost(
 
     Parameters
     ----------
-    table : ndarray of int64, shape (n, 5)
-        Table of gaps.
     spans : iterable of pairs of int
         First and last instant [ns since 1970] of each lost file.
-    start, rate : int, float
-        First stamp [ns since 1970] and sampling rate [Hz] of the log.
     """
     table = table.copy()
     for span in spans:
@@ -193,11 +180,7 @@ def read_gap_columns(log: xr.Dataset) -> list[NDArray[np.int64]] | None:
                 f"{name!r} holds {int(np.isnat(values).sum())} missing times (NaT); every time "
                 "must be known"
             )
-        columns.append(
-            values.astype("datetime64[ns]").view(np.int64)
-            if kind == "M"
-            else values.astype(np.int64)
-        )
+        columns.append(to_nanoseconds(values) if kind == "M" else values.astype(np.int64))
     first, end, samples, _, cause = columns
     spoilt = (
         np.any(end < first)

@@ -36,32 +36,25 @@ TYPICAL_RATE_HZ, RATE_DECADES = 100.0, 1.0
 #: Smallest score of a group of columns that is taken for the gyro: one sign in its name, or a unit.
 MIN_SCORE = 1.5
 
-
 _STRONG = re.compile(
     r"gyr|omega|ang(ular)?[ _.]?(rate|vel)|rot(ation)?[ _.]?(rate|vel)|turn[ _.]?rate|uncompgyro"
 )
 
-
 _LETTER = re.compile(r"(^|[^a-z])[wg]_?\*|w_rs_s_\*|(^|[^a-z])rate|^\*?j\*$")
-
 
 _OTHER = re.compile(
     r"acc|(^|[^a-z])[amft]_?\*|mag|quat|pos|euler|orient|gps|temp|press|cov|force|free|linear|lat|lon|field|torque|curr|volt|batt|state"
 )
 
-
 _DERIVED = re.compile(
     r"est|pred|filt|ref|bias|cal|std|var|noise|err|setpoint|sp_|integral|delta|dt|ramp|theta|incr"
 )
 
-
 _TIME_WORD = re.compile(r"time|stamp|tow|clock|epoch|elapsed|seconds|(^|[^a-z])t($|[^a-z])|sec$")
-
 
 _COUNTER_WORD = re.compile(
     r"count|packet|seq|index|sample|(^|[^a-z])(n|no|nr|id|row|frame)($|[^a-z])"
 )
-
 
 _EPOCHS = {
     "s": 1e9,
@@ -69,7 +62,6 @@ _EPOCHS = {
     "us": 1e15,
     "ns": 1e18,
 }  # Unix time between 2001 and 2033 is 1 to 2 of these
-
 
 _TIME_UNIT_PATTERNS = (
     (r"nanos|(^|[^a-z])ns$|_ns|nsec", "ns"),
@@ -111,19 +103,12 @@ def guess_columns(
 
     Parameters
     ----------
-    inspection : FileInspection
-        Inspection of the file.
     rate : float, optional
         Sampling rate given by the user [Hz].
     rate_hint : float, optional
         Sampling rate that a text in the file contains [Hz].
     angles : bool
         Whether the gyro columns are angles.
-
-    Returns
-    -------
-    Guess
-        Columns and units, with the reasons.
     """
     reasons: list[str] = []
     warnings: list[str] = []

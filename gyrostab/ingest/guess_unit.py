@@ -25,14 +25,11 @@ __all__ = [
 #: Rotation of the Earth [deg/h].
 EARTH_RATE_DPH = 15.041
 
-
 #: Relative error with which a fine gyro measures it; its bias is a few tenths of a deg/h.
 EARTH_TOLERANCE = 0.02
 
-
 #: Relative error of a gyro with a bias of a few deg/h.
 EARTH_NEIGHBOURHOOD = 0.3
-
 
 #: Largest full scale of gyros [deg/h].
 MAX_RATE_DPH = 4000.0 * HOUR
@@ -83,21 +80,7 @@ def guess_unit(
     *,
     angles: bool,
 ) -> str:
-    """Guess the unit of the gyro columns, and add the reasons and warnings.
-
-    Parameters
-    ----------
-    inspection : FileInspection
-        The inspected file.
-    axes : dict
-        Axis -> gyro column.
-    rate : float
-        Sampling rate [Hz].
-    reasons, warnings : list of str
-        Lists to extend.
-    angles : bool
-        Whether the columns are angles.
-    """
+    """Guess the unit of the gyro columns, and add the reasons and warnings."""
     group = list(axes.values())
     for column in group:
         named = name_unit(column, "rate")

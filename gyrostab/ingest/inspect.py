@@ -77,13 +77,6 @@ class FileInspection:
 def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileInspection:
     r"""Inspect every column of a file, in any format that gyrostab reads.
 
-    Parameters
-    ----------
-    path : path
-        The file.
-    options : ReadOptions, optional
-        Known reading options, if any.
-
     Returns
     -------
     FileInspection

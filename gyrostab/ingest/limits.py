@@ -2,7 +2,8 @@
 
 A reader knows rows, columns and bytes of a file before it reads values, and the regularisation
 knows rows and samples before it allocates the grid. They compare these numbers with the limits, so
-a damaged or absurd file ends in one message.
+a damaged or absurd file ends in one message: with the numbers, and the option that raises the
+limit.
 """
 
 from __future__ import annotations
@@ -186,22 +187,7 @@ def bytes_present(path: Path) -> int:
 def check_stored(
     path: Path, rows: int, columns: int, given: Mapping[str, float] | None = None
 ) -> None:
-    """Refuse a file that declares far more samples than its bytes can hold.
-
-    Parameters
-    ----------
-    path : Path
-        File or directory.
-    rows, columns : int
-        Declared size of the columns that are read.
-    given : mapping of str to float, optional
-        Limits that the user set.
-
-    Raises
-    ------
-    FormatError
-        With the numbers, and the option that raises the limit.
-    """
+    """Refuse a file that declares far more samples than its bytes can hold."""
     claimed = rows * columns
     if claimed <= limit_value("stored_samples", given):
         return
@@ -218,26 +204,14 @@ def check_stored(
 def check_declared(
     path: Path, stored: xr.Dataset, *, given: Mapping[str, float] | None = None
 ) -> None:
-    """Refuse a dataset whose largest variable is out of proportion to the bytes of its file.
-
-    Raises
-    ------
-    FormatError
-        As in `check_stored`.
-    """
+    """Refuse a dataset whose largest variable is out of proportion to the bytes of its file."""
     shape = max((item.shape for item in stored.variables.values()), key=math.prod, default=())
     rows = max(shape, default=0)
     check_stored(path, rows, math.prod(shape) // max(rows, 1), given)
 
 
 def check_columns(path: Path, columns: int, given: Mapping[str, float] | None = None) -> None:
-    """Refuse a table with too many columns.
-
-    Raises
-    ------
-    FormatError
-        With their number, and the option that raises the limit.
-    """
+    """Refuse a table with too many columns."""
     if columns > limit_value("columns", given):
         raise FormatError(
             f"{path.name}: it has {columns:,} columns; is the separator another one, or is the "
@@ -249,13 +223,7 @@ def check_columns(path: Path, columns: int, given: Mapping[str, float] | None = 
 def check_chunk(
     path: Path, name: str, chunk_bytes: int, given: Mapping[str, float] | None = None
 ) -> None:
-    """Refuse a variable whose chunks are too large to decode in memory.
-
-    Raises
-    ------
-    FormatError
-        With the size of a chunk, and the option that raises the limit.
-    """
+    """Refuse a variable whose chunks are too large to decode in memory."""
     if chunk_bytes > limit_value("chunk_bytes", given):
         raise FormatError(
             f"{path.name}: a chunk of {name!r} has {chunk_bytes:.4g} bytes. If the file is "

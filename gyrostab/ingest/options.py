@@ -46,11 +46,6 @@ class ReadOptions:
     limits : mapping of str to float
         Limits of `gyrostab.ingest.limits` with other values.
 
-    Raises
-    ------
-    OptionError
-        When a value is invalid.
-
     Examples
     --------
     >>> ReadOptions(rate=400.0, unit={"gyro": "deg/s"}).rate

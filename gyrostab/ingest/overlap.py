@@ -8,13 +8,13 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.ingest.columns.stamps import NAT, read_stamps
+from gyrostab.ingest.copies import count_alike, is_copy
 from gyrostab.schema import SIGNAL_UNITS
 
 __all__ = ["drop_repeats", "stamp_span"]
 
 _BLOCK_ROWS = 2**20
 _COMPARED_ROWS = 2**15  # at each end of an overlap
-_MIN_ALIKE_SHARE = 0.9  # share of equal rows in a copy, which may be damaged
 
 
 def drop_repeats(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
@@ -119,7 +119,7 @@ def _is_copy(held: xr.Dataset, part: xr.Dataset, tail: int, head: int) -> bool:
         held, part, (max(tail, size - _COMPARED_ROWS), size), (max(0, head - _COMPARED_ROWS), head)
     )
     common, same = (int(a + b) for a, b in zip(near, far, strict=True))
-    return common >= 2 and same >= _MIN_ALIKE_SHARE * common
+    return is_copy(common, same)
 
 
 def _count_common(
@@ -139,7 +139,4 @@ def _count_common(
         return 0, 0
     left = np.asarray(held[signal].sel(axis=axes)[:, rows[0] : rows[1]].values)[:, a]
     right = np.asarray(part[signal].sel(axis=axes)[:, others[0] : others[1]].values)[:, b]
-    known = np.isfinite(left) & np.isfinite(right)
-    close = np.isclose(left, right, rtol=1e-6, atol=0.0) | ~known
-    has_values = known.any(axis=0)
-    return int(has_values.sum()), int((close.all(axis=0) & has_values).sum())
+    return count_alike(left, right)

@@ -28,7 +28,6 @@ MAX_MISSING_SHARE = 0.1
 #: Samples from which the noise is estimated: 8 MB for each axis, an estimate within 1 %.
 _MAX_NOISE_SAMPLES = 2**20
 
-
 #: Columns of the table: span [s], rate [Hz], share of missing samples between start and end.
 COLUMNS = (
     "file",

@@ -21,13 +21,6 @@ __all__ = ["next_command", "print_inspection", "print_next", "print_scan"]
 def next_command(paths: Sequence[str | Path], options: dict[str, Any]) -> str:
     """Return the complete command that makes a product of logs.
 
-    Parameters
-    ----------
-    paths : sequence of path
-        The logs.
-    options : dict
-        Reading options, as for `scan`.
-
     Examples
     --------
     >>> next_command(["run 7.csv"], {"map": {"wx": "gyro_x"}, "unit": {"gyro": "deg/s"}})

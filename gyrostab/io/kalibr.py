@@ -47,22 +47,13 @@ KEYS = {
 
 @dataclass(frozen=True)
 class KalibrValue:
-    """One number for Kalibr.
+    """One number for Kalibr."""
 
-    Attributes
-    ----------
-    value : float
-        Median over the windows that observe the term, or of their upper limits where more windows
-        only bound it [unit of the key in `KEYS`]; NaN when there is neither.
-    meaning : str
-        Meaning of the value.
-    share : float
-        Share of the windows that enter the median [1].
-    """
-
+    #: Median over the windows that observe the term, or of their upper limits where more windows
+    #: only bound it [unit of the key in `KEYS`]; NaN when there is neither.
     value: float
-    meaning: Literal["observed", "upper_limit_only", "not_observable"]
-    share: float
+    meaning: Literal["observed", "upper_limit_only", "not_observable"]  # meaning of the value
+    share: float  # share of the windows that enter the median [1]
 
 
 def kalibr_noise(product: xr.Dataset) -> dict[str, dict[str, KalibrValue]]:

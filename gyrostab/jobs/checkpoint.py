@@ -61,10 +61,6 @@ def write_block(folder: Path, part: slice, dataset: xr.Dataset, *, job: str) -> 
 
     Parameters
     ----------
-    folder : Path
-        Job folder.
-    part : slice
-        Windows of the part.
     dataset : xarray.Dataset
         The part, in memory.
     job : str

@@ -86,16 +86,10 @@ def compute_blocks(
 
     Parameters
     ----------
-    folder : Path
-        Job folder.
-    parts : sequence of slice
-        All parts.
     blocks : dict
         Finished parts; computed parts are added, also when an error follows.
     job : str
         Hash of the job.
-    pool : Pool
-        Where the parts are computed.
     call : sequence
         Function and its first arguments; the part is the last one.
     check : callable

@@ -37,17 +37,10 @@ def estimate_run(
 
     Parameters
     ----------
-    paths : sequence of path
-        Logs.
     reading, windows, fitting : mapping
         Options as for `gyrostab.jobs.run.run`.
     workers : int, optional
         Number of cores; all by default.
-
-    Returns
-    -------
-    str
-        Lines to print.
     """
     log = load_log(paths, **reading)
     opened = time.process_time()  # of the process, with its start

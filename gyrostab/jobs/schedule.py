@@ -277,17 +277,6 @@ def run_calls(
 
     Only a few more calls are submitted than can run at a time.
 
-    Parameters
-    ----------
-    pool : Pool
-        The workers.
-    calls : iterable of tuple
-        Function and its arguments.
-
-    Yields
-    ------
-    call, result
-
     Raises
     ------
     WorkerError

@@ -127,7 +127,6 @@ class AgeingNoise(Effect):
     stage: ClassVar[Stage] = "noise"
     terms: ClassVar[str] = "N"
     size_parameters: ClassVar[tuple[str, ...]] = ("growth",)
-    references: ClassVar[tuple[str, ...]] = ("Jin et al. 2010, Sci. China Tech. Sci. 53, 3056",)
 
     growth: float = parameter(
         "1", "growth of N^2 in the first hour, as a share of it", typical=6e-4, low=0.0, high=1e3

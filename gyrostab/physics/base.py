@@ -155,8 +155,6 @@ class Effect:
         Parameters that disable the effect when all of them are zero.
     terms : str
         For the stage "noise": symbols that it may change, of QNBK; all by default.
-    references : tuple of str
-        Sources of the equation and the sizes.
 
     Attributes
     ----------
@@ -174,7 +172,6 @@ class Effect:
     channels: ClassVar[Mapping[str, str]] = {}
     size_parameters: ClassVar[tuple[str, ...]] = ()
     terms: ClassVar[str] = "QNBK"
-    references: ClassVar[tuple[str, ...]] = ()
 
     axes: tuple[str, ...] = ()
     driver: tuple[str, ...] = ()

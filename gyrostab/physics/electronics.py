@@ -62,7 +62,6 @@ class SupplyBias(Effect):
         "light_power": INNER["power"],
     }
     size_parameters: ClassVar[tuple[str, ...]] = ("voltage", "power", "ripple")
-    references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997",)
 
     voltage: float = parameter(
         "deg/h/V", "bias per volt", default=0.0, typical=0.01, low=-1e4, high=1e4
@@ -213,7 +212,6 @@ class GaussMarkov(Effect):
     )
     stage: ClassVar[Stage] = "rate"
     size_parameters: ClassVar[tuple[str, ...]] = ("rms",)
-    references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997, annex C",)
 
     rms: tuple[float, ...] = parameter(
         "deg/h", "rms of the bias", typical=(0.05,), low=0.0, high=1e9, many=True
@@ -294,7 +292,6 @@ class Clipping(Effect):
     next_measurement: ClassVar[str] = "widen the output range"
     stage: ClassVar[Stage] = "electronics"
     size_parameters: ClassVar[tuple[str, ...]] = ("limit",)
-    references: ClassVar[tuple[str, ...]] = ("Lefevre 2014, The Fiber-Optic Gyroscope",)
 
     limit: float = parameter(
         "deg/h", "largest distance from the centre; 0 for no limit", typical=5.0, low=0.0, high=1e12
@@ -357,7 +354,6 @@ class ClockError(Effect):
     next_measurement: ClassVar[str] = "log a second clock, or a known line such as the mains"
     stage: ClassVar[Stage] = "sampling"
     size_parameters: ClassVar[tuple[str, ...]] = ("error", "drift")
-    references: ClassVar[tuple[str, ...]] = ("Allan 1987, IEEE Trans. UFFC",)
 
     error: float = parameter(
         "ppm",

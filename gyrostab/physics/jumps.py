@@ -122,7 +122,6 @@ class BiasJump(Effect):
     )
     stage: ClassVar[Stage] = "rate"
     size_parameters: ClassVar[tuple[str, ...]] = ("restart", "shock", "step")
-    references: ClassVar[tuple[str, ...]] = ("Wang et al. 2016, Sensors",)
 
     restart: float = parameter(
         "deg/h", "rms of the jump at every restart", default=0.0, typical=0.05, low=0.0, high=1e6
@@ -230,7 +229,6 @@ class Telegraph(Effect):
     )
     stage: ClassVar[Stage] = "rate"
     size_parameters: ClassVar[tuple[str, ...]] = ("step",)
-    references: ClassVar[tuple[str, ...]] = ("Machlup 1954, J. Appl. Phys.",)
 
     step: tuple[float, ...] = parameter(
         "deg/h", "upper level over the lower", typical=(0.1,), low=-1e9, high=1e9, many=True
@@ -340,7 +338,6 @@ class FringeHop(Effect):
     )
     stage: ClassVar[Stage] = "electronics"
     size_parameters: ClassVar[tuple[str, ...]] = ("order",)
-    references: ClassVar[tuple[str, ...]] = ("Lefevre 2014, The Fiber-Optic Gyroscope",)
 
     order: float = parameter("1", "signed number of fringes", default=1.0, low=-1000.0, high=1000.0)
     length: float = parameter(

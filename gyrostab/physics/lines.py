@@ -62,7 +62,6 @@ class SpectralLine(Effect):
     )
     stage: ClassVar[Stage] = "rate"
     size_parameters: ClassVar[tuple[str, ...]] = ("amplitude",)
-    references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997, annex C",)
 
     amplitude: tuple[float, ...] = parameter(
         "deg/h", "amplitude, sqrt(2) times the rms", typical=0.2, low=-1e6, high=1e6, many=True

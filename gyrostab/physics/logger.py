@@ -66,9 +66,6 @@ class LoggerFilter(Effect):
     )
     stage: ClassVar[Stage] = "sampling"
     size_parameters: ClassVar[tuple[str, ...]] = ("cutoff", "length", "pick")
-    references: ClassVar[tuple[str, ...]] = (
-        "Oppenheim and Schafer 2010, Discrete-Time Signal Processing",
-    )
 
     cutoff: float = parameter(
         "Hz", "half power of the low-pass; 0 for none", default=0.0, typical=2.0, low=0.0, high=1e6
@@ -256,7 +253,6 @@ class RateQuantization(Effect):
     next_measurement: ClassVar[str] = "log with one more bit, or in counts"
     stage: ClassVar[Stage] = "logger"
     size_parameters: ClassVar[tuple[str, ...]] = ("step",)
-    references: ClassVar[tuple[str, ...]] = ("Widrow and Kollar 2008, Quantization Noise",)
 
     step: float = parameter("deg/h", "distance between the values", typical=1.0, low=0.0, high=1e9)
     mode: str = parameter(
@@ -324,7 +320,6 @@ class Spikes(Effect):
     )
     stage: ClassVar[Stage] = "logger"
     size_parameters: ClassVar[tuple[str, ...]] = ("per_hour",)
-    references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997",)
 
     per_hour: float = parameter(
         "1/h", "wrong samples of every axis", typical=60.0, low=0.0, high=1e8
@@ -422,7 +417,6 @@ class HeldSamples(Effect):
     next_measurement: ClassVar[str] = "log a counter with each sample"
     stage: ClassVar[Stage] = "logger"
     size_parameters: ClassVar[tuple[str, ...]] = ("per_hour",)
-    references: ClassVar[tuple[str, ...]] = ("Wang et al. 2016, Sensors",)
 
     per_hour: float = parameter(
         "1/h", "losses, outside of a loss", typical=360.0, low=0.0, high=1e8

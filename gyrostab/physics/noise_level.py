@@ -78,7 +78,6 @@ class TemperatureNoise(Effect):
     terms: ClassVar[str] = "N"
     channels: ClassVar[Mapping[str, str]] = {"temperature": INNER["temperature"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("linear", "quadratic")
-    references: ClassVar[tuple[str, ...]] = ("Li et al. 2013, Chin. J. Lasers 40, 0908004",)
 
     linear: float = parameter(
         "1/degC", "growth of N^2 per degree, as a share of it", typical=2e-3, low=-1.0, high=10.0
@@ -149,10 +148,6 @@ class LightPowerNoise(Effect):
     terms: ClassVar[str] = "N"
     channels: ClassVar[Mapping[str, str]] = {"light_power": INNER["power"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("thermal", "shot")
-    references: ClassVar[tuple[str, ...]] = (
-        "Blin et al. 2007, IEEE Photonics Technol. Lett. 19, 1520",
-        "Jin et al. 2010, Sci. China Tech. Sci. 53, 3056",
-    )
 
     thermal: float = parameter(
         "1",
@@ -276,10 +271,6 @@ class VibrationNoise(_FollowsVibration):
     )
     terms: ClassVar[str] = "QN"
     size_parameters: ClassVar[tuple[str, ...]] = ("white", "quantization")
-    references: ClassVar[tuple[str, ...]] = (
-        "Li et al. 2013, Chin. J. Lasers 40, 0908004",
-        "Zhang et al. 2017, Sensors 17, 2367",
-    )
 
     white: float = parameter(
         "deg/sqrt(h)/g",
@@ -358,10 +349,6 @@ class VibrationRandomWalk(_FollowsVibration):
     )
     terms: ClassVar[str] = "K"
     size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity",)
-    references: ClassVar[tuple[str, ...]] = (
-        "Li et al. 2013, Chin. J. Lasers 40, 0908004",
-        "Wang et al. 2016, Sensors",
-    )
 
     sensitivity: float = parameter(
         "deg/h^1.5/g", "added K, in squares, per rms g", typical=0.5, low=0.0, high=1e4

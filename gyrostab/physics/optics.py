@@ -56,7 +56,6 @@ class DeadZone(Effect):
     next_measurement: ClassVar[str] = "add a slow known rotation that carries the rate through zero"
     stage: ClassVar[Stage] = "sensor"
     size_parameters: ClassVar[tuple[str, ...]] = ("width",)
-    references: ClassVar[tuple[str, ...]] = ("Cao et al. 2025, Opt. Commun.", "US patent 6744519")
 
     width: float = parameter(
         "deg/h", "half of the zone", typical=0.2, low=0.0, high=1e6, source="Cao et al. 2025"
@@ -147,10 +146,6 @@ class FeedbackReset(Effect):
     stage: ClassVar[Stage] = "electronics"
     channels: ClassVar[Mapping[str, str]] = {"ramp": INNER["number"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("kick", "tail", "sawtooth")
-    references: ClassVar[tuple[str, ...]] = (
-        "Lefevre 2014, The Fiber-Optic Gyroscope",
-        "recording of a blueSeis-3A",
-    )
 
     kick: float = parameter(
         "nrad",
@@ -406,10 +401,6 @@ class SharedSource(Effect):
     )
     stage: ClassVar[Stage] = "rate"
     size_parameters: ClassVar[tuple[str, ...]] = ("N",)
-    references: ClassVar[tuple[str, ...]] = (
-        "Blin et al. 2007, IEEE Photon. Technol. Lett.",
-        "Cao et al. 2025, Opt. Commun.",
-    )
 
     N: tuple[float, ...] = parameter(
         "deg/sqrt(h)",

@@ -59,7 +59,6 @@ class ScaleFactor(Effect):
         "temperature": INNER["temperature"],
     }
     size_parameters: ClassVar[tuple[str, ...]] = ("linear", "asymmetry", "cubic", "thermal")
-    references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997", "He et al. 2015, OECC")
 
     linear: float = parameter(
         "ppm", "error of the scale factor", default=0.0, typical=50.0, low=-1e6, high=1e6
@@ -165,7 +164,6 @@ class Misalignment(Effect):
     next_measurement: ClassVar[str] = "rotate about one axis at a time and read the others"
     stage: ClassVar[Stage] = "rate"
     size_parameters: ClassVar[tuple[str, ...]] = ("x", "y", "z")
-    references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997",)
 
     x: float = parameter(
         "mrad", "misalignment angle towards axis x", default=0.0, typical=0.5, low=-1e3, high=1e3
@@ -258,7 +256,6 @@ class EarthRate(Effect):
     stage: ClassVar[Stage] = "motion"
     channels: ClassVar[Mapping[str, str]] = {"rotation_rate": INNER["rotation_rate"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("rate",)
-    references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997, annex C",)
 
     latitude: float = parameter(
         "deg", "latitude, north positive", typical=45.0, low=-90.0, high=90.0
@@ -414,7 +411,6 @@ class RealMotion(Effect):
         "rotation_rate": INNER["rotation_rate"]
     } | dict.fromkeys(("accel_x", "accel_y", "accel_z"), INNER["acceleration"])
     size_parameters: ClassVar[tuple[str, ...]] = ("sway", "spin", "x", "y", "z")
-    references: ClassVar[tuple[str, ...]] = ("Optik, linear vibration and three-axis FOGs in MWD",)
 
     direction: tuple[float, ...] = parameter(
         "1", "share of each axis", default=(1.0,), low=-1.0, high=1.0, many=True

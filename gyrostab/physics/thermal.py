@@ -55,7 +55,6 @@ class TemperatureBias(Effect):
     stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {"temperature": INNER["temperature"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity", "quadratic", "cubic")
-    references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997",)
 
     sensitivity: float = parameter(
         "deg/h/degC", "bias per degree", typical=1e-3, low=-10.0, high=10.0
@@ -139,12 +138,6 @@ class Shupe(Effect):
     stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {"temperature": INNER["temperature"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity", "transient")
-    references: ClassVar[tuple[str, ...]] = (
-        "Shupe 1980, Appl. Opt. 19, 654",
-        "Mohr and Schadt 2004, Proc. SPIE 5502, 410",
-        "Zhuo and Du, Shupe effect of fiber sensing coils in multidimensional thermal field",
-        "Senol et al. 2024, Sci. Rep.",
-    )
 
     sensitivity: float = parameter(
         "deg/h/(degC/min)",
@@ -307,10 +300,6 @@ class ThermalGradient(Effect):
         ("temperature", "temperature_2"), INNER["temperature"]
     )
     size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity", "change")
-    references: ClassVar[tuple[str, ...]] = (
-        "Zhuo and Du, Shupe effect of fiber sensing coils in multidimensional thermal field",
-        "Jo et al., J. Korea Inst. Mil. Sci. Technol.",
-    )
 
     sensitivity: float = parameter(
         "deg/h/degC", "bias per difference", default=0.0, typical=0.05, low=-1e3, high=1e3
@@ -409,7 +398,6 @@ class ThermalHysteresis(Effect):
     stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {"temperature": INNER["temperature"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity",)
-    references: ClassVar[tuple[str, ...]] = ("Zhou et al. 2025, Micromachines 16, 357",)
 
     sensitivity: float = parameter(
         "deg/h/degC", "bias per degree in the dead band", typical=3e-4, low=-10.0, high=10.0

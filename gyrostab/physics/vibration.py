@@ -89,7 +89,6 @@ class GSensitivity(_Vector):
         ("accel_x", "accel_y", "accel_z"), INNER["acceleration"]
     )
     size_parameters: ClassVar[tuple[str, ...]] = ("x", "y", "z")
-    references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997", "Cordova 1998, US patent 5847829")
 
     x: float = parameter(
         "deg/h/g", "bias per g along x", default=0.0, typical=1e-3, low=-10.0, high=10.0
@@ -151,11 +150,6 @@ class VibrationRectification(Effect):
     stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {"vibration": INNER["acceleration"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity", "quartic")
-    references: ClassVar[tuple[str, ...]] = (
-        "Qin et al. 2026",
-        "Cordova 1998, US patent 5847829",
-        "Wang et al. 2016, Sensors",
-    )
 
     sensitivity: float = parameter(
         "deg/h/g^2",
@@ -237,10 +231,6 @@ class AliasedVibration(Effect):
     stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {"vibration": INNER["acceleration"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity",)
-    references: ClassVar[tuple[str, ...]] = (
-        "Wang et al. 2016, Sensors",
-        "Optik, linear vibration and three-axis FOGs in MWD",
-    )
 
     sensitivity: tuple[float, ...] = parameter(
         "deg/h/g", "rms rate in the band per rms g", typical=3.7, low=-1e6, high=1e6, many=True
@@ -382,7 +372,6 @@ class Magnetic(_Vector):
         ("mag_x", "mag_y", "mag_z"), INNER["magnetic"]
     )
     size_parameters: ClassVar[tuple[str, ...]] = ("x", "y", "z")
-    references: ClassVar[tuple[str, ...]] = ("Fizoptika, glossary of fiber-optic gyros",)
 
     x: float = parameter(
         "deg/h/uT", "bias per microtesla along x", default=0.0, typical=1e-3, low=-10.0, high=10.0

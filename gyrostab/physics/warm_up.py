@@ -55,7 +55,6 @@ class WarmUp(Effect):
     )
     stage: ClassVar[Stage] = "rate"
     size_parameters: ClassVar[tuple[str, ...]] = ("amplitude", "slow_amplitude")
-    references: ClassVar[tuple[str, ...]] = ("Lefevre 2014, The Fiber-Optic Gyroscope",)
 
     amplitude: float = parameter(
         "deg/h", "bias of a cold gyro at power-on", typical=0.1, low=-1e4, high=1e4

@@ -28,6 +28,7 @@ from gyrostab.plot.style import (
     upper_limit_marker,
     window_text,
 )
+from gyrostab.plot.surface import find_time_edges
 from gyrostab.schema import NOT_OBSERVABLE, OBSERVED, UPPER_LIMIT_ONLY
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ def plot_coefficients(
     figure = new_figure(width / INCH_MM, 7.6, stacked=True)
     panels = figure.subplots(len(LAWS), 1, sharex=True)
     time = product["time"].values
-    edges = _time_edges(time)
+    edges = find_time_edges(time)
     for panel, (symbol, law) in zip(panels, LAWS.items(), strict=True):
         for name in names:
             _draw_axis(panel, product.sel(axis=name), symbol, name, axis_style(product, name))
@@ -205,13 +206,6 @@ def _legend_handles(product: xr.Dataset, names: list[str]) -> list[Any]:
     )
     keys.append(Patch(facecolor=GREY, alpha=0.5, label="not observable"))
     return keys
-
-
-def _time_edges(time: NDArray[Any]) -> NDArray[Any]:
-    stamps = time.astype("datetime64[ns]").astype(np.int64)
-    half = int(np.median(np.diff(stamps)) // 2) if stamps.size > 1 else 5 * 10**8
-    inner = stamps[:-1] + np.diff(stamps) // 2
-    return np.concatenate([[stamps[0] - half], inner, [stamps[-1] + half]]).astype("datetime64[ns]")
 
 
 def _find_runs(mask: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:

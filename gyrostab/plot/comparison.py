@@ -81,10 +81,6 @@ def plot_comparison(
     width : float
         Width of the figure [mm]: 180 for a page, 85 for a column.
 
-    Returns
-    -------
-    matplotlib.figure.Figure
-
     Raises
     ------
     SchemaError, OptionError

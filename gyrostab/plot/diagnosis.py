@@ -189,10 +189,6 @@ def plot_surfaces(
         Contents of `diagnosis.json`; its mismatches are framed.
     width : float
         Width of the figure [mm]: 180 for a page, 85 for a column.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
     """
     from matplotlib.colors import LogNorm
 

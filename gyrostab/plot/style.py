@@ -337,12 +337,6 @@ def save_png(
 
     Parameters
     ----------
-    figure : matplotlib.figure.Figure
-        Figure to write.
-    target : path-like or binary file
-        File to write to.
-    dpi : int
-        Pixels per inch.
     colours : int
         Largest number of colours, 2 to 256, for a file a third as large; 0 keeps all.
     """

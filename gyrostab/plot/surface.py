@@ -26,12 +26,13 @@ from gyrostab.plot.style import (
     window_text,
 )
 from gyrostab.schema import ESTIMATORS, check_surface
+from gyrostab.time.stamps import to_nanoseconds
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["plot_davar", "plot_davar_3d"]
+__all__ = ["find_time_edges", "plot_davar", "plot_davar_3d"]
 
 CMAP = "viridis"
 CHANGE_CMAP = "PuOr_r"  # safe for colour-blind readers, white where nothing changes
@@ -84,7 +85,8 @@ def plot_davar(
     panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     time, tau = product["time"].values, product["tau"].values
     cells, merged = _merge_windows(product, names, columns)
-    time_edges, tau_edges = _time_edges(time, merged, product.attrs.get("step_s")), log_edges(tau)
+    time_edges = find_time_edges(time, merged, product.attrs.get("step_s"))
+    tau_edges = log_edges(tau)
     if relative:
         cells = [(_divide_by_median(deviation), weighted) for deviation, weighted in cells]
     norm = LogNorm(*_colour_limits([deviation for deviation, _ in cells], relative=relative))
@@ -279,9 +281,9 @@ def _colour_bar(figure: Figure, mesh: Any, label: str, *, relative: bool) -> Non
         bar.minorticks_off()
 
 
-def _time_edges(time: NDArray[Any], merged: int, step: Any) -> NDArray[Any]:
+def find_time_edges(time: NDArray[Any], merged: int = 1, step: Any = None) -> NDArray[Any]:
     """Find the edges of the columns, half-way between window centres."""
-    stamps = time.astype("datetime64[ns]").astype(np.int64)
+    stamps = to_nanoseconds(time)
     half = (
         int(float(step) * 5e8)
         if step is not None

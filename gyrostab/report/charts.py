@@ -11,6 +11,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.time.stamps import to_nanoseconds
+
 if TYPE_CHECKING:
     import plotly.graph_objects as go
 
@@ -43,20 +45,13 @@ _MAX_GAPS = 200
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart of a page.
+    """A chart of a page."""
 
-    Attributes
-    ----------
-    name, title, caption : str
-        Identifier in the page, heading, and how to read the chart.
-    figure : str
-        Plotly figure as JSON that can stand in a script element.
-    """
-
+    #: Identifier in the page, heading, and how to read the chart.
     name: str
     title: str
     caption: str
-    figure: str
+    figure: str  # plotly figure as JSON that can stand in a script element
 
 
 @functools.cache
@@ -121,8 +116,7 @@ def log_axis(
 
 def milliseconds(product: xr.Dataset) -> NDArray[np.float64]:
     """Return window centres as plotly counts them [ms since 1970]."""
-    nanoseconds = product["time"].values.astype("datetime64[ns]").astype(np.int64)
-    return np.asarray(nanoseconds / 1e6)
+    return np.asarray(to_nanoseconds(product["time"].values) / 1e6)
 
 
 def single(values: Any) -> NDArray[np.float32]:

@@ -53,20 +53,6 @@ def write_diagnosis_report(
 ) -> Path:
     """Write the report of a diagnosis.
 
-    Parameters
-    ----------
-    diagnosis : Diagnosis
-        From `gyrostab.diagnose` or `gyrostab.open_diagnosis`.
-    path : path-like
-        The HTML file to make.
-    overwrite : bool
-        Replace an existing file.
-
-    Returns
-    -------
-    pathlib.Path
-        The file.
-
     Raises
     ------
     SchemaError

@@ -18,15 +18,6 @@ def page_text(template: str, *, title: str, **content: Any) -> str:
     ----------
     template : str
         Name of the template, which extends ``frame.html.jinja``.
-    title : str
-        Title and heading of the page.
-    **content
-        Variables of the template.
-
-    Returns
-    -------
-    str
-        HTML.
     """
     import jinja2
 

@@ -34,37 +34,17 @@ class Step:
 
 @dataclass(frozen=True)
 class Plan:
-    """Constant properties of a simulation.
+    """Constant properties of a simulation."""
 
-    Attributes
-    ----------
-    rate : float
-        Sampling rate of the log [Hz].
-    oversampling : int
-        Samples of the instrument in one of the log.
-    start : int
-        First stamp [ns since 1970].
-    axes : tuple of str
-    coefficients : tuple of mapping
-        Noise coefficients of each axis.
-    steps : tuple of Step
-        The effects, in the order in which they act.
-    sources : mapping of str to Source
-        Channels that are needed, by their names in the log.
-    turning : str
-        Axis that feels the channel ``rotation_rate``; empty when none does.
-    gaps : ndarray of int64, shape (n, 2)
-        Samples of the log that are missing, [first, one past last], rising.
-    """
-
-    rate: float
-    oversampling: int
-    start: int
+    rate: float  # sampling rate of the log [Hz]
+    oversampling: int  # samples of the instrument in one of the log
+    start: int  # first stamp [ns since 1970]
     axes: tuple[str, ...]
-    coefficients: tuple[Mapping[str, float], ...]
-    steps: tuple[Step, ...]
-    sources: Mapping[str, Source]
-    turning: str
+    coefficients: tuple[Mapping[str, float], ...]  # noise coefficients of each axis
+    steps: tuple[Step, ...]  # the effects, in the order in which they act
+    sources: Mapping[str, Source]  # channels that are needed, by their names in the log
+    turning: str  # axis that feels the channel ``rotation_rate``; empty when none does
+    #: (n, 2): samples of the log that are missing, [first, one past last], rising.
     gaps: NDArray[np.int64]
 
 
@@ -89,7 +69,6 @@ def next_block(
 
     Parameters
     ----------
-    plan : Plan
     state : BlockState
         From the stretch before; it is left as it was.
     first, count : int

@@ -37,6 +37,7 @@ from gyrostab.simulate.noise import begin_noise, stream
 from gyrostab.time.clock import time_of_day
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import first_stamp, grid_index, stamp_ns, time_coordinate
+from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import parse_unit
 
 __all__ = ["simulate"]
@@ -264,7 +265,7 @@ def _gap_table(environment: xr.Dataset, frame: _Frame) -> NDArray[np.int64]:
             grid_index(
                 frame.start,
                 frame.rate,
-                environment[name].values.astype("datetime64[ns]").astype(np.int64),
+                to_nanoseconds(environment[name].values),
             )
             - 1e-3
         )

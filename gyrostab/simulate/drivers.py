@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import SchemaError
 from gyrostab.time.grid import TimeGridIndex, grid_index
+from gyrostab.time.stamps import to_nanoseconds
 
 __all__ = ["Source", "Stretch", "make_source"]
 
@@ -29,37 +30,19 @@ class Stretch:
 
 @dataclass(frozen=True)
 class Source:
-    """A channel that can be interpolated at any time.
+    """A channel that can be interpolated at any time."""
 
-    Attributes
-    ----------
-    name : str
-        Name in the log.
-    units : str
-        Its unit.
-    held : bool
-        Values hold until the next one; otherwise they run straight towards it.
-    stamps : ndarray of int64, or None
-        Instants of the values [ns since 1970]; None for a long channel.
-    values : ndarray or dask array
-        The values; a long channel may have NaN.
-    start, rate
-        Grid of a long channel: first stamp [ns since 1970], samples in a second [Hz].
-    first : float
-        First value that is a number.
-    size : int
-        Number of its values.
-    """
-
-    name: str
-    units: str
-    held: bool
+    name: str  # name in the log
+    units: str  # its unit
+    held: bool  # values hold until the next one; otherwise they run straight towards it
+    #: Instants of the values [ns since 1970]; None for a long channel.
     stamps: NDArray[np.int64] | None
-    values: Any
+    values: Any  # the values; a long channel may have NaN
+    #: Grid of a long channel: first stamp [ns since 1970], samples in a second [Hz].
     start: int = 0
     rate: float = 1.0
-    first: float = np.nan
-    size: int = 0
+    first: float = np.nan  # first value that is a number
+    size: int = 0  # number of its values
 
     def stretch(self, before: int, end: int) -> Stretch | None:
         """Find the values needed for times after `before` up to `end` [ns]; None if in memory."""
@@ -183,5 +166,5 @@ def make_source(log: xr.Dataset, name: str) -> Source:
     good = ~np.isnan(values)
     if not good.any():
         _first_number(values, name)
-    stamps = log[dim].values.astype("datetime64[ns]").astype(np.int64)[good]
+    stamps = to_nanoseconds(log[dim].values)[good]
     return Source(name, units, held, stamps, values[good])

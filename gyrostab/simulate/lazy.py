@@ -160,7 +160,6 @@ def lazy_rates(
 
     Parameters
     ----------
-    plan : Plan
     state : BlockState
         Before the first sample.
     starts : sequence of NoiseState

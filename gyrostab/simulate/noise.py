@@ -88,10 +88,6 @@ def begin_noise(
 
     Parameters
     ----------
-    seed : int
-        Seed of the simulation.
-    axis : str
-        Name of the axis.
     rate : float
         Sampling rate [Hz].
     terms : str

@@ -43,6 +43,7 @@ from gyrostab.store.safe_names import (
 )
 from gyrostab.time.clock import time_of_day
 from gyrostab.time.grid import TimeGridIndex, grid_times, period_ns, time_coordinate
+from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import ON_DISK, on_disk
 
 __all__ = [
@@ -277,13 +278,9 @@ def _has_whole_microseconds(
                 stamps and (fraction or whole * grid.stride % 1000)
             ):
                 return False
-        elif variable.dtype.kind == "M" and np.any(_as_nanoseconds(variable.values) % 1000):
+        elif variable.dtype.kind == "M" and np.any(to_nanoseconds(variable.values) % 1000):
             return False
     return True
-
-
-def _as_nanoseconds(stamps: Any) -> NDArray[np.int64]:
-    return np.asarray(stamps).astype("datetime64[ns]").view(np.int64)
 
 
 def _encode_stamps(name: Any, variable: xr.Variable, divisor: int) -> NDArray[np.int64]:
@@ -294,7 +291,7 @@ def _encode_stamps(name: Any, variable: xr.Variable, divisor: int) -> NDArray[np
             f"{name!r} holds {int(np.isnat(stamps).sum())} missing times (NaT); "
             "every time must be known"
         )
-    return _as_nanoseconds(stamps) // divisor
+    return to_nanoseconds(stamps) // divisor
 
 
 def _encode_attributes(attrs: dict[str, Any]) -> dict[str, Any]:
@@ -485,7 +482,7 @@ def _has_stamps_of(rule: dict[str, Any], stamps: xr.Variable, folder: Path) -> b
     samples = rule["first"] + rule["stride"] * ends
     try:
         check_blosc_chunks(folder)
-        found = _as_nanoseconds(decode_stamps(stamps[ends], stamps.attrs).values)
+        found = to_nanoseconds(decode_stamps(stamps[ends], stamps.attrs).values)
     except Exception:  # damaged stamps, for which the libraries raise errors of many kinds
         return True
     return np.array_equal(found, grid_times(rule["start_ns"], rule["rate_hz"], samples))

@@ -16,8 +16,6 @@ class ChunkCache:
 
     Parameters
     ----------
-    most_bytes : int
-        Limit of the bytes of all chunks.
     largest_bytes : int
         Limit of the bytes of one chunk; a larger one is not stored.
     """

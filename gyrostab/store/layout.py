@@ -103,10 +103,6 @@ def read_chunk(
 
     Parameters
     ----------
-    path : Path
-        NetCDF file or Zarr directory.
-    name : str
-        Variable.
     place : tuple of int
         Number of the chunk along each dimension.
     zarr : bool
@@ -131,13 +127,7 @@ def read_chunk(
 def read_written_chunk(
     path: Path, name: str, place: tuple[int, ...], *, opened: str
 ) -> NDArray[Any] | None:
-    """Read one chunk of an HDF5 file as it is on disk; None if it was never written.
-
-    Raises
-    ------
-    ChunkDamage, FormatError
-        As from `read_chunk`.
-    """
+    """Read one chunk of an HDF5 file as it is on disk; None if it was never written."""
     layout = _read_hdf5_layout(path, name, opened)
     if place not in layout.places and not layout.damage:
         return None

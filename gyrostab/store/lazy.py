@@ -47,22 +47,13 @@ __all__ = [
 
 
 class Source:
-    """Values that are read when they are needed; as much of an array as dask asks for.
+    """Values that are read when they are needed; as much of an array as dask asks for."""
 
-    Attributes
-    ----------
-    shape, dtype
-        Of the whole array.
-    parts : sequence of array
-        Arrays that the values are derived from.
-    path : Path or None
-        File that the values are read from.
-    """
-
+    #: Of the whole array.
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
-    parts: Sequence[Any] = ()
-    path: Path | None = None
+    parts: Sequence[Any] = ()  # arrays that the values are derived from
+    path: Path | None = None  # file that the values are read from
 
     @property
     def ndim(self) -> int:
@@ -180,8 +171,6 @@ def read_into(array: Any, row: int, begin: int, out: NDArray[Any]) -> None:
         The array.
     row : int
         The row; 0 for an array of one dimension.
-    begin : int
-        First sample.
     out : ndarray
         Receives as many samples as it has elements, converted to its type.
     """

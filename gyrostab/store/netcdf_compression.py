@@ -18,7 +18,7 @@ import xarray as xr
 from gyrostab.store.lazy import read_box
 from gyrostab.store.private import library_lock
 from gyrostab.store.threads import map_in_order
-from gyrostab.store.write import Progress
+from gyrostab.store.write import Progress, create_variables
 
 __all__ = ["append_compressed", "large_variables"]
 
@@ -55,15 +55,11 @@ def append_compressed(
 
     Parameters
     ----------
-    path : Path
-        The file.
     large : mapping of str to xarray.Variable
         Numeric variables, in memory or of dask; the latter are computed chunk by chunk.
     encoding : mapping
         ``zlib``, ``complevel``, ``shuffle``, ``chunksizes`` and ``_FillValue`` of each variable, as
         for xarray.
-    progress : callable, optional
-        Called with the share that is written.
     """
     import h5py
     import netCDF4
@@ -72,19 +68,7 @@ def append_compressed(
         return
     lock = library_lock()
     with lock, netCDF4.Dataset(path, "a") as file:
-        for name, variable in large.items():
-            options = dict(encoding[name])
-            for dim, size in variable.sizes.items():
-                if dim not in file.dimensions:
-                    file.createDimension(str(dim), size)
-            made = file.createVariable(
-                name,
-                variable.dtype,
-                [str(dim) for dim in variable.dims],
-                fill_value=options.pop("_FillValue"),
-                **options,
-            )
-            made.setncatts(variable.attrs)
+        create_variables(file, large, encoding)
     total, done = sum(variable.size for variable in large.values()), 0
     pieces = _list_chunks(large, encoding)
     with lock:

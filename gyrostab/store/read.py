@@ -48,8 +48,6 @@ def open_stored(
 
     Parameters
     ----------
-    path : Path
-        A NetCDF file or a Zarr directory.
     strict : bool
         Raise `FormatError` for a damaged chunk of a log instead of leaving a gap.
     check : callable, optional

@@ -16,30 +16,19 @@ _NO_SPANS = np.empty((0, 2), dtype=np.int64)
 
 
 class RowInspection(NamedTuple):
-    """Result of the inspection of some rows.
+    """Result of the inspection of some rows."""
 
-    Attributes
-    ----------
-    rows, absent : int
-        Number of rows, and of rows without any number.
-    bits : ndarray of uint8
-        One bit per row: whether some axis has a number.
-    unreadable, infinite : ndarray of int64, shape (n, 2)
-        Half-open spans of present rows in which an axis is NaN or infinite.
-    low, high : ndarray of float64, shape (n_axes,)
-        Range of the finite values.
-    filled : dict
-        Number of rows with a number, by channel.
-    """
-
+    #: Number of rows, and of rows without any number.
     rows: int
     absent: int
-    bits: NDArray[np.uint8]
+    bits: NDArray[np.uint8]  # one bit per row: whether some axis has a number
+    #: (n, 2): half-open spans of present rows in which an axis is NaN or infinite.
     unreadable: NDArray[np.int64]
     infinite: NDArray[np.int64]
+    #: (n_axes,): range of the finite values.
     low: NDArray[np.float64]
     high: NDArray[np.float64]
-    filled: dict[str, int]
+    filled: dict[str, int]  # number of rows with a number, by channel
 
 
 def inspect_rows(
@@ -51,8 +40,6 @@ def inspect_rows(
     ----------
     cells : ndarray, shape (n_axes, n)
         Values by axis and row.
-    channels : mapping of str to ndarray, shape (n,)
-        Channels by name.
     begin : int
         Row of the log at which the block begins.
     """

@@ -49,23 +49,12 @@ class Rows(Protocol):
 
 @dataclass(frozen=True)
 class EvenRows:
-    """Numbers at even distances in a file.
-
-    Attributes
-    ----------
-    path : Path
-    dtype : dtype
-        With its byte order.
-    begin : int
-        Byte of row 0.
-    stride : int
-        Bytes from one row to the next.
-    """
+    """Numbers at even distances in a file."""
 
     path: Path
-    dtype: np.dtype[Any]
-    begin: int
-    stride: int
+    dtype: np.dtype[Any]  # with its byte order
+    begin: int  # byte of row 0
+    stride: int  # bytes from one row to the next
 
     @classmethod
     def of_array(
@@ -109,32 +98,20 @@ class EvenRows:
 
 @dataclass(frozen=True)
 class ChunkedRows:
-    """Numbers in chunks along one dimension, or one place of a second dimension.
+    """Numbers in chunks along one dimension, or one place of a second dimension."""
 
-    Attributes
-    ----------
-    load : callable
-        Function of the number of the chunk along each dimension. It returns the chunk, which may
-        be shorter at the end, or None if it was never written.
-    shape, chunks : tuple of int
-        Shape of the variable and of its chunks.
-    dtype : dtype
-    fill : number
-        Value of samples that were never written.
-    along, place : int
-        Dimension of the rows, and index along the other one.
-    key : tuple
-        Identifier of one opening of the variable, common to its columns.
-    """
-
+    #: Function of the number of the chunk along each dimension. It returns the chunk, which may be
+    #: shorter at the end, or None if it was never written.
     load: Callable[[tuple[int, ...]], NDArray[Any] | None]
+    #: Shape of the variable and of its chunks.
     shape: tuple[int, ...]
     chunks: tuple[int, ...]
     dtype: np.dtype[Any]
-    fill: Any
+    fill: Any  # value of samples that were never written
+    #: Dimension of the rows, and index along the other one.
     along: int
     place: int
-    key: tuple[str]
+    key: tuple[str]  # identifier of one opening of the variable, common to its columns
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Return the numbers of some rows as they are stored."""
@@ -176,17 +153,10 @@ class ChunkedRows:
 
 @dataclass(frozen=True)
 class LibraryRows:
-    """Numbers that only a library can read, while the file is open.
+    """Numbers that only a library can read, while the file is open."""
 
-    Attributes
-    ----------
-    variable : Any
-        Variable of the library; indexing it returns stored numbers.
-    along, place : int
-        Dimension of the rows, and index along the other one.
-    """
-
-    variable: Any
+    variable: Any  # variable of the library; indexing it returns stored numbers
+    #: Dimension of the rows, and index along the other one.
     along: int = 0
     place: int = 0
 
@@ -203,13 +173,6 @@ class LibraryRows:
 
 def hdf5_rows(path: Path, variable: Any) -> Callable[[int, int], Rows] | None:
     """Find a way to read the rows of an HDF5 dataset without the library.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    variable : h5py.Dataset
-        Dataset of one or two dimensions.
 
     Returns
     -------

@@ -104,11 +104,6 @@ def rename_new(source: Path, target: Path) -> None:
 
     Without a flagged rename, a file gets the new name as a hard link, which also fails when the
     name is taken. A folder, or a file on a file system without links, is looked up first.
-
-    Raises
-    ------
-    FileExistsError
-        When the name is taken.
     """
     if rename_with_flag(source, target, NO_REPLACE):
         return

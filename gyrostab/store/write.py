@@ -28,6 +28,7 @@ __all__ = [
     "as_counts",
     "chunk_samples",
     "common_packing",
+    "create_variables",
     "long_variables",
 ]
 
@@ -37,7 +38,6 @@ CHUNK_LIMITS = (2**16, 2**22)
 #: Size [bytes] of the doubles that are computed at a time while a lazy log is written.
 MAX_BATCH_BYTES = 2**26
 FILL_VALUES = {"int16": -32767, "int32": -2147483647}  # the defaults of NetCDF
-
 
 #: Function that is called with the share that is done.
 Progress = Callable[[float], None]
@@ -65,7 +65,7 @@ def as_counts(name: str, variable: xr.Variable) -> xr.Variable:
 
     Raises
     ------
-    Misfit
+    NotCountsError
         When counts do not give the same doubles; for a lazy variable, when it is computed.
     """
     scale, declared = (
@@ -147,6 +147,26 @@ def _dim_names(variable: xr.Variable) -> list[str]:
     return [str(dim) for dim in variable.dims]
 
 
+def create_variables(
+    file: Any, variables: Mapping[str, xr.Variable], encoding: Mapping[Any, Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Create variables and their dimensions in a NetCDF file; `encoding` as for xarray."""
+    created = {}
+    for name, variable in variables.items():
+        for dim, size in variable.sizes.items():
+            if dim not in file.dimensions:
+                file.createDimension(str(dim), size)
+        options = dict(encoding[name])
+        fill = variable.attrs.get("_FillValue", options.pop("_FillValue", None))
+        made = file.createVariable(
+            name, variable.dtype, _dim_names(variable), fill_value=fill, **options
+        )
+        made.setncatts({key: value for key, value in variable.attrs.items() if key != "_FillValue"})
+        made.set_auto_maskandscale(False)
+        created[name] = made
+    return created
+
+
 def append_netcdf(
     path: Path,
     long: dict[str, xr.Variable],
@@ -161,21 +181,8 @@ def append_netcdf(
     with lock:
         file = netCDF4.Dataset(path, "a")
     try:
-        targets = {}
         with lock:
-            for name, variable in long.items():
-                for dim, size in variable.sizes.items():
-                    if dim not in file.dimensions:
-                        file.createDimension(str(dim), size)
-                options = dict(encoding[name])
-                fill = variable.attrs.get("_FillValue", options.pop("_FillValue", None))
-                targets[name] = file.createVariable(
-                    name, variable.dtype, _dim_names(variable), fill_value=fill, **options
-                )
-                targets[name].setncatts(
-                    {key: value for key, value in variable.attrs.items() if key != "_FillValue"}
-                )
-                targets[name].set_auto_maskandscale(False)
+            targets = create_variables(file, long, encoding)
 
         def put(name: str, row: tuple[int, ...], part: slice, values: NDArray[Any]) -> None:
             with lock:

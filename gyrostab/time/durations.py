@@ -87,8 +87,6 @@ def samples(value: Any, rate: float, option: str) -> int:
         The length. A bare number is refused: it could be seconds or samples.
     rate : float
         Sampling rate [Hz].
-    option : str
-        Name of the option, for messages.
 
     Raises
     ------

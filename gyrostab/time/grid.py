@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from xarray.indexes import CoordinateTransform, CoordinateTransformIndex
 
 from gyrostab.errors import OptionError, TimeError
+from gyrostab.time.stamps import to_nanoseconds
 
 __all__ = [
     "TimeGridIndex",
@@ -96,8 +97,6 @@ def stamp_ns(start: Any, what: str = "start") -> int:
     ----------
     start : str, int or datetime
         The instant; text is ISO 8601, UTC unless it says otherwise.
-    what : str
-        Name of the instant, for the message.
 
     Raises
     ------
@@ -206,8 +205,6 @@ def grid_times(start: int, rate: float, index: Any) -> NDArray[np.int64]:
         Stamp of sample 0 [ns since 1970-01-01T00:00:00].
     rate : float
         Sampling rate [Hz].
-    index : array_like of int
-        Sample numbers.
 
     Examples
     --------
@@ -227,8 +224,7 @@ def grid_index(start: int, rate: float, stamps: Any) -> NDArray[np.float64]:
 
 def first_stamp(log: xr.Dataset) -> int:
     """Return the first stamp of a log [ns since 1970] without computing the others."""
-    first = np.asarray(log.variables["time"][0].values).astype("datetime64[ns]")
-    return int(first.astype(np.int64).ravel()[0])
+    return int(to_nanoseconds(log.variables["time"][0].values).ravel()[0])
 
 
 class _GridTransform(CoordinateTransform):
@@ -263,9 +259,7 @@ class _GridTransform(CoordinateTransform):
         return {self.coord_names[0]: stamps.view("datetime64[ns]")}
 
     def reverse(self, coord_labels: dict[Any, Any]) -> dict[str, Any]:
-        stamps = (
-            np.asarray(coord_labels[self.coord_names[0]]).astype("datetime64[ns]").view(np.int64)
-        )
+        stamps = to_nanoseconds(coord_labels[self.coord_names[0]])
         return {
             self.dims[0]: (grid_index(self.start, self.rate, stamps) - self.first) / self.stride
         }
@@ -302,7 +296,7 @@ class _GridTransform(CoordinateTransform):
         return bool(np.array_equal(own, others))
 
 
-def _selection(positions: dict[Any, Any]) -> Any:
+def _wrap_positions(positions: dict[Any, Any]) -> Any:
     """Wrap positions by dimension as xarray expects them; it does not export the class."""
     return type(xr.indexes.PandasIndex([0], "n").sel({"n": 0}))(positions)
 
@@ -347,11 +341,13 @@ class TimeGridIndex(CoordinateTransformIndex):
         label = labels[name]
         dim = self.transform.dims[0]
         if isinstance(label, slice):
-            return _selection({dim: self._slice(label)})
+            return _wrap_positions({dim: self._find_slice(label)})
         if isinstance(label, str) and method is None and len(label) < len("2000-01-01T00:00:00"):
             # "2026-11-20" or "2026-11-20T14": the whole day or hour, as in pandas
             period = pd.Period(label)
-            return _selection({dim: self._slice(slice(period.start_time, period.end_time))})
+            return _wrap_positions(
+                {dim: self._find_slice(slice(period.start_time, period.end_time))}
+            )
         stamps = np.asarray(getattr(label, "values", label)).astype("datetime64[ns]")
         position = self.transform.reverse({name: stamps})[dim]
         nearest = np.rint(position).astype(np.int64)
@@ -370,10 +366,10 @@ class TimeGridIndex(CoordinateTransformIndex):
             if np.any(miss > np.timedelta64(pd.Timedelta(tolerance))):
                 raise KeyError(f"no sample within {tolerance} of {label}")
         if isinstance(label, xr.DataArray | xr.Variable):
-            return _selection({dim: xr.Variable(label.dims, nearest)})
-        return _selection({dim: int(nearest) if nearest.ndim == 0 else nearest})
+            return _wrap_positions({dim: xr.Variable(label.dims, nearest)})
+        return _wrap_positions({dim: int(nearest) if nearest.ndim == 0 else nearest})
 
-    def _slice(self, label: slice) -> slice:
+    def _find_slice(self, label: slice) -> slice:
         (name,), (dim,) = self.transform.coord_names, self.transform.dims
 
         def edge(bound: Any, side: str) -> int | None:

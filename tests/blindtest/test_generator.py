@@ -57,12 +57,9 @@ def test_coil_conserves_heat():
 
 def test_quadrupole_cancels_shupe_except_for_trim_error():
     ramp = 20 + np.arange(3000) / 60.0
-    even = coil.coil_rate(ramp, dt=1.0, weights=coil.layer_weights(24))[-1]
-    trimmed = coil.coil_rate(ramp, dt=1.0, weights=coil.layer_weights(24, trim=1e-3))[-1]
-    # half to half asymmetry of 2 trim: n / (D L) (dn/dT + n alpha) 2 trim L^2 dT/dt
-    expected = (
-        1.45 / (0.04 * 500) * (8.6e-6 + 1.45 * 0.55e-6) * 2e-3 * 500**2 / 60 * coil.DEG_PER_HOUR
-    )
+    speed = np.gradient(coil.layer_temperatures(ramp, dt=1.0, layers=24), axis=1)[:, -1]
+    even, trimmed = (coil.layer_weights(24, trim=trim) @ speed for trim in (0.0, 1e-3))
+    expected = 2e-3 * 500**2 / 60  # half to half asymmetry of 2 trim: 2 trim L^2 dT/dt
     assert abs(even) < 1e-3 * expected
     assert trimmed == pytest.approx(expected, rel=1e-3)
 
@@ -89,9 +86,8 @@ def test_shot_noise_level_matches_textbook():
         / math.sin(depth)
         / math.sqrt(2)
     )
-    rate = phase * 1.55e-6 * light.LIGHT_SPEED / (2 * math.pi * 500 * 0.04)
-    level = light.rate_noise(np.array([power]), rin=0.0, load=1e12, depth=depth)[0]
-    assert level == pytest.approx(math.degrees(rate) * 3600, rel=1e-3)
+    level = light.relative_psd(np.array([power]), rin=0.0, load=1e12, depth=depth)[0]
+    assert math.sqrt(level / 2) == pytest.approx(phase, rel=1e-3)
 
 
 @given(st.lists(st.floats(-0.9, 0.9), min_size=2, max_size=3))

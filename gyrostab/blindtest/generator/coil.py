@@ -8,11 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-__all__ = ["coil_rate", "diffusion_time", "layer_temperatures", "layer_weights"]
+__all__ = ["diffusion_time", "layer_temperatures", "layer_weights"]
 
 Array = NDArray[np.float64]
-
-DEG_PER_HOUR = math.degrees(1.0) * 3600.0  # rad/s -> deg/h
 
 
 def diffusion_time(thickness: float, diffusivity: float) -> float:
@@ -128,39 +126,3 @@ def layer_weights(
             ends**2 - begins**2
         )  # (L - 2 l) integrated, l counted from the middle
     return weights + 2.0 * trim * length * lengths
-
-
-def coil_rate(
-    face: Array,
-    *,
-    dt: float,
-    weights: Array,
-    diameter: float = 0.04,
-    length: float = 500.0,
-    index: float = 1.45,
-) -> Array:
-    """Compute the apparent rotation rate [deg/h] of a coil from its outer temperature `face`.
-
-    Parameters
-    ----------
-    face : ndarray, shape (time,)
-        Temperature of the outer face [degC].
-    dt : float
-        Step [s].
-    weights : ndarray, shape (layers,)
-        From `layer_weights` [m2].
-    diameter, length : float
-        Diameter of the coil and length of its fibre [m].
-    index : float
-        Refractive index.
-
-    Examples
-    --------
-    >>> ramp = 20.0 + np.arange(3000) / 60.0  # 1 K/min
-    >>> rate = coil_rate(ramp, dt=1.0, weights=layer_weights(24, trim=1e-5))
-    >>> bool(abs(rate[-1] - rate[-500]) < 1e-3 * abs(rate[-1]))  # steady error of a steady ramp
-    True
-    """
-    speed = np.gradient(layer_temperatures(face, dt=dt, layers=weights.size), dt, axis=1)
-    strain = 8.6e-6 + index * 0.55e-6  # dn/dT + n alpha of silica [1/K]
-    return np.asarray(index / (diameter * length) * strain * (weights @ speed) * DEG_PER_HOUR)

@@ -53,7 +53,6 @@ def mean_size(scenario: Scenario, mean: Array, *, white: bool = False) -> float:
 
     Parameters
     ----------
-    scenario : World
     mean : ndarray, shape (axis, time)
     white : bool
         Whether to count white noise only: the limit in its simplest form.
@@ -117,7 +116,6 @@ def learned_nats(scenario: Scenario, mean: Array) -> float:
 
     Parameters
     ----------
-    scenario : World
     mean : ndarray, shape (axis, time)
     """
     return sum(
@@ -170,15 +168,10 @@ def variance_size(scenario: Scenario, ratio: Array) -> float:
 
     Parameters
     ----------
-    scenario : World
     ratio : ndarray, shape (axis, second) or (axis, second, frequency)
         Density with the effect over density without; the frequencies divide (0, rate / 2) equally.
         With length 1 along the second dimension the change is permanent and is compared with no
         change; otherwise it is compared with its mean over time.
-
-    Returns
-    -------
-    float
     """
     if scenario.measured is not None:
         return math.sqrt(_measured_nats(scenario, ratio) / NATS)

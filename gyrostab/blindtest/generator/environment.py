@@ -32,7 +32,6 @@ def temperature(rng: np.random.Generator, seconds: float, *, still: bool = False
 
     Parameters
     ----------
-    rng : numpy.random.Generator
     seconds : float
         Length [s].
     still : bool
@@ -72,7 +71,6 @@ def shaking(
 
     Parameters
     ----------
-    rng : numpy.random.Generator
     seconds : float
         Length [s].
     bursts : int

@@ -7,13 +7,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["detector_psd", "loss_db", "rate_noise", "relative_psd", "share_source"]
+__all__ = ["detector_psd", "loss_db", "relative_psd", "share_source"]
 
 Array = NDArray[np.float64]
 
 CHARGE = 1.602176634e-19
 BOLTZMANN = 1.380649e-23
-LIGHT_SPEED = 299_792_458.0
 
 
 def detector_psd(
@@ -74,26 +73,6 @@ def relative_psd(power: Array, *, depth: float = 0.75 * math.pi, **detector: flo
     total = sum(detector_psd(seen, **detector).values())
     slope = detector.get("responsivity", 0.9) * np.asarray(power) * math.sin(depth)
     return np.asarray(total / slope**2)
-
-
-def rate_noise(
-    power: Array,
-    *,
-    diameter: float = 0.04,
-    length: float = 500.0,
-    wavelength: float = 1.55e-6,
-    **detector: float,
-) -> Array:
-    """Compute the white noise N_s of the rate [deg/h per root Hz, two-sided] at a light power [W].
-
-    Examples
-    --------
-    >>> bool(0.005 < rate_noise(np.array([20e-6]))[0] < 1.0)
-    True
-    """
-    phase_per_rate = 2 * math.pi * length * diameter / (wavelength * LIGHT_SPEED)
-    two_sided = relative_psd(power, **detector) / 2
-    return np.asarray(np.sqrt(two_sided) / phase_per_rate * math.degrees(1.0) * 3600.0)
 
 
 def loss_db(

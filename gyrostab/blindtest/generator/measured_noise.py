@@ -46,30 +46,18 @@ _LINES_PER_INDEPENDENT = (
 
 @dataclass(frozen=True)
 class MeasuredNoise:
-    """Noise of a real recording.
+    """Noise of a real recording."""
 
-    Attributes
-    ----------
-    rate : float
-        Sampling rate [Hz].
-    lines : ndarray, shape (axis, line)
-        Two-sided density [(deg/h)2/Hz] at the frequencies ``k rate / (2 size)``, k from 1.
-    level : ndarray, shape (axis, band)
-        Typical density in `BANDS` bands [(deg/h)2/Hz].
-    log_power : ndarray, shape (axis, block, band)
-        Logarithm of the density near each block over `level`; NaN where too much is missing.
-    block : int
-        Samples of a block.
-    outlier_sigma : ndarray, shape (axis,)
-        Standard deviation that a single outlier must exceed [deg/h].
-    """
-
-    rate: float
+    rate: float  # sampling rate [Hz]
+    #: (axis, line): two-sided density [(deg/h)2/Hz] at the frequencies ``k rate / (2 size)``, k
+    #: from 1.
     lines: Array
-    level: Array
+    level: Array  # (axis, band): typical density in `BANDS` bands [(deg/h)2/Hz]
+    #: (axis, block, band): logarithm of the density near each block over `level`; NaN where too
+    #: much is missing.
     log_power: Array
-    block: int
-    outlier_sigma: Array
+    block: int  # samples of a block
+    outlier_sigma: Array  # (axis,): standard deviation that a single outlier must exceed [deg/h]
 
     def blocks(self, values: Array) -> Array:
         """Average values (..., second, band) over blocks; the first starts half a block late."""
@@ -86,7 +74,6 @@ class MeasuredNoise:
         ----------
         change : ndarray, shape (block, band)
             Change of the logarithm of the density.
-        axis : int
 
         Returns
         -------

@@ -52,9 +52,6 @@ def flicker(
 
     Parameters
     ----------
-    rng : numpy.random.Generator
-    size : int
-        Samples.
     b : float
         Coefficient B [deg/h].
     rate : float

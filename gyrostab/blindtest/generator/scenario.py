@@ -33,7 +33,6 @@ AXES = ("x", "y", "z")
 #: Step of the rotation of the tool [s]; everything else around the gyros has one value a second.
 ROTATION_STEP_S = 0.1
 
-
 #: Labels under which some streams were first drawn. They stay, so that a published seed keeps
 #: drawing the same cases.
 STREAM_LABELS = {
@@ -188,7 +187,6 @@ def draw_scenario(
 
     Parameters
     ----------
-    rng : numpy.random.Generator
     rate : float
         Rate of the log [Hz].
     seconds : float

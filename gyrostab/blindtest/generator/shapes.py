@@ -128,7 +128,6 @@ def make_mean_effect(
 
     Parameters
     ----------
-    scenario : World
     shape : ndarray, shape (time,) or (axis, time)
         Shape in any unit, one for all axes or one for each.
     shares : ndarray, shape (axis,)
@@ -142,10 +141,6 @@ def make_mean_effect(
         axis is the least-squares fit to the mean.
     unless : tuple of str
         Nonlinear terms; where the diagnosis fits one of them, the parameter is not comparable.
-
-    Returns
-    -------
-    Effect
     """
     mean = np.asarray(shares[:, None] * (shape if shape.ndim == 2 else shape[None, :]))
     mean *= strength / mean_size(scenario, mean)
@@ -198,7 +193,6 @@ def make_variance_effect(
 
     Parameters
     ----------
-    scenario : World
     ratio : callable
         Function from amplitude to the density ratio of `variance_size`; 1 at amplitude 0.
     strength : float
@@ -207,10 +201,6 @@ def make_variance_effect(
         Small amplitude at which the search starts.
     name, axes, driver, form, differs, tau, active
         See `Effect`.
-
-    Returns
-    -------
-    Effect, float
     """
     amplitude = amplitude_for(lambda a: variance_size(scenario, ratio(a)), strength, first=first)
     final = ratio(amplitude)

@@ -22,9 +22,6 @@ def draw_losses(
 
     Parameters
     ----------
-    rng : numpy.random.Generator
-    size : int
-        Samples.
     share : float
         Mean share lost, 0 to below 1.
     frame : int
@@ -92,7 +89,6 @@ def flip_bits(
 
     Parameters
     ----------
-    rng : numpy.random.Generator
     values : ndarray, shape (time,)
         Samples [deg/h].
     number : int
@@ -128,10 +124,7 @@ def repeat_frames(
 
     Parameters
     ----------
-    rng : numpy.random.Generator
     values : ndarray, shape (axis, time)
-    number : int
-        Frames to overwrite.
     frame : int
         Samples of a frame.
     hold : bool

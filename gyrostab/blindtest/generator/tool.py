@@ -27,7 +27,6 @@ def rotation(
 
     Parameters
     ----------
-    rng : numpy.random.Generator
     seconds : float
         Length [s].
     dt : float

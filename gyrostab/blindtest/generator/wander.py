@@ -29,7 +29,6 @@ def wander_size(
 
     Parameters
     ----------
-    scenario : World
     shares : ndarray, shape (axis,)
         Factors of the axes, in addition to `rms`.
     time : float

@@ -162,8 +162,6 @@ def begin_run(
         ``cases``, ``seed`` and ``nulls`` as given, None where not given.
     usual : mapping
         Defaults; keys that are not in `wanted` are stored as they are.
-    resume, overwrite : bool
-        Continue an existing run; replace it.
 
     Returns
     -------

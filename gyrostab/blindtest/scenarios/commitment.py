@@ -56,10 +56,6 @@ def commit_case(log: xr.Dataset, truth: dict[str, Any], directory: str | Path, *
 
     Parameters
     ----------
-    log : xarray.Dataset
-        Recording.
-    truth : dict
-        Ground truth from `make_case`.
     directory : path
         Parent of both folders.
     name : str

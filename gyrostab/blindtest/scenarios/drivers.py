@@ -43,7 +43,6 @@ def degrade_driver(
         left out; replaced by a similar channel with other times; delayed by 30 to 180 s;
         accompanied by another channel that moves with it; with noise of its standard deviation;
         clipped at the middle of its range.
-    rng : numpy.random.Generator
 
     Raises
     ------

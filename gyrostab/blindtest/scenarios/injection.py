@@ -143,7 +143,6 @@ def inject_effect(
     strength : float
         Size in units of the closed-form limit for the noise of this log, as measured by
         `gyrostab.blindtest.generator.measured_noise`.
-    rng : numpy.random.Generator
 
     Returns
     -------

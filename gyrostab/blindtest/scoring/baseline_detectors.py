@@ -188,9 +188,6 @@ def allan_band(
         Rate [Hz].
     missing : ndarray of bool, shape (time,)
         Missing samples.
-    rng : numpy.random.Generator
-    nulls : int
-        Number of null records.
     flicker : str
         Method of `floor.flicker`.
 
@@ -235,9 +232,6 @@ def allan_detector(
         Rates [deg/h], NaN where lost.
     truth : dict
         Truth of the case, which holds its noise.
-    rng : numpy.random.Generator
-    nulls : int
-        Null records for each axis.
     """
     axes = len(truth["noise"])
     for row, noise in zip(record, truth["noise"].values(), strict=True):
@@ -267,7 +261,6 @@ def channel_detector(log: xr.Dataset, *, block: float = 10.0) -> bool:
 
     Parameters
     ----------
-    log : xarray.Dataset
     block : float
         Length of the blocks [s].
     """

@@ -115,7 +115,7 @@ def record_statistics(rate: Array, log: xr.Dataset) -> dict[str, Array]:
             out[f"lines/{row}"] = np.log([np.mean(line) for line in lines if line.size])
             out[f"peaks/{row}"] = np.log([np.max(line) for line in lines if line.size])
     for one, other in combinations(range(len(rate)), 2):
-        out[f"coherency/{one}{other}"] = _coherencies(spectra[one], spectra[other])
+        out[f"coherency/{one}{other}"] = _measure_coherencies(spectra[one], spectra[other])
     return out
 
 
@@ -154,7 +154,7 @@ def _octave_powers(values: Array) -> dict[str, Array]:
         }
 
 
-def _coherencies(one: NDArray[Any], other: NDArray[Any]) -> Array:
+def _measure_coherencies(one: NDArray[Any], other: NDArray[Any]) -> Array:
     """Return real and imaginary coherency of two axes by octave, in standard deviations."""
     edges = np.unique(one.shape[1] // 2 ** np.arange(_BANDS + 1))
     out = []

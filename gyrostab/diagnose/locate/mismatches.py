@@ -60,8 +60,6 @@ def locate_mismatches(
 
     Parameters
     ----------
-    baseline : xarray.Dataset
-        What the simulation predicts.
     nulls : iterable of xarray.Dataset, or NullScores
         Null records from `gyrostab.diagnose.nulls.records.null_records`, or their `null_scores`.
     level : float

@@ -22,89 +22,46 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class Variant:
-    """One point of the grid of nuisance parameters.
+    """One point of the grid of nuisance parameters."""
 
-    Attributes
-    ----------
-    values : mapping
-        Nonlinear parameters and their values.
-    columns : tuple of str
-        Linear parameters, one per column.
-    design : ndarray
-        By statistic. mean: (column, axis, block) [degree hour-1 per unit]; power: (column, axis,
-        block, band), added density [degree2 hour-2 Hz-1 per unit], of the squared parameter if
-        `squared`; cross: the same for the product of the factors of two axes; order: (1, axis,
-        harmonic), complex; phase_locked: (column, phase); transfer: (column, band), complex; marks,
-        line: empty; wander: (column, block); levels: (1, 1, block), empty before the means
-        determine the course. The axis has the size 1 if all axes have the same design.
-    squared : bool
-        Whether the parameter enters by its square.
-    time : float
-        Correlation time of a random mean [s], inf for a random walk.
-    weight : float
-        Prior probability relative to the other variants of the candidate.
-    inside : ndarray, shape (block, sub_block)
-        For levels: share of the sub-blocks on the upper level; empty unless the bias switches
-        within blocks.
-    """
-
-    values: Mapping[str, Any]
-    columns: tuple[str, ...]
+    values: Mapping[str, Any]  # nonlinear parameters and their values
+    columns: tuple[str, ...]  # linear parameters, one per column
+    #: By statistic. mean: (column, axis, block) [degree hour-1 per unit]; power: (column, axis,
+    #: block, band), added density [degree2 hour-2 Hz-1 per unit], of the squared parameter if
+    #: `squared`; cross: the same for the product of the factors of two axes; order: (1, axis,
+    #: harmonic), complex; phase_locked: (column, phase); transfer: (column, band), complex; marks,
+    #: line: empty; wander: (column, block); levels: (1, 1, block), empty before the means determine
+    #: the course. The axis has the size 1 if all axes have the same design.
     design: Array
-    squared: bool = False
-    time: float = np.inf
-    weight: float = 1.0
+    squared: bool = False  # whether the parameter enters by its square
+    time: float = np.inf  # correlation time of a random mean [s], inf for a random walk
+    weight: float = 1.0  # prior probability relative to the other variants of the candidate
+    #: (block, sub_block): for levels: share of the sub-blocks on the upper level; empty unless the
+    #: bias switches within blocks.
     inside: Array = field(default_factory=lambda: np.empty(0))
 
 
 class Prospect(NamedTuple):
-    """An effect with given nuisance values, before a statistic makes variants of it.
-
-    Attributes
-    ----------
-    values : dict
-        Nuisance values.
-    seen : Prediction
-        From `gyrostab.physics.base.Effect.explain`.
-    blocks : xarray.Dataset
-        Block statistics.
-    coefficient : xarray.DataArray
-        ``(axis, term)``: noise of the baseline.
-    """
+    """An effect with given nuisance values, before a statistic makes variants of it."""
 
     values: dict[str, Any]
-    seen: Prediction
+    seen: Prediction  # from `gyrostab.physics.base.Effect.explain`
     blocks: xr.Dataset
-    coefficient: xr.DataArray
+    coefficient: xr.DataArray  # ``(axis, term)``: noise of the baseline
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """An effect in one statistic.
+    """An effect in one statistic."""
 
-    Attributes
-    ----------
-    effect : str
-        Name in the registry; that of a nuisance alternative begins with "~".
-    statistic : Statistic
-        One of `gyrostab.diagnose.statistics.STATISTICS`.
-    driver : tuple of str
-        Channels of the log that it follows, in the order of the effect's channels; an empty string
-        for a missing one.
-    variants : tuple of Variant
-        Over the grid of nuisance parameters.
-    reference : tuple of str
-        Reference channel or axis of each column, for a transfer.
-    each : bool
-        Whether every axis has its own size; otherwise one size holds for all.
-    """
-
-    effect: str
-    statistic: Statistic
+    effect: str  # name in the registry; that of a nuisance alternative begins with "~"
+    statistic: Statistic  # one of `gyrostab.diagnose.statistics.STATISTICS`
+    #: Channels of the log that it follows, in the order of the effect's channels; an empty string
+    #: for a missing one.
     driver: tuple[str, ...]
-    variants: tuple[Variant, ...]
-    reference: tuple[str, ...] = ()
-    each: bool = True
+    variants: tuple[Variant, ...]  # over the grid of nuisance parameters
+    reference: tuple[str, ...] = ()  # reference channel or axis of each column, for a transfer
+    each: bool = True  # whether every axis has its own size; otherwise one size holds for all
 
     @property
     def key(self) -> str:
@@ -120,23 +77,13 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Component:
-    """One row of a statistic in which a named effect shows.
-
-    Attributes
-    ----------
-    row : tuple of str
-        Axes of the row.
-    evidence_nats : float
-        Held-out evidence [nats].
-    place : int
-        Index of the line, or of the set of harmonics; -1 if there is none.
-    """
+    """One row of a statistic in which a named effect shows."""
 
     candidate: Candidate
     variant: Variant
-    row: tuple[str, ...]
-    evidence_nats: float
-    place: int = -1
+    row: tuple[str, ...]  # axes of the row
+    evidence_nats: float  # held-out evidence [nats]
+    place: int = -1  # index of the line, or of the set of harmonics; -1 if there is none
 
     @property
     def statistic(self) -> Statistic:
@@ -151,22 +98,11 @@ class Component:
 
 @dataclass(frozen=True)
 class CandidateEvidence:
-    """Evidence of one candidate.
-
-    Attributes
-    ----------
-    rows : list of tuple of str
-        Axes of each row.
-    evidence_nats : ndarray, shape (record, row)
-        Held-out evidence [nats].
-    best : tuple of Variant
-        Best variant of each row for the first record.
-    place : ndarray, shape (record, row)
-        Index of the line for lines; otherwise empty.
-    """
+    """Evidence of one candidate."""
 
     candidate: Candidate
-    rows: list[tuple[str, ...]]
-    evidence_nats: Array
-    best: tuple[Variant, ...]
+    rows: list[tuple[str, ...]]  # axes of each row
+    evidence_nats: Array  # (record, row): held-out evidence [nats]
+    best: tuple[Variant, ...]  # best variant of each row for the first record
+    #: (record, row): index of the line for lines; otherwise empty.
     place: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 0), np.int64))

@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Mapping
 import numpy as np
 import xarray as xr
 
+from gyrostab.diagnose.predict.windows import channel_units
 from gyrostab.diagnose.reduce.aligned_channels import ROTATION_WAVE_PREFIXES
 from gyrostab.physics.registry import effects
 
@@ -19,13 +20,7 @@ CALIBRATION_CHANNELS = ("vibration", "temperature", "rotation_rate")
 
 
 def missing_channel_reason(channels: Collection[str], blocks: xr.Dataset) -> str:
-    """Explain why an effect can use none of its channels.
-
-    Parameters
-    ----------
-    channels : collection of str
-        Channels of the effect.
-    """
+    """Explain why an effect can use none of its channels."""
     unused: Mapping[str, str] = blocks.attrs.get("unused_channels", {})
     for name in channels:
         if name in unused:
@@ -52,9 +47,8 @@ def unused_channels(blocks: xr.Dataset, used: Iterable[str]) -> list[dict[str, s
     """
     found = dict(blocks.attrs.get("unused_channels", {}))
     known = set(used)
-    for variable in map(str, blocks.data_vars):
-        name = variable.removeprefix("channel_")
-        if name == variable or name in known:
+    for name in channel_units(blocks):
+        if name in known:
             continue
         problem = _describe_problem(name, blocks)
         if problem or not name.startswith(CALIBRATION_CHANNELS):

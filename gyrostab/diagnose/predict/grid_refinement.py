@@ -33,20 +33,12 @@ MAX_RATIO = 100.0  # of two neighbours, above which the smaller one counts as ze
 
 @dataclass(frozen=True)
 class Point:
-    """A variant with its sizes and its weight in the average over the grid.
-
-    Attributes
-    ----------
-    share : float
-        Length of the part of the grid that it represents, in steps.
-    unlikely : float
-        Prior penalty [nats].
-    """
+    """A variant with its sizes and its weight in the average over the grid."""
 
     variant: Variant
     sizes: Mixture
-    share: float = 1.0
-    unlikely: float = 0.0
+    share: float = 1.0  # length of the part of the grid that it represents, in steps
+    unlikely: float = 0.0  # prior penalty [nats]
 
     @property
     def evidence(self) -> float:
@@ -76,13 +68,6 @@ def refine_grid(component: Component, state: State, points: Sequence[Point]) -> 
     The grid is extended where the likelihood still rises at its end. A step is halved about the
     best point, and again while its ends are likely and differ, so that the likelihood is smooth
     from point to point. Points within a step share its weight.
-
-    Parameters
-    ----------
-    state : State
-        With all other effects in the model.
-    points : sequence of Point
-        Points of the grid.
     """
     name = _find_scale(component, points)
     if name is None:

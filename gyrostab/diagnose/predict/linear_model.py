@@ -48,26 +48,16 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class State:
-    """Model of a record in which a candidate is tried.
-
-    Attributes
-    ----------
-    weight : ndarray, shape (axis, block, band)
-        Powers that define the weights of all cells [degree2 hour-2 Hz-1]: expected, plus those of
-        the named effects.
-    masked : ndarray of bool, shape (axis, block)
-        Blocks whose powers and cross-spectra are left out.
-    given : mapping of (str, str) to list of ndarray
-        (statistic, row) -> columns in the model with and without a candidate; the row is an axis,
-        or the two axes of a pair with a comma between them.
-    settings : Settings
-        What the diagnosis was started with.
-    """
+    """Model of a record in which a candidate is tried."""
 
     blocks: xr.Dataset
     baseline: xr.Dataset
+    #: (axis, block, band): powers that define the weights of all cells [degree2 hour-2 Hz-1]:
+    #: expected, plus those of the named effects.
     weight: Array
-    masked: NDArray[np.bool_]
+    masked: NDArray[np.bool_]  # (axis, block): blocks whose powers and cross-spectra are left out
+    #: (statistic, row) -> columns in the model with and without a candidate; the row is an axis, or
+    #: the two axes of a pair with a comma between them.
     given: dict[tuple[str, str], list[Array]] = field(default_factory=dict)
     settings: Settings = DEFAULTS
 

@@ -29,19 +29,11 @@ _RIDGE = 1e-12  # of the trace of the Gram matrix, against singular columns
 
 @dataclass(frozen=True)
 class Mixture:
-    """A mixture of normal distributions of some sizes.
+    """A mixture of normal distributions of some sizes."""
 
-    Attributes
-    ----------
-    log_weight : ndarray, shape (point,)
-        Not normalised.
-    mean : ndarray, shape (point, size)
-    covariance : ndarray, shape (point, size, size)
-    """
-
-    log_weight: Array
-    mean: Array
-    covariance: Array
+    log_weight: Array  # (point,): not normalised
+    mean: Array  # (point, size)
+    covariance: Array  # (point, size, size)
 
     def weights(self) -> Array:
         """Return the probabilities of the points."""

@@ -35,11 +35,10 @@ _MAX_DESIGN_DIFFERENCE = 1e-3  # of its size, up to which designs are equal; des
 
 def channel_units(blocks: xr.Dataset) -> dict[str, str]:
     """Return the units of the channels of the log."""
-    begin = "channel_"
     return {
-        str(name)[len(begin) :]: str(blocks[name].attrs.get("units", ""))
-        for name in blocks.data_vars
-        if str(name).startswith(begin)
+        name.removeprefix("channel_"): str(blocks[name].attrs.get("units", ""))
+        for name in map(str, blocks.data_vars)
+        if name.startswith("channel_")
     }
 
 

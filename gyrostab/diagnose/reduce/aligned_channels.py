@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from gyrostab.schema import log_channels, signal_name
 from gyrostab.time.grid import TimeGridIndex, first_stamp, grid_index, grid_times
+from gyrostab.time.stamps import format_stamp, to_nanoseconds
 
 __all__ = ["ROTATION_WAVE_PREFIXES", "Aligned", "align_channels"]
 
@@ -43,27 +44,16 @@ ROTATION_WAVE_PREFIXES = ("rotation_rate", "toolface", "accel", "mag_")
 _MAX_STAMPS_INSPECTED = 2**20  # limits memory
 _CHUNK_SAMPLES = 2**20  # samples converted at once; limits memory
 
-
 #: Instants, stamps and their values, reach and period of the gyro [ns] -> value at each instant.
 _Choose = Callable[[Stamps, Stamps, Array, float, float], Array]
 
 
 class Aligned(NamedTuple):
-    """A log with its channels on the time grid of the gyro, as far as possible.
+    """A log with its channels on the time grid of the gyro, as far as possible."""
 
-    Attributes
-    ----------
-    log : xarray.Dataset
-        The log without unused channels.
-    unused : dict of str to str
-        Why each unused channel is not used.
-    notes : list of str
-        Sentences on resampled channels.
-    """
-
-    log: xr.Dataset
-    unused: dict[str, str]
-    notes: list[str]
+    log: xr.Dataset  # the log without unused channels
+    unused: dict[str, str]  # why each unused channel is not used
+    notes: list[str]  # sentences on resampled channels
 
 
 @dataclass(frozen=True)
@@ -174,8 +164,8 @@ def _place_channel(log: xr.Dataset, name: str) -> _Placed | str | None:
     end = int(grid_times(start, rate, size - 1))
     if last < start or first > end:
         return (
-            f"its values, {_format_stamp(first)} to {_format_stamp(last)}, "
-            f"lie outside the time of the gyro, {_format_stamp(start)} to {_format_stamp(end)}"
+            f"its values, {format_stamp(first)}Z to {format_stamp(last)}Z, "
+            f"lie outside the time of the gyro, {format_stamp(start)}Z to {format_stamp(end)}Z"
         )
     period = clock.find_period()
     ratio = period * rate / 1e9
@@ -231,7 +221,7 @@ def _clock_of(log: xr.Dataset, name: str) -> _Clock:
     index = log.xindexes.get(f"time_{name}")
     if isinstance(index, TimeGridIndex):
         return _Clock(log.sizes[f"time_{name}"], index.start, index.rate)
-    stamps = log[f"time_{name}"].values.astype("datetime64[ns]").view(np.int64)
+    stamps = to_nanoseconds(log[f"time_{name}"].values)
     return _Clock(stamps.size, stamps=stamps)
 
 
@@ -251,10 +241,6 @@ def _describe_placement(
         else ""
     )
     return f"channel {name}: {offset}{method}"
-
-
-def _format_stamp(stamp: int) -> str:
-    return str(np.datetime64(stamp, "ns").astype("datetime64[ms]")) + "Z"
 
 
 # -------------------------------------------------------------------------------- chunk by chunk

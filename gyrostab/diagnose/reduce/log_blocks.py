@@ -13,6 +13,7 @@ from gyrostab.noise import HOUR
 from gyrostab.schema import log_channels, signal_name
 from gyrostab.simulate.drivers import Source, make_source
 from gyrostab.store import lazy
+from gyrostab.time.stamps import to_nanoseconds
 
 __all__ = [
     "BlockBatch",
@@ -31,17 +32,11 @@ _CHANNEL_VALUES_PER_READ = 2**22  # limits memory
 
 
 class BlockBatch(NamedTuple):
-    """A batch of consecutive blocks of a log.
+    """A batch of consecutive blocks of a log."""
 
-    Attributes
-    ----------
-    first : int
-        Index of the first block.
-    values : ndarray, shape (row, block, sample)
-        The axes [degree hour-1], then the channels on the log's time; NaN where missing.
-    """
-
-    first: int
+    first: int  # index of the first block
+    #: (row, block, sample): the axes [degree hour-1], then the channels on the log's time; NaN
+    #: where missing.
     values: Array
 
 
@@ -72,10 +67,6 @@ def read_batches(log: xr.Dataset, size: int) -> Iterator[BlockBatch]:
         Regular log; its chunks set the size of the reads.
     size : int
         Samples of a block. An incomplete block at the end is not read.
-
-    Yields
-    ------
-    Stretch
     """
     rows = count_rows(log)
     blocks_per_batch = max(1, _SAMPLES_PER_BATCH // (rows * size))
@@ -160,10 +151,6 @@ def channel_means(log: xr.Dataset, name: str, edges: NDArray[np.int64], *, rms: 
 
     Parameters
     ----------
-    log : xarray.Dataset
-        The log.
-    name : str
-        The channel.
     edges : ndarray of int64, shape (n + 1,)
         Ends of the intervals, rising [ns since 1970].
     rms : bool
@@ -174,7 +161,7 @@ def channel_means(log: xr.Dataset, name: str, edges: NDArray[np.int64], *, rms: 
     ndarray, shape (n,)
         NaN where the channel has no value for longer than three of its median intervals.
     """
-    stamps = log[f"time_{name}"].values.astype("datetime64[ns]").astype(np.int64)
+    stamps = to_nanoseconds(log[f"time_{name}"].values)
     data = log[name].data
     ends = np.searchsorted(stamps, edges)
     sums, counts = np.zeros(edges.size - 1), np.zeros(edges.size - 1)

@@ -133,7 +133,6 @@ BLOCK_STATISTICS: dict[str, Variable] = {
     "restart_end": Variable(("restart",), "s", "power back, since the start"),
 }
 
-
 #: Coordinates of the block statistics.
 COORDINATES: dict[str, Variable] = {
     "bin": Variable(("bin",), "1", "zero bin, or both of its neighbours"),

@@ -35,47 +35,29 @@ Region = Mapping[str, Any]
 
 
 class NullDraw(NamedTuple):
-    """Some null records, of which means, powers, lines and cross-spectra are drawn.
+    """Some null records, of which means, powers, lines and cross-spectra are drawn."""
 
-    Attributes
-    ----------
-    blocks, baseline : xarray.Dataset
-        The recording, for its blocks, gaps and channels, and the noise.
-    expected, power : ndarray, shape (record, axis, block, band)
-        Expected and drawn powers [degree2 hour-2 Hz-1].
-    sample_sd : ndarray, shape (axis, 2)
-        Standard deviations of a sample and of a difference of neighbours [degree hour-1].
-    """
-
+    #: The recording, for its blocks, gaps and channels, and the noise.
     blocks: xr.Dataset
     baseline: xr.Dataset
     record_count: int
     rng: np.random.Generator
+    #: (record, axis, block, band): expected and drawn powers [degree2 hour-2 Hz-1].
     expected: Array
     power: Array
+    #: (axis, 2): standard deviations of a sample and of a difference of neighbours [degree hour-1].
     sample_sd: Array
 
 
 class SizeFit(NamedTuple):
-    """What the sizes of an effect are estimated from.
+    """What the sizes of an effect are estimated from."""
 
-    Attributes
-    ----------
-    components : sequence of Component
-        Of one effect, all in one statistic.
-    state : State
-        With all other effects in the model.
-    candidates : sequence of Candidate
-        All that were tried; they have the grids of nuisance parameters.
-    counts : CountEvidence
-        Expected sample counts.
-    """
-
-    components: Sequence[Component]
+    components: Sequence[Component]  # of one effect, all in one statistic
     axes: tuple[str, ...]
-    state: State
+    state: State  # with all other effects in the model
+    #: All that were tried; they have the grids of nuisance parameters.
     candidates: Sequence[Candidate]
-    counts: CountEvidence
+    counts: CountEvidence  # expected sample counts
 
 
 class Statistic:

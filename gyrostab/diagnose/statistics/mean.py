@@ -251,15 +251,7 @@ def slow_coefficients(baseline: xr.Dataset, axis: int) -> tuple[float, float]:
 
 
 def mean_noise(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, present: Array) -> MeanNoise:
-    """Return the covariance of the block means of an axis, with all known random processes.
-
-    Parameters
-    ----------
-    axis : int
-        Index of the axis.
-    present : ndarray of bool (block,)
-        Blocks with a mean.
-    """
+    """Return the covariance of the block means of an axis, with all known random processes."""
     b, k = slow_coefficients(baseline, axis)
     begin, end = blocks["begin"].values, blocks["end"].values
     step = np.diff((begin + end) / 2.0, append=end[-1])

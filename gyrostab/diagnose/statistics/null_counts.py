@@ -51,8 +51,6 @@ def null_counts(
 
     Parameters
     ----------
-    blocks : xarray.Dataset
-        The recording, for its blocks, gaps and quantization grids.
     sd : ndarray, shape (axis, 2)
         Standard deviations of a sample and of a difference of neighbours [degree hour-1].
 
@@ -101,8 +99,6 @@ def neighbour_statistics(blocks: xr.Dataset, sd: Array) -> tuple[Array, Array]:
 
     Parameters
     ----------
-    blocks : xarray.Dataset
-        Recording, from `reduce_log`.
     sd : ndarray, shape (axis, 2)
         Standard deviations of a sample and of a difference of neighbours [degree hour-1], for axes
         without measured powers.

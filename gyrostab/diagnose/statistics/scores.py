@@ -46,12 +46,8 @@ def window_set(block_count: int, lengths: Sequence[int], *, whole: bool = True) 
 
     Parameters
     ----------
-    block_count : int
-        Number of blocks of the record.
     lengths : sequence of int
         Lengths [blocks]; those above half of the record are skipped.
-    whole : bool
-        Whether to add the record as one window.
 
     Examples
     --------
@@ -148,8 +144,6 @@ def statistic_dataset(
         Statistic, as named in diagnosis.json.
     blocks : xarray.Dataset
         From `gyrostab.diagnose.reduce.block_statistics.reduce_log`; defines the window edges.
-    windows : Windows
-        Windows of blocks.
     columns : dict
         ``what`` (str), ``tau_min_s``, ``tau_max_s`` [s] and ``frequency`` [Hz] of each column, and
         ``floor``, the smallest standard deviation that null records may give a score.

@@ -40,13 +40,6 @@ def estimate_shared_factors(
     more common noise than noise. A single pair determines only a product: each factor then lies
     anywhere between the limits that the other axis and the axis itself set.
 
-    Parameters
-    ----------
-    components : sequence of Component
-        Of cross-spectra.
-    state : State
-        With all other effects in the model.
-
     Returns
     -------
     dict of str to (float, float, float, float)
@@ -94,25 +87,14 @@ def _summarise_draws(draws: Array, alike: NDArray[np.bool_]) -> tuple[float, flo
 
 
 class CrossEvidence(NamedTuple):
-    """What the cross-spectra show for white noise and low-passes.
+    """What the cross-spectra show for white noise and low-passes."""
 
-    Attributes
-    ----------
-    width : ndarray, shape (point,)
-        Bandwidth [Hz].
-    share : ndarray, shape (point,)
-        Probability.
-    product, error : ndarray, shape (point, pair)
-        Products of the factors, and their errors.
-    limit : ndarray, shape (point, axis)
-        The largest factor that the power of the axis allows.
-    """
-
-    width: Array
-    share: Array
+    width: Array  # (point,): bandwidth [Hz]
+    share: Array  # (point,): probability
+    #: (point, pair): products of the factors, and their errors.
     product: Array
     error: Array
-    limit: Array
+    limit: Array  # (point, axis): the largest factor that the power of the axis allows
 
 
 def _weight_bandwidths(

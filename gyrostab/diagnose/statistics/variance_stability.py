@@ -140,8 +140,6 @@ def scale_to_expected(
 
     Parameters
     ----------
-    blocks, baseline : xarray.Dataset
-        A recording, and the expectation of the simulation.
     spans : sequence of (axes, begin, end)
         Names of axes, and times [s since the start].
     """

@@ -75,12 +75,8 @@ def plan_columns(
 
     Parameters
     ----------
-    path : Path
-        The file, for messages.
     headers : sequence of str
         Header cells as written, or ``"0"``, ``"1"``, ... for a file without a header.
-    options : ReadOptions
-        Reading options of the user.
     units : mapping of int to str, optional
         Units that the format stores outside the header (NetCDF attributes).
     calendars : mapping of int to str, optional
@@ -101,11 +97,6 @@ def plan_columns(
     -------
     Plan
         ``Plan.check()`` raises the first problem.
-
-    Raises
-    ------
-    FormatError
-        When there are more columns than the limit allows.
     """
     check_columns(path, len(headers), options.limits)
     preset = _known_program(path, headers, above, is_filled)

@@ -18,7 +18,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-__all__ = ["PresetMatch", "find_preset", "preset_names"]
+__all__ = ["PresetMatch", "find_preset"]
 
 _KEYS = {"name", "above", "file", "needs", "times", "drops", "rate", "columns"}
 
@@ -46,17 +46,6 @@ def _load_presets() -> dict[str, dict[str, Any]]:
     return found
 
 
-def preset_names() -> dict[str, str]:
-    """Return the name of each preset and the program whose files it describes.
-
-    Examples
-    --------
-    >>> preset_names()["phyphox"]
-    'phyphox'
-    """
-    return {key: preset["name"] for key, preset in _load_presets().items()}
-
-
 def find_preset(
     path: Path,
     headers: Sequence[tuple[str, str]],
@@ -64,23 +53,14 @@ def find_preset(
     above: Sequence[str] = (),
     is_filled: Callable[[int], bool] | None = None,
 ) -> PresetMatch | None:
-    """Find the preset that fits a file.
+    """Find the preset that fits a file; None for the files of other programs.
 
     Parameters
     ----------
-    path : Path
-        The file, for its name.
     headers : sequence of (str, str)
         Full header and name without unit of each column.
-    above : sequence of str
-        Lines above the header.
     is_filled : callable, optional
         Returns whether any of the first cells of a column is filled.
-
-    Returns
-    -------
-    Found or None
-        The targets of the columns, or None for the files of other programs.
     """
     places: dict[str, int] = {}
     for place, names in reversed(list(enumerate(headers))):

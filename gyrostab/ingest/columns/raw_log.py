@@ -37,52 +37,31 @@ Locate = Callable[[Sequence[int]], list[str]]
 
 
 class ConvertedBlock(NamedTuple):
-    """A converted block of rows for `RawLogBuilder.add`; row numbers count from its first row.
-
-    Attributes
-    ----------
-    rows : int
-        Rows.
-    block : dict
-        Column number -> values in the inner unit, or a piece of the column.
-    ranges : dict
-        Column number -> number of missing values, range of the others in the unit of the file, and
-        whether these are whole numbers.
-    bad_rows, cell_rows : ndarray of int64
-        Unreadable rows, and other rows with an unreadable gyro cell.
-    bad_cells, cells : int
-        Unreadable cells, and unreadable gyro cells of `cell_rows`.
-    low, high : int
-        Range of the stamps of readable rows [ns since 1970]; high < low if there are none.
-    seen : Seen or None
-        Findings of the scan pass over values that stay in the file.
-    """
+    """A converted block of rows for `RawLogBuilder.add`; row numbers count from its first row."""
 
     rows: int
+    #: Column number -> values in the inner unit, or a piece of the column.
     block: dict[int, NDArray[Any] | Piece]
+    #: Column number -> number of missing values, range of the others in the unit of the file, and
+    #: whether these are whole numbers.
     ranges: dict[int, tuple[int, float, float, bool]]
+    #: Unreadable rows, and other rows with an unreadable gyro cell.
     bad_rows: NDArray[np.int64]
     cell_rows: NDArray[np.int64]
+    #: Unreadable cells, and unreadable gyro cells of `cell_rows`.
     bad_cells: int
     cells: int
+    #: Range of the stamps of readable rows [ns since 1970]; high < low if there are none.
     low: int
     high: int
-    seen: RowInspection | None = None
+    seen: RowInspection | None = None  # findings of the scan pass over values that stay in the file
 
 
 _NO_ROWS = np.empty(0, np.int64)
 
 
 class RawLogBuilder:
-    """Collect the blocks of one file and build its raw log.
-
-    Parameters
-    ----------
-    plan : Plan
-        Role and unit of each column.
-    options : ReadOptions
-        Reading options of the user.
-    """
+    """Collect the blocks of one file and build its raw log."""
 
     def __init__(self, plan: Plan, options: ReadOptions):
         self.plan, self.options = plan, options
@@ -161,8 +140,6 @@ class RawLogBuilder:
 
         Parameters
         ----------
-        converted : ConvertedBlock
-            From `prepare`.
         locate : callable, optional
             Row numbers within the block -> names of the rows for messages.
         """
@@ -359,14 +336,8 @@ def summary_of(
     ----------
     plan : Plan
         Role and unit of each column, and the problems that prevent reading.
-    form : str
-        Name of the format.
-    rows : int or None
-        Number of rows, if known.
     head, tail : sequence of int
         Stamps at the two ends [ns since 1970], `NAT` where unreadable.
-    notes : sequence of str
-        Notes of the reader.
     """
     first, last = (
         next((np.datetime64(int(stamp), "ns") for stamp in end if stamp != NAT), None)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import UnitError
 from gyrostab.store.lazy import read_slice
 from gyrostab.time.grid import split_instant
+from gyrostab.time.stamps import to_nanoseconds
 
 __all__ = [
     "NAT",
@@ -178,11 +179,6 @@ def dates_to_ns(dates: NDArray[Any]) -> NDArray[np.int64]:
     Dates that exceed 64 bits (before 1678, after 2262) become `NAT`; numpy would wrap them around
     without an error.
 
-    Parameters
-    ----------
-    dates : ndarray of datetime64
-        Dates, any shape.
-
     Examples
     --------
     >>> dates_to_ns(np.array(["1500-01-01", "1970-01-02"], dtype="datetime64[us]")).tolist()
@@ -195,13 +191,13 @@ def dates_to_ns(dates: NDArray[Any]) -> NDArray[np.int64]:
     outside = (native < low) | (native > high)
     if native.dtype == np.dtype("datetime64[ns]") or not outside.any():
         return native.astype("datetime64[ns]").view(np.int64)
-    return np.where(outside, np.datetime64("NaT"), native).astype("datetime64[ns]").view(np.int64)
+    return to_nanoseconds(np.where(outside, np.datetime64("NaT"), native))
 
 
 def read_stamps(raw: xr.Dataset, begin: int, end: int) -> NDArray[np.int64]:
     """Read the stamps of rows of a raw log [ns since 1970], `NAT` where unreadable."""
     stamps = read_slice(raw["time"].data, max(begin, 0), min(end, raw.sizes["row"]))
-    return stamps.astype("datetime64[ns]", copy=False).view(np.int64)
+    return to_nanoseconds(stamps)
 
 
 def texts_to_ns(texts: Sequence[Any] | NDArray[Any]) -> NDArray[np.int64]:

@@ -108,16 +108,8 @@ def read_columns(
 
     Parameters
     ----------
-    plan : Plan
-        Role and unit of each column.
-    options : ReadOptions
-        Reading options of the user.
-    rows : int
-        Number of rows.
     fetch : callable
         Column number, first row, row after the last one -> values.
-    notes : sequence of str
-        Notes of the reader.
     parallel : bool
         Whether `fetch` is thread-safe.
     stay : bool

@@ -2,6 +2,14 @@
 
 from gyrostab.ingest.concat.axes import group_axes, split_axes
 from gyrostab.ingest.concat.core import concatenate_logs, log_span
-from gyrostab.ingest.concat.notes import merge_notes, name_some
+from gyrostab.ingest.concat.notes import absence_notes, merge_notes, name_some
 
-__all__ = ["concatenate_logs", "group_axes", "log_span", "merge_notes", "name_some", "split_axes"]
+__all__ = [
+    "absence_notes",
+    "concatenate_logs",
+    "group_axes",
+    "log_span",
+    "merge_notes",
+    "name_some",
+    "split_axes",
+]

@@ -18,11 +18,6 @@ __all__ = ["group_axes", "split_axes"]
 def group_axes(axes: Sequence[Sequence[str]]) -> list[list[int]]:
     """Group logs by their axes: logs of one group share axes, directly or through other logs.
 
-    Parameters
-    ----------
-    axes : sequence of sequence of str
-        The axes of each log.
-
     Returns
     -------
     list of list of int

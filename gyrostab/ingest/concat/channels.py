@@ -14,6 +14,7 @@ from gyrostab.ingest.concat.lazy import PlacedArray, chunk_of, place_on_grid
 from gyrostab.schema import log_channels
 from gyrostab.store.lazy import concatenate_columns, take_samples
 from gyrostab.time.grid import grid_index, grid_times
+from gyrostab.time.stamps import to_nanoseconds
 
 __all__ = ["concatenate_channels"]
 
@@ -31,11 +32,6 @@ def concatenate_channels(
     variables, coordinates : dict
         Channels, NaN where a log lacks them, and the stamps ``time_<channel>`` of those with
         separate stamps.
-
-    Raises
-    ------
-    UnitError
-        When a channel has different units.
     """
     variables: dict[str, Any] = {}
     coordinates: dict[str, Any] = {}
@@ -102,9 +98,7 @@ def _scatter_values(
 
 def _channel_stamps(piece: PlacedLog, name: str, start: int, rate: float) -> NDArray[np.int64]:
     """Return the stamps of a channel [ns since 1970], shifted with its log after a clock step."""
-    stamps = (
-        piece.source.log.variables[f"time_{name}"].values.astype("datetime64[ns]").view(np.int64)
-    )
+    stamps = to_nanoseconds(piece.source.log.variables[f"time_{name}"].values)
     moved = int(grid_times(start, rate, piece.first)) - piece.source.start
     return np.asarray(stamps + moved if abs(moved) > 1e9 / rate else stamps)
 

@@ -16,9 +16,9 @@ from gyrostab.ingest.concat.channels import concatenate_channels
 from gyrostab.ingest.concat.gaps import merge_gaps
 from gyrostab.ingest.concat.grid import PlacedLog, Source, log_span, source_of
 from gyrostab.ingest.concat.lazy import chunk_of, place_on_grid
-from gyrostab.ingest.concat.notes import merge_notes, name_some
+from gyrostab.ingest.concat.notes import absence_notes, merge_notes
 from gyrostab.ingest.concat.place import place_logs
-from gyrostab.ingest.gap_table import format_stamp, gap_variables, name_lost
+from gyrostab.ingest.gap_table import gap_variables, name_lost
 from gyrostab.ingest.limits import describe_limit, is_absurd_grid
 from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name, texts
 from gyrostab.store.private import close_function
@@ -26,6 +26,7 @@ from gyrostab.store.write import common_packing
 from gyrostab.time.clock import time_of_day
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import grid_times, time_coordinate
+from gyrostab.time.stamps import format_stamp
 
 __all__ = ["concatenate_logs", "log_span"]
 
@@ -53,8 +54,6 @@ def concatenate_logs(
     logs : sequence of xarray.Dataset
         Regular logs, in any order, overlapping or with gaps between them: ``rate(axis, time)``
         [degree hour-1] or ``angle(axis, time)`` [degree], channels, tables of gaps.
-    paths : sequence of path
-        Files of the logs, for messages.
     max_gap : str or float
         A longer pause is taken as a step of the clock, and the next log follows after one missing
         sample; a number is in seconds.
@@ -204,11 +203,7 @@ def _describe_absent(sources: Sequence[Source], axes: Sequence[str]) -> list[str
         names[f"channel {channel}"] = _logs_without(
             groups, [source for source in sources if channel in source.log]
         )
-    return [
-        f"{what} is not in {name_some(files)} and is missing there"
-        for what, files in names.items()
-        if files
-    ]
+    return absence_notes(names)
 
 
 def _logs_without(groups: Sequence[Sequence[Source]], holders: Sequence[Source]) -> list[str]:

@@ -61,11 +61,6 @@ def _missing_in_both(held: Table, new: Table) -> Table:
 def merge_gaps(pieces: Sequence[PlacedLog]) -> Table:
     """Return the table of gaps of the concatenated log; a gap on some axes counts as a gap.
 
-    Parameters
-    ----------
-    pieces : sequence of Piece
-        Logs in the order in which they were placed.
-
     Returns
     -------
     ndarray of int64, shape (n, 5)

@@ -46,27 +46,16 @@ LogSlice = tuple[Source, int, int]
 
 @dataclass(frozen=True, eq=False)
 class PlacedLog:
-    """A log placed on the common grid.
-
-    Attributes
-    ----------
-    source : Source
-        The log.
-    runs : ndarray of int64, shape (n, 3)
-        First sample of the grid, first sample of the log, length; more than one where the log's
-        rate differs from the grid's.
-    off : float
-        Offset of its samples from those of the grid [samples].
-    clock : tuple of int
-        A stamp of its clock [ns since 1970] and the corresponding sample of the grid.
-    cause : int
-        Cause (number in schema.GAP_CAUSES) of the gap before it; -1 if the stamps define the gap.
-    """
+    """A log placed on the common grid."""
 
     source: Source
+    #: (n, 3): first sample of the grid, first sample of the log, length; more than one where the
+    #: log's rate differs from the grid's.
     runs: NDArray[np.int64]
-    off: float
+    off: float  # offset of its samples from those of the grid [samples]
+    #: A stamp of its clock [ns since 1970] and the corresponding sample of the grid.
     clock: tuple[int, int]
+    #: Cause (number in schema.GAP_CAUSES) of the gap before it; -1 if the stamps define the gap.
     cause: int = -1
 
     @property

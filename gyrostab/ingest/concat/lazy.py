@@ -76,10 +76,6 @@ def place_on_grid(
     rows : sequence of sequence of PlacedArray
         Arrays with samples of each row of the result. Where they overlap, the first value that is
         not NaN counts.
-    size : int
-        Samples of the grid.
-    chunk : int
-        Samples of a chunk of the result.
     flat : bool
         Whether the result has one dimension only.
     convert : callable, optional

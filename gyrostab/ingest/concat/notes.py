@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
-__all__ = ["first_notes", "merge_notes", "name_some"]
+__all__ = ["absence_notes", "first_notes", "merge_notes", "name_some"]
 
 _MAX_NAMED = 5  # events of one kind that are listed one by one
 
@@ -18,6 +18,15 @@ def name_some(names: Sequence[str], most: int = 3) -> str:
     'a, b, c and 2 more'
     """
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def absence_notes(absent: Mapping[str, Sequence[str]]) -> list[str]:
+    """Return notes on axes and channels that some files lack, by the names of these files."""
+    return [
+        f"{what} is not in {name_some(files)} and is missing there"
+        for what, files in absent.items()
+        if files
+    ]
 
 
 def merge_notes(notes_by_file: Iterable[tuple[str, Sequence[str]]]) -> list[str]:

@@ -10,16 +10,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.ingest.concat.grid import LogSlice, PlacedLog, Source, read_log_slices, runs_of
 from gyrostab.ingest.concat.notes import first_notes, name_some
-from gyrostab.ingest.gap_table import format_duration, format_stamp
+from gyrostab.ingest.copies import MIN_ALIKE_SHARE, count_alike, is_copy
+from gyrostab.ingest.gap_table import format_duration
 from gyrostab.schema import GAP_CAUSES
 from gyrostab.time.grid import grid_index, grid_times
+from gyrostab.time.stamps import format_stamp
 
 __all__ = ["place_logs"]
 
@@ -35,7 +36,6 @@ MAX_SHIFT_SAMPLES = 64
 _COMPARED_SAMPLES = 2**13  # samples at each end of an overlap whose values are compared
 _PROBED_SAMPLES = 64  # compared samples that are tried at every displacement
 _MIN_COMMON_SAMPLES = 32  # common samples needed to find a displacement
-_MIN_ALIKE_SHARE = 0.9  # share of equal samples in a copy, which may be damaged
 _BATCH_LOGS = 50  # logs whose overlaps are read at once
 _Cache = dict[LogSlice, NDArray[np.float64]]
 _STEP, _RESTART = GAP_CAUSES.index("clock_step"), GAP_CAUSES.index("restart")
@@ -51,33 +51,25 @@ class _Match:
 
     @property
     def alike(self) -> bool:
-        return self.common >= 2 and self.same >= _MIN_ALIKE_SHARE * self.common
-
-
-def _count_alike(held: NDArray[np.float64], new: NDArray[np.float64]) -> tuple[Any, Any]:
-    """Count the samples known in both arrays (axis, ..., sample), and the equal ones."""
-    known = np.isfinite(held) & np.isfinite(new)
-    has_values = known.any(axis=0)
-    same = (np.isclose(held, new, rtol=1e-6, atol=0.0) | ~known).all(axis=0) & has_values
-    return has_values.sum(axis=-1), same.sum(axis=-1)
+        return is_copy(self.common, self.same)
 
 
 def _find_shift(held: NDArray[np.float64], new: NDArray[np.float64]) -> _Match:
     """Compare `new` at every shift with `held`, which has a margin of `MAX_SHIFT_SAMPLES`."""
     size = new.shape[1]
-    here = _Match(*_count_alike(held[:, MAX_SHIFT_SAMPLES : MAX_SHIFT_SAMPLES + size], new), 0)
+    here = _Match(*count_alike(held[:, MAX_SHIFT_SAMPLES : MAX_SHIFT_SAMPLES + size], new), 0)
     if here.alike or here.common < _MIN_COMMON_SAMPLES:
         return here
     probe = np.flatnonzero(np.isfinite(new).any(axis=0))[:_PROBED_SAMPLES]
     shifts = np.array(sorted(range(-MAX_SHIFT_SAMPLES, MAX_SHIFT_SAMPLES + 1), key=abs))
-    common, same = _count_alike(
+    common, same = count_alike(
         held[:, MAX_SHIFT_SAMPLES + shifts[:, None] + probe], new[:, None, probe]
     )
     for shift in shifts[
-        (common >= _MIN_COMMON_SAMPLES) & (same >= _MIN_ALIKE_SHARE * common)
+        (common >= _MIN_COMMON_SAMPLES) & (same >= MIN_ALIKE_SHARE * common)
     ].tolist():
         there = _Match(
-            *_count_alike(
+            *count_alike(
                 held[:, MAX_SHIFT_SAMPLES + shift : MAX_SHIFT_SAMPLES + shift + size], new
             ),
             shift,
@@ -152,7 +144,7 @@ def place_logs(sources: Sequence[Source], *, max_gap: float) -> tuple[list[Place
 
     Returns
     -------
-    pieces : list of Piece
+    pieces : list of PlacedLog
         The logs in the same order; the first sample of all is sample 0.
     notes : list of str
         Notes on logs between the samples of the grid, overlaps and steps of the clock.

@@ -82,13 +82,7 @@ def _read_curves(path: Path, options: ReadOptions) -> Table:
 
 
 def _date_and_time(path: Path, date: Any, time: Any) -> NDArray[np.datetime64]:
-    """Combine a curve of dates and a curve of times of day to stamps.
-
-    Raises
-    ------
-    FormatError
-        When the order of day, month and year is ambiguous.
-    """
+    """Combine a curve of dates and a curve of times of day to stamps."""
     import pandas as pd
 
     days = [

@@ -41,11 +41,6 @@ def check_structure(path: Path) -> None:
     ----------
     path : Path
         The file. Files that are not of level 5 pass.
-
-    Raises
-    ------
-    FormatError
-        When the structure is damaged.
     """
     with path.open("rb") as file:
         head = file.read(_HEADER_BYTES)

@@ -39,6 +39,7 @@ from gyrostab.store.hdf5_heaps import check_global_heaps
 from gyrostab.store.layout import read_attribute
 from gyrostab.store.read import open_stored
 from gyrostab.time.grid import grid_times, time_coordinate
+from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import ON_DISK
 
 __all__ = ["matches", "read", "scan"]
@@ -223,7 +224,7 @@ def _with_uniform_time(log: xr.Dataset) -> xr.Dataset:
     stored = log["time"].variable
 
     def stamps(start: int, stop: int) -> Any:
-        return np.asarray(stored[start:stop].values).astype("datetime64[ns]").view(np.int64)
+        return to_nanoseconds(stored[start:stop].values)
 
     if size > CHECKED_BLOCKS * 1024 and np.isfinite(rate) and rate > 0:
         begin = int(stamps(0, 1)[0])
@@ -263,9 +264,7 @@ def _summarise_log(path: Path, log: xr.Dataset) -> FileSummary:
 
 
 def _stamp_at(log: xr.Dataset, place: int) -> np.datetime64:
-    return np.datetime64(
-        int(log["time"][place].values.astype("datetime64[ns]").view(np.int64)), "ns"
-    )
+    return np.datetime64(int(to_nanoseconds(log["time"][place].values)), "ns")
 
 
 def _plan_file(

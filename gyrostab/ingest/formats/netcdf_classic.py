@@ -10,6 +10,7 @@ NetCDF classic format specification, Unidata (appendix B of the NetCDF users gui
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -164,7 +165,7 @@ def _lay_out(
     for name, dtype, places, _ in found:
         shape = [lengths[place] for place in places]
         is_record = bool(shape) and shape[0] == 0
-        spans[name] = (is_record, dtype.itemsize * _multiply(shape[1:] if is_record else shape))
+        spans[name] = (is_record, dtype.itemsize * math.prod(shape[1:] if is_record else shape))
     rows = [span for is_record, span in spans.values() if is_record]
     stride = rows[0] if len(rows) == 1 else sum(-(-span // 4) * 4 for span in rows)
     variables = {}
@@ -183,13 +184,6 @@ def _lay_out(
         if end > size:
             raise header.fail(f"{name!r} would end at byte {end:,} of {size:,}")
         shape = [records, *shape[1:]] if is_record else shape
-        step = stride if is_record else dtype.itemsize * _multiply(shape[1:])
+        step = stride if is_record else dtype.itemsize * math.prod(shape[1:])
         variables[name] = ClassicVariable(name, dtype, tuple(shape), begin, step)
     return variables
-
-
-def _multiply(lengths: list[int]) -> int:
-    total = 1
-    for length in lengths:  # Python integers do not overflow
-        total *= length
-    return total

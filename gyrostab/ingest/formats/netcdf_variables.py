@@ -29,41 +29,22 @@ Locate = Callable[[int, int], Rows]
 
 @dataclass(frozen=True)
 class StoredVariable:
-    """A variable as it is stored.
-
-    Attributes
-    ----------
-    name : str
-    dimensions : tuple of str
-    shape : tuple of int
-    dtype : dtype
-    attributes : mapping
-        As in the file, with the default fill value of the format if the variable has none.
-    values : Any
-        Returns the stored numbers when indexed, while the file is open.
-    locate : callable
-        Dimension of the rows, index along the other -> column.
-    """
+    """A variable as it is stored."""
 
     name: str
     dimensions: tuple[str, ...]
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
+    #: As in the file, with the default fill value of the format if the variable has none.
     attributes: Mapping[str, Any]
+    #: Returns the stored numbers when indexed, while the file is open.
     values: Any = field(repr=False)
-    locate: Locate = field(repr=False)
+    locate: Locate = field(repr=False)  # dimension of the rows, index along the other -> column
 
 
 @contextmanager
 def open_variables(path: Path, limits: Mapping[str, float]) -> Iterator[dict[str, StoredVariable]]:
     """Open a file or store, and describe its variables.
-
-    Parameters
-    ----------
-    path : Path
-        NetCDF file or Zarr store.
-    limits : mapping of str to float
-        Limits that the user set.
 
     Raises
     ------

@@ -61,24 +61,14 @@ ATTRIBUTES = (*_PACKING, "units", "calendar")
 
 @dataclass(frozen=True)
 class Packing:
-    """Packing of one variable, from its attributes.
+    """Packing of one variable, from its attributes."""
 
-    Attributes
-    ----------
-    dtype : dtype
-        Type of the stored numbers; unsigned if ``_Unsigned`` is "true".
-    missing : tuple of number
-        Stored numbers that mark missing values, in `dtype`.
-    low, high : float
-        Stored numbers outside this range are invalid.
-    scale, offset : float
-        ``value = stored * scale + offset``.
-    """
-
-    dtype: np.dtype[Any]
-    missing: tuple[Any, ...] = ()
+    dtype: np.dtype[Any]  # type of the stored numbers; unsigned if ``_Unsigned`` is "true"
+    missing: tuple[Any, ...] = ()  # stored numbers that mark missing values, in `dtype`
+    #: Stored numbers outside this range are invalid.
     low: float = -np.inf
     high: float = np.inf
+    #: ``value = stored * scale + offset``.
     scale: float = 1.0
     offset: float = 0.0
 
@@ -88,12 +78,8 @@ class Packing:
 
         Parameters
         ----------
-        where : str
-            File and variable, for messages.
         dtype : dtype
             Type of the stored numbers, in any byte order.
-        attributes : mapping of str to Any
-            All attributes as in the file, with their types.
 
         Raises
         ------
@@ -277,8 +263,6 @@ def fold_packing(
 
     Parameters
     ----------
-    plan : Plan
-        Role and unit of each column.
     dtypes, attributes : sequence of dtype, sequence of mapping
         Type and attributes of each column's variable, by the column's source.
 
@@ -335,8 +319,6 @@ def decode_variables(path: Path, stored: xr.Dataset) -> xr.Dataset:
     ----------
     path : Path
         The file; it is named in errors of later reads.
-    stored : xarray.Dataset
-        Stored variables, with all attributes.
 
     Returns
     -------

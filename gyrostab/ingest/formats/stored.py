@@ -44,7 +44,7 @@ class StoredTable:
 
     def scan(self, form: str) -> FileSummary:
         """Summarise columns, number of rows, and first and last stamps."""
-        fetch = partial(_fetch, self.columns, self.decoders)
+        fetch = partial(_fetch_rows, self.columns, self.decoders)
         return summarise_columns(form, self.plan, self.options, self.rows, fetch, self.notes)
 
     def read(self) -> xr.Dataset:
@@ -56,7 +56,7 @@ class StoredTable:
             plan,
             self.options,
             self.rows,
-            partial(_fetch, columns, self.decoders),
+            partial(_fetch_rows, columns, self.decoders),
             notes=[*self.notes, *float32_note(plan, [column.dtype for column in columns])],
             parallel=not any(isinstance(rows, LibraryRows) for rows in wanted),
             stay=all(isinstance(rows, EvenRows) for rows in wanted),
@@ -87,7 +87,7 @@ def plan_stored(
     return StoredTable(columns, rows, plan, decoders, options, notes)
 
 
-def _fetch(
+def _fetch_rows(
     columns: Sequence[StoredColumn],
     decoders: Mapping[int, Decoder],
     source: int,

@@ -195,13 +195,7 @@ def read_tables(
 
 
 def library(name: str, path: Path, *, extra: str) -> Any:
-    """Import a format library.
-
-    Raises
-    ------
-    OptionError
-        When it is not installed; the message names the extra that installs it.
-    """
+    """Import a format library."""
     try:
         return import_module(name)
     except ImportError as error:

@@ -71,13 +71,7 @@ _FORMATS: list[tuple[str, Callable[[bytes], bool], str]] = [
 
 
 def refuse_unread(path: Path) -> None:
-    """Raise an error for a file of a format that is recognised but not read.
-
-    Raises
-    ------
-    FormatError
-        With the name of the format and how to convert the file.
-    """
+    """Raise an error for a file of a format that is recognised but not read."""
     if not path.is_file():
         return
     with path.open("rb") as file:

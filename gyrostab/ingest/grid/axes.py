@@ -26,15 +26,6 @@ def regularise_axes(
     ----------
     raw : xarray.Dataset
         Raw log with the attribute ``axis_rows``: lists of axes, first row, row after the last.
-    regularise : callable
-        Function that makes a regular log of one group.
-    max_gap, limits
-        As for `gyrostab.ingest.concat.concatenate_logs`.
-
-    Returns
-    -------
-    xarray.Dataset
-        One regular log; samples of other groups are placed on the nearest grid samples.
     """
     parts = [part.assign_attrs(notes=[]) for part in split_axes(raw)]
     logs = [regularise(part) for part in parts]

@@ -40,11 +40,6 @@ def rows_on_grid(
     ----------
     rows : array, shape (..., n_rows)
         numpy, memmap or dask.
-    placement : Placement
-    chunk : int
-        Samples of a chunk of the result.
-    scale : float
-        Factor on the values.
     unit : float, optional
         Unit of which the values are whole multiples; the result has exact whole multiples of
         ``unit * scale``.

@@ -74,13 +74,7 @@ def _dropped_rows(events: NDArray[np.int64]) -> NDArray[np.int64]:
 def find_gaps(
     placement: Placement, scanned: ScanPass, *, most: int = MAX_TABLE_ROWS
 ) -> NDArray[np.int64]:
-    """Make the table of gaps in samples.
-
-    Returns
-    -------
-    ndarray of int64, shape (n, 5)
-        First missing sample, first present sample after, samples missing, rows concerned, cause.
-    """
+    """Make the table of gaps in samples, with the columns of `ingest.gap_table.COLUMNS`."""
     table = np.concatenate(
         [
             _missing_samples(placement, scanned),

@@ -31,9 +31,7 @@ __all__ = [
 
 Integers = NDArray[np.int64]
 
-
 ObservedStamps = tuple[Integers, Integers]
-
 
 #: Smallest standard deviation of the jitter that is passed to the kernel [samples].
 MIN_SIGMA = 0.1
@@ -62,37 +60,22 @@ _SEARCH_ROWS, _MAX_CANDIDATES, _MAX_REFINED = 8_000, 200, 4
 #: gain of 0.02, lags by a fortieth of a sample.
 _PERIOD_STEP = 0.001
 
-
 TRACE_ROWS = 1 << 13
 
 
 @dataclass(frozen=True)
 class JitterModel:
-    """Sampling period and jitter of noisy stamps.
+    """Sampling period and jitter of noisy stamps."""
 
-    Attributes
-    ----------
-    period : float
-        Sampling period [ns].
-    sigma : float
-        Standard deviation of the jitter [samples].
-    observe : str
-        Rows whose stamps are used: ``"all"``, the ``"first"`` or the ``"last"`` of each group of
-        rows with one stamp.
-    group : float
-        Mean number of rows for each used stamp.
-    nats : float
-        Cost of a row.
-    fits : bool
-        Whether few rows have no sample, some steps are single samples, and the cost is that of
-        jitter.
-    """
-
-    period: float
-    sigma: float
+    period: float  # sampling period [ns]
+    sigma: float  # standard deviation of the jitter [samples]
+    #: Rows whose stamps are used: ``"all"``, the ``"first"`` or the ``"last"`` of each group of
+    #: rows with one stamp.
     observe: str
-    group: float
-    nats: float
+    group: float  # mean number of rows for each used stamp
+    nats: float  # cost of a row
+    #: Whether few rows have no sample, some steps are single samples, and the cost is that of
+    #: jitter.
     fits: bool = True
 
     @property

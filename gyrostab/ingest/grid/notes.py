@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.ingest.gap_table import format_duration, format_stamp
+from gyrostab.ingest.gap_table import format_duration
 from gyrostab.ingest.grid.fill import samples_of
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.rate import RateEstimate
@@ -14,6 +14,7 @@ from gyrostab.ingest.grid.scan_pass import ScanPass, file_of
 from gyrostab.kernels.grid.stamps import DUPLICATE, OUT_OF_ORDER, RESTART
 from gyrostab.schema import GAP_CAUSES, log_channels
 from gyrostab.time.grid import grid_times
+from gyrostab.time.stamps import format_stamp, to_nanoseconds
 
 __all__ = ["describe_channels", "describe_placement", "describe_rate"]
 
@@ -43,9 +44,7 @@ def describe_channels(log: xr.Dataset) -> list[str]:
 
 
 def _format_span(first: np.datetime64, last: np.datetime64) -> str:
-    return " to ".join(
-        format_stamp(int(stamp.astype("datetime64[ns]").view(np.int64))) for stamp in (first, last)
-    )
+    return " to ".join(format_stamp(int(to_nanoseconds(stamp))) for stamp in (first, last))
 
 
 def _count_of(number: int, what: str) -> str:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import TimeError
 from gyrostab.ingest.columns.stamps import read_stamps
-from gyrostab.ingest.gap_table import format_duration, format_stamp
+from gyrostab.ingest.gap_table import format_duration
 from gyrostab.ingest.grid.rate import RateEstimate
 from gyrostab.ingest.grid.scan_pass import file_of
 from gyrostab.ingest.grid.starting_period import Stamps, recut_blocks
@@ -26,6 +26,7 @@ from gyrostab.kernels.grid.stamps import (
     STEP,
 )
 from gyrostab.time.grid import period_ns
+from gyrostab.time.stamps import format_stamp
 
 __all__ = [
     "NO_STAMPS",
@@ -43,31 +44,21 @@ NO_STAMPS = (
     "or give --rate HZ for a log without time"
 )
 
-
 #: Rows that the placement kernel processes at one time.
 _STRETCH_ROWS = 1 << 18
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Rows placed on the samples of a uniform grid.
+    """Rows placed on the samples of a uniform grid."""
 
-    Attributes
-    ----------
-    start : int
-        Stamp of sample 0 [ns since 1970].
-    runs : ndarray of int64, shape (n, 3)
-        First sample, first row, length; sorted by sample, without overlap.
-    events : ndarray of int64, shape (n, 5)
-        Cause (number in schema.GAP_CAUSES), sample, row, stamp before [ns], stamp [ns]; sorted by
-        sample.
-    wander : float
-        Largest distance of the smoothed stamps from the grid [samples]; only for counted rows.
-    """
-
-    start: int
+    start: int  # stamp of sample 0 [ns since 1970]
+    #: (n, 3): first sample, first row, length; sorted by sample, without overlap.
     runs: NDArray[np.int64]
+    #: (n, 5): cause (number in schema.GAP_CAUSES), sample, row, stamp before [ns], stamp [ns];
+    #: sorted by sample.
     events: NDArray[np.int64]
+    #: Largest distance of the smoothed stamps from the grid [samples]; only for counted rows.
     wander: float = 0.0
 
     @property
@@ -100,24 +91,7 @@ def make_placement(
 def check_grid(
     raw: xr.Dataset, placement: Placement, rate: float, max_gap: float, limits: Mapping[str, float]
 ) -> None:
-    """Refuse a grid with far more samples than rows, before it is allocated.
-
-    Parameters
-    ----------
-    raw : xarray.Dataset
-        Raw log.
-    placement : Placement
-        Rows of the log on the grid.
-    rate, max_gap : float
-        Sampling rate [Hz] and longest gap [s].
-    limits : mapping of str to float
-        Limits that the user set.
-
-    Raises
-    ------
-    TimeError
-        With the two stamps around the longest gap, and the options that help.
-    """
+    """Refuse a grid with far more samples than rows, before it is allocated."""
     if not is_absurd_grid(placement.size, placement.placed, limits):
         return
     runs = placement.runs
@@ -185,8 +159,6 @@ def place_by_stamp(
         is skipped [samples].
     max_gap : float
         A longer step ahead is taken as a step of the clock [s].
-    where : str
-        The file, for messages.
 
     Raises
     ------
@@ -303,12 +275,6 @@ def place_by_count(
 
     Parameters
     ----------
-    stamps : callable
-        Returns an iterator over blocks of (row numbers, stamps [ns]).
-    estimate : RateEstimate
-        Sampling rate and kind of the stamps.
-    rate : float
-        Sampling rate [Hz].
     max_gap : float
         A longer loss is taken as a step of the clock [s].
     """

@@ -175,15 +175,8 @@ def place_in_order(
     ----------
     stamps, rate, tolerance, max_gap, where
         As for `place_by_stamp`.
-    jitter : JitterModel
-        Period and jitter of the stamps.
     by_row : bool
         Whether rows that `stamps` leaves out occupy samples.
-
-    Raises
-    ------
-    TimeError
-        When no stamp can be read.
     """
     ahead = int(min(_AHEAD_ROWS * np.ceil(jitter.group), _MAX_AHEAD_ROWS))
     size = int(min(TRACE_ROWS * np.ceil(jitter.group), _MAX_ROWS))

@@ -37,58 +37,36 @@ __all__ = ["RateEstimate", "deviating_stretches", "estimate_near", "estimate_rat
 
 _MAX_TRUSTED_SAMPLES = 500.0  # reached in a long log
 
-
 # Larger than the share of backward steps by jitter: 0.12 at a scatter of 0.6 samples; random order
 # has 0.5.
 _MAX_BACKWARD_SHARE = 0.35
 
-
 _MIN_SINGLE_SHARE = 0.1  # of steps that are one sample of a given rate
-
 
 #: Largest scatter of the steps about whole samples at which single stamps give the sample: jitter
 #: of 0.08 samples, so that half a sample is 6 standard deviations.
 _SHARP_SCATTER = 0.12
 
-
 _FAR_WORSE_NATS = 0.2  # a row
-
 
 _BLOCK = 1 << 20
 
 
 @dataclass(frozen=True)
 class RateEstimate:
-    """A sampling rate, and how it was found.
+    """A sampling rate, and how it was found."""
 
-    Attributes
-    ----------
-    rate : float
-        Sampling rate [Hz].
-    stderr : float
-        Its standard error [Hz].
-    counted : bool
-        Whether rows are placed by their count, not by their stamps.
-    coarse : bool
-        Whether many rows share one stamp.
-    raw : float
-        Rate before rounding to a plain number [Hz].
-    even : float or None
-        Rate [Hz] if the recurring losses found in the stamps are not losses; None without such
-        losses.
-    finer : float or None
-        Rate [Hz] if the pattern of steps is due to recurring losses; None without such a pattern.
-    jitter : JitterModel or None
-        Jitter of the stamps, if single stamps do not give the sample but many together do.
-    """
-
-    rate: float
-    stderr: float
-    counted: bool
-    coarse: bool
-    raw: float
+    rate: float  # sampling rate [Hz]
+    stderr: float  # its standard error [Hz]
+    counted: bool  # whether rows are placed by their count, not by their stamps
+    coarse: bool  # whether many rows share one stamp
+    raw: float  # rate before rounding to a plain number [Hz]
+    #: Rate [Hz] if the recurring losses found in the stamps are not losses; None without such
+    #: losses.
     even: float | None = None
+    #: Rate [Hz] if the pattern of steps is due to recurring losses; None without such a pattern.
     finer: float | None = None
+    #: Jitter of the stamps, if single stamps do not give the sample but many together do.
     jitter: JitterModel | None = None
 
 
@@ -113,12 +91,6 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
     ----------
     stamps : callable
         Returns an iterator over blocks of (row numbers, stamps [ns]).
-    where : str
-        The file, for messages.
-
-    Returns
-    -------
-    RateEstimate
 
     Raises
     ------

@@ -7,6 +7,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.ingest.columns.stamps import read_stamps
+from gyrostab.ingest.copies import is_copy
 from gyrostab.ingest.grid.fill import samples_of
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS
@@ -17,7 +18,6 @@ __all__ = ["find_repeats", "with_repeats"]
 
 _MAX_CANDIDATES = 8  # earlier rows with the stamp of a set-back that are compared
 _MIN_ROWS = 16  # shorter repetitions are found by their stamps alone
-_MIN_ALIKE_SHARE = 0.9  # share of equal rows in a copy, which may be damaged
 
 
 def find_repeats(raw: xr.Dataset, name: str, placement: Placement) -> NDArray[np.int64]:
@@ -28,10 +28,6 @@ def find_repeats(raw: xr.Dataset, name: str, placement: Placement) -> NDArray[np
 
     Parameters
     ----------
-    raw : xarray.Dataset
-        Raw log with stamps.
-    name : str
-        Name of the signal.
     placement : Placement
         Rows on the grid, with the set-backs of the clock among the events.
 
@@ -97,7 +93,7 @@ def _same_values(raw: xr.Dataset, name: str, source: int, row: int, length: int)
         changes = changes or bool(
             ((np.diff(left, axis=1) != 0) & known[:, 1:] & known[:, :-1]).any()
         )
-    return changes and compared >= 2 and alike >= _MIN_ALIKE_SHARE * compared
+    return changes and is_copy(compared, alike)
 
 
 def with_repeats(placement: Placement, raw: xr.Dataset, repeats: NDArray[np.int64]) -> Placement:

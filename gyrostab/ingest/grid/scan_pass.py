@@ -27,34 +27,18 @@ BLOCK_ROWS = 1 << 20
 
 @dataclass
 class ScanPass:
-    """Findings of one pass over a raw log.
+    """Findings of one pass over a raw log."""
 
-    Attributes
-    ----------
-    rows : int
-        Rows of the raw log.
-    present : ndarray of uint8
-        One bit a row: whether any axis has a number.
-    absent : int
-        Rows without any number.
-    unreadable, infinite : ndarray of int64, shape (n, 2)
-        Half-open spans of present rows in which an axis is NaN, or infinite.
-    constant : list of str
-        Axes whose value never changes.
-    filled : dict
-        Channel on ``row`` -> number of rows with a value.
-    repeated : int
-        Number of rows that repeat others.
-    """
-
-    rows: int
-    present: NDArray[np.uint8]
-    absent: int
+    rows: int  # rows of the raw log
+    present: NDArray[np.uint8]  # one bit a row: whether any axis has a number
+    absent: int  # rows without any number
+    #: (n, 2): half-open spans of present rows in which an axis is NaN, or infinite.
     unreadable: NDArray[np.int64]
     infinite: NDArray[np.int64]
-    constant: list[str]
+    constant: list[str]  # axes whose value never changes
+    #: Channel on ``row`` -> number of rows with a value.
     filled: dict[str, int] = field(default_factory=dict)
-    repeated: int = 0
+    repeated: int = 0  # number of rows that repeat others
 
     def leave_out(self, begin: int, end: int) -> None:
         """Mark the rows `begin` to `end` as repetitions, which hold no new sample."""

@@ -28,7 +28,6 @@ __all__ = [
 
 SECOND = 1e9
 
-
 #: Returns a new iterator over all blocks of row numbers and stamps at each call.
 Stamps = Callable[[], Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]]
 
@@ -144,7 +143,6 @@ def finer_period(parts: list[NDArray[np.int64]], period: float) -> float | None:
 
 
 GAIN = 0.1
-
 
 SHARED_SHARE = (
     0.05  # smallest share of rows with the stamp of the previous row if stamps are shared

@@ -20,27 +20,13 @@ VOID_CELLS = frozenset(("", "nan", "-nan", "null", "na", "n/a", "none"))
 
 
 class ParsedBlock(NamedTuple):
-    """Rows of a block of text.
+    """Rows of a block of text."""
 
-    Attributes
-    ----------
-    values : dict of int to ndarray
-        Column number -> numbers, NaN where missing.
-    stamps : ndarray of int64 or None
-        Stamps [ns since 1970].
-    words : int
-        Channel cells that are neither a number nor void.
-    starts : ndarray of int64
-        Position of each row in the block.
-    lines : int
-        Number of lines, with comments and empty lines.
-    """
-
-    values: dict[int, NDArray[np.float64]]
-    stamps: NDArray[np.int64] | None
-    words: int
-    starts: NDArray[np.int64]
-    lines: int
+    values: dict[int, NDArray[np.float64]]  # column number -> numbers, NaN where missing
+    stamps: NDArray[np.int64] | None  # stamps [ns since 1970]
+    words: int  # channel cells that are neither a number nor void
+    starts: NDArray[np.int64]  # position of each row in the block
+    lines: int  # number of lines, with comments and empty lines
 
 
 class BlockParser:

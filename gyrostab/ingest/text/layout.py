@@ -92,14 +92,8 @@ def find_layout(
 
     Parameters
     ----------
-    path : Path
-        The file, for messages.
-    head : bytes
-        The beginning of the file, decompressed.
     complete : bool
         Whether `head` is the whole file.
-    limits : mapping of str to float, optional
-        Limits that the user set.
 
     Raises
     ------

@@ -26,6 +26,7 @@ from gyrostab.ingest.uniform.grid import UniformGrid, find_grid
 from gyrostab.schema import GAP_CAUSES, check_log, signal_name, texts
 from gyrostab.store.private import close_function
 from gyrostab.time.grid import TimeGridIndex, grid_index, time_coordinate
+from gyrostab.time.stamps import to_nanoseconds
 
 __all__ = [
     "add_holes",
@@ -34,6 +35,7 @@ __all__ = [
     "change_rate",
     "grid_of",
     "has_gap_table",
+    "merge_lines",
     "place_samples",
     "with_table",
 ]
@@ -106,7 +108,7 @@ def grid_of(log: xr.Dataset, nominal: float | None = None) -> tuple[UniformGrid,
         )
 
     def read(begin: int, end: int) -> NDArray[np.int64]:
-        return np.asarray(time[begin:end].values).astype("datetime64[ns]").view(np.int64)
+        return to_nanoseconds(time[begin:end].values)
 
     return find_grid(read, size, nominal=nominal), False
 
@@ -257,8 +259,6 @@ def change_rate(table: Table, log: xr.Dataset, old_rate: float, start: int, rate
         Log with the exact ends of the gaps.
     old_rate : float
         Sampling rate for which the table was made [Hz].
-    start, rate : int, float
-        First stamp [ns since 1970] and present sampling rate [Hz].
     """
     columns = read_gap_columns(log)
     assert columns is not None  # read_gaps has read them
@@ -279,7 +279,7 @@ def change_rate(table: Table, log: xr.Dataset, old_rate: float, start: int, rate
 def add_holes(table: Table, runs: Table) -> Table:
     """Add the samples between runs that the table does not list, with cause "missing"."""
     first, end = runs[:-1, 0] + runs[:-1, 2], runs[1:, 0]
-    begin, stop = _merge_lines(table[table[:, END] > table[:, FIRST]])
+    begin, stop = merge_lines(table[table[:, END] > table[:, FIRST]])
     if len(begin):  # clip by listed gaps at either end, then count listed samples within
         which = np.maximum(np.searchsorted(begin, first, side="right") - 1, 0)
         first = np.where((begin[which] <= first) & (first < stop[which]), stop[which], first)
@@ -298,7 +298,7 @@ def add_holes(table: Table, runs: Table) -> Table:
     return _sort_table(np.concatenate([table, holes]))
 
 
-def _merge_lines(table: Table) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def merge_lines(table: Table) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return first samples and ends of the union of the lines of a table."""
     order = np.argsort(table[:, FIRST], kind="stable")
     first, end = (

@@ -18,6 +18,7 @@ from gyrostab.ingest.uniform.core import (
     add_spans,
     grid_of,
     has_gap_table,
+    merge_lines,
     place_samples,
     with_table,
 )
@@ -26,6 +27,7 @@ from gyrostab.schema import GAP_CAUSES, check_log
 from gyrostab.time.clock import time_of_day
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import grid_index, grid_times, stamp_ns
+from gyrostab.time.stamps import to_nanoseconds
 
 __all__ = ["cut_log", "parse_instant"]
 
@@ -47,15 +49,6 @@ def parse_instant(value: Any, option: str, *, example: str = _EXAMPLE) -> int | 
     value : str, timedelta, datetime or float
         ISO 8601 text (UTC unless it says otherwise), a duration such as ``"10min"``, a number of
         seconds after the start.
-    option : str
-        Name of the option, for messages.
-    example : str
-        Valid example, for messages.
-
-    Raises
-    ------
-    OptionError
-        When it is neither a date nor a duration.
 
     Examples
     --------
@@ -222,13 +215,8 @@ def _format_stamp(stamp: np.datetime64) -> str:
 
 def _merge_spans(spans: Sequence[tuple[int, int]]) -> NDArray[np.int64]:
     """Sort spans, merge those that touch, and drop empty ones."""
-    merged: list[list[int]] = []
-    for first, end in sorted(span for span in spans if span[1] > span[0]):
-        if merged and first <= merged[-1][1]:
-            merged[-1][1] = max(merged[-1][1], end)
-        else:
-            merged.append([first, end])
-    return np.array(merged, dtype=np.int64).reshape(-1, 2)
+    filled = np.array([span for span in spans if span[1] > span[0]], dtype=np.int64)
+    return np.stack(merge_lines(filled.reshape(-1, 2)), axis=1)
 
 
 def _kept_runs(low: int, high: int, excluded: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -259,7 +247,7 @@ def _cut_channels(
     """Cut the channels with separate time coordinates."""
     edges = grid_times(grid.start, grid.rate, np.concatenate([[low, high], excluded.ravel()]))
     for dim in [dim for dim in part.dims if str(dim).startswith("time_") and dim in part.coords]:
-        stamps = part.variables[dim].values.astype("datetime64[ns]").view(np.int64)
+        stamps = to_nanoseconds(part.variables[dim].values)
         keep = (stamps >= edges[0]) & (stamps < edges[1])
         for first, end in edges[2:].reshape(-1, 2):
             keep &= (stamps < first) | (stamps >= end)

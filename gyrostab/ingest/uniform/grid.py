@@ -56,8 +56,6 @@ def find_grid(read: ReadStamps, count: int, *, nominal: float | None = None) -> 
     ----------
     read : callable
         First stamp, stamp after the last one -> stamps [ns since 1970].
-    count : int
-        Number of stamps.
     nominal : float, optional
         Sampling rate that the log declares [Hz]; only a candidate, the stamps decide.
 

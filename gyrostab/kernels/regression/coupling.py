@@ -124,8 +124,6 @@ def fit_lags(laws: Laws, series: Array, driver: Array) -> LagFit:
 
     Parameters
     ----------
-    laws : Laws
-        Result of `project_out`.
     series, driver : float64 (n, n_series), (n, n_lags)
         Columns.
 
@@ -183,8 +181,6 @@ def simulate_p_values(
 
     Parameters
     ----------
-    laws : Laws
-        Result of `project_out`.
     driver : float64 (n, n_lags)
         Columns.
     weight : float64 (n_laws,)

@@ -52,8 +52,6 @@ def check_output(
 
     Parameters
     ----------
-    path : path-like
-        File, Zarr folder or other folder to be written.
     suffixes : sequence of str
         Allowed suffixes, with the dot; empty for any.
     overwrite : bool
@@ -64,11 +62,6 @@ def check_output(
     find_foreign : callable, optional
         Function that finds an item that must not be removed; the output is a folder then. By
         default the output is a Zarr store if its name ends in ``.zarr``, else a file.
-
-    Returns
-    -------
-    pathlib.Path
-        The path.
 
     Raises
     ------
@@ -99,20 +92,6 @@ def check_folder(
     folder: str | os.PathLike[str], names: Iterable[str], *, overwrite: bool = False
 ) -> Path:
     """Check that files can be written to a folder, which may hold others or not exist yet.
-
-    Parameters
-    ----------
-    folder : path-like
-        The folder.
-    names : iterable of str
-        Names of the files.
-    overwrite : bool
-        Whether files of these names may be replaced.
-
-    Returns
-    -------
-    pathlib.Path
-        The folder.
 
     Raises
     ------

@@ -45,11 +45,6 @@ def is_store(folder: Path) -> bool:
 def find_foreign_item(folder: Path) -> str | None:
     """Find an item in a folder that is not part of a Zarr store.
 
-    Parameters
-    ----------
-    folder : pathlib.Path
-        The folder.
-
     Returns
     -------
     str or None

@@ -85,11 +85,6 @@ def protect_inputs(
     An output is also refused when an input has changed before the output is complete, except for
     TOML files, which are read at the start.
 
-    Parameters
-    ----------
-    paths : path-like, or several of them
-        Files, folders and patterns.
-
     Examples
     --------
     >>> import tempfile

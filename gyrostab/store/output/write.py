@@ -45,8 +45,6 @@ def new_output(
     ----------
     path : path-like
         The final name; a symbolic link means its target.
-    overwrite : bool
-        Replace an existing output.
     find_foreign : callable, optional
         Function that finds an item of an existing folder that must not be removed; the output is a
         folder then. See `gyrostab.store.output.check_output`.
@@ -126,8 +124,6 @@ def new_folder(folder: str | os.PathLike[str], *, overwrite: bool = False) -> It
     ----------
     folder : path-like
         The folder; it is made, with its parents, if it does not exist.
-    overwrite : bool
-        Replace files of the same names.
 
     Yields
     ------
