@@ -26,7 +26,7 @@ from gyrostab.blindtest.generator.scenario import stream
 from gyrostab.blindtest.scenarios.case import describe_truth, draw_effects, draw_suitable
 from gyrostab.blindtest.scenarios.plan import INCOMPATIBLE
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
-from gyrostab.diagnose.baseline.known_effects import remove_known_lines
+from gyrostab.diagnose.baseline.known_lines import remove_known_lines
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.forward_search import name_effects

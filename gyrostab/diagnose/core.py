@@ -13,12 +13,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.baseline.calibrate import (
-    baseline_from_model,
-    baseline_from_simulation,
-    calibrate_noise,
-)
-from gyrostab.diagnose.baseline.known_effects import expect_known_motion, remove_known_lines
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.baseline.from_model import baseline_from_model
+from gyrostab.diagnose.baseline.from_simulation import baseline_from_simulation
+from gyrostab.diagnose.baseline.known_effects import expect_known_motion
+from gyrostab.diagnose.baseline.known_lines import remove_known_lines
 from gyrostab.diagnose.estimate.expected_effects import expected_baseline, without_expected
 from gyrostab.diagnose.estimate.recalibrate import remove_fast_switching
 from gyrostab.diagnose.identify.forward_search import name_effects
@@ -130,11 +129,11 @@ def _run_steps(task: Task, block: Any) -> Diagnosis:
     """Run the seven steps in their order; each reason to compare again occurs at most once."""
     started = time.perf_counter()
     task, blocks = _reduce_recording(task, block)
-    comparison = _compare(task, *_calibrate(task, blocks))
+    comparison = _compare_blocks(task, *_calibrate_baseline(task, blocks))
     for revise in (_leave_out_motion, _take_out_fast_switching):
         revised = revise(task, comparison)
         if revised is not None:
-            comparison = _compare(task, *revised)
+            comparison = _compare_blocks(task, *revised)
     task.progress("fitting", 0)
     return finish_diagnosis(task, comparison, started)
 
@@ -155,7 +154,7 @@ def _reduce_recording(task: Task, block: Any) -> tuple[Task, xr.Dataset]:
     return replace(task, log=log, simulation=simulation), blocks
 
 
-def _calibrate(task: Task, blocks: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
+def _calibrate_baseline(task: Task, blocks: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
     """Step 2: return the blocks in which the model does not move the rate, and the baseline."""
     task.progress("calibrating", 0)
     baseline = _make_baseline(task, blocks)
@@ -182,7 +181,7 @@ def _make_baseline(task: Task, blocks: xr.Dataset) -> xr.Dataset:
     return baseline_from_simulation(blocks, simulated, quiet=task.quiet, settings=task.settings)
 
 
-def _compare(task: Task, blocks: xr.Dataset, baseline: xr.Dataset) -> Comparison:
+def _compare_blocks(task: Task, blocks: xr.Dataset, baseline: xr.Dataset) -> Comparison:
     """Steps 3 to 5: draw null records, identify effects, and locate the mismatches.
 
     Identified effects and located mismatches have half of the false-alarm level each.
@@ -229,7 +228,7 @@ def _leave_out_motion(task: Task, comparison: Comparison) -> tuple[xr.Dataset, x
     if not moving.any():
         return None
     try:
-        return _calibrate(task, _at_rest(task, blocks, moving))
+        return _calibrate_baseline(task, _at_rest(task, blocks, moving))
     except SchemaError as error:
         warnings.warn(
             f"the diagnosis includes unexplained motion: without it too little is left ({error})",

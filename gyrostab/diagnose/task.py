@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.baseline.known_effects import expect_known_motion, remove_known_lines
+from gyrostab.diagnose.baseline.known_effects import expect_known_motion
+from gyrostab.diagnose.baseline.known_lines import remove_known_lines
 from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.identify.moving_axes import without_motion
 from gyrostab.diagnose.nulls.scores import NullScores
@@ -21,20 +22,12 @@ __all__ = ["Comparison", "Task", "lines_without_motion"]
 
 @dataclass(frozen=True)
 class Task:
-    """A recording, and how it is to be compared.
+    """A recording, and how it is to be compared."""
 
-    Attributes
-    ----------
-    log : xarray.Dataset
-        The recording, with the axes that vary.
-    simulation : Model, xarray.Dataset or None
-        What the recording is compared with; None when the noise is calibrated on the recording.
-    quiet, restart_gap, seed, nulls, level, progress, settings
-        The options of `gyrostab.diagnose`; `level` is its `false_alarm_level`.
-    """
-
-    log: xr.Dataset
+    log: xr.Dataset  # the recording, with the axes that vary
+    #: What the recording is compared with; None when the noise is calibrated on the recording.
     simulation: Model | xr.Dataset | None
+    #: The options of `gyrostab.diagnose`; `level` is its `false_alarm_level`.
     quiet: Any
     restart_gap: Any
     seed: int
@@ -45,22 +38,12 @@ class Task:
 
 
 class Comparison(NamedTuple):
-    """What the comparison of a recording with its baseline found.
-
-    Attributes
-    ----------
-    baseline : xarray.Dataset
-        What the simulation predicts for them.
-    mismatches : xarray.Dataset
-        From `gyrostab.diagnose.locate.mismatches.locate_mismatches`.
-    identifications : Identifications
-        The effects that explain the differences.
-    """
+    """What the comparison of a recording with its baseline found."""
 
     blocks: xr.Dataset
-    baseline: xr.Dataset
-    mismatches: xr.Dataset
-    identifications: Identifications
+    baseline: xr.Dataset  # what the simulation predicts for them
+    mismatches: xr.Dataset  # from `gyrostab.diagnose.locate.mismatches.locate_mismatches`
+    identifications: Identifications  # the effects that explain the differences
     null: NullScores
 
 

@@ -49,7 +49,7 @@ __all__ = [
 class Source:
     """Values that are read when they are needed; as much of an array as dask asks for."""
 
-    #: Of the whole array.
+    #: Those of the whole array.
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     parts: Sequence[Any] = ()  # arrays that the values are derived from

@@ -6,7 +6,6 @@ B and K. The posterior is kept as draws, so that null records include the calibr
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -17,12 +16,9 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.baseline.expected_statistics import (
     NOISE,
     common_variance,
-    line_columns,
     noise_powers,
     white_variance,
 )
-from gyrostab.diagnose.baseline.known_effects import expect_known_effects, independent_line_share
-from gyrostab.diagnose.baseline.noise_level import quiescent_level, scale_noise
 from gyrostab.diagnose.baseline.posterior import (
     Fit,
     Posterior,
@@ -33,33 +29,17 @@ from gyrostab.diagnose.baseline.posterior import (
     visible_coefficients,
 )
 from gyrostab.diagnose.baseline.quiescent import (
-    GIVEN,
     find_quiescent_blocks,
     find_quiescent_spans,
-    given_quiescent_blocks,
     noise_level_excess,
 )
-from gyrostab.diagnose.baseline.simulated import (
-    add_extra_statistics,
-    measure_extra_statistics,
-    worst_band,
-)
-from gyrostab.diagnose.baseline.wandering import with_wandering
 from gyrostab.diagnose.evidence.products import mean_products
 from gyrostab.diagnose.reduce.schema import BASELINE, label_variables
 from gyrostab.diagnose.settings import DEFAULTS, Settings
-from gyrostab.errors import OptionError, SchemaError
+from gyrostab.errors import SchemaError
 from gyrostab.noise import HOUR, TERMS
-from gyrostab.simulate.model import Model, read_model
 
-__all__ = [
-    "DRAWS",
-    "assemble_baseline",
-    "baseline_from_model",
-    "baseline_from_simulation",
-    "calibrate_noise",
-    "grid_values",
-]
+__all__ = ["DRAWS", "assemble_baseline", "calibrate_axes", "calibrate_noise", "grid_values"]
 
 Array = NDArray[np.float64]
 #: Number of draws from the posterior of the noise of an axis; limits memory.
@@ -67,7 +47,6 @@ DRAWS = 512
 #: Values of K and B on the coarse grid, as multiples of the calibrated ones. Design choice.
 _FACTORS = {"K": (0.0, 1.0 / 3.0, 1.0, 3.0, 10.0, 30.0), "B": (0.0, 1.0, 3.0, 10.0)}
 _MIN_LOW_SHAPE = 20.0  # of the lowest bands, which define the white noise of a block mean
-_MIN_BANDS = 6  # that the noise terms are fitted to, with any spectral shape
 
 
 def _mean_noise_excess(power: Array, shape: Array, spectrum: Array, settings: Settings) -> Array:
@@ -148,11 +127,11 @@ def calibrate_noise(
         "calibrated_on": find_quiescent_spans(blocks, chosen),
         "quiet_by": reason,
     }
-    posteriors = _calibrate_axes(blocks, chosen, settings)
+    posteriors = calibrate_axes(blocks, chosen, settings)
     return assemble_baseline(blocks, posteriors, quiet=chosen, attrs=attrs, settings=settings)
 
 
-def _calibrate_axes(
+def calibrate_axes(
     blocks: xr.Dataset, chosen: NDArray[np.bool_], settings: Settings
 ) -> list[Posterior]:
     """Compute the noise of every axis from the chosen blocks (axis, block)."""
@@ -211,8 +190,6 @@ def assemble_baseline(
 
     Parameters
     ----------
-    posteriors : list of Posterior
-        One for each axis.
     quiet : ndarray of bool, shape (axis, block)
     attrs : mapping
         ``source``, ``calibrated_on`` and other attributes.
@@ -306,230 +283,3 @@ def _ramp_error(blocks: xr.Dataset, white: Array, value: Array, quiet: NDArray[n
         ).gram[0, 0, 0]
         error[row] = 1.0 / np.sqrt(seen) if seen > 0.0 else np.inf
     return error
-
-
-def baseline_from_model(
-    blocks: xr.Dataset, model: Any, *, quiet: Any = None, settings: Settings = DEFAULTS
-) -> xr.Dataset:
-    """Take the noise of a model, and its effects as far as means and band powers show them.
-
-    Parameters
-    ----------
-    blocks : xarray.Dataset
-        The recording, from `reduce_log`.
-    model : path, mapping or Model
-        As `gyrostab.simulate` takes it.
-    quiet : array_like of bool (block,), or (start, end) or several of these, optional
-        Quiescent time of the recording. One factor for each axis then fits the noise of the model
-        to it; the noise terms keep their proportions, and the effects their sizes. By default, and
-        with a warning where `quiet` is too short, the noise is taken unchanged.
-
-    Returns
-    -------
-    xarray.Dataset
-        As from `calibrate_noise`; the noise has the error of that factor, or none. If axes share an
-        effect of the model, with ``cross(pair, block, band)``, the expected cross-spectrum.
-        ``attrs["left_out"]`` lists the effects that also show elsewhere (in distributions,
-        transfers, rotation orders, random wander): that part of them is not included.
-
-    Raises
-    ------
-    OptionError, FormatError
-        If the model is invalid, or has no noise.
-    SchemaError
-        If the recording lacks the channel of an effect.
-    """
-    parsed = model if isinstance(model, Model) else read_model(model)
-    axes = [str(axis) for axis in blocks["axis"].values]
-    posteriors = []
-    for axis in axes:
-        coefficients = parsed.coefficients(axis)
-        square = np.array([coefficients[term] ** 2 for term in NOISE])
-        if not square.any():
-            raise OptionError(
-                f"{parsed.source}: axis {axis} has no noise to compare a recording with; "
-                f"give N in [noise] or [noise.{axis}]"
-            )
-        draws = np.tile(square, (DRAWS, 1))
-        K, B = np.array([coefficients["K"]]), np.array([coefficients["B"]])
-        posteriors.append(
-            Posterior(square, np.zeros(4), K, B, np.ones(1), draws, draws[:, 2:], True)
-        )
-    chosen = np.ones((len(axes), blocks.sizes["block"]), np.bool_)
-    attrs: dict[str, Any] = {"source": "model", "calibrated_on": [], "model": parsed.source}
-    given = given_quiescent_blocks(blocks, quiet, settings=settings)
-    if given is not None:
-        chosen, attrs["quiet_by"] = given, GIVEN
-        attrs["calibrated_on"] = find_quiescent_spans(blocks, chosen)
-        posteriors = _scale_to_quiescent(blocks, parsed, posteriors, chosen)
-    known = expect_known_effects(
-        blocks, parsed, np.stack([posterior.square for posterior in posteriors])
-    )
-    attrs["left_out"] = known.left_out
-    hours = (blocks["begin"].values + blocks["end"].values) / (2.0 * HOUR)
-    ramp = np.array([parsed.coefficients(axis)["R"] for axis in axes])
-    out = assemble_baseline(
-        blocks,
-        posteriors,
-        quiet=chosen,
-        attrs=attrs,
-        known_mean=known.mean + ramp[:, None] * hours,
-        spectrum=known.spectrum,
-        settings=settings,
-    )
-    out = with_wandering(out, known.wandering, known.spectrum)
-    extra = known.lines if known.cross is None else {"cross": known.cross, **known.lines}
-    out = out.assign(label_variables(extra, BASELINE))
-    if known.lines:
-        noise = np.stack([line_columns(blocks) @ posterior.square for posterior in posteriors])
-        out["shape_alone"] *= independent_line_share(noise + known.lines["peaks"], blocks)[:, None]
-    out["coefficient"].loc[{"term": "R"}] = ramp
-    out["stderr"].loc[{"term": list(TERMS) if given is None else ["R"]}] = 0.0
-    return out
-
-
-def _scale_to_quiescent(
-    blocks: xr.Dataset, model: Model, posteriors: list[Posterior], quiet: NDArray[np.bool_]
-) -> list[Posterior]:
-    """Scale the noise of a model to the quiescent blocks (axis, block), given its effects."""
-    square = np.stack([posterior.square for posterior in posteriors])
-    whole, added = (
-        expect_known_effects(blocks, model, values).spectrum for values in (square, 0.0 * square)
-    )
-    return _scale_axes(blocks, posteriors, *quiescent_level(blocks, whole - added, added, quiet))
-
-
-def _scale_axes(
-    blocks: xr.Dataset, posteriors: list[Posterior], factor: Array, error: Array
-) -> list[Posterior]:
-    """Scale the noise of all axes, with the errors of the factors, and say so."""
-    sizes = ", ".join(
-        f"{root:.3g} on axis {axis}"
-        for axis, root in zip(blocks["axis"].values, np.sqrt(factor), strict=True)
-    )
-    warnings.warn(
-        f"the noise of the simulation is multiplied by {sizes}: its level in the quiet time given",
-        stacklevel=2,
-    )
-    scalings = zip(posteriors, factor.tolist(), error.tolist(), strict=True)
-    return [
-        scale_noise(posterior, by, relative_error, np.random.default_rng(row))
-        for row, (posterior, by, relative_error) in enumerate(scalings)
-    ]
-
-
-def baseline_from_simulation(
-    blocks: xr.Dataset, simulated: xr.Dataset, *, quiet: Any = None, settings: Settings = DEFAULTS
-) -> xr.Dataset:
-    """Take the noise of a simulated log with its calibration error, and its level over time.
-
-    Its stationary statistics other than the five noise terms are taken as measured: the shape of
-    its spectrum, coherency of axes, steady lines. What a simulation does to the means over time is
-    indistinguishable from its random walk and therefore not known; `baseline_from_model` knows it.
-
-    Parameters
-    ----------
-    blocks, simulated : xarray.Dataset
-        Recording and simulation, from `reduce_log`.
-    quiet : array_like of bool (block,), or (start, end) or several of these, optional
-        Quiescent time of the recording: one factor for each axis fits the noise of the simulation
-        to it.
-
-    Raises
-    ------
-    SchemaError
-        If the two differ in axes, sampling rate or length.
-    """
-    for name, wanted, got in (
-        (
-            "sampling rate [Hz]",
-            blocks.attrs["sampling_rate_hz"],
-            simulated.attrs["sampling_rate_hz"],
-        ),
-        (
-            "blocks",
-            (blocks.sizes["block"], blocks.attrs["block_samples"]),
-            (simulated.sizes["block"], simulated.attrs["block_samples"]),
-        ),
-        ("axes", list(blocks["axis"].values), list(simulated["axis"].values)),
-    ):
-        if wanted != got:
-            raise SchemaError(
-                f"simulation: {name} {got}, but {wanted} in the recording; "
-                "simulate with --like RECORDING"
-            )
-    chosen, reason = find_quiescent_blocks(simulated, settings=settings)
-    posteriors, level, unexplained = _calibrate_simulation(simulated, chosen, settings)
-    plain = (
-        np.einsum(
-            "abfn,an->abf",
-            noise_powers(simulated),
-            np.stack([posterior.square for posterior in posteriors]),
-        )
-        * level[..., None]
-    )
-    shown = measure_extra_statistics(simulated, plain, unexplained, settings=settings)
-    noise = np.einsum(
-        "abfn,an->abf",
-        noise_powers(blocks),
-        np.stack([posterior.square for posterior in posteriors]),
-    )
-    attrs = {
-        "source": "simulation",
-        "calibrated_on": find_quiescent_spans(simulated, chosen),
-        "quiet_by": reason,
-    }
-    spectrum = noise * level[..., None] * shown.form[:, None]
-    given = given_quiescent_blocks(blocks, quiet, settings=settings)
-    if given is not None:
-        chosen, attrs["quiet_by"] = given, GIVEN
-        attrs["calibrated_on"] = find_quiescent_spans(blocks, chosen)
-        factor, error = quiescent_level(blocks, spectrum, 0.0 * spectrum, chosen)
-        posteriors = _scale_axes(blocks, posteriors, factor, error)
-        spectrum = spectrum * factor[:, None, None]
-    return add_extra_statistics(
-        assemble_baseline(
-            blocks, posteriors, quiet=chosen, attrs=attrs, spectrum=spectrum, settings=settings
-        ),
-        shown,
-        blocks,
-    )
-
-
-def _calibrate_simulation(
-    simulated: xr.Dataset, chosen: NDArray[np.bool_], settings: Settings
-) -> tuple[list[Posterior], Array, NDArray[np.bool_]]:
-    """Calibrate a simulation on the bands that the noise terms explain.
-
-    Returns the noise of every axis, its level over time (axis, block), and the unexplained bands
-    (axis, band).
-    """
-    columns = noise_powers(simulated)
-    unexplained = np.zeros((simulated.sizes["axis"], simulated.sizes["band"]), np.bool_)
-    while True:
-        explained = simulated.assign(
-            power=simulated["power"].where(~xr.DataArray(unexplained, dims=("axis", "band")))
-        )
-        posteriors = _calibrate_axes(explained, chosen, settings)
-        plain = np.einsum(
-            "abfn,an->abf", columns, np.stack([posterior.square for posterior in posteriors])
-        )
-        level = _level_over_time(explained, plain, settings)
-        newly_unexplained = worst_band(
-            explained, plain * level[..., None], min_sigma=settings.excess_sigma
-        ) & (unexplained.sum(axis=1, keepdims=True) < unexplained.shape[1] - _MIN_BANDS)
-        if not newly_unexplained.any():
-            return posteriors, level, unexplained
-        unexplained |= newly_unexplained
-
-
-def _level_over_time(simulated: xr.Dataset, plain: Array, settings: Settings) -> Array:
-    """Return the noise level of every block (axis, block); 1 if not significant."""
-    power, shape = (simulated[name].values for name in ("power", "shape"))
-    level = np.ones(plain.shape[:2])
-    for row in range(len(plain)):
-        risen, deviation = noise_level_excess(
-            power[row] / plain[row] - 1.0, shape[row], settings=settings
-        )
-        level[row] = np.where(deviation > settings.excess_sigma, risen, 1.0)
-    return level

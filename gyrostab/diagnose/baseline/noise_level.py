@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 import xarray as xr
@@ -12,7 +13,7 @@ from gyrostab.diagnose.baseline.expected_statistics import common_variance
 from gyrostab.diagnose.baseline.posterior import Posterior
 from gyrostab.errors import SchemaError
 
-__all__ = ["quiescent_level", "scale_noise"]
+__all__ = ["quiescent_level", "scale_axes"]
 
 Array = NDArray[np.float64]
 _ROUNDS = 20  # of Fisher scoring, which converges quadratically
@@ -80,21 +81,15 @@ def _fit_factor(power: Array, noise: Array, added: Array, weight: Array) -> tupl
     return factor, 1.0 / (factor * math.sqrt(information))
 
 
-def scale_noise(
+def _scale_noise(
     noise: Posterior, factor: float, error: float, rng: np.random.Generator
 ) -> Posterior:
     """Scale the noise of an axis, with the error of the scale in its draws.
 
     Parameters
     ----------
-    noise : Posterior
-        Noise of the simulation.
-    factor : float
-        Factor of its power.
     error : float
         Standard error of `factor`, relative to it.
-    rng : numpy.random.Generator
-        Generator of the draws.
     """
     scatter = rng.gamma(error**-2, error**2, (len(noise.draws), 1))
     return noise._replace(
@@ -105,3 +100,22 @@ def scale_noise(
         draws=noise.draws * factor * scatter,
         slow=noise.slow * factor * scatter,
     )
+
+
+def scale_axes(
+    blocks: xr.Dataset, posteriors: list[Posterior], factor: Array, error: Array
+) -> list[Posterior]:
+    """Scale the noise of all axes, with the errors of the factors, and say so."""
+    sizes = ", ".join(
+        f"{root:.3g} on axis {axis}"
+        for axis, root in zip(blocks["axis"].values, np.sqrt(factor), strict=True)
+    )
+    warnings.warn(
+        f"the noise of the simulation is multiplied by {sizes}: its level in the quiet time given",
+        stacklevel=2,
+    )
+    scalings = zip(posteriors, factor.tolist(), error.tolist(), strict=True)
+    return [
+        _scale_noise(posterior, by, relative_error, np.random.default_rng(row))
+        for row, (posterior, by, relative_error) in enumerate(scalings)
+    ]

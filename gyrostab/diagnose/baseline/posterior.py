@@ -33,31 +33,16 @@ _PRIOR_PRECISION = 1e-9  # of effects in the means, over that of one mean; nearl
 
 
 class Fit(NamedTuple):
-    """Band powers as a sum of noise terms and effects.
+    """Band powers as a sum of noise terms and effects."""
 
-    Attributes
-    ----------
-    power, weight : ndarray, shape (cell,)
-        Powers, averaged over blocks, and the shapes of their gamma distributions.
-    columns : ndarray, shape (cell, 4)
-        Power of the noise terms per squared coefficient.
-    known : ndarray, shape (cell,), optional
-        Known power of effects.
-    free_columns : ndarray, shape (cell, column), optional
-        Power of effects per unit of free sizes.
-    precision : ndarray, shape (column,), optional
-        Precisions of normal priors of these sizes about 0.
-    start : ndarray, shape (cell,), optional
-        Expected powers to start from; white noise by default.
-    """
-
+    #: (cell,): powers, averaged over blocks, and the shapes of their gamma distributions.
     power: Array
-    columns: Array
+    columns: Array  # (cell, 4): power of the noise terms per squared coefficient
     weight: Array
-    known: Array | None = None
-    free_columns: Array | None = None
-    precision: Array | None = None
-    start: Array | None = None
+    known: Array | None = None  # (cell,): known power of effects
+    free_columns: Array | None = None  # (cell, column): power of effects per unit of free sizes
+    precision: Array | None = None  # (column,): precisions of normal priors of these sizes about 0
+    start: Array | None = None  # (cell,): expected powers to start from; white noise by default
 
     def rest(self) -> Array:
         """Return the powers minus the known ones."""
@@ -74,31 +59,20 @@ class Fit(NamedTuple):
 
 
 class Posterior(NamedTuple):
-    """Noise of one axis.
+    """Noise of one axis."""
 
-    Attributes
-    ----------
-    square, error : ndarray, shape (4,)
-        Squares of Q, N, B, K that fit the band powers best, and their errors [squared units of the
-        noise table].
-    K, B, weight : ndarray, shape (cell,)
-        Fine grid of K and B, and its posterior probabilities.
-    draws : ndarray, shape (draw, 4)
-        Squares of Q, N, B, K in the band powers.
-    slow : ndarray, shape (draw, 2)
-        Squares of B and K in the block means; the same as in `draws` when `joined`.
-    joined : bool
-        Whether band powers and means agree about B and K.
-    """
-
+    #: (4,): squares of Q, N, B, K that fit the band powers best, and their errors [squared units of
+    #: the noise table].
     square: Array
     error: Array
+    #: (cell,): fine grid of K and B, and its posterior probabilities.
     K: Array
     B: Array
     weight: Array
-    draws: Array
+    draws: Array  # (draw, 4): squares of Q, N, B, K in the band powers
+    #: (draw, 2): squares of B and K in the block means; the same as in `draws` when `joined`.
     slow: Array
-    joined: bool
+    joined: bool  # whether band powers and means agree about B and K
 
 
 def average_blocks(power: Array, shape: Array, columns: Array) -> Fit:
@@ -336,8 +310,6 @@ def noise_posterior(
         Quiescent blocks with a mean.
     step : float
         Length of a block [s].
-    draws : int
-        Number of draws from the posterior.
     effects : ndarray, shape (block, column), optional
         Designs of effects in the means, of any size.
     max_disagreement_nats : float

@@ -178,11 +178,6 @@ def find_quiescent_blocks(
     quiet : ndarray of bool, shape (axis, block)
     reason : str
         Description of the criterion.
-
-    Raises
-    ------
-    OptionError
-        As `given_quiescent_blocks`.
     """
     n = blocks.sizes["block"]
     given = given_quiescent_blocks(blocks, quiet, settings=settings)
@@ -205,11 +200,6 @@ def given_quiescent_blocks(
     blocks: xr.Dataset, quiet: Any, *, settings: Settings = DEFAULTS
 ) -> NDArray[np.bool_] | None:
     """Return the blocks (axis, block) given as quiescent by the user, if they can be used.
-
-    Parameters
-    ----------
-    quiet : array_like of bool (block,), or sequence of (start, end), or None
-        As `find_quiescent_blocks` takes it.
 
     Returns
     -------

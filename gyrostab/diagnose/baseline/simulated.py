@@ -26,27 +26,16 @@ _SMOOTHING_LINES = 5  # over which a peak is smoothed; design choice
 
 
 class ExtraStatistics(NamedTuple):
-    """Stationary statistics of a simulation in addition to its noise terms.
+    """Stationary statistics of a simulation in addition to its noise terms."""
 
-    Attributes
-    ----------
-    form : ndarray, shape (axis, band)
-        Its powers over those of the noise terms; 1 on axes that agree.
-    form_shape : ndarray, shape (axis, band)
-        Shape of the gamma distribution of `form`; infinite if it is 1.
-    coherency : ndarray of complex, shape (pair, band)
-        Coherency of the axes; 0 if not significant.
-    coherency_error : ndarray, shape (pair, band)
-        Standard deviation of its real and imaginary parts; 0 if it is 0.
-    lines, peaks : ndarray, shape (axis, line)
-        Power of steady lines, and other power missing in the noise terms near unexplained bands
-        [degree2 hour-2 Hz-1].
-    """
-
-    form: Array
+    form: Array  # (axis, band): its powers over those of the noise terms; 1 on axes that agree
+    #: (axis, band): shape of the gamma distribution of `form`; infinite if it is 1.
     form_shape: Array
-    coherency: NDArray[np.complex128]
+    coherency: NDArray[np.complex128]  # (pair, band): coherency of the axes; 0 if not significant
+    #: (pair, band): standard deviation of its real and imaginary parts; 0 if it is 0.
     coherency_error: Array
+    #: (axis, line): power of steady lines, and other power missing in the noise terms near
+    #: unexplained bands [degree2 hour-2 Hz-1].
     lines: Array
     peaks: Array
 

@@ -18,24 +18,12 @@ Array = NDArray[np.float64]
 
 
 class Wandering(NamedTuple):
-    """Random means of all axes.
+    """Random means of all axes."""
 
-    Attributes
-    ----------
-    square : ndarray, shape (axis, process)
-        Variances of exponentially correlated biases [degree2 hour-2].
-    time : ndarray, shape (process,)
-        Their correlation times [s].
-    walk : ndarray, shape (axis, block)
-        Growth of the variance of random walks [degree2 hour-2 s-1].
-    power : ndarray, shape (axis, block)
-        Power of all of them in the lowest band [degree2 hour-2 Hz-1].
-    """
-
-    square: Array
-    time: Array
-    walk: Array
-    power: Array
+    square: Array  # (axis, process): variances of exponentially correlated biases [degree2 hour-2]
+    time: Array  # (process,): their correlation times [s]
+    walk: Array  # (axis, block): growth of the variance of random walks [degree2 hour-2 s-1]
+    power: Array  # (axis, block): power of all of them in the lowest band [degree2 hour-2 Hz-1]
 
 
 def is_described_by_variance(seen: Prediction) -> bool:

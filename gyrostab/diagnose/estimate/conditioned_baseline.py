@@ -37,8 +37,6 @@ def predict_baseline(
     ----------
     identifications : Identifications
         The effects, with those that were expected; their nuisance parameters are kept.
-    baseline : xarray.Dataset
-        The baseline that the identification started from.
     known : ndarray of bool, shape (block,), optional
         Blocks that the sizes are fitted to; all by default.
     left_out : sequence of Identification, optional

@@ -21,15 +21,7 @@ __all__ = ["expected_baseline", "fit_expected", "without_expected"]
 def expected_baseline(
     identifications: Identifications, baseline: xr.Dataset, known: NDArray[np.bool_] | None = None
 ) -> xr.Dataset:
-    """Return the baseline with the expected effects only, fitted to the `known` blocks.
-
-    Parameters
-    ----------
-    baseline : xarray.Dataset
-        The baseline that the identification started from.
-    known : ndarray of bool, shape (block,), optional
-        Blocks that the sizes are fitted to; all by default.
-    """
+    """Return the baseline with the expected effects only, fitted to the `known` blocks."""
     return (
         predict_baseline(replace(identifications, identified=(), unknown=()), baseline, known)
         if identifications.expected

@@ -47,23 +47,14 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Fitted:
-    """An effect with its sizes, on one axis or on several together.
-
-    Attributes
-    ----------
-    parameters : mapping of str to Estimate
-        Keys are ``name``, or ``name.axis`` for a size of each of several axes.
-    effect : Effect or None
-        With these sizes, as a model takes it; None where they make no effect.
-    note : str
-        What the sizes do not show.
-    """
+    """An effect with its sizes, on one axis or on several together."""
 
     identification: Identification
     axes: tuple[str, ...]
+    #: Keys are ``name``, or ``name.axis`` for a size of each of several axes.
     parameters: Mapping[str, Estimate]
-    effect: Effect | None
-    note: str = ""
+    effect: Effect | None  # with these sizes, as a model takes it; None where they make no effect
+    note: str = ""  # what the sizes do not show
 
     def say(self) -> str:
         """Describe the effect with its sizes in one sentence; empty without sizes."""
@@ -75,13 +66,6 @@ class Fitted:
 
 def fit_identifications(identifications: Identifications, baseline: xr.Dataset) -> list[Fitted]:
     """Fit all identified effects, each with the others in the model.
-
-    Parameters
-    ----------
-    identifications : Identifications
-        From `gyrostab.diagnose.identify.forward_search.name_effects`.
-    baseline : xarray.Dataset
-        The baseline that the identification started from.
 
     Returns
     -------

@@ -18,7 +18,6 @@ from gyrostab.diagnose.baseline.expected_statistics import (
     noise_powers,
     white_variance,
 )
-from gyrostab.diagnose.baseline.known_effects import find_drivers
 from gyrostab.diagnose.baseline.posterior import (
     Fit,
     Posterior,
@@ -26,6 +25,7 @@ from gyrostab.diagnose.baseline.posterior import (
     floor_square,
     noise_posterior,
 )
+from gyrostab.diagnose.baseline.predicted_effects import find_drivers
 from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_identifications
 from gyrostab.diagnose.identify.identification import Identifications, components_of
 from gyrostab.diagnose.predict.candidates import Component
@@ -44,27 +44,13 @@ LEVEL_GROUPS = 150  # of blocks of similar level, over which powers are averaged
 
 @dataclass
 class AxisEffects:
-    """What the effects do on one axis.
+    """What the effects do on one axis."""
 
-    Attributes
-    ----------
-    known : ndarray, shape (block, band)
-        Power of fixed size.
-    response : ndarray, shape (band,)
-        Factor of the noise.
-    doubt : float
-        Relative error of `known`.
-    free : list of ndarray, shape (block, band)
-        Power per unit of a free size.
-    means : list of ndarray, shape (block,)
-        Means per unit of a free size.
-    """
-
-    known: Array
-    response: Array
-    doubt: float
-    free: list[Array] = field(default_factory=list)
-    means: list[Array] = field(default_factory=list)
+    known: Array  # (block, band): power of fixed size
+    response: Array  # (band,): factor of the noise
+    doubt: float  # relative error of `known`
+    free: list[Array] = field(default_factory=list)  # (block, band): power per unit of a free size
+    means: list[Array] = field(default_factory=list)  # (block,): means per unit of a free size
 
 
 def recalibrate(
@@ -84,8 +70,6 @@ def recalibrate(
     baseline : xarray.Dataset
         The baseline that the identification started from; returned as it is unless it was
         calibrated on the recording.
-    fitted : sequence of Fitted
-        The effects with their sizes.
     known : ndarray of bool, shape (block,), optional
         Blocks that may be used; all by default.
 
@@ -378,11 +362,6 @@ def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identi
     """Return the identifications with designs for another noise.
 
     A share of N^2 is a share of the new one.
-
-    Parameters
-    ----------
-    baseline : xarray.Dataset
-        With the new noise.
     """
     blocks = identifications.state.blocks
     swapped = {}

@@ -35,7 +35,7 @@ def expected_processes(baseline: xr.Dataset, axis: str | int) -> RandomProcesses
     Parameters
     ----------
     baseline : xarray.Dataset
-        From `gyrostab.diagnose.baseline.calibrate.baseline_from_model`, with ``wander_square``
+        From `gyrostab.diagnose.baseline.from_model.baseline_from_model`, with ``wander_square``
         (axis, wander), ``wander_time`` (wander) and ``wander_walk`` (axis, block). Without these,
         there are no such processes.
     axis : str or int

@@ -81,14 +81,10 @@ def null_records(
 
     Parameters
     ----------
-    blocks : xarray.Dataset
-        The recording, for its blocks, gaps and channels.
     baseline : xarray.Dataset
         From `calibrate_noise`, `baseline_from_model` or `baseline_from_simulation`.
     rng : numpy.random.Generator
         Generator; the same state gives the same records for the same `chunk`.
-    chunk : int
-        Number of records drawn at a time.
 
     Yields
     ------

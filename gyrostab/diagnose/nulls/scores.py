@@ -62,19 +62,11 @@ class StatisticNull:
 
 @dataclass(frozen=True)
 class NullScores:
-    """All statistics in null records.
+    """All statistics in null records."""
 
-    Attributes
-    ----------
-    statistics : mapping of str to StatisticNull
-        By the names of `gyrostab.diagnose.statistics.STATISTICS`.
-    family : Tail
-        Of the largest ``-log p`` over the statistics, with p of each one's largest score.
-    records : int
-        Number of null records.
-    """
-
+    #: By the names of `gyrostab.diagnose.statistics.STATISTICS`.
     statistics: Mapping[str, StatisticNull]
+    #: The largest ``-log p`` over the statistics, with p of each one's largest score.
     family: MaximumDistribution
     records: int
 
@@ -96,8 +88,6 @@ def null_scores(
 
     Parameters
     ----------
-    baseline : xarray.Dataset
-        Expectation of the scores.
     nulls : iterable of xarray.Dataset
         Null records in chunks with a leading dimension ``record``.
     """

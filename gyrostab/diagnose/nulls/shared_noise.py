@@ -17,26 +17,14 @@ _MIN_EIGENVALUE = 1e-9  # of a coherence: with gaps it may be negative for nearl
 
 
 class SharedNoise(NamedTuple):
-    """Noise that axes have in common.
+    """Noise that axes have in common."""
 
-    Attributes
-    ----------
-    root : ndarray of complex, shape (block, band, axis, axis)
-        Square root of the coherency matrix.
-    pairs : list of (int, int)
-        Indices of the axes of each pair.
-    axis_shape : ndarray, shape (axis, block, band)
-        Shape of the gamma distribution of each power.
-    pair_shape : ndarray, shape (pair, block, band)
-        The same for samples that both axes of a pair have.
-    white : ndarray, shape (block, axis, axis)
-        Square root of the correlation matrix of the white noise of the block means.
-    """
-
-    root: NDArray[np.complex128]
-    pairs: list[tuple[int, int]]
-    axis_shape: Array
-    pair_shape: Array
+    root: NDArray[np.complex128]  # (block, band, axis, axis): square root of the coherency matrix
+    pairs: list[tuple[int, int]]  # indices of the axes of each pair
+    axis_shape: Array  # (axis, block, band): shape of the gamma distribution of each power
+    pair_shape: Array  # (pair, block, band): the same for samples that both axes of a pair have
+    #: (block, axis, axis): square root of the correlation matrix of the white noise of the block
+    #: means.
     white: Array
 
 

@@ -129,18 +129,11 @@ def attribute_mismatches(
         Mismatches from `gyrostab.diagnose.locate.mismatches.locate_mismatches`.
     blocks, after : xarray.Dataset
         The recording, and the baseline with the effects.
-    level : float
-        False-alarm level.
     without : callable, optional
         Returns the baseline with the effects except those given, at the sizes of the joint fit.
         Without it, every effect at the place of a mismatch explains it.
     still : xarray.Dataset, optional
         Line spectra of the recording without the blocks in which an effect moves the rate.
-
-    Returns
-    -------
-    list of list of str
-        Names of effects, for each mismatch.
     """
     regions = [
         {str(name): found[name].values[number] for name in found.data_vars}

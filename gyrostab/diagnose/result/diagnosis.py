@@ -159,8 +159,6 @@ def model_text(model: Mapping[str, Any], *, heading: str = "") -> str:
     ----------
     model : mapping
         Tables ``noise``, ``log`` and lists of tables ``effect``, ``environment``.
-    heading : str
-        Comment lines to begin with.
 
     Examples
     --------

@@ -52,20 +52,11 @@ __all__ = ["Fit", "finish_diagnosis", "fit_supported", "measure_evidence", "refi
 
 
 class Fit(NamedTuple):
-    """The effects with their final sizes.
+    """The effects with their final sizes."""
 
-    Attributes
-    ----------
-    identifications : Identifications
-        With designs for the noise below.
-    noise : xarray.Dataset
-        The baseline with the noise that the effects leave.
-    fitted, expected : list of Fitted
-        Effects that the simulation lacks, and those that it already contains.
-    """
-
-    identifications: Identifications
-    noise: xr.Dataset
+    identifications: Identifications  # with designs for the noise below
+    noise: xr.Dataset  # the baseline with the noise that the effects leave
+    #: Effects that the simulation lacks, and those that it already contains.
     fitted: list[Fitted]
     expected: list[Fitted]
 

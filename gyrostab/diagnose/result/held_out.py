@@ -181,8 +181,6 @@ def log_likelihood(
 
     Parameters
     ----------
-    blocks, baseline : xarray.Dataset
-        The recording, and a model.
     known, held : ndarray of bool (block,)
         Blocks to predict from, and blocks to predict.
     """

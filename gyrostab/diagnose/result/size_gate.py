@@ -56,11 +56,6 @@ def keep_supported(
     What an effect gained on the other axes becomes unidentified if that exceeds its threshold:
     something is there, but the record does not show that this effect caused it.
 
-    Parameters
-    ----------
-    fitted : sequence of sequence of Fitted
-        Fits of each identification, in the same order.
-
     Returns
     -------
     Identifications

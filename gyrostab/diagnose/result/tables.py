@@ -17,6 +17,7 @@ from gyrostab.diagnose.identify.components import are_lines
 from gyrostab.diagnose.identify.forward_search import MIN_P_VALUE, tail_probability
 from gyrostab.diagnose.identify.identification import Identification, Identifications, Unidentified
 from gyrostab.diagnose.identify.nuisance_alternatives import NUISANCE_ALTERNATIVES
+from gyrostab.diagnose.predict.windows import channel_units
 from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
 from gyrostab.diagnose.result.diagnosis import effect_table
@@ -72,18 +73,13 @@ def iso(blocks: xr.Dataset, seconds: float) -> str:
 
 def recording_table(blocks: xr.Dataset) -> dict[str, Any]:
     """Describe the recording."""
-    channels = [
-        str(name).removeprefix("channel_")
-        for name in blocks.data_vars
-        if str(name).startswith("channel_")
-    ]
     return {
         "files": [str(name) for name in blocks.attrs["source_files"]],
         "axes": [str(axis) for axis in blocks["axis"].values],
         "start": blocks.attrs["start"],
         "end": blocks.attrs["end"],
         "sampling_rate_hz": float(blocks.attrs["sampling_rate_hz"]),
-        "channels": channels,
+        "channels": list(channel_units(blocks)),
         "missing_share": float(blocks.attrs["missing_share"]),
     }
 

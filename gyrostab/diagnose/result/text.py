@@ -118,8 +118,6 @@ def mismatch_statement(region: Mapping[str, Any], whole: float) -> str:
     ----------
     region : mapping
         Fields of `gyrostab.diagnose.locate.mismatches.FIELDS`, with ``axes`` as a list.
-    whole : float
-        Length of the record [s].
 
     Examples
     --------

@@ -29,11 +29,6 @@ def _has_coverage(held: Mapping[str, Any], tolerance: float) -> bool:
 def failed_checks(held: Mapping[str, Any], *, settings: Settings = DEFAULTS) -> list[str]:
     """List the held-out checks that the effects fail.
 
-    Parameters
-    ----------
-    held : mapping
-        The table ``held_out`` of a diagnosis.
-
     Examples
     --------
     >>> held = {"log_likelihood_gain": 41.2, "forecast_gain": -3.0,
@@ -66,15 +61,6 @@ def decide_verdict(
     settings: Settings = DEFAULTS,
 ) -> str:
     """Choose one of `gyrostab.diagnose.result.content.VERDICTS`.
-
-    Parameters
-    ----------
-    mismatches, named : sequence
-        Mismatches, and named effects.
-    unexplained : iterable of int
-        Mismatches that no effect explains.
-    held : mapping
-        The table ``held_out`` of a diagnosis.
 
     Examples
     --------

@@ -29,7 +29,7 @@ from gyrostab.diagnose.predict.candidates import (
 from gyrostab.diagnose.predict.condition import free_shape
 from gyrostab.diagnose.predict.linear_model import State, cross_without
 from gyrostab.diagnose.predict.search import Trial
-from gyrostab.diagnose.reduce.block_statistics import MIN_MEAN_SHARE
+from gyrostab.diagnose.reduce.label_statistics import MIN_MEAN_SHARE
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics.base import NullDraw, SizeFit, Sizes, Statistic
 from gyrostab.diagnose.statistics.null_counts import null_counts

@@ -6,16 +6,14 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import (
-    baseline_from_model,
-    baseline_from_simulation,
-    calibrate_noise,
-)
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.expected_statistics import (
     common_variance,
     noise_powers,
     white_variance,
 )
+from gyrostab.diagnose.baseline.from_model import baseline_from_model
+from gyrostab.diagnose.baseline.from_simulation import baseline_from_simulation
 from gyrostab.diagnose.baseline.posterior import Fit, fit_squares
 from gyrostab.diagnose.baseline.quiescent import find_quiescent_blocks
 from gyrostab.diagnose.nulls.records import null_records

@@ -9,8 +9,8 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.diagnose.baseline.calibrate import baseline_from_model
-from gyrostab.diagnose.baseline.known_effects import remove_known_lines
+from gyrostab.diagnose.baseline.from_model import baseline_from_model
+from gyrostab.diagnose.baseline.known_lines import remove_known_lines
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines, line_evidence
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import gyrostab
-from gyrostab.diagnose.baseline.calibrate import baseline_from_model
+from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
 

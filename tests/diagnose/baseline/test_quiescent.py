@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 import gyrostab
-from gyrostab.diagnose.baseline.calibrate import (
-    baseline_from_model,
-    baseline_from_simulation,
-    calibrate_noise,
-)
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.baseline.from_model import baseline_from_model
+from gyrostab.diagnose.baseline.from_simulation import baseline_from_simulation
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.errors import OptionError
 from tests.diagnose.baseline.test_calibrate import NOISE, SHAKEN, log

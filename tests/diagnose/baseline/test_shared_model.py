@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.diagnose.baseline.calibrate import baseline_from_model
+from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate

@@ -7,7 +7,7 @@ import pytest
 from scipy import signal
 
 import gyrostab
-from gyrostab.diagnose.baseline.calibrate import baseline_from_model
+from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion
 from gyrostab.diagnose.evidence.wandering import block_mean_variance, expected_processes
 from gyrostab.diagnose.nulls.records import null_records

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 from scipy.signal import lfilter
 
-from gyrostab.diagnose.baseline.calibrate import baseline_from_model
+from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.components import group_components, sum_evidence
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates

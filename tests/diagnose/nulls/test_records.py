@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import baseline_from_model, calibrate_noise
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.reduce.outliers import EXPECTED_FALSE_OUTLIERS

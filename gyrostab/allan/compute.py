@@ -1,0 +1,261 @@
+"""Computation of a surface: units of work, with all dask calls, and the published methods."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import dask
+import dask.array as da
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.allan.plan import Plan, last_sample, thin_factors, units_of_work
+from gyrostab.allan.variance import variance_columns, white_freedoms
+from gyrostab.errors import OptionError
+from gyrostab.kernels.allan.gap_edges import gap_edge_ratio
+from gyrostab.kernels.allan.outlier_count import count_outliers
+from gyrostab.kernels.allan.reference import direct_sums, recursive_sums, reference_theta
+from gyrostab.kernels.allan.surface import STRICT, Cells, Unit, surface_unit, window_means
+from gyrostab.kernels.allan.trend import window_trends
+from gyrostab.kernels.fit.covariance import diagonal_products
+from gyrostab.kernels.fit.least_squares import cell_freedoms, combine_diagonal, identify_noise
+from gyrostab.kernels.fit.third_differences import third_diagonals
+from gyrostab.kernels.workspace import Workspace
+from gyrostab.noise import HOUR, sample_squares
+from gyrostab.store.lazy import find_source, keep_sources, read_into, read_slice
+
+__all__ = [
+    "CELL_FIELDS",
+    "FIELD_TYPES",
+    "PLANE_FIELDS",
+    "compute_unit",
+    "join_units",
+    "make_noise_tables",
+    "read_spans",
+    "run_published_method",
+    "run_units",
+]
+
+Floats = NDArray[np.float64]
+
+#: Variables by axis, window and averaging time, in the order in which `compute_unit` returns them.
+CELL_FIELDS = (*Cells._fields, "edf")
+#: Types of the variables that are not float64.
+FIELD_TYPES = {"count": np.int64, "estimator": np.int8, "outlier_count": np.int64}
+#: Variables by axis and window, in the order in which `compute_unit` returns them.
+PLANE_FIELDS = (
+    "window_mean",
+    "window_coverage",
+    "window_trend",
+    "trend_response",
+    "outlier_count",
+    "gap_edge_ratio",
+)
+#: Largest number of samples of a part of which all axes are read together.
+_MAX_SAMPLES_READ_AT_ONCE = 2**21
+
+
+def read_spans(
+    data: Any, spans: Sequence[tuple[int, int]], space: Workspace
+) -> Iterator[NDArray[np.generic]]:
+    """Read the samples of each span, axis by axis; use each result before asking for the next.
+
+    Without dask, spans are read one by one, and the samples that two spans share are read once.
+    With dask, all axes are read together if they are few.
+    """
+    begin, end = spans[0][0], spans[-1][1]
+    if find_source(data) is not None:
+        longest = max(last - first for first, last in spans)
+        line = space.array("samples", longest).view(data.dtype)[:longest]
+        for row in range(data.shape[0]):
+            held_from = held_to = begin
+            for first, last in spans:
+                shared = max(held_to - first, 0)
+                line[:shared] = line[first - held_from : held_to - held_from]
+                read_into(data, row, first + shared, line[shared : last - first])
+                held_from, held_to = first, last
+                yield line[: last - first]
+        return
+    together = 1 if data.shape[0] * (end - begin) > _MAX_SAMPLES_READ_AT_ONCE else data.shape[0]
+    for row in range(0, data.shape[0], together):
+        for whole in read_slice(data[row : row + together], begin, end):
+            yield from (whole[first - begin : last - begin] for first, last in spans)
+
+
+def compute_unit(
+    x: NDArray[np.generic], unit: Unit, tables: NoiseTables, space: Workspace | None = None
+) -> tuple[list[Floats], Floats]:
+    """Compute one unit: the fields of the cells, see `Cells`, and plane fields (6, n_windows)."""
+    x = np.ascontiguousarray(x)
+    cells, means = surface_unit(x, unit, space)
+    scale = (
+        HOUR if unit.angle else 1.0
+    )  # angles are in degree, so their slopes in degree per second
+    if unit.angle:
+        cells.avar[:] *= scale**2
+    means[0] *= scale
+    fields = [*cells, _cell_freedoms(cells, tables)]
+    return fields, np.concatenate([means, _describe_windows(x, unit)])
+
+
+def _stack_unit(x: NDArray[np.generic], unit: Unit, tables: NoiseTables) -> tuple[Floats, Floats]:
+    """`compute_unit` with all fields in one array (9, n_windows, n_tau)."""
+    fields, means = compute_unit(x, unit, tables)
+    return np.stack(np.broadcast_arrays(*fields)), means
+
+
+def join_units(
+    results: Sequence[tuple[list[Floats], Floats]], n_axes: int
+) -> tuple[list[NDArray[Any]], Floats]:
+    """Join units, axis by axis: fields (axis, time, tau), plane fields (6, axis, time).
+
+    A field that is the same in all windows is stored once, and repeated as a view.
+    """
+    sizes = [plane.shape[1] for _, plane in results]
+    fields = [
+        _join_field([unit[i] for unit, _ in results], sizes, n_axes, FIELD_TYPES.get(name, float))
+        for i, name in enumerate(CELL_FIELDS)
+    ]
+    means = np.concatenate([plane for _, plane in results], axis=1)
+    return fields, means.reshape(len(PLANE_FIELDS), n_axes, -1)
+
+
+def _join_field(parts: list[Floats], sizes: list[int], n_axes: int, kind: Any) -> NDArray[Any]:
+    shape = n_axes, sum(sizes) // n_axes, parts[0].shape[1]
+    parts = [part.astype(kind, copy=False) for part in parts]
+    if all(part.shape[0] == 1 and np.array_equal(part, parts[0]) for part in parts):
+        return np.broadcast_to(parts[0], shape)
+    if len(parts) > 1:
+        rows = zip(parts, sizes, strict=True)
+        parts = [np.concatenate([np.broadcast_to(part, (n, shape[2])) for part, n in rows])]
+    return parts[0].reshape(shape)
+
+
+def _describe_windows(
+    x: NDArray[np.generic], unit: Unit, windows: int | None = None
+) -> NDArray[np.float64]:
+    """Compute the plane fields from the trend on, (4, n_windows)."""
+    count = (x.size - unit.window - unit.angle) // unit.step + 1 if windows is None else windows
+    first = np.arange(count) * unit.step
+    trends = window_trends(x, angle=unit.angle, window=unit.window, step=unit.step, n_windows=count)
+    trends[0] *= HOUR / unit.interval * (HOUR / unit.interval if unit.angle else 1.0)
+    outliers = count_outliers(x, first, unit.window)
+    return np.vstack([trends, outliers, gap_edge_ratio(x, first, unit.window)])
+
+
+class NoiseTables(NamedTuple):
+    """Arguments of `identify_noise` and `cell_freedoms` that all windows share."""
+
+    chosen: NDArray[np.int64]
+    columns: Floats
+    weight: Floats
+    to_samples: Floats
+    diagonal: Floats
+
+
+def make_noise_tables(plan: Plan) -> NoiseTables:
+    """Make the tables for the degrees of freedom, once for all parts of a log."""
+    unit = plan.unit
+    factors, thinning = tuple(unit.ks.tolist()), tuple(unit.shifts.tolist())
+    return _cached_noise_tables(unit.window, factors, thinning, plan.rate, unit.variance)
+
+
+@lru_cache(maxsize=4)
+def _cached_noise_tables(
+    window: int, factors: tuple[int, ...], thinning: tuple[int, ...], rate: float, variance: str
+) -> NoiseTables:
+    ks, shifts = np.array(factors, dtype=np.int64), np.array(thinning, dtype=np.int64)
+    columns = variance_columns(variance, ks, rate)
+    if variance == "avar":
+        pairs, ramps = diagonal_products(window, ks, shifts)
+    else:
+        pairs, ramps = third_diagonals(variance, window, ks, shifts)
+    weight = white_freedoms(variance, window, ks, pairs)
+    diagonal = combine_diagonal(pairs, ramps)
+    return NoiseTables(thin_factors(ks), columns, weight, sample_squares(rate), diagonal)
+
+
+def _cell_freedoms(cells: Cells, tables: NoiseTables) -> Floats:
+    """Compute the degrees of freedom of cells (n_windows, n_tau) from a quick fit of the noise."""
+    chosen, columns, weight, to_samples, diagonal = tables
+    seen = (cells.avar, *cells[5:], cells.gap_factor)
+    few = [np.ascontiguousarray(field[:, chosen]) for field in seen]
+    squares = identify_noise(*few, columns[chosen], weight[chosen], to_samples)
+    return np.asarray(cell_freedoms(squares, *seen, columns, to_samples, diagonal))
+
+
+def run_units(data: Any, plan: Plan) -> tuple[Any, Any]:
+    """Run the units of work: fields (axis, time, tau), plane fields (6, axis, time).
+
+    The results are dask arrays if `data` is one.
+    """
+    lazy, unit, tables = isinstance(data, da.Array), plan.unit, make_noise_tables(plan)
+    units = units_of_work(data.shape[1], unit)
+    spans = [slice(part.start * unit.step, last_sample(part, unit)) for part in units]
+    if not lazy:
+        tasks = [
+            partial(compute_unit, data[row, span], unit, tables)
+            for row in range(data.shape[0])
+            for span in spans
+        ]
+        if len(tasks) == 1:  # a short call does not wait for a graph
+            return join_units([tasks[0]()], 1)
+        run = dask.compute(*(dask.delayed(task, pure=False)() for task in tasks))
+        return join_units(run, data.shape[0])
+    shared = dask.delayed(tables, pure=True, traverse=False)
+    work = dask.delayed(_stack_unit, nout=2, pure=False)
+    rows_cells, rows_means = [], []
+    for row in range(data.shape[0]):
+        cells, means = [], []
+        for part, span in zip(units, spans, strict=True):
+            n = part.stop - part.start
+            unit_cells, unit_means = work(data[row, span], unit, shared)
+            shape = len(CELL_FIELDS), n, unit.ks.size
+            cells.append(da.from_delayed(unit_cells, shape, dtype=np.float64))
+            means.append(da.from_delayed(unit_means, (len(PLANE_FIELDS), n), dtype=np.float64))
+        rows_cells.append(da.concatenate(cells, axis=1))
+        rows_means.append(da.concatenate(means, axis=1))
+    stacked = da.stack(rows_cells, axis=1), da.stack(rows_means, axis=1)
+    cells_array, means_array = (keep_sources(data, part) for part in stacked)
+    kinds = [FIELD_TYPES.get(name, np.float64) for name in CELL_FIELDS]
+    return [cells_array[i].astype(kind) for i, kind in enumerate(kinds)], means_array
+
+
+def run_published_method(
+    plan: Plan, method: str, *, paper: bool
+) -> tuple[list[NDArray[Any]], Floats]:
+    """Run a published algorithm in memory: fields (axis, time, tau), plane (6, axis, time)."""
+    signal, unit, _, _ = plan
+    points = unit.window + (0 if paper and not unit.angle else 1)
+    all_points = signal.sizes["time"] + (0 if unit.angle or paper else 1)
+    n_windows = (all_points - points) // unit.step + (0 if paper else 1)
+    if n_windows < 1:
+        raise OptionError(
+            "convention='paper' leaves no window, because it omits the last one; give a longer "
+            "record"
+        )
+    run = direct_sums if method == "direct" else recursive_sums
+    tables = make_noise_tables(plan)
+    full = (points - 2 * unit.ks).astype(np.float64)
+    results = []
+    for row in range(signal.sizes["axis"]):
+        x = np.asarray(signal.isel(axis=row).data)
+        theta, present, missing = reference_theta(x, angle=unit.angle, paper=paper)
+        sums, counts = run(theta, present, missing, points, unit.step, n_windows, unit.ks)
+        interval = unit.interval / HOUR if unit.angle else 1.0
+        with np.errstate(invalid="ignore", divide="ignore"):
+            avar = sums / (2.0 * (unit.ks * interval) ** 2 * (full if unit.zero_fill else counts))
+        coverage = counts / full
+        if not unit.zero_fill:
+            avar[coverage < unit.min_coverage] = np.nan
+        one = np.ones_like(avar)
+        cells = Cells(
+            avar, counts.astype(np.float64), coverage, coverage, STRICT * one, one, one, one
+        )
+        means = window_means(x, unit)[:, :n_windows]
+        means[0] *= HOUR if unit.angle else 1.0
+        plane = np.concatenate([means, _describe_windows(x, unit, n_windows)])
+        results.append(([*cells, _cell_freedoms(cells, tables)], plane))
+    return join_units(results, len(results))

@@ -1,0 +1,150 @@
+"""The baseline of a simulated log: its noise, with its level over time and other statistics."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.baseline.calibrate import assemble_baseline, calibrate_axes
+from gyrostab.diagnose.baseline.expected_statistics import noise_powers
+from gyrostab.diagnose.baseline.noise_level import quiescent_level, scale_axes
+from gyrostab.diagnose.baseline.posterior import Posterior
+from gyrostab.diagnose.baseline.quiescent import (
+    GIVEN,
+    find_quiescent_blocks,
+    find_quiescent_spans,
+    given_quiescent_blocks,
+    noise_level_excess,
+)
+from gyrostab.diagnose.baseline.simulated import (
+    add_extra_statistics,
+    measure_extra_statistics,
+    worst_band,
+)
+from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.errors import SchemaError
+
+__all__ = ["baseline_from_simulation"]
+
+Array = NDArray[np.float64]
+_MIN_BANDS = 6  # that the noise terms are fitted to, with any spectral shape
+
+
+def baseline_from_simulation(
+    blocks: xr.Dataset, simulated: xr.Dataset, *, quiet: Any = None, settings: Settings = DEFAULTS
+) -> xr.Dataset:
+    """Take the noise of a simulated log with its calibration error, and its level over time.
+
+    Its stationary statistics other than the five noise terms are taken as measured: the shape of
+    its spectrum, coherency of axes, steady lines. What a simulation does to the means over time is
+    indistinguishable from its random walk and therefore not known; `baseline_from_model` knows it.
+
+    Parameters
+    ----------
+    blocks, simulated : xarray.Dataset
+        Recording and simulation, from `reduce_log`.
+    quiet : array_like of bool (block,), or (start, end) or several of these, optional
+        Quiescent time of the recording: one factor for each axis fits the noise of the simulation
+        to it.
+
+    Raises
+    ------
+    SchemaError
+        If the two differ in axes, sampling rate or length.
+    """
+    for name, wanted, got in (
+        (
+            "sampling rate [Hz]",
+            blocks.attrs["sampling_rate_hz"],
+            simulated.attrs["sampling_rate_hz"],
+        ),
+        (
+            "blocks",
+            (blocks.sizes["block"], blocks.attrs["block_samples"]),
+            (simulated.sizes["block"], simulated.attrs["block_samples"]),
+        ),
+        ("axes", list(blocks["axis"].values), list(simulated["axis"].values)),
+    ):
+        if wanted != got:
+            raise SchemaError(
+                f"simulation: {name} {got}, but {wanted} in the recording; "
+                "simulate with --like RECORDING"
+            )
+    chosen, reason = find_quiescent_blocks(simulated, settings=settings)
+    posteriors, level, unexplained = _calibrate_simulation(simulated, chosen, settings)
+    plain = (
+        np.einsum(
+            "abfn,an->abf",
+            noise_powers(simulated),
+            np.stack([posterior.square for posterior in posteriors]),
+        )
+        * level[..., None]
+    )
+    shown = measure_extra_statistics(simulated, plain, unexplained, settings=settings)
+    noise = np.einsum(
+        "abfn,an->abf",
+        noise_powers(blocks),
+        np.stack([posterior.square for posterior in posteriors]),
+    )
+    attrs = {
+        "source": "simulation",
+        "calibrated_on": find_quiescent_spans(simulated, chosen),
+        "quiet_by": reason,
+    }
+    spectrum = noise * level[..., None] * shown.form[:, None]
+    given = given_quiescent_blocks(blocks, quiet, settings=settings)
+    if given is not None:
+        chosen, attrs["quiet_by"] = given, GIVEN
+        attrs["calibrated_on"] = find_quiescent_spans(blocks, chosen)
+        factor, error = quiescent_level(blocks, spectrum, 0.0 * spectrum, chosen)
+        posteriors = scale_axes(blocks, posteriors, factor, error)
+        spectrum = spectrum * factor[:, None, None]
+    return add_extra_statistics(
+        assemble_baseline(
+            blocks, posteriors, quiet=chosen, attrs=attrs, spectrum=spectrum, settings=settings
+        ),
+        shown,
+        blocks,
+    )
+
+
+def _calibrate_simulation(
+    simulated: xr.Dataset, chosen: NDArray[np.bool_], settings: Settings
+) -> tuple[list[Posterior], Array, NDArray[np.bool_]]:
+    """Calibrate a simulation on the bands that the noise terms explain.
+
+    Returns the noise of every axis, its level over time (axis, block), and the unexplained bands
+    (axis, band).
+    """
+    columns = noise_powers(simulated)
+    unexplained = np.zeros((simulated.sizes["axis"], simulated.sizes["band"]), np.bool_)
+    while True:
+        explained = simulated.assign(
+            power=simulated["power"].where(~xr.DataArray(unexplained, dims=("axis", "band")))
+        )
+        posteriors = calibrate_axes(explained, chosen, settings)
+        plain = np.einsum(
+            "abfn,an->abf", columns, np.stack([posterior.square for posterior in posteriors])
+        )
+        level = _level_over_time(explained, plain, settings)
+        newly_unexplained = worst_band(
+            explained, plain * level[..., None], min_sigma=settings.excess_sigma
+        ) & (unexplained.sum(axis=1, keepdims=True) < unexplained.shape[1] - _MIN_BANDS)
+        if not newly_unexplained.any():
+            return posteriors, level, unexplained
+        unexplained |= newly_unexplained
+
+
+def _level_over_time(simulated: xr.Dataset, plain: Array, settings: Settings) -> Array:
+    """Return the noise level of every block (axis, block); 1 if not significant."""
+    power, shape = (simulated[name].values for name in ("power", "shape"))
+    level = np.ones(plain.shape[:2])
+    for row in range(len(plain)):
+        risen, deviation = noise_level_excess(
+            power[row] / plain[row] - 1.0, shape[row], settings=settings
+        )
+        level[row] = np.where(deviation > settings.excess_sigma, risen, 1.0)
+    return level

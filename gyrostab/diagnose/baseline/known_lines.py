@@ -1,0 +1,189 @@
+"""Known lines and resonances of a model in the spectra at full resolution."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.baseline.predicted_effects import complex_factors, predict_effect
+from gyrostab.diagnose.evidence.spectral_lines import LEAK_LINES, expected_lines
+from gyrostab.diagnose.predict.linear_model import unspread_share
+from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
+from gyrostab.physics.base import Effect
+
+__all__ = [
+    "average_in_bands",
+    "expect_lines",
+    "independent_line_share",
+    "remove_known_lines",
+    "resonance_density",
+]
+
+Array = NDArray[np.float64]
+_LEAK_LINES = 100  # on either side, that a line leaks into; limits time
+_PLACES_BETWEEN = 4  # positions of a line on either side of a frequency of the spectrum
+_PEAK_POINTS = 1000  # within a step of a density
+
+
+def expect_lines(
+    blocks: xr.Dataset, narrow: Sequence[tuple[Effect, list[int], Array]], response: Array
+) -> dict[str, Array]:
+    """Return lines of effects after a filter (axis, band), as in `KnownEffects.lines`.
+
+    The effects come with their axes and their power in the bands.
+    """
+    axes = [str(axis) for axis in blocks["axis"].values]
+    frequency, bands = blocks["line_frequency"].values, blocks["frequency"].values
+    passed = np.stack(
+        [np.interp(np.log(frequency), np.log(bands), axis_response) for axis_response in response]
+    )
+    steady, largest, broad = (np.zeros(passed.shape) for _ in range(3))
+    near, band_power = unspread_share(blocks)[..., None], np.zeros((len(axes), bands.size))
+    leak = _line_leakage(int(blocks.attrs["block_samples"]))
+    for effect, rows, density in narrow:
+        chosen = tuple(axes[row] for row in rows)
+        prediction = predict_effect(effect, blocks, chosen, frequency)
+        band_power += (near * density).mean(axis=1) * response
+        for name, values in prediction.spectrum.items():
+            size = np.abs(complex_factors(effect, name, chosen)[:, None]) ** 2 * values.mean(
+                axis=-2
+            )
+            places = 0 if prediction.line is None else prediction.line.size // blocks.sizes["block"]
+            alone = np.count_nonzero(values, axis=-1).max() <= places
+            peak = resonance_density(effect, name, blocks, chosen)
+            if peak is not None:
+                broad[rows] += (
+                    np.abs(complex_factors(effect, name, chosen)[:, None]) ** 2
+                    * peak
+                    * passed[rows]
+                )
+                continue
+            own_leak = leak[1]
+            if (
+                alone
+                and places == 1
+                and prediction.line is not None
+                and np.ptp(prediction.line) == 0.0
+            ):
+                apart = (
+                    float(prediction.line.flat[0])
+                    - frequency[int(np.argmax(values.reshape(-1, frequency.size)[0]))]
+                )
+                own_leak = _line_leakage(
+                    int(blocks.attrs["block_samples"]), apart * float(blocks.attrs["block_s"])
+                )[0]
+            for row, power in zip(rows, size * passed[rows], strict=True):
+                (steady if alone else broad)[row] += np.convolve(
+                    power, own_leak if alone else leak[0], "same"
+                )
+                largest[row] += np.convolve(power, leak[2], "same") if alone else 0.0
+    return {"lines": steady, "lines_most": largest, "peaks": broad, "line_spectrum": band_power}
+
+
+def resonance_density(
+    effect: Effect, name: str, blocks: xr.Dataset, axes: tuple[str, ...]
+) -> Array | None:
+    """Return the tapered density of a resonance per squared unit, (line,); None without resonance.
+
+    Its peak may be narrower than the width of the taper.
+    """
+    if not math.isfinite(getattr(effect, "quality", math.inf)) or "line_frequency" not in blocks:
+        return None
+    frequency = blocks["line_frequency"].values
+    finer = 2 * _PLACES_BETWEEN
+    size = int(blocks.attrs["block_samples"])
+    fine = frequency[0] / finer * np.arange(1, finer * frequency.size + 1)
+    prediction = predict_effect(effect, blocks, axes, fine)
+    density = prediction.spectrum[name].reshape(-1, fine.size)[0].copy()
+    centre = (
+        fine.size
+        if prediction.line is None
+        else int(np.argmin(np.abs(fine - prediction.line.flat[0])))
+    )
+    inside = (np.arange(_PEAK_POINTS) + 0.5) / _PEAK_POINTS - 0.5
+    # The peak may be narrower than the steps of the density.
+    for place in range(max(centre - 1, 0), min(centre + 2, fine.size)):
+        frequencies = fine[place] + (fine[1] - fine[0]) * inside
+        density[place] = (
+            predict_effect(effect, blocks, axes, frequencies)
+            .spectrum[name]
+            .reshape(-1, inside.size)[0]
+            .mean()
+        )
+    window = np.abs(np.fft.fft(taper(size), size * finer)) ** 2
+    reach = min(_LEAK_LINES, frequency.size // 2) * finer
+    window = np.concatenate([window[-reach:], window[: reach + 1]])
+    tapered = np.convolve(
+        np.concatenate([density[::-1], density[:1], density]), window / window.sum(), "same"
+    )
+    return np.asarray(tapered[fine.size + finer :: finer])
+
+
+def average_in_bands(density: Array, blocks: xr.Dataset) -> Array:
+    """Average a density over the lines of every band."""
+    edges = band_edges(int(blocks.attrs["block_samples"])) - 1
+    return np.asarray(np.add.reduceat(density, edges[:-1]) / np.diff(edges))
+
+
+def independent_line_share(density: Array, blocks: xr.Dataset) -> Array:
+    """Return the equivalent share of independent lines of a band (axis, band).
+
+    It is below 1 if the density (axis, line) is dominated by some lines.
+    """
+    return np.stack(
+        [
+            average_in_bands(axis_density, blocks) ** 2 / average_in_bands(axis_density**2, blocks)
+            for axis_density in density
+        ]
+    )
+
+
+def _line_leakage(size: int, apart: float = 0.0) -> tuple[Array, Array, Array]:
+    """Return the share of a line in the lines around it: at an offset, on average, at most.
+
+    The offset `apart` from the middle line is in lines.
+    """
+    weights = taper(size)
+    reach = min(_LEAK_LINES, ordinates(size) // 2)
+    finer = 2 * _PLACES_BETWEEN
+    turned = weights * np.exp(2j * np.pi * apart * np.arange(size) / size)
+    padded = np.abs(np.fft.fft(turned, size * finer)) ** 2 / (size * (weights**2).sum())
+    place = np.arange(-reach, reach + 1) * finer
+    inside = padded[place[:, None] + np.arange(-_PLACES_BETWEEN, _PLACES_BETWEEN + 1)]
+    ends = np.array([0.5, *[1.0] * (2 * _PLACES_BETWEEN - 1), 0.5])
+    return inside[:, _PLACES_BETWEEN], np.average(inside, axis=1, weights=ends), inside.max(axis=1)
+
+
+def remove_known_lines(
+    blocks: xr.Dataset, baseline: xr.Dataset, *, settings: Settings = DEFAULTS
+) -> xr.Dataset:
+    """Subtract the known steady lines from the line spectrum.
+
+    The excess over a known line stays if it exceeds the model error of an effect and the scatter of
+    the noise.
+    """
+    if "lines" not in baseline:
+        return blocks
+    power, weight = blocks["line_power"], blocks["line_weight"]
+    noise = expected_lines(baseline, blocks["line_frequency"].values)[:, None]
+    known, largest = (baseline[name].values[:, None] for name in ("lines", "lines_most"))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scatter = np.sqrt((noise**2 + 2.0 * noise * largest) / weight.values[..., None])
+    above = power.values - noise - known
+    error = settings.spectrum_error_share
+    exceeds = power.values - noise - largest > error * largest + settings.known_line_sigma * scatter
+    padded_lines = np.pad(exceeds, ((0, 0), (0, 0), (LEAK_LINES, LEAK_LINES)))
+    # With the lines that it leaks into.
+    exceeds = np.lib.stride_tricks.sliding_window_view(
+        padded_lines, 2 * LEAK_LINES + 1, axis=-1
+    ).any(axis=-1)
+    freed = noise + np.where(exceeds | (largest < error * noise), above, 0.0)
+    freed = np.where(known > 0.0, np.maximum(freed, 0.0), power.values)
+    return blocks.assign(
+        line_power=power.copy(data=np.where(np.isfinite(power.values), freed, np.nan))
+    )

@@ -1,0 +1,352 @@
+"""Assembly of the dataset of block statistics from the arrays that were filled."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.reduce.accumulate import (
+    CHANNEL_PARTS,
+    HARMONICS,
+    LAGGED_CHANNEL_PREFIXES,
+    RAMP_PHASE_BINS,
+    Accumulator,
+)
+from gyrostab.diagnose.reduce.log_blocks import channel_means, numeric_channels
+from gyrostab.diagnose.reduce.outliers import count_outliers, quantization_step, zeros_beyond_chance
+from gyrostab.diagnose.reduce.schema import COORDINATES, check_block_statistics, label_variables
+from gyrostab.diagnose.reduce.zero_bin import BINS, bin_widths
+from gyrostab.kernels.regression.smooth import smooth_curve
+from gyrostab.schema import GAP_CAUSES, texts
+from gyrostab.time.grid import grid_index, grid_times
+from gyrostab.time.stamps import format_stamp, to_nanoseconds
+
+__all__ = ["MIN_MEAN_SHARE", "label_statistics"]
+
+Array = NDArray[np.float64]
+_MAX_SMOOTHING_BLOCKS = 2.0  # longest time scale of the smoothing of a channel; design choice
+_STEP_VALUES_PER_BLOCK = 256  # values from which the quantization step is found; limits time
+MIN_MEAN_SHARE = 0.1  # of a block that must be present for its mean; design choice
+
+
+def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Dataset:
+    """Assemble the dataset of block statistics."""
+    axes = slice(0, work.axes)
+    counts, moments = work.counts[axes], work.moments[axes]
+    present = counts[..., 0]
+    enough = present >= max(MIN_MEAN_SHARE * work.length, 1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        kurtosis = moments[..., 2] / moments[..., 1] ** 2 - 3.0
+    peaks, outliers = count_outliers(work.histogram, work.peaks)
+    subset, at_once = np.array(list(work.at_once), np.bool_), np.stack(list(work.at_once.values()))
+    filled = zeros_beyond_chance(work.common_zeros, counts[..., 1], present, subset, at_once)
+    steps = np.array(
+        [
+            quantization_step(_kept_values(work, row, _STEP_VALUES_PER_BLOCK))
+            for row in range(work.axes)
+        ]
+    )
+    widths = np.array([bin_widths(_kept_values(work, row), step) for row, step in enumerate(steps)])
+    line_total, line_square = np.moveaxis(work.line_counts, -1, 0)
+    weight = np.divide(
+        line_total**2, line_square, where=line_square > 0, out=np.zeros(line_total.shape)
+    )
+    weight *= _equal_block_share(work.power[axes], work.shape, present, weight.shape[1])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        lines = work.line_sum / (work.line_expected * work.rate)
+    arrays: dict[str, Any] = {
+        "mean": np.where(enough, moments[..., 0], np.nan),
+        "variance": np.where(enough, moments[..., 1], np.nan),
+        "samples": present,
+        "power": work.power[axes],
+        "shape": work.shape,
+        "neighbours": work.neighbours,
+        "kurtosis": np.where(np.isnan(work.neighbours), np.nan, kurtosis),
+        "peaks": peaks,
+        "outliers": outliers,
+        "adjacent": work.adjacent,
+        "repeats": _count_repeats(moments, counts),
+        "repeat_runs": counts[..., 7],
+        "zero_runs": counts[..., 8],
+        "extremes": _count_at_range_ends(moments, counts[..., 3], counts[..., 4]),
+        "zeros": counts[..., 1],
+        "stuck": _count_stuck(moments, counts, filled),
+        "filled": filled,
+        "axes_at_once": subset,
+        "at_once": at_once,
+        "quantization_step": steps,
+        "line_power": lines,
+        "line_weight": weight,
+        "bin_width": widths[:, 0],
+        "bin_width_stderr": widths[:, 1],
+    }
+    variables = (
+        label_variables(
+            arrays
+            | _sub_block_means(work)
+            | _phase_locked_statistics(work)
+            | _gap_table(work, log, restart)
+        )
+        | _cross_spectra(work, log)
+        | _channel_means(work, log)
+        | _channel_part_means(work, log)
+    )
+    if work.ramp_turns is not None:
+        variables["ramp_turns"][2].update(zip(("low", "high"), work.ramp_range, strict=True))
+    return check_block_statistics(
+        xr.Dataset(
+            variables,
+            coords=_make_coordinates(work, log),
+            attrs=_make_attributes(work, log, present),
+        )
+    )
+
+
+def _kept_values(work: Accumulator, row: int, most: int | None = None) -> Array:
+    """Return the kept samples of an axis, up to `most` of each block."""
+    return np.concatenate([kept[row][:most] for kept in work.kept_samples])
+
+
+def _sub_block_means(work: Accumulator) -> dict[str, Any]:
+    """Return means over sub-blocks, which show a bias that switches within blocks."""
+    total, count = work.sub_blocks
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return {"sub_block_mean": total / count, "sub_block_samples": count.astype(np.int64)}
+
+
+def _make_attrs(name: str, units: str) -> dict[str, Any]:
+    """Return the attributes of a variable."""
+    return {"long_name": name, "units": units}
+
+
+def _equal_block_share(
+    power: Array, shape: Array, samples: NDArray[np.int64], part_count: int
+) -> Array:
+    """Return the equivalent share of equal-power blocks of each part, (axis, part).
+
+    A few noisy blocks carry all the weight of a mean.
+    """
+    good = np.isfinite(power) & np.isfinite(shape) & (shape > 0.0)
+    ordinates = np.where(good, shape, 0.0)
+    known = np.where(good, power, 0.0)
+    usual = (ordinates * known).sum(axis=1, keepdims=True) / np.maximum(
+        ordinates.sum(axis=1, keepdims=True), 1e-300
+    )
+    total = np.maximum(ordinates.sum(axis=2), 1e-300)
+    level = (ordinates * np.divide(known, usual, out=np.zeros_like(known), where=usual > 0.0)).sum(
+        axis=2
+    ) / total
+    out = np.ones((len(power), part_count))
+    for part in range(part_count):
+        in_part = np.arange(power.shape[1]) * part_count // power.shape[1] == part
+        size, level_of_part = samples[:, in_part].astype(np.float64), level[:, in_part]
+        square = size.sum(axis=1) * (
+            size * level_of_part**2 * (1.0 - 1.0 / np.maximum(total[:, in_part], 2.0))
+        ).sum(axis=1)  # minus the scatter of the levels
+        out[:, part] = np.divide(
+            (size * level_of_part).sum(axis=1) ** 2,
+            square,
+            out=np.ones(len(power)),
+            where=square > 0.0,
+        )
+    return np.minimum(out, 1.0)
+
+
+def _record_range(moments: Array) -> tuple[Array, Array]:
+    """Return the smallest and largest value of every axis, (axis, 1)."""
+    return np.fmin.reduce(moments[..., 3], axis=1, keepdims=True), np.fmax.reduce(
+        moments[..., 4], axis=1, keepdims=True
+    )
+
+
+def _count_at_range_ends(
+    moments: Array, low: NDArray[np.int64], high: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Count samples at the record's smallest and largest value in each block."""
+    lowest, highest = _record_range(moments)
+    return np.asarray(
+        np.where(moments[..., 3] == lowest, low, 0)
+        + np.where((moments[..., 4] == highest) & (lowest < highest), high, 0)
+    )
+
+
+def _count_repeats(moments: Array, counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Count held samples; those at zero or at an end of the range have another cause."""
+    return counts[..., 2] - _count_at_range_ends(moments, counts[..., 5], counts[..., 6])
+
+
+def _count_stuck(
+    moments: Array, counts: NDArray[np.int64], filled: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Count zeros of one axis alone, unless zero is the end of its range."""
+    lowest, highest = _record_range(moments)
+    return np.asarray(np.where((lowest < 0.0) & (highest > 0.0), counts[..., 1] - filled, 0))
+
+
+def _cross_spectra(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
+    """Return cross-spectra of the axes, and of each axis with the channels on the log's time."""
+    axes = work.axes
+    own = [number for number, (_, other) in enumerate(work.pairs) if other < axes]
+    variables = label_variables(
+        {
+            "cross": work.cross[own],
+            "cross_shape": work.cross_shape[own],
+            "cross_neighbours": work.cross_neighbours[own],
+            "cross_samples": work.cross_samples[own],
+        }
+    )
+    if work.channels:
+        shape = (axes, len(work.channels), *work.cross.shape[1:])
+        with_axes = np.full(shape, np.nan + 0j)
+        for number, (a, b) in enumerate(work.pairs):
+            if b >= axes:
+                with_axes[a, b - axes] = work.cross[number]
+        unit_list = ", ".join(
+            f"{name} in {log[name].attrs.get('units', '1')}" for name in work.channels
+        )
+        references = label_variables(
+            {"reference_power": work.power[axes:], "reference_cross": with_axes}
+        )
+        for _, _, attrs in references.values():
+            attrs["units"] += f" ({unit_list})"
+        variables |= references
+    return variables
+
+
+def _phase_locked_statistics(work: Accumulator) -> dict[str, Any]:
+    """Return what is locked to the tool rotation and to the ramp phase."""
+    arrays: dict[str, Any] = {}
+    if work.order is not None:
+        arrays |= {"order": work.order, "order_level": work.order_level}
+    if work.profile_sums is not None:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            arrays["profile"] = work.profile_sums / work.profile_counts
+        arrays |= {"profile_samples": work.profile_counts, "ramp_turns": work.ramp_turns}
+    return arrays
+
+
+def _channel_means(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
+    """Return block means of the channels; the rms of vibration."""
+    variables: dict[str, Any] = {}
+    inside, own = numeric_channels(log)
+    edges = grid_times(work.start, work.rate, np.arange(work.block_count + 1) * work.length)
+    for name in (*inside, *own):
+        rms = name.startswith("vibration")
+        if name in inside:
+            mean, spread = np.moveaxis(work.moments[work.axes + inside.index(name), :, :2], -1, 0)
+            values = np.sqrt(mean**2 + spread) if rms else mean
+        else:
+            values = channel_means(log, name, edges, rms=rms)
+        units = str(log[name].attrs.get("units", "1"))
+        band = {"band_hz": log[name].attrs["band_hz"]} if "band_hz" in log[name].attrs else {}
+        variables[f"channel_{name}"] = (
+            "block",
+            values,
+            _make_attrs(f"{'rms' if rms else 'mean'} of {name} over the block", units) | band,
+        )
+    return variables
+
+
+def _channel_part_means(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
+    """Return smoothed channels in parts of the blocks, if sampled often enough."""
+    variables: dict[str, Any] = {}
+    edges = grid_times(
+        work.start,
+        work.rate,
+        np.arange(work.block_count * CHANNEL_PARTS + 1) * work.length // CHANNEL_PARTS,
+    )
+    for name in numeric_channels(log)[1]:
+        if not name.startswith(LAGGED_CHANNEL_PREFIXES):
+            continue
+        span = np.ptp(to_nanoseconds(log[f"time_{name}"].values)) / 1e9
+        if log.sizes[f"time_{name}"] * work.length >= span * work.rate * CHANNEL_PARTS > 0.0:
+            work.channel_parts[name] = channel_means(log, name, edges, rms=False).reshape(
+                -1, CHANNEL_PARTS
+            )
+    for name, values in work.channel_parts.items():
+        good = np.isfinite(values)
+        if good.mean() > 1.0 / 2.0:
+            place = np.arange(values.size)
+            bridged = np.interp(place, place[good.ravel()], values[good])
+            units = str(log[name].attrs.get("units", "1"))
+            smooth = smooth_curve(bridged, longest=_MAX_SMOOTHING_BLOCKS * CHANNEL_PARTS).reshape(
+                values.shape
+            )
+            variables[f"fine_{name}"] = (
+                ("block", "block_part"),
+                smooth,
+                _make_attrs(f"{name} in parts of the block, without noise", units),
+            )
+    return variables
+
+
+def _gap_table(work: Accumulator, log: xr.Dataset, restart: float) -> dict[str, Any]:
+    """Return gaps, and those after which the tool restarted, in seconds since the start."""
+    gaps = np.array(work.gaps, dtype=np.float64).reshape(-1, 2) / work.rate
+    starts = gaps[gaps[:, 1] - gaps[:, 0] >= restart].tolist()
+    if "gap_cause" in log.variables:
+        known = log["gap_cause"].values == GAP_CAUSES.index("restart")
+        ends = [to_nanoseconds(log[name].values[known]) for name in ("gap_start", "gap_end")]
+        known_restarts = grid_index(work.start, work.rate, np.stack(ends, axis=-1)) / work.rate
+        starts += [
+            span
+            for span in known_restarts.tolist()
+            if not any(low <= span[1] and span[0] <= high for low, high in starts)
+        ]
+    restarts = np.array(sorted(starts), dtype=np.float64).reshape(-1, 2)
+    return {
+        "gap_begin": gaps[:, 0],
+        "gap_end": gaps[:, 1],
+        "restart_begin": restarts[:, 0],
+        "restart_end": restarts[:, 1],
+    }
+
+
+def _make_coordinates(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
+    """Return the coordinates of the block statistics."""
+    ends = np.arange(work.block_count + 1) * work.length
+    stamps = grid_times(work.start, work.rate, ends)
+    step = work.rate / work.length
+    axes = np.array([str(name) for name in log["axis"].values], dtype=object)
+    pairs = np.array([pair for pair in work.pairs if pair[1] < work.axes], np.int64).reshape(-1, 2)
+    arrays: dict[str, Any] = {
+        "bin": np.array(BINS, dtype=object),
+        "axis": axes,
+        "first": axes[pairs[:, 0]],
+        "second": axes[pairs[:, 1]],
+        "time": (stamps[:-1] + np.diff(stamps) // 2).view("datetime64[ns]"),
+        "begin": ends[:-1] / work.rate,
+        "end": ends[1:] / work.rate,
+        "frequency": (work.edges[:-1] + work.edges[1:] - 1) / 2.0 * step,
+        "band_low": (work.edges[:-1] - 0.5) * step,
+        "band_high": (work.edges[1:] - 0.5) * step,
+        "line_frequency": np.arange(1, work.line_sum.shape[-1] + 1) * step,
+    }
+    if work.channels:
+        arrays["reference"] = np.array(work.channels, dtype=object)
+    if work.order is not None:
+        arrays["harmonic"] = np.array(HARMONICS)
+    if work.profile_sums is not None:
+        arrays["phase"] = (np.arange(RAMP_PHASE_BINS) + 0.5) / RAMP_PHASE_BINS
+    return label_variables(arrays, COORDINATES)
+
+
+def _make_attributes(
+    work: Accumulator, log: xr.Dataset, present: NDArray[np.int64]
+) -> dict[str, Any]:
+    end = grid_times(work.start, work.rate, log.sizes["time"])
+    return {
+        "start": f"{format_stamp(work.start)}Z",
+        "end": f"{format_stamp(int(end))}Z",
+        "start_ns": work.start,
+        "sampling_rate_hz": work.rate,
+        "block_s": work.length / work.rate,
+        "block_samples": work.length,
+        "missing_share": 1.0 - float(present.sum()) / (present.size * work.length),
+        "source_files": texts(log, "source_files"),
+        "notes": texts(log, "notes"),
+        "unused_channels": dict(log.attrs.get("unused_channels", {})),
+    }
