@@ -1,7 +1,7 @@
 """LAS well logs (versions 1.2 and 2, text): curves by their mnemonics, with the header's units.
 
-A curve ``TIME`` is the time; if the file also has a curve ``DATE`` (real-time logs), ``TIME`` is
-the time of day.
+A curve ``TIME``, or an index of dates and times, is the time; if the file also has a curve ``DATE``
+(real-time logs), ``TIME`` is the time of day.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ __all__ = ["matches", "read", "scan"]
 
 # Date fields in units of curves -> codes of `datetime.strptime`.
 _DATE_CODES = {"yyyy": "%Y", "yy": "%y", "mmm": "%b", "mm": "%m", "dd": "%d"}
+#: A cell with a date and a time of day, such as ``14-Mar-26/08:00:00.5``.
+_DATE_AND_TIME = re.compile(r"^(\S+?)[T_/:;-](\d{1,2}:\d\d:\d\d(?:\.\d+)?)Z?$")
 
 
 def matches(path: Path) -> bool:
@@ -47,66 +49,71 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
 
 def _read_curves(path: Path, options: ReadOptions) -> Table:
     lasio = library("lasio", path, extra="las")
-    curves = lasio.read(str(path)).curves
+    curves = list(lasio.read(str(path)).curves)
+    clocks, dates = _find_clock(path, curves, options)
+    names = tuple(
+        "" if any(curve is clock for clock in clocks) else str(curve.mnemonic) for curve in curves
+    )
     units = tuple(
         None if holds_dates(curve.data) else str(curve.unit or "").strip() or None
         for curve in curves
     )
     columns = tuple(sliced(np.asarray(curve.data)) for curve in curves)
-    clocks = [
-        curve
-        for curve in curves
-        if curve.mnemonic.upper() in ("TIME", "DATETIME") and holds_dates(curve.data)
-    ][:1]
-    dates = clocks[0].data if clocks else None
-    curves_by_name = {
-        curve.mnemonic.upper(): curve
-        for curve in curves
-        if curve.mnemonic.upper() in ("TIME", "DATE")
-    }
-    named = {name.strip().upper() for name in options.map}
-    if not clocks and len(curves_by_name) == 2 and not named & curves_by_name.keys():
-        clocks = list(curves_by_name.values())
-        dates = _date_and_time(path, curves_by_name["DATE"], curves_by_name["TIME"])
-    names = tuple(
-        "" if any(curve is clock for clock in clocks) else str(curve.mnemonic) for curve in curves
-    )
-    rows = len(curves[0].data) if len(curves) else 0
-    return Table(
-        rows,
-        names,
-        units,
-        columns,
-        None if dates is None else sliced(np.asarray(dates)),
-    )
+    rows = len(curves[0].data) if curves else 0
+    return Table(rows, names, units, columns, None if dates is None else sliced(dates))
 
 
-def _date_and_time(path: Path, date: Any, time: Any) -> NDArray[np.datetime64]:
-    """Combine a curve of dates and a curve of times of day to stamps."""
-    import pandas as pd
-
+def _find_clock(
+    path: Path, curves: list[Any], options: ReadOptions
+) -> tuple[list[Any], NDArray[Any] | None]:
+    """Return the curves of dates and times with their stamps; none where a number counts time."""
+    by_name = {curve.mnemonic.upper(): curve for curve in curves}
+    found = [by_name[name] for name in ("TIME", "DATETIME") if name in by_name]
+    mapped = {name.strip().upper() for name in options.map}
+    pair = {"DATE", "TIME"} <= by_name.keys() - mapped
+    for curve in found if pair else [*found, *curves[:1]]:
+        if holds_dates(curve.data):
+            return [curve], np.asarray(curve.data)
+        cells = [_DATE_AND_TIME.match(str(cell).strip()) for cell in curve.data]
+        if any(cells[:50]):
+            days, times = ([cell[part] if cell else "" for cell in cells] for part in (1, 2))
+            unit = re.split("[ T_]", str(curve.unit or ""))[0]
+            return [curve], _to_stamps(path, curve.mnemonic, days, unit, times)
+    if not pair:
+        return [], None
+    date, time = by_name["DATE"], by_name["TIME"]
     days = [
         str(int(cell)) if isinstance(cell, float) and np.isfinite(cell) else str(cell).strip()
         for cell in date.data
     ]
-    order = _date_order(str(date.unit or ""), days[:1000])
+    stamps = _to_stamps(path, "DATE", days, str(date.unit or ""), time.data, str(time.unit))
+    return [date, time], stamps
+
+
+def _to_stamps(
+    path: Path, name: str, days: list[str], date_unit: str, times: Any, time_unit: str = ""
+) -> NDArray[np.datetime64]:
+    """Combine dates and times of day to stamps."""
+    import pandas as pd
+
+    order = _date_order(date_unit, days[:1000])
     if order is None:
-        fix = "write the dates as 2026-03-14, or drop the curve with --map DATE=-"
+        fix = f"write the dates as 2026-03-14, or drop the curve with --map {name}=-"
         raise FormatError(
-            f"{path.name}: the order of day and month in the curve DATE ({days[0]!r}) is not "
+            f"{path.name}: the order of day and month in the curve {name} ({days[0]!r}) is not "
             f"clear; {fix}"
         )
     start = dates_to_ns(
         pd.to_datetime(pd.Series(days), format=order, errors="coerce").to_numpy()
     ).view("datetime64[ns]")
-    clock = pd.Series(time.data)
+    clock = pd.Series(times)
     if clock.dtype.kind not in "iuf":
         since = pd.to_timedelta(clock.astype(str).str.strip(), errors="coerce").to_numpy(
             dtype="timedelta64[ns]"
         )
     else:
         numbers = clock.to_numpy(dtype=np.float64)
-        if "HHMM" in str(time.unit).upper():
+        if "HHMM" in time_unit.upper():
             numbers = numbers // 10000 * 3600 + numbers // 100 % 100 * 60 + numbers % 100
         usable = np.isfinite(numbers)
         counts = np.rint(np.where(usable, numbers, 0.0) * 1e9).astype(np.int64)
