@@ -279,7 +279,7 @@ def test_any_file_with_a_layout_file_is_binary(tmp_path: Path) -> None:
         (None, r"the layout of its records is unknown; write run\.bin\.toml"),
         ("fields = [", "not valid TOML"),
         ("fields = []", "needs fields"),
-        ('fields = [{name = "a", type = "int24"}]', "field 1 is .*float64"),
+        ('fields = [{name = "a", type = "int48"}]', "field 1 is .*float64"),
         ("rows = 3", "'rows' is not a key"),
         ('byte_order = "mixed"\nfields = []', "byte_order"),
     ],

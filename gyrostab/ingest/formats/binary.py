@@ -1,45 +1,31 @@
-"""Raw binary files with a layout file: ``run7.bin.toml``, ``run7.toml`` or ``layout.toml``.
+"""Raw binary files: records by a layout file, or messages of a known sensor.
 
-The layout names the fields of a record in order, with units as in header cells::
-
-    header_bytes = 512          # before the first record; 0 by default
-    byte_order = "little"       # or "big"
-    fields = [
-        {name = "time [us]", type = "uint32"},
-        {name = "gyro_x [0.1 arcsec/s]", type = "int32"},
-        {skip = 4},             # bytes
-    ]
+See `gyrostab.ingest.formats.layout` for the layouts. Messages are numbered by their counter: the
+time follows from it and ``--rate``, and lost messages are gaps.
 """
 
 from __future__ import annotations
 
-import tomllib
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
-from gyrostab.errors import FormatError, OptionError
-from gyrostab.ingest.formats.tables import Table, read_tables, scan_tables
+from gyrostab.errors import FormatError
+from gyrostab.ingest.columns.stamps import TimeUnit, integers_to_ns
+from gyrostab.ingest.formats.layout import Field, Layout, find_layout, layout_path
+from gyrostab.ingest.formats.messages import find_messages, unwrap_counter
+from gyrostab.ingest.formats.tables import Table, read_tables, scan_tables, sliced
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
 __all__ = ["has_layout", "matches", "read", "scan"]
 
 SUFFIXES = (".bin", ".raw")
-TYPES = (
-    "int8",
-    "uint8",
-    "int16",
-    "uint16",
-    "int32",
-    "uint32",
-    "int64",
-    "uint64",
-    "float32",
-    "float64",
-)
 
 
 def matches(path: Path) -> bool:
@@ -53,118 +39,85 @@ def matches(path: Path) -> bool:
 
 def has_layout(path: Path) -> bool:
     """Return whether a file has a layout file named after it."""
-    return _layout_path(path).is_file()
+    return layout_path(path).is_file()
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Summarise fields, number of records, and first and last stamps."""
-    table, notes = _make_table(path)
+    """Summarise fields, number of records, and first and last stamps; searches all messages."""
+    table, notes = _make_table(path, options)
     return scan_tables(path, "binary", [table], options, notes)
 
 
 def read(path: Path, options: ReadOptions) -> xr.Dataset:
     """Return the raw log of a binary file; see `gyrostab.ingest.read_log`."""
-    table, notes = _make_table(path)
+    table, notes = _make_table(path, options)
     return read_tables(path, [table], options, notes=notes)
 
 
-def _layout_path(path: Path) -> Path:
-    return path.with_name(f"{path.name}.toml")
-
-
-def _read_layout(path: Path) -> tuple[Path, dict[str, Any]]:
-    places = [_layout_path(path), path.with_suffix(".toml"), path.with_name("layout.toml")]
-    place = next((place for place in places if place.is_file()), None)
-    if place is None:
-        example = (
-            'fields = [{name = "time [us]", type = "uint32"}, {name = "gyro_x [deg/h]", '
-            'type = "int32"}]'
-        )
-        raise OptionError(
-            f"{path.name}: the layout of its records is unknown; write {places[0].name} next to "
-            f"it, for instance: {example}"
-        )
-    try:
-        return place, tomllib.loads(place.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise OptionError(
-            f"{place.name}: this layout is not valid TOML ({error}); correct it"
-        ) from error
-
-
-def _record_type(path: Path) -> tuple[np.dtype[Any], int]:
-    """Return the type of a record, and the number of bytes before the first."""
-    place, layout = _read_layout(path)
-    known = {"header_bytes", "byte_order", "fields"}
-    if unknown := sorted(set(layout) - known):
-        raise OptionError(
-            f"{place.name}: {unknown[0]!r} is not a key of a layout; known are "
-            f"{', '.join(sorted(known))}"
-        )
-    order = {"little": "<", "big": ">"}.get(layout.get("byte_order", "little"))
-    header = layout.get("header_bytes", 0)
-    if order is None or not isinstance(header, int) or header < 0:
-        raise OptionError(
-            f'{place.name}: byte_order is "little" or "big", and header_bytes a whole number; '
-            "correct the layout"
-        )
-    names, types, offsets, size = [], [], [], 0
-    for number, field in enumerate(layout.get("fields", ()), 1):
-        if (
-            isinstance(field, dict)
-            and set(field) == {"skip"}
-            and isinstance(field["skip"], int)
-            and field["skip"] > 0
-        ):
-            size += field["skip"]
-            continue
-        if (
-            not isinstance(field, dict)
-            or set(field) != {"name", "type"}
-            or field["type"] not in TYPES
-        ):
-            what = (
-                f'is {{name = "...", type = "..."}} or {{skip = BYTES}}, the types are '
-                f"{', '.join(TYPES)}"
-            )
-            raise OptionError(f"{place.name}: field {number} {what}; correct the layout")
-        names.append(str(field["name"]))
-        types.append(np.dtype(order + np.dtype(field["type"]).str[1:]))
-        offsets.append(size)
-        size += types[-1].itemsize
-    if not names or len(set(names)) < len(names):
-        raise OptionError(f"{place.name}: a layout needs fields with different names; correct it")
-    given = path.stat().st_size
-    if header + size > given:
+def _make_table(path: Path, options: ReadOptions) -> tuple[Table, list[str]]:
+    layout = find_layout(path)
+    rows, rest = divmod(path.stat().st_size - layout.header, layout.size)
+    starts = None
+    if layout.sync and rows > 0:
+        raw = np.memmap(path, dtype=np.uint8, mode="r", offset=layout.header)
+        starts = find_messages(raw, layout.sync, layout.size)
+        rows, rest = len(starts), len(raw) - len(starts) * layout.size
+    if rows < 1:
         raise FormatError(
-            f"{path.name}: it holds no record by the layout {place.name} ({given} bytes, but "
-            f"{header} of header and {size} a record); copy it again, or correct the layout"
+            f"{path.name}: it holds no record by the layout {layout.place} "
+            f"({path.stat().st_size} bytes, but {layout.header} of header and {layout.size} a "
+            "record); copy it again, or correct the layout"
         )
-    record = np.dtype({"names": names, "formats": types, "offsets": offsets, "itemsize": size})
-    return record, header
+    fetch = partial(_read_field, path, layout, starts)
+    stamps, notes = _count_time(layout, fetch, rows, options)
+    if layout.sync:
+        notes.insert(0, f"read as messages of {layout.place}{layout.note and ': '}{layout.note}")
+    if rest:
+        what = "part of a message" if layout.sync else f"a whole record of {layout.size} bytes"
+        where = "" if layout.sync else "the last "
+        notes.append(f"{where}{rest} bytes are not {what}; is the layout right?")
+    names = tuple(field.name for field in layout.fields)
+    columns = tuple(partial(fetch, field) for field in layout.fields)
+    units = (None,) * len(names)
+    return Table(rows, names, units, columns, stamps, "ns" if stamps else None), notes
 
 
-def _make_table(path: Path) -> tuple[Table, list[str]]:
-    record, header = _record_type(path)
-    rows, rest = divmod(path.stat().st_size - header, record.itemsize)
-    notes = (
-        [
-            f"the last {rest} bytes are not a whole record of {record.itemsize} bytes; is the "
-            "layout right?"
-        ]
-        if rest
-        else []
-    )
-    names = tuple(record.names or ())
-    columns = tuple(partial(_read_field, path, record, header, name) for name in names)
-    return Table(rows, names, (None,) * len(names), columns), notes
+def _count_time(
+    layout: Layout, fetch: Any, rows: int, options: ReadOptions
+) -> tuple[Any, list[str]]:
+    """Return the stamps by the counter of the layout [ns], and a note on lost messages."""
+    counter = layout.counter
+    if counter is None or options.rate is None:
+        return None, []
+    counts = unwrap_counter(fetch(counter, 0, rows), counter.turn)
+    steps, times = np.unique(np.diff(counts), return_counts=True)
+    step = max(int(steps[times.argmax()]) if len(steps) else 1, 1)
+    numbers = (counts + step // 2) // step
+    lost = int(numbers[-1]) + 1 - rows
+    period = TimeUnit("", 10**9 / Fraction(repr(float(options.rate))))
+    notes = [f"by their counter, {lost} messages were lost"] if lost > 0 else []
+    return sliced(integers_to_ns(numbers, period, 0)), notes
 
 
 def _read_field(
-    path: Path, record: np.dtype[Any], header: int, name: str, start: int, stop: int
+    path: Path,
+    layout: Layout,
+    starts: NDArray[np.int64] | None,
+    field: Field,
+    begin: int,
+    stop: int,
 ) -> Any:
-    records = np.memmap(
-        path, dtype=record, mode="r", offset=header + start * record.itemsize, shape=(stop - start,)
-    )
-    values = np.array(records[name])
-    return values.astype(values.dtype.newbyteorder("="))
+    """Return the values of a field in a range of records, which begin at `starts`, or adjoin."""
+    raw = np.memmap(path, dtype=np.uint8, mode="r", offset=layout.header)
+    width = field.dtype.itemsize
+    if starts is None:
+        first = begin * layout.size + field.offset
+        values = np.array(np.ndarray(stop - begin, field.dtype, raw, first, layout.size))
+    else:
+        values = sliding_window_view(raw, width)[starts[begin:stop] + field.offset]
+        values = values.view(field.dtype)[:, 0]
+    if field.dtype.kind != "V":
+        return values.astype(values.dtype.newbyteorder("="))
+    cells = values.view(np.uint8).reshape(-1, width)
+    wide = np.pad(cells, ((0, 0), (0, 1) if layout.order == ">" else (1, 0)))
+    return (wide.view(f"{layout.order}i4")[:, 0] >> 8).astype(np.int32)

@@ -1,0 +1,179 @@
+"""Layouts of binary records in TOML: of a user, or of known sensors in the folder ``layouts``.
+
+A layout names the fields of a record in order, with units as in header cells::
+
+    header_bytes = 512          # before the first record; 0 by default
+    byte_order = "little"       # or "big"
+    fields = [
+        {name = "time [us]", type = "uint32"},
+        {name = "gyro_x [0.1 arcsec/s]", type = "int32"},
+        {skip = 4},             # bytes
+    ]
+
+With ``sync = "FE81FF55"`` the records are messages that begin with these bytes and end with a
+checksum (see `gyrostab.ingest.formats.messages`); neither is listed as a field. A field
+``{counter = 128, type = "uint8"}`` numbers the messages, from 0 again after 127. A ``note`` is
+shown with every file of the layout.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gyrostab.errors import OptionError
+from gyrostab.ingest.formats.messages import CRC_BYTES, find_messages
+
+__all__ = ["Field", "Layout", "find_layout", "layout_path"]
+
+#: Name of a type -> code of numpy; 24 bits are read as three bytes.
+TYPES = {
+    **{
+        f"{kind}{bits}": f"{kind[0]}{bits // 8}"
+        for kind in ("int", "uint")
+        for bits in (8, 16, 32, 64)
+    },
+    "int24": "V3",
+    "float32": "f4",
+    "float64": "f8",
+}
+_KEYS = ("byte_order", "fields", "header_bytes", "note", "sync")
+#: Bytes at the beginning of a file, and messages in them, that decide on a known sensor.
+_HEAD_BYTES, _HEAD_MESSAGES = 2**16, 3
+
+
+@dataclass(frozen=True)
+class Field:
+    """A field of a record; `turn` is the number of values of a counter, 0 for other fields."""
+
+    name: str
+    dtype: np.dtype[Any]
+    offset: int
+    turn: int = 0
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Fields of a record of `size` bytes, in a byte order of numpy; messages have `sync` bytes."""
+
+    place: str
+    order: str
+    header: int
+    size: int
+    fields: tuple[Field, ...]
+    counter: Field | None = None
+    sync: bytes = b""
+    note: str = ""
+
+
+def layout_path(path: Path) -> Path:
+    """Return the layout file that is named after a file."""
+    return path.with_name(f"{path.name}.toml")
+
+
+def find_layout(path: Path) -> Layout:
+    """Return the layout of a file: that of a layout file, or of a sensor whose messages it holds.
+
+    Raises
+    ------
+    OptionError
+        When there is no layout, or it is not usable.
+    """
+    places = [layout_path(path), path.with_suffix(".toml"), path.with_name("layout.toml")]
+    place = next((place for place in places if place.is_file()), None)
+    if place is None:
+        return _find_known(path, places[0].name)
+    try:
+        content = tomllib.loads(place.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise OptionError(
+            f"{place.name}: this layout is not valid TOML ({error}); correct it"
+        ) from error
+    return _parse_layout(place.name, content)
+
+
+def _find_known(path: Path, name: str) -> Layout:
+    with path.open("rb") as file:
+        head = np.frombuffer(file.read(_HEAD_BYTES), dtype=np.uint8)
+    for layout in _known_layouts():
+        if len(find_messages(head, layout.sync, layout.size)) >= _HEAD_MESSAGES:
+            return layout
+    fields = '{name = "time [us]", type = "uint32"}, {name = "gyro_x [deg/h]", type = "int32"}'
+    raise OptionError(
+        f"{path.name}: the layout of its records is unknown; write {name} next to it, for "
+        f"instance: fields = [{fields}]"
+    )
+
+
+@cache
+def _known_layouts() -> list[Layout]:
+    places = files("gyrostab.ingest.formats").joinpath("layouts").iterdir()
+    return [
+        _parse_layout(place.name.removesuffix(".toml"), tomllib.loads(place.read_text("utf-8")))
+        for place in sorted(places, key=lambda place: place.name)
+    ]
+
+
+def _parse_layout(place: str, content: Mapping[str, Any]) -> Layout:
+    for key in content:
+        if key not in _KEYS:
+            raise OptionError(
+                f"{place}: {key!r} is not a key of a layout; known are {', '.join(_KEYS)}"
+            )
+    order = {"little": "<", "big": ">"}.get(str(content.get("byte_order", "little")))
+    header = content.get("header_bytes", 0)
+    if order is None or not isinstance(header, int) or header < 0:
+        raise OptionError(
+            f'{place}: byte_order is "little" or "big", and header_bytes a whole number; '
+            "correct the layout"
+        )
+    try:
+        sync = bytes.fromhex(content.get("sync", ""))
+    except (TypeError, ValueError) as error:
+        raise OptionError(f'{place}: sync is written as in "FE81FF55"; correct it') from error
+    items = content.get("fields", ())
+    found: list[Field] = []
+    size = len(sync)
+    for number, item in enumerate(items if isinstance(items, list) else (), 1):
+        one = _parse_field(item, order, size)
+        if one is None:
+            raise OptionError(
+                f'{place}: field {number} is {{name = "...", type = "..."}}, {{counter = TURN, '
+                f'type = "..."}} or {{skip = BYTES}}, the types are {", ".join(TYPES)}; correct '
+                "the layout"
+            )
+        size = one.offset + one.dtype.itemsize
+        found.append(one)
+    fields = tuple(one for one in found if one.name)
+    counters = [one for one in found if one.turn]
+    if not fields or len({one.name for one in fields}) < len(fields) or len(counters) > 1:
+        raise OptionError(
+            f"{place}: a layout needs fields with different names, and one counter at most; "
+            "correct it"
+        )
+    size += CRC_BYTES if sync else 0
+    counter = next(iter(counters), None)
+    return Layout(place, order, header, size, fields, counter, sync, str(content.get("note", "")))
+
+
+def _parse_field(item: Any, order: str, offset: int) -> Field | None:
+    """Return a field, with neither name nor turn for skipped bytes; None if it is not usable."""
+    keys = set(item) if isinstance(item, dict) else set()
+    if keys == {"skip"} and isinstance(item["skip"], int) and 0 < item["skip"] < 2**31:
+        return Field("", np.dtype(f"V{item['skip']}"), offset)
+    code = TYPES.get(str(item["type"])) if "type" in keys else None
+    if code is None:
+        return None
+    stored = np.dtype(code if code == "V3" else order + code)
+    if keys == {"name", "type"}:
+        return Field(str(item["name"]), stored, offset)
+    turn = item.get("counter")
+    usable = keys == {"counter", "type"} and isinstance(turn, int) and stored.kind == "u"
+    return Field("", stored, offset, turn) if usable and 1 < turn <= 2**32 else None

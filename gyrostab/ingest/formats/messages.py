@@ -1,0 +1,87 @@
+"""Messages with sync bytes and a checksum in a stream of bytes, and the counters in them.
+
+A message begins with its sync bytes and ends with the CRC-32/MPEG-2 of all bytes before it
+(polynomial 0x04C11DB7, start 0xFFFFFFFF, not reflected), padded with zeros to a multiple of four
+bytes, most significant byte first.
+
+References
+----------
+KVH Industries, 1775 IMU technical manual 56-0298, section 5; Sensonor, STIM300 datasheet TS1524.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+__all__ = ["CRC_BYTES", "crc32_mpeg2", "find_messages", "unwrap_counter"]
+
+CRC_BYTES = 4
+_POLYNOMIAL = np.uint32(0x04C11DB7)
+#: Bytes that are searched at one time.
+_BLOCK = 2**18
+
+
+@cache
+def _crc_table() -> NDArray[Any]:
+    remainders = np.arange(256, dtype=np.uint32) << 24
+    for _ in range(8):
+        remainders = remainders << 1 ^ (remainders >> 31) * _POLYNOMIAL
+    return remainders
+
+
+def crc32_mpeg2(rows: NDArray[np.uint8]) -> NDArray[np.uint32]:
+    """Return the checksum of each row of bytes, padded with zeros to a multiple of four bytes.
+
+    Examples
+    --------
+    >>> rows = np.frombuffer(b"123456789", np.uint8)[None, :8]
+    >>> hex(crc32_mpeg2(rows)[0])
+    '0x5660ffe2'
+    """
+    table, found = _crc_table(), np.full(len(rows), 0xFFFFFFFF, dtype=np.uint32)
+    for column in np.pad(rows, ((0, 0), (0, -rows.shape[1] % 4))).T:
+        found = found << 8 ^ table[found >> 24 ^ column]
+    return found
+
+
+def find_messages(raw: NDArray[np.uint8], sync: bytes, size: int) -> NDArray[np.int64]:
+    """Return the first byte of each message that is complete and whose checksum is right.
+
+    Parameters
+    ----------
+    raw : ndarray of uint8, shape (bytes,)
+        The stream, such as a memory map of a file.
+    sync : bytes
+        First bytes of a message.
+    size : int
+        Bytes of a message with sync bytes and checksum.
+    """
+    found = [np.empty(0, dtype=np.int64)]
+    for begin in range(0, max(len(raw) - size + 1, 0), _BLOCK):
+        part = np.asarray(raw[begin : begin + _BLOCK + size - 1])
+        starts = np.flatnonzero(part[: len(part) - size + 1] == sync[0])
+        for place, byte in enumerate(sync[1:], 1):
+            starts = starts[part[starts + place] == byte]
+        rows = sliding_window_view(part, size)[starts]
+        sums = np.ascontiguousarray(rows[:, -CRC_BYTES:]).view(">u4")[:, 0]
+        found.append(starts[crc32_mpeg2(rows[:, :-CRC_BYTES]) == sums] + begin)
+    return np.concatenate(found)
+
+
+def unwrap_counter(counter: NDArray[Any], modulus: int) -> NDArray[np.int64]:
+    """Return the sum of the steps of a counter that restarts from 0 after `modulus` - 1.
+
+    A loss of a whole turn of the counter is not visible.
+
+    Examples
+    --------
+    >>> unwrap_counter(np.array([126, 127, 0, 3]), 128).tolist()
+    [0, 1, 2, 5]
+    """
+    steps = np.diff(counter.astype(np.int64), prepend=counter[:1].astype(np.int64))
+    return np.cumsum(np.remainder(steps, modulus), dtype=np.int64)
