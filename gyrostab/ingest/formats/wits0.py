@@ -1,0 +1,80 @@
+"""WITS level 0 (text): the items of each record type by their four digits, such as ``0921``.
+
+A frame begins with ``&&`` and ends with ``!!``; each line in between is a record type, an item and
+its value. Items 05 and 06 of every record are the date (YYMMDD) and the time (HHMMSS). The stream
+contains no units: give name and unit as in ``--map "0921=temperature [degC]"``.
+
+References
+----------
+Wellsite Information Transfer Specification, level 0.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from datetime import UTC, datetime
+from pathlib import Path
+
+import xarray as xr
+
+from gyrostab.ingest.columns.stamps import NAT
+from gyrostab.ingest.formats.collect import Messages
+from gyrostab.ingest.formats.tables import Table, read_tables, scan_tables
+from gyrostab.ingest.options import FileSummary, ReadOptions
+
+__all__ = ["matches", "read", "scan"]
+
+_HEAD = re.compile(rb"^\s*&&\s*\n\s*\d{4}")
+_ITEM = re.compile(r"^\s*(\d\d)(\d\d)\s?(.*?)\s*$")
+_LONGEST_LINE = 1000
+
+
+def matches(path: Path) -> bool:
+    """Return whether the file begins with a frame of items."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return bool(_HEAD.match(file.read(256)))
+
+
+def scan(path: Path, options: ReadOptions) -> FileSummary:
+    """Summarise items, and first and last stamps; reads the whole file."""
+    return scan_tables(path, "wits0", _read_records(path), options)
+
+
+def read(path: Path, options: ReadOptions) -> xr.Dataset:
+    """Return the raw log of a WITS stream; see `gyrostab.ingest.read_log`."""
+    return read_tables(path, _read_records(path), options)
+
+
+def _read_records(path: Path) -> list[Table]:
+    """Return a table for each record type."""
+    records: dict[str, Messages] = {}
+    frame: dict[str, dict[str, str]] = {}
+    with path.open(encoding="ascii", errors="replace") as file:
+        while line := file.readline(_LONGEST_LINE):
+            if line.startswith(("&&", "!!")):
+                for record, values in frame.items():
+                    stamp = _stamp(values.pop("05", "") + values.pop("06", ""))
+                    numbers = {record + item: _number(text) for item, text in values.items()}
+                    records.setdefault(record, Messages()).add(stamp, numbers)
+                frame = {}
+            elif item := _ITEM.match(line):
+                frame.setdefault(item[1], {})[item[2]] = item[3]
+    return [messages.make_table() for messages in records.values()]
+
+
+def _stamp(text: str) -> int:
+    try:
+        date = datetime.strptime(text, "%y%m%d%H%M%S").replace(tzinfo=UTC)
+    except ValueError:
+        return NAT
+    return int(date.timestamp()) * 10**9
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

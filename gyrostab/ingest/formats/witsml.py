@@ -1,0 +1,115 @@
+"""Logs in WITSML 1.3 and 1.4 documents (XML): curves by their mnemonics, with the units there.
+
+The index of a log must be of dates and times; a document may hold several logs.
+
+References
+----------
+Energistics, WITSML data schema 1.4.1.1, object log.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from io import StringIO
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pandas as pd
+import xarray as xr
+
+from gyrostab.errors import FormatError
+from gyrostab.ingest.columns.stamps import texts_to_ns
+from gyrostab.ingest.formats.tables import Table, read_tables, scan_tables, sliced
+from gyrostab.ingest.options import FileSummary, ReadOptions
+
+__all__ = ["matches", "read", "scan"]
+
+_HEAD = re.compile(rb"(?is)^(?:\xef\xbb\xbf)?\s*<.*witsml")
+
+
+def matches(path: Path) -> bool:
+    """Return whether the file is an XML document that names WITSML near its beginning."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return bool(_HEAD.match(file.read(4096)))
+
+
+def scan(path: Path, options: ReadOptions) -> FileSummary:
+    """Summarise curves, rows, and first and last stamps."""
+    return scan_tables(path, "witsml", list(_read_logs(path)), options)
+
+
+def read(path: Path, options: ReadOptions) -> xr.Dataset:
+    """Return the raw log of a WITSML document; see `gyrostab.ingest.read_log`."""
+    return read_tables(path, list(_read_logs(path)), options)
+
+
+def _read_logs(path: Path) -> Iterator[Table]:
+    """Yield a table for each log with data and an index of dates and times.
+
+    Raises
+    ------
+    FormatError
+        When there is none.
+    """
+    found = 0
+    for _, log in ElementTree.iterparse(path):
+        if _name(log) == "log":
+            table = _make_table(log)
+            log.clear()
+            if table is not None:
+                found += 1
+                yield table
+    if not found:
+        raise FormatError(
+            f"{path.name}: this WITSML document has no log of version 1 with values over dates "
+            "and times; export the log by time as WITSML 1.4.1.1, LAS or CSV"
+        )
+
+
+def _make_table(log: Any) -> Table | None:
+    if "time" not in _text(log, "indexType").lower():
+        return None
+    names, units, lines = [], {}, []
+    for element in log.iter():
+        if _name(element) == "logCurveInfo":
+            units[_text(element, "mnemonic")] = _text(element, "unit")
+        elif _name(element) == "mnemonicList":
+            names = [name.strip() for name in (element.text or "").split(",")]
+        elif _name(element) == "data" and element.text:
+            lines.append(element.text.strip())
+    names = names or list(units)
+    if not lines or not names:
+        return None
+    cells = pd.read_csv(
+        StringIO("\n".join(lines)),
+        header=None,
+        names=range(len(names)),
+        index_col=False,
+        na_values=[_text(log, "nullValue")],
+        on_bad_lines="skip",
+    )
+    index = _text(log, "indexCurve")
+    place = names.index(index) if index in names else 0
+    stamps = texts_to_ns(cells[place].astype(str).tolist()).view("datetime64[ns]")
+    kept = [number for number in range(len(names)) if number != place]
+    return Table(
+        len(cells),
+        tuple(names[number] for number in kept),
+        tuple(units.get(names[number]) or None for number in kept),
+        tuple(sliced(cells[number].to_numpy()) for number in kept),
+        sliced(stamps),
+    )
+
+
+def _name(element: Any) -> str:
+    """Return the name of an element without its namespace."""
+    return str(element.tag).rpartition("}")[2]
+
+
+def _text(parent: Any, name: str) -> str:
+    """Return the text of a child, empty if there is none."""
+    return next(((child.text or "").strip() for child in parent if _name(child) == name), "")
