@@ -1,0 +1,105 @@
+"""ROS 1 bags, ROS 2 bags and MCAP files: the numbers of each topic, ``angular_velocity.x``.
+
+A ROS 2 bag is a folder with ``metadata.yaml``, or a file of it. Stamps are those of the headers of
+messages, otherwise the times of recording. Units follow from the definitions of the messages.
+
+References
+----------
+ROS common_interfaces, package sensor_msgs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from gyrostab.ingest.formats.collect import Messages
+from gyrostab.ingest.formats.tables import (
+    Table,
+    library,
+    plain_names,
+    read_tables,
+    scan_tables,
+)
+from gyrostab.ingest.options import FileSummary, ReadOptions
+
+__all__ = ["matches", "read", "scan"]
+
+_MAGICS = (b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0")
+#: Type of a message -> field -> target in the form of ``--map``.
+_MEANINGS = {
+    "sensor_msgs/msg/Imu": {
+        **{f"angular_velocity.{axis}": f"gyro_{axis} [rad/s]" for axis in "xyz"},
+        **{f"linear_acceleration.{axis}": f"accel_{axis} [m/s^2]" for axis in "xyz"},
+    },
+    "sensor_msgs/msg/MagneticField": {f"magnetic_field.{a}": f"mag_{a} [T]" for a in "xyz"},
+    "sensor_msgs/msg/Temperature": {"temperature": "temperature [degC]"},
+    "sensor_msgs/msg/FluidPressure": {"fluid_pressure": "pressure [Pa]"},
+}
+#: Larger messages hold images or clouds of points, and are left out [bytes].
+_LARGEST_MESSAGE = 4096
+
+
+def matches(path: Path) -> bool:
+    """Return whether the file begins like a bag, or the folder is a ROS 2 bag."""
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file()
+    with path.open("rb") as file:
+        return file.read(16).startswith(_MAGICS)
+
+
+def scan(path: Path, options: ReadOptions) -> FileSummary:
+    """Summarise topics and stamps; reads the whole bag."""
+    tables, notes = _read_topics(path)
+    return scan_tables(path, "rosbag", tables, options, notes)
+
+
+def read(path: Path, options: ReadOptions) -> xr.Dataset:
+    """Return the raw log of a bag; see `gyrostab.ingest.read_log`."""
+    tables, notes = _read_topics(path)
+    return read_tables(path, tables, options, notes=notes)
+
+
+def _read_topics(path: Path) -> tuple[list[Table], list[str]]:
+    """Return a table for each topic with numbers, and a note on topics that are left out."""
+    highlevel = library("rosbags.highlevel", path, extra="rosbag")
+    typesys = library("rosbags.typesys", path, extra="rosbag")
+    known = typesys.get_typestore(typesys.Stores.LATEST)
+    found: dict[tuple[str, str], Messages] = {}
+    left_out: dict[str, None] = {}
+    with highlevel.AnyReader([path], default_typestore=known) as reader:
+        for connection, received, raw in reader.messages():
+            if len(raw) > _LARGEST_MESSAGE:
+                left_out[connection.topic] = None
+                continue
+            message = reader.deserialize(raw, connection.msgtype)
+            messages = found.setdefault((connection.topic, connection.msgtype), Messages())
+            messages.add(_stamp(message) or received, dict(_numbers(message)))
+    fields = [(topic, name) for (topic, _), one in found.items() for name in one.columns]
+    names = iter(plain_names(fields))
+    tables = [
+        messages.make_table([next(names) for _ in messages.columns], meanings=_MEANINGS.get(kind))
+        for (_, kind), messages in found.items()
+    ]
+    notes = [f"left out, as their messages are large: {', '.join(left_out)}"] if left_out else []
+    return tables, notes
+
+
+def _stamp(message: Any) -> int:
+    """Return the stamp in the header [ns since 1970], 0 without one."""
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    return 0 if stamp is None else int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def _numbers(message: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
+    """Yield names and values of the numbers in a message, also of messages within it."""
+    for field in dataclasses.fields(message):
+        value = getattr(message, field.name)
+        if isinstance(value, int | float):
+            yield prefix + field.name, float(value)
+        elif dataclasses.is_dataclass(value) and field.name != "header":
+            yield from _numbers(value, f"{prefix}{field.name}.")
