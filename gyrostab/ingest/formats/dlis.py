@@ -1,0 +1,83 @@
+"""DLIS well logs (RP66 V1): channels by their mnemonics, with their units.
+
+An index of the kind TIME is the time. Frames may have separate rates; channels with several values
+a row are left out.
+
+References
+----------
+American Petroleum Institute, Recommended Practice 66, version 1.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from gyrostab.ingest.columns.headers import is_time_unit
+from gyrostab.ingest.formats.tables import (
+    Table,
+    library,
+    plain_names,
+    read_tables,
+    scan_tables,
+    sliced,
+)
+from gyrostab.ingest.options import FileSummary, ReadOptions
+
+__all__ = ["matches", "read", "scan"]
+
+
+def matches(path: Path) -> bool:
+    """Return whether the file has the label of a DLIS storage unit, or such a suffix."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return path.suffix.lower() == ".dlis" or file.read(15)[4:] == b"V1.00RECORD"
+
+
+def scan(path: Path, options: ReadOptions) -> FileSummary:
+    """Summarise frames, channels and stamps; reads the whole file."""
+    return scan_tables(path, "dlis", _read_frames(path), options)
+
+
+def read(path: Path, options: ReadOptions) -> xr.Dataset:
+    """Return the raw log of a DLIS file; see `gyrostab.ingest.read_log`."""
+    return read_tables(path, _read_frames(path), options)
+
+
+def _read_frames(path: Path) -> list[Table]:
+    """Return a table for each frame of each logical file."""
+    dlis = library("dlisio.dlis", path, extra="dlis")
+    logging.getLogger("dlisio").setLevel(logging.ERROR)
+    with dlis.load(str(path)) as files:
+        frames = [frame for logical in files for frame in logical.frames]
+        kept = [
+            (frame, [channel for channel in frame.channels if list(channel.dimension) == [1]])
+            for frame in frames
+        ]
+        names = iter(
+            plain_names([(frame.name, one.name) for frame, channels in kept for one in channels])
+        )
+        return [
+            _make_table(frame, channels, [next(names) for _ in channels])
+            for frame, channels in kept
+        ]
+
+
+def _make_table(frame: Any, channels: list[Any], names: list[str]) -> Table:
+    values = frame.curves()
+    units = [str(channel.units or "").strip() or None for channel in channels]
+    columns = [sliced(values[channel.name]) for channel in channels]
+    timed = "TIME" in str(frame.index_type or "").upper() and is_time_unit(units[0] or "")
+    first = 1 if timed else 0
+    return Table(
+        len(values),
+        tuple(names[first:]),
+        tuple(units[first:]),
+        tuple(columns[first:]),
+        columns[0] if timed else None,
+        units[0] if timed else None,
+    )
