@@ -1,0 +1,72 @@
+"""NovAtel SPAN logs, binary and ASCII: raw counts of the IMU.
+
+The scale of a count is in the manual of the IMU; a count is an angle, so it is multiplied with the
+rate. The axis y is negated in the messages, and turned back here. Stamps are GPS time.
+
+References
+----------
+NovAtel, OEM7 commands and logs reference manual, RAWIMU, RAWIMUX, RAWIMUS and RAWIMUSX.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import xarray as xr
+
+from gyrostab.ingest.columns.stamps import NAT
+from gyrostab.ingest.formats.collect import Messages
+from gyrostab.ingest.formats.tables import Table, library, plain_names, read_tables, scan_tables
+from gyrostab.ingest.options import FileSummary, ReadOptions
+
+__all__ = ["matches", "read", "scan"]
+
+_SYNC = (b"\xaa\x44\x12", b"\xaa\x44\x13")
+_TEXT = re.compile(rb"^[#%][A-Z0-9]{3,}A,[^\r\n]*;", re.MULTILINE)
+_SENSORS = ("gyro", "accel")
+_KINDS = ("RAWIMU", "RAWIMUX", "RAWIMUS", "RAWIMUSX")
+_GPS_EPOCH = 315_964_800  # 1980-01-06 [s since 1970]
+_WEEK = 604_800
+
+
+def matches(path: Path) -> bool:
+    """Return whether the file begins with a message of a NovAtel receiver."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        head = file.read(4096)
+    return head.startswith(_SYNC) or bool(_TEXT.search(head))
+
+
+def scan(path: Path, options: ReadOptions) -> FileSummary:
+    """Summarise messages and stamps; reads the whole file."""
+    tables, notes = _read_messages(path)
+    return scan_tables(path, "novatel", tables, options, notes)
+
+
+def read(path: Path, options: ReadOptions) -> xr.Dataset:
+    """Return the raw log of a SPAN log; see `gyrostab.ingest.read_log`."""
+    tables, notes = _read_messages(path)
+    return read_tables(path, tables, options, notes=notes)
+
+
+def _read_messages(path: Path) -> tuple[list[Table], list[str]]:
+    """Return a table for each kind of message, and a note on their time."""
+    oem = library("novatel_edie.oem", path, extra="novatel")
+    found: dict[str, Messages] = {}
+    for message in oem.FileParser(str(path)):
+        if getattr(message, "name", None) not in _KINDS:  # or bytes between messages
+            continue
+        fields = message.to_dict()
+        week, seconds = int(fields["gps_week"]), float(fields["gps_seconds"])
+        counts = {f"{kind}_{axis}": fields[f"{kind}_{axis}"] for kind in _SENSORS for axis in "xyz"}
+        counts |= {f"{kind}_y": -counts[f"{kind}_y"] for kind in _SENSORS}
+        usable = 0 <= week < 10_000 and 0.0 <= seconds <= _WEEK
+        stamp = (_GPS_EPOCH + week * _WEEK) * 10**9 + round(seconds * 1e9) if usable else NAT
+        found.setdefault(message.name, Messages()).add(stamp, counts)
+    names = iter(plain_names([(kind, name) for kind, one in found.items() for name in one.columns]))
+    tables = [one.make_table([next(names) for _ in one.columns]) for one in found.values()]
+    return tables, [
+        "the stamps are GPS time, which has no leap seconds (18 s ahead of UTC in 2026)"
+    ]
