@@ -1,0 +1,85 @@
+"""ArduPilot DataFlash logs, binary and text: gyros, accelerometers and what explains them.
+
+Columns are named by message, instance and field (``IMU[0].GyrX``); axes and channels are those of
+the first instance. Stamps are microseconds since the start of the autopilot.
+
+References
+----------
+ArduPilot, onboard message log messages.
+"""
+
+from __future__ import annotations
+
+import re
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+from pathlib import Path
+
+import xarray as xr
+
+from gyrostab.ingest.formats.collect import Messages
+from gyrostab.ingest.formats.tables import Table, library, read_tables, scan_tables
+from gyrostab.ingest.options import FileSummary, ReadOptions
+
+__all__ = ["matches", "read", "scan"]
+
+_BINARY = b"\xa3\x95\x80"
+_TEXT = re.compile(rb"^FMT, ?128, ?89, ?FMT,", re.MULTILINE)
+_GYRO = {f"Gyr{axis.upper()}": f"gyro_{axis} [rad/s]" for axis in "xyz"}
+_ACCEL = {f"Acc{axis.upper()}": f"accel_{axis} [m/s^2]" for axis in "xyz"}
+#: Message -> field -> target in the form of ``--map``; GYR and ACC hold every sample of a sensor.
+_MEANINGS = {
+    "IMU": {**_GYRO, **_ACCEL, "T": "temperature [degC]"},
+    "GYR": _GYRO,
+    "ACC": _ACCEL,
+    "MAG": {f"Mag{axis.upper()}": f"mag_{axis} [mG]" for axis in "xyz"},
+    "BARO": {"Press": "pressure [Pa]", "Temp": "temperature_baro [degC]"},
+}
+
+
+def matches(path: Path) -> bool:
+    """Return whether the file begins with the description of a message."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        head = file.read(4096)
+    return head.startswith(_BINARY) or bool(_TEXT.search(head))
+
+
+def scan(path: Path, options: ReadOptions) -> FileSummary:
+    """Summarise messages and stamps; reads the whole file."""
+    return scan_tables(path, "ardupilot", _read_messages(path), options)
+
+
+def read(path: Path, options: ReadOptions) -> xr.Dataset:
+    """Return the raw log of an ArduPilot log; see `gyrostab.ingest.read_log`."""
+    return read_tables(path, _read_messages(path), options)
+
+
+def _read_messages(path: Path) -> list[Table]:
+    """Return a table for each message and instance of a sensor."""
+    reader = library("pymavlink.DFReader", path, extra="ardupilot")
+    with path.open("rb") as file:
+        binary = file.read(3) == _BINARY
+    found: dict[tuple[str, int], Messages] = {}
+    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):  # it prints what it skips
+        log = (reader.DFReader_binary if binary else reader.DFReader_text)(str(path))
+        while (message := log.recv_match(type=list(_MEANINGS))) is not None:
+            fields = message.to_dict()
+            kind, instance = message.get_type(), fields.pop("I", 0)
+            stamp = fields.pop("TimeUS", None)
+            stamp = fields.pop("SampleUS", stamp)
+            if isinstance(stamp, int):
+                numbers = {
+                    name: value for name, value in fields.items() if isinstance(value, int | float)
+                }
+                found.setdefault((kind, instance), Messages()).add(stamp, numbers)
+    axes = "IMU" if ("IMU", 0) in found else "GYR"
+    return [
+        messages.make_table(
+            [f"{kind}[{instance}].{name}" for name in messages.columns],
+            time_unit="us",
+            meanings=_MEANINGS[kind] if instance == 0 and kind in (axes, "MAG", "BARO") else None,
+        )
+        for (kind, instance), messages in found.items()
+    ]
