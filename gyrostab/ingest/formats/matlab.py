@@ -23,6 +23,7 @@ from gyrostab.ingest.columns.headers import (
     is_time_unit,
 )
 from gyrostab.ingest.formats.matlab5 import check_structure
+from gyrostab.ingest.formats.matlab_tables import read_matlab_tables
 from gyrostab.ingest.formats.packing import ATTRIBUTES
 from gyrostab.ingest.formats.stored import StoredColumn, StoredTable, plan_stored
 from gyrostab.ingest.limits import check_chunk
@@ -66,6 +67,8 @@ def _plan_file(path: Path, options: ReadOptions, stack: ExitStack) -> StoredTabl
         for name, array in _find_arrays(path, stack, objects)
         for column in _columns_of(path, name, array, options)
     ]
+    if not found:
+        found = list(read_matlab_tables(path, objects))
     if not found and objects:
         what = f"it holds {', '.join(dict.fromkeys(objects))}, which MATLAB alone can read"
         raise FormatError(f"{path.name}: {what}; save plain arrays instead: {_PLAIN_ARRAYS}")
