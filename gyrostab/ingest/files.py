@@ -77,12 +77,15 @@ def readers() -> tuple[str, ...]:
 
 
 def _find_reader(path: Path) -> Reader:
-    """Find the reader of a file; text is tried last, as it matches most files."""
+    """Find the reader of a file; binary and text are tried last, as they match most files."""
     if not path.exists():
         raise FormatError(f"{path}: there is no such file")
-    if not has_layout(path):
+    first = "binary" if has_layout(path) else None
+    if first is None:
         refuse_unread(path)
-    for name in sorted(_entry_points(), key=lambda name: (name == "text", name)):
+    order = ("binary", "text")
+    names = sorted(set(_entry_points()) - {*order}) + list(order)
+    for name in sorted(names, key=lambda name: name != first):
         reader = cast(Reader, _entry_points()[name].load())
         if reader.matches(path):
             return reader

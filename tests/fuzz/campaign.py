@@ -17,6 +17,7 @@ from tests.fuzz.mutate import damage
 from tests.fuzz.seeds import Seed, make_seeds
 from tests.fuzz.server import Outcome, Server
 from tests.fuzz.structured import STRUCTURED, draw_inputs
+from tests.ingest.field_files import WRITERS
 
 BATCH = 100
 
@@ -94,6 +95,7 @@ FORMATS = (
     "tdms",
     "binary",
     "layout",
+    *WRITERS,
     "model",
     "options",
     "checkpoint",

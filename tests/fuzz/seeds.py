@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.ingest.field_files import WRITERS
+
 ROWS = 80
 RATE = 10.0
 #: Placeholder in inputs for the folder that they are written to.
@@ -446,6 +448,22 @@ def binary_seeds() -> Iterator[Seed]:
     yield Seed("layout", files, "log.bin", keep=("log.bin",))
 
 
+def field_seeds() -> Iterator[Seed]:
+    """Return the files of the contract test of formats of rigs, robots and vehicles."""
+    for name, write in WRITERS.items():
+        with folder() as place:
+            path, _, options = write(place)
+            command = [
+                text
+                for key, value in options.items()
+                for one in (
+                    [f"{k}={v}" for k, v in value.items()] if isinstance(value, dict) else [value]
+                )
+                for text in (f"--{key}", str(one))
+            ]
+            yield Seed(name, contents(path, place), path.name, tuple(command), ("scan", "ingest"))
+
+
 NOISE = """
 [log]
 axes = ["x", "y"]
@@ -657,6 +675,7 @@ MAKERS: tuple[Callable[[], Iterator[Seed]], ...] = (
     las_seeds,
     tdms_seeds,
     binary_seeds,
+    field_seeds,
     model_seeds,
     option_seeds,
     checkpoint_seeds,

@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 __all__ = ["doctor"]
 
 #: Extras that users install; the others are for developers.
-_EXTRAS = ("distributed", "las", "miniseed", "tdms", "ulog")
+_EXTRAS = (
+    "ardupilot", "distributed", "dlis", "las", "matlab", "miniseed", "novatel", "rosbag", "tdms",
+    "ulog",
+)  # fmt: skip
 
 
 @app.command(sort_key=15, help_epilogue="")

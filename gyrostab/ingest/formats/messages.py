@@ -39,9 +39,9 @@ def crc32_mpeg2(rows: NDArray[np.uint8]) -> NDArray[np.uint32]:
 
     Examples
     --------
-    >>> rows = np.frombuffer(b"123456789", np.uint8)[None, :8]
+    >>> rows = np.frombuffer(b"12345678", np.uint8)[None]
     >>> hex(crc32_mpeg2(rows)[0])
-    '0x5660ffe2'
+    '0x49e3c2fb'
     """
     table, found = _crc_table(), np.full(len(rows), 0xFFFFFFFF, dtype=np.uint32)
     for column in np.pad(rows, ((0, 0), (0, -rows.shape[1] % 4))).T:

@@ -1,0 +1,164 @@
+"""Formats of rigs, robots and vehicles: small files written here, all with the same log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gyrostab.errors import FormatError, GyrostabError, MissingUnitError, OptionError
+from gyrostab.ingest import ReadOptions, read_log, scan_file
+from gyrostab.ingest.channel import read_channel
+from gyrostab.ingest.formats.messages import crc32_mpeg2
+from gyrostab.ingest.grid.regularise import gap_table, regularise
+from tests.ingest.field_files import (
+    RATES,
+    ROWS,
+    STAMPS,
+    TEMPERATURE,
+    WRITERS,
+    Made,
+    kvh_message,
+    stim_message,
+    write_wits0,
+    write_witsml,
+)
+
+
+@pytest.fixture(params=WRITERS, scope="module")
+def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Made:
+    return WRITERS[request.param](tmp_path_factory.mktemp("field"))
+
+
+def test_every_format_holds_the_same_log(made: Made) -> None:
+    raw = read_log(made.path, **made.options)
+    assert raw.axis.values.tolist() == ["x", "y", "z"]
+    np.testing.assert_allclose(raw.rate.values, RATES * 3.6, rtol=1e-6)
+    assert np.array_equal(raw.time.values, STAMPS)
+    if made.form != "novatel":
+        np.testing.assert_allclose(raw.temperature.values, TEMPERATURE, rtol=1e-6)
+    summary = scan_file(made.path, ReadOptions(**made.options))
+    assert (summary.format, summary.axes, summary.n_rows) == (made.form, ("x", "y", "z"), ROWS)
+    assert (summary.first, summary.last) == (STAMPS[0], STAMPS[-1])
+
+
+def test_a_file_that_is_cut_off_is_read_in_part_or_named(made: Made, tmp_path: Path) -> None:
+    if made.path.is_dir():
+        pytest.skip("a folder")
+    data = made.path.read_bytes()
+    for size in (len(data) // 2, 40):
+        path = tmp_path / made.path.name
+        path.write_bytes(data[:size])
+        try:
+            rows, said = read_log(path, **made.options).sizes["row"], path.name
+        except GyrostabError as error:
+            rows, said = 0, str(error)
+        assert rows < ROWS
+        assert path.name in said
+
+
+@pytest.mark.parametrize(
+    ("cell", "unit", "first"),
+    [
+        ("2026-03-14T23:59:59.5Z", "", "2026-03-14T23:59:59.5"),
+        ("2026/03/14_23:59:59", "", "2026-03-14T23:59:59"),
+        ("14-Mar-26/23:59:59.5", "", "2026-03-14T23:59:59.5"),
+        ("03/04/2026-08:00:00", "DD/MM/YYYY", "2026-04-03T08:00"),
+    ],
+)
+def test_the_index_of_las_holds_dates_and_times(
+    tmp_path: Path, cell: str, unit: str, first: str
+) -> None:
+    path = tmp_path / "a.las"
+    head = "~V\nVERS. 2.0 :\nWRAP. NO :\n~W\nSTRT. 0 :\nSTOP. 9 :\nSTEP. 0 :\nNULL. -999.25 :\n"
+    path.write_text(f"{head}~C\nINDEX.{unit} : index\nGYRO_X.deg/h :\n~A\n{cell} 1.5\n{cell} 2\n")
+    raw = read_log(path)
+    assert raw.time.values.tolist() == [np.datetime64(first, "ns").astype(np.int64)] * 2
+    assert raw.rate[0].values.tolist() == [1.5, 2.0]
+
+
+def test_the_checksum_is_that_of_a_message_of_a_sensor() -> None:
+    """A message of a KVH 1750, from the test of a driver."""
+    text = "FE81FF5537A96A6E38586C1FB75BF862BF803E78BB650D283B0A37AC773D00284BFA34D8"
+    message = np.frombuffer(bytes.fromhex(text), dtype=np.uint8)
+    assert crc32_mpeg2(message[None, :-4]) == message[-4:].view(">u4")
+
+
+@pytest.mark.parametrize("sensor", ["kvh-a", "stim300-a5"])
+def test_messages_of_known_sensors(tmp_path: Path, sensor: str) -> None:
+    if sensor == "kvh-a":
+        messages = [kvh_message(n, RATES[:, n % ROWS] * 1e-3, 40) for n in range(300)]
+        options: dict[str, Any] = {"unit": {"gyro": "deg/s", "temperature": "degC"}}
+    else:
+        messages = [stim_message(n, RATES[:, n % ROWS], 40 * 256) for n in range(300)]
+        options = {}
+    lost, broken = 20, bytearray(messages[140])
+    broken[9] ^= 1
+    stream = b"".join([b"\xfe\x81", *messages[:100], *messages[100 + lost : 140], bytes(broken)])
+    path = tmp_path / "log.bin"
+    path.write_bytes(stream + b"\r\n".join(messages[141:]) + messages[0][:20])
+    raw = read_log(path, rate=250.0, epoch="2026-03-01", **options)
+    numbers = np.r_[0:100, 100 + lost : 140, 141:300]
+    scale = 3.6 if sensor == "kvh-a" else 3600 / 2**14
+    np.testing.assert_allclose(raw.rate, RATES[:, numbers % ROWS] * scale, rtol=1e-6)
+    since = (raw.time.values - np.datetime64("2026-03-01", "ns")).astype(np.int64)
+    assert np.array_equal(since, numbers * 4_000_000)
+    assert (raw.temperature.values == 40.0).all()
+    assert any(sensor in note for note in raw.attrs["notes"])
+    assert any(f"{lost + 1} messages were lost" in note for note in raw.attrs["notes"])
+    gaps = gap_table(regularise(raw))
+    assert gaps["samples"].tolist() == [lost, 1]
+
+
+def test_without_a_unit_or_a_rate_the_messages_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "log.bin"
+    path.write_bytes(b"".join(kvh_message(n, RATES[:, n] * 1e-3, 40) for n in range(ROWS)))
+    with pytest.raises(OptionError, match=r"log\.bin: .*--rate HZ"):
+        read_log(path, unit={"gyro": "deg/s"})
+    with pytest.raises(MissingUnitError, match=r"log\.bin: .*--unit gyro="):
+        read_log(path, rate=1000.0)
+
+
+@pytest.mark.parametrize("order", ["little", "big"])
+def test_numbers_of_24_bits(tmp_path: Path, order: Any) -> None:
+    values = [0, 1, -1, 2**23 - 1, -(2**23)]
+    path = tmp_path / "run.bin"
+    path.write_bytes(b"".join(b"!" + value.to_bytes(3, order, signed=True) for value in values))
+    fields = '[{skip = 1}, {name = "gyro_x [deg/h]", type = "int24"}]'
+    path.with_suffix(".toml").write_text(f'byte_order = "{order}"\nfields = {fields}')
+    assert read_log(path, rate=1.0).rate[0].values.tolist() == values
+
+
+@pytest.mark.parametrize(
+    "layout",
+    [
+        'sync = "GG"\nfields = [{name = "gyro_x", type = "int8"}]',
+        'fields = [{name = "gyro_x", type = "int8"}, {counter = 128, type = "float32"}]',
+        'fields = [{name = "gyro_x", type = "int8"}, {counter = 1, type = "uint8"}]',
+        'fields = [{name = "gyro_x", type = ["int8"]}]',
+        "fields = 3",
+    ],
+)
+def test_unusable_layouts_are_named(tmp_path: Path, layout: str) -> None:
+    (tmp_path / "run.bin").write_bytes(bytes(100))
+    (tmp_path / "run.toml").write_text(layout)
+    with pytest.raises(OptionError, match=r"^run\.toml: "):
+        read_log(tmp_path / "run.bin", rate=1.0)
+
+
+def test_items_of_wits_are_channels(tmp_path: Path) -> None:
+    path, form, options = write_wits0(tmp_path)
+    found = read_channel(path, **options)
+    assert found.values.tolist() == [60.5, 62.5, 64.5, 66.5, 68.5]
+    assert found.time_temperature.values[1] == np.datetime64("2026-03-14T08:00:02")
+    assert scan_file(path).format == form
+    assert {column.name for column in scan_file(path).columns} >= {"0110", "0921"}
+
+
+def test_witsml_over_depth_is_refused(tmp_path: Path) -> None:
+    made = write_witsml(tmp_path)
+    made.path.write_text(made.path.read_text().replace("date time", "measured depth"))
+    with pytest.raises(FormatError, match=r"log\.xml: .*export the log by time"):
+        read_log(made.path)
