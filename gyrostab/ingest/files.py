@@ -34,7 +34,16 @@ from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.ingest.overlap import stamp_span
 from gyrostab.schema import texts
 
-__all__ = ["OnFile", "Reader", "check_options", "read_log", "readers", "scan_file"]
+__all__ = [
+    "OnFile",
+    "ReadFile",
+    "Reader",
+    "check_options",
+    "read_file",
+    "read_log",
+    "readers",
+    "scan_file",
+]
 
 GROUP = "gyrostab.readers"
 #: Text files that are read in parallel.
@@ -42,6 +51,8 @@ _FILES_AHEAD = 2
 
 #: Called with the number of a file, the number of files and the path.
 OnFile = Callable[[int, int, Path], None]
+#: Reads one file in place of `read_file`.
+ReadFile = Callable[[Path, ReadOptions], xr.Dataset]
 
 
 class Reader(Protocol):
@@ -157,6 +168,7 @@ def scan_file(path: str | Path, options: ReadOptions | None = None) -> FileSumma
 
 
 def read_file(path: Path, options: ReadOptions) -> xr.Dataset:
+    """Read one file into a raw log, or open it as a regular log."""
     reader = _find_reader(path)
     with reading_of(path):
         return reader.read(path, options)
@@ -176,6 +188,7 @@ def read_log(
     max_gap: str | float = "10D",
     limits: Mapping[str, float] | None = None,
     on_file: OnFile | None = None,
+    read: ReadFile | None = None,
 ) -> xr.Dataset:
     r"""Read one or more logs as they were written.
 
@@ -210,6 +223,8 @@ def read_log(
     on_file : callable, optional
         Called with the number of the file (from 1), the number of files and the path before each
         file is read.
+    read : callable, optional
+        Function that reads one file, such as one that remembers files; by default each is read.
 
     Returns
     -------
@@ -251,7 +266,7 @@ def read_log(
     )
     found = expand(paths)
     extra = expand(options.channel) if options.channel else []
-    parts, lost = _read_all(found, options, on_file)
+    parts, lost = _read_all(found, options, on_file, read)
     regular = [path for path, part in parts.items() if "sampling_rate_hz" in part.attrs]
     if regular and len(regular) < len(parts):
         raw = next(path for path in parts if path not in regular)
@@ -290,14 +305,17 @@ def read_log(
 
 
 def _read_all(
-    paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None = None
+    paths: Sequence[Path],
+    options: ReadOptions,
+    on_file: OnFile | None = None,
+    read_one: ReadFile | None = None,
 ) -> tuple[dict[Path, xr.Dataset], list[LostFile]]:
     """Read the files one by one; move them to disk when they exceed the memory limit together."""
     parts: dict[Path, xr.Dataset] = {}
     lost: list[LostFile] = []
     spool = Spool()
     held = 0
-    with closing(_read_ahead(paths, options, on_file)) as reading:
+    with closing(_read_ahead(paths, options, on_file, read_one)) as reading:
         for path, read in zip(paths, reading, strict=True):
             try:
                 part = read()
@@ -316,9 +334,9 @@ def _read_all(
 
 
 def _read_ahead(
-    paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None
+    paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None, read_one: ReadFile | None
 ) -> Generator[Callable[[], xr.Dataset], None, None]:
-    """Yield a function that reads each file; text files are read ahead in threads."""
+    """Yield a function that reads each file; text files are read ahead in threads by default."""
     stop = Event()
     with ThreadPoolExecutor(_FILES_AHEAD, thread_name_prefix="gyrostab-file") as pool:
         waiting: deque[Callable[[], xr.Dataset]] = deque()
@@ -326,11 +344,11 @@ def _read_ahead(
             for number, path in enumerate(paths, 1):
                 if on_file is not None:
                     on_file(number, len(paths), path)
-                early = len(paths) > 1 and _is_text(path)
+                early = read_one is None and len(paths) > 1 and _is_text(path)
                 waiting.append(
                     pool.submit(_read_text, path, options, stop).result
                     if early
-                    else partial(read_file, path, options)
+                    else partial(read_one or read_file, path, options)
                 )
                 if len(waiting) == _FILES_AHEAD:
                     yield waiting.popleft()

@@ -41,6 +41,8 @@ class ReadOptions:
         Files with further channels.
     channels_only : bool
         Whether the file is read only for its channels, without gyro axes.
+    growing : bool
+        Whether the file is still written: the last line of a text file counts once it has its end.
     strict : bool
         Whether damage in a regular log is an error instead of a gap.
     limits : mapping of str to float
@@ -60,6 +62,7 @@ class ReadOptions:
     kind: str | None = None
     channel: Sequence[str | Path] = ()
     channels_only: bool = False
+    growing: bool = False
     strict: bool = False
     limits: Mapping[str, float] = field(default_factory=dict)
 

@@ -37,7 +37,15 @@ from gyrostab.store.write import (
     long_variables,
 )
 
-__all__ = ["open_dataset", "open_log", "open_product", "open_surface", "to_netcdf", "to_zarr"]
+__all__ = [
+    "open_dataset",
+    "open_log",
+    "open_product",
+    "open_surface",
+    "plan_zarr",
+    "to_netcdf",
+    "to_zarr",
+]
 
 #: Values in one compressed chunk of a surface or product: 1 MiB of float64.
 CHUNK_VALUES = 2**17
@@ -261,7 +269,7 @@ def to_zarr(
 
     def write(packed: xr.Dataset) -> None:
         long = long_variables(packed) if _find_rate(packed) is not None else {}
-        encoding = _zarr_encoding(packed)
+        encoding = plan_zarr(packed)
         rest = {name: options for name, options in encoding.items() if name not in long}
         lazy = {
             name: packed[name].variable
@@ -290,7 +298,7 @@ def to_zarr(
     return Path(path)
 
 
-def _zarr_encoding(stored: xr.Dataset) -> dict[Any, dict[str, Any]]:
+def plan_zarr(stored: xr.Dataset) -> dict[Any, dict[str, Any]]:
     """Choose chunks and compression; add a checksum to every chunk of a log, as blosc has none."""
     from numcodecs import Blosc, Fletcher32
 

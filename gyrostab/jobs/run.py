@@ -75,7 +75,7 @@ def load_log(
         `gyrostab.ingest.uniform.cut_log`.
     **reading
         Options of `gyrostab.ingest.read_log`: ``rate``, ``start``, ``epoch``, ``map``, ``unit``,
-        ``kind``, ``channel``, ``strict``, ``limits``, ``on_file``.
+        ``kind``, ``channel``, ``strict``, ``limits``, ``on_file``, ``read``.
 
     Returns
     -------
@@ -95,7 +95,7 @@ def load_log(
         said = "; ".join(
             f"{name}: {_format_option(value)}"
             for name, value in reading.items()
-            if value and name != "on_file"
+            if value and name not in ("on_file", "read")
         )
         if said:
             log.attrs["history"] += f" (read with {said})"

@@ -100,15 +100,19 @@ def find_kind(dataset: xr.Dataset) -> str:
     return "dataset"
 
 
-def to_disk(dataset: xr.Dataset, verb: str, *, stamps: bool = False) -> xr.Dataset:
+def to_disk(
+    dataset: xr.Dataset, verb: str, *, stamps: bool = False, nanoseconds: bool = False
+) -> xr.Dataset:
     """Encode a dataset as the file will hold it; `verb` is added to its history.
 
     With `stamps`, a computed time axis becomes a lazy coordinate, with its rule as an attribute.
+    With `nanoseconds`, times are not stored as microseconds, even if that would be exact.
     """
     kind = find_kind(dataset)
     dataset = make_names_storable(dataset)
     grids = _find_time_grids(dataset)
-    divisor = 1000 if _has_whole_microseconds(dataset, grids, stamps=stamps) else 1
+    short = not nanoseconds and _has_whole_microseconds(dataset, grids, stamps=stamps)
+    divisor = 1000 if short else 1
     since = {
         "units": f"{'microseconds' if divisor == 1000 else 'nanoseconds'} since {_EPOCH}",
         **_CALENDAR,

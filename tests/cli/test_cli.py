@@ -30,6 +30,7 @@ COMMANDS = (
     "scan",
     "ingest",
     "run",
+    "watch",
     "davar",
     "fit",
     "report",

@@ -97,7 +97,9 @@ def read(
     builder = RawLogBuilder(plan.check(), options)
     parse = partial(_parse_block, parser=BlockParser(layout, plan, options), builder=builder)
     line = layout.line
-    for converted, block, starts, lines in map_in_order(parse, _read_blocks(path, layout.offset)):
+    for converted, block, starts, lines in map_in_order(
+        parse, _read_blocks(path, layout.offset, growing=options.growing)
+    ):
         if stop is not None and stop():
             raise CancelledError
         builder.add(converted, partial(_line_names, block, starts, line))
@@ -231,8 +233,8 @@ def _read_chunk(path: Path, file: IO[bytes], size: int, done: int) -> bytes:
     return b"".join(parts)
 
 
-def _read_blocks(path: Path, offset: int) -> Iterator[bytes]:
-    """Yield the data rows in blocks that end with a line."""
+def _read_blocks(path: Path, offset: int, *, growing: bool = False) -> Iterator[bytes]:
+    """Yield the data rows in blocks that end with a line; of a growing file, whole lines only."""
     with _open_text(path) as file:
         done = len(_read_chunk(path, file, offset, 0))
         rest = b""
@@ -249,7 +251,7 @@ def _read_blocks(path: Path, offset: int) -> Iterator[bytes]:
                 continue
             yield b"".join((rest, memoryview(chunk)[:cut]))
             rest = chunk[cut:]
-        if rest.strip():
+        if rest.strip() and not growing:
             yield rest + b"\n"
 
 

@@ -5,6 +5,7 @@ from gyrostab.store.output.content import find_foreign_item, read_json
 from gyrostab.store.output.inputs import (
     describe_file,
     find_sources,
+    follow_inputs,
     protect_inputs,
 )
 from gyrostab.store.output.write import (
@@ -22,6 +23,7 @@ __all__ = [
     "describe_file",
     "find_foreign_item",
     "find_sources",
+    "follow_inputs",
     "is_leftover",
     "new_folder",
     "new_output",

@@ -22,6 +22,7 @@ __all__ = [
     "check_unchanged",
     "describe_file",
     "find_sources",
+    "follow_inputs",
     "match_files",
     "protect_inputs",
     "protected_inputs",
@@ -100,6 +101,17 @@ def protect_inputs(
     before = _PROTECTED.get() or {}
     files = {path: _describe_data(path) for path in match_files(paths) if path not in before}
     token = _PROTECTED.set({**before, **files})
+    try:
+        yield
+    finally:
+        _PROTECTED.reset(token)
+
+
+@contextlib.contextmanager
+def follow_inputs(paths: Iterable[str | os.PathLike[str]]) -> Iterator[None]:
+    """Protect inputs as `protect_inputs` does, but let these and all others change: they grow."""
+    inputs = [*protected_inputs(), *match_files(paths)]
+    token = _PROTECTED.set(dict.fromkeys(inputs))
     try:
         yield
     finally:

@@ -1,0 +1,199 @@
+"""Files of a live view: those of a folder that grow, and the rows of standard input."""
+
+from __future__ import annotations
+
+import glob
+import re
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import xarray as xr
+
+from gyrostab.errors import FormatError
+from gyrostab.ingest.columns.pieces import Spool
+from gyrostab.ingest.combine import move_to_disk
+from gyrostab.ingest.files import read_file
+from gyrostab.ingest.options import ReadOptions
+
+__all__ = ["FileMemory", "RowKeeper", "list_files"]
+
+#: Files written this long [s] before the newest one, or later, may still grow.
+_GROWING_SECONDS = 60.0
+#: Size of the files in which rows of standard input are kept [bytes].
+_MAX_ROW_FILE_BYTES = 2**26
+_READ_BYTES = 2**16
+_DATA_ROW = re.compile(rb'\s*"?[-+.\d]')
+_ROW_FILE = "rows-{:06d}.csv"
+
+
+class FileState(NamedTuple):
+    """Size [bytes] and time of change [ns] of a file."""
+
+    size: int
+    changed: int
+
+
+def list_files(source: str) -> dict[Path, FileState]:
+    """List the files of a folder, of a pattern, or a single file, with their states.
+
+    Hidden files and folders are left out.
+    """
+    path = Path(source)
+    if path.is_dir():
+        found = list(path.iterdir())
+    elif path.exists() or not glob.has_magic(source):
+        found = [path]
+    else:
+        found = [Path(name) for name in glob.glob(source, recursive=True)]
+    states = {}
+    for item in sorted(found):
+        if item.name.startswith(".") or not item.is_file():
+            continue
+        status = item.stat()
+        if status.st_size:
+            states[item] = FileState(status.st_size, status.st_mtime_ns)
+    return states
+
+
+class FileMemory:
+    """Reads files, and remembers those that have not changed since, on disk.
+
+    Attributes
+    ----------
+    files : dict
+        The files to read, as from `list_files`.
+    ended : bool
+        Whether no file grows any more.
+    """
+
+    def __init__(self) -> None:
+        self.files: dict[Path, FileState] = {}
+        self.ended = False
+        self._spool = Spool()
+        self._kept: dict[Path, tuple[FileState, bool, xr.Dataset]] = {}
+
+    def is_growing(self, path: Path) -> bool:
+        """Whether a file may still grow."""
+        newest = max(state.changed for state in self.files.values())
+        age = (newest - self.files[path].changed) / 1e9
+        return not self.ended and age < _GROWING_SECONDS
+
+    def update(self, files: dict[Path, FileState]) -> bool:
+        """Take over a new list of files; return whether an earlier file was replaced or cut."""
+        before, self.files = self.files, files
+        for path in self._kept.keys() - files.keys():
+            del self._kept[path]
+        return any(
+            path not in files or files[path].size < state.size for path, state in before.items()
+        )
+
+    def read(self, path: Path, options: ReadOptions) -> xr.Dataset:
+        """Read a file, or return what was read of it before."""
+        if path not in self.files:  # a channel
+            return read_file(path, options)
+        state, growing = self.files[path], self.is_growing(path)
+        if path in self._kept and self._kept[path][:2] == (state, growing):
+            return self._kept[path][2].copy(deep=False)
+        log = read_file(path, replace(options, growing=growing))
+        if "row" not in log.dims:
+            raise FormatError(
+                f"{path}: is a regular log, which does not grow; analyse it with gyrostab run"
+            )
+        if not growing:
+            log = move_to_disk(log, self._spool)
+        self._kept[path] = state, growing, log
+        return log.copy(deep=False)
+
+
+class RowKeeper:
+    """Keeps the rows of a stream in files of a folder, which a restart and a later run read.
+
+    Parameters
+    ----------
+    stream : binary file
+        Text rows, with or without a header; without one, rows of an earlier stream give it.
+    folder : Path
+        Where the rows are kept.
+
+    Attributes
+    ----------
+    ended : bool
+        Whether the stream has ended.
+    error : Exception or None
+        Error that ended the copying.
+    """
+
+    def __init__(self, stream: IO[bytes], folder: Path):
+        self.folder, self.ended = folder, False
+        self.error: Exception | None = None
+        folder.mkdir(exist_ok=True)
+        self._files = sorted(folder.glob(_ROW_FILE.format(0).replace("000000", "*")))
+        self._thread = threading.Thread(target=self._copy, args=(stream,), daemon=True)
+        self._thread.start()
+
+    def _copy(self, stream: Any) -> None:
+        try:
+            read = getattr(stream, "read1", stream.read)
+            for block in _split_blocks(iter(lambda: read(_READ_BYTES), b"")):
+                self._write_file(block)
+        except Exception as error:  # shown by the main thread
+            self.error = error
+        finally:
+            self.ended = True
+
+    def _write_file(self, pieces: Iterator[bytes]) -> None:
+        """Write the pieces of one file as they come, with the header of the first file."""
+        first = next(pieces)
+        header = b""
+        if _DATA_ROW.match(first) and self._files:
+            header = _read_header(self._files[0])
+        path = self.folder / _ROW_FILE.format(len(self._files) + 1)
+        with path.open("xb") as file:
+            self._files.append(path)
+            file.write(header + first)
+            file.flush()
+            for piece in pieces:
+                file.write(piece)
+                file.flush()
+
+
+def _split_blocks(pieces: Iterator[bytes]) -> Iterator[Iterator[bytes]]:
+    r"""Split a stream at line ends into the contents of files.
+
+    Examples
+    --------
+    >>> [b"".join(block) for block in _split_blocks(iter([b"a\n1", b"\n2\n"]))]
+    [b'a\n1\n2\n']
+    """
+    rest = b""
+
+    def take(first: bytes) -> Iterator[bytes]:
+        nonlocal rest
+        size, piece = 0, first
+        while piece:
+            cut = piece.rfind(b"\n") + 1
+            if size + len(piece) > _MAX_ROW_FILE_BYTES and cut:
+                yield piece[:cut]
+                rest = piece[cut:]
+                return
+            yield piece
+            size += len(piece)
+            piece = next(pieces, b"")
+
+    while first := rest or next(pieces, b""):
+        rest = b""
+        yield take(first)
+
+
+def _read_header(path: Path) -> bytes:
+    """Read the lines before the first data row of a file of rows."""
+    lines = []
+    with path.open("rb") as file:
+        for line in file:
+            if _DATA_ROW.match(line):
+                break
+            lines.append(line)
+    return b"".join(lines)

@@ -1,0 +1,411 @@
+"""Follow growing logs: the product of the rows so far, at any moment that of a run over them.
+
+Whenever rows for a new window have come, all files are read as a run reads them (`load_log`), where
+files that have not changed are remembered. Windows are computed in the units of work of a run, and
+only units whose samples differ from the last time: the last one, which grows, and earlier ones into
+which late rows fell.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import re
+import sys
+import time
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import IO, Any, NamedTuple, Protocol
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.allan.plan import last_sample, make_plan, units_of_work
+from gyrostab.errors import FormatError, GyrostabError, OutputError, TimeError
+from gyrostab.ingest.concat.lazy import GridSource
+from gyrostab.ingest.uniform import cut_log
+from gyrostab.io.datasets import open_product
+from gyrostab.io.growing import LayoutError, write_windows
+from gyrostab.jobs.alarms import Alarm, check_alarms, describe_windows
+from gyrostab.jobs.checks import check_windows
+from gyrostab.jobs.engine import compute_part, find_record_bands
+from gyrostab.jobs.follow import FileMemory, RowKeeper, list_files
+from gyrostab.jobs.job import (
+    describe_differences,
+    job_folder,
+    lock_job,
+    make_fingerprint,
+    remove_job,
+)
+from gyrostab.jobs.run import load_log
+from gyrostab.kernels.workspace import Workspace
+from gyrostab.schema import log_channels, signal_name
+from gyrostab.store.lazy import find_source, read_slice
+from gyrostab.store.output import check_output, follow_inputs, resolve_link
+from gyrostab.time.durations import duration_seconds, samples
+from gyrostab.time.grid import first_stamp, grid_times
+
+__all__ = ["Listener", "rows_folder", "watch"]
+
+#: Attribute of the product with the options that made it.
+_OPTIONS = "gyrostab_watch"
+#: Largest share of the time that is spent on updates: after a long one, the next one waits.
+_MAX_WORK_SHARE = 0.1
+#: Share of the bytes that the next window is estimated to need from which on files are read.
+_DUE_SHARE = 0.9
+#: Notes whose counts matter are repeated when the counts change.
+_COUNTED_NOTES = ("out of order", "dropped")
+
+
+class Listener(Protocol):
+    """Receives what a live view finds."""
+
+    def show_window(self, window: Mapping[str, Any]) -> None:
+        """Receive a new window, as from `gyrostab.jobs.alarms.describe_windows`."""
+
+    def show_alarm(self, event: Mapping[str, str]) -> None:
+        """Receive the begin or end of an alarm: ``time``, ``state`` and ``text``."""
+
+    def show_note(self, text: str) -> None:
+        """Receive a remark on the rows, or on what is awaited."""
+
+
+def rows_folder(output: str | Path) -> Path:
+    """Return the folder in which the rows of standard input are kept."""
+    path = Path(output)
+    return path.with_name(f"{path.stem}-rows")
+
+
+def watch(
+    source: str,
+    output: str | Path,
+    *,
+    listener: Listener,
+    reading: Mapping[str, Any] | None = None,
+    windows: Mapping[str, Any] | None = None,
+    fitting: Mapping[str, Any] | None = None,
+    alarms: Sequence[Alarm] = (),
+    lateness: str | None = None,
+    idle: str | None = None,
+    poll: float = 1.0,
+    overwrite: bool = False,
+    stream: IO[bytes] | None = None,
+) -> Path:
+    """Follow growing logs, and append each window to a Zarr product once it is complete.
+
+    The product is that of `gyrostab.jobs.run.run` over the same rows, bit for bit.
+
+    Parameters
+    ----------
+    source : str
+        A folder, a pattern or a file; or ``-`` for rows of `stream`, which are kept in
+        `rows_folder`.
+    output : path
+        Zarr store. One that this function made with the same options is continued.
+    listener : Listener
+        Receives windows, alarms and notes.
+    reading, windows, fitting : mapping
+        As for `gyrostab.jobs.run.run`; the window is 10 min by default.
+    alarms : sequence of Alarm
+        Limits, see `gyrostab.jobs.alarms.parse_alarm`.
+    lateness : str, optional
+        How long after its end a window waits for rows that come out of order, in the time of the
+        stamps. A window into which rows fall later is computed again.
+    idle : str, optional
+        Return when no row has come for so long. By default, only the end of the stream, or an
+        interruption, ends the function; the last windows are then written too.
+    poll : float
+        Time between two looks at the files [s].
+    overwrite : bool
+        Replace an existing output.
+    stream : binary file, optional
+        Standard input by default.
+
+    Returns
+    -------
+    Path
+        The product.
+
+    Raises
+    ------
+    OutputError
+        When the output exists and is not that of the same options, or cannot be written.
+    OptionError, UnitError
+        When an option or the unit of a column is wrong or missing.
+    FormatError
+        When no window could be computed until the end.
+    """
+    options = {
+        "reading": dict(reading or {}),
+        "windows": {"window": "10min", **(windows or {})},
+        "fitting": dict(fitting or {}),
+    }
+    check_windows(**options["windows"])
+    wait = duration_seconds(lateness, "--lateness") if lateness else 0.0
+    quiet = duration_seconds(idle, "--idle") if idle else np.inf
+    path = Path(output)
+    with follow_inputs([] if source == "-" else [source]):
+        state = _continue_product(path, options, overwrite=overwrite)
+        folder = job_folder(resolve_link(path))
+        with lock_job(folder):
+            try:
+                keeper = None
+                if source == "-":
+                    _check_rows(path, overwrite=overwrite)
+                    keeper = RowKeeper(stream or sys.stdin.buffer, rows_folder(path))
+                    source = str(rows_folder(path))
+                view = _View(path, options, wait, list(alarms), listener, state)
+                _follow(view, source, keeper, quiet, poll)
+            finally:
+                remove_job(folder, output=resolve_link(path))
+    return path
+
+
+def _follow(view: _View, source: str, keeper: RowKeeper | None, quiet: float, poll: float) -> None:
+    """Update a view until the stream has ended, nothing has come for long, or Ctrl-C."""
+    changed = time.monotonic()
+    with contextlib.suppress(KeyboardInterrupt):
+        while True:
+            ended = keeper is not None and keeper.ended
+            files = list_files(source)
+            if files != view.memory.files:
+                changed = time.monotonic()
+                view.take_files(files)
+            if ended or time.monotonic() - changed > quiet:
+                break
+            view.update()
+            time.sleep(poll)
+    if keeper is not None and keeper.error is not None:
+        raise keeper.error
+    view.memory.ended = True
+    view.take_files(list_files(source))
+    view.update(final=True)
+
+
+def _check_rows(path: Path, *, overwrite: bool) -> None:
+    if overwrite and rows_folder(path).exists():
+        raise OutputError(
+            f"{rows_folder(path)} holds the rows of an earlier live view, which a new one would "
+            "include; move or remove that folder, or give another name with -o"
+        )
+
+
+class _Continued(NamedTuple):
+    """What an earlier call has left."""
+
+    exists: bool
+    until: np.datetime64 | None
+
+
+def _continue_product(path: Path, options: dict[str, Any], *, overwrite: bool) -> _Continued:
+    """Check that the output can be written; find the last window of one that is continued."""
+    before = None
+    if path.exists() and not overwrite:
+        with contextlib.suppress(GyrostabError), open_product(path) as product:
+            before = product.attrs.get(_OPTIONS)
+            until = product["time"].values[-1]
+    if before is None:
+        check_output(path, suffixes=[".zarr"], overwrite=overwrite)
+        return _Continued(False, None)
+    check_output(path, suffixes=[".zarr"], overwrite=True)
+    if changes := describe_differences(json.loads(before), _describe_options(options)):
+        raise OutputError(
+            f"output {str(path)!r} exists already, and {changes}; give the same options to "
+            "continue it, --overwrite to replace it, or another name with -o"
+        )
+    return _Continued(True, until)
+
+
+def _describe_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    plain = {**options["reading"], **options["windows"]}
+    return make_fingerprint([], {**plain, **{f"fit {k}": v for k, v in options["fitting"].items()}})
+
+
+class _View:
+    """The product so far, and which samples it was computed from."""
+
+    def __init__(
+        self,
+        path: Path,
+        options: dict[str, Any],
+        lateness: float,
+        alarms: list[Alarm],
+        listener: Listener,
+        state: _Continued,
+    ):
+        self.path, self.options, self.lateness = path, options, lateness
+        self.alarms, self.listener, self.state = alarms, listener, state
+        self.memory = FileMemory()
+        self.space = Workspace()
+        self.digests: list[bytes] = []
+        self.common = ""
+        self.shown = 0  # windows
+        self.missing_samples, self.samples, self.bytes = 0, 0, 0
+        self.next_update = 0.0
+        self.notes: set[str] = set()
+        self.is_new_data = False
+
+    def take_files(self, files: dict[Path, Any]) -> None:
+        """Take over a new list of files."""
+        if self.memory.update(files):
+            self.digests = []
+        self.is_new_data = True
+
+    def update(self, *, final: bool = False) -> None:
+        """Compute and write the windows that are complete now, if there may be new ones."""
+        if not final and not (self.is_new_data and self._is_due()):
+            return
+        if not self.memory.files:
+            if final:
+                raise FormatError("no row has come, so there is no product")
+            return
+        begun = time.monotonic()
+        try:
+            self._update(final=final)
+        except (FormatError, TimeError) as error:
+            if final and not self.state.exists:
+                raise
+            self._note(f"waiting: {error}")
+        self.is_new_data = False
+        spent = time.monotonic() - begun
+        self.next_update = time.monotonic() + spent * (1.0 / _MAX_WORK_SHARE - 1.0)
+
+    def _is_due(self) -> bool:
+        """Whether a new window may be complete: by the time of the last update, and by bytes."""
+        held = sum(state.size for state in self.memory.files.values())
+        needed = _DUE_SHARE * self.missing_samples * self.bytes / max(self.samples, 1)
+        return time.monotonic() >= self.next_update and held >= self.bytes + needed
+
+    def _note(self, text: str) -> None:
+        """Show a note once, and again when the number of rows in it changes."""
+        counts = any(kind in text for kind in _COUNTED_NOTES)
+        key = text if counts else re.sub(r"\d+", "", text)
+        if key not in self.notes:
+            self.notes.add(key)
+            self.listener.show_note(text)
+
+    def _load(self) -> xr.Dataset:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            log = load_log(
+                list(self.memory.files), **self.options["reading"], read=self.memory.read
+            )
+        for warning in caught:
+            self._note(str(warning.message))
+        return log
+
+    def _update(self, *, final: bool) -> None:
+        log, windows = self._load(), self.options["windows"]
+        self.bytes = sum(state.size for state in self.memory.files.values())
+        self.samples = log.sizes["time"]
+        rate = float(log.attrs["sampling_rate_hz"])
+        wait = 0 if final else round(self.lateness * rate)
+        points = samples(windows["window"], rate, "window") + (signal_name(log) == "angle")
+        complete = self.samples - wait - points
+        if complete < 0 and not (final and not self.state.exists):
+            self.missing_samples = -complete
+            return
+        unit = make_plan(log, **windows).unit  # at the end, it raises that the record is too short
+        count = complete // unit.step + 1
+        self.missing_samples = count * unit.step - complete
+        size = last_sample(slice(0, count), unit)
+        units = units_of_work(size, unit)
+        spans = [(part.start * unit.step, last_sample(part, unit)) for part in units]
+        start = first_stamp(log)
+        used = log
+        if wait:
+            used = cut_log(log, time_to=np.datetime64(int(grid_times(start, rate, size)), "ns"))
+        fitting = find_record_bands(used, windows, self.options["fitting"])
+        source = type(find_source(log[signal_name(log)].data)).__name__
+        common = repr(
+            (start, rate, fitting, log["axis"].values.tolist(), log_channels(log), source)
+        )
+        digests = [hash_samples(log, span, common) for span in spans]
+        same_record, self.common = common == self.common, common
+        self._write(used, units, digests, fitting or {}, same_record=same_record)
+
+    def _write(
+        self,
+        log: xr.Dataset,
+        units: list[slice],
+        digests: list[bytes],
+        fitting: Mapping[str, Any],
+        *,
+        same_record: bool,
+    ) -> None:
+        """Compute the units whose samples have changed, write and show them."""
+        exists = self.state.exists and self.path.exists()
+        old = self.digests if exists else []
+        same = [i < len(old) and old[i] == digest for i, digest in enumerate(digests)]
+        if all(same) and len(old) == len(digests):
+            return
+        attrs = {_OPTIONS: json.dumps(_describe_options(self.options))}
+
+        def compute(parts: Sequence[slice]) -> Iterator[tuple[slice, xr.Dataset]]:
+            for part in parts:
+                result = compute_part(log, part, self.options["windows"], fitting, self.space)
+                windows = describe_windows(result.isel(time=slice(self.shown - part.start, None)))
+                if windows and not self.shown:
+                    check_alarms(self.alarms, windows[0])
+                yield part, result.assign_attrs(attrs)
+                self._show(windows)
+
+        changed = [part for part, is_same in zip(units, same, strict=True) if not is_same]
+        layout = {"size": units[-1].stop, "unit": units[0].stop}
+        try:
+            write_windows(self.path, compute(changed), new=not exists, **layout)
+        except LayoutError:
+            write_windows(self.path, compute(units), new=True, **layout)
+        self.digests = digests
+        self.state = self.state._replace(exists=True)
+        revised = sum(not is_same for is_same in same[: len(old) - 1]) if same_record else 0
+        if revised:
+            self.listener.show_note(
+                f"late rows changed {revised} earlier part{'s' * (revised > 1)} of the record; "
+                "the windows there were computed again"
+            )
+
+    def _show(self, windows: Sequence[Mapping[str, Any]]) -> None:
+        """Show new windows and alarms; windows of an earlier call only set the alarms."""
+        for window in windows:
+            self.shown += 1
+            is_known = self.state.until is not None and bool(
+                np.datetime64(window["time"]) <= self.state.until
+            )
+            if not is_known:
+                self.listener.show_window(window)
+            for event in (event for alarm in self.alarms for event in alarm.update(window)):
+                if not is_known:
+                    self.listener.show_alarm(event)
+
+
+def hash_samples(log: xr.Dataset, span: tuple[int, int], common: str) -> bytes:
+    """Hash what determines the samples of a span: where rows of text lie, or else the values.
+
+    Rows that were read are taken not to change; which row a sample comes from may change when late
+    rows come.
+    """
+    total = hashlib.sha256(repr((common, span)).encode())
+    start, rate = first_stamp(log), float(log.attrs["sampling_rate_hz"])
+    for name in [signal_name(log), *log_channels(log)]:
+        variable, (begin, end) = log.variables[name], span
+        if variable.dims[-1] != "time":
+            stamps = log.variables[f"time_{name}"].values.astype("datetime64[ns]").view(np.int64)
+            begin, end = np.searchsorted(stamps, grid_times(start, rate, np.array(span))).tolist()
+            total.update(stamps[begin:end].tobytes())
+        source = find_source(variable.data)
+        if isinstance(source, GridSource):
+            for _, _, runs in (part for row in source.rows for part in row):
+                first = np.searchsorted(runs[:, 0] + runs[:, 2], begin, side="right")
+                near = runs[first : np.searchsorted(runs[:, 0], end)].copy()
+                if len(near):
+                    ends = near[:, 0] + near[:, 2]
+                    cut = np.maximum(begin - near[:, 0], 0)
+                    near[:, :2] += cut[:, None]
+                    near[:, 2] = np.minimum(ends, end) - near[:, 0]
+                total.update(near.tobytes())
+        else:
+            total.update(read_slice(variable.data, begin, end).tobytes())
+    return total.digest()

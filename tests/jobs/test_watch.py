@@ -1,0 +1,326 @@
+"""A live view: the product of rows that come bit by bit is that of a run over all of them."""
+
+from __future__ import annotations
+
+import io
+import json
+import signal
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gyrostab.cli import main
+from gyrostab.errors import FormatError, OptionError, OutputError
+from gyrostab.ingest.make_log import make_log
+from gyrostab.io.datasets import open_product, to_netcdf, to_zarr
+from gyrostab.jobs import watch as module
+from gyrostab.jobs.alarms import parse_alarm
+from gyrostab.jobs.live_page import LivePage
+from gyrostab.jobs.run import run
+from gyrostab.jobs.watch import rows_folder, watch
+
+RATE, ROWS = 50, 300_000  # two units of work of 2**18 samples
+WINDOWS = {"window": "20s", "step": "20s", "taus": "8"}
+HEADER = "time [s],gyro_x [deg/h],temperature [degC]\n"
+GAP = slice(100_000, 104_000)
+
+
+class Recorder:
+    """Keeps what a live view shows, and calls `grow` after each window."""
+
+    def __init__(self, grow=None):
+        self.windows, self.alarms, self.notes = [], [], []
+        self.grow = grow
+
+    def show_window(self, window):
+        self.windows.append(window)
+        if self.grow is not None:
+            self.grow()
+
+    def show_alarm(self, event):
+        self.alarms.append(event)
+
+    def show_note(self, text):
+        self.notes.append(text)
+
+
+def make_rows(count: int = ROWS) -> list[str]:
+    """Rows with a gap, every hundredth with a temperature, and some late ones."""
+    noise = np.random.default_rng(3).standard_normal(count) * 8.0
+    noise[: count // 2] += 2.0
+    rows = [
+        f"{i / RATE:.2f},{x:.3f},{25 + i / 1e5 if i % 100 == 0 else ''}\n"
+        for i, x in enumerate(noise.tolist())
+    ]
+    for at, delay in ((500, 7), (1_500, 3), (90_000, 900), (200_000, 12)):
+        if at + delay < count:
+            rows.insert(at + delay, rows.pop(at))
+    del rows[GAP]
+    return rows
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[str]:
+    return make_rows()
+
+
+@pytest.fixture(scope="module")
+def whole(rows, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("whole")
+    (folder / "log.csv").write_text(HEADER + "".join(rows))
+    return run([folder / "log.csv"], folder / "product.nc", windows=WINDOWS)
+
+
+@pytest.fixture(autouse=True)
+def without_pauses(monkeypatch):
+    monkeypatch.setattr(module, "_MAX_WORK_SHARE", 1.0)
+
+
+def follow(source, output, listener=None, **options):
+    listener = listener or Recorder()
+    given = {"windows": WINDOWS, "idle": "0.3s", "poll": 0.02, **options}
+    watch(str(source), output, listener=listener, **given)
+    return listener
+
+
+def assert_same_product(left: Path, right: Path) -> None:
+    with open_product(left) as a, open_product(right) as b:
+        assert a.sizes == b.sizes
+        assert set(a.variables) == set(b.variables)
+        for name, variable in a.variables.items():
+            other = b.variables[name]
+            assert variable.dims == other.dims, name
+            assert variable.dtype == other.dtype, name
+            assert bits(variable) == bits(other), name
+            assert plain(variable.attrs) == plain(other.attrs), name
+        own = {"history", "gyrostab_watch", "gyrostab_job", "date_created", "source", "notes"}
+        own |= {"source_files", "row_start"}
+        assert plain(a.attrs, own) == plain(b.attrs, own)
+
+
+def bits(variable) -> bytes:
+    """Values as bytes; of NaN, NetCDF does not keep the sign."""
+    values = np.array(variable.values)
+    if values.dtype.kind == "f":
+        values[np.isnan(values)] = np.nan
+    return values.tobytes()
+
+
+def plain(attrs, left_out=()) -> dict:
+    """Attributes with arrays as lists, as JSON holds them."""
+    return {k: np.asarray(v).tolist() for k, v in attrs.items() if k not in left_out}
+
+
+def test_a_growing_file_gives_the_bits_of_a_run_over_the_whole(rows, whole, tmp_path):
+    """Rows come in pieces that end within a line, with a gap, late rows and a slow channel."""
+    text = HEADER + "".join(rows)
+    cuts = [0, len(text) // 3, len(text) // 3 + 1_000, int(0.9 * len(text)) + 7, len(text)]
+    pieces = [text[a:b] for a, b in pairwise(cuts)]
+    folder = tmp_path / "in"
+    folder.mkdir()
+    (folder / "log.csv").write_text(pieces.pop(0))
+
+    def grow() -> None:
+        if pieces:
+            with (folder / "log.csv").open("a") as file:
+                file.write(pieces.pop(0))
+
+    seen = follow(folder, tmp_path / "live.zarr", Recorder(grow))
+    assert not pieces
+    assert_same_product(tmp_path / "live.zarr", whole)
+    with open_product(whole) as product:
+        assert len(seen.windows) == product.sizes["time"]
+        assert [window["time"] for window in seen.windows] == [
+            str(stamp) for stamp in product["time"].values.astype("datetime64[ms]")
+        ]
+    assert any("out of order" in note for note in seen.notes)
+
+
+@pytest.mark.slow
+def test_a_file_that_comes_late_changes_earlier_windows(rows, tmp_path):
+    """The file with the middle of the record comes last, and after a restart."""
+    folder = tmp_path / "in"
+    folder.mkdir()
+    parts = [rows[:60_000], rows[80_000:], rows[60_000:80_000]]
+    names = ["a.csv", "c.csv", "b.csv"]
+
+    def grow() -> None:
+        if parts:
+            (folder / names.pop(0)).write_text(HEADER + "".join(parts.pop(0)))
+
+    grow()
+    first = follow(folder, tmp_path / "live.zarr")
+    seen = follow(folder, tmp_path / "live.zarr", Recorder(grow=None) if grow() else Recorder(grow))
+    run(sorted(folder.glob("*.csv")), tmp_path / "run.nc", windows=WINDOWS)
+    assert_same_product(tmp_path / "live.zarr", tmp_path / "run.nc")
+    assert not parts
+    assert any("late rows changed 1 earlier part" in note for note in seen.notes)
+    assert len({window["time"] for window in first.windows + seen.windows}) == len(
+        first.windows + seen.windows
+    )
+
+
+def test_standard_input_is_kept_and_continued(tmp_path):
+    rows = make_rows(20_000)
+    text = HEADER + "".join(rows)
+    cut = text.index("\n", 200_000) + 1
+    output = tmp_path / "live.zarr"
+    first = follow("-", output, stream=io.BytesIO(text[:cut].encode()))
+    second = follow("-", output, stream=io.BytesIO(text[cut:].rstrip().encode()))
+    kept = sorted(rows_folder(output).iterdir())
+    assert "".join(path.read_text() for path in kept) == text[:cut] + HEADER + text[cut:].rstrip()
+    run(kept, tmp_path / "kept.nc", windows=WINDOWS)
+    assert_same_product(output, tmp_path / "kept.nc")
+    assert first.windows[-1]["time"] < second.windows[0]["time"]
+    with pytest.raises(OutputError, match="rows of an earlier live view"):
+        follow("-", output, stream=io.BytesIO(b""), overwrite=True)
+
+
+def test_lateness_delays_a_window_and_the_end_writes_it(tmp_path):
+    source = tmp_path / "log.csv"
+    source.write_text(HEADER + "".join(make_rows(6_000)))
+    sizes = []
+
+    class Sizes(Recorder):
+        def show_window(self, window):
+            super().show_window(window)
+            sizes.append(window["time"])
+            if len(sizes) == 1:
+                raise KeyboardInterrupt
+
+    seen = follow(source, tmp_path / "live.zarr", Sizes(), lateness="70s", idle=None)
+    run([source], tmp_path / "run.nc", windows=WINDOWS)
+    assert_same_product(tmp_path / "live.zarr", tmp_path / "run.nc")
+    assert len(seen.windows) == 6
+
+
+def test_alarms_are_said_once_when_they_begin_and_end(tmp_path):
+    noise = np.random.default_rng(0).standard_normal(12_000) * 3.0
+    noise[4_000:8_000] *= 10.0
+    body = "".join(f"{i / RATE:.2f},{v:.3f},{40 + i / 1000:.2f}\n" for i, v in enumerate(noise))
+    source = tmp_path / "log.csv"
+    source.write_text("time [s],gyro_x [deg/h],temperature [degC]\n" + body)
+    alarms = ["N>0.05 deg/sqrt(h)", "x:N>9 deg/sqrt(h)", "temperature<313.65 K", "loss>5%"]
+    seen = follow(source, tmp_path / "a.zarr", alarms=[parse_alarm(text) for text in alarms])
+    said = [(event["state"], event["text"].split(" (", 1)[1]) for event in seen.alarms]
+    assert said == [
+        ("begins", "temperature<313.65 K)"),
+        ("ends", "temperature<313.65 K)"),
+        ("begins", "N>0.05 deg/sqrt(h))"),
+        ("ends", "N>0.05 deg/sqrt(h))"),
+    ]
+    again = follow(source, tmp_path / "a.zarr", alarms=[parse_alarm(text) for text in alarms])
+    assert (again.windows, again.alarms) == ([], [])
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("N>0.01", "needs the unit 'deg/sqrt(h)'"),
+        ("N=3 deg/sqrt(h)", "write NAME>LIMIT UNIT"),
+        ("misfit>3 deg", "has no unit"),
+        ("temperature>3 parsec", "not known"),
+        ("x:temperature>3 degC", "has no axis"),
+    ],
+)
+def test_alarms_that_cannot_be_read(text, says):
+    with pytest.raises(OptionError, match="--alarm") as error:
+        parse_alarm(text)
+    assert says in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("z:misfit>3", "there is no axis z"),
+        ("pressure>3 Pa", "is none of Q, N"),
+        ("temperature>3 V", "in degree_Celsius"),
+    ],
+)
+def test_alarms_that_do_not_fit_the_log(text, says, tmp_path):
+    (tmp_path / "log.csv").write_text(HEADER + "".join(make_rows(2_000)))
+    with pytest.raises(OptionError, match=says):
+        follow(tmp_path / "log.csv", tmp_path / "a.zarr", alarms=[parse_alarm(text)])
+    assert not (tmp_path / "a.zarr").exists()
+
+
+def test_other_options_and_foreign_outputs_are_refused(tmp_path):
+    source = tmp_path / "log.csv"
+    source.write_text(HEADER + "".join(make_rows(3_000)))
+    follow(source, tmp_path / "a.zarr")
+    with pytest.raises(OutputError, match="window is 30s, was 20s"):
+        follow(source, tmp_path / "a.zarr", windows={**WINDOWS, "window": "30s"})
+    follow(source, tmp_path / "a.zarr", windows={**WINDOWS, "window": "30s"}, overwrite=True)
+    log = make_log(np.zeros(100), rate=1.0, unit="deg/h")
+    to_zarr(log, tmp_path / "log.zarr")
+    with pytest.raises(OutputError, match="exists already"):
+        follow(source, tmp_path / "log.zarr")
+    with pytest.raises(OptionError, match=r"must end in \.zarr"):
+        follow(source, tmp_path / "a.nc")
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_what_cannot_be_followed_is_said(tmp_path):
+    with pytest.raises(FormatError, match="no row has come"):
+        follow(tmp_path / "nothing.csv", tmp_path / "a.zarr")
+    short = tmp_path / "short.csv"
+    short.write_text(HEADER + "".join(make_rows(500)))
+    with pytest.raises(OptionError, match="longer than the record"):
+        follow(short, tmp_path / "a.zarr")
+    regular = to_netcdf(make_log(np.zeros(100), rate=1.0, unit="deg/h"), tmp_path / "log.nc")
+    with pytest.raises(FormatError, match="regular log, which does not grow"):
+        follow(regular, tmp_path / "a.zarr")
+
+
+def test_the_page_serves_this_machine_only_and_data_as_data():
+    page = LivePage(0, "gyrostab watch <script>alert(1)</script>")
+    try:
+        page.add_event({"time": "now", "state": "note", "text": "<b>"}, ["N>1"])
+        with urllib.request.urlopen(page.address) as answer:
+            assert "script" not in answer.headers["Content-Security-Policy"].split(";")[0]
+            text = answer.read().decode()
+        assert "innerHTML" not in text
+        assert "alert(1)" not in text
+        with urllib.request.urlopen(page.address + "state.json") as answer:
+            state = json.load(answer)
+        assert (state["active"], state["events"][0]["text"]) == (["N>1"], "<b>")
+        for path, host in (("", "evil.example"), ("etc/passwd", None)):
+            request = urllib.request.Request(page.address + path)
+            if host:
+                request.add_header("Host", host)
+            with pytest.raises(urllib.error.HTTPError):
+                urllib.request.urlopen(request)
+        with pytest.raises(OptionError, match="cannot be used"):
+            LivePage(int(page.address.rsplit(":", 1)[1].strip("/")), "")
+    finally:
+        page.close()
+
+
+@pytest.mark.parametrize(
+    "number",
+    [
+        pytest.param(signal.SIGINT, marks=pytest.mark.slow),
+        pytest.param(signal.SIGKILL, marks=pytest.mark.slow),
+    ],
+)
+def test_a_command_that_is_stopped_or_killed_is_continued(number, tmp_path):
+    rows = make_rows(12_000)
+    source, output = tmp_path / "log.csv", tmp_path / "live.zarr"
+    source.write_text(HEADER + "".join(rows[:6_000]))
+    options = [part for name, value in WINDOWS.items() for part in (f"--{name}", value)]
+    command = [sys.executable, "-m", "gyrostab", "watch", str(source), "-o", str(output), *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline().split()[0] == "1970-01-01T00:00:10"
+        process.send_signal(number)
+        process.communicate(timeout=60)
+    assert process.returncode == (0 if number == signal.SIGINT else -number)
+    source.write_text(HEADER + "".join(rows))
+    assert main([*command[3:], "--idle", "0.3s"]) == 0
+    run([source], tmp_path / "run.nc", windows=WINDOWS)
+    assert_same_product(output, tmp_path / "run.nc")
