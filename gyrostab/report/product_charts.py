@@ -211,11 +211,9 @@ def _average_windows(product: xr.Dataset) -> xr.Dataset:
     record = part.isel(time=[part.sizes["time"] // 2])
     record = record.assign({name: mean[name].transpose(*part[name].dims) for name in surface})
     record["edf"] = record["edf"] * independent
-    if "window_trend" in part:
-        record["window_trend"] = (
-            ("axis", "time"),
-            part["window_trend"].mean("time").values[:, None],
-        )
+    if "window_trend" in part:  # ramps add the mean of their squares to the mean surface
+        trend = np.sqrt((part["window_trend"] ** 2).mean("time"))
+        record["window_trend"] = trend.expand_dims(time=1, axis=1)
     return record
 
 
