@@ -87,7 +87,7 @@ prove-quick: $(VENV)/.installed  ## a short blind test with a fresh seed, which 
 	$(BIN)/gyrostab prove --cases 10 --nulls 200 --overwrite -o proof-quick
 
 real-recordings: $(VENV)/.installed  ## write docs/real-recordings.md from the recordings (environment variable GYROSTAB_RECORDINGS)
-	$(BIN)/python pipelines/real_recordings.py
+	$(BIN)/python docs/generate/real_recordings.py
 
 interop: $(VENV)/.installed-test  ## open the files in other installed programs (Debian: octave octave-netcdf netcdf-bin)
 	$(BIN)/python -m pytest -n0 -v tests/interop

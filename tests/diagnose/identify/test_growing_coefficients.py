@@ -21,8 +21,8 @@ from gyrostab.ingest.make_log import make_log
 from tests.conftest import ROOT
 from tests.support.scripts import load_script
 
-SCRIPT = load_script("pipelines/diagnose_p16.py")
-PLAN = tomllib.loads((ROOT / "pipelines" / "diagnose_p16.toml").read_text(encoding="utf-8"))
+SCRIPT = load_script("docs/generate/diagnose_p16.py")
+PLAN = tomllib.loads((ROOT / "docs" / "generate" / "diagnose_p16.toml").read_text(encoding="utf-8"))
 #: Four minutes of the axes across the vibration, on which the rectified bias is not hidden.
 SMALL: dict[str, Any] = {
     "log": {"duration": "240 s", "axes": ["y", "z"]},
@@ -49,7 +49,7 @@ SMALL: dict[str, Any] = {
 @pytest.fixture(scope="module")
 def small() -> tuple[xr.Dataset, gyrostab.Diagnosis]:
     plan = PLAN | {"change": SMALL, "nulls": 100, "run": {"five": {"five_terms": True}}}
-    log, runs = SCRIPT.experiment(plan, ROOT / "pipelines")
+    log, runs = SCRIPT.experiment(plan, ROOT / "docs" / "generate")
     return log, runs["five"]
 
 
@@ -98,7 +98,7 @@ def test_docs_contain_the_tables_of_the_script(small) -> None:
     text = (ROOT / "docs" / "diagnosis.md").read_text(encoding="utf-8")
     for name in ("fit", "found", "proof"):
         table = text.split(f"<!-- {name}: begin -->\n")[1].split(f"<!-- {name}: end -->")[0]
-        assert table.count("\n") >= 4, "run pipelines/diagnose_p16.py"
+        assert table.count("\n") >= 4, "run docs/generate/diagnose_p16.py"
     head = SCRIPT.found({"five": small[1]}).splitlines()[0]
     assert head in text
     assert (ROOT / "docs" / "figures" / "diagnosis-p16.png").stat().st_size > 1000

@@ -1,7 +1,7 @@
 """Draw a log with and without each physical effect; write figures and table of docs/physics/.
 
-Each effect has its experiment in effect_figures.toml; ``python pipelines/effect_figures.py shupe
-warm_up`` makes some of them.
+Each effect has its experiment in effect_figures.toml; ``python docs/generate/effect_figures.py
+shupe warm_up`` makes some of them.
 """
 
 import re
@@ -16,14 +16,10 @@ from gyrostab.plot import plot_comparison
 from gyrostab.plot.style import save_png
 from gyrostab.simulate import read_model, simulate
 
-ROOT, PLAN = (
-    Path(__file__).resolve().parents[1],
-    tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")),
-)
-DEFAULTS, OPTIONS = (
-    PLAN.pop("defaults"),
-    ("window", "step", "moments", "driver", "difference", "coherency"),
-)
+ROOT = Path(__file__).resolve().parents[2]
+PLAN = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+DEFAULTS = PLAN.pop("defaults")
+OPTIONS = ("window", "step", "moments", "driver", "difference", "coherency")
 
 
 def simulate_pair(name):

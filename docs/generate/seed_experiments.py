@@ -11,10 +11,8 @@ import numpy as np
 import gyrostab
 from gyrostab.plot.style import save_png
 
-ROOT, PLAN = (
-    Path(__file__).resolve().parents[1],
-    tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")),
-)
+ROOT = Path(__file__).resolve().parents[2]
+PLAN = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
 def simulate(name, run):

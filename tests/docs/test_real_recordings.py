@@ -21,7 +21,7 @@ from tests.support.scripts import load_script
 ROOT = Path(__file__).resolve().parents[2]
 
 
-SCRIPT = load_script("pipelines/real_recordings.py")
+SCRIPT = load_script("docs/generate/real_recordings.py")
 ENTRIES: dict[str, Any] = SCRIPT.PLAN["recording"]
 Outcome = tuple[xr.Dataset, xr.Dataset, dict[str, float]]
 

@@ -20,7 +20,7 @@ PAGES = ROOT / "docs" / "physics"
 INDEX = (PAGES / "README.md").read_text(encoding="utf-8")
 
 
-SCRIPT = load_script("pipelines/effect_figures.py")
+SCRIPT = load_script("docs/generate/effect_figures.py")
 
 
 def section(name: str) -> str:
@@ -51,7 +51,7 @@ def test_every_effect_is_described_drawn_and_listed(name: str) -> None:
 
 def test_the_table_is_that_of_the_registry() -> None:
     made = "".join(SCRIPT.rows([page for page in PAGES.glob("*.md") if page.name != "README.md"]))
-    assert made in INDEX, "run pipelines/effect_figures.py"
+    assert made in INDEX, "run docs/generate/effect_figures.py"
     assert made.count("\n") == len(effects()) == len(SCRIPT.PLAN)
 
 

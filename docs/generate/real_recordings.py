@@ -13,10 +13,8 @@ import pandas as pd
 import gyrostab
 from gyrostab.units import parse_unit
 
-ROOT, PLAN = (
-    Path(__file__).resolve().parents[1],
-    tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")),
-)
+ROOT = Path(__file__).resolve().parents[2]
+PLAN = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
 def pick(value, log, product):
