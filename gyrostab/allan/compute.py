@@ -125,7 +125,7 @@ def join_units(
 def _join_field(parts: list[Floats], sizes: list[int], n_axes: int, kind: Any) -> NDArray[Any]:
     shape = n_axes, sum(sizes) // n_axes, parts[0].shape[1]
     parts = [part.astype(kind, copy=False) for part in parts]
-    if all(part.shape[0] == 1 and np.array_equal(part, parts[0]) for part in parts):
+    if all(part.shape[0] == 1 and np.array_equal(part, parts[0], equal_nan=True) for part in parts):
         return np.broadcast_to(parts[0], shape)
     if len(parts) > 1:
         rows = zip(parts, sizes, strict=True)

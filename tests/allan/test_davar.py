@@ -390,6 +390,12 @@ class TestGaps:
         assert (result["count"][empty] == 0).all()
         assert (result.estimator[empty] == ESTIMATORS.index("none")).all()
 
+    def test_record_that_is_only_a_gap_has_empty_windows(self):
+        result = davar(log_of(np.full(3000, np.nan)), window="100samples", step="10samples")
+        assert result.sizes["time"] == 291
+        assert result.avar.isnull().all()
+        assert (result["count"] == 0).all()
+
     def test_cells_with_low_coverage_are_nan(self):
         x = np.full(1000, np.nan)
         x[:60] = np.random.default_rng(15).standard_normal(60)
