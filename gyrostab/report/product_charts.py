@@ -212,7 +212,7 @@ def _average_windows(product: xr.Dataset) -> xr.Dataset:
     record = record.assign({name: mean[name].transpose(*part[name].dims) for name in surface})
     record["edf"] = record["edf"] * independent
     if "window_trend" in part:  # ramps add the mean of their squares to the mean surface
-        trend = np.sqrt((part["window_trend"] ** 2).mean("time"))
+        trend = (part["window_trend"] ** 2).mean("time") ** 0.5
         record["window_trend"] = trend.expand_dims(time=1, axis=1)
     return record
 
