@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from gyrostab.io.datasets import to_netcdf as to_netcdf
     from gyrostab.io.datasets import to_zarr as to_zarr
     from gyrostab.io.kalibr import to_kalibr as to_kalibr
+    from gyrostab.io.survey_files import to_iscwsa as to_iscwsa
+    from gyrostab.io.survey_terms import survey_terms as survey_terms
     from gyrostab.plot import plot_adev as plot_adev
     from gyrostab.plot import plot_coefficients as plot_coefficients
     from gyrostab.plot import plot_correlation as plot_correlation
@@ -84,6 +86,8 @@ _HOME = {
     "save_figures": "plot",
     "scan": "ingest.scan",
     "simulate": "simulate",
+    "survey_terms": "io.survey_terms",
+    "to_iscwsa": "io.survey_files",
     "to_kalibr": "io.kalibr",
     "to_netcdf": "io.datasets",
     "to_zarr": "io.datasets",
@@ -122,6 +126,8 @@ __all__ = [
     "save_figures",
     "scan",
     "simulate",
+    "survey_terms",
+    "to_iscwsa",
     "to_kalibr",
     "to_netcdf",
     "to_zarr",

@@ -14,12 +14,23 @@ from cyclopts.validators import Number
 from gyrostab.errors import OptionError
 from gyrostab.ingest.limits import check_limits
 
-__all__ = ["ChannelFile", "Common", "Fitting", "Flag", "Reading", "Running", "Windows", "read_toml"]
+__all__ = [
+    "ChannelFile",
+    "Common",
+    "Fitting",
+    "Flag",
+    "Reading",
+    "Running",
+    "Survey",
+    "Windows",
+    "read_toml",
+]
 
 _READING = Group("Reading options", sort_key=1)
 _WINDOWS = Group("Analysis options", sort_key=2)
 _FITTING = Group("Fitting options", sort_key=3)
 _RUNNING = Group("Running options", sort_key=4)
+_SURVEY = Group("Survey options (iscwsa)", sort_key=4)
 _COMMON = Group("Common options", sort_key=5)
 Flag = Annotated[bool, Parameter(negative=(), show_default=False)]
 
@@ -234,6 +245,49 @@ class Running:
 
     resume: Flag = False
     scheduler: Annotated[str, Parameter(metavar="ADDRESS")] = "threads"
+
+
+@Parameter(name="*", group=_SURVEY)
+@dataclass(frozen=True)
+class Survey:
+    """The survey for which a tool error model is made.
+
+    Parameters
+    ----------
+    station_time
+        Time of the measurement at a station (default: 2min).
+    section_time
+        Duration of the survey section after the calibration of the bias (default: 1h).
+    calibration_time
+        Time over which the bias was averaged before the section (default: the station time).
+    statistic
+        Statistic over the windows that observe a coefficient, median or 95 % quantile (default:
+        median).
+    diagnosis
+        Folder written by gyrostab diagnose, for the g-dependent terms.
+    running_speed
+        Speed of a continuous survey along the hole in m/s; without it, JSON and WITSML hold the
+        stationary terms only.
+    continuous_from
+        Inclination in degrees from which x and y gyros survey continuously (default: 15).
+    """
+
+    station_time: Annotated[str | None, Parameter(metavar="DURATION")] = None
+    section_time: Annotated[str | None, Parameter(metavar="DURATION")] = None
+    calibration_time: Annotated[str | None, Parameter(metavar="DURATION")] = None
+    statistic: Literal["median", "p95"] | None = None
+    diagnosis: Annotated[Path | None, Parameter(metavar="DIR")] = None
+    running_speed: Annotated[float | None, Parameter(metavar="M/S")] = None
+    continuous_from: Annotated[float | None, Parameter(metavar="DEG")] = None
+
+    def options(self) -> dict[str, Any]:
+        """Return the keyword arguments of `gyrostab.to_iscwsa`."""
+        given = {name: value for name, value in asdict(self).items() if value is not None}
+        if self.diagnosis:
+            from gyrostab.report.diagnosis_folder import open_diagnosis
+
+            given["diagnosis"] = open_diagnosis(self.diagnosis).content
+        return given
 
 
 @Parameter(name="*", group=_COMMON)

@@ -589,6 +589,7 @@ class TestSurface:
             "plot_davar_3d",
             "plot_coefficients",
             "to_kalibr",
+            "survey_terms",
             "correlate",
             "confidence_interval",
         ],

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from gyrostab.cli.frame import Output, Product, app, show_stages
-from gyrostab.cli.options import ChannelFile, Common
+from gyrostab.cli.options import ChannelFile, Common, Survey
 from gyrostab.errors import OptionError
 
 __all__ = ["correlate", "export", "plot", "report"]
@@ -168,10 +168,11 @@ def export(
     /,
     *,
     output: Output,
-    format: Literal["kalibr", "zarr"],
+    format: Literal["iscwsa", "kalibr", "zarr"],
+    survey: Survey = Survey(),
     common: Common = Common(),
 ) -> None:
-    """Export a product to other programs: YAML for Kalibr and ROS, or Zarr.
+    """Export a product to other programs: survey error models, YAML for Kalibr and ROS, or Zarr.
 
     Example: gyrostab export product.nc -o imu.yaml --format kalibr
 
@@ -180,22 +181,28 @@ def export(
     product
         File written by gyrostab run or gyrostab fit.
     output
-        File (YAML) or folder (Zarr) to write.
+        File or, for zarr, folder to write.
     format
-        kalibr: N, K and B in radians, for the worst axis and for each axis. zarr: the whole
-        product.
+        iscwsa: gyro terms of an ISCWSA tool error model, as a table (.csv), as JSON for welleng
+        (.json) or as a WITSML ToolErrorModel (.xml), to be confirmed by a survey engineer. kalibr:
+        N, K and B in radians, for the worst axis and for each axis. zarr: the whole product.
     """
     from gyrostab.io.datasets import open_product, to_zarr
     from gyrostab.io.kalibr import to_kalibr
+    from gyrostab.io.survey_files import SUFFIXES, to_iscwsa
     from gyrostab.store.output import check_output
 
     writers: dict[str, tuple[Any, list[str]]] = {
+        "iscwsa": (to_iscwsa, list(SUFFIXES)),
         "kalibr": (to_kalibr, [".yaml", ".yml"]),
         "zarr": (to_zarr, [".zarr"]),
     }
     write, suffixes = writers[format]
     target = check_output(output, suffixes=suffixes, overwrite=common.overwrite)
+    options = survey.options()
+    if options and format != "iscwsa":
+        raise OptionError(f"survey options are for --format iscwsa, not for {format}")
     with show_stages(common) as stage:
         stage("writing", 0)
-        write(open_product(product), target, overwrite=common.overwrite)
-    print(target)
+        written = write(open_product(product), target, overwrite=common.overwrite, **options)
+    print(*([written, ""] if format == "iscwsa" else []), target, sep="\n")

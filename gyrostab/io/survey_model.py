@@ -1,0 +1,100 @@
+"""Hold the gyro terms of a survey tool, with their origin and validity."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+__all__ = ["Status", "SurveyModel", "SurveyTerm", "Tool"]
+
+Status = Literal["observed", "upper_limit_only", "not_observable"]
+Tool = Literal["xyz", "xy", "z"]
+
+
+@dataclass(frozen=True)
+class SurveyTerm:
+    """One error term of a tool.
+
+    Attributes
+    ----------
+    code : str
+        Name in SPE 90408 and in the tool codes of OWSG, such as ``GXY-RN``.
+    value : float
+        Standard deviation (1 sigma) of the error source [`unit`]; NaN if not observable.
+    low, high : float
+        The same from the 5 % and 95 % quantiles of the coefficients over the windows, or from the
+        95 % interval of a diagnosis [`unit`]; 0 and `value` for an upper limit.
+    status : str
+        ``observed``; ``upper_limit_only`` if the upper limit of a coefficient entered;
+        ``not_observable`` if a coefficient has neither value nor limit.
+    unit : str
+        ``deg/h``, ``deg/sqrt(h)`` or ``deg/h/g``.
+    mode : str
+        ``stationary`` or ``continuous``.
+    propagation : str
+        ``Random`` (independent between stations) or ``Systematic`` (the same in a survey).
+    derivation : str
+        Coefficients and axes from which the value was computed.
+    """
+
+    code: str
+    value: float
+    low: float
+    high: float
+    status: Status
+    unit: str
+    mode: str
+    propagation: str
+    derivation: str
+
+
+@dataclass(frozen=True)
+class SurveyModel:
+    """Gyro terms of a tool, with their origin and the conditions they hold for.
+
+    Attributes
+    ----------
+    tool : str
+        Gyro axes of the tool: ``xyz``, ``xy`` or ``z``.
+    terms : tuple of SurveyTerm
+        In the order of the tables of SPE 90408.
+    validity : mapping of str to (float, float, str)
+        Smallest and largest mean of a window and unit of each channel that was logged.
+    origin, notes : tuple of str
+        Sentences on the record and the settings, and on what to observe.
+    """
+
+    tool: Tool
+    terms: tuple[SurveyTerm, ...]
+    validity: Mapping[str, tuple[float, float, str]]
+    origin: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def conditions(self) -> str:
+        """Return the conditions of the record in a sentence."""
+        ranges = [f"{name} {a:.4g} to {b:.4g} {u}" for name, (a, b, u) in self.validity.items()]
+        if not ranges:
+            return "No channel was logged: the conditions for which the terms hold are unknown."
+        return f"Measured at (means of windows) {', '.join(ranges)}."
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Return all sentences on the terms."""
+        return (*self.origin, self.conditions, *self.notes)
+
+    def __str__(self) -> str:
+        """Return the terms as an aligned table, followed by the remarks."""
+        rows = [("term", "1 sigma", "5 % to 95 %", "unit", "mode", "propagation", "from")]
+        for term in self.terms:
+            value = f"{'< ' * (term.status == 'upper_limit_only')}{term.value:.3g}"
+            spread = f"{term.low:.3g} to {term.high:.3g}"
+            known = (value, spread if term.status == "observed" else "")
+            rows.append(
+                (term.code, *(known if term.value >= 0.0 else ("-", "")), term.unit, term.mode,
+                 term.propagation, term.derivation)
+            )  # fmt: skip
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+        return "\n".join([*lines, "", *self.remarks])
