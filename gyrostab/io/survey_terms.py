@@ -313,7 +313,8 @@ def _read_sensitivities(diagnosis: Mapping[str, Any]) -> dict[str, _Magnitude]:
                     low, high = sorted(map(abs, ends))
                     low = 0.0 if ends[0] * ends[1] < 0.0 else low
                     magnitude = _Magnitude(abs(value), low, high, "observed")
-                    found |= {axis + name: magnitude for axis in effect["axes"]}
+                    along, _, axis = name.partition(".")  # "x", or "x.y" for the gyro y alone
+                    found |= {gyro + along: magnitude for gyro in axis or effect["axes"]}
     return found
 
 
@@ -370,12 +371,13 @@ def _make_notes(
     limits = diagnosis["not_found"].get("g_sensitivity")
     if limits and limits["upper_limit"] is None:
         notes.append(f"The diagnosis has no g-dependent terms: {limits['reason']}.")
-    for effect in diagnosis["effects"]:
-        if effect["name"] != "g_sensitivity":
-            notes.append(f"No term covers what the diagnosis found: {effect['statement']}")
-        elif effect["alternatives"]:
-            notes.append(
-                "The g-dependent terms may also be due to "
-                f"{' or '.join(effect['alternatives'])}, which the record cannot tell apart."
-            )
+    effects = diagnosis["effects"]
+    if others := sorted({effect["name"] for effect in effects} - {"g_sensitivity"}):
+        notes.append(f"No term covers what else the diagnosis found: {', '.join(others)}.")
+    rivals = {name for e in effects if e["name"] == "g_sensitivity" for name in e["alternatives"]}
+    if rivals:
+        notes.append(
+            f"The g-dependent terms may also be due to {', '.join(sorted(rivals))}: the record "
+            "cannot tell them apart."
+        )
     return notes

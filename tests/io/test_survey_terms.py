@@ -185,7 +185,6 @@ def make_effect(axes: list[str], alternatives=(), **sizes: tuple[float, float, f
             for name, size in sizes.items()
         },
         "alternatives": list(alternatives),
-        "statement": "The bias follows the acceleration.",
     }
 
 
@@ -193,7 +192,7 @@ def test_g_dependent_terms_come_from_the_diagnosis():
     """G4: own axis; G1: the other cross axis; G2 and G3: along the tool; z gyro: ZG1 and ZG2."""
     diagnosis = make_diagnosis(
         make_effect(["x"], x=(0.3, 0.2, 0.4), y=(-0.5, -0.7, -0.3), z=(0.1, -0.1, 0.3)),
-        make_effect(["y"], ["earth_rate"], y=(0.4, 0.3, 0.5)),
+        make_effect(["x", "y"], ["earth_rate"], **{"y.y": (0.4, 0.3, 0.5)}),
         make_effect(["z"], z=(0.6, 0.5, 0.7)),
     )
     model = survey_terms(make_product(), diagnosis=diagnosis)
@@ -222,9 +221,9 @@ def test_limit_of_a_diagnosis_is_the_limit_of_all_g_dependent_terms():
 
 
 def test_other_effects_of_the_diagnosis_are_named():
-    effect = make_effect(["x"]) | {"name": "shupe", "statement": "The bias follows heating."}
+    effect = make_effect(["x"]) | {"name": "shupe"}
     model = survey_terms(make_product(), diagnosis=make_diagnosis(effect))
-    assert any("The bias follows heating." in note for note in model.notes)
+    assert any("found: shupe" in note for note in model.notes)
 
 
 class TestWeights:
