@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,30 @@ def test_a_file_that_is_cut_off_is_read_in_part_or_named(made: Made, tmp_path: P
             rows, said = 0, str(error)
         assert rows < ROWS
         assert path.name in said
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "extra"),
+    [
+        ("dlis", "dlisio.dlis", "dlis"),
+        ("ardupilot", "pymavlink.DFReader", "ardupilot"),
+        ("mcap", "rosbags.highlevel", "rosbag"),
+        ("novatel", "novatel_edie.oem", "novatel"),
+        ("timetable5", "matio", "matlab"),
+    ],
+)
+def test_a_missing_library_is_named_with_its_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, module: str, extra: str
+) -> None:
+    made = WRITERS[name](tmp_path)
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(OptionError, match=rf"{made.path.name}: .*{module}.*gyrostab\[{extra}\]"):
+        read_log(made.path, **made.options)
+
+
+def test_the_file_of_a_ros_bag_is_read_without_its_folder(tmp_path: Path) -> None:
+    file = next(WRITERS["mcap"](tmp_path).path.glob("*.mcap"))
+    assert read_log(file).sizes["row"] == ROWS
 
 
 @pytest.mark.parametrize(

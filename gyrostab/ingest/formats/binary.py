@@ -16,7 +16,7 @@ import xarray as xr
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from gyrostab.errors import FormatError
+from gyrostab.errors import FormatError, OptionError
 from gyrostab.ingest.columns.stamps import TimeUnit, integers_to_ns
 from gyrostab.ingest.formats.layout import Field, Layout, find_layout, layout_path
 from gyrostab.ingest.formats.messages import find_messages, unwrap_counter
@@ -69,7 +69,7 @@ def _make_table(path: Path, options: ReadOptions) -> tuple[Table, list[str]]:
             "record); copy it again, or correct the layout"
         )
     fetch = partial(_read_field, path, layout, starts)
-    stamps, notes = _count_time(layout, fetch, rows, options)
+    stamps, notes = _count_time(path, layout, fetch, rows, options)
     if layout.sync:
         notes.insert(0, f"read as messages of {layout.place}{layout.note and ': '}{layout.note}")
     if rest:
@@ -83,12 +83,17 @@ def _make_table(path: Path, options: ReadOptions) -> tuple[Table, list[str]]:
 
 
 def _count_time(
-    layout: Layout, fetch: Any, rows: int, options: ReadOptions
+    path: Path, layout: Layout, fetch: Any, rows: int, options: ReadOptions
 ) -> tuple[Any, list[str]]:
     """Return the stamps by the counter of the layout [ns], and a note on lost messages."""
     counter = layout.counter
-    if counter is None or options.rate is None:
+    if counter is None:
         return None, []
+    if options.rate is None:
+        raise OptionError(
+            f"{path.name}: the messages of {layout.place} are numbered; give their rate with "
+            "--rate HZ (and the time of the first with --epoch)"
+        )
     counts = unwrap_counter(fetch(counter, 0, rows), counter.turn)
     steps, times = np.unique(np.diff(counts), return_counts=True)
     step = max(int(steps[times.argmax()]) if len(steps) else 1, 1)

@@ -53,10 +53,10 @@ def _read_frames(path: Path) -> list[Table]:
     dlis = library("dlisio.dlis", path, extra="dlis")
     logging.getLogger("dlisio").setLevel(logging.ERROR)
     with dlis.load(str(path)) as files:
-        frames = [frame for logical in files for frame in logical.frames]
         kept = [
-            (frame, [channel for channel in frame.channels if list(channel.dimension) == [1]])
-            for frame in frames
+            (frame, [one for one in frame.channels if one and list(one.dimension) == [1]])
+            for logical in files
+            for frame in logical.frames
         ]
         names = iter(
             plain_names([(frame.name, one.name) for frame, channels in kept for one in channels])
@@ -64,6 +64,7 @@ def _read_frames(path: Path) -> list[Table]:
         return [
             _make_table(frame, channels, [next(names) for _ in channels])
             for frame, channels in kept
+            if channels
         ]
 
 
@@ -71,7 +72,8 @@ def _make_table(frame: Any, channels: list[Any], names: list[str]) -> Table:
     values = frame.curves()
     units = [str(channel.units or "").strip() or None for channel in channels]
     columns = [sliced(values[channel.name]) for channel in channels]
-    timed = "TIME" in str(frame.index_type or "").upper() and is_time_unit(units[0] or "")
+    kind = str(frame.index_type or "").upper()
+    timed = "TIME" in kind and channels[0].name == frame.index and is_time_unit(units[0] or "")
     first = 1 if timed else 0
     return Table(
         len(values),

@@ -5,25 +5,14 @@ from __future__ import annotations
 import bz2
 import lzma
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 
 from gyrostab.errors import FormatError
 
 __all__ = ["refuse_unread"]
 
-HEAD_BYTES = 4096
-
-#: Name, test of the first bytes, advice.
-_FORMATS: list[tuple[str, Callable[[bytes], bool], str]] = [
-    (
-        "a file of R data",
-        lambda head: _decompress(head).startswith(
-            (b"RDX2\n", b"RDX3\n", b"RDA2\n", b"RDA3\n", b"X\n\0\0\0")
-        ),
-        "save it as CSV in R: write.csv(as.data.frame(x), 'log.csv', row.names = FALSE)",
-    ),
-]
+_HEAD_BYTES = 4096
+_R_DATA = (b"RDX2\n", b"RDX3\n", b"RDA2\n", b"RDA3\n", b"X\n\0\0\0")
 
 
 def refuse_unread(path: Path) -> None:
@@ -31,13 +20,12 @@ def refuse_unread(path: Path) -> None:
     if not path.is_file():
         return
     with path.open("rb") as file:
-        head = file.read(HEAD_BYTES)
-    for name, is_one, advice in _FORMATS:
-        if is_one(head):
-            raise FormatError(
-                f"{path.name}: this is {name}, which is not read yet; "
-                f"{advice.replace('FILE', path.name)}"
-            )
+        head = file.read(_HEAD_BYTES)
+    if _decompress(head).startswith(_R_DATA):
+        raise FormatError(
+            f"{path.name}: this is a file of R data, which is not read; save it as CSV in R: "
+            "write.csv(as.data.frame(x), 'log.csv', row.names = FALSE)"
+        )
 
 
 def _decompress(head: bytes) -> bytes:
