@@ -119,19 +119,19 @@ def expand(paths: str | Path | Iterable[str | Path]) -> list[Path]:
     FormatError
         When a pattern matches no file.
     """
-    found: list[Path] = []
+    found: dict[Path, None] = {}
     for item in [paths] if isinstance(paths, str | Path) else paths:
         text = str(item)
-        if Path(text).exists() or not glob.has_magic(text):
+        if not glob.has_magic(text) or Path(text).exists():
             matching = [Path(text)]
         else:
             matching = [Path(match) for match in sorted(glob.glob(text, recursive=True))]
             if not matching:
                 raise FormatError(f"{text}: no file fits this pattern")
-        found += [path for path in matching if path not in found]
+        found.update(dict.fromkeys(matching))
     if not found:
         raise OptionError("no file was given; name at least one log")
-    return found
+    return list(found)
 
 
 def scan_file(path: str | Path, options: ReadOptions | None = None) -> FileSummary:

@@ -18,7 +18,7 @@ from gyrostab.allan.band_limit import choose_windows
 from gyrostab.allan.davar import davar_part
 from gyrostab.allan.fit import find_bands, fit_part
 from gyrostab.allan.plan import make_plan, units_of_work
-from gyrostab.io.datasets import to_netcdf
+from gyrostab.io.datasets import to_netcdf, to_zarr
 from gyrostab.jobs.checkpoint import Block, assemble, write_block
 from gyrostab.jobs.schedule import Pool, run_calls
 from gyrostab.kernels.workspace import Workspace
@@ -134,9 +134,17 @@ def compute_blocks(
 
 
 def write_blocks(
-    blocks: Blocks, target: Path, *, attrs: Mapping[str, Any], overwrite: bool, stage: Stage
+    blocks: Blocks,
+    target: Path,
+    *,
+    attrs: Mapping[str, Any],
+    overwrite: bool,
+    stage: Stage,
+    zarr: bool = False,
 ) -> xr.Dataset:
     """Write all blocks as one NetCDF file, in a fixed order, so that its bytes are reproducible.
+
+    With `zarr`, a Zarr group is written instead.
 
     Returns
     -------
@@ -172,7 +180,7 @@ def write_blocks(
 
     stage("writing", variables, 0, "variables")
     with dask.config.set(scheduler=in_order):
-        to_netcdf(whole, target, overwrite=overwrite, progress=share)
+        (to_zarr if zarr else to_netcdf)(whole, target, overwrite=overwrite, progress=share)
     return whole
 
 

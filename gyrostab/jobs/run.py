@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
-import os
+import pickle
 import warnings
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from functools import lru_cache, partial
@@ -44,9 +44,23 @@ from gyrostab.jobs.job import (
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool
 from gyrostab.kernels.workspace import Workspaces
 from gyrostab.progress import Stage, no_stage
-from gyrostab.store.output import check_output, protect_inputs, remove_leftovers, resolve_link
+from gyrostab.store.output import (
+    check_output,
+    find_foreign_item,
+    protect_inputs,
+    read_json,
+    remove_leftovers,
+    resolve_link,
+)
+from gyrostab.store.private import library_lock
 
-__all__ = ["count_samples", "load_log", "run"]
+__all__ = ["count_samples", "find_job_name", "load_log", "read_job_name", "run"]
+
+#: Options of `check_output` for a NetCDF file and for a Zarr group.
+_FORMS: dict[bool, dict[str, Any]] = {
+    False: {"suffixes": [".nc"]},
+    True: {"find_foreign": find_foreign_item},
+}
 
 
 def load_log(
@@ -132,6 +146,7 @@ def run(
     scheduler: str = "threads",
     workers: int | None = None,
     stage: Stage = no_stage,
+    zarr: bool = False,
 ) -> Path:
     """Compute the product of some logs and write it as NetCDF, in parts that can be continued.
 
@@ -144,7 +159,7 @@ def run(
     paths : sequence of path
         Logs.
     output : path
-        NetCDF file to be written.
+        NetCDF file to be written, or Zarr group.
     reading, windows, fitting : mapping
         Options of `gyrostab.ingest.read_log`, `gyrostab.allan.davar.davar` and
         `gyrostab.allan.fit.fit_noise`.
@@ -154,7 +169,7 @@ def run(
         Whether an existing output may be replaced, and an unfinished run of it discarded.
     resume : bool
         Continue an unfinished run of the same inputs and options, or begin one; do nothing when the
-        product is complete.
+        product is complete. With `overwrite`, what belongs to other inputs or options is replaced.
     scheduler : str
         ``threads``, ``processes``, or the address of a dask.distributed scheduler, whose workers
         must see the same files.
@@ -162,11 +177,13 @@ def run(
         Threads or processes; one for each core by default.
     stage : callable
         Called with the name of each stage, how much is to be done in it, and how much is done.
+    zarr : bool
+        Write a Zarr group instead of a NetCDF file.
 
     Returns
     -------
     Path
-        The file written.
+        The file or group written.
 
     Raises
     ------
@@ -190,8 +207,8 @@ def run(
     }
     check_windows(**options["windows"])
     with protect_inputs(paths), protect_inputs(options["reading"].get("channel", ())):
-        check_output(output, suffixes=[".nc"], overwrite=True)
-        job = _describe_job(paths, resolve_link(output), options)
+        check_output(output, overwrite=True, **_FORMS[zarr])
+        job = _describe_job(paths, resolve_link(output), options, zarr=zarr)
         check_job_folder(job.folder)
         pool = partial(open_pool, scheduler, workers=workers, files=job.files)
         _run_job(job, paths, pool, resume=resume, overwrite=overwrite, stage=stage)
@@ -207,6 +224,7 @@ class _Job(NamedTuple):
     fingerprint: dict[str, Any]
     name: str
     options: dict[str, Any]
+    zarr: bool
 
 
 class _Progress(NamedTuple):
@@ -249,7 +267,21 @@ def _run_job(
         remove_job(job.folder, output=job.target)
 
 
-def _describe_job(paths: Sequence[str | Path], target: Path, options: dict[str, Any]) -> _Job:
+def find_job_name(
+    paths: Sequence[str | Path],
+    *,
+    reading: Mapping[str, Any],
+    windows: Mapping[str, Any],
+    fitting: Mapping[str, Any] | None,
+) -> str:
+    """Hash inputs, options and versions of a run; `read_job_name` finds the hash in a product."""
+    options = {"reading": dict(reading), "windows": dict(windows), "fitting": fitting}
+    return _describe_job(paths, Path("product"), options).name
+
+
+def _describe_job(
+    paths: Sequence[str | Path], target: Path, options: dict[str, Any], *, zarr: bool = False
+) -> _Job:
     from gyrostab.ingest.files import expand
 
     extra = options["reading"].get("channel", ())
@@ -263,15 +295,14 @@ def _describe_job(paths: Sequence[str | Path], target: Path, options: dict[str, 
     fingerprint = make_fingerprint(
         files, {**plain, "fit": "left out" if options["fitting"] is None else None}
     )
-    return _Job(
-        target, job_folder(target), files, fingerprint, hash_fingerprint(fingerprint), options
-    )
+    name = hash_fingerprint(fingerprint)
+    return _Job(target, job_folder(target), files, fingerprint, name, options, zarr)
 
 
 def _inspect_job(job: _Job, *, resume: bool, overwrite: bool) -> _Progress:
     """Find the state of a job, and refuse to destroy an output or to mix two jobs."""
     before, kept = read_job(job.folder), has_finished_work(job.folder)
-    if resume and _read_job_name(job.target) == job.name:
+    if resume and read_job_name(job.target) == job.name:
         return _Progress(complete=True, fresh=False, overwrite=False)
     if before and kept and not (resume or overwrite):
         raise ResumeError(
@@ -279,7 +310,7 @@ def _inspect_job(job: _Job, *, resume: bool, overwrite: bool) -> _Progress:
             + ", --overwrite starts anew"
         )
     changes = describe_differences(before, job.fingerprint) if before else ""
-    if resume and kept and changes:
+    if resume and kept and changes and not overwrite:
         raise ResumeError(
             f"{job.target}: the run that was begun cannot be continued, because {changes}; "
             "put that back, or give --overwrite in place of --resume to start anew"
@@ -292,18 +323,21 @@ def _inspect_job(job: _Job, *, resume: bool, overwrite: bool) -> _Progress:
             "and is not the product of these logs and options; "
             "give --overwrite to replace it, or another name with -o"
         )
-    check_output(job.target, overwrite=overwrite)
+    check_output(job.target, overwrite=overwrite, **_FORMS[job.zarr])
     return _Progress(complete=False, fresh=not again, overwrite=overwrite)
 
 
-def _read_job_name(path: Path) -> str | None:
+def read_job_name(path: Path) -> str | None:
     """Read the hash of the job that made a product; None for anything else."""
+    if path.is_dir():
+        attributes = read_json(path / ".zattrs")
+        return attributes.get("gyrostab_job") if isinstance(attributes, dict) else None
     if not path.is_file():
         return None
     import netCDF4
 
     try:
-        with netCDF4.Dataset(path) as file:
+        with library_lock(), netCDF4.Dataset(path) as file:
             return str(file.getncattr("gyrostab_job"))
     except (OSError, AttributeError):
         return None
@@ -382,25 +416,15 @@ def _compute_missing(
         fitting = find_record_bands(log, windows, fitting)
     call: tuple[Any, ...] = (_compute_part_of_log, log, Workspaces(), windows, fitting)
     if pool.remote and len(blocks) < len(parts):
-        source = {
-            **reading,
-            "paths": _make_absolute(paths),
-            "channel": _make_absolute(reading.get("channel", ())),
-        }
         if not store.exists() and not any(
             map(_is_own_log, job.files)
         ):  # some may be damaged; the two kinds do not mix
             stage("storing", 0)
             to_zarr(log, store, stamps=False)
             write_store_checksum(job.folder)
-        if store.exists():
-            source = {"paths": _make_absolute([store])}
-        call = (
-            _compute_part_of_files,
-            pool.share(json.dumps(source, default=str)),
-            windows,
-            fitting,
-        )
+            log = load_log([store])
+        copy = zlib.compress(pickle.dumps(log), level=1)  # holds names and places, not samples
+        call = (_compute_part_of_copy, pool.share(copy), windows, fitting)
     advance(0)
     compute_blocks(
         job.folder,
@@ -424,10 +448,6 @@ def _check_inputs(job: _Job) -> None:
         raise FormatError(f"{said}; a log must not change while it is read: put it back")
 
 
-def _make_absolute(paths: Sequence[str | Path]) -> list[str]:
-    return [os.path.abspath(path) for path in paths]
-
-
 def _compute_part_of_log(
     log: xr.Dataset,
     spaces: Workspaces,
@@ -438,24 +458,28 @@ def _compute_part_of_log(
     return compute_part(log, part, windows, fitting, spaces.own)
 
 
-def _compute_part_of_files(
-    source: str, windows: Mapping[str, Any], fitting: Mapping[str, Any] | None, part: slice
+def _compute_part_of_copy(
+    copy: bytes, windows: Mapping[str, Any], fitting: Mapping[str, Any] | None, part: slice
 ) -> xr.Dataset:
-    """Compute a part in another process, which opens the log once; only names are sent."""
-    return compute_part(_open_once(source), part, windows, fitting)
+    """Compute a part in another process, which opens only the files of this part."""
+    return compute_part(_unpack_log(copy), part, windows, fitting)
 
 
 @lru_cache(maxsize=1)
-def _open_once(source: str) -> xr.Dataset:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the parent process has shown the warnings
-        return load_log(**json.loads(source))
+def _unpack_log(copy: bytes) -> xr.Dataset:
+    log: xr.Dataset = pickle.loads(zlib.decompress(copy))
+    return log
 
 
 def _write_product(job: _Job, blocks: Blocks, *, overwrite: bool, stage: Stage) -> None:
     """Write the product, and warn of windows in which an axis is constant."""
     product = write_blocks(
-        blocks, job.target, attrs={"gyrostab_job": job.name}, overwrite=overwrite, stage=stage
+        blocks,
+        job.target,
+        attrs={"gyrostab_job": job.name},
+        overwrite=overwrite,
+        stage=stage,
+        zarr=job.zarr,
     )
     stage("checking", 0)
     for axis, share in find_constant_shares(product).items():

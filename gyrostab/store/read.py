@@ -19,7 +19,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.errors import FormatError, reading_of
+from gyrostab.errors import DamageError, FormatError, reading_of
 from gyrostab.kernels.encoding.counts import from_counts
 from gyrostab.store.blosc_chunks import check_blosc_chunks
 from gyrostab.store.cf import decode_stamps, index_dim, parse_time_grids, replace_stamps
@@ -77,7 +77,7 @@ def _open_dataset(
             path, engine=engine, chunks=None, decode_times=False, create_default_indexes=False
         )
     except Exception as error:  # the backends raise errors of many kinds on damaged files
-        raise FormatError(
+        raise DamageError(
             f"{path}: is not {name}, or is damaged or cut short ({error}); make or copy it again"
         ) from error
     if check is not None:

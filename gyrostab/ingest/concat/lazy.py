@@ -10,7 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.store.lazy import RowSource, can_read_directly, make_dask, read_into
+from gyrostab.store.lazy import (
+    RowSource,
+    can_read_directly,
+    find_source,
+    make_dask,
+    read_into,
+)
 
 __all__ = ["GridSource", "PlacedArray", "chunk_of", "place_on_grid"]
 
@@ -42,8 +48,13 @@ class GridSource(RowSource):
         shape: tuple[int, ...],
         convert: Callable[[NDArray[np.float64]], None] | None,
     ):
-        self.rows, self.shape, self.convert = rows, shape, convert
-        self.parts = [array for parts in rows for array, _, _ in parts]
+        # the sources alone: dask arrays around them are slow to look into and to send
+        self.rows = [
+            [(find_source(array) or array, row, runs) for array, row, runs in parts]
+            for parts in rows
+        ]
+        self.shape, self.convert = shape, convert
+        self.parts = [array for parts in self.rows for array, _, _ in parts]
 
     def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
         """Read samples of one row from `begin` on into `out`."""
