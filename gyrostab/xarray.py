@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -94,6 +95,7 @@ class GyrostabBackend(BackendEntrypoint):
 
     description = "Open gyro logs, dynamic Allan variances and products of gyrostab"
     open_dataset_parameters = ("filename_or_obj", "drop_variables", "strict")
+    supports_groups = True
 
     def open_dataset(  # type: ignore[override]
         self,
@@ -117,6 +119,29 @@ class GyrostabBackend(BackendEntrypoint):
         lazy = lazy.drop_vars(dropped, errors="ignore")
         lazy.set_close(opened.close)
         return lazy
+
+    def open_groups_as_dict(  # type: ignore[override]
+        self,
+        filename_or_obj: str | os.PathLike[str],
+        *,
+        drop_variables: str | Iterable[str] | None = None,
+        strict: bool = False,
+    ) -> dict[str, xr.Dataset]:
+        """Open the products in a folder of ``gyrostab fleet``, by the names of their runs."""
+        folder = Path(filename_or_obj)
+        found = {"/": xr.Dataset()}
+        for path in sorted(folder.rglob("*.nc")):
+            name = path.relative_to(folder).as_posix().removesuffix(".nc")
+            found[f"/{name}"] = self.open_dataset(
+                path, drop_variables=drop_variables, strict=strict
+            )
+        return found
+
+    def open_datatree(  # type: ignore[override]
+        self, filename_or_obj: str | os.PathLike[str], **options: Any
+    ) -> xr.DataTree:
+        """Open a folder of ``gyrostab fleet`` as a tree with one node for each run."""
+        return xr.DataTree.from_dict(self.open_groups_as_dict(filename_or_obj, **options))
 
     def guess_can_open(self, filename_or_obj: Any) -> bool:
         """Return False: without ``engine``, xarray opens these files with its own engines."""

@@ -11,13 +11,15 @@ from gyrostab.report.charts import plotly_script
 __all__ = ["page_text"]
 
 
-def page_text(template: str, *, title: str, **content: Any) -> str:
+def page_text(template: str, *, title: str, plotly: str = "", **content: Any) -> str:
     """Render a template, with the time and the version that made the page.
 
     Parameters
     ----------
     template : str
         Name of the template, which extends ``frame.html.jinja``.
+    plotly : str
+        Address of plotly.js, relative to the page; by default the page holds all of it.
     """
     import jinja2
 
@@ -33,7 +35,8 @@ def page_text(template: str, *, title: str, **content: Any) -> str:
         title=title,
         made=made,
         version=metadata.version("gyrostab"),
-        plotly=plotly_script(),
+        plotly="" if plotly else plotly_script(),
+        plotly_address=plotly,
         charts_script=script.read_text(encoding="utf-8"),
         **content,
     )

@@ -32,6 +32,7 @@ def write_report(
     *,
     log: xr.Dataset | None = None,
     overwrite: bool = False,
+    plotly: str = "",
 ) -> Path:
     """Write a report on a product as one self-contained HTML file.
 
@@ -45,6 +46,9 @@ def write_report(
         Log from which the product was computed; adds the signal and the gaps to the report.
     overwrite : bool
         Replace an existing file.
+    plotly : str
+        Address of plotly.js, relative to the page, for many pages that share it; such a page has no
+        static figures. By default the page holds all that it needs.
 
     Returns
     -------
@@ -81,7 +85,8 @@ def write_report(
             table=table,
             charts={chart.name: chart for chart in product_charts(product, log)},
             window_data=window_data(product),
-            figures=_make_figures(product, log),
+            figures=[] if plotly else _make_figures(product, log),
+            plotly=plotly,
             gaps=gaps,
             gap_summary=_summarise_gaps(log, gaps) if log is not None and gaps else "",
             notes=_note_lines(product.attrs.get("notes")),

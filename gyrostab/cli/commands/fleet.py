@@ -1,0 +1,133 @@
+"""Commands that work on an archive of many runs."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from gyrostab.cli.frame import Output, app, show_stages
+from gyrostab.cli.options import Common, Fitting, Reading, Windows
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = ["fleet", "index"]
+
+Archives = Annotated[list[Path], Parameter(name="ARCHIVE...", negative=())]
+Scheduler = Annotated[str, Parameter(metavar="ADDRESS")]
+
+
+@app.command(sort_key=2, help_epilogue="")
+def index(
+    archive: Archives,
+    /,
+    *,
+    output: Output,
+    scheduler: Scheduler = "processes",
+    reading: Reading = Reading(),
+    common: Common = Common(),
+) -> None:
+    """List the logs of an archive in a table: span, rate, axes, channels and rows of each file.
+
+    An existing table is brought up to date: files that have not changed are not opened again.
+    gyrostab fleet takes the table in place of the archive, and opens only the logs it computes.
+
+    Example: gyrostab index /archive -o files.parquet
+
+    Parameters
+    ----------
+    archive
+        Folders, which are searched with all folders below, files, or quoted patterns.
+    output
+        Parquet file to write.
+    scheduler
+        Where to open the files: processes, or the address of a dask scheduler.
+    """
+    from gyrostab.jobs.fleet import write_file_table
+
+    with show_stages(common) as stage:
+        table = write_file_table(
+            archive,
+            output,
+            reading=reading.options(),
+            overwrite=common.overwrite,
+            scheduler=scheduler,
+            workers=common.workers,
+            stage=stage,
+        )
+    _print_left_out(table)
+    print(output)
+
+
+@app.command(sort_key=5, help_epilogue="")
+def fleet(
+    archive: Archives,
+    /,
+    *,
+    output: Output,
+    per: Literal["folder", "file"] = "folder",
+    tool: Annotated[str | None, Parameter(metavar="REGEX")] = None,
+    reports: bool = True,
+    windows: Windows = Windows(),
+    fitting: Fitting = Fitting(),
+    reading: Reading = Reading(),
+    scheduler: Scheduler = "processes",
+    common: Common = Common(),
+) -> None:
+    """Analyse many runs: a product for each, a table of all, reports, and a page of overview.
+
+    The logs of a folder are one run. A second call computes only what is new, has changed or has
+    failed before; it also continues a call that was stopped.
+
+    Example: gyrostab fleet /archive -o fleet --window 10min
+
+    Parameters
+    ----------
+    archive
+        Folders, which are searched with all folders below, files, or quoted patterns; or a table
+        written by gyrostab index.
+    output
+        Folder to write: products, index.parquet, index.html and reports. FLEET.zarr makes the
+        products groups of a Zarr store.
+    per
+        What a run is: all logs of a folder, or each file.
+    tool
+        Regular expression for the part of a run's name that names the tool (default: the folders
+        above the run).
+    reports
+        Write a report for each run.
+    scheduler
+        Where to compute: processes, the workers of a dask scheduler, given by its address,
+        tcp://cluster:8786, or threads: one run after the other in this process.
+    """
+    from gyrostab.jobs.fleet import run_fleet
+
+    with show_stages(common) as stage:
+        table = run_fleet(
+            archive,
+            output,
+            per=per,
+            tool=tool,
+            reading=reading.options(),
+            windows=windows.options(),
+            fitting=fitting.options(),
+            reports=reports,
+            overwrite=common.overwrite,
+            scheduler=scheduler,
+            workers=common.workers,
+            stage=stage,
+        )
+    print(f"{len(table)} runs of {table['tool'].nunique()} tools")
+    print(output / "index.html", output, sep="\n")
+
+
+def _print_left_out(table: pd.DataFrame) -> None:
+    """Print on stderr how many files are logs, and the first of those that are not."""
+    others: Any = table[~table["is_log"].astype(bool) & (table["format"] != "diagnosis")]
+    print(f"{int(table['is_log'].sum())} of {len(table)} files are logs", file=sys.stderr)
+    if len(others):
+        first = others.iloc[0]
+        print(f"note: not a log: {first['file']} ({first['note']})", file=sys.stderr)

@@ -1,0 +1,405 @@
+"""Logs in an archive: a table of its files, and the runs that they make."""
+
+from __future__ import annotations
+
+import glob
+import itertools
+import json
+import os
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from gyrostab.errors import DamageError, FormatError, GyrostabError, OptionError
+from gyrostab.ingest.files import scan_file
+from gyrostab.ingest.options import ReadOptions
+from gyrostab.jobs.schedule import Pool, run_calls
+from gyrostab.progress import Stage
+from gyrostab.store.output import describe_file, new_output, read_json
+from gyrostab.store.output.content import is_store
+
+__all__ = [
+    "DIAGNOSIS",
+    "FLEET_MARK",
+    "FLEET_SCHEMA",
+    "RESERVED_NAMES",
+    "Archive",
+    "LogRun",
+    "find_archive",
+    "find_runs",
+    "index_files",
+    "is_fleet",
+    "read_table",
+    "write_table",
+]
+
+#: File that marks a folder of `gyrostab.jobs.fleet`.
+FLEET_MARK = "fleet.json"
+FLEET_SCHEMA = "gyrostab.fleet/1"
+#: Names inside such a folder that are not runs.
+RESERVED_NAMES = (
+    FLEET_MARK, "effects.parquet", "files.parquet", "index.html", "index.parquet", "reports",
+)  # fmt: skip
+#: Format of a folder that ``gyrostab diagnose`` wrote, in the table of files.
+DIAGNOSIS = "diagnosis"
+#: Name of the metadata of a table of this package in a Parquet file.
+_METADATA = b"gyrostab"
+#: Files that a worker inspects in one call: a call of dask takes a millisecond.
+_FILES_PER_CALL = 50
+
+
+@dataclass(frozen=True)
+class Archive:
+    """Files of an archive.
+
+    Attributes
+    ----------
+    base : Path
+        Folder that the names of runs are relative to.
+    files : list of Path
+        Files and Zarr stores that may be logs, sorted.
+    diagnoses : list of Path
+        Folders that ``gyrostab diagnose`` wrote.
+    """
+
+    base: Path
+    files: list[Path]
+    diagnoses: list[Path]
+
+
+@dataclass(frozen=True)
+class LogRun:
+    """Logs that are analysed as one record.
+
+    Attributes
+    ----------
+    name : str
+        Path of the run in the archive, with slashes.
+    tool : str
+        Tool that recorded it.
+    files : tuple of Path
+        Its logs.
+    bytes : int
+        Their size together.
+    diagnosis : Path or None
+        Folder of its diagnosis.
+    """
+
+    name: str
+    tool: str
+    files: tuple[Path, ...]
+    bytes: int
+    diagnosis: Path | None
+
+
+def find_archive(paths: Sequence[str | Path]) -> Archive:
+    """List the files of an archive, in one pass over its folders.
+
+    Parameters
+    ----------
+    paths : sequence of path
+        Folders, which are searched with all folders below, files, Zarr stores and patterns. Hidden
+        items and fleets that gyrostab wrote are left out.
+
+    Returns
+    -------
+    Archive
+
+    Raises
+    ------
+    FormatError
+        When a path does not exist, or nothing is found.
+    """
+    found: dict[Path, None] = {}
+    diagnoses: dict[Path, None] = {}
+    visited: set[str] = set()
+    bases = []
+    for item in map(str, paths):
+        is_pattern = glob.has_magic(item) and not os.path.lexists(item)
+        matching = sorted(glob.iglob(item, recursive=True)) if is_pattern else [item]
+        for path in map(Path, matching):
+            if not path.exists():
+                raise FormatError(f"{path}: there is no such file or folder")
+            if path.is_dir() and not (is_store(path) or is_fleet(path)):
+                for kind, inside in _walk_folder(path, visited):
+                    (diagnoses if kind == DIAGNOSIS else found)[inside] = None
+            elif not (is_pattern and _is_inside_output(path)):
+                found[path] = None
+        bases.append(_find_base(item, is_pattern=is_pattern, alone=len(paths) == 1))
+    if not found:
+        raise FormatError(f"{', '.join(map(str, paths))}: there are no files")
+    base = os.path.commonpath([os.path.abspath(base) for base in bases])
+    return Archive(Path(base), sorted(found), sorted(diagnoses))
+
+
+def _find_base(item: str, *, is_pattern: bool, alone: bool) -> Path:
+    """Find the folder that names are relative to: the fixed part of a pattern, or a lone folder."""
+    path = Path(item)
+    if is_pattern:
+        fixed = itertools.takewhile(lambda part: not glob.has_magic(part), path.parts)
+        return Path(*fixed)
+    return path if alone and path.is_dir() and not is_store(path) else path.parent
+
+
+def _walk_folder(folder: Path, visited: set[str]) -> Iterator[tuple[str, Path]]:
+    """Yield the files, stores and diagnoses below a folder, each folder once."""
+    for place, folders, names in os.walk(folder):
+        if place in visited:
+            folders.clear()
+            continue
+        visited.add(place)
+        if "diagnosis.json" in names:
+            folders.clear()
+            yield DIAGNOSIS, Path(place)
+            continue
+        for name in sorted(folders):
+            path = Path(place, name)
+            if name.startswith(".") or is_store(path) or is_fleet(path):
+                folders.remove(name)
+                if is_store(path) and not (name.startswith(".") or is_fleet(path)):
+                    yield "file", path
+        folders.sort()
+        yield from (("file", Path(place, name)) for name in names if not name.startswith("."))
+
+
+def is_fleet(path: Path) -> bool:
+    """Whether `gyrostab.jobs.fleet` wrote a folder."""
+    content = read_json(path / FLEET_MARK)
+    return isinstance(content, dict) and content.get("schema") == FLEET_SCHEMA
+
+
+def _is_inside_output(path: Path) -> bool:
+    """Whether a path is part of a Zarr store or of a fleet."""
+    return is_fleet(path) or any(is_store(f) or is_fleet(f) for f in path.parents)
+
+
+def index_files(
+    archive: Archive,
+    *,
+    reading: Mapping[str, Any],
+    known: pd.DataFrame | None,
+    pool: Pool,
+    stage: Stage,
+) -> pd.DataFrame:
+    """Tabulate the files of an archive; files that have not changed are not opened again.
+
+    Parameters
+    ----------
+    archive : Archive
+        The files.
+    reading : mapping
+        Options of `gyrostab.jobs.run.load_log`.
+    known : pandas.DataFrame or None
+        Earlier table.
+    pool : Pool
+        Where the files are opened.
+    stage : callable
+        Called with the number of files that are done.
+
+    Returns
+    -------
+    pandas.DataFrame
+        One row a file: file, base (of the archive), bytes, changed_ns, options (of reading, as
+        JSON), is_log, format, start, end (UTC), rate [Hz], axes, channels, rows, note. A file in
+        which no gyro is found is not a log; a damaged one counts as a log, whose time is a gap of
+        its run.
+    """
+    options = json.dumps(dict(reading), sort_keys=True, default=str)
+    records: Any = [] if known is None else known.to_dict("records")
+    before = {row["file"]: row for row in records}
+    rows: dict[str, dict[str, Any]] = {}
+    changed: list[str] = []
+    for path in [*archive.files, *archive.diagnoses]:
+        found = describe_file(path)
+        row = {
+            "file": os.path.abspath(path),
+            "base": str(archive.base),
+            "bytes": found["bytes"],
+            "changed_ns": found["changed_ns"],
+            "options": options,
+        }
+        old = before.get(row["file"], {})
+        is_same = all(old.get(key) == value for key, value in row.items())
+        rows[row["file"]] = old if is_same else row
+        if not is_same:
+            changed.append(row["file"])
+    diagnosed = {os.path.abspath(path) for path in archive.diagnoses}
+    for name in diagnosed:
+        rows[name] |= {"is_log": False, "format": DIAGNOSIS, "note": ""}
+    names = [name for name in changed if name not in diagnosed]
+    batches = [names[at : at + _FILES_PER_CALL] for at in range(0, len(names), _FILES_PER_CALL)]
+    done = 0
+    for _, result in run_calls(pool, ((_describe_logs, batch, dict(reading)) for batch in batches)):
+        for name, described in result.items():
+            rows[name].update(described)
+        done += len(result)
+        stage("indexing", len(names), done, "files")
+    return pd.DataFrame(list(rows.values()))
+
+
+def _describe_logs(names: Sequence[str], reading: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    return {name: _describe_log(name, reading) for name in names}
+
+
+def _describe_log(name: str, reading: Mapping[str, Any]) -> dict[str, Any]:
+    """Describe a file by its columns and its first and last stamps, without reading its data."""
+    kept = {key: value for key, value in reading.items() if key in ReadOptions.__annotations__}
+    row: dict[str, Any] = dict.fromkeys(
+        ("format", "start", "end", "rate [Hz]", "axes", "channels", "rows")
+    )
+    try:
+        summary = scan_file(name, ReadOptions(**kept))
+    except FormatError as error:
+        return {**row, "is_log": isinstance(error, DamageError), "note": str(error)}
+    except (GyrostabError, OSError) as error:
+        return {**row, "is_log": True, "note": str(error)}
+    rate = None
+    if summary.first is not None and summary.last is not None and (summary.n_rows or 0) > 1:
+        seconds = (summary.last - summary.first).astype("timedelta64[ns]").astype(int) / 1e9
+        rate = ((summary.n_rows or 0) - 1) / seconds if seconds > 0 else None
+    return {
+        "is_log": bool(summary.axes),
+        "format": summary.format,
+        "start": summary.first,
+        "end": summary.last,
+        "rate [Hz]": rate,
+        "axes": " ".join(summary.axes),
+        "channels": " ".join(summary.channels),
+        "rows": summary.n_rows,
+        "note": "; ".join(summary.notes) if summary.axes else "no gyro axis is found",
+    }
+
+
+def find_runs(
+    archive: Archive, table: pd.DataFrame, *, per: str = "folder", tool: str | None = None
+) -> list[LogRun]:
+    """Group the logs of an archive into runs.
+
+    Parameters
+    ----------
+    archive : Archive
+        The files.
+    table : pandas.DataFrame
+        From `index_files`.
+    per : {"folder", "file"}
+        Whether the logs of a folder together, or each log, are a run.
+    tool : str, optional
+        Regular expression whose first match in the name of a run is its tool; by default, the
+        folders above the run.
+
+    Returns
+    -------
+    list of LogRun
+        By name.
+
+    Raises
+    ------
+    FormatError
+        When no file is a log, with the reason of the first.
+    OptionError
+        When `tool` is not a regular expression.
+    """
+    try:
+        pattern = re.compile(tool) if tool else None
+    except re.error as error:
+        raise OptionError(f"--tool {tool!r}: is not a regular expression ({error})") from error
+    logs = table[table["is_log"].astype(bool)]
+    if not len(logs):
+        raise FormatError(f"no file is a log: {table['note'].iloc[0]}")
+    sizes = {Path(name): int(size) for name, size in zip(logs["file"], logs["bytes"], strict=True)}
+    groups: dict[Path, list[Path]] = defaultdict(list)
+    for path in sizes:
+        groups[path.parent if per == "folder" else path].append(path)
+    diagnoses = _read_diagnosed_files(archive.diagnoses)
+    runs = []
+    for name, files in _name_groups(groups, archive.base, per).items():
+        match = pattern.search(name) if pattern else None
+        above = name.rpartition("/")[0]
+        runs.append(
+            LogRun(
+                name,
+                (match[0] if match else "") if pattern else above,
+                tuple(files),
+                sum(sizes[path] for path in files),
+                _find_diagnosis(files, diagnoses),
+            )
+        )
+    return sorted(runs, key=lambda run: run.name)
+
+
+def _name_groups(groups: Mapping[Path, list[Path]], base: Path, per: str) -> dict[str, list[Path]]:
+    """Name runs by their place below `base`; no run is inside another one."""
+    bare = {path: path.with_name(path.name.split(".")[0] or path.name) for path in groups}
+    is_shared = len(set(bare.values())) < len(bare)
+    names: dict[Path, str] = {}
+    for path in groups:
+        shown = bare[path] if per == "file" and not is_shared else path
+        parts = list(Path(os.path.relpath(shown, base)).parts) or [base.name or "run"]
+        names[path] = "/".join(part.replace("\\", "_") for part in parts)
+    above = {
+        "/".join(name.split("/")[:depth])
+        for name in names.values()
+        for depth in range(1, name.count("/") + 1)
+    }
+    return {
+        _avoid_names(name, {*above, *RESERVED_NAMES}): groups[path] for path, name in names.items()
+    }
+
+
+def _avoid_names(name: str, taken: Iterable[str]) -> str:
+    """Return the name, or for a folder around other runs ``name/files``."""
+    while name in taken:
+        name = f"{name}/files"
+    return name
+
+
+def _read_diagnosed_files(folders: Sequence[Path]) -> list[tuple[Path, set[str]]]:
+    found = []
+    for folder in folders:
+        content = read_json(folder / "diagnosis.json")
+        recording = content.get("recording", {}) if isinstance(content, dict) else {}
+        files = recording.get("files", []) if isinstance(recording, dict) else []
+        found.append((folder, {Path(str(name)).name for name in files}))
+    return found
+
+
+def _find_diagnosis(
+    files: Sequence[Path], diagnoses: Sequence[tuple[Path, set[str]]]
+) -> Path | None:
+    """Find the diagnosis of these files in their folder or below."""
+    names, folder = {path.name for path in files}, files[0].parent
+    for place, diagnosed in diagnoses:
+        if diagnosed & names and folder in Path(os.path.abspath(place)).parents:
+            return place
+    return None
+
+
+def write_table(table: pd.DataFrame, path: Path, *, content: str, overwrite: bool) -> None:
+    """Write a table as a Parquet file whose metadata names its content."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    made = pa.Table.from_pandas(table, preserve_index=False)
+    made = made.replace_schema_metadata({**(made.schema.metadata or {}), _METADATA: content})
+    with new_output(path, overwrite=overwrite) as temporary:
+        pq.write_table(made, temporary)
+
+
+def read_table(path: Path, *, content: str) -> pd.DataFrame | None:
+    """Read a table that `write_table` wrote; None for any other file."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.read_table(path)
+    except (OSError, pa.ArrowException):
+        return None
+    if (table.schema.metadata or {}).get(_METADATA) != content.encode():
+        return None
+    frame: pd.DataFrame = table.to_pandas()
+    return frame

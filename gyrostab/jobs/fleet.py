@@ -1,0 +1,548 @@
+"""Many runs of many tools: one product for each, a table of all, and a page to look at them.
+
+The output is a folder with a NetCDF file for each run, or a Zarr store with a group for each run.
+It also holds ``files.parquet`` (the files of the archive), ``index.parquet`` (one row a run),
+``effects.parquet`` (effects that diagnoses name), ``index.html`` and ``reports``. A run is computed
+by `gyrostab.jobs.run.run`, so that its finished parts survive a stop as well.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import time
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from gyrostab.errors import FormatError, GyrostabError, WorkerError
+from gyrostab.jobs.archive import (
+    DIAGNOSIS,
+    FLEET_MARK,
+    FLEET_SCHEMA,
+    Archive,
+    LogRun,
+    find_archive,
+    find_runs,
+    index_files,
+    is_fleet,
+    read_table,
+    write_table,
+)
+from gyrostab.jobs.checks import check_windows
+from gyrostab.jobs.fleet_effects import list_effects, read_verdict
+from gyrostab.jobs.job import check_job_folder, job_folder, lock_job, remove_job
+from gyrostab.jobs.run import find_job_name, read_job_name, run
+from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool, run_calls
+from gyrostab.progress import Stage, no_stage
+from gyrostab.schema import texts
+from gyrostab.store.output import (
+    check_output,
+    protect_inputs,
+    read_json,
+    replace_file,
+    resolve_link,
+)
+
+__all__ = ["run_fleet", "summarise_run", "write_file_table"]
+
+#: Time after which the table of runs is written again [s]; a killed call loses rows of this time,
+#: which are made again from the products.
+_SAVE_SECONDS = 30.0
+_MAX_NAMES = 3  # runs that an error message names
+PLOTLY_FILE = "plotly.js"  # in the folder of the reports, which share it
+_FILES, _RUNS = "files", "runs"  # contents of the tables
+
+
+def write_file_table(
+    paths: Sequence[str | Path],
+    output: str | Path,
+    *,
+    reading: Mapping[str, Any] | None = None,
+    overwrite: bool = False,
+    scheduler: str = "processes",
+    workers: int | None = None,
+    stage: Stage = no_stage,
+) -> pd.DataFrame:
+    """Write the table of the files of an archive, which `run_fleet` takes in place of the archive.
+
+    Parameters
+    ----------
+    paths : sequence of path
+        Folders, files, Zarr stores and patterns.
+    output : path
+        Parquet file. An earlier table is brought up to date: files that have not changed are not
+        opened again.
+    reading : mapping
+        Options of `gyrostab.jobs.run.load_log`.
+    overwrite : bool
+        Open all files again.
+    scheduler, workers, stage
+        As for `run_fleet`.
+
+    Returns
+    -------
+    pandas.DataFrame
+        The table of `gyrostab.jobs.archive.index_files`.
+    """
+    scheduler = check_scheduler(scheduler)
+    known = read_table(Path(output), content=_FILES)
+    check_output(output, suffixes=[".parquet"], overwrite=overwrite or known is not None)
+    archive = find_archive(paths)
+    with _open_workers(scheduler, workers, archive.files[:1]) as pool:
+        table = index_files(
+            archive,
+            reading=reading or {},
+            known=None if overwrite else known,
+            pool=pool,
+            stage=stage,
+        )
+    write_table(table, Path(output), content=_FILES, overwrite=overwrite or known is not None)
+    return table
+
+
+def run_fleet(
+    paths: Sequence[str | Path],
+    output: str | Path,
+    *,
+    per: str = "folder",
+    tool: str | None = None,
+    reading: Mapping[str, Any] | None = None,
+    windows: Mapping[str, Any] | None = None,
+    fitting: Mapping[str, Any] | None = None,
+    reports: bool = True,
+    overwrite: bool = False,
+    scheduler: str = "processes",
+    workers: int | None = None,
+    stage: Stage = no_stage,
+) -> pd.DataFrame:
+    """Analyse the runs of an archive: a product for each, a table of all, reports and an overview.
+
+    Runs are independent: one that fails is a row with its error. A second call computes only runs
+    whose files, options or versions have changed, and those that failed. A call that was stopped or
+    killed is continued in the same way.
+
+    Parameters
+    ----------
+    paths : sequence of path
+        Folders, files, Zarr stores and patterns; or one table of `write_file_table`.
+    output : path
+        Folder to write, or to bring up to date; a Zarr store if its name ends in ``.zarr``.
+    per : {"folder", "file"}
+        Whether the logs of a folder together, or each log, are a run.
+    tool : str, optional
+        Regular expression whose first match in the name of a run is its tool; by default, the
+        folders above the run.
+    reading, windows, fitting : mapping
+        Options as for `gyrostab.jobs.run.run`.
+    reports : bool
+        Whether each run gets a report.
+    overwrite : bool
+        Compute all runs again.
+    scheduler : str
+        ``processes``, the address of a dask.distributed scheduler, whose workers must see the
+        archive and the output under the same names, or ``threads``: one run after the other in this
+        process. Each worker computes one run at a time.
+    workers : int, optional
+        Number of processes; one for each core by default.
+    stage : callable
+        Called with the number of files and runs that are done.
+
+    Returns
+    -------
+    pandas.DataFrame
+        One row a run, see docs/how-to/fleet.md.
+
+    Raises
+    ------
+    FormatError
+        At the end, when a run has failed.
+    WorkerError, KeyboardInterrupt
+        When the workers fail, or at an interruption; the message says how much is done.
+    OutputError, OptionError
+        When the output or an option is wrong.
+    """
+    scheduler = check_scheduler(scheduler)
+    options = {
+        "reading": dict(reading or {}),
+        "windows": dict(windows or {}),
+        "fitting": dict(fitting or {}),
+    }
+    check_windows(**options["windows"])
+    check_output(output, overwrite=True, find_foreign=_find_foreign)
+    target = resolve_link(output)
+    check_job_folder(job_folder(target))
+    with protect_inputs(paths), lock_job(job_folder(target)):
+        try:
+            _begin_output(target, reports=reports)
+            archive, known = _open_archive(paths, target)
+            files = [target, *archive.files[:1]]
+            with _open_workers(scheduler, workers, files) as pool:
+                table = index_files(
+                    archive, reading=options["reading"], known=known, pool=pool, stage=stage
+                )
+                write_table(table, target / "files.parquet", content=_FILES, overwrite=True)
+                runs = find_runs(archive, table, per=per, tool=tool)
+                rows = _compute_runs(
+                    target,
+                    runs,
+                    options,
+                    reports=reports,
+                    overwrite=overwrite,
+                    pool=pool,
+                    stage=stage,
+                )
+        finally:
+            remove_job(job_folder(target), output=target)
+    failed = rows[rows["error"] != ""]
+    for row in failed.to_dict("records"):
+        warnings.warn(f"{row['run']}: {row['error']}", stacklevel=2)
+    if len(failed):
+        names = ", ".join(failed["run"][:_MAX_NAMES])
+        more = f" and {len(failed) - _MAX_NAMES} more" if len(failed) > _MAX_NAMES else ""
+        raise FormatError(
+            f"{len(failed)} of {len(rows)} runs failed: {names}{more}; "
+            f"{Path(output) / 'index.html'} lists the reasons"
+        )
+    return rows
+
+
+def _open_workers(
+    scheduler: str, workers: int | None, files: Sequence[Path]
+) -> contextlib.AbstractContextManager[Pool]:
+    """Open processes or a cluster; one thread, as the file libraries do not share a process."""
+    count = 1 if scheduler == "threads" else workers
+    return open_pool(scheduler, workers=count, files=files)
+
+
+def _find_foreign(folder: Path) -> str | None:
+    """Return an item of a folder that is not a fleet; None for a fleet and an empty folder."""
+    return None if is_fleet(folder) else min(os.listdir(folder), default=None)
+
+
+def _is_zarr(target: Path) -> bool:
+    return target.suffix.lower() == ".zarr"
+
+
+def _product_path(target: Path, name: str) -> Path:
+    """Return the path of the product of a run."""
+    return target / (name if _is_zarr(target) else f"{name}.nc")
+
+
+def _begin_output(target: Path, *, reports: bool) -> None:
+    from gyrostab.report.charts import plotly_script
+
+    target.mkdir(exist_ok=True)
+    _write_json(target / FLEET_MARK, {"schema": FLEET_SCHEMA})
+    if _is_zarr(target):
+        _write_json(target / ".zgroup", {"zarr_format": 2})
+    if reports:
+        (target / "reports").mkdir(exist_ok=True)
+        with replace_file(target / "reports" / PLOTLY_FILE) as temporary:
+            temporary.write_text(plotly_script(), encoding="utf-8")
+
+
+def _write_json(path: Path, content: Any) -> None:
+    with replace_file(path) as temporary:
+        temporary.write_text(json.dumps(content), encoding="utf-8")
+
+
+def _open_archive(paths: Sequence[str | Path], target: Path) -> tuple[Archive, pd.DataFrame | None]:
+    """List an archive, or take the files of a table; return the latest table of its files too."""
+    known = read_table(target / "files.parquet", content=_FILES)
+    if len(paths) == 1 and Path(paths[0]).suffix.lower() == ".parquet":
+        given = read_table(Path(paths[0]), content=_FILES)
+        if given is not None:
+            is_diagnosis = given["format"] == DIAGNOSIS
+            files, diagnoses = (
+                [Path(name) for name in given.loc[part, "file"]]
+                for part in (~is_diagnosis, is_diagnosis)
+            )
+            return Archive(Path(given["base"].iloc[0]), files, diagnoses), given
+    return find_archive(paths), known
+
+
+def _compute_runs(
+    target: Path,
+    runs: Sequence[LogRun],
+    options: Mapping[str, Any],
+    *,
+    reports: bool,
+    overwrite: bool,
+    pool: Pool,
+    stage: Stage,
+) -> pd.DataFrame:
+    """Compute the runs that are new or changed, and write the table and the page of all runs."""
+    before = _read_rows(target)
+    waiting = [
+        item
+        for item in runs
+        if overwrite or not _is_current(before.get(item.name), target, item, options, reports)
+    ]
+    waiting.sort(key=lambda item: -item.bytes)  # a long run at the end would leave workers idle
+    stale = {item.name for item in waiting}
+    rows = {
+        name: row
+        for name, row in before.items()
+        if name not in stale and _product_path(target, name).exists()
+    }
+    work = partial(
+        process_run, str(target.absolute()), json.dumps(options, default=str), reports, overwrite
+    )
+    done, saved = 0, time.monotonic()
+    stage("computing", len(waiting), 0, "runs")
+    try:
+        with _without_notes():
+            for _, row in run_calls(pool, ((work, _pack(item)) for item in waiting)):
+                rows[row["run"]] = row
+                done += 1
+                stage("computing", len(waiting), done, "runs")
+                if time.monotonic() - saved > _SAVE_SECONDS:
+                    _write_rows(_make_table(rows, runs), target)
+                    saved = time.monotonic()
+    except (KeyboardInterrupt, WorkerError) as error:
+        what = str(error) or "interrupted"
+        raise type(error)(
+            f"{what}; {done} of {len(waiting)} runs are done, and the same command continues"
+        ) from error
+    finally:
+        stage("writing", 0)
+        table = _make_table(rows, runs)
+        _write_rows(table, target)
+        _write_overview(table, target)
+        if _is_zarr(target):
+            _consolidate(target, list(rows))
+    return table
+
+
+@contextlib.contextmanager
+def _without_notes() -> Iterator[None]:
+    """Show no notes on single logs, which are in the table, in this thread and its workers."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        yield
+
+
+def _is_current(
+    row: Mapping[str, Any] | None,
+    target: Path,
+    item: LogRun,
+    options: Mapping[str, Any],
+    reports: bool,
+) -> bool:
+    """Whether row, product and report of a run are those of its files and options."""
+    if row is None or row["error"] or (reports and not (target / str(row["report"])).is_file()):
+        return False
+    made_by = read_job_name(_product_path(target, item.name))
+    return bool(row["job"] == made_by == find_job_name(item.files, **options))
+
+
+def _pack(item: LogRun) -> dict[str, Any]:
+    return {**asdict(item), "files": [os.path.abspath(path) for path in item.files]}
+
+
+def process_run(
+    target: str, options: str, reports: bool, overwrite: bool, item: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Compute a run in this thread, write its product and report, and return its row.
+
+    Parameters
+    ----------
+    target : str
+        The store.
+    options : str
+        Options of reading, windows and fitting, as JSON.
+    reports : bool
+        Whether to write a report.
+    overwrite : bool
+        Whether to compute a product again that is complete.
+    item : mapping
+        Fields of a `LogRun`.
+
+    Returns
+    -------
+    dict
+        The row; ``error`` is empty unless the run failed.
+    """
+    import dask
+
+    name, product = item["name"], _product_path(Path(target), item["name"])
+    row = {
+        "run": name,
+        "tool": item["tool"],
+        "error": "",
+        "files": len(item["files"]),
+        "report": f"reports/{name}.html" if reports else "",
+    }
+    given = json.loads(options)
+    try:
+        _make_folders(Path(target), product.parent)
+        row["job"] = find_job_name(item["files"], **given)
+        with dask.config.set(scheduler="synchronous"):
+            run(
+                item["files"],
+                product,
+                **given,
+                workers=1,
+                resume=not overwrite,  # which does nothing if the product is complete
+                overwrite=True,
+                zarr=_is_zarr(Path(target)),
+            )
+            report = Path(target, row["report"]) if reports else None
+            row |= _finish_run(product, report, "../" * name.count("/") + PLOTLY_FILE)
+    except (GyrostabError, OSError) as error:
+        row["error"] = " ".join(str(error).split())
+    except Exception as error:  # one run must not stop the others
+        row["error"] = f"unexpected {type(error).__name__}: {error}"
+    return row
+
+
+def _make_folders(target: Path, folder: Path) -> None:
+    """Make the folders between the output and a run, in a Zarr store as groups."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for group in [folder, *folder.parents] if _is_zarr(target) else ():
+        if group == target:
+            break
+        if not (group / ".zgroup").exists():
+            _write_json(group / ".zgroup", {"zarr_format": 2})
+
+
+def _finish_run(path: Path, report: Path | None, plotly: str) -> dict[str, Any]:
+    """Write the report of a product, and return what the table says of it."""
+    from gyrostab.io.datasets import open_product
+    from gyrostab.report import write_report
+
+    with open_product(path) as product:
+        product = product.load()
+    if report is not None:
+        report.parent.mkdir(parents=True, exist_ok=True)
+        write_report(product, report, overwrite=True, plotly=plotly)
+    return summarise_run(product)
+
+
+def summarise_run(product: xr.Dataset) -> dict[str, Any]:
+    """Summarise a product in one row of a table.
+
+    Parameters
+    ----------
+    product : xarray.Dataset
+        Product of a run.
+
+    Returns
+    -------
+    dict
+        Span, rate, windows, share of missing samples, worst window, and by axis the median of each
+        term where it is observed (NaN elsewhere), its median upper limit, and the misfit. Names of
+        columns end with the unit.
+
+    Examples
+    --------
+    >>> from gyrostab import davar, fit_noise, make_log
+    >>> noise = 6.0 * np.random.default_rng(1).standard_normal(60_000)
+    >>> noise[30_000:36_000] *= 3.0
+    >>> log = make_log(noise, rate=100.0, unit="deg/h")
+    >>> row = summarise_run(fit_noise(davar(log, window="1min", step="1min")))
+    >>> round(row["N_x [deg/sqrt(h)]"], 4), str(row["worst_window"])[11:19]
+    (0.01, '00:05:30')
+    """
+    from gyrostab.allan.summary import summarise_fit, summarise_terms
+
+    bounds = product["time_bounds"].values
+    row: dict[str, Any] = {
+        "start": bounds.min(),
+        "end": bounds.max(),
+        "span [s]": float((bounds.max() - bounds.min()) / np.timedelta64(1, "s")),
+        "rate [Hz]": float(product.attrs["sampling_rate_hz"]),
+        "windows": product.sizes["time"],
+        "missing_share": 1.0 - float(product["window_coverage"].mean()),
+        "notes": "\n".join(texts(product, "notes")),
+        **_find_worst_window(product),
+    }
+    for term in summarise_terms(product):
+        is_limit = term.status == "upper_limit_only"
+        name = f"{term.symbol}_{term.axis}"
+        row[f"{name} [{term.unit}]"] = np.nan if is_limit else term.value
+        row[f"{name}_upper [{term.unit}]"] = term.value if is_limit else np.nan
+    for fit in summarise_fit(product):
+        row[f"misfit_{fit.axis}"] = fit.chi2_per_dof
+    return row
+
+
+def _find_worst_window(product: xr.Dataset) -> dict[str, Any]:
+    """Find the window and axis whose Allan deviation is largest, relative to the median window.
+
+    Ratios are averaged over the averaging times on a logarithmic scale, with the equivalent degrees
+    of freedom as weights: the variance of the logarithm of an Allan variance is about 2 / edf.
+    """
+    known = product["avar"].where(product["avar"] > 0.0)
+    logs = known.copy(data=np.log(known.values))
+    change = logs - logs.median("time")
+    level = change.weighted(product["edf"].fillna(0.0)).mean("tau").transpose("axis", "time")
+    if not np.isfinite(level.values).any():
+        return {"worst_window": np.datetime64("NaT", "ns"), "worst_axis": "", "worst_ratio": np.nan}
+    axis, window = np.unravel_index(np.nanargmax(level.values), level.shape)
+    return {
+        "worst_window": product["time"].values[window],
+        "worst_axis": str(product["axis"].values[axis]),
+        "worst_ratio": float(np.exp(level.values[axis, window] / 2.0)),
+    }
+
+
+def _read_rows(target: Path) -> dict[str, dict[str, Any]]:
+    table = read_table(target / "index.parquet", content=_RUNS)
+    records: Any = [] if table is None else table.to_dict("records")
+    return {row["run"]: row for row in records}
+
+
+def _make_table(rows: Mapping[str, Mapping[str, Any]], runs: Sequence[LogRun]) -> pd.DataFrame:
+    """Make the table of runs, with the verdicts of their diagnoses."""
+    diagnosed = {item.name: os.path.abspath(item.diagnosis) for item in runs if item.diagnosis}
+    first = ("run", "tool", "error", "files", "start", "end", "span [s]", "rate [Hz]", "windows")
+    return pd.DataFrame(
+        [
+            {
+                **dict.fromkeys(first),
+                **rows[name],
+                "verdict": read_verdict(diagnosed.get(name, "")),
+                "diagnosis": diagnosed.get(name, ""),
+            }
+            for name in sorted(rows)
+        ],
+        columns=None if rows else list(first),
+    )
+
+
+def _write_rows(table: pd.DataFrame, target: Path) -> None:
+    write_table(table, target / "index.parquet", content=_RUNS, overwrite=True)
+
+
+def _write_overview(table: pd.DataFrame, target: Path) -> None:
+    from gyrostab.report.fleet import write_overview
+
+    effects = list_effects(table)
+    write_table(effects, target / "effects.parquet", content="effects", overwrite=True)
+    write_overview(table, target / "index.html", effects=effects, overwrite=True)
+
+
+def _consolidate(target: Path, names: Sequence[str]) -> None:
+    """Write the metadata of all groups in one file, from those that each group has."""
+    metadata: dict[str, Any] = {
+        ".zgroup": {"zarr_format": 2},
+    }
+    for name in names:
+        content = read_json(target / name / ".zmetadata")
+        if content is None:
+            continue
+        parts = name.split("/")
+        for depth in range(1, len(parts)):
+            metadata["/".join([*parts[:depth], ".zgroup"])] = {"zarr_format": 2}
+        metadata |= {f"{name}/{key}": value for key, value in content["metadata"].items()}
+    _write_json(target / ".zmetadata", {"zarr_consolidated_format": 1, "metadata": metadata})

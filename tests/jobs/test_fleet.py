@@ -1,0 +1,264 @@
+"""A fleet of runs: products, table, overview; what is new, what failed, and what was killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+from gyrostab import make_log, open_product, to_netcdf
+from gyrostab.cli import main
+from gyrostab.errors import FormatError, OutputError
+from gyrostab.jobs import fleet as fleet_module
+from gyrostab.jobs.archive import find_archive, find_runs, read_table
+from gyrostab.jobs.fleet import process_run, run_fleet
+from gyrostab.jobs.run import run
+from gyrostab.report.fleet import write_overview
+
+RATE = 10.0
+WINDOWS = {"window": "60s", "step": "30s", "taus": "12"}
+OPTIONS = {"windows": WINDOWS, "reports": False, "scheduler": "threads", "workers": 1}
+
+
+def write_log(path: Path, seed: int, *, minutes: float = 5.0, start: str = "2026-05-01") -> Path:
+    rng = np.random.default_rng(seed)
+    values = 5.0 + rng.standard_normal((1, round(60 * minutes * RATE)))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return to_netcdf(make_log(values, rate=RATE, unit="deg/h", start=start), path)
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory) -> Path:
+    """Three runs of two tools: two files that follow each other, one file, and a damaged file."""
+    folder = tmp_path_factory.mktemp("archive")
+    write_log(folder / "tool 1" / "run a" / "1.nc", 1)
+    write_log(folder / "tool 1" / "run a" / "2.nc", 2, start="2026-05-01T00:05:00")
+    write_log(folder / "tool 1" / "run <b>" / "log.nc", 3)
+    whole = write_log(folder / "tool 2" / "broken" / "log.nc", 4)
+    whole.write_bytes(whole.read_bytes()[:2000])
+    (folder / "tool 1" / "README.txt").write_text("Logs of the spring campaign.\n")
+    return folder
+
+
+@pytest.fixture
+def computed(monkeypatch) -> list[str]:
+    """Names of the runs that are computed from now on."""
+    names: list[str] = []
+
+    def count(*arguments):
+        names.append(arguments[-1]["name"])
+        return process_run(*arguments)
+
+    monkeypatch.setattr(fleet_module, "process_run", count)
+    return names
+
+
+def analyse(paths, output: Path, **options) -> pd.DataFrame:
+    with pytest.warns(UserWarning, match="tool 2/broken: "):
+        return run_fleet([paths], output, **{**OPTIONS, **options})
+
+
+@pytest.fixture(scope="module")
+def done(archive, tmp_path_factory) -> Path:
+    output = tmp_path_factory.mktemp("fleet") / "fleet"
+    with pytest.raises(FormatError, match=r"1 of 3 runs failed: tool 2/broken; .*index\.html"):
+        analyse(archive, output)
+    return output
+
+
+# ------------------------------------------------------------------------------
+# which files are a run
+
+
+@pytest.mark.parametrize(
+    ("per", "expected"),
+    [
+        ("folder", {"a": ["1.nc", "2.nc"], "b/c": ["3.nc"], "b/files": ["4.nc"]}),
+        ("file", {"a/1": ["1.nc"], "a/2": ["2.nc"], "b/c/3": ["3.nc"], "b/4": ["4.nc"]}),
+    ],
+)
+def test_runs_are_folders_or_files(tmp_path, per, expected):
+    for name in ("a/1.nc", "a/2.nc", "b/c/3.nc", "b/4.nc", ".hidden/5.nc"):
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    for paths in ([tmp_path], [f"{tmp_path}/**"], [tmp_path / "a", tmp_path / "b"]):
+        archive = find_archive(paths)
+        table = pd.DataFrame(
+            {"file": map(str, archive.files), "bytes": 0, "is_log": True, "note": ""}
+        )
+        runs = find_runs(archive, table, per=per)
+        assert {item.name: [path.name for path in item.files] for item in runs} == expected
+    assert {item.tool for item in runs} == {item.name.rpartition("/")[0] for item in runs}
+    assert {item.tool for item in find_runs(archive, table, tool="^.")} == {"a", "b"}
+
+
+def test_an_archive_of_ten_thousand_files_is_listed_in_linear_time(tmp_path):
+    names = [f"r{number // 100}/{number}.nc" for number in range(2000)]
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    begun = time.process_time()
+    assert len(find_archive([tmp_path]).files) == len(names)
+    assert time.process_time() - begun < 0.5
+
+
+# ------------------------------------------------------------------------------
+# what is written
+
+
+def test_products_equal_those_of_single_runs(archive, done, tmp_path):
+    files = sorted((archive / "tool 1" / "run a").iterdir())
+    single = run(files, tmp_path / "product.nc", windows=WINDOWS)
+    with (
+        open_product(single) as expected,
+        xr.open_datatree(done, engine="gyrostab") as tree,
+    ):
+        xr.testing.assert_equal(expected, open_product(done / "tool 1" / "run a.nc"))
+        assert set(tree["tool 1"].children) == {"run a", "run <b>"}
+        xr.testing.assert_equal(tree["tool 1/run a"].to_dataset(), expected)
+
+
+def test_a_zarr_store_holds_the_same_products(archive, done, tmp_path):
+    output = tmp_path / "fleet.zarr"
+    run_fleet([archive / "tool 1"], output, **OPTIONS)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tree = xr.open_datatree(output, engine="zarr")
+    assert set(tree.children) == {"run a", "run <b>"}
+    expected = open_product(done / "tool 1" / "run a.nc")
+    xr.testing.assert_equal(open_product(output / "run a"), expected)
+    np.testing.assert_array_equal(tree["run a"]["N"].values, expected["N"].values)
+
+
+def test_the_table_has_a_row_for_each_run(done):
+    table = read_table(done / "index.parquet", content="runs")
+    assert list(table["run"]) == ["tool 1/run <b>", "tool 1/run a", "tool 2/broken"]
+    assert list(table["tool"]) == ["tool 1", "tool 1", "tool 2"]
+    assert list(table["files"]) == [1, 2, 1]
+    row = table.iloc[1]
+    assert (row["start"], row["span [s]"], row["rate [Hz]"]) == (
+        pd.Timestamp("2026-05-01"),
+        600.0,
+        RATE,
+    )
+    white = 1.0 / np.sqrt(RATE * 3600.0)  # deg/sqrt(h), of 1 deg/h in each sample
+    assert row["N_x [deg/sqrt(h)]"] == pytest.approx(white, rel=0.1)
+    assert "log.nc: is damaged" in table.iloc[2]["error"]
+    files = read_table(done / "files.parquet", content="files").set_index("file")
+    readme = next(name for name in files.index if name.endswith("README.txt"))
+    assert not files.loc[readme, "is_log"]
+
+
+def test_the_overview_escapes_names_and_links_reports(done, tmp_path):
+    page = (done / "index.html").read_text(encoding="utf-8")
+    assert "run &lt;b&gt;" in page
+    assert "<b>" not in page
+    assert "http" not in page.replace("http://www.w3.org", "")
+    table = read_table(done / "index.parquet", content="runs")
+    table["report"] = "reports/" + table["run"] + ".html"
+    text = write_overview(table, tmp_path / "index.html").read_text(encoding="utf-8")
+    assert 'href="reports/tool%201/run%20%3Cb%3E.html"' in text
+
+
+# ------------------------------------------------------------------------------
+# the second call
+
+
+def test_a_second_call_computes_what_is_new_changed_or_failed(tmp_path, computed):
+    own, output = tmp_path / "archive", tmp_path / "fleet"
+    for name in ("a", "b"):
+        write_log(own / name / "log.nc", 5)
+    run_fleet([own], output, **OPTIONS)
+    assert sorted(computed) == ["a", "b"]
+    write_log(own / "c" / "log.nc", 6)
+    log = own / "b" / "log.nc"
+    log.unlink()
+    write_log(log, 7, minutes=6.0)
+    del computed[:]
+    table = run_fleet([own], output, **OPTIONS)
+    assert sorted(computed) == ["b", "c"]
+    assert list(table["span [s]"]) == [300.0, 360.0, 300.0]
+    del computed[:]
+    run_fleet([own], output, **OPTIONS)
+    assert computed == []
+
+
+def test_a_table_of_files_takes_the_place_of_the_archive(archive, tmp_path, monkeypatch):
+    table = tmp_path / "files.parquet"
+    options = ["--quiet-progress", "--scheduler", "threads"]
+    assert main(["index", str(archive), "-o", str(table), *options]) == 0
+    monkeypatch.setattr("gyrostab.jobs.archive.scan_file", None)  # no file is opened to list it
+    monkeypatch.setattr(fleet_module, "process_run", tell_name)
+    assert main(["index", str(archive), "-o", str(table), *options]) == 0
+    with (
+        pytest.raises(FormatError, match="3 of 3 runs failed"),
+        pytest.warns(UserWarning, match="tool 2/broken: not computed"),
+    ):
+        run_fleet([table], tmp_path / "fleet", **OPTIONS, reading={"max_gap": "10D"})
+    rows = read_table(tmp_path / "fleet" / "index.parquet", content="runs")
+    assert list(rows["run"]) == ["tool 1/run <b>", "tool 1/run a", "tool 2/broken"]
+
+
+def tell_name(*arguments):
+    return {"run": arguments[-1]["name"], "tool": "", "error": "not computed", "diagnosis": ""}
+
+
+def test_nothing_foreign_is_replaced(archive, tmp_path):
+    output = tmp_path / "fleet"
+    output.mkdir()
+    (output / "notes.txt").write_text("mine")
+    with pytest.raises(OutputError, match=r"notes\.txt.*gyrostab did not make"):
+        run_fleet([archive], output, overwrite=True)
+    assert [path.name for path in output.iterdir()] == ["notes.txt"]
+
+
+def test_the_command_line_tells_the_failures(archive, tmp_path, capfd):
+    output = tmp_path / "fleet"
+    arguments = ["fleet", str(archive), "-o", str(output), "--window", "60s", "--no-reports"]
+    assert main([*arguments, "--scheduler", "threads", "--quiet-progress"]) == 2
+    shown = capfd.readouterr().err
+    assert "note: tool 2/broken: " in shown
+    assert "1 of 3 runs failed" in shown
+    assert "Traceback" not in shown
+
+
+# ------------------------------------------------------------------------------
+# stopped and killed
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_killed_fleet_goes_on_where_it_was(tmp_path, computed):
+    """Kill a call in its third run, with the product computed and not yet renamed."""
+    own, output = tmp_path / "archive", tmp_path / "fleet"
+    for number in range(4):
+        write_log(own / f"run{number}" / "log.nc", number)
+
+    replace = os.replace
+
+    def kill_third(source, target):
+        if str(target).endswith(".nc") and len(list(output.glob("*.nc"))) == 2:
+            os.kill(os.getpid(), signal.SIGKILL)
+        replace(source, target)
+
+    child = os.fork()
+    if child == 0:
+        os.replace = kill_third
+        run_fleet([own], output, **OPTIONS)
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+    before = {path.name: path.stat().st_mtime_ns for path in output.glob("*.nc")}
+    assert len(before) == 2
+    table = run_fleet([own], output, **OPTIONS)
+    assert list(table["error"]) == [""] * 4
+    after = {path.name: path.stat().st_mtime_ns for path in output.glob("*.nc")}
+    assert len(after) == 4
+    assert {name: after[name] for name in before} == before
+    assert not [path for path in output.rglob("*") if path.name.endswith((".job", ".part"))]
