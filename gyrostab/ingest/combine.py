@@ -19,9 +19,8 @@ from gyrostab.ingest.columns.pieces import (
     as_lazy,
     pieces_of,
 )
-from gyrostab.ingest.columns.stamps import NAT, read_stamps
 from gyrostab.ingest.concat import absence_notes, group_axes, merge_notes, name_some, split_axes
-from gyrostab.ingest.overlap import drop_repeats, stamp_span
+from gyrostab.ingest.overlap import drop_repeats, first_known_stamp, stamp_span
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store.lazy import concatenate_columns, select_part, stack_rows
 from gyrostab.store.write import common_packing
@@ -144,15 +143,7 @@ def _in_order(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
             f"{with_time} has time stamps and {without} has none; read them one by one, or give "
             "the latter a time column"
         )
-    return sorted(parts, key=_first_stamp)
-
-
-def _first_stamp(part: xr.Dataset) -> int:
-    for start in range(0, part.sizes["row"], 2**16):
-        stamps = read_stamps(part, start, start + 2**16)
-        if (stamps != NAT).any():
-            return int(stamps[np.argmax(stamps != NAT)])
-    return int(np.iinfo(np.int64).max)
+    return sorted(parts, key=first_known_stamp)
 
 
 def _common_signal(parts: Sequence[xr.Dataset]) -> str | None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import SchemaError
 from gyrostab.schema import GAP_CAUSES
 from gyrostab.time.grid import grid_index, grid_times
-from gyrostab.time.stamps import to_nanoseconds
+from gyrostab.time.stamps import format_stamp, to_nanoseconds
 from gyrostab.units import HOUR
 
 __all__ = [
@@ -20,7 +20,6 @@ __all__ = [
     "COLUMNS",
     "END",
     "FIRST",
-    "MAX_TABLE_ROWS",
     "ROWS",
     "SAMPLES",
     "clip_table",
@@ -33,14 +32,15 @@ __all__ = [
 ]
 
 #: Largest table; in a longer one, neighbours of one cause are merged into one row.
-MAX_TABLE_ROWS = 10_000
+_MAX_TABLE_ROWS = 10_000
 
 #: Columns of the table: first missing sample, first present sample after, samples missing, rows
 #: concerned, cause.
 COLUMNS = FIRST, END, SAMPLES, ROWS, CAUSE = range(5)
 
 _MISSING, _UNREADABLE = GAP_CAUSES.index("missing"), GAP_CAUSES.index("unreadable")
-_NEVER_THINNED = (GAP_CAUSES.index("clock_step"), GAP_CAUSES.index("restart"))
+_RESTART = GAP_CAUSES.index("restart")
+_NEVER_THINNED = (GAP_CAUSES.index("clock_step"), _RESTART)
 
 
 def format_duration(seconds: float) -> str:
@@ -56,14 +56,29 @@ def format_duration(seconds: float) -> str:
     return f"{seconds:.1f} s" if abs(seconds) < 7200 else f"{seconds / HOUR:.1f} h"
 
 
-def merge_neighbours(table: NDArray[np.int64], most: int = MAX_TABLE_ROWS) -> NDArray[np.int64]:
-    """Reduce a table to about `most` lines by merging the nearest neighbours of one cause."""
-    if len(table) <= most:
+def describe_break(place: str, cause: int, before: int, after: int, samples: str) -> str:
+    """Describe a restart or step of the clock between two stamps [ns since 1970].
+
+    `samples` names what the log consists of, rows or samples.
+    """
+    jump = (after - before) / 1e9
+    what = "time restarts" if cause == _RESTART else "the clock steps"
+    return (
+        f"{what}{place}: from {format_stamp(before)} to {format_stamp(after)}, "
+        f"{format_duration(abs(jump))} {'back' if jump < 0 else 'ahead'}; "
+        f"the pause is of unknown length, so the {samples} that follow come after one missing "
+        f"sample{'' if jump < 0 else '; if the pause is real, raise max_gap'}"
+    )
+
+
+def merge_neighbours(table: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Reduce a table that is too long by merging the nearest neighbours of one cause."""
+    if len(table) <= _MAX_TABLE_ROWS:
         return table
     parts = []
     for cause in np.unique(table[:, CAUSE]):
         part = table[table[:, CAUSE] == cause]
-        room = max(1, int(most * len(part) / len(table)))
+        room = max(1, int(_MAX_TABLE_ROWS * len(part) / len(table)))
         if len(part) > room and cause not in _NEVER_THINNED:
             distance = part[1:, FIRST] - part[:-1, END]
             at = np.concatenate(

@@ -11,9 +11,10 @@ from gyrostab.ingest.columns.stamps import NAT, read_stamps
 from gyrostab.ingest.copies import count_alike, is_copy
 from gyrostab.schema import SIGNAL_UNITS
 
-__all__ = ["drop_repeats", "stamp_span"]
+__all__ = ["drop_repeats", "first_known_stamp", "stamp_span"]
 
 _BLOCK_ROWS = 2**20
+_FIRST_ROWS = 2**16  # read at once in search of the first stamp
 _COMPARED_ROWS = 2**15  # at each end of an overlap
 
 
@@ -79,15 +80,22 @@ def _with_note(part: xr.Dataset, note: str) -> xr.Dataset:
     return part.assign_attrs(notes=[*part.attrs["notes"], note])
 
 
+def first_known_stamp(part: xr.Dataset) -> int:
+    """Return the first stamp of a raw log [ns since 1970]; the largest integer without any."""
+    for begin in range(0, part.sizes["row"], _FIRST_ROWS):
+        stamps = read_stamps(part, begin, begin + _FIRST_ROWS)
+        if (stamps != NAT).any():
+            return int(stamps[np.argmax(stamps != NAT)])
+    return int(np.iinfo(np.int64).max)
+
+
 def stamp_span(part: xr.Dataset) -> tuple[int, int]:
     """Return the first and the latest stamp of a raw log [ns since 1970]."""
-    first, latest = None, NAT
+    latest = NAT
     for begin in range(0, part.sizes["row"], _BLOCK_ROWS):
         stamps = read_stamps(part, begin, begin + _BLOCK_ROWS)
         latest = max(latest, int(stamps.max()))  # NAT is the smallest integer
-        if first is None and latest != NAT:
-            first = int(stamps[np.argmax(stamps != NAT)])
-    return (first if first is not None else int(np.iinfo(np.int64).max)), latest
+    return first_known_stamp(part), latest
 
 
 def _rows_from(part: xr.Dataset, first: int) -> int:

@@ -2,7 +2,7 @@
 
 On disk the dimensions are ``(axis, tau, time)``, every time is an exact integer, every unit string
 is one that UDUNITS reads rightly, only data carries a fill value, and lists stand in the attributes
-as JSON. `open_dataset` turns all of that back (`gyrostab.store.cf` holds the rules;
+as JSON. `open_dataset` turns all of that back (`gyrostab.store.cf` and `.times` hold the rules;
 `gyrostab.store` the chunks of a log). A file takes its final name only once it is complete.
 """
 
@@ -22,11 +22,12 @@ from gyrostab.errors import FormatError, OptionError, SchemaError, TimeError, re
 from gyrostab.ingest.convert import as_log
 from gyrostab.ingest.limits import check_declared
 from gyrostab.schema import SIGNAL_UNITS, check_log, check_product, check_surface
-from gyrostab.store.cf import GRID, find_kind, from_disk, index_dim, to_disk
+from gyrostab.store.cf import find_kind, from_disk, to_disk
 from gyrostab.store.netcdf_compression import append_compressed, large_variables
 from gyrostab.store.output import find_foreign_item, find_sources, new_output
 from gyrostab.store.private import library_lock
 from gyrostab.store.read import open_stored
+from gyrostab.store.times import GRID, index_dim
 from gyrostab.store.write import (
     NotCountsError,
     Progress,

@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from gyrostab.errors import DamageError, FormatError, reading_of
 from gyrostab.kernels.encoding.counts import from_counts
 from gyrostab.store.blosc_chunks import check_blosc_chunks
-from gyrostab.store.cf import decode_stamps, index_dim, parse_time_grids, replace_stamps
 from gyrostab.store.chunk_cache import ChunkCache
 from gyrostab.store.hdf5_heaps import check_global_heaps
 from gyrostab.store.layout import ChunkDamage, is_readable, read_chunk
 from gyrostab.store.lazy import FileVariable, RowSource, make_dask
 from gyrostab.store.private import close_function
+from gyrostab.store.times import decode_stamps, index_dim, parse_time_grids, replace_stamps
 from gyrostab.time.grid import grid_times
 
 __all__ = ["MIN_LAZY_VALUES", "make_variable_lazy", "open_stored"]

@@ -66,7 +66,7 @@ class NullScores:
 
     #: By the names of `gyrostab.diagnose.statistics.STATISTICS`.
     statistics: Mapping[str, StatisticNull]
-    #: The largest ``-log p`` over the statistics, with p of each one's largest score.
+    #: Law of the largest ``-log p`` over the statistics, with p of each one's largest score.
     family: MaximumDistribution
     records: int
 

@@ -78,7 +78,7 @@ def free_shape(state: State, axis: str) -> State:
     )
 
 
-def refit_weights(state: State, *, rounds: int = 4) -> State:
+def refit_weights(state: State) -> State:
     """Set the weights by a fit of all given power columns (Fisher scoring, gamma likelihood)."""
     weight = state.weight.copy()
     for row, axis in enumerate(state.axes):
@@ -89,20 +89,19 @@ def refit_weights(state: State, *, rounds: int = 4) -> State:
                 row,
                 axis,
                 np.stack([np.broadcast_to(one, weight.shape[1:]) for one in named], axis=-1),
-                rounds,
             )[0]
     return replace(
         state, weight=weight, blocks=drop_changed_tails(state.blocks, weight, state.settings)
     )
 
 
-def power_shares(state: State, axis: str, *, rounds: int = 4) -> Array:
+def power_shares(state: State, axis: str) -> Array:
     """Return the fitted contribution of each power column of an axis, (column, block, band)."""
     row, shape = state.axes.index(axis), state.weight.shape[1:]
     named = [np.broadcast_to(one, shape) for one in state.given.get(("power", axis), [])]
     if not named:
         return np.empty((0, *shape))
-    sizes = _fit_powers(state, row, axis, np.stack(named, axis=-1), rounds)[1]
+    sizes = _fit_powers(state, row, axis, np.stack(named, axis=-1))[1]
     return np.stack([size * one for size, one in zip(sizes, named, strict=True)])
 
 
@@ -135,9 +134,10 @@ def drop_changed_tails(
     )
 
 
-def _fit_powers(
-    state: State, row: int, axis: str, named: Array, rounds: int
-) -> tuple[Array, Array]:
+_ROUNDS = 4  # steps of Fisher scoring
+
+
+def _fit_powers(state: State, row: int, axis: str, named: Array) -> tuple[Array, Array]:
     """Fit the powers of an axis; return them and the sizes of the named columns."""
     expected = state.baseline["spectrum"].sel(axis=axis).values
     level, precision = noise_columns(state.baseline, axis=axis)
@@ -154,7 +154,7 @@ def _fit_powers(
         np.isfinite(power) & np.isfinite(shape) & ~np.repeat(state.masked[row], expected.shape[1])
     )
     fitted, sizes = expected.ravel().copy(), np.zeros(size.size)
-    for _ in range(rounds):
+    for _ in range(_ROUNDS):
         w = np.where(good, shape / fitted**2, 0.0)
         w = np.where(np.isfinite(w), w, 0.0)
         normal = (columns * w[:, None]).T @ columns + np.diag(prior)

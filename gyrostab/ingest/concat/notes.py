@@ -6,10 +6,11 @@ from collections.abc import Iterable, Mapping, Sequence
 
 __all__ = ["absence_notes", "first_notes", "merge_notes", "name_some"]
 
+_MAX_FILES = 3  # files named in one note
 _MAX_NAMED = 5  # events of one kind that are listed one by one
 
 
-def name_some(names: Sequence[str], most: int = 3) -> str:
+def name_some(names: Sequence[str]) -> str:
     """Name a few of several files.
 
     Examples
@@ -17,7 +18,8 @@ def name_some(names: Sequence[str], most: int = 3) -> str:
     >>> name_some(["a", "b", "c", "d", "e"])
     'a, b, c and 2 more'
     """
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+    more = len(names) - _MAX_FILES
+    return ", ".join(names[:_MAX_FILES]) + (f" and {more} more" if more > 0 else "")
 
 
 def absence_notes(absent: Mapping[str, Sequence[str]]) -> list[str]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from gyrostab.ingest.concat.grid import LogSlice, PlacedLog, Source, read_log_slices, runs_of
 from gyrostab.ingest.concat.notes import first_notes, name_some
 from gyrostab.ingest.copies import MIN_ALIKE_SHARE, count_alike, is_copy
-from gyrostab.ingest.gap_table import format_duration
+from gyrostab.ingest.gap_table import describe_break, format_duration
 from gyrostab.schema import GAP_CAUSES
 from gyrostab.time.grid import grid_index, grid_times
 from gyrostab.time.stamps import format_stamp
@@ -288,12 +288,5 @@ def _overlap_note(piece: PlacedLog, held: PlacedLog, match: _Match, rate: float)
 
 def _break_note(pieces: Sequence[PlacedLog], piece: PlacedLog) -> str:
     before = max(one.source.end for one in pieces if one.clock == pieces[-1].clock)
-    jump = (piece.source.start - before) / 1e9
-    what = "time restarts" if piece.cause == _RESTART else "the clock steps"
-    return (
-        f"{piece.source.name}: {what}: from {format_stamp(before)} to "
-        f"{format_stamp(piece.source.start)}, {format_duration(abs(jump))} "
-        f"{'back' if jump < 0 else 'ahead'}; the pause is of unknown length, so the samples that "
-        "follow come after one missing sample"
-        + ("" if jump < 0 else "; if the pause is real, raise max_gap")
-    )
+    what = describe_break("", piece.cause, before, piece.source.start, "samples")
+    return f"{piece.source.name}: {what}"

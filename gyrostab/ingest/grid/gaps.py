@@ -8,7 +8,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import SchemaError
-from gyrostab.ingest.gap_table import CAUSE, FIRST, MAX_TABLE_ROWS, merge_neighbours
+from gyrostab.ingest.gap_table import CAUSE, FIRST, merge_neighbours
 from gyrostab.ingest.grid.fill import samples_of
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.scan_pass import ScanPass
@@ -71,9 +71,7 @@ def _dropped_rows(events: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.stack([sample, sample, np.zeros_like(count), count, rows[at, 0]], axis=1)
 
 
-def find_gaps(
-    placement: Placement, scanned: ScanPass, *, most: int = MAX_TABLE_ROWS
-) -> NDArray[np.int64]:
+def find_gaps(placement: Placement, scanned: ScanPass) -> NDArray[np.int64]:
     """Make the table of gaps in samples, with the columns of `ingest.gap_table.COLUMNS`."""
     table = np.concatenate(
         [
@@ -83,7 +81,7 @@ def find_gaps(
             _dropped_rows(placement.events),
         ]
     )
-    table = merge_neighbours(table, most)
+    table = merge_neighbours(table)
     return table[np.lexsort((table[:, CAUSE], table[:, FIRST]))]
 
 

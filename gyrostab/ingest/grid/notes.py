@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.ingest.gap_table import format_duration
+from gyrostab.ingest.gap_table import describe_break, format_duration
 from gyrostab.ingest.grid.fill import samples_of
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.rate import RateEstimate
@@ -127,15 +127,7 @@ def _describe_breaks(raw: xr.Dataset, placement: Placement) -> list[str]:
     ]
     for cause, _sample, row, before, after in events[:_MAX_NAMED].tolist():
         file, local = file_of(raw, row)
-        jump = (after - before) / 1e9
-        way = "back" if jump < 0 else "ahead"
-        what = "time restarts" if cause == RESTART else "the clock steps"
-        notes.append(
-            f"{file}: {what} at row {local}: from {format_stamp(before)} to "
-            f"{format_stamp(after)}, {format_duration(abs(jump))} {way}; "
-            "the pause is of unknown length, so the rows that follow come after one missing sample"
-            + ("" if jump < 0 else "; if the pause is real, raise max_gap")
-        )
+        notes.append(f"{file}: {describe_break(f' at row {local}', cause, before, after, 'rows')}")
     if len(events) > _MAX_NAMED:
         notes.append(
             f"{file_of(raw)[0]}: {len(events) - _MAX_NAMED} more restarts and steps of the clock "

@@ -285,25 +285,26 @@ def _estimate_sharp(
     )
 
 
-def deviating_stretches(
-    stamps: Stamps, period: float, *, size: int = 1024
-) -> list[tuple[int, int, float]]:
+_STRETCH = 1024  # stretch whose rate is compared with that of the log [stamps]
+
+
+def deviating_stretches(stamps: Stamps, period: float) -> list[tuple[int, int, float]]:
     """Find stretches whose rate deviates by more than 2 %: first row, its stamp [ns], rate [Hz].
 
     Only steps of another length count as a deviation, not missing or doubled rows.
     """
     found: list[tuple[int, int, float]] = []
     inside = False
-    for rows, values in recut_blocks(stamps, 64 * size):
+    for rows, values in recut_blocks(stamps, 64 * _STRETCH):
         known = values != NO_STAMP
         rows, values = rows[known], values[known]
-        begins, paces = _stretch_paces(values, size)
+        begins, paces = _stretch_paces(values)
         far = np.abs(paces / period - 1) >= 0.02
         if not far.any():
             inside = False if len(far) else inside
             continue
         for begin, look in zip(begins.tolist(), far.tolist(), strict=True):
-            part = values[begin : begin + size]
+            part = values[begin : begin + _STRETCH]
             own_period = period_of_lines([part]) if look else None
             is_deviating = own_period is not None and abs(own_period / period - 1) > 0.02
             if is_deviating and not inside and own_period is not None:
@@ -312,15 +313,14 @@ def deviating_stretches(
     return found
 
 
-def _stretch_paces(
-    values: NDArray[np.int64], size: int
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return first row and median step [ns] of every stretch of `size` stamps."""
-    whole = len(values) // size
-    table = np.diff(values[: whole * size].reshape(whole, size)[:, ::16], axis=1)
+def _stretch_paces(values: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return first row and median step [ns] of every stretch."""
+    whole = len(values) // _STRETCH
+    rest = whole * _STRETCH
+    table = np.diff(values[:rest].reshape(whole, _STRETCH)[:, ::16], axis=1)
     paces = np.median(table, axis=1) / 16 if whole else np.empty(0)
-    begins = np.arange(whole) * size
-    if len(values) - whole * size >= size // 4:
-        last = np.median(np.diff(values[whole * size :: 16])) / 16
-        begins, paces = np.append(begins, whole * size), np.append(paces, last)
+    begins = np.arange(whole) * _STRETCH
+    if len(values) - rest >= _STRETCH // 4:
+        last = np.median(np.diff(values[rest::16])) / 16
+        begins, paces = np.append(begins, rest), np.append(paces, last)
     return begins, paces

@@ -73,23 +73,23 @@ def readable_stamps(block: NDArray[np.int64]) -> NDArray[np.int64]:
     return block if known.all() else block[known]
 
 
-def sample_stretches(
-    stamps: Stamps, *, size: int = 8192, most: int = 64
-) -> list[NDArray[np.int64]]:
+_STRETCH = 8192  # longest sampled stretch [stamps]
+_MAX_STRETCHES = 128
+
+
+def sample_stretches(stamps: Stamps) -> list[NDArray[np.int64]]:
     """Return stretches of stamps from the whole log, a few hundred thousand in all."""
     found: list[NDArray[np.int64]] = []
     for _, block in stamps():
         block = readable_stamps(block)
-        found += [block[i : i + size] for i in range(0, len(block), size)]
-        if len(found) > 2 * most:
+        found += [block[i : i + _STRETCH] for i in range(0, len(block), _STRETCH)]
+        if len(found) > _MAX_STRETCHES:
             found = found[::2]
     return [part for part in found if len(part) > 1]
 
 
-_PATTERN, _ROWS = (
-    8,
-    17,
-)  # longest pattern of steps, and further rows in which it must recur
+_PATTERN = 8  # longest pattern of steps [steps]
+_ROWS = 17  # further rows in which a pattern must recur
 _WHOLE = 0.15  # largest distance of a step of a pattern from whole samples [samples]
 _LONGEST = 5.0  # longest step of a pattern [samples]
 

@@ -1,0 +1,129 @@
+"""Attributes of datasets and variables in files, by the CF and ACDD conventions.
+
+References
+----------
+CF conventions 1.11, section 3.1 (units); ACDD 1.3.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.kernels.allan.variances import VARIANCES
+from gyrostab.schema import texts
+from gyrostab.store.safe_names import is_storable, make_name_storable
+from gyrostab.time.clock import time_of_day
+from gyrostab.units import ON_DISK, on_disk
+
+__all__ = ["decode_attributes", "encode_attributes", "make_global_attributes"]
+
+_CONVENTIONS = "CF-1.11, ACDD-1.3"
+_TITLES = {
+    "product": "Dynamic Allan variance of a gyro log, "
+    "with the noise coefficients Q, N, B, K and R of every window",
+    "surface": "Dynamic Allan variance of a gyro log",
+    "log": "Gyro log on a uniform time axis",
+    "dataset": "Gyro stability data",
+}
+_JSON_NAMES = "json_attributes"
+
+# Names that UDUNITS reads as intended. An integer power may follow; UDUNITS misreads a fractional
+# one without an error, so none passes.
+_SAFE_UNIT_NAMES = (
+    "degree_Celsius|standard_free_fall|degree|hour|microradian|radian|"
+    "s|m|K|V|W|Pa|T|uT|Hz|kg|percent"
+)
+_SAFE_UNIT = re.compile(
+    rf"(?:{_SAFE_UNIT_NAMES})(?:-?[1-9])?(?: (?:{_SAFE_UNIT_NAMES})(?:-?[1-9])?)*"
+)
+
+
+def encode_attributes(attrs: dict[str, Any]) -> dict[str, Any]:
+    """Convert attributes to NetCDF types; a unit that UDUNITS misreads goes to `source_units`."""
+    if "units" in attrs:
+        units = on_disk(str(attrs["units"]))
+        if units in ("1", *ON_DISK.values()) or _SAFE_UNIT.fullmatch(units):
+            attrs["units"] = units
+        else:
+            attrs["source_units"] = attrs.pop("units")
+    for name in [name for name in attrs if not is_storable(str(name))]:
+        attrs[make_name_storable(str(name), attrs, kind="attribute")] = attrs.pop(name)
+    coded = []
+    for name, value in attrs.items():
+        if isinstance(value, np.generic):
+            attrs[name] = value = value.item()
+        if isinstance(value, str) or (
+            isinstance(value, int | float) and not isinstance(value, bool)
+        ):
+            continue
+        if not isinstance(value, np.ndarray):
+            # in ASCII: Octave cannot list a file with other characters in a global attribute
+            attrs[name] = json.dumps(value, default=str)
+            coded.append(name)
+    if coded:
+        attrs[_JSON_NAMES] = " ".join(coded)
+    return attrs
+
+
+def make_global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[str, Any]:
+    """Make the attributes of a file: those of the dataset, with title, history and version."""
+    now = time_of_day()
+    try:
+        version = metadata.version("gyrostab")
+    except metadata.PackageNotFoundError:
+        version = "unknown"
+    given = dict(dataset.attrs)
+    history = given.get("history", "")
+    lines = [history] if isinstance(history, str) else [str(line) for line in history]
+    given["history"] = "\n".join(
+        [*filter(None, lines), f"{now} gyrostab {version}: {verb}, {kind}"]
+    )
+    variance = VARIANCES.get(str(given.get("variance")), VARIANCES["avar"]).text
+    titles = {name: text.replace("Allan", variance) for name, text in _TITLES.items()}
+    if given.get("title") in (None, *titles.values()):  # also a title of an earlier stage
+        given["title"] = titles[kind]
+    names = texts(dataset, "source_files")
+    source = "gyro log: " + ", ".join(names) if names else "gyro log"
+    given.setdefault("source", source.encode("ascii", "backslashreplace").decode())
+    given |= {
+        "Conventions": _CONVENTIONS,
+        "date_created": now,
+        "gyrostab_version": version,
+        "gyrostab_content": kind,
+    }
+    given.setdefault(
+        "references",
+        "IEEE Std 952; Wang et al., Sensors 16 (2016) 2081 "
+        "(dynamic Allan variance of gyros with missing data)",
+    )
+    times = dataset.get("time")
+    if times is not None and times.dtype.kind == "M" and times.size:
+        for end, position in (("start", 0), ("end", -1)):
+            # one dimension when the axis is computed
+            stamp = np.asarray(times[position].values).ravel()[0]
+            given[f"time_coverage_{end}"] = f"{stamp.astype('datetime64[us]')}Z"
+    return encode_attributes(given)
+
+
+def decode_attributes(attrs: dict[str, Any]) -> dict[str, Any]:
+    """Convert attributes of a file back; those that concern only the file are dropped."""
+    for name in set(str(attrs.pop(_JSON_NAMES, "")).split()) & set(attrs):
+        attrs[name] = json.loads(attrs[name])
+    for name, value in attrs.items():
+        attrs[name] = value.item() if isinstance(value, np.generic) else value
+    if "since" in str(attrs.get("units", "")):
+        del attrs["units"]
+    for name in ("calendar", "units_metadata", "ancillary_variables"):
+        attrs.pop(name, None)
+    if "source_units" in attrs:
+        attrs["units"] = attrs.pop("source_units")
+    inner = {stored: units for units, stored in ON_DISK.items()}
+    if "units" in attrs:
+        attrs["units"] = inner.get(attrs["units"], attrs["units"])
+    return attrs

@@ -1,0 +1,312 @@
+"""Times in files: computed time axes as a first stamp and a rule, and stored stamps by CF.
+
+References
+----------
+CF conventions 1.11, section 4.4 (time).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import FormatError, SchemaError
+from gyrostab.store.blosc_chunks import check_blosc_chunks
+from gyrostab.store.lazy import RowSource, make_dask
+from gyrostab.time.grid import TimeGridIndex, grid_times, period_ns, time_coordinate
+from gyrostab.time.stamps import to_nanoseconds
+
+__all__ = [
+    "GRID",
+    "decode_stamps",
+    "encode_all_stamps",
+    "encode_first_stamp",
+    "encode_stamps",
+    "find_time_grids",
+    "has_whole_microseconds",
+    "index_dim",
+    "make_time_axes",
+    "parse_time_grids",
+    "replace_stamps",
+    "time_attributes",
+]
+
+#: Attribute with the rule of a computed time axis, on the variable that holds its first stamp.
+GRID = "sampling_grid"
+#: Stamps that are computed together.
+_STAMPS_CHUNK = 2**20
+_EPOCH = "1970-01-01T00:00:00"
+#: Units of stored stamps, by their length [ns].
+_UNITS = {1: f"nanoseconds since {_EPOCH}", 1000: f"microseconds since {_EPOCH}"}
+
+
+def time_attributes(divisor: int) -> dict[str, str]:
+    """Return the attributes of stamps in units of `divisor` nanoseconds, 1 or 1000."""
+    return {
+        "units": _UNITS[divisor],
+        "calendar": "proleptic_gregorian",
+        "units_metadata": "leap_seconds: none",
+    }
+
+
+def index_dim(dim: Any) -> str:
+    """Name a dimension with computed stamps in the file; CF reserves ``time`` for stored ones."""
+    return f"{dim}_index"
+
+
+def find_time_grids(dataset: xr.Dataset) -> dict[Any, Any]:
+    """Find the rules of the computed time axes."""
+    grids = {
+        name: index.transform
+        for name, index in dataset.xindexes.items()
+        if isinstance(index, TimeGridIndex)
+    }
+    taken = [
+        other
+        for name in grids
+        for other in (f"{name}_start", index_dim(name))
+        if other in dataset.variables
+    ]
+    if taken:
+        raise SchemaError(
+            f"the name {taken[0]!r} is needed for the time axis; rename that variable"
+        )
+    return grids
+
+
+def encode_first_stamp(grid: Any, attrs: dict[Any, Any], divisor: int) -> xr.Variable:
+    """Encode a computed time axis: its first stamp, with rate and exact rule as attributes."""
+    (dim,) = grid.dims
+    first = int(grid_times(grid.start, grid.rate, grid.first))
+    attributes = {
+        "long_name": f"time of the first sample on the dimension {index_dim(dim)}",
+        "comment": "sample n (from 0) is at this time + n / sampling_rate_hz; "
+        f"{GRID} is the exact rule: "
+        "start_ns + round((first + stride * n) * 1e9 / rate_hz) nanoseconds since 1970",
+        "sampling_rate_hz": grid.rate / grid.stride,
+    }
+    return xr.Variable(
+        (),
+        np.int64(first // divisor),
+        {**attributes, **_encode_rule(grid, attrs), **time_attributes(divisor)},
+    )
+
+
+def encode_all_stamps(grid: Any, attrs: dict[Any, Any], divisor: int) -> xr.Variable:
+    """Encode a computed time axis as a lazy CF coordinate, with its exact rule as an attribute."""
+    (dim,) = grid.dims
+    attributes = {"long_name": "time", "standard_name": "time"}
+    attributes |= {"axis": "T"} if dim == "time" else {}
+    stamps = make_dask(_GridStamps(grid, divisor), min(max(grid.size, 1), _STAMPS_CHUNK))
+    return xr.Variable(
+        (dim,), stamps, {**attributes, **_encode_rule(grid, attrs), **time_attributes(divisor)}
+    )
+
+
+def _encode_rule(grid: Any, attrs: dict[Any, Any]) -> dict[str, str]:
+    (dim,) = grid.dims
+    rule = {
+        "dim": dim,
+        "start_ns": grid.start,
+        "rate_hz": grid.rate,
+        "first": grid.first,
+        "stride": grid.stride,
+        "size": grid.size,
+    }
+    return {
+        GRID: json.dumps(rule),
+        **({"axis_attributes": json.dumps(dict(attrs), default=str)} if attrs else {}),
+    }
+
+
+class _GridStamps(RowSource):
+    """Stamps of a computed time axis, in whole units of `divisor` nanoseconds since 1970."""
+
+    def __init__(self, grid: Any, divisor: int):
+        self.grid, self.divisor = grid, divisor
+        self.shape, self.dtype = (grid.size,), np.dtype(np.int64)
+
+    def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
+        """Compute the stamps of the samples from `begin` on."""
+        grid = self.grid
+        samples = grid.first + grid.stride * np.arange(begin, begin + out.size)
+        np.floor_divide(grid_times(grid.start, grid.rate, samples), self.divisor, out=out)
+
+
+def has_whole_microseconds(
+    dataset: xr.Dataset, grids: dict[Any, Any], *, stamps: bool = False
+) -> bool:
+    """Whether microseconds represent every time exactly; fewer programs read nanoseconds."""
+    for name, variable in dataset.variables.items():
+        if name in grids:
+            grid = grids[name]
+            whole, fraction = period_ns(grid.rate)
+            if int(grid_times(grid.start, grid.rate, grid.first)) % 1000 or (
+                stamps and (fraction or whole * grid.stride % 1000)
+            ):
+                return False
+        elif variable.dtype.kind == "M" and np.any(to_nanoseconds(variable.values) % 1000):
+            return False
+    return True
+
+
+def encode_stamps(name: Any, variable: xr.Variable, divisor: int) -> NDArray[np.int64]:
+    """Encode times as integer microseconds or nanoseconds since 1970."""
+    stamps = variable.values
+    if np.isnat(stamps).any():
+        raise SchemaError(
+            f"{name!r} holds {int(np.isnat(stamps).sum())} missing times (NaT); "
+            "every time must be known"
+        )
+    return to_nanoseconds(stamps) // divisor
+
+
+def parse_time_grids(stored: xr.Dataset, where: object) -> dict[str, dict[str, Any]]:
+    """Parse the rules of the computed time axes that a file declares, by name of the variable."""
+    declared = {
+        str(name): variable.attrs[GRID]
+        for name, variable in stored.variables.items()
+        if GRID in variable.attrs
+    }
+    try:
+        return {name: _parse_grid(text) for name, text in declared.items()}
+    except (TypeError, ValueError) as error:
+        raise FormatError(
+            f"{where}: the rule of its time axis, attribute {GRID!r}, is damaged ({error}); "
+            "copy it again"
+        ) from error
+
+
+def _parse_grid(text: Any) -> dict[str, Any]:
+    """Parse the rule of a time axis; `ValueError` when `to_disk` did not write it."""
+    rule = json.loads(text)
+    kinds = {
+        "dim": str,
+        "size": int,
+        "start_ns": int,
+        "first": int,
+        "stride": int,
+        "rate_hz": int | float,
+    }
+    wrong = [
+        name
+        for name, kind in kinds.items()
+        if not isinstance(rule, dict) or not isinstance(rule.get(name), kind)
+    ]
+    if wrong:
+        raise ValueError(f"no {' and no '.join(wrong)}")
+    first, last = (rule["first"] + rule["stride"] * n for n in (0, max(rule["size"], 1) - 1))
+    spans = (
+        (rule["start_ns"] + n * 1e9 / rule["rate_hz"] for n in (first, last))
+        if rule["rate_hz"] > 0
+        else ()
+    )
+    if not (
+        rule["rate_hz"] > 0
+        and math.isfinite(rule["rate_hz"])
+        and rule["size"] >= 0
+        and rule["stride"] != 0
+    ):
+        raise ValueError(f"{text}")
+    if any(abs(stamp) >= 2.0**63 for stamp in spans):
+        raise ValueError("it leaves the years 1678 to 2262")
+    return dict(rule)
+
+
+def make_time_axes(
+    stored: xr.Dataset, grids: dict[str, dict[str, Any]], where: str
+) -> dict[str, xr.Coordinates]:
+    """Make the coordinates of the computed time axes, by name of the declaring variable."""
+    axes = {}
+    for name, rule in grids.items():
+        dim = rule["dim"]
+        size = stored.sizes.get(index_dim(dim), stored.sizes.get(dim, 0))
+        if size != rule["size"]:
+            raise FormatError(
+                f"{where}: has {size} samples on {index_dim(dim)!r}, but was written with "
+                f"{rule['size']}: some other program has cut it, and its times are lost; "
+                "cut it in Python with gyrostab.open_log(...).isel or .sel, "
+                "and write it with gyrostab.to_netcdf"
+            )
+        axes[name] = time_coordinate(
+            rule["start_ns"],
+            rule["rate_hz"],
+            size,
+            name=dim,
+            first=rule["first"],
+            stride=rule["stride"],
+        )
+    return axes
+
+
+def replace_stamps(stored: xr.Dataset, where: object) -> xr.Dataset:
+    """Replace stored stamps by the rule that they follow.
+
+    A rule that another program has left unchanged with other stamps is dropped: `stored` then has
+    an ordinary time coordinate.
+    """
+    for name, rule in parse_time_grids(stored, where).items():
+        stamps = stored.variables[name]
+        if not stamps.ndim:
+            continue
+        if _has_stamps_of(rule, stamps, Path(str(where)) / name):
+            start = xr.Variable((), 0, stamps.attrs)
+            stored = stored.drop_vars(name).assign({f"{name}_start": start})
+        else:
+            rest = {key: value for key, value in stamps.attrs.items() if key != GRID}
+            changed = xr.Variable(stamps.dims, stamps.data, rest, stamps.encoding)
+            stored = stored.drop_vars(name).assign_coords(
+                xr.Coordinates({name: changed}, indexes={})
+            )
+    return stored
+
+
+def _has_stamps_of(rule: dict[str, Any], stamps: xr.Variable, folder: Path) -> bool:
+    """Whether stamps on disk agree in number and at both ends with a rule, or are damaged.
+
+    `folder` holds the chunks of the stamps of a Zarr store.
+    """
+    if stamps.shape != (rule["size"],):
+        return False
+    ends = np.unique([0, max(rule["size"] - 1, 0)])[: rule["size"]]
+    samples = rule["first"] + rule["stride"] * ends
+    try:
+        check_blosc_chunks(folder)
+        found = to_nanoseconds(decode_stamps(stamps[ends], stamps.attrs).values)
+    except Exception:  # damaged stamps, for which the libraries raise errors of many kinds
+        return True
+    return np.array_equal(found, grid_times(rule["start_ns"], rule["rate_hz"], samples))
+
+
+def decode_stamps(variable: xr.Variable, attrs: dict[Any, Any] | None = None) -> xr.Variable:
+    """Decode times to datetime64[ns], by the units in `attrs` or else of the variable.
+
+    A variable without units of time is returned unchanged.
+    """
+    attrs = variable.attrs if attrs is None else attrs
+    if " since " not in str(attrs.get("units", "")):
+        return variable
+    step = {units: step for step, units in _UNITS.items()}.get(attrs["units"])
+    if step and variable.dtype.kind == "i":  # as `to_disk` writes them; xarray is slower
+        rest = {
+            key: value for key, value in variable.attrs.items() if key not in ("units", "calendar")
+        }
+        return xr.Variable(
+            variable.dims,
+            (np.asarray(variable.values, dtype=np.int64) * step).view("datetime64[ns]"),
+            rest,
+        )
+    timed = variable.copy(deep=False)
+    timed.attrs = {
+        **variable.attrs,
+        "units": attrs["units"],
+        "calendar": attrs.get("calendar", "standard"),
+    }
+    decoded = xr.decode_cf(xr.Dataset({"stamps": timed})).variables["stamps"].load()
+    return decoded.astype("datetime64[ns]")
