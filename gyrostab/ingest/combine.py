@@ -19,11 +19,12 @@ from gyrostab.ingest.columns.pieces import (
     as_lazy,
     pieces_of,
 )
-from gyrostab.ingest.concat import absence_notes, group_axes, merge_notes, name_some, split_axes
+from gyrostab.ingest.concat import absence_notes, group_axes, merge_notes, split_axes
 from gyrostab.ingest.overlap import drop_repeats, first_known_stamp, stamp_span
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store.lazy import concatenate_columns, select_part, stack_rows
 from gyrostab.store.write import common_packing
+from gyrostab.wording import list_some
 
 __all__ = ["attach_channels", "concatenate", "memory_bytes", "move_to_disk", "with_channels"]
 
@@ -307,7 +308,7 @@ def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Datase
     for channel, found in pieces.items():
         if len({units for _, _, units in found}) > 1:
             raise UnitError(
-                f"channel {channel!r} has different units in {name_some(files)}; give one with "
+                f"channel {channel!r} has different units in {list_some(files)}; give one with "
                 f"--unit {channel}=UNIT"
             )
         stamps, values = (np.concatenate([piece[place] for piece in found]) for place in (0, 1))

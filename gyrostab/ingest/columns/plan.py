@@ -12,9 +12,9 @@ from gyrostab.ingest.columns.headers import (
     split_header,
 )
 from gyrostab.ingest.columns.plan_draft import (
+    MAX_HEADERS,
     Column,
     PlanDraft,
-    list_names,
     name_columns,
     resolve_duplicates,
 )
@@ -22,6 +22,7 @@ from gyrostab.ingest.columns.plan_roles import find_time, plan_channels, plan_gy
 from gyrostab.ingest.columns.preset import PresetMatch, find_preset
 from gyrostab.ingest.limits import check_columns
 from gyrostab.ingest.options import ColumnSummary, ReadOptions
+from gyrostab.wording import list_some
 
 __all__ = ["Column", "Plan", "plan_columns", "split_header"]
 
@@ -124,7 +125,7 @@ def plan_columns(
     elif found := [
         f"{c.header} is {c.name}" for c in named if c.preset and AXIS_PATTERN.match(c.low)
     ]:
-        draft.notes.append(f"taken for axes: {list_names(found)}; --map overrules it")
+        draft.notes.append(f"taken for axes: {list_some(found, MAX_HEADERS)}; --map overrules it")
     if time is None and options.rate is None and rate is None and not draft.problems:
         message = (
             f"{path.name}: there is no time column; give the sampling rate with --rate HZ "
@@ -132,7 +133,8 @@ def plan_columns(
         )
         draft.problems.append(
             OptionError(
-                f"{message}, or name the column: --map NAME=time. Columns: {list_names(headers)}"
+                f"{message}, or name the column: --map NAME=time. Columns: "
+                f"{list_some(headers, MAX_HEADERS)}"
             )
         )
     draft.add_notes(headers)

@@ -20,15 +20,19 @@ from gyrostab.ingest.columns.headers import (
 from gyrostab.ingest.columns.stamps import TimeUnit
 from gyrostab.ingest.limits import describe_limit
 from gyrostab.ingest.options import ColumnSummary, ReadOptions
+from gyrostab.wording import list_some
 
 __all__ = [
+    "MAX_HEADERS",
     "Column",
     "PlanDraft",
     "by_lower_name",
-    "list_names",
     "name_columns",
     "resolve_duplicates",
 ]
+
+#: Columns that a message lists by name.
+MAX_HEADERS = 30
 
 
 @dataclass(frozen=True)
@@ -116,7 +120,7 @@ class PlanDraft:
             )
             self.notes.append(
                 "left out, as they carry no unit: "
-                f"{list_names([header for _, _, header in self.unitless])} ({advice})"
+                f"{list_some([header for _, _, header in self.unitless], MAX_HEADERS)} ({advice})"
             )
         if self.surplus:
             needed = self.kept_channels + len(self.surplus)
@@ -126,11 +130,12 @@ class PlanDraft:
             )
             self.notes.append(
                 "left out, as there are more channels than a log keeps: "
-                f"{list_names(self.surplus, 5)} ({advice})"
+                f"{list_some(self.surplus, 5)} ({advice})"
             )
         if self.left_out:
             self.notes.append(
-                f"left out, as the file is read for its channels: {list_names(self.left_out)}"
+                "left out, as the file is read for its channels: "
+                f"{list_some(self.left_out, MAX_HEADERS)}"
             )
         place = {header.strip(): index for index, header in enumerate(headers)}
         self.summaries.sort(key=lambda summary: place.get(summary.header, -1))
@@ -139,12 +144,6 @@ class PlanDraft:
 def by_lower_name(names: Mapping[str, str]) -> dict[str, str]:
     """Return lower-case name -> name."""
     return {name.lower(): name for name in names}
-
-
-def list_names(names: Sequence[str], most: int = 30) -> str:
-    """Join the first names of a list, and say how many more there are."""
-    shown = ", ".join(name for name in names[:most] if name)
-    return shown + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def name_columns(
@@ -210,7 +209,7 @@ def resolve_duplicates(draft: PlanDraft, named: list[Header]) -> list[Header]:
             dropped.update(column.source for column in others)
             draft.notes.append(
                 f"left out, as --map names another column {name}: "
-                f"{list_names([column.header for column in others])}"
+                f"{list_some([column.header for column in others], MAX_HEADERS)}"
             )
         else:
             for number, column in enumerate(
@@ -220,8 +219,7 @@ def resolve_duplicates(draft: PlanDraft, named: list[Header]) -> list[Header]:
                 taken.add(column.name)
                 renamed.append(f"{column.header!r} is {column.name!r}")
     if renamed:
-        more = f" and {len(renamed) - 5} more" if len(renamed) > 5 else ""
-        draft.notes.append(f"columns of one name are renamed: {', '.join(renamed[:5])}{more}")
+        draft.notes.append(f"columns of one name are renamed: {list_some(renamed, 5)}")
     return [column for column in named if column.source not in dropped]
 
 

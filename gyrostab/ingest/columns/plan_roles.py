@@ -24,10 +24,11 @@ from gyrostab.ingest.columns.headers import (
     split_header,
     unit_quantity,
 )
-from gyrostab.ingest.columns.plan_draft import Column, PlanDraft, by_lower_name, list_names
+from gyrostab.ingest.columns.plan_draft import Column, PlanDraft, by_lower_name
 from gyrostab.ingest.columns.stamps import TimeUnit, names_epoch, parse_time_unit
 from gyrostab.ingest.limits import limit_value
 from gyrostab.units import HOUR, INNER, known_units, parse_unit
+from gyrostab.wording import list_some
 
 __all__ = ["find_time", "plan_channels", "plan_gyro"]
 
@@ -329,7 +330,7 @@ def _no_gyro(path: Path, headers: Sequence[str]) -> FormatError:
     )
     message = (
         f"{path.name}: no gyro column (gyro_x, gyro_y, gyro_z or angle_x ...). Columns: "
-        f"{list_names([c.name for c in columns], 100)}"
+        f"{list_some([c.name for c in columns], 100)}"
     )
     advice = (
         "Say which they are, for instance: --map "

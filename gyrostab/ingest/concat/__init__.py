@@ -2,7 +2,7 @@
 
 from gyrostab.ingest.concat.axes import group_axes, split_axes
 from gyrostab.ingest.concat.core import concatenate_logs, log_span
-from gyrostab.ingest.concat.notes import absence_notes, merge_notes, name_some
+from gyrostab.ingest.concat.notes import absence_notes, merge_notes
 
 __all__ = [
     "absence_notes",
@@ -10,6 +10,5 @@ __all__ = [
     "group_axes",
     "log_span",
     "merge_notes",
-    "name_some",
     "split_axes",
 ]

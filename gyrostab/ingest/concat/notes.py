@@ -4,28 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-__all__ = ["absence_notes", "first_notes", "merge_notes", "name_some"]
+from gyrostab.wording import list_some
 
-_MAX_FILES = 3  # files named in one note
+__all__ = ["absence_notes", "first_notes", "merge_notes"]
+
 _MAX_NAMED = 5  # events of one kind that are listed one by one
-
-
-def name_some(names: Sequence[str]) -> str:
-    """Name a few of several files.
-
-    Examples
-    --------
-    >>> name_some(["a", "b", "c", "d", "e"])
-    'a, b, c and 2 more'
-    """
-    more = len(names) - _MAX_FILES
-    return ", ".join(names[:_MAX_FILES]) + (f" and {more} more" if more > 0 else "")
 
 
 def absence_notes(absent: Mapping[str, Sequence[str]]) -> list[str]:
     """Return notes on axes and channels that some files lack, by the names of these files."""
     return [
-        f"{what} is not in {name_some(files)} and is missing there"
+        f"{what} is not in {list_some(files)} and is missing there"
         for what, files in absent.items()
         if files
     ]
@@ -44,7 +33,7 @@ def merge_notes(notes_by_file: Iterable[tuple[str, Sequence[str]]]) -> list[str]
     for name, notes in notes_by_file:
         for note in notes:
             pooled.setdefault(note.removeprefix(f"{name}: "), []).append(name)
-    return [f"{name_some(names)}: {note}" for note, names in pooled.items()]
+    return [f"{list_some(names)}: {note}" for note, names in pooled.items()]
 
 
 def first_notes(notes: Sequence[str], what: str) -> list[str]:

@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.ingest.concat.grid import LogSlice, PlacedLog, Source, read_log_slices, runs_of
-from gyrostab.ingest.concat.notes import first_notes, name_some
+from gyrostab.ingest.concat.notes import first_notes
 from gyrostab.ingest.copies import MIN_ALIKE_SHARE, count_alike, is_copy
 from gyrostab.ingest.gap_table import describe_break, format_duration
 from gyrostab.schema import GAP_CAUSES
 from gyrostab.time.grid import grid_index, grid_times
 from gyrostab.time.stamps import format_stamp
+from gyrostab.wording import list_some
 
 __all__ = ["place_logs"]
 
@@ -242,7 +243,7 @@ def _grid_notes(pieces: Sequence[PlacedLog], rate: float) -> list[str]:
     between = [piece for piece in pieces if abs(piece.off) > NOTED_OFFSET_SAMPLES]
     if between:
         most = max(abs(piece.off) for piece in between)
-        names = name_some([piece.source.name for piece in between])
+        names = list_some([piece.source.name for piece in between])
         notes.append(
             f"{names}: begin between two samples of the grid of {pieces[0].source.name}; their "
             "samples were put on the nearest ones, "
@@ -252,7 +253,7 @@ def _grid_notes(pieces: Sequence[PlacedLog], rate: float) -> list[str]:
     if other:
         most = max(abs(piece.source.rate / rate - 1) for piece in other)
         notes.append(
-            f"{name_some([piece.source.name for piece in other])}: the sampling rate is up to "
+            f"{list_some([piece.source.name for piece in other])}: the sampling rate is up to "
             f"{1e6 * most:.3g} parts per million from the "
             f"{rate:.10g} Hz of {pieces[0].source.name}; each sample was put on the nearest one "
             "of its grid"

@@ -6,9 +6,10 @@ from collections.abc import Callable, Mapping
 
 import xarray as xr
 
-from gyrostab.ingest.concat import concatenate_logs, name_some, split_axes
+from gyrostab.ingest.concat import concatenate_logs, split_axes
 from gyrostab.schema import texts
 from gyrostab.time.grid import first_stamp
+from gyrostab.wording import list_some
 
 __all__ = ["regularise_axes"]
 
@@ -29,7 +30,7 @@ def regularise_axes(
     """
     parts = [part.assign_attrs(notes=[]) for part in split_axes(raw)]
     logs = [regularise(part) for part in parts]
-    labels = [name_some(texts(part, "source_files")) for part in parts]
+    labels = [list_some(texts(part, "source_files")) for part in parts]
     if len(set(labels)) < len(labels):
         labels = [
             f"{label} ({', '.join(axes)})"
