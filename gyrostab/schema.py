@@ -152,6 +152,11 @@ VARIABLES: dict[str, dict[str, Any]] = {
         "the sensor on the averaging times of the fit, 0 without a filter",
         "units": "s",
     },
+    "filter_white_error": {
+        "long_name": "relative standard error of N by that of filter_time_constant, which the "
+        "standard error of N includes",
+        "units": "1",
+    },
 }
 
 

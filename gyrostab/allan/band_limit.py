@@ -47,6 +47,9 @@ _MEMORY_MARGIN = 1.5
 _MAX_TIME_CONSTANT = 0.6
 #: Steps of the search for the time constant; each goes on around the best of these values.
 _GRID_POINTS, _GRID_STEPS = 25, 3
+#: Distance of the time constants that give the curvature of chi-square, over the shortest averaging
+#: time: within one to three standard errors of the time constant in records of 2 to 24 windows.
+_CURVATURE_STEP = 0.02
 #: A filter removes power at every frequency. Measured over unfiltered Allan variance at the
 #: shortest averaging time, at most, and anywhere below the band limit, at most: a spectral line or
 #: resets of a feedback loop exceed the latter.
@@ -64,6 +67,7 @@ class BandLimit(NamedTuple):
     #: Time constant of the first-order low-pass with the same effect on longer averaging times [s];
     #: 0 without a filter.
     time_constant: float
+    white_error: float = 0.0  # relative standard error of N by that of the time constant
 
 
 def choose_windows(count: int, window: int, step: int) -> NDArray[np.int64]:
@@ -169,16 +173,15 @@ def find_band_limit(
             unfiltered = columns[:start, 1:4] @ squares[1:4] * mean.rows[1][:start]
             ratio = mean.rows[0][:start] / unfiltered
             lacks_power = ratio[0] < _MAX_SHORTEST_RATIO and np.nanmax(ratio) < _MAX_RATIO
-            return (
-                BandLimit(float(tau[start]), _round_constant(constant))
-                if lacks_power
-                else unlimited
-            )
+            if not lacks_power:
+                return unlimited
+            error = _find_white_error(tau, mean, start, constant, allowed, fit)
+            return BandLimit(float(tau[start]), *map(_round_number, (constant, error)))
     return unlimited
 
 
-def _round_constant(constant: float) -> float:
-    return float(f"{constant:.3g}")
+def _round_number(value: float) -> float:
+    return float(f"{value:.3g}")
 
 
 class _Mean(NamedTuple):
@@ -214,6 +217,18 @@ def _average_windows(cells: Sequence[Array], trend: Array, response: Array) -> _
     return _Mean(rows, float(slope), float(np.mean(response[used])), used.size)
 
 
+def _fit_constants(
+    tau: Array, mean: _Mean, start: int, constants: Array, terms: int, fit: Fit
+) -> tuple[Array, Array, Array]:
+    """Fit the average from a position on: squares, chi-square and degrees of freedom of each."""
+    rows = [np.tile(values, (constants.size, 1)) for values in mean.rows]
+    rows[0][:, :start] = np.nan
+    rows[1] *= filter_response(tau, constants[:, None])
+    every = np.ones(constants.size)
+    squares, misfit = fit(rows, mean.trend * every, mean.response * every, terms)
+    return squares, misfit[:, 0] * mean.windows, misfit[:, 1]
+
+
 def _fit_from(
     tau: Array, mean: _Mean, start: int, constants: Array, terms: int, fit: Fit
 ) -> tuple[int, Array, float]:
@@ -221,15 +236,25 @@ def _fit_from(
 
     The probability is NaN without degrees of freedom.
     """
-    rows = [np.tile(values, (constants.size, 1)) for values in mean.rows]
-    rows[0][:, :start] = np.nan
-    rows[1] *= filter_response(tau, constants[:, None])
-    every = np.ones(constants.size)
-    squares, misfit = fit(rows, mean.trend * every, mean.response * every, terms)
-    chi2, dof = misfit[:, 0] * mean.windows, misfit[:, 1]
+    squares, chi2, dof = _fit_constants(tau, mean, start, constants, terms, fit)
     best = int(np.argmin(np.where(np.isfinite(chi2) & (dof > 0), chi2, np.inf)))
     probability = gammaincc(dof[best] / 2.0, chi2[best] / 2.0) if dof[best] > 0 else np.nan
     return best, np.nan_to_num(squares[best]), float(probability)
+
+
+def _find_white_error(
+    tau: Array, mean: _Mean, start: int, constant: float, allowed: int, fit: Fit
+) -> float:
+    """Compute the relative standard error of N by that of the time constant.
+
+    The variance of the constant is twice the reciprocal of the second derivative of chi-square.
+    """
+    step = _CURVATURE_STEP * tau[start]
+    constants = constant + step * np.array([-1.0, 0.0, 1.0])
+    squares, chi2, _ = _fit_constants(tau, mean, start, constants, allowed & ~_Q_BIT, fit)
+    curvature = (chi2[0] - 2.0 * chi2[1] + chi2[2]) / step**2
+    slope = np.log(squares[2, 1] / squares[0, 1]) / (2.0 * step)
+    return float(0.5 * abs(slope) * np.sqrt(2.0 / curvature)) if curvature > 0 else 0.0
 
 
 def _fit_constant(

@@ -34,7 +34,7 @@ from gyrostab.time.durations import duration_seconds, thin
 __all__ = ["Bands", "find_bands", "fit_noise", "fit_part", "is_described", "refit"]
 
 #: Band limit of each axis, by its name.
-Bands = Mapping[str, tuple[float, float]]
+Bands = Mapping[str, tuple[float, ...]]
 
 #: One-sided normal quantiles: 95 % for limits, 99 % for an observed term; two-sided 99 %, for the
 #: sign of a ramp is unknown.
@@ -182,8 +182,9 @@ def refit(product: xr.Dataset, **options: Any) -> xr.Dataset:
 
 
 def _stored_bands(product: xr.Dataset) -> Bands:
-    pairs = zip(*(product[name].values for name in _BAND_VARIABLES), strict=True)
-    return dict(zip(map(str, product["axis"].values), pairs, strict=True))
+    stored = [product[name].values for name in _BAND_VARIABLES if name in product]
+    limits = zip(*stored, strict=True)
+    return dict(zip(map(str, product["axis"].values), limits, strict=True))
 
 
 def is_described(chi2: Any, dof: Any) -> Any:
@@ -274,7 +275,7 @@ def _fit_checked(
 
 
 #: Product variables of the fields of a `BandLimit`.
-_BAND_VARIABLES = ("fit_tau_min", "filter_time_constant")
+_BAND_VARIABLES = ("fit_tau_min", "filter_time_constant", "filter_white_error")
 
 
 def find_bands(
@@ -298,7 +299,8 @@ def find_bands(
     Returns
     -------
     dict
-        Axis to shortest averaging time to fit [s] and time constant of the filter [s].
+        Axis to shortest averaging time to fit [s], time constant of the filter [s], and relative
+        standard error of N by that of the time constant [1].
 
     Examples
     --------
@@ -307,7 +309,7 @@ def find_bands(
     >>> noise = np.random.default_rng(1).standard_normal(60_000)
     >>> smooth = np.convolve(noise, np.ones(9) / 9, mode="valid")  # time constant 80 / 27 samples
     >>> find_bands(davar(make_log(smooth, rate=100.0, unit="deg/h"), window="1min"))
-    {'x': BandLimit(tau_min=0.13, time_constant=0.0292)}
+    {'x': BandLimit(tau_min=0.13, time_constant=0.0292, white_error=0.0122)}
     """
     wanted, chosen = _check_options(surface, terms, method, tau_min, tau_max)
     tau, axes = surface["tau"].values, list(map(str, surface["axis"].values))
@@ -446,19 +448,21 @@ def _fit_gls(
         allowed &= ~(1 << STOCHASTIC)
     cells, tables, chosen = _prepare_fit(surface, within)
     tau = surface["tau"].values
-    tau_min, constant = (np.array(values)[:, None, None] for values in zip(*limits, strict=True))
+    tau_min, constant, error = (
+        np.array(values)[:, None, None] for values in zip(*limits, strict=True)
+    )
     below = tau < tau_min * (1 - 1e-9)
     if (constant > 0).any():
         cells[0] = np.where(below, np.nan, cells[0])
         cells[1] = cells[1] * filter_response(tau, constant)
-    cells.append(np.broadcast_to(constant, cells[-1].shape))
+    cells += [np.broadcast_to(values, cells[-1].shape) for values in (constant, error)]
 
     def block(*arrays: NDArray[np.float64]) -> NDArray[np.float64]:
         flat = [
             np.ascontiguousarray(a[..., chosen].reshape(-1, chosen.size), dtype=np.float64)
             for a in arrays[:5]
         ]
-        trend, response, filtered = (
+        trend, response, filtered, white_error = (
             np.asarray(a, dtype=np.float64).reshape(-1) for a in arrays[5:]
         )
         fitted = np.empty((trend.size, width))
@@ -469,6 +473,7 @@ def _fit_gls(
                     trend[rows],
                     response[rows],
                     tables,
+                    white_error=white_error[rows],
                     allowed=terms,
                     observed_only=observed_only,
                 )
@@ -482,9 +487,10 @@ def _fit_gls(
         lazy = isinstance(cells[0], da.Array)
         whole = [
             cell.rechunk({2: -1}) if lazy else da.from_array(cell, chunks=(1, 256, -1))
-            for cell in cells[:-1]
+            for cell in cells[:-2]
         ]
-        whole.append(da.from_array(cells[-1], chunks=(*whole[-1].chunks[:2], -1)))
+        planes = (*whole[-1].chunks[:2], -1)
+        whole += [da.from_array(cell, chunks=planes) for cell in cells[-2:]]
         fitted = da.map_blocks(
             block, *whole, chunks=(*whole[0].chunks[:2], (width,)), dtype=np.float64
         )
@@ -573,12 +579,17 @@ def _fit_block(
     response: NDArray[np.float64],
     tables: _Tables,
     *,
+    white_error: NDArray[np.float64],
     allowed: int,
     observed_only: bool,
 ) -> NDArray[np.float64]:
-    """Fit windows: coefficients, errors, limits, observability, chi2, dof and edf as columns."""
+    """Fit windows: coefficients, errors, limits, observability, chi2, dof and edf as columns.
+
+    `white_error` is the relative error of N that a window does not show.
+    """
     result, misfit, dof = _run_kernel(flat, trend, response, tables, allowed)
     field = {name: result[:, i] for i, name in enumerate(FIT_FIELDS)}
+    field["variance_square"][:, TERMS.index("N")] += (2.0 * white_error) ** 2
     fails = _widen_misfits(field, misfit)
     square = field["square"]
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -6,6 +6,7 @@ import xarray as xr
 from scipy.signal import butter, firwin, lfilter
 
 import gyrostab
+from gyrostab.allan import fit
 from gyrostab.allan.band_limit import choose_windows, filter_response
 from gyrostab.allan.summary import describe_record, summarise_fit
 from gyrostab.jobs.run import run
@@ -57,6 +58,22 @@ def test_behind_a_filter_the_noise_is_that_without_it(name):
     assert (product.observable.sel(term="Q") == 0).all()
     assert 0.6 < summarise_fit(product)[0].chi2_per_dof < 1.4
     assert not summarise_fit(product)[0].fails
+
+
+def test_the_error_of_n_includes_that_of_the_time_constant():
+    """Two windows determine the time constant hardly better than N."""
+    scores = []
+    for seed in range(24):
+        surface = make_surface(filtered("boxcar", seed, windows=2, samples=4000))
+        product = gyrostab.fit_noise(surface, observed_only=False)
+        limit = [product[name].item() for name in fit._BAND_VARIABLES]
+        assert 0.003 < limit[2] < 0.05
+        alone = fit.fit_part(surface, bands={"x": limit[:2]}, observed_only=False)
+        squares = alone.N_stderr**2 + (limit[2] * product.N) ** 2
+        np.testing.assert_allclose(product.N_stderr, np.sqrt(squares), rtol=0.05)
+        scores.append([((one.N - N) / one.N_stderr).values for one in (product, alone)])
+    with_error, without = np.std(scores, axis=(0, 2, 3))
+    assert with_error < 1.2 < without
 
 
 def test_the_response_is_exact_beyond_the_memory_of_a_moving_average():
