@@ -37,17 +37,22 @@ def surface_of(x: np.ndarray, rate: float) -> xr.Dataset:
     return davar(make_log(x.reshape(-1), rate=rate, unit="deg/h"), window=length, step=length)
 
 
-def simulate_units(rng: np.random.Generator, trials: int, n: int, rate: float, share: float):  # type: ignore[no-untyped-def]
-    """Return unit records of similar size and their surfaces, alone and in pairs."""
+def make_units(rng: np.random.Generator, trials: int, n: int, rate: float):  # type: ignore[no-untyped-def]
+    """Return unit coefficients of similar size, and records of each term alone."""
     hours = (np.arange(n) / rate - n / rate / 2) / 3600
     units = np.array([120.0, N, 20.0, 60 / np.sqrt(n / rate / 3600), 200 / (n / rate / 3600)])
-    records = [
+    return units, [
         quantization(rng, trials, n, Q=units[0], rate=rate),
         white(rng, trials, n, N=units[1], rate=rate),
         flicker(rng, trials, n, B=units[2]),
         random_walk(rng, trials, n, K=units[3], rate=rate),
         np.tile(units[4] * hours, (trials, 1)),
     ]
+
+
+def simulate_units(rng: np.random.Generator, trials: int, n: int, rate: float, share: float):  # type: ignore[no-untyped-def]
+    """Return surfaces of unit records, alone and in pairs."""
+    units, records = make_units(rng, trials, n, rate)
     lost = lose(rng, np.zeros((trials, n)), share, 50.0)
     alone = [surface_of(record + lost, rate) for record in records]
     parts = {}
