@@ -272,6 +272,7 @@ def compare(folder: Path, hours: float, given: argparse.Namespace) -> list[list[
     for name in given.formats:
         ending, write = FORMATS[name]
         path = write(folder / f"{name}.{ending}", hours, given.jitter)
+        os.sync()  # so that the run does not compete with the writing of its input
         size = size_of(path)
         run = measure("run", path, given)
         peer = (
