@@ -96,6 +96,7 @@ FORMATS = (
     "binary",
     "layout",
     *WRITERS,
+    "wits0",
     "model",
     "options",
     "checkpoint",

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.ingest.field_files import WRITERS
+from tests.ingest.field_files import WRITERS, write_wits0
 
 ROWS = 80
 RATE = 10.0
@@ -450,9 +450,10 @@ def binary_seeds() -> Iterator[Seed]:
 
 def field_seeds() -> Iterator[Seed]:
     """Return the files of the contract test of formats of rigs, robots and vehicles."""
-    for name, write in WRITERS.items():
+    for name, write in {**WRITERS, "wits0": write_wits0}.items():
         with folder() as place:
-            path, _, options = write(place)
+            path, form, options = write(place)
+            options |= {"map": {"0110": "gyro_x [deg/h]"}} if form == "wits0" else {}
             command = [
                 text
                 for key, value in options.items()

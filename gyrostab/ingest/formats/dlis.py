@@ -52,6 +52,8 @@ def _read_frames(path: Path) -> list[Table]:
     """Return a table for each frame of each logical file."""
     dlis = library("dlisio.dlis", path, extra="dlis")
     logging.getLogger("dlisio").setLevel(logging.ERROR)
+    common = library("dlisio.common", path, extra="dlis")
+    common.set_encodings(["utf-8", "latin1"])
     with dlis.load(str(path)) as files:
         kept = [
             (frame, [one for one in frame.channels if one and list(one.dimension) == [1]])
