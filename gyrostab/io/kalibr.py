@@ -1,13 +1,18 @@
-"""Export gyro noise for Kalibr and ROS: continuous-time densities in radians, in a YAML file.
+"""Export gyro noise for Kalibr and ROS: continuous-time densities in SI units, in a YAML file.
 
-==========================  ================  =========  =======================================
-key                         unit              from       factor
-==========================  ================  =========  =======================================
-gyroscope_noise_density     rad/s/sqrt(Hz)    N          pi / 180 / 60, N in deg/sqrt(h)
-gyroscope_random_walk       rad/s^2/sqrt(Hz)  K          pi / 180 / 3600^1.5, K in deg/h^1.5
-gyroscope_bias_instability  rad/s             B          pi / 180 / 3600, B in deg/h
-update_rate                 Hz                           sampling rate of the log
-==========================  ================  =========  =======================================
+===========================  ================  =========  ====================================
+key                          unit              from       factor
+===========================  ================  =========  ====================================
+gyroscope_noise_density      rad/s/sqrt(Hz)    N          pi / 180 / 60, N in deg/sqrt(h)
+gyroscope_random_walk        rad/s^2/sqrt(Hz)  K          pi / 180 / 3600^1.5, K in deg/h^1.5
+gyroscope_bias_instability   rad/s             B          pi / 180 / 3600, B in deg/h
+accelerometer_noise_density  m/s^2/sqrt(Hz)    N          9.80665 * 60, N in g sqrt(h)
+accelerometer_random_walk    m/s^3/sqrt(Hz)    K          9.80665 / 60, K in g/sqrt(h)
+update_rate                  Hz                           sampling rate of the log
+===========================  ================  =========  ====================================
+
+The accelerometers are channels of the log. Allan variance and fit are homogeneous in the signal, so
+that the same functions serve accelerations in g.
 
 Kalibr itself does not use bias instability and ignores its key. The floor of the Allan deviation
 lies at 0.664 of it.
@@ -23,25 +28,38 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import pandas as pd
 import xarray as xr
 
+from gyrostab.allan.davar import davar
+from gyrostab.allan.fit import fit_noise
 from gyrostab.allan.summary import FitSummary, TermSummary, summarise_fit, summarise_terms
 from gyrostab.errors import SchemaError
+from gyrostab.ingest.make_log import make_log
 from gyrostab.noise import HOUR, LAWS
-from gyrostab.schema import texts
+from gyrostab.schema import check_product, texts
 from gyrostab.store.output import new_output
 
-__all__ = ["KEYS", "KalibrValue", "kalibr_noise", "to_kalibr"]
+__all__ = ["ACCELEROMETER_KEYS", "KEYS", "KalibrValue", "kalibr_noise", "to_kalibr"]
 
+_GRAVITY = 9.80665  # m/s^2
+#: Samples of an accelerometer that are read at a time.
+_SAMPLES_READ = 2**22
 #: Key -> symbol of the term, factor from the unit of the field, unit of Kalibr.
 KEYS = {
     "gyroscope_noise_density": ("N", math.pi / 180.0 / 60.0, "rad/s/sqrt(Hz)"),
     "gyroscope_random_walk": ("K", math.pi / 180.0 / HOUR**1.5, "rad/s^2/sqrt(Hz)"),
     "gyroscope_bias_instability": ("B", math.pi / 180.0 / HOUR, "rad/s"),
+}
+#: The same for accelerations in g.
+ACCELEROMETER_KEYS = {
+    "accelerometer_noise_density": ("N", _GRAVITY * math.sqrt(HOUR), "m/s^2/sqrt(Hz)"),
+    "accelerometer_random_walk": ("K", _GRAVITY / math.sqrt(HOUR), "m/s^3/sqrt(Hz)"),
 }
 
 
@@ -75,13 +93,42 @@ def kalibr_noise(product: xr.Dataset) -> dict[str, dict[str, KalibrValue]]:
     SchemaError
         When `product` is not a product.
     """
-    keys = {symbol: (key, factor) for key, (symbol, factor, _) in KEYS.items()}
+    return _convert_terms(product, KEYS)
+
+
+def _convert_terms(
+    product: xr.Dataset, keys: Mapping[str, tuple[str, float, str]]
+) -> dict[str, dict[str, KalibrValue]]:
+    by_symbol = {symbol: (key, factor) for key, (symbol, factor, _) in keys.items()}
     found: dict[str, dict[str, KalibrValue]] = {}
     for term in summarise_terms(product):
-        if term.symbol in keys:
-            key, factor = keys[term.symbol]
+        if term.symbol in by_symbol:
+            key, factor = by_symbol[term.symbol]
             found.setdefault(term.axis, {})[key] = _convert_term(term, factor)
-    return {axis: {key: values[key] for key in KEYS} for axis, values in found.items()}
+    return {axis: {key: values[key] for key in keys} for axis, values in found.items()}
+
+
+def _fit_accelerometers(log: xr.Dataset, product: xr.Dataset) -> xr.Dataset:
+    """Fit the noise of the accelerometers of a log in the windows of a product, in g for deg/h."""
+    names = [
+        name
+        for name in ("accel_x", "accel_y", "accel_z")
+        if name in log and log[name].dims == ("time",)
+    ]
+    if not names:
+        raise SchemaError(
+            "the log has no channel accel_x, accel_y or accel_z with the sampling rate of the gyro"
+        )
+    axes = pd.Index([name[-1] for name in names], name="axis")
+    signals = [log[name].chunk(time=_SAMPLES_READ) for name in names]
+    accelerations = make_log(
+        xr.concat(signals, axes, combine_attrs="drop").data,
+        rate=float(log.attrs["sampling_rate_hz"]),
+        unit="deg/h",
+        axis=list(axes),
+    )
+    window, step = (f"{product.attrs[name]}s" for name in ("window_s", "step_s"))
+    return fit_noise(davar(accelerations, window=window, step=step))
 
 
 def _convert_term(term: TermSummary, factor: float) -> KalibrValue:
@@ -92,7 +139,11 @@ def _convert_term(term: TermSummary, factor: float) -> KalibrValue:
 
 
 def to_kalibr(
-    product: xr.Dataset, path: str | os.PathLike[str], *, overwrite: bool = False
+    product: xr.Dataset,
+    path: str | os.PathLike[str],
+    *,
+    log: xr.Dataset | None = None,
+    overwrite: bool = False,
 ) -> Path:
     """Write N, K and B as a YAML file for Kalibr.
 
@@ -105,6 +156,9 @@ def to_kalibr(
         ``sampling_rate_hz``.
     path : path-like
         The file to write.
+    log : xarray.Dataset, optional
+        Log of the product with the channels ``accel_x``, ``accel_y`` or ``accel_z`` at the sampling
+        rate of the gyro, for the noise of the accelerometers in the windows of the product.
     overwrite : bool
         Replace an existing file.
 
@@ -116,11 +170,11 @@ def to_kalibr(
     Raises
     ------
     SchemaError
-        When `product` is not a product, or has no sampling rate.
+        When `product` is not a product, or has no sampling rate, or `log` has no accelerometer.
     OutputError
         When the file exists, or cannot be written.
     """
-    noise = kalibr_noise(product)
+    check_product(product)
     rate = product.attrs.get("sampling_rate_hz")
     if rate is None:
         raise SchemaError(
@@ -128,24 +182,31 @@ def to_kalibr(
             "give it one in Hz"
         )
     names = [Path(name).name for name in texts(product, "source_files")]
+    fitted = {"gyroscope": (product, KEYS)}
+    if log is not None:
+        fitted["accelerometer"] = (_fit_accelerometers(log, product), ACCELEROMETER_KEYS)
     lines = [
         "# Noise of a gyro for Kalibr: medians over the windows of a dynamic Allan variance, "
         "made by gyrostab",
         f"# from {', '.join(names) or 'a log'}. At the top the worst axis, below each of them.",
-        "# Kalibr also asks for rostopic, accelerometer_noise_density and "
-        "accelerometer_random_walk: a gyro log does not tell them.",
+        "# Kalibr also asks for rostopic."
+        if log is not None
+        else "# Kalibr also asks for rostopic, accelerometer_noise_density and "
+        "accelerometer_random_walk: give the log too (--log) if it has accelerations.",
         *(_describe_fit(fit) for fit in summarise_fit(product)),
         f"update_rate: {float(rate)!r}  # Hz",
     ]
-    for key in KEYS:
-        lines += _format_entry(
-            key, _find_worst([values[key] for values in noise.values()]), indent=""
-        )
+    noise = {sensor: _convert_terms(*part) for sensor, part in fitted.items()}
+    for sensor, (_, keys) in fitted.items():
+        for key in keys:
+            worst = _find_worst([values[key] for values in noise[sensor].values()])
+            lines += _format_entry(key, worst, indent="")
     lines.append("axes:")
-    for axis, values in noise.items():
+    for axis in dict.fromkeys(axis for found in noise.values() for axis in found):
         lines.append(f"  {json.dumps(axis)}:")
-        for key, value in values.items():
-            lines += _format_entry(key, value, indent="    ")
+        for found in noise.values():
+            for key, value in found.get(axis, {}).items():
+                lines += _format_entry(key, value, indent="    ")
     with new_output(path, overwrite=overwrite) as temporary:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return Path(path)
@@ -176,7 +237,7 @@ def _find_worst(values: list[KalibrValue]) -> KalibrValue:
 
 
 def _format_entry(key: str, found: KalibrValue, *, indent: str) -> list[str]:
-    symbol, _, unit = KEYS[key]
+    symbol, _, unit = (KEYS | ACCELEROMETER_KEYS)[key]
     said = {
         "observed": f"{unit}; {symbol}, {LAWS[symbol].name}, "
         f"observed in {found.share:.0%} of the windows",

@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import gyrostab
 from gyrostab.cli import main
 from gyrostab.errors import OutputError, SchemaError
 from gyrostab.io.datasets import to_netcdf
-from gyrostab.io.kalibr import KEYS, kalibr_noise, to_kalibr
+from gyrostab.io.kalibr import ACCELEROMETER_KEYS, KEYS, kalibr_noise, to_kalibr
+from gyrostab.io.kalibr import _convert_terms as convert_terms
+from gyrostab.io.kalibr import _fit_accelerometers as fit_accelerometers
 from gyrostab.schema import OBSERVABLE
 from tests.support import synthetic
 
@@ -170,3 +173,58 @@ def test_command(tmp_path, capsys):
     )
     assert main(["export", source, "-o", str(tmp_path / "imu.txt"), "--format", "kalibr"]) == 2
     assert ".yaml" in capsys.readouterr().err
+
+
+def make_accelerometers(rate: float = 100.0, samples: int = 60_000) -> xr.Dataset:
+    """Log whose accelerometers have white noise of 1e-4 (x) and 2e-4 (z) m/s^2/sqrt(Hz)."""
+    rng = np.random.default_rng(5)
+    scatter = {"accel_x": 1e-4, "accel_z": 2e-4}  # m/s^2/sqrt(Hz)
+    channels = {
+        name: (1.0 + rng.normal(0.0, density * math.sqrt(rate) / 9.80665, samples), "g")
+        for name, density in scatter.items()
+    }
+    gyro = rng.normal(0.0, 6.0, (2, samples))
+    return gyrostab.make_log(gyro, rate=rate, unit="deg/h", channels=channels)
+
+
+class TestAccelerometers:
+    def test_density_is_that_of_the_samples(self, tmp_path):
+        log = make_accelerometers()
+        product = gyrostab.fit_noise(gyrostab.davar(log, window="1min"))
+        text = parse(to_kalibr(product, tmp_path / "imu.yaml", log=log))
+        found = {
+            axis: values.get("accelerometer_noise_density") for axis, values in text["axes"].items()
+        }
+        assert float(found["x"]) == pytest.approx(1e-4, rel=0.02)
+        assert float(found["z"]) == pytest.approx(2e-4, rel=0.02)
+        assert found["y"] is None
+        assert text["accelerometer_noise_density"] == found["z"]
+        assert text["accelerometer_random_walk_meaning"] == "upper_limit_only"
+
+    def test_random_walk_is_that_of_the_samples(self):
+        """A random walk of k m/s^3/sqrt(Hz) has steps of k sqrt(interval) from sample to sample."""
+        walk, rate = 1e-3, 10.0
+        steps = np.random.default_rng(2).normal(0.0, walk / math.sqrt(rate), 40_000)
+        acceleration = np.cumsum(steps) / 9.80665
+        log = gyrostab.make_log(
+            np.zeros(40_000), rate=rate, unit="deg/h", channels={"accel_y": (acceleration, "g")}
+        )
+        product = xr.Dataset(attrs={"window_s": 1000.0, "step_s": 500.0})
+        found = convert_terms(fit_accelerometers(log, product), ACCELEROMETER_KEYS)
+        assert found["y"]["accelerometer_random_walk"].value == pytest.approx(walk, rel=0.05)
+
+    def test_slow_or_missing_channels_are_named(self, product, tmp_path):
+        log = make_accelerometers(samples=2_000).drop_vars(["accel_x", "accel_z"])
+        with pytest.raises(SchemaError, match="accel_x, accel_y or accel_z"):
+            to_kalibr(product, tmp_path / "imu.yaml", log=log)
+
+    def test_command(self, tmp_path):
+        log = make_accelerometers(samples=12_000)
+        to_netcdf(log, tmp_path / "log.nc")
+        to_netcdf(gyrostab.fit_noise(gyrostab.davar(log, window="30s")), tmp_path / "product.nc")
+        given = [str(tmp_path / "product.nc"), "-o", str(tmp_path / "imu.yaml")]
+        log_option = ["--log", str(tmp_path / "log.nc")]
+        assert main(["export", *given, "--format", "kalibr", *log_option]) == 0
+        text = parse(tmp_path / "imu.yaml")
+        assert float(text["accelerometer_noise_density"]) == pytest.approx(2e-4, rel=0.05)
+        assert main(["export", *given, "--format", "zarr", *log_option]) == 2

@@ -169,6 +169,7 @@ def export(
     *,
     output: Output,
     format: Literal["iscwsa", "kalibr", "zarr"],
+    log: Annotated[Path | None, Parameter(metavar="LOG.nc")] = None,
     survey: Survey = Survey(),
     common: Common = Common(),
 ) -> None:
@@ -186,8 +187,10 @@ def export(
         iscwsa: gyro terms of an ISCWSA tool error model, as a table (.csv), as JSON for welleng
         (.json) or as a WITSML ToolErrorModel (.xml), to be confirmed by a survey engineer. kalibr:
         N, K and B in radians, for the worst axis and for each axis. zarr: the whole product.
+    log
+        Log of the product, for kalibr: adds the noise of the channels accel_x, accel_y and accel_z.
     """
-    from gyrostab.io.datasets import open_product, to_zarr
+    from gyrostab.io.datasets import open_log, open_product, to_zarr
     from gyrostab.io.kalibr import to_kalibr
     from gyrostab.io.survey_files import SUFFIXES, to_iscwsa
     from gyrostab.store.output import check_output
@@ -202,6 +205,10 @@ def export(
     options = survey.options()
     if options and format != "iscwsa":
         raise OptionError(f"survey options are for --format iscwsa, not for {format}")
+    if log:
+        if format != "kalibr":
+            raise OptionError(f"--log is for --format kalibr, not for {format}")
+        options = {"log": open_log(log)}
     with show_stages(common) as stage:
         stage("writing", 0)
         written = write(open_product(product), target, overwrite=common.overwrite, **options)
