@@ -33,6 +33,7 @@ from gyrostab.ingest.formats.unread import refuse_unread
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.ingest.overlap import stamp_span
 from gyrostab.schema import texts
+from gyrostab.store.remote import fetch_file, find_store, find_url, list_urls
 
 __all__ = [
     "OnFile",
@@ -89,6 +90,8 @@ def readers() -> tuple[str, ...]:
 
 def _find_reader(path: Path) -> Reader:
     """Find the reader of a file; binary and text are tried last, as they match most files."""
+    if find_url(path):
+        return cast(Reader, _entry_points()["netcdf"].load())
     if not path.exists():
         raise FormatError(f"{path}: there is no such file")
     first = "binary" if has_layout(path) else None
@@ -122,12 +125,15 @@ def expand(paths: str | Path | Iterable[str | Path]) -> list[Path]:
     found: dict[Path, None] = {}
     for item in [paths] if isinstance(paths, str | Path) else paths:
         text = str(item)
+        url = find_url(item)
         if not glob.has_magic(text) or Path(text).exists():
             matching = [Path(text)]
+        elif url is not None:
+            matching = [Path(match) for match in list_urls(url)]
         else:
             matching = [Path(match) for match in sorted(glob.glob(text, recursive=True))]
-            if not matching:
-                raise FormatError(f"{text}: no file fits this pattern")
+        if not matching:
+            raise FormatError(f"{url or text}: no file fits this pattern")
         found.update(dict.fromkeys(matching))
     if not found:
         raise OptionError("no file was given; name at least one log")
@@ -161,14 +167,21 @@ def scan_file(path: str | Path, options: ReadOptions | None = None) -> FileSumma
     >>> summary.axes, summary.n_rows, summary.last
     (('x',), 2, np.datetime64('1970-01-01T00:00:00.500000000'))
     """
-    path = Path(path)
+    path = _fetch(Path(path))
     reader = _find_reader(path)
     with reading_of(path):
         return reader.scan(path, options or ReadOptions())
 
 
+def _fetch(path: Path) -> Path:
+    """Return a temporary copy of a file at an address; other paths and Zarr stores as they are."""
+    url = find_url(path)
+    return path if url is None or find_store(url) else fetch_file(url)
+
+
 def read_file(path: Path, options: ReadOptions) -> xr.Dataset:
     """Read one file into a raw log, or open it as a regular log."""
+    path = _fetch(path)
     reader = _find_reader(path)
     with reading_of(path):
         return reader.read(path, options)

@@ -233,7 +233,8 @@ def to_zarr(
     dataset : xarray.Dataset
         In memory ``(axis, time, tau)``.
     path : path-like
-        The directory to write.
+        The directory to write, or an address such as ``s3://bucket/log.zarr``, where nothing is
+        replaced.
     overwrite : bool
         Replace an existing store, unless other files are in it, or the dataset is lazy and still
         reads from it.

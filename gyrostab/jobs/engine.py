@@ -142,7 +142,7 @@ def write_blocks(
     stage: Stage,
     zarr: bool = False,
 ) -> xr.Dataset:
-    """Write all blocks as one NetCDF file, in a fixed order, so that its bytes are reproducible.
+    """Write all blocks as one file or Zarr store, in a fixed order: its bytes are reproducible.
 
     With `zarr`, a Zarr group is written instead.
 

@@ -26,6 +26,7 @@ import numpy as np
 from gyrostab.errors import OutputError, ResumeError
 from gyrostab.store.output import describe_file, is_leftover, remove_leftovers, replace_file
 from gyrostab.store.output.content import read_json
+from gyrostab.store.remote import find_url
 from gyrostab.store.system import lock_file, read_at, write_at
 
 __all__ = [
@@ -55,7 +56,9 @@ _MAX_DIFFERENCES = 4  # differences that a message lists
 
 
 def job_folder(output: Path) -> Path:
-    """Return the job folder of an output."""
+    """Return the job folder of an output; that of an output at an address is in this directory."""
+    if find_url(output):
+        return Path(f".{output.name}.job")
     return output.with_name(f".{output.name}.job")
 
 
@@ -105,7 +108,9 @@ def _read_start(path: Path, count: int) -> bytes | None:
 
 def describe_inputs(paths: Sequence[Path]) -> list[dict[str, Any]]:
     """Describe each input by path, size [bytes] and time of change; a Zarr folder as a whole."""
-    return [{"path": os.path.abspath(path), **describe_file(path)} for path in paths]
+    return [
+        {"path": find_url(path) or os.path.abspath(path), **describe_file(path)} for path in paths
+    ]
 
 
 def make_fingerprint(paths: Sequence[Path], options: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The whole analysis: logs -> regular log -> dynamic Allan variance -> coefficients -> NetCDF."""
+"""The whole analysis: logs -> regular log -> dynamic Allan variance -> coefficients -> file."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def run(
     stage: Stage = no_stage,
     zarr: bool = False,
 ) -> Path:
-    """Compute the product of some logs and write it as NetCDF, in parts that can be continued.
+    """Compute the product of some logs and write it, in parts that can be continued.
 
     The log is never held in memory as a whole. Each finished part is kept in the folder
     ``.PRODUCT.nc.job``, next to the output, until the product is complete. A run that was stopped
@@ -159,7 +159,8 @@ def run(
     paths : sequence of path
         Logs.
     output : path
-        NetCDF file to be written, or Zarr group.
+        NetCDF file, or Zarr store (``.zarr``), to be written; a Zarr store may be at an address,
+        ``s3://bucket/product.zarr``, where nothing is replaced.
     reading, windows, fitting : mapping
         Options of `gyrostab.ingest.read_log`, `gyrostab.allan.davar.davar` and
         `gyrostab.allan.fit.fit_noise`.
@@ -207,6 +208,7 @@ def run(
     }
     check_windows(**options["windows"])
     with protect_inputs(paths), protect_inputs(options["reading"].get("channel", ())):
+        zarr = zarr or Path(output).suffix.lower() == ".zarr"
         check_output(output, overwrite=True, **_FORMS[zarr])
         job = _describe_job(paths, resolve_link(output), options, zarr=zarr)
         check_job_folder(job.folder)

@@ -23,7 +23,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.allan.plan import last_sample, make_plan, units_of_work
-from gyrostab.errors import FormatError, GyrostabError, OutputError, TimeError
+from gyrostab.errors import FormatError, GyrostabError, OptionError, OutputError, TimeError
 from gyrostab.ingest.concat.lazy import GridSource
 from gyrostab.ingest.uniform import cut_log
 from gyrostab.io.datasets import open_product
@@ -44,6 +44,7 @@ from gyrostab.kernels.workspace import Workspace
 from gyrostab.schema import log_channels, signal_name
 from gyrostab.store.lazy import find_source, read_slice
 from gyrostab.store.output import check_output, follow_inputs, resolve_link
+from gyrostab.store.remote import find_url
 from gyrostab.time.durations import duration_seconds, samples
 from gyrostab.time.grid import first_stamp, grid_times
 
@@ -201,6 +202,11 @@ class _Continued(NamedTuple):
 
 def _continue_product(path: Path, options: dict[str, Any], *, overwrite: bool) -> _Continued:
     """Check that the output can be written; find the last window of one that is continued."""
+    if find_url(path):
+        raise OptionError(
+            f"{find_url(path)}: a live view writes to a local store; copy it to the address with "
+            "a tool such as aws s3 sync"
+        )
     before = None
     if path.exists() and not overwrite:
         with contextlib.suppress(GyrostabError), open_product(path) as product:

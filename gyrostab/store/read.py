@@ -27,6 +27,7 @@ from gyrostab.store.hdf5_heaps import check_global_heaps
 from gyrostab.store.layout import ChunkDamage, is_readable, read_chunk
 from gyrostab.store.lazy import FileVariable, RowSource, make_dask
 from gyrostab.store.private import close_function
+from gyrostab.store.remote import find_store, find_url, reaching
 from gyrostab.store.times import decode_stamps, index_dim, parse_time_grids, replace_stamps
 from gyrostab.time.grid import grid_times
 
@@ -59,10 +60,26 @@ def open_stored(
     FormatError
         When there is no such file, or when it is damaged as a whole.
     """
+    if url := find_url(path):
+        return _open_remote(path, url)
     if not path.exists():
         raise FormatError(f"{path}: there is no such file")
     with reading_of(path):
         return _open_dataset(path, strict=strict, check=check)
+
+
+def _open_remote(path: Path, url: str) -> xr.Dataset:
+    """Open a Zarr store at an address; the Zarr library reads its chunks."""
+    address = find_store(url)
+    if address is None:
+        raise FormatError(f"{url}: is not a Zarr store; copy the file here, and give the copy")
+    with reaching(url):
+        stored = xr.open_dataset(
+            address, engine="zarr", chunks=None, decode_times=False, create_default_indexes=False
+        )
+        is_log = stored.attrs.get("gyrostab_content") == "log"
+        stored = replace_stamps(stored, path)
+        return _make_variables_lazy(stored, {}, path, small=MIN_LAZY_VALUES if is_log else 0)
 
 
 def _open_dataset(

@@ -20,8 +20,8 @@ __all__ = ["doctor"]
 
 #: Extras that users install; the others are for developers.
 _EXTRAS = (
-    "ardupilot", "distributed", "dlis", "las", "matlab", "miniseed", "novatel", "rosbag", "tdms",
-    "ulog",
+    "ardupilot", "distributed", "dlis", "gcs", "http", "las", "matlab", "miniseed", "novatel",
+    "rosbag", "s3", "tdms", "ulog",
 )  # fmt: skip
 
 

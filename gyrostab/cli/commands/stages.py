@@ -29,7 +29,8 @@ def run(
     """Analyse logs: dynamic Allan variance and noise coefficients of every window.
 
     Reads the logs, puts them on a uniform time axis, computes the dynamic Allan variance, fits the
-    noise coefficients and writes the product, one NetCDF file. The logs may be larger than memory.
+    noise coefficients and writes the product, one file. The logs may be larger than memory, and
+    may be Zarr logs in an object store: s3://bucket/run7.zarr.
     An interrupted run is continued with --resume.
 
     Example: gyrostab run run7/*.csv -o product.nc --window 10min --step 1min
@@ -37,9 +38,9 @@ def run(
     Parameters
     ----------
     logs
-        One or more logs, in any order.
+        One or more logs, in any order: files, folders, patterns, addresses.
     output
-        NetCDF file to write.
+        NetCDF file or Zarr store (.zarr) to write; a Zarr store also at an address, s3://...
     dry_run
         Print the windows and averaging times, and the time, memory and size of the output as
         estimated from the first part, and write nothing.
@@ -123,13 +124,14 @@ def _print_product(target: Path) -> None:
 
     from gyrostab.allan.summary import format_product
     from gyrostab.io.datasets import open_product
+    from gyrostab.store.remote import find_url
 
     with open_product(target) as product:
         print(format_product(product))
-    print(
-        f"\nNext: gyrostab report {quote(str(target))} -o {quote(str(target.with_suffix('.html')))}"
-    )
-    print(target)
+    url, page = find_url(target), target.with_suffix(".html")
+    name, page = (url, Path(page.name)) if url else (str(target), page)
+    print(f"\nNext: gyrostab report {quote(name)} -o {quote(str(page))}")
+    print(name)
 
 
 def _run_job(

@@ -38,6 +38,7 @@ from gyrostab.store.cf import from_disk
 from gyrostab.store.hdf5_heaps import check_global_heaps
 from gyrostab.store.layout import read_attribute
 from gyrostab.store.read import open_stored
+from gyrostab.store.remote import find_url
 from gyrostab.time.grid import grid_times, time_coordinate
 from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import ON_DISK
@@ -66,7 +67,7 @@ def matches(path: Path) -> bool:
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Summarise variables, sizes, and first and last stamps."""
-    log = _open_log(path, options)
+    log = _open_remote(path) if find_url(path) else _open_log(path, options)
     if log is not None:
         with log:
             return _summarise_log(path, log)
@@ -76,11 +77,26 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
 
 def read(path: Path, options: ReadOptions) -> xr.Dataset:
     """Open a regular log lazily, or read the raw log of a foreign file; see `read_log`."""
-    log = _open_log(path, options)
+    log = _open_remote(path) if find_url(path) else _open_log(path, options)
     if log is not None:
         return log
     with open_variables(path, options.limits) as variables:
         return _plan_file(path, variables, options).read()
+
+
+def _open_remote(path: Path) -> xr.Dataset:
+    """Open a Zarr log of gyrostab at an address."""
+    stored = open_stored(path)
+    content = str(stored.attrs.get("gyrostab_content", ""))
+    if content != "log":
+        raise FormatError(
+            f"{find_url(path)}: is {_OTHER_CONTENT.get(content, 'a Zarr store of another program')}"
+            ", not a log of gyrostab; open it with xarray and give it to gyrostab.davar, or copy "
+            "it here and use gyrostab ingest"
+        )
+    log = as_uniform(from_disk(stored, path.name))
+    log.attrs.setdefault("source_files", [path.name])
+    return log
 
 
 def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from gyrostab.errors import OptionError, OutputError
 from gyrostab.store.output.content import FindForeign, find_foreign_item, is_store
 from gyrostab.store.output.inputs import match_files, protected_inputs
+from gyrostab.store.remote import find_url, is_taken
 
 __all__ = ["check_folder", "check_output", "check_target", "resolve_link"]
 
@@ -84,7 +85,8 @@ def check_output(
     if find_foreign is None and path.suffix.lower() == ".zarr":
         find_foreign = find_foreign_item
     target = check_target(path, overwrite=overwrite, inputs=inputs, find_foreign=find_foreign)
-    _check_writable(path, target.parent)
+    if not find_url(path):
+        _check_writable(path, target.parent)
     return path
 
 
@@ -124,6 +126,10 @@ def check_target(
     find_foreign: FindForeign | None = None,
 ) -> Path:
     """Do what `check_output` does, without a test write; return the target of the path."""
+    url = find_url(path)
+    if url is not None:
+        _check_address(url, store=find_foreign is not None)
+        return path
     label = f"output {str(path)!r}"
     target = resolve_link(path)
     if not target.parent.is_dir():
@@ -168,6 +174,20 @@ def check_target(
             "give --overwrite (overwrite=True) to replace it, or another name with -o"
         )
     return target
+
+
+def _check_address(url: str, *, store: bool) -> None:
+    """Check that nothing is at an address; what is there is never replaced."""
+    if not store:
+        raise OutputError(
+            f"output {url!r}: only a Zarr store (.zarr) is written to an address; give another "
+            "name with -o, and copy the file there"
+        )
+    if is_taken(url):
+        raise OutputError(
+            f"output {url!r} exists already, and nothing at an address is replaced; remove it "
+            "first, or give another name with -o"
+        )
 
 
 def _find_foreign(label: str, target: Path, find_foreign: FindForeign) -> str | None:

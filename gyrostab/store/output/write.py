@@ -18,6 +18,7 @@ from gyrostab.errors import GyrostabError, OutputError
 from gyrostab.store.output.check import check_folder, check_target
 from gyrostab.store.output.content import FindForeign
 from gyrostab.store.output.inputs import check_unchanged
+from gyrostab.store.remote import find_url, upload
 from gyrostab.store.system import exchange_paths, rename_new, sync_path
 
 __all__ = ["is_leftover", "new_folder", "new_output", "remove_leftovers", "replace_file"]
@@ -81,6 +82,12 @@ def new_output(
         return check_target(path, overwrite=overwrite, inputs=inputs, find_foreign=find_foreign)
 
     target = check()
+    url = find_url(path)
+    if url is not None:
+        with upload(url) as temporary:
+            yield temporary
+            check_unchanged()
+        return
     for left in _find_leftovers(target):
         warnings.warn(
             f"{left} is being written now, or was left by a process that was killed: "

@@ -1,0 +1,158 @@
+"""Addresses of object stores, such as ``s3://bucket/log.zarr``, which fsspec opens.
+
+pathlib joins the slashes of an address, ``s3:/bucket/log.zarr``; `find_url` restores it, so that
+addresses are paths everywhere else. Credentials and endpoints are those of the environment, as the
+library of each store reads them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import tempfile
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path, PurePath
+from typing import Any
+
+from gyrostab.errors import FormatError, GyrostabError, OptionError, OutputError
+
+__all__ = ["fetch_file", "find_store", "find_url", "is_taken", "list_urls", "reaching", "upload"]
+
+_URL = re.compile(r"([a-z][a-z0-9+.-]+):/+(.+)")  # a single letter is a drive of Windows
+#: Scheme -> the extra that installs its library.
+_EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs", "http": "http", "https": "http"}
+#: Names without which a store cannot be opened; they are uploaded last.
+_ROOT_METADATA = (".zgroup", ".zattrs", ".zmetadata", "zarr.json")
+
+
+def find_url(path: str | os.PathLike[str]) -> str | None:
+    """Find the address that a path is; None for a local path.
+
+    Examples
+    --------
+    >>> find_url(Path("s3://bucket/log.zarr")), find_url(Path("C:/log.zarr"))
+    ('s3://bucket/log.zarr', None)
+    """
+    text = path.as_posix() if isinstance(path, PurePath) else os.fspath(path)
+    match = _URL.fullmatch(text)
+    return None if match is None else f"{match[1]}://{match[2]}"
+
+
+@contextlib.contextmanager
+def reaching(url: str, *, error: type[GyrostabError] = FormatError) -> Iterator[None]:
+    """Convert exceptions of the library of a store to one `GyrostabError` that names the address.
+
+    Parameters
+    ----------
+    url : str
+        The address.
+    error : type
+        Exception to raise; `OptionError` if a library is missing or the scheme is not known.
+    """
+    scheme = url.partition(":")[0]
+    try:
+        yield
+    except GyrostabError:
+        raise
+    except ImportError as problem:
+        extra = _EXTRAS.get(scheme)
+        advice = f"pip install 'gyrostab[{extra}]'" if extra else f"install it ({problem})"
+        raise OptionError(f"{url}: the library for {scheme}:// is missing; {advice}") from problem
+    except Exception as problem:  # libraries raise exceptions of many kinds
+        raise error(f"{url}: {_describe_problem(scheme, problem)}") from problem
+
+
+def _describe_problem(scheme: str, problem: Exception) -> str:
+    text = " ".join(str(problem).split()) or type(problem).__name__
+    if isinstance(problem, ValueError) and "rotocol not known" in text:
+        return f"{scheme}:// is not known; give a local path, s3://, gs:// or https://"
+    if isinstance(problem, FileNotFoundError):
+        return "there is no such object; check the bucket and the name"
+    if isinstance(problem, PermissionError) or "redentials" in f"{type(problem).__name__} {text}":
+        return (
+            f"access was refused, or no credentials were found ({text}); set those of the store in "
+            "the environment, such as AWS_PROFILE, or for a public bucket "
+            f"FSSPEC_{scheme.upper()}='{{\"anon\": true}}'"
+        )
+    return f"the store cannot be reached ({text}); check the address and the network"
+
+
+def _open_filesystem(url: str) -> tuple[Any, str]:
+    import fsspec
+
+    filesystem, path = fsspec.core.url_to_fs(url)
+    return filesystem, str(path).rstrip("/")
+
+
+def is_taken(url: str) -> bool:
+    """Whether there is something at an address; what an interrupted upload left does not count."""
+    with reaching(url, error=OutputError):
+        filesystem, path = _open_filesystem(url)
+        if filesystem.isfile(path):
+            return True
+        return any(filesystem.exists(f"{path}/{name}") for name in _ROOT_METADATA)
+
+
+def find_store(url: str) -> str | None:
+    """Find the Zarr store at an address: the address without a slash at the end; None if none is.
+
+    Raises
+    ------
+    FormatError
+        When there is nothing at the address, or it cannot be reached.
+    OptionError
+        When the library for it is missing.
+    """
+    with reaching(url):
+        filesystem, path = _open_filesystem(url)
+        if any(filesystem.exists(f"{path}/{name}") for name in _ROOT_METADATA):
+            return url.rstrip("/")
+        if not filesystem.exists(path):
+            raise FileNotFoundError(url)
+    return None
+
+
+def list_urls(url: str) -> list[str]:
+    """List the addresses that match a pattern."""
+    with reaching(url):
+        filesystem, path = _open_filesystem(url)
+        return [filesystem.unstrip_protocol(name) for name in sorted(filesystem.glob(path))]
+
+
+@lru_cache(maxsize=2**10)
+def fetch_file(url: str) -> Path:
+    """Download a file to a temporary copy of the same name, once for the process."""
+    with reaching(url):
+        filesystem, path = _open_filesystem(url)
+        if filesystem.info(path)["type"] == "directory":
+            raise FormatError(f"{url}: is a folder, not a Zarr store; name the files in it")
+        folder = tempfile.TemporaryDirectory(prefix="gyrostab-")
+        _COPIES.append(folder)
+        target = Path(folder.name, path.rpartition("/")[2])
+        filesystem.get_file(path, str(target))
+        return target
+
+
+#: Folders of downloaded files; removed when the process ends.
+_COPIES: list[tempfile.TemporaryDirectory[str]] = []
+
+
+@contextlib.contextmanager
+def upload(url: str) -> Iterator[Path]:
+    """Provide a local folder, and upload the Zarr store written there if the block succeeds.
+
+    The metadata without which a store cannot be opened come last.
+    """
+    with tempfile.TemporaryDirectory(prefix="gyrostab-") as folder:
+        yield Path(folder)
+        names = [item.relative_to(folder) for item in Path(folder).rglob("*") if item.is_file()]
+        with reaching(url, error=OutputError):
+            filesystem, path = _open_filesystem(url)
+            for is_last in (False, True):
+                chosen = [n for n in names if (n.as_posix() in _ROOT_METADATA) == is_last]
+                filesystem.put(
+                    [str(Path(folder, name)) for name in chosen],
+                    [f"{path}/{name.as_posix()}" for name in chosen],
+                )
