@@ -28,7 +28,7 @@ from gyrostab.plot.style import (
 from gyrostab.report.page import page_text
 from gyrostab.store.output import new_output
 
-__all__ = ["write_overview"]
+__all__ = ["combine_effects", "write_overview"]
 
 _PANEL_MM = 45.0
 
@@ -69,7 +69,7 @@ def write_overview(
             terms=[(term, unit_symbol(LAWS[term].label)) for term in LAWS],
             axes=axes,
             tools=[_describe_tool(str(tool), part, axes) for tool, part in done.groupby("tool")],
-            effects=[] if effects is None else _combine_effects(effects, done),
+            effects=[] if effects is None else combine_effects(effects, done),
             runs=[_describe_run(row, axes, Path(path).parent) for row in done.to_dict("records")],
             figures=[_make_figure(done, axes)] if len(done) and axes else [],
         )
@@ -112,7 +112,7 @@ def _describe_tool(tool: str, part: pd.DataFrame, axes: list[str]) -> dict[str, 
     return {"tool": tool or "–", "runs": len(part), "cells": cells}
 
 
-def _combine_effects(effects: pd.DataFrame, done: pd.DataFrame) -> list[dict[str, Any]]:
+def combine_effects(effects: pd.DataFrame, done: pd.DataFrame) -> list[dict[str, Any]]:
     """Combine the effects of the same name over the diagnosed runs of each tool."""
     diagnosed = done[done["diagnosis"] != ""].groupby("tool").size()
     rows = []
@@ -182,8 +182,8 @@ def _make_figure(done: pd.DataFrame, axes: list[str]) -> dict[str, str]:
         _plot_noise(done, axes),
         "N of each run over time",
         "Each point is the median angle random walk N of one run, at the middle of the run; each "
-        "panel is an axis. The tools with the most runs have a colour each, all others are grey. A "
-        "point far above those of its tool is a run to look at; a trend of one colour is ageing.",
+        "panel is an axis. The tools with the most runs have a colour each, all others are grey. "
+        "A point far above those of its tool is a run to look at; a trend may be ageing.",
     )
 
 

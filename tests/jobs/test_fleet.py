@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import time
@@ -19,8 +20,9 @@ from gyrostab.errors import FormatError, OutputError
 from gyrostab.jobs import fleet as fleet_module
 from gyrostab.jobs.archive import find_archive, find_runs, read_table
 from gyrostab.jobs.fleet import process_run, run_fleet
+from gyrostab.jobs.fleet_effects import list_effects
 from gyrostab.jobs.run import run
-from gyrostab.report.fleet import write_overview
+from gyrostab.report.fleet import combine_effects, write_overview
 
 RATE = 10.0
 WINDOWS = {"window": "60s", "step": "30s", "taus": "12"}
@@ -166,6 +168,30 @@ def test_the_overview_escapes_names_and_links_reports(done, tmp_path):
     table["report"] = "reports/" + table["run"] + ".html"
     text = write_overview(table, tmp_path / "index.html").read_text(encoding="utf-8")
     assert 'href="reports/tool%201/run%20%3Cb%3E.html"' in text
+
+
+def test_effects_of_one_name_are_combined_over_the_runs_of_a_tool(tmp_path):
+    names = ["tool/a", "tool/b", "tool/c"]
+    for name, nats in zip(names, (4.0, 8.5, None), strict=True):
+        size = {"value": 0.4, "stderr": 0.1, "low": 0.2, "high": 0.6, "unit": "deg/h/g"}
+        effect = {
+            "name": "vibration_noise",
+            "axes": ["x"],
+            "driver": "vibration",
+            "parameters": {"sensitivity": size},
+            "held_out_gain": {"nats": nats},
+        }
+        (tmp_path / name).mkdir(parents=True)
+        content = {"verdict": "explained", "effects": [effect] if nats else []}
+        (tmp_path / name / "diagnosis.json").write_text(json.dumps(content))
+    table = pd.DataFrame({"run": names, "tool": "tool", "start": pd.Timestamp("2026-05-01")})
+    table["diagnosis"] = [str(tmp_path / name) for name in names]
+    effects = list_effects(table)
+    assert list(effects["evidence [nats]"]) == [4.0, 8.5]
+    (combined,) = combine_effects(effects, table)
+    assert combined["seen"] == "2 of 3 diagnosed runs"
+    assert combined["evidence"] == "12.5"
+    assert combined["sizes"][0] == "tool/a, x: sensitivity 0.4 (0.2 to 0.6) deg/h/g"
 
 
 # ------------------------------------------------------------------------------
