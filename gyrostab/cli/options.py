@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from cyclopts.validators import Number
 
 from gyrostab.errors import OptionError
 from gyrostab.ingest.limits import check_limits
+from gyrostab.store.toml import parse_toml
 
 __all__ = [
     "ChannelFile",
@@ -340,7 +340,7 @@ _PAIR_EXAMPLES = {"--map": "wx=gyro_x", "--unit": "gyro=deg/s", "--limit": "colu
 def read_toml(path: Path) -> dict[str, Any]:
     """Read a TOML file of options."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return parse_toml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise OptionError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, RecursionError) as error:

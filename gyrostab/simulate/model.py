@@ -6,7 +6,6 @@ import inspect
 import json
 import math
 import os
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +17,7 @@ from gyrostab.physics.base import Effect
 from gyrostab.physics.registry import amount, close_to, make_effect
 from gyrostab.simulate import environment, losses
 from gyrostab.simulate.noise import FLICKER_LOW
+from gyrostab.store.toml import parse_toml
 
 __all__ = ["PROFILES", "Model", "read_model"]
 
@@ -147,7 +147,7 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
         where, path = str(model), Path(model)
         try:
             text = path.read_text(encoding="utf-8")
-            tables = tomllib.loads(text)
+            tables = parse_toml(text)
         except OSError as error:
             raise FormatError(f"{path}: cannot be read ({error.strerror})") from error
         except (ValueError, RecursionError) as error:

@@ -1,0 +1,35 @@
+"""TOML files of users: models, layouts and options."""
+
+from __future__ import annotations
+
+import tomllib
+from typing import Any
+
+__all__ = ["parse_toml"]
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """Parse TOML 1.0, in which integers have at most 64 bits.
+
+    Raises
+    ------
+    ValueError, RecursionError
+        If the text is not TOML.
+
+    Examples
+    --------
+    >>> parse_toml("a = [1, 2.5]")
+    {'a': [1, 2.5]}
+    """
+    content = tomllib.loads(text)
+    _check_integers(content)
+    return content
+
+
+def _check_integers(value: Any) -> None:
+    """Raise ValueError for an integer of more than 64 bits in nested tables and lists."""
+    if isinstance(value, dict | list):
+        for item in value.values() if isinstance(value, dict) else value:
+            _check_integers(item)
+    elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+        raise ValueError(f"an integer of {value.bit_length()} bits, where 64 are the most")
