@@ -77,7 +77,7 @@ def ladder(name: str, strength: float, number: int) -> list[float]:
     tried = [
         one
         for one in effect_candidates(reduced, baseline["coefficient"])[0]
-        if one.effect == name and one.view == "mean"
+        if one.effect == name and one.statistic.is_in_means
     ]
     scored = evidence_by_effect(
         compute_evidence(tried, reduced, initial_state(reduced, baseline), folds)

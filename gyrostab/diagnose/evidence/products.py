@@ -282,10 +282,14 @@ def held_out_evidence(
     factors: Array,
     owner: Sequence[int] | NDArray[np.int64],
     *,
-    weight: Sequence[float] | None = None,
+    weight: Sequence[float] | Array | None = None,
     folds: int = FOLDS,
 ) -> Array:
     """Compute the held-out evidence of candidates, the largest over the fold lengths.
+
+    The longest interval is the whole record, predicted from nothing: its evidence is the Bayes
+    factor itself. What lasts for most of the record is predicted from both sides of any shorter
+    interval, also by a random walk.
 
     Parameters
     ----------
@@ -294,7 +298,7 @@ def held_out_evidence(
         Factors of independent data, such as means and powers, may be added before.
     owner : sequence of int, shape (design,)
         Index of the candidate of each design.
-    weight : sequence of float, shape (design,), optional
+    weight : array_like, shape (design,) or (design, record), optional
         Prior probability of each design relative to the others of its candidate; equal by default.
 
     Returns
@@ -312,15 +316,13 @@ def held_out_evidence(
     [8.]
     """
     owner = np.asarray(owner)
-    chance = (
-        np.zeros(owner.size) if weight is None else np.log(np.asarray(weight, dtype=np.float64))
-    )
+    given = np.ones(owner.size) if weight is None else np.asarray(weight, dtype=np.float64)
+    chance = np.log(given.reshape(owner.size, -1))
     out = []
     for candidate in range(int(owner.max()) + 1 if owner.size else 0):
         chosen = owner == candidate
-        log_prior = chance[chosen] - np.logaddexp.reduce(chance[chosen])
-        mixed = np.logaddexp.reduce(factors[:, chosen] + log_prior[:, None], axis=1)
-        out.append(
-            (mixed[:1] - mixed[1:]).reshape(-1, folds, mixed.shape[1]).sum(axis=1).max(axis=0)
-        )
+        log_prior = chance[chosen] - np.logaddexp.reduce(chance[chosen], axis=0)
+        mixed = np.logaddexp.reduce(factors[:, chosen] + log_prior, axis=1)
+        parts = (mixed[:1] - mixed[1:]).reshape(-1, folds, mixed.shape[1]).sum(axis=1)
+        out.append(np.maximum(parts.max(axis=0), mixed[0]))
     return np.array(out).reshape(len(out), factors.shape[2])

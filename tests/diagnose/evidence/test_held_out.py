@@ -230,7 +230,7 @@ def test_factors_of_powers_are_those_of_dense_marginal_likelihoods(tier):
                 assert factors[number, place, record] == pytest.approx(expected, abs=1e-6)
 
 
-def test_evidence_is_the_loss_without_the_folds_at_the_best_length():
+def test_evidence_is_the_loss_without_the_folds_at_the_best_length_or_the_whole_factor():
     rng = np.random.default_rng(0)
     factors = rng.standard_normal((1 + 3 * FOLDS, 3, 5))
     gains = held_out_evidence(factors, [0, 0, 1])
@@ -239,9 +239,12 @@ def test_evidence_is_the_loss_without_the_folds_at_the_best_length():
         components = [
             sum(mixed[0] - mixed[1 + 4 * length + fold] for fold in range(4)) for length in range(3)
         ]
-        assert gains[0, record] == pytest.approx(max(components))
-    assert gains[1, 0] == pytest.approx(
-        max((factors[0, 2, 0] - factors[1 + 4 * i : 5 + 4 * i, 2, 0]).sum() for i in range(3))
+        assert gains[0, record] == pytest.approx(max(*components, mixed[0]))
+    parts = [(factors[0, 2, 0] - factors[1 + 4 * i : 5 + 4 * i, 2, 0]).sum() for i in range(3)]
+    assert gains[1, 0] == pytest.approx(max(*parts, factors[0, 2, 0]))
+    factors[1:] = factors[0] - 0.1  # hardly any interval is needed: the others predict it
+    assert held_out_evidence(factors, [0, 0, 0])[0] == pytest.approx(
+        np.maximum(np.log(np.exp(factors[0]).mean(axis=0)), 0.4)
     )
 
 
