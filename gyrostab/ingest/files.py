@@ -167,13 +167,13 @@ def scan_file(path: str | Path, options: ReadOptions | None = None) -> FileSumma
     >>> summary.axes, summary.n_rows, summary.last
     (('x',), 2, np.datetime64('1970-01-01T00:00:00.500000000'))
     """
-    path = _fetch(Path(path))
+    path = _fetch_remote(Path(path))
     reader = _find_reader(path)
     with reading_of(path):
         return reader.scan(path, options or ReadOptions())
 
 
-def _fetch(path: Path) -> Path:
+def _fetch_remote(path: Path) -> Path:
     """Return a temporary copy of a file at an address; other paths and Zarr stores as they are."""
     url = find_url(path)
     return path if url is None or find_store(url) else fetch_file(url)
@@ -181,7 +181,7 @@ def _fetch(path: Path) -> Path:
 
 def read_file(path: Path, options: ReadOptions) -> xr.Dataset:
     """Read one file into a raw log, or open it as a regular log."""
-    path = _fetch(path)
+    path = _fetch_remote(path)
     reader = _find_reader(path)
     with reading_of(path):
         return reader.read(path, options)

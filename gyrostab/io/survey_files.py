@@ -257,48 +257,48 @@ def _make_witsml(
             "uuid": _make_uuid(name),
         },
     )
-    _add(root, "eml:Citation", {
+    _add_element(root, "eml:Citation", {
         "eml:Title": name, "eml:Originator": "gyrostab",
         "eml:Creation": f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}", "eml:Format": "gyrostab",
         "eml:Description": " ".join(model.remarks)[:_MAX_TEXT],
     })  # fmt: skip
-    _add(root, "Application", model.conditions[:_MAX_TEXT])
-    _add(root, "Source", model.origin[0][:_MAX_TEXT])
-    _add(root, "ToolKind", "gyroscopic")
-    _add(root, "ToolSubKind", "north seeking gyro" if "x" in model.tool else "unknown")
-    _add(root, "MisalignmentMode", "3")
-    constraints = _add(root, "OperatingConstraints")
+    _add_element(root, "Application", model.conditions[:_MAX_TEXT])
+    _add_element(root, "Source", model.origin[0][:_MAX_TEXT])
+    _add_element(root, "ToolKind", "gyroscopic")
+    _add_element(root, "ToolSubKind", "north seeking gyro" if "x" in model.tool else "unknown")
+    _add_element(root, "MisalignmentMode", "3")
+    constraints = _add_element(root, "OperatingConstraints")
     for channel, (low, high, unit) in model.validity.items():
-        _add(constraints, "CustomRange", {
+        _add_element(constraints, "CustomRange", {
             "EndInclusive": "true", "StartInclusive": "true", "Start": low, "End": high,
             "Title": channel, "Uom": unit,
         })  # fmt: skip
-    _add(root, "Authorization", {
+    _add_element(root, "Authorization", {
         "ApprovalAuthority": "none: to be confirmed by a survey engineer",
         "RevisionComment": model.notes[0], "Status": "provisional",
     })  # fmt: skip
     for term in _exported_terms(model, running_speed):
-        value = _add(root, "ErrorTermValue")
-        _add(value, "Magnitude", term.value).set("uom", _WITSML_UNITS[term.unit])
-        reference = _add(value, "ErrorTerm", {
+        value = _add_element(root, "ErrorTermValue")
+        _add_element(value, "Magnitude", term.value).set("uom", _WITSML_UNITS[term.unit])
+        reference = _add_element(value, "ErrorTerm", {
             "eml:Uuid": _make_uuid(term.code), "eml:QualifiedType": "witsml21.ErrorTerm",
             "eml:Title": term.code,
         })  # fmt: skip
         for key in ("status", "low", "high", "mode", "propagation", "derivation"):
-            _add(reference, "eml:ExtensionNameValue", {
+            _add_element(reference, "eml:ExtensionNameValue", {
                 "eml:Name": key, "eml:Value": getattr(term, key),
             })  # fmt: skip
-    _add_gyros(_add(root, "GyroToolConfiguration"), model, running_speed, continuous_from)
+    _add_gyros(_add_element(root, "GyroToolConfiguration"), model, running_speed, continuous_from)
     ET.indent(root)
     return f"{ET.tostring(root, encoding='unicode', xml_declaration=True)}\n"
 
 
-def _add(parent: ET.Element, tag: str, content: Any = None) -> ET.Element:
+def _add_element(parent: ET.Element, tag: str, content: Any = None) -> ET.Element:
     """Add an element with a text, with elements that each have a text, or empty."""
     element = ET.SubElement(parent, tag)
     if isinstance(content, dict):
         for name, text in content.items():
-            _add(element, name, text)
+            _add_element(element, name, text)
     elif content is not None:
         element.text = str(content)
     return element
@@ -308,19 +308,19 @@ def _add_gyros(
     parent: ET.Element, model: SurveyModel, running_speed: float | None, continuous_from: float
 ) -> None:
     """Add where the gyros survey continuously and where they stop at stations."""
-    _add(parent, "ExternalReference", "true" if model.tool == "z" else "false")
+    _add_element(parent, "ExternalReference", "true" if model.tool == "z" else "false")
     start = continuous_from if model.tool == "xy" else 0.0
     if running_speed is not None:
-        gyro = _add(parent, "ContinuousGyro", {"AxisCombination": model.tool})
+        gyro = _add_element(parent, "ContinuousGyro", {"AxisCombination": model.tool})
         _add_range(gyro, start, 180.0)
-        _add(gyro, "Speed", running_speed).set("uom", "m/s")
-        _add(gyro, "Initialization", start).set("uom", "dega")
+        _add_element(gyro, "Speed", running_speed).set("uom", "m/s")
+        _add_element(gyro, "Initialization", start).set("uom", "dega")
     if model.tool != "z":
-        gyro = _add(parent, "StationaryGyro", {"AxisCombination": model.tool})
+        gyro = _add_element(parent, "StationaryGyro", {"AxisCombination": model.tool})
         _add_range(gyro, 0.0, 180.0 if running_speed is None else start)
 
 
 def _add_range(parent: ET.Element, start: float, end: float) -> None:
-    _add(parent, "Range", {
+    _add_element(parent, "Range", {
         "EndInclusive": "true", "StartInclusive": "true", "Start": start, "End": end, "Uom": "dega",
     })  # fmt: skip

@@ -194,16 +194,17 @@ def describe_windows(part: xr.Dataset) -> list[dict[str, Any]]:
             "time": str(stamps[j]),
             "end": str(ends[j]),
             "axes": {
-                axis: {name: _plain(values[i, j]) for name, values in fields.items()}
+                axis: {name: _finite_or_none(values[i, j]) for name, values in fields.items()}
                 for i, axis in enumerate(axes)
             },
             "channels": {
-                name: (_plain(values[j]), units) for name, (values, units) in channels.items()
+                name: (_finite_or_none(values[j]), units)
+                for name, (values, units) in channels.items()
             },
         }
         for j in range(part.sizes["time"])
     ]
 
 
-def _plain(value: Any) -> float | None:
+def _finite_or_none(value: Any) -> float | None:
     return float(value) if np.isfinite(value) else None

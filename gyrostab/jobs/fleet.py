@@ -301,7 +301,7 @@ def _compute_runs(
     stage("computing", len(waiting), 0, "runs")
     try:
         with _without_notes():
-            for _, row in run_calls(pool, ((work, _pack(item)) for item in waiting)):
+            for _, row in run_calls(pool, ((work, _pack_run(item)) for item in waiting)):
                 rows[row["run"]] = row
                 done += 1
                 stage("computing", len(waiting), done, "runs")
@@ -319,7 +319,7 @@ def _compute_runs(
         _write_rows(table, target)
         _write_overview(table, target)
         if _is_zarr(target):
-            _consolidate(target, list(rows))
+            _consolidate_metadata(target, list(rows))
     return table
 
 
@@ -345,7 +345,7 @@ def _is_current(
     return bool(row["job"] == made_by == find_job_name(item.files, **options))
 
 
-def _pack(item: LogRun) -> dict[str, Any]:
+def _pack_run(item: LogRun) -> dict[str, Any]:
     return {**asdict(item), "files": [os.path.abspath(path) for path in item.files]}
 
 
@@ -532,7 +532,7 @@ def _write_overview(table: pd.DataFrame, target: Path) -> None:
     write_overview(table, target / "index.html", effects=effects, overwrite=True)
 
 
-def _consolidate(target: Path, names: Sequence[str]) -> None:
+def _consolidate_metadata(target: Path, names: Sequence[str]) -> None:
     """Write the metadata of all groups in one file, from those that each group has."""
     metadata: dict[str, Any] = {
         ".zgroup": {"zarr_format": 2},

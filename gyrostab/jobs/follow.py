@@ -131,10 +131,10 @@ class RowKeeper:
         self.error: Exception | None = None
         folder.mkdir(exist_ok=True)
         self._files = sorted(folder.glob(_ROW_FILE.format(0).replace("000000", "*")))
-        self._thread = threading.Thread(target=self._copy, args=(stream,), daemon=True)
+        self._thread = threading.Thread(target=self._copy_stream, args=(stream,), daemon=True)
         self._thread.start()
 
-    def _copy(self, stream: Any) -> None:
+    def _copy_stream(self, stream: Any) -> None:
         try:
             read = getattr(stream, "read1", stream.read)
             for block in _split_blocks(iter(lambda: read(_READ_BYTES), b"")):

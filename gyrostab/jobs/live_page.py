@@ -109,13 +109,13 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(403)
         elif self.path == "/":
             text = resources.files("gyrostab.report").joinpath("live.html").read_bytes()
-            self._send(text, "text/html; charset=utf-8")
+            self._send_reply(text, "text/html; charset=utf-8")
         elif self.path == "/state.json":
-            self._send(self.page.state(), "application/json")
+            self._send_reply(self.page.state(), "application/json")
         else:
             self.send_error(404)
 
-    def _send(self, content: bytes, kind: str) -> None:
+    def _send_reply(self, content: bytes, kind: str) -> None:
         self.send_response(200)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(content)))

@@ -58,7 +58,7 @@ __all__ = ["count_samples", "find_job_name", "load_log", "read_job_name", "run"]
 
 #: Options of `check_output` for a NetCDF file and for a Zarr group.
 _FORMS: dict[bool, dict[str, Any]] = {
-    False: {"suffixes": [".nc"]},
+    False: {"suffixes": [".nc", ".zarr"]},
     True: {"find_foreign": find_foreign_item},
 }
 

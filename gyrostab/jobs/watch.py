@@ -158,13 +158,15 @@ def watch(
                     keeper = RowKeeper(stream or sys.stdin.buffer, rows_folder(path))
                     source = str(rows_folder(path))
                 view = _View(path, options, wait, list(alarms), listener, state)
-                _follow(view, source, keeper, quiet, poll)
+                _follow_source(view, source, keeper, quiet, poll)
             finally:
                 remove_job(folder, output=resolve_link(path))
     return path
 
 
-def _follow(view: _View, source: str, keeper: RowKeeper | None, quiet: float, poll: float) -> None:
+def _follow_source(
+    view: _View, source: str, keeper: RowKeeper | None, quiet: float, poll: float
+) -> None:
     """Update a view until the stream has ended, nothing has come for long, or Ctrl-C."""
     changed = time.monotonic()
     with contextlib.suppress(KeyboardInterrupt):
@@ -269,11 +271,11 @@ class _View:
             return
         begun = time.monotonic()
         try:
-            self._update(final=final)
+            self._update_product(final=final)
         except (FormatError, TimeError) as error:
             if final and not self.state.exists:
                 raise
-            self._note(f"waiting: {error}")
+            self._show_note(f"waiting: {error}")
         self.is_new_data = False
         spent = time.monotonic() - begun
         self.next_update = time.monotonic() + spent * (1.0 / _MAX_WORK_SHARE - 1.0)
@@ -284,7 +286,7 @@ class _View:
         needed = _DUE_SHARE * self.missing_samples * self.bytes / max(self.samples, 1)
         return time.monotonic() >= self.next_update and held >= self.bytes + needed
 
-    def _note(self, text: str) -> None:
+    def _show_note(self, text: str) -> None:
         """Show a note once, and again when the number of rows in it changes."""
         counts = any(kind in text for kind in _COUNTED_NOTES)
         key = text if counts else re.sub(r"\d+", "", text)
@@ -292,18 +294,18 @@ class _View:
             self.notes.add(key)
             self.listener.show_note(text)
 
-    def _load(self) -> xr.Dataset:
+    def _load_rows(self) -> xr.Dataset:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             log = load_log(
                 list(self.memory.files), **self.options["reading"], read=self.memory.read
             )
         for warning in caught:
-            self._note(str(warning.message))
+            self._show_note(str(warning.message))
         return log
 
-    def _update(self, *, final: bool) -> None:
-        log, windows = self._load(), self.options["windows"]
+    def _update_product(self, *, final: bool) -> None:
+        log, windows = self._load_rows(), self.options["windows"]
         self.bytes = sum(state.size for state in self.memory.files.values())
         self.samples = log.sizes["time"]
         rate = float(log.attrs["sampling_rate_hz"])
@@ -330,9 +332,9 @@ class _View:
         )
         digests = [hash_samples(log, span, common) for span in spans]
         same_record, self.common = common == self.common, common
-        self._write(used, units, digests, fitting or {}, same_record=same_record)
+        self._write_product(used, units, digests, fitting or {}, same_record=same_record)
 
-    def _write(
+    def _write_product(
         self,
         log: xr.Dataset,
         units: list[slice],
@@ -356,7 +358,7 @@ class _View:
                 if windows and not self.shown:
                     check_alarms(self.alarms, windows[0])
                 yield part, result.assign_attrs(attrs)
-                self._show(windows)
+                self._show_windows(windows)
 
         changed = [part for part, is_same in zip(units, same, strict=True) if not is_same]
         layout = {"size": units[-1].stop, "unit": units[0].stop}
@@ -373,7 +375,7 @@ class _View:
                 "the windows there were computed again"
             )
 
-    def _show(self, windows: Sequence[Mapping[str, Any]]) -> None:
+    def _show_windows(self, windows: Sequence[Mapping[str, Any]]) -> None:
         """Show new windows and alarms; windows of an earlier call only set the alarms."""
         for window in windows:
             self.shown += 1

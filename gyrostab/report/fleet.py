@@ -79,12 +79,12 @@ def write_overview(
 
 def _find_axes(table: pd.DataFrame) -> list[str]:
     """Find the axes in the names of the columns, ``N_x [deg/sqrt(h)]``."""
-    pattern = re.compile(re.escape(_column("N", "AXIS")).replace("AXIS", "(.+)"))
+    pattern = re.compile(re.escape(_column_name("N", "AXIS")).replace("AXIS", "(.+)"))
     names = [match[1] for match in map(pattern.fullmatch, map(str, table.columns)) if match]
     return sorted(name for name in names if not name.endswith("_upper"))
 
 
-def _column(term: str, axis: str, kind: str = "") -> str:
+def _column_name(term: str, axis: str, kind: str = "") -> str:
     return f"{term}_{axis}{kind} [{LAWS[term].label}]"
 
 
@@ -104,7 +104,7 @@ def _describe_tool(tool: str, part: pd.DataFrame, axes: list[str]) -> dict[str, 
     for term in LAWS:
         lines = []
         for axis in axes:
-            values = part[_column(term, axis)].dropna()
+            values = part[_column_name(term, axis)].dropna()
             if len(values):
                 low, middle, high = np.quantile(values, [0.0, 0.5, 1.0])
                 lines.append(f"{axis} {middle:.3g} ({low:.3g} to {high:.3g})")
@@ -168,7 +168,7 @@ def _describe_term(row: Mapping[Any, Any], term: str, axes: list[str]) -> dict[s
     """Give the medians of a term by axis, or upper limits, and the largest for sorting."""
     texts, values = [], [0.0]
     for axis in axes:
-        value, limit = (row.get(_column(term, axis, kind), np.nan) for kind in ("", "_upper"))
+        value, limit = (row.get(_column_name(term, axis, kind), np.nan) for kind in ("", "_upper"))
         if np.isfinite(value):
             texts.append(f"{value:.3g}")
             values.append(float(value))
@@ -195,7 +195,7 @@ def _plot_noise(done: pd.DataFrame, axes: list[str]) -> Any:
     times = (done["start"] + (done["end"] - done["start"]) / 2).to_numpy()
     common = list(done["tool"].value_counts().index[: len(COLOURS)])
     for panel, axis in zip(panels, axes, strict=True):
-        values = done[_column("N", axis)].to_numpy()
+        values = done[_column_name("N", axis)].to_numpy()
         others = ~done["tool"].isin(common).to_numpy()
         panel.plot(times[others], values[others], "o", color=GREY, markersize=3)
         for tool, colour in zip(common, COLOURS, strict=False):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 __all__ = ["find_families", "group_families"]
 
@@ -71,7 +71,7 @@ def _try_families(
                 share = 2.0 * resolution * min(1.0 / spacing, 2.0 * highest / bandwidth)
                 own = 2 if centre else 1  # lines that define the family
                 tried = math.comb(lines.size, own) * order**2
-                chance = binom.sf(len(members) - own - 1, lines.size - own, min(share, 1.0))
+                chance = bdtrc(len(members) - own - 1, lines.size - own, min(share, 1.0))
                 label = (
                     f"side bands of {centre:.4g} Hz, {spacing:.4g} Hz apart"
                     if centre

@@ -34,7 +34,7 @@ class Messages:
         """Add a message; fields that it lacks are NaN, and a stamp beyond 64 bits is NaT."""
         for name, value in values.items():
             column = self.columns.setdefault(name, array("d"))
-            self._fill(column)
+            self._fill_column(column)
             column.append(value)
         self.stamps.append(stamp if abs(stamp) < 2**63 else NAT)
 
@@ -51,7 +51,7 @@ class Messages:
         in the form of ``--map``.
         """
         for column in self.columns.values():
-            self._fill(column)
+            self._fill_column(column)
         stamps = np.frombuffer(self.stamps, dtype=np.int64)
         return Table(
             len(stamps),
@@ -63,6 +63,6 @@ class Messages:
             tuple((meanings or {}).get(name) for name in self.columns),
         )
 
-    def _fill(self, column: array[float]) -> None:
+    def _fill_column(self, column: array[float]) -> None:
         if len(column) < len(self.stamps):
             column.extend([np.nan] * (len(self.stamps) - len(column)))

@@ -78,7 +78,7 @@ def _read_topics(path: Path) -> tuple[list[Table], list[str]]:
                 continue
             message = reader.deserialize(raw, connection.msgtype)
             messages = found.setdefault((connection.topic, connection.msgtype), Messages())
-            messages.add(_stamp(message) or received, dict(_numbers(message)))
+            messages.add(_message_time(message) or received, dict(_select_numbers(message)))
     fields = [(topic, name) for (topic, _), one in found.items() for name in one.columns]
     names = iter(plain_names(fields))
     tables = [
@@ -89,17 +89,17 @@ def _read_topics(path: Path) -> tuple[list[Table], list[str]]:
     return tables, notes
 
 
-def _stamp(message: Any) -> int:
+def _message_time(message: Any) -> int:
     """Return the stamp in the header [ns since 1970], 0 without one."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     return 0 if stamp is None else int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
-def _numbers(message: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
+def _select_numbers(message: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
     """Yield names and values of the numbers in a message, also of messages within it."""
     for field in dataclasses.fields(message):
         value = getattr(message, field.name)
         if isinstance(value, int | float):
             yield prefix + field.name, float(value)
         elif dataclasses.is_dataclass(value) and field.name != "header":
-            yield from _numbers(value, f"{prefix}{field.name}.")
+            yield from _select_numbers(value, f"{prefix}{field.name}.")

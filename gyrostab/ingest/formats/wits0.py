@@ -56,8 +56,8 @@ def _read_records(path: Path) -> list[Table]:
         while line := file.readline(_LONGEST_LINE):
             if line.startswith(("&&", "!!")):
                 for record, values in frame.items():
-                    stamp = _stamp(values.pop("05", "") + values.pop("06", ""))
-                    numbers = {record + item: _number(text) for item, text in values.items()}
+                    stamp = _parse_stamp(values.pop("05", "") + values.pop("06", ""))
+                    numbers = {record + item: _parse_number(text) for item, text in values.items()}
                     records.setdefault(record, Messages()).add(stamp, numbers)
                 frame = {}
             elif item := _ITEM.match(line):
@@ -65,7 +65,7 @@ def _read_records(path: Path) -> list[Table]:
     return [messages.make_table() for messages in records.values()]
 
 
-def _stamp(text: str) -> int:
+def _parse_stamp(text: str) -> int:
     try:
         date = datetime.strptime(text, "%y%m%d%H%M%S").replace(tzinfo=UTC)
     except ValueError:
@@ -73,7 +73,7 @@ def _stamp(text: str) -> int:
     return int(date.timestamp()) * 10**9
 
 
-def _number(text: str) -> float:
+def _parse_number(text: str) -> float:
     try:
         return float(text)
     except ValueError:

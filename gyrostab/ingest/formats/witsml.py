@@ -57,7 +57,7 @@ def _read_logs(path: Path) -> Iterator[Table]:
     """
     found = 0
     for _, log in ElementTree.iterparse(path):
-        if _name(log) == "log":
+        if _local_name(log) == "log":
             table = _make_table(log)
             log.clear()
             if table is not None:
@@ -71,15 +71,15 @@ def _read_logs(path: Path) -> Iterator[Table]:
 
 
 def _make_table(log: Any) -> Table | None:
-    if "time" not in _text(log, "indexType").lower():
+    if "time" not in _child_text(log, "indexType").lower():
         return None
     names, units, lines = [], {}, []
     for element in log.iter():
-        if _name(element) == "logCurveInfo":
-            units[_text(element, "mnemonic")] = _text(element, "unit")
-        elif _name(element) == "mnemonicList":
+        if _local_name(element) == "logCurveInfo":
+            units[_child_text(element, "mnemonic")] = _child_text(element, "unit")
+        elif _local_name(element) == "mnemonicList":
             names = [name.strip() for name in (element.text or "").split(",")]
-        elif _name(element) == "data" and element.text:
+        elif _local_name(element) == "data" and element.text:
             lines.append(element.text.strip())
     names = names or list(units)
     if not lines or not names:
@@ -89,10 +89,10 @@ def _make_table(log: Any) -> Table | None:
         header=None,
         names=range(len(names)),
         index_col=False,
-        na_values=[_text(log, "nullValue")],
+        na_values=[_child_text(log, "nullValue")],
         on_bad_lines="skip",
     )
-    index = _text(log, "indexCurve")
+    index = _child_text(log, "indexCurve")
     place = names.index(index) if index in names else 0
     stamps = texts_to_ns(cells[place].astype(str).tolist()).view("datetime64[ns]")
     kept = [number for number in range(len(names)) if number != place]
@@ -105,11 +105,11 @@ def _make_table(log: Any) -> Table | None:
     )
 
 
-def _name(element: Any) -> str:
+def _local_name(element: Any) -> str:
     """Return the name of an element without its namespace."""
     return str(element.tag).rpartition("}")[2]
 
 
-def _text(parent: Any, name: str) -> str:
+def _child_text(parent: Any, name: str) -> str:
     """Return the text of a child, empty if there is none."""
-    return next(((child.text or "").strip() for child in parent if _name(child) == name), "")
+    return next(((child.text or "").strip() for child in parent if _local_name(child) == name), "")
