@@ -34,6 +34,7 @@ from gyrostab.errors import OptionError
 from gyrostab.io.survey_model import SurveyModel, SurveyTerm
 from gyrostab.io.survey_terms import survey_terms
 from gyrostab.store.output import check_output, new_output
+from gyrostab.units import HOUR
 
 __all__ = ["SUFFIXES", "WEIGHTS", "to_iscwsa"]
 
@@ -170,7 +171,7 @@ def _make_json(
     parameters: dict[str, Any] = {"inc_min": 0, "inc_max": 180, "noise_reduction_factor": 1.0}
     start = math.inf if running_speed is None else continuous_from if model.tool == "xy" else -1.0
     if running_speed is not None:
-        parameters["gxy_running_speed"] = running_speed * 3600.0  # m/h
+        parameters["gxy_running_speed"] = running_speed * HOUR  # m/h
         parameters["xy_static_gyro_end_inc"] = math.radians(start)
     content = {
         "$schema": "https://github.com/iscwsa/error-models/blob/main/schemas/draft.json",

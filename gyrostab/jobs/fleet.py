@@ -450,7 +450,7 @@ def summarise_run(product: xr.Dataset) -> dict[str, Any]:
     >>> noise[30_000:36_000] *= 3.0
     >>> log = make_log(noise, rate=100.0, unit="deg/h")
     >>> row = summarise_run(fit_noise(davar(log, window="1min", step="1min")))
-    >>> round(row["N_x [deg/sqrt(h)]"], 4), str(row["worst_window"])[11:19]
+    >>> round(row["N_x [deg/sqrt(h)]"], 3), str(row["worst_window"])[11:19]
     (0.01, '00:05:30')
     """
     from gyrostab.allan.summary import summarise_fit, summarise_terms

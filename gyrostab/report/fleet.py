@@ -27,6 +27,7 @@ from gyrostab.plot.style import (
 )
 from gyrostab.report.page import page_text
 from gyrostab.store.output import new_output
+from gyrostab.units import HOUR
 
 __all__ = ["combine_effects", "write_overview"]
 
@@ -92,7 +93,7 @@ def _summarise_fleet(table: pd.DataFrame, done: pd.DataFrame, failed: pd.DataFra
     runs, tools = len(table), table["tool"].nunique()
     text = f"{runs} run{'s' * (runs != 1)} of {tools} tool{'s' * (tools != 1)}"
     if len(done):
-        hours = done["span [s]"].sum() / 3600.0
+        hours = done["span [s]"].sum() / HOUR
         first, last = done["start"].min(), done["end"].max()
         text += f", {hours:.4g} h of logs from {first:%Y-%m-%d} to {last:%Y-%m-%d}"
     return text + (f". {len(failed)} failed." if len(failed) else ". None failed.")

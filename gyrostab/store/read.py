@@ -73,7 +73,8 @@ def _open_remote(path: Path, url: str) -> xr.Dataset:
     address = find_store(url)
     if address is None:
         raise FormatError(f"{url}: is not a Zarr store; copy the file here, and give the copy")
-    with reaching(url):
+    with reaching(url), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # without consolidated metadata
         stored = xr.open_dataset(
             address, engine="zarr", chunks=None, decode_times=False, create_default_indexes=False
         )
