@@ -289,6 +289,12 @@ def check_log(log: xr.Dataset, *, rate: bool = True) -> None:
     _check_units(log, name)
     if log.sizes["axis"] == 0 or log.sizes["time"] == 0:
         raise SchemaError("the log is empty: it has no axis or no sample")
+    names = [str(axis) for axis in log["axis"].values]
+    if len(set(names)) < len(names):
+        raise SchemaError(
+            f"the axes {', '.join(map(repr, names))} have names in common; rename them with "
+            "log.assign_coords(axis=[...])"
+        )
     declared = log.attrs.get("sampling_rate_hz")
     if rate and (declared is None or not np.isfinite(declared) or declared <= 0):
         raise SchemaError(

@@ -154,6 +154,7 @@ def _round_up(needed: float) -> str:
     >>> _round_up(1_010_000), _round_up(7)
     ('1.1e+06', '7')
     """
+    needed = float(min(needed, 1e300))  # damaged files declare integers beyond any float
     digits = 10.0 ** (max(np.floor(np.log10(max(needed, 1.0))), 1.0) - 1.0)
     return f"{np.ceil(needed / digits) * digits:.2g}"
 

@@ -87,16 +87,20 @@ def _waveform_clock(path: Path, channel: Any) -> tuple[float, Any] | None:
         if start is None or np.datetime64(start, "us") < _FIRST_DATE
         else np.datetime64(start, "us")
     )
-    if start is not None:
-        began = int(dates_to_ns(np.array(start)))
-        if began == NAT:
-            raise FormatError(
-                f"{path.name}: channel {channel.name!r} begins at {start}, which is after the "
-                "year 2262; correct wf_start_time"
-            )
-        start = np.datetime64(began, "ns")
-    offset = round(float(properties.get("wf_start_offset") or 0.0) * 1e9)
-    return step, offset if start is None else start + np.timedelta64(offset, "ns")
+    began = 0 if start is None else int(dates_to_ns(np.array(start)))
+    if began == NAT:
+        raise FormatError(
+            f"{path.name}: channel {channel.name!r} begins at {start}, which is after the "
+            "year 2262; correct wf_start_time"
+        )
+    offset = float(properties.get("wf_start_offset") or 0.0)
+    if not (step < np.inf and abs(offset) * 1e9 + abs(began) < np.iinfo(np.int64).max):
+        raise FormatError(
+            f"{path.name}: channel {channel.name!r} has wf_increment {step} and wf_start_offset "
+            f"{offset}; correct them"
+        )
+    first = round(offset * 1e9)
+    return step, first if start is None else np.datetime64(began + first, "ns")
 
 
 def _make_table(members: list[tuple[str, Any]], clock: tuple[float, Any] | None) -> Table:
