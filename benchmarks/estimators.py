@@ -27,7 +27,7 @@ from scipy.optimize import least_squares, nnls
 from scipy.stats import chi2
 
 from gyrostab import davar, fit_noise, make_log
-from gyrostab.allan import fit
+from gyrostab.allan import window_fit
 from gyrostab.kernels.spectra.expected import sample_covariance
 from gyrostab.noise import LAWS, NORMAL_95, TERMS, avar_columns
 
@@ -184,7 +184,7 @@ def fit_gmwm(records: Records) -> Estimates:
     under this fit; that is exact here, where `simts` takes it from simulated records.
     """
     n, (ks, avar) = records.values.shape[1], records.octaves
-    tables = fit._cached_tables(tuple(ks.tolist()), (0,) * ks.size, records.rate, n)
+    tables = window_fit.fit_tables(tuple(ks.tolist()), (0,) * ks.size, records.rate, n)
     columns, wavelet = tables.columns / 2, avar / 2
     freedom = np.maximum((n - 2 * ks + 1) / (2 * ks), 1.0)
     width = freedom / chi2.ppf(0.025, freedom) - freedom / chi2.ppf(0.975, freedom)
@@ -277,7 +277,7 @@ def compare(seconds: float, rate: float, trials: int, mixtures: tuple[str, ...] 
     """Yield mixture, term, relative bound, and per estimator its figures and processor time."""
     n = int(seconds * rate)
     units, parts = make_units(np.random.default_rng([n, 1]), trials, n, rate)
-    tables = fit._cached_tables(*_default_factors(parts[1][:1], rate), rate, n)
+    tables = window_fit.fit_tables(*_default_factors(parts[1][:1], rate), rate, n)
     likelihood = Cosines(n, rate)
     for mixture in mixtures:
         squares = choose_squares(tables, mixture)

@@ -22,7 +22,7 @@ import numpy as np
 from page import machine, renew
 
 from gyrostab import davar, fit_noise, make_log
-from gyrostab.allan import fit
+from gyrostab.allan import fit, window_fit
 from gyrostab.kernels.fit.covariance import diagonal_products
 from gyrostab.kernels.fit.least_squares import cell_freedoms, combine_diagonal, identify_noise
 from tests.support.noise_records import lose, quantization, random_walk, white
@@ -59,13 +59,13 @@ def measure(x: np.ndarray, taus: int, repeats: int) -> tuple[int, list[float]]:
     flat = [np.ascontiguousarray(cell.reshape(-1, ks.size), dtype=np.float64) for cell in cells[:5]]
     trends = [cell.reshape(-1) for cell in cells[5:]]
     shifts = np.zeros_like(ks)
-    tables = fit._cached_tables(tuple(ks.tolist()), tuple(shifts.tolist()), rate, window)
+    tables = window_fit.fit_tables(tuple(ks.tolist()), tuple(shifts.tolist()), rate, window)
     seen = (tables.columns, tables.weight, tables.to_samples)
     diagonal = combine_diagonal(*diagonal_products(window, ks, shifts))
     whole = best(lambda: fit_noise(surface), repeats)
-    kernel = best(lambda: fit._run_kernel(flat, *trends, tables, 31), repeats)
+    kernel = best(lambda: window_fit.run_kernel(flat, *trends, tables, 31), repeats)
     block = best(
-        lambda: fit._fit_block(flat, *trends, tables, allowed=31, observed_only=True), repeats
+        lambda: window_fit.fit_block(flat, *trends, tables, allowed=31, observed_only=True), repeats
     )
     seconds = [
         whole,
@@ -79,7 +79,7 @@ def measure(x: np.ndarray, taus: int, repeats: int) -> tuple[int, list[float]]:
             repeats,
         ),
     ]
-    once = best(lambda: fit._Tables(ks, shifts, rate, window), 1)
+    once = best(lambda: window_fit.FitTables(ks, shifts, rate, window), 1)
     return ks.size, [1e6 * s / flat[0].shape[0] for s in seconds] + [once]
 
 

@@ -23,7 +23,7 @@ from page import renew
 from scipy.optimize import brentq
 
 from gyrostab import davar, fit_noise, make_log
-from gyrostab.allan import fit
+from gyrostab.allan import window_fit
 from gyrostab.noise import NORMAL_95, TERMS
 from tests.support.noise_records import flicker, lose, quantization, random_walk, white
 
@@ -77,7 +77,7 @@ def mix(white_surface: xr.Dataset, parts, trends, squares: np.ndarray) -> xr.Dat
     )
 
 
-def choose_squares(tables: fit._Tables, mixture: str) -> np.ndarray:
+def choose_squares(tables: window_fit.FitTables, mixture: str) -> np.ndarray:
     """Find the squared coefficients of a mixture such as ``QmKs`` on white noise."""
 
     def excess(log_square: float, term: int, wanted: float) -> float:
@@ -142,7 +142,7 @@ def main() -> None:
             rng = np.random.default_rng([n, int(10 * share)])
             whole, parts, trends = simulate_units(rng, trials, n, rate, share)
             ks = np.round(whole.tau.values * rate).astype(np.int64)
-            tables = fit._cached_tables(tuple(ks.tolist()), (0,) * ks.size, rate, n)
+            tables = window_fit.fit_tables(tuple(ks.tolist()), (0,) * ks.size, rate, n)
             for mixture in MIXTURES:
                 squares = choose_squares(tables, mixture)
                 product = fit_noise(mix(whole, parts, trends, squares), observed_only=False)

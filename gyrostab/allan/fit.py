@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from functools import lru_cache
 from typing import Any
 
 import dask.array as da
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.special import gammaincc, gammaincinv
 
 from gyrostab.allan.band_limit import (
     BandLimit,
@@ -19,35 +17,18 @@ from gyrostab.allan.band_limit import (
     find_band_limit,
 )
 from gyrostab.allan.plan import thin_factors
-from gyrostab.allan.variance import variance_columns, white_freedoms
+from gyrostab.allan.window_fit import FitTables, fit_block, fit_tables, run_kernel
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.kernels.allan.variances import VARIANCES
-from gyrostab.kernels.fit.covariance import STOCHASTIC, product_tables
-from gyrostab.kernels.fit.least_squares import FIT_FIELDS, combine_diagonal, fit_windows
-from gyrostab.kernels.fit.limits import cell_limits, estimate_bounds
-from gyrostab.kernels.fit.third_differences import third_tables
-from gyrostab.kernels.fit.trend import detrend_tables
-from gyrostab.noise import HOUR, LAWS, NORMAL_95, TERMS, avar_columns, sample_squares
+from gyrostab.kernels.fit.covariance import STOCHASTIC
+from gyrostab.kernels.fit.least_squares import FIT_FIELDS
+from gyrostab.noise import LAWS, TERMS, avar_columns
 from gyrostab.schema import attributes, check_surface
 from gyrostab.time.durations import duration_seconds, thin
 
-__all__ = ["Bands", "find_bands", "fit_noise", "fit_part", "is_described", "refit"]
+__all__ = ["Bands", "find_bands", "fit_noise", "fit_part", "refit"]
 
 #: Band limit of each axis, by its name.
 Bands = Mapping[str, tuple[float, ...]]
-
-#: One-sided normal quantiles: 95 % for limits, 99 % for an observed term; two-sided 99 %, for the
-#: sign of a ramp is unknown.
-_LIMIT_SIGMA, _OBSERVED_SIGMA, _RAMP_SIGMA = 1.6449, 2.3263, 2.5758
-#: Probability of a misfit by chance below which the model does not fit a window.
-_MISFIT_PROBABILITY = 1e-3
-#: Ratio of the averaging times, from the longest down, that bound the terms (except Q) of a window
-#: that the model does not fit.
-_LIMIT_SPAN = 10.0
-#: Degrees of freedom above which the limit of a cell takes them as infinite.
-_MAX_FREEDOM = 1e6
-#: Smallest share of the column of a term that the other terms must not reproduce.
-_MIN_SEPARATION = 1e-4
 
 
 def fit_noise(
@@ -187,32 +168,6 @@ def _stored_bands(product: xr.Dataset) -> Bands:
     return dict(zip(map(str, product["axis"].values), limits, strict=True))
 
 
-def is_described(chi2: Any, dof: Any) -> Any:
-    """Test whether the sum of the fitted terms describes a window.
-
-    Parameters
-    ----------
-    chi2, dof : array_like
-        ``fit_chi2`` and ``fit_dof`` of a product [1].
-
-    Returns
-    -------
-    ndarray of bool
-        False where noise that the terms describe would exceed `chi2` in fewer than one window of
-        1000; True without degrees of freedom.
-
-    Examples
-    --------
-    >>> is_described([20.0, 900.0, np.nan], [16.0, 16.0, 0.0])
-    array([ True, False,  True])
-    """
-    chi2, dof = (
-        np.nan_to_num(np.asarray(chi2, np.float64)),
-        np.nan_to_num(np.asarray(dof, np.float64)),
-    )
-    return ~((dof > 0) & (gammaincc(np.maximum(dof, 1.0) / 2.0, chi2 / 2.0) < _MISFIT_PROBABILITY))
-
-
 def fit_part(surface: xr.Dataset, **options: Any) -> xr.Dataset:
     """Fit a part of a surface, immediately and in the calling thread.
 
@@ -328,7 +283,7 @@ def find_bands(
         response: NDArray[np.float64],
         allowed: int,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        result, misfit, _ = _run_kernel(rows, trend, response, tables, allowed)
+        result, misfit, _ = run_kernel(rows, trend, response, tables, allowed)
         return result[:, FIT_FIELDS.index("square")], misfit
 
     return {
@@ -423,15 +378,13 @@ _FIT_VARIABLES = (
 
 def _prepare_fit(
     surface: xr.Dataset, within: NDArray[np.int64]
-) -> tuple[list[Any], _Tables, NDArray[np.int64]]:
+) -> tuple[list[Any], FitTables, NDArray[np.int64]]:
     """Return the cells of a surface, and tables and positions of the averaging times to fit."""
     cells, ks, rate, window = _fit_inputs(surface)
     chosen = within[thin_factors(ks[within])]
     shifts = thin(ks[chosen]) if surface.attrs.get("overlap") == "octave" else np.zeros_like(chosen)
     variance = surface.attrs.get("variance", "avar")
-    tables = _cached_tables(
-        tuple(ks[chosen].tolist()), tuple(shifts.tolist()), rate, window, variance
-    )
+    tables = fit_tables(tuple(ks[chosen].tolist()), tuple(shifts.tolist()), rate, window, variance)
     return cells, tables, chosen
 
 
@@ -468,7 +421,7 @@ def _fit_gls(
         fitted = np.empty((trend.size, width))
         for rows, terms in ((filtered == 0, allowed), (filtered > 0, allowed & ~_bits("Q"))):
             if rows.any():
-                fitted[rows] = _fit_block(
+                fitted[rows] = fit_block(
                     [a[rows] for a in flat],
                     trend[rows],
                     response[rows],
@@ -508,227 +461,6 @@ def _fit_gls(
         edf = np.where(below, surface["edf"].data, fitted[..., 4 * n + 2 :])
         extra["edf"] = (("axis", "time", "tau"), edf, surface["edf"].attrs)
     return _assemble_product(surface, *(parts[i * n : (i + 1) * n] for i in range(4)), extra=extra)
-
-
-class _Tables:
-    """Tables that all windows of a surface share."""
-
-    def __init__(
-        self, ks: NDArray[np.int64], shifts: NDArray[np.int64], rate: float, window: int,
-        variance: str = "avar",
-    ):  # fmt: skip
-        self.columns = variance_columns(variance, ks, rate)
-        self.to_samples = sample_squares(rate)
-        if variance == "avar":
-            self.pairs, self.ramps = product_tables(window, ks, shifts)
-        else:
-            self.pairs, self.ramps = third_tables(variance, window, ks, shifts)
-        diagonal = np.einsum("abii->abi", self.pairs)
-        self.diagonal = combine_diagonal(diagonal, np.einsum("aii->ai", self.ramps))
-        summed = VARIANCES[variance].summed
-        self.trend = detrend_tables(window, ks, self.pairs, self.ramps, summed=summed)
-        #: Variance of the trend of a window per squared coefficient [degree2 hour-4].
-        self.trend_variance = (
-            self.trend.variance * self.to_samples[:STOCHASTIC] * (rate * HOUR) ** 2
-        )
-        self.weight = white_freedoms(variance, window, ks, diagonal)
-        own = np.einsum("aaii,a->ai", self.pairs, self.to_samples[:STOCHASTIC] ** 2)
-        #: Degrees of freedom of a cell in which a term is alone, (term, tau); a ramp alone does not
-        #: scatter.
-        self.own_dof = np.vstack(
-            [2.0 * self.columns.T[:STOCHASTIC] ** 2 / own, np.full(ks.size, np.inf)]
-        )
-        self.ks = ks.astype(np.float64)
-        self.quantile = _quantile_curve(0.05)
-
-
-def _quantile_curve(level: float) -> tuple[float, float, NDArray[np.float64]]:
-    """Tabulate the quantile q at `level` of chi-square over its degrees of freedom nu.
-
-    Returns start, step and ``nu ln q`` for `chi_square_quantile`. A step of 0.02 in ln nu leaves a
-    relative error of q below 1e-9.
-    """
-    start, step = (
-        np.log(0.01 * np.log(level) / np.log(0.05)),
-        0.02,
-    )  # from here on the quantile is above zero
-    freedom = np.exp(start + step * np.arange(int(np.log(1e15) / step)))
-    return (
-        float(start),
-        step,
-        np.asarray(freedom * np.log(gammaincinv(freedom / 2.0, level) * 2.0 / freedom)),
-    )
-
-
-@lru_cache(maxsize=4)
-def _cached_tables(
-    ks: tuple[int, ...],
-    shifts: tuple[int, ...],
-    rate: float,
-    window: int,
-    variance: str = "avar",
-) -> _Tables:
-    """Make the tables once for all parts of a record."""
-    factors, thinning = (np.array(values, dtype=np.int64) for values in (ks, shifts))
-    return _Tables(factors, thinning, rate, window, variance)
-
-
-def _fit_block(
-    flat: list[NDArray[np.float64]],
-    trend: NDArray[np.float64],
-    response: NDArray[np.float64],
-    tables: _Tables,
-    *,
-    white_error: NDArray[np.float64],
-    allowed: int,
-    observed_only: bool,
-) -> NDArray[np.float64]:
-    """Fit windows: coefficients, errors, limits, observability, chi2, dof and edf as columns.
-
-    `white_error` is the relative error of N that a window does not show.
-    """
-    result, misfit, dof = _run_kernel(flat, trend, response, tables, allowed)
-    field = {name: result[:, i] for i, name in enumerate(FIT_FIELDS)}
-    field["variance_square"][:, TERMS.index("N")] += (2.0 * white_error) ** 2
-    fails = _widen_misfits(field, misfit)
-    square = field["square"]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        visible = np.isfinite(square) & (field["separation"] > _MIN_SEPARATION)
-        observed = visible & (field["free"] > 0) & _exceed_chance(field) & ~fails[:, None]
-        value = np.sqrt(np.where(observed, field["free"], square))
-        stderr, limit = _bound_estimates(field, value)
-        limit[fails] = _limit_of_curve(
-            [cell[fails] for cell in flat], square[fails], dof[fails], tables
-        )
-        upper = np.where(visible & ~(observed & observed_only), np.sqrt(limit), np.nan)
-    reported = observed if observed_only else visible
-    stderr = np.where(reported, stderr, np.nan)
-    value = np.where(reported, value, np.nan)
-    observable = np.where(observed, 2.0, np.where(visible & np.isfinite(upper), 1.0, 0.0))
-    return np.concatenate([value, stderr, upper, observable, misfit, dof], axis=1)
-
-
-def _run_kernel(
-    flat: list[NDArray[np.float64]],
-    trend: NDArray[np.float64],
-    response: NDArray[np.float64],
-    tables: _Tables,
-    allowed: int,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Run `fit_windows`, less the trend if a ramp is allowed; other terms are NaN."""
-    trends = np.zeros((trend.size, STOCHASTIC + 1))
-    pairs, ramps = tables.pairs, tables.ramps
-    if allowed >> STOCHASTIC & 1:
-        pairs, ramps = tables.trend.pairs, tables.trend.ramps
-        trends[:, :STOCHASTIC] = tables.trend_variance
-        trends[:, TERMS.index("N")] *= response
-        trends[:, STOCHASTIC] = trend**2
-        trends = np.nan_to_num(trends)
-    noise = allowed if allowed & 15 else allowed | 1 << TERMS.index("N")  # for a ramp alone
-    result, misfit, dof = fit_windows(
-        *flat,
-        trends,
-        tables.columns,
-        tables.to_samples,
-        pairs,
-        ramps,
-        tables.diagonal,
-        tables.weight,
-        noise,
-    )
-    result[..., [not allowed >> a & 1 for a in range(len(TERMS))]] = np.nan
-    return result, misfit, dof
-
-
-def _exceed_chance(field: dict[str, NDArray[np.float64]]) -> NDArray[np.bool_]:
-    """Find the terms that noise without them exceeds in 1 % of windows, at most 3 %.
-
-    The likelihood ratio of the best submodels with and without the term must exceed chance, for a
-    ramp the trend of the window.
-    """
-    exceeds = field["likelihood_ratio"] > _OBSERVED_SIGMA**2
-    exceeds[:, 4] = np.sqrt(field["free"][:, 4]) > _RAMP_SIGMA * _trend_error(field, _RAMP_SIGMA)
-    return np.asarray(exceeds)
-
-
-def _trend_error(field: dict[str, NDArray[np.float64]], sigma: float) -> NDArray[np.float64]:
-    """Compute the standard error of the trend, of which `sigma` give an interval.
-
-    The variance v of the trend follows from the fitted noise, with a standard error w. To first
-    order in ``(w / v)^2``, the quantile of a normal variable of such a variance is that of
-    Student's t: ``sigma^2 v (1 + (sigma^2 + 1) / 4 (w / v)^2)``. Where the noise is hardly known,
-    the 95 % upper limit ``v + 1.64 w`` is lower, and sufficient.
-    """
-    variance = field["variance_null"][:, 4]
-    spread = np.sqrt(field["variance_linear"][:, 4])
-    ratio = np.where(variance > 0, spread / variance, 0.0)
-    wider = np.minimum(0.25 * (sigma**2 + 1.0) * ratio**2, _LIMIT_SIGMA * ratio)
-    return np.sqrt(variance * (1.0 + wider))
-
-
-def _widen_misfits(
-    field: dict[str, NDArray[np.float64]], misfit: NDArray[np.float64]
-) -> NDArray[np.bool_]:
-    """Find the windows that the model does not fit, and scale their variances by chi2 / dof."""
-    chi2, dof = misfit.T
-    fails = ~is_described(chi2, dof)
-    wider = np.where(fails, chi2 / np.maximum(dof, 1.0), 1.0)[:, None]
-    for name in ("variance_null", "variance_linear", "variance_square"):
-        field[name] *= wider
-    return np.asarray(fails)
-
-
-def _bound_estimates(
-    field: dict[str, NDArray[np.float64]], value: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Find standard errors of coefficients, and 95 % upper limits of their squares.
-
-    Interval and limit follow from `estimate_bounds`. 1.96 standard errors are half of the 95 %
-    interval; where it begins at zero, they reach its upper end at least.
-    """
-    names = ("free", "variance_null", "variance_linear", "variance_square")
-    scores = np.array([NORMAL_95, -NORMAL_95, -_LIMIT_SIGMA])
-    bounds = estimate_bounds(*(np.ravel(field[name]) for name in names), scores)
-    low, high, limit = bounds.reshape(3, *value.shape)
-    half = 0.5 * (np.sqrt(high) - np.sqrt(low))
-    half = np.where(low > 0, half, np.maximum(half, np.sqrt(high) - value))
-    trend = np.sqrt(field["free"][:, 4])
-    limit[:, 4] = (trend + _LIMIT_SIGMA * _trend_error(field, _LIMIT_SIGMA)) ** 2
-    stderr = half / NORMAL_95
-    stderr[:, 4] = _trend_error(field, NORMAL_95)
-    return stderr, limit
-
-
-def _limit_of_curve(
-    flat: list[NDArray[np.float64]],
-    square: NDArray[np.float64],
-    dof: NDArray[np.float64],
-    tables: _Tables,
-) -> NDArray[np.float64]:
-    """Find the 95 % upper limit of a squared coefficient without assuming the five-term model.
-
-    The part of a term cannot exceed the whole curve, because anything else in a cell, noise or not,
-    only adds to it. A filter, or an alias that looks like filtered noise, removes power and bends
-    the curve at short averaging times; therefore only the cells of the last decade are used.
-    Quantization, which dominates at the shortest times, is bounded by all cells. A ramp gets the
-    scatter of the noise that scatters most.
-    """
-    span = np.array([np.inf, *[_LIMIT_SPAN] * (len(TERMS) - 1)])
-    own_dof = np.vstack([tables.own_dof[:STOCHASTIC], tables.own_dof[:STOCHASTIC].min(axis=0)])
-    square = np.ascontiguousarray(square)
-    return np.asarray(
-        cell_limits(
-            *flat,
-            square,
-            dof,
-            tables.columns,
-            own_dof,
-            tables.ks,
-            span,
-            _MAX_FREEDOM,
-            *tables.quantile,
-        )
-    )
 
 
 def _assemble_product(

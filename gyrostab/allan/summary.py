@@ -9,8 +9,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.allan.fit import is_described, refit
+from gyrostab.allan.fit import refit
 from gyrostab.allan.judgement import judge_product
+from gyrostab.allan.window_fit import is_described
 from gyrostab.noise import LAWS
 from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY, check_product
 

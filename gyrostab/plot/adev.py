@@ -214,7 +214,7 @@ def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours:
 
 def _name_curve(window: xr.Dataset) -> str:
     """Label the fitted curve, with its misfit."""
-    from gyrostab.allan.fit import is_described
+    from gyrostab.allan.window_fit import is_described
 
     chi2, dof = float(window["fit_chi2"]), float(window["fit_dof"])
     if not dof > 0:

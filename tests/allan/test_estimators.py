@@ -9,7 +9,7 @@ import pytest
 from scipy.fft import dct
 from scipy.linalg import toeplitz
 
-from gyrostab.allan import fit
+from gyrostab.allan import window_fit
 from gyrostab.kernels.spectra.expected import sample_covariance
 from gyrostab.noise import LAWS, TERMS
 from tests.support.scripts import ROOT, load_script
@@ -64,7 +64,7 @@ def test_the_bound_is_that_of_the_exact_likelihood(estimators, covariances, ramp
 def test_wavelet_variances_are_those_published_for_the_method_of_wavelet_moments():
     """Manual of the R package gmwm, processes to Haar wavelet variance, at scale 2 k."""
     ks = 2 ** np.arange(9)
-    tables = fit._cached_tables(tuple(ks.tolist()), (0,) * ks.size, RATE, 2048)
+    tables = window_fit.fit_tables(tuple(ks.tolist()), (0,) * ks.size, RATE, 2048)
     found = tables.columns / 2 / tables.to_samples
     scale = 2.0 * ks
     np.testing.assert_allclose(found[:, 0], 6 / scale**2, rtol=1e-9)

@@ -14,7 +14,7 @@ from numba import njit
 from scipy.integrate import quad
 from scipy.stats import chi2
 
-from gyrostab.allan import fit
+from gyrostab.allan import fit, window_fit
 from gyrostab.allan.confidence import confidence_interval
 from gyrostab.allan.davar import davar
 from gyrostab.allan.fit import fit_noise
@@ -176,7 +176,7 @@ def test_absent_terms_are_rarely_observed_and_their_limits_hold(share):
             float((product.observable.sel(term=term) == OBSERVABLE.index("observed")).mean())
             <= 0.025
         )
-    described = fit.is_described(product.fit_chi2, product.fit_dof)
+    described = window_fit.is_described(product.fit_chi2, product.fit_dof)
     assert described.mean() > 0.98
     np.testing.assert_array_equal(
         product.observable.sel(term="N") == OBSERVABLE.index("observed"), described
@@ -248,7 +248,7 @@ def test_no_term_is_observed_where_the_five_terms_do_not_describe_the_window():
     tone = 60.0 * np.sin(2 * np.pi * 1.3 * t + rng.uniform(0, 2 * np.pi, (100, 1)))
     surface = windows_of(white(rng, 100, 2000, N=0.01, rate=RATE) + tone, taus=30)
     product = fit_noise(surface)
-    assert not fit.is_described(product.fit_chi2, product.fit_dof).any()
+    assert not window_fit.is_described(product.fit_chi2, product.fit_dof).any()
     assert (product.observable != OBSERVABLE.index("observed")).all()
     assert float((product.N_upper >= 0.01).mean()) >= 0.95
     for term in TERMS:
@@ -277,7 +277,7 @@ def test_errors_widen_only_with_a_misfit():
     spoiled = surface.assign(avar=surface.avar * (1 + 0.2 * (np.arange(surface.sizes["tau"]) % 2)))
     for cells, fits in ((surface, True), (spoiled, False)):
         product = fit_noise(cells, terms="N", observed_only=False)
-        result, misfit, _ = fit._run_kernel(*cells_of(cells), 2)
+        result, misfit, _ = window_fit.run_kernel(*cells_of(cells), 2)
         fails = chi2.sf(misfit[:, 0], misfit[:, 1]) < 1e-3
         assert fails.mean() < 0.06 if fits else fails.all()
         scale = np.where(fails, misfit[:, 0] / misfit[:, 1], 1.0)
@@ -445,7 +445,7 @@ def test_fast_fit_equals_the_reference_implementation(law, share, block):
     )
     given = cells_of(windows_of(lose(rng, x, share, block), taus=21))
     given[0][0][3, 5] = np.nan
-    result, misfit, _ = fit._run_kernel(*given, 31)
+    result, misfit, _ = window_fit.run_kernel(*given, 31)
     for w, plain in enumerate(plain_fits(*given)):
         assert misfit[w, 0] == pytest.approx(float(plain["chi2"]), rel=1e-5)
         averaged = average_plainly(plain)
@@ -460,9 +460,9 @@ def test_fast_fit_equals_the_reference_implementation(law, share, block):
 
 
 def cells_of(surface):
-    """Arguments of `fit._run_kernel` for the windows of a surface with one axis."""
+    """Arguments of `window_fit.run_kernel` for the windows of a surface with one axis."""
     cells, ks, rate, window = fit._fit_inputs(surface)
-    tables = fit._cached_tables(tuple(ks.tolist()), (0,) * ks.size, rate, window)
+    tables = window_fit.fit_tables(tuple(ks.tolist()), (0,) * ks.size, rate, window)
     flat = [np.ascontiguousarray(cell[0], dtype=np.float64) for cell in cells[:5]]
     return flat, *(cell[0, :, 0] for cell in cells[5:]), tables
 
@@ -487,17 +487,17 @@ def test_fit_of_a_window_does_not_depend_on_other_windows():
     flat, *trends, tables = cells_of(
         windows_of(lose(rng, mixed_records(rng, 21), 0.2, 20), taus=21)
     )
-    expected = fit._run_kernel(flat, *trends, tables, 31)
+    expected = window_fit.run_kernel(flat, *trends, tables, 31)
     order = rng.permutation(21)
     moved = [cell[order] for cell in flat], *(cell[order] for cell in trends)
-    for got, want in zip(fit._run_kernel(*moved, tables, 31), expected, strict=True):
+    for got, want in zip(window_fit.run_kernel(*moved, tables, 31), expected, strict=True):
         np.testing.assert_array_equal(got, want[order])
     spoiled = [cell.copy() for cell in flat]
     spoiled[0][3::8] = np.nan
     spoiled[0][5::8] *= 1e200
     spoiled[0][6::8] *= 1e-200
     left = np.flatnonzero(~np.isin(np.arange(21) % 8, (3, 5, 6)))
-    result, misfit, dof = fit._run_kernel(spoiled, *trends, tables, 31)
+    result, misfit, dof = window_fit.run_kernel(spoiled, *trends, tables, 31)
     for got, want in zip((result, misfit, dof), expected, strict=True):
         np.testing.assert_array_equal(got[left], want[left])
     assert np.isnan(result[3::8, 0]).all()
@@ -514,7 +514,7 @@ def test_a_covariance_that_is_not_positive_definite_is_widened_only_where_it_mus
     values, vectors = np.linalg.eigh(pairs[3, 3] / np.outer(scale, scale))
     pairs[3, 3] -= (values[0] + 2e-5) * np.outer(vectors[:, 0] * scale, vectors[:, 0] * scale)
     damaged = SimpleNamespace(**{**vars(tables), "trend": tables.trend._replace(pairs=pairs)})
-    _, misfit, _ = fit._run_kernel(flat, *trends, damaged, 31)
+    _, misfit, _ = window_fit.run_kernel(flat, *trends, damaged, 31)
     widened = 0
     for w, plain in enumerate(plain_fits(flat, *trends, damaged)):
         assert misfit[w, 0] == pytest.approx(float(plain["chi2"]), rel=1e-4)
@@ -534,7 +534,7 @@ def test_windows_have_the_same_fit_alone_and_together():
 
 @pytest.fixture(scope="module")
 def quantile_curve():
-    return fit._quantile_curve(0.05)
+    return window_fit.quantile_curve(0.05)
 
 
 @njit
