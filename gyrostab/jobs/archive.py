@@ -15,7 +15,8 @@ from typing import Any
 
 import pandas as pd
 
-from gyrostab.errors import DamageError, FormatError, GyrostabError, OptionError
+from gyrostab.diagnose.result.content import check_diagnosis
+from gyrostab.errors import DamageError, FormatError, GyrostabError, OptionError, SchemaError
 from gyrostab.ingest.files import scan_file
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.jobs.schedule import Pool, run_calls
@@ -34,6 +35,7 @@ __all__ = [
     "find_runs",
     "index_files",
     "is_fleet",
+    "read_diagnosis",
     "read_table",
     "write_table",
 ]
@@ -49,6 +51,11 @@ RESERVED_NAMES = (
 DIAGNOSIS = "diagnosis"
 #: Name of the metadata of a table of this package in a Parquet file.
 _METADATA = b"gyrostab"
+#: Content -> columns without which a table is not one of this package.
+_COLUMNS = {
+    "files": ("file", "base", "bytes", "changed_ns", "options", "is_log", "format", "note"),
+    "runs": ("run", "error", "report"),
+}
 #: Files that a worker inspects in one call: a call of dask takes a millisecond.
 _FILES_PER_CALL = 50
 
@@ -340,6 +347,11 @@ def _name_groups(groups: Mapping[Path, list[Path]], base: Path, per: str) -> dic
     for path in groups:
         shown = bare[path] if per == "file" and not is_shared else path
         parts = list(Path(os.path.relpath(shown, base)).parts) or [base.name or "run"]
+        if parts[0] == "..":
+            raise FormatError(
+                f"{path}: is not inside {base}, the folder of the table of files; "
+                "make the table again with gyrostab index"
+            )
         names[path] = "/".join(part.replace("\\", "_") for part in parts)
     above = {
         "/".join(name.split("/")[:depth])
@@ -358,23 +370,34 @@ def _avoid_names(name: str, taken: Iterable[str]) -> str:
     return name
 
 
-def _read_diagnosed_files(folders: Sequence[Path]) -> list[tuple[Path, set[str]]]:
+def read_diagnosis(folder: Path) -> Mapping[str, Any] | None:
+    """Read the diagnosis in a folder; None when it cannot be read or is damaged."""
+    content = read_json(folder / "diagnosis.json")
+    try:
+        check_diagnosis(content)
+    except SchemaError:
+        return None
+    return dict(content)
+
+
+def _read_diagnosed_files(folders: Sequence[Path]) -> list[tuple[Path, set[str] | None]]:
+    """Read which files each diagnosis is of; None, at the end, for those that are damaged."""
     found = []
     for folder in folders:
-        content = read_json(folder / "diagnosis.json")
-        recording = content.get("recording", {}) if isinstance(content, dict) else {}
-        files = recording.get("files", []) if isinstance(recording, dict) else []
-        found.append((folder, {Path(str(name)).name for name in files}))
-    return found
+        content = read_diagnosis(folder)
+        files = content["recording"]["files"] if content else ()
+        found.append((folder, {Path(name).name for name in files} if content else None))
+    return sorted(found, key=lambda item: item[1] is None)
 
 
 def _find_diagnosis(
-    files: Sequence[Path], diagnoses: Sequence[tuple[Path, set[str]]]
+    files: Sequence[Path], diagnoses: Sequence[tuple[Path, set[str] | None]]
 ) -> Path | None:
-    """Find the diagnosis of these files in their folder or below."""
+    """Find the diagnosis of these files in their folder or below; a damaged one may be of any."""
     names, folder = {path.name for path in files}, files[0].parent
     for place, diagnosed in diagnoses:
-        if diagnosed & names and folder in Path(os.path.abspath(place)).parents:
+        is_of_files = diagnosed is None or diagnosed & names
+        if is_of_files and folder in Path(os.path.abspath(place)).parents:
             return place
     return None
 
@@ -391,7 +414,7 @@ def write_table(table: pd.DataFrame, path: Path, *, content: str, overwrite: boo
 
 
 def read_table(path: Path, *, content: str) -> pd.DataFrame | None:
-    """Read a table that `write_table` wrote; None for any other file."""
+    """Read a table that `write_table` wrote; None for any other file, and one without rows."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -399,7 +422,8 @@ def read_table(path: Path, *, content: str) -> pd.DataFrame | None:
         table = pq.read_table(path)
     except (OSError, pa.ArrowException):
         return None
-    if (table.schema.metadata or {}).get(_METADATA) != content.encode():
+    is_own = (table.schema.metadata or {}).get(_METADATA) == content.encode()
+    if not is_own or not len(table) or not set(_COLUMNS[content]) <= set(table.column_names):
         return None
     frame: pd.DataFrame = table.to_pandas()
     return frame

@@ -342,7 +342,7 @@ def _is_current(
     if row is None or row["error"] or (reports and not (target / str(row["report"])).is_file()):
         return False
     made_by = read_job_name(_product_path(target, item.name))
-    return bool(row["job"] == made_by == find_job_name(item.files, **options))
+    return bool(row.get("job") == made_by == find_job_name(item.files, **options))
 
 
 def _pack_run(item: LogRun) -> dict[str, Any]:

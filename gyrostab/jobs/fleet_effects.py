@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
-from gyrostab.store.output import read_json
+from gyrostab.jobs.archive import read_diagnosis
 
 __all__ = ["list_effects", "read_verdict"]
 
@@ -18,14 +16,12 @@ _COLUMNS = (
 )  # fmt: skip
 
 
-def _read_diagnosis(folder: str) -> Mapping[str, Any]:
-    content = read_json(Path(folder, "diagnosis.json")) if folder else None
-    return content if isinstance(content, dict) else {}
-
-
 def read_verdict(folder: str) -> str:
-    """Read the verdict of a diagnosis; empty without one."""
-    return str(_read_diagnosis(folder).get("verdict") or "")
+    """Read the verdict of a diagnosis; empty without one, ``not readable`` of a damaged one."""
+    if not folder:
+        return ""
+    content = read_diagnosis(Path(folder))
+    return "not readable" if content is None else str(content["verdict"])
 
 
 def list_effects(table: pd.DataFrame) -> pd.DataFrame:
@@ -44,7 +40,8 @@ def list_effects(table: pd.DataFrame) -> pd.DataFrame:
     """
     rows = []
     for run in table.to_dict("records"):
-        for effect in _read_diagnosis(run["diagnosis"]).get("effects", ()):
+        content = read_diagnosis(Path(run["diagnosis"])) if run["diagnosis"] else None
+        for effect in content["effects"] if content else ():
             known = {
                 **{name: run[name] for name in ("run", "tool", "start")},
                 "effect": effect["name"],

@@ -12,6 +12,7 @@ from urllib.parse import quote
 import numpy as np
 import pandas as pd
 
+from gyrostab.diagnose.result.content import VERDICTS
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import (
     COLOURS,
@@ -115,7 +116,7 @@ def _describe_tool(tool: str, part: pd.DataFrame, axes: list[str]) -> dict[str, 
 
 def combine_effects(effects: pd.DataFrame, done: pd.DataFrame) -> list[dict[str, Any]]:
     """Combine the effects of the same name over the diagnosed runs of each tool."""
-    diagnosed = done[done["diagnosis"] != ""].groupby("tool").size()
+    diagnosed = done[done["verdict"].isin(VERDICTS)].groupby("tool").size()
     rows = []
     for (tool, effect), part in effects.groupby(["tool", "effect"]):
         single = part.drop_duplicates(["run", "axes", "evidence [nats]"])

@@ -18,11 +18,12 @@ from gyrostab import make_log, open_product, to_netcdf
 from gyrostab.cli import main
 from gyrostab.errors import FormatError, OutputError
 from gyrostab.jobs import fleet as fleet_module
-from gyrostab.jobs.archive import find_archive, find_runs, read_table
-from gyrostab.jobs.fleet import process_run, run_fleet
-from gyrostab.jobs.fleet_effects import list_effects
+from gyrostab.jobs.archive import find_archive, find_runs, read_table, write_table
+from gyrostab.jobs.fleet import process_run, run_fleet, write_file_table
+from gyrostab.jobs.fleet_effects import list_effects, read_verdict
 from gyrostab.jobs.run import run
 from gyrostab.report.fleet import combine_effects, write_overview
+from tests.support.diagnosed import content
 
 RATE = 10.0
 WINDOWS = {"window": "60s", "step": "30s", "taus": "12"}
@@ -170,28 +171,44 @@ def test_the_overview_escapes_names_and_links_reports(done, tmp_path):
     assert 'href="reports/tool%201/run%20%3Cb%3E.html"' in text
 
 
+def write_diagnosis(folder: Path, nats: float | None) -> None:
+    """A diagnosis that names the noise of vibration, or nothing."""
+    made = content() | {"mismatches": []}
+    (effect,) = (one for one in made["effects"] if one["name"] == "vibration_noise")
+    effect["held_out_gain"]["nats"] = nats
+    folder.mkdir(parents=True)
+    found = {"effects": [effect] if nats else [], "verdict": "explained" if nats else "no mismatch"}
+    (folder / "diagnosis.json").write_text(json.dumps(made | found))
+
+
 def test_effects_of_one_name_are_combined_over_the_runs_of_a_tool(tmp_path):
-    names = ["tool/a", "tool/b", "tool/c"]
-    for name, nats in zip(names, (4.0, 8.5, None), strict=True):
-        size = {"value": 0.4, "stderr": 0.1, "low": 0.2, "high": 0.6, "unit": "deg/h/g"}
-        effect = {
-            "name": "vibration_noise",
-            "axes": ["x"],
-            "driver": "vibration",
-            "parameters": {"sensitivity": size},
-            "held_out_gain": {"nats": nats},
-        }
-        (tmp_path / name).mkdir(parents=True)
-        content = {"verdict": "explained", "effects": [effect] if nats else []}
-        (tmp_path / name / "diagnosis.json").write_text(json.dumps(content))
+    names = ["tool/a", "tool/b", "tool/c", "tool/damaged"]
+    for name, nats in zip(names, (4.0, 8.5, None, 1.0), strict=True):
+        write_diagnosis(tmp_path / name, nats)
+    damaged = tmp_path / names[-1] / "diagnosis.json"
+    damaged.write_text(damaged.read_text().replace('"nats"', '"gnats"'))
     table = pd.DataFrame({"run": names, "tool": "tool", "start": pd.Timestamp("2026-05-01")})
     table["diagnosis"] = [str(tmp_path / name) for name in names]
+    table["verdict"] = [read_verdict(folder) for folder in table["diagnosis"]]
+    assert list(table["verdict"]) == ["explained", "explained", "no mismatch", "not readable"]
     effects = list_effects(table)
     assert list(effects["evidence [nats]"]) == [4.0, 8.5]
     (combined,) = combine_effects(effects, table)
     assert combined["seen"] == "2 of 3 diagnosed runs"
     assert combined["evidence"] == "12.5"
-    assert combined["sizes"][0] == "tool/a, x: sensitivity 0.4 (0.2 to 0.6) deg/h/g"
+    assert combined["sizes"][0] == "tool/a, x: white 0.00045 (0.000405 to 0.000495) deg/sqrt(h)/g"
+
+
+@pytest.mark.parametrize("text", ["{", "[" * 100_000, '{"recording": {"files": 5}}'])
+def test_a_damaged_diagnosis_is_that_of_the_run_above_it(text, tmp_path):
+    table = pd.DataFrame(
+        {"file": [str(tmp_path / "a" / "log.nc")], "bytes": 0, "is_log": True, "note": ""}
+    )
+    (tmp_path / "a" / "found").mkdir(parents=True)
+    (tmp_path / "a" / "log.nc").touch()
+    (tmp_path / "a" / "found" / "diagnosis.json").write_text(text)
+    (found,) = find_runs(find_archive([tmp_path]), table)
+    assert read_verdict(str(found.diagnosis)) == "not readable"
 
 
 # ------------------------------------------------------------------------------
@@ -233,8 +250,23 @@ def test_a_table_of_files_takes_the_place_of_the_archive(archive, tmp_path, monk
     assert list(rows["run"]) == ["tool 1/run <b>", "tool 1/run a", "tool 2/broken"]
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [({"base": "/elsewhere"}, "log.nc: is not inside /elsewhere"), ({"is_log": None}, "no gyro")],
+)
+def test_a_given_table_cannot_name_products_outside_the_output(changes, message, tmp_path):
+    log, path, output = tmp_path / "log.nc", tmp_path / "files.parquet", tmp_path / "fleet"
+    write_log(log, 1)
+    table = write_file_table([log], path, scheduler="threads")
+    made = table.assign(**changes).dropna(axis="columns", subset=[0])
+    write_table(made, path, content="files", overwrite=True)
+    with pytest.raises(FormatError, match=message):
+        run_fleet([path], output, **OPTIONS, per="file")
+    assert not list(output.rglob("*.nc"))
+
+
 def tell_name(*arguments):
-    return {"run": arguments[-1]["name"], "tool": "", "error": "not computed", "diagnosis": ""}
+    return {"run": arguments[-1]["name"], "tool": "", "error": "not computed", "report": ""}
 
 
 def test_nothing_foreign_is_replaced(archive, tmp_path):

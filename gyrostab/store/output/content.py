@@ -24,7 +24,7 @@ def read_json(path: Path) -> Any:
     """Read a JSON file; None when it cannot be read."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
 
 
