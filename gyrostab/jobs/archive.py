@@ -21,7 +21,7 @@ from gyrostab.ingest.files import scan_file
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.jobs.schedule import Pool, run_calls
 from gyrostab.progress import Stage
-from gyrostab.store.output import describe_file, new_output, read_json
+from gyrostab.store.output import describe_file, read_json
 from gyrostab.store.output.content import is_store
 
 __all__ = [
@@ -36,8 +36,6 @@ __all__ = [
     "index_files",
     "is_fleet",
     "read_diagnosis",
-    "read_table",
-    "write_table",
 ]
 
 #: File that marks a folder of `gyrostab.jobs.fleet`.
@@ -49,13 +47,6 @@ RESERVED_NAMES = (
 )  # fmt: skip
 #: Format of a folder that ``gyrostab diagnose`` wrote, in the table of files.
 DIAGNOSIS = "diagnosis"
-#: Name of the metadata of a table of this package in a Parquet file.
-_METADATA = b"gyrostab"
-#: Content -> columns without which a table is not one of this package.
-_COLUMNS = {
-    "files": ("file", "base", "bytes", "changed_ns", "options", "is_log", "format", "note"),
-    "runs": ("run", "error", "report"),
-}
 #: Files that a worker inspects in one call: a call of dask takes a millisecond.
 _FILES_PER_CALL = 50
 
@@ -400,30 +391,3 @@ def _find_diagnosis(
         if is_of_files and folder in Path(os.path.abspath(place)).parents:
             return place
     return None
-
-
-def write_table(table: pd.DataFrame, path: Path, *, content: str, overwrite: bool) -> None:
-    """Write a table as a Parquet file whose metadata names its content."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    made = pa.Table.from_pandas(table, preserve_index=False)
-    made = made.replace_schema_metadata({**(made.schema.metadata or {}), _METADATA: content})
-    with new_output(path, overwrite=overwrite) as temporary:
-        pq.write_table(made, temporary)
-
-
-def read_table(path: Path, *, content: str) -> pd.DataFrame | None:
-    """Read a table that `write_table` wrote; None for any other file, and one without rows."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        table = pq.read_table(path)
-    except (OSError, pa.ArrowException):
-        return None
-    is_own = (table.schema.metadata or {}).get(_METADATA) == content.encode()
-    if not is_own or not len(table) or not set(_COLUMNS[content]) <= set(table.column_names):
-        return None
-    frame: pd.DataFrame = table.to_pandas()
-    return frame

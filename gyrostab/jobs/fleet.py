@@ -19,9 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
-import xarray as xr
 
 from gyrostab.errors import FormatError, GyrostabError, WorkerError
 from gyrostab.jobs.archive import (
@@ -34,16 +32,22 @@ from gyrostab.jobs.archive import (
     find_runs,
     index_files,
     is_fleet,
-    read_table,
-    write_table,
 )
 from gyrostab.jobs.checks import check_windows
-from gyrostab.jobs.fleet_effects import list_effects, read_verdict
+from gyrostab.jobs.fleet_table import (
+    FILES,
+    list_effects,
+    make_table,
+    read_rows,
+    read_table,
+    summarise_run,
+    write_rows,
+    write_table,
+)
 from gyrostab.jobs.job import check_job_folder, job_folder, lock_job, remove_job
 from gyrostab.jobs.run import find_job_name, read_job_name, run
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool, run_calls
 from gyrostab.progress import Stage, no_stage
-from gyrostab.schema import texts
 from gyrostab.store.output import (
     check_output,
     protect_inputs,
@@ -52,14 +56,13 @@ from gyrostab.store.output import (
     resolve_link,
 )
 
-__all__ = ["run_fleet", "summarise_run", "write_file_table"]
+__all__ = ["process_run", "run_fleet", "write_file_table"]
 
 #: Time after which the table of runs is written again [s]; a killed call loses rows of this time,
 #: which are made again from the products.
 _SAVE_SECONDS = 30.0
 _MAX_NAMES = 3  # runs that an error message names
 PLOTLY_FILE = "plotly.js"  # in the folder of the reports, which share it
-_FILES, _RUNS = "files", "runs"  # contents of the tables
 
 
 def write_file_table(
@@ -94,7 +97,7 @@ def write_file_table(
         The table of `gyrostab.jobs.archive.index_files`.
     """
     scheduler = check_scheduler(scheduler)
-    known = read_table(Path(output), content=_FILES)
+    known = read_table(Path(output), content=FILES)
     check_output(output, suffixes=[".parquet"], overwrite=overwrite or known is not None)
     archive = find_archive(paths)
     with _open_workers(scheduler, workers, archive.files[:1]) as pool:
@@ -105,7 +108,7 @@ def write_file_table(
             pool=pool,
             stage=stage,
         )
-    write_table(table, Path(output), content=_FILES, overwrite=overwrite or known is not None)
+    write_table(table, Path(output), content=FILES, overwrite=overwrite or known is not None)
     return table
 
 
@@ -189,7 +192,7 @@ def run_fleet(
                 table = index_files(
                     archive, reading=options["reading"], known=known, pool=pool, stage=stage
                 )
-                write_table(table, target / "files.parquet", content=_FILES, overwrite=True)
+                write_table(table, target / "files.parquet", content=FILES, overwrite=True)
                 runs = find_runs(archive, table, per=per, tool=tool)
                 rows = _compute_runs(
                     target,
@@ -257,9 +260,9 @@ def _write_json(path: Path, content: Any) -> None:
 
 def _open_archive(paths: Sequence[str | Path], target: Path) -> tuple[Archive, pd.DataFrame | None]:
     """List an archive, or take the files of a table; return the latest table of its files too."""
-    known = read_table(target / "files.parquet", content=_FILES)
+    known = read_table(target / "files.parquet", content=FILES)
     if len(paths) == 1 and Path(paths[0]).suffix.lower() == ".parquet":
-        given = read_table(Path(paths[0]), content=_FILES)
+        given = read_table(Path(paths[0]), content=FILES)
         if given is not None:
             is_diagnosis = given["format"] == DIAGNOSIS
             files, diagnoses = (
@@ -281,7 +284,7 @@ def _compute_runs(
     stage: Stage,
 ) -> pd.DataFrame:
     """Compute the runs that are new or changed, and write the table and the page of all runs."""
-    before = _read_rows(target)
+    before = read_rows(target)
     waiting = [
         item
         for item in runs
@@ -306,7 +309,7 @@ def _compute_runs(
                 done += 1
                 stage("computing", len(waiting), done, "runs")
                 if time.monotonic() - saved > _SAVE_SECONDS:
-                    _write_rows(_make_table(rows, runs), target)
+                    write_rows(make_table(rows, runs), target)
                     saved = time.monotonic()
     except (KeyboardInterrupt, WorkerError) as error:
         what = str(error) or "interrupted"
@@ -315,8 +318,8 @@ def _compute_runs(
         ) from error
     finally:
         stage("writing", 0)
-        table = _make_table(rows, runs)
-        _write_rows(table, target)
+        table = make_table(rows, runs)
+        write_rows(table, target)
         _write_overview(table, target)
         if _is_zarr(target):
             _consolidate_metadata(target, list(rows))
@@ -426,102 +429,6 @@ def _finish_run(path: Path, report: Path | None, plotly: str) -> dict[str, Any]:
         report.parent.mkdir(parents=True, exist_ok=True)
         write_report(product, report, overwrite=True, plotly=plotly)
     return summarise_run(product)
-
-
-def summarise_run(product: xr.Dataset) -> dict[str, Any]:
-    """Summarise a product in one row of a table.
-
-    Parameters
-    ----------
-    product : xarray.Dataset
-        Product of a run.
-
-    Returns
-    -------
-    dict
-        Span, rate, windows, share of missing samples, worst window, and by axis the median of each
-        term where it is observed (NaN elsewhere), its median upper limit, and the misfit. Names of
-        columns end with the unit.
-
-    Examples
-    --------
-    >>> from gyrostab import davar, fit_noise, make_log
-    >>> noise = 6.0 * np.random.default_rng(1).standard_normal(60_000)
-    >>> noise[30_000:36_000] *= 3.0
-    >>> log = make_log(noise, rate=100.0, unit="deg/h")
-    >>> row = summarise_run(fit_noise(davar(log, window="1min", step="1min")))
-    >>> round(row["N_x [deg/sqrt(h)]"], 3), str(row["worst_window"])[11:19]
-    (0.01, '00:05:30')
-    """
-    from gyrostab.allan.summary import summarise_fit, summarise_terms
-
-    bounds = product["time_bounds"].values
-    row: dict[str, Any] = {
-        "start": bounds.min(),
-        "end": bounds.max(),
-        "span [s]": float((bounds.max() - bounds.min()) / np.timedelta64(1, "s")),
-        "rate [Hz]": float(product.attrs["sampling_rate_hz"]),
-        "windows": product.sizes["time"],
-        "missing_share": 1.0 - float(product["window_coverage"].mean()),
-        "notes": "\n".join(texts(product, "notes")),
-        **_find_worst_window(product),
-    }
-    for term in summarise_terms(product):
-        is_limit = term.status == "upper_limit_only"
-        name = f"{term.symbol}_{term.axis}"
-        row[f"{name} [{term.unit}]"] = np.nan if is_limit else term.value
-        row[f"{name}_upper [{term.unit}]"] = term.value if is_limit else np.nan
-    for fit in summarise_fit(product):
-        row[f"misfit_{fit.axis}"] = fit.chi2_per_dof
-    return row
-
-
-def _find_worst_window(product: xr.Dataset) -> dict[str, Any]:
-    """Find the window and axis whose Allan deviation is largest, relative to the median window.
-
-    Ratios are averaged over the averaging times on a logarithmic scale, with the equivalent degrees
-    of freedom as weights: the variance of the logarithm of an Allan variance is about 2 / edf.
-    """
-    known = product["avar"].where(product["avar"] > 0.0)
-    logs = known.copy(data=np.log(known.values))
-    change = logs - logs.median("time")
-    level = change.weighted(product["edf"].fillna(0.0)).mean("tau").transpose("axis", "time")
-    if not np.isfinite(level.values).any():
-        return {"worst_window": np.datetime64("NaT", "ns"), "worst_axis": "", "worst_ratio": np.nan}
-    axis, window = np.unravel_index(np.nanargmax(level.values), level.shape)
-    return {
-        "worst_window": product["time"].values[window],
-        "worst_axis": str(product["axis"].values[axis]),
-        "worst_ratio": float(np.exp(level.values[axis, window] / 2.0)),
-    }
-
-
-def _read_rows(target: Path) -> dict[str, dict[str, Any]]:
-    table = read_table(target / "index.parquet", content=_RUNS)
-    records: Any = [] if table is None else table.to_dict("records")
-    return {row["run"]: row for row in records}
-
-
-def _make_table(rows: Mapping[str, Mapping[str, Any]], runs: Sequence[LogRun]) -> pd.DataFrame:
-    """Make the table of runs, with the verdicts of their diagnoses."""
-    diagnosed = {item.name: os.path.abspath(item.diagnosis) for item in runs if item.diagnosis}
-    first = ("run", "tool", "error", "files", "start", "end", "span [s]", "rate [Hz]", "windows")
-    return pd.DataFrame(
-        [
-            {
-                **dict.fromkeys(first),
-                **rows[name],
-                "verdict": read_verdict(diagnosed.get(name, "")),
-                "diagnosis": diagnosed.get(name, ""),
-            }
-            for name in sorted(rows)
-        ],
-        columns=None if rows else list(first),
-    )
-
-
-def _write_rows(table: pd.DataFrame, target: Path) -> None:
-    write_table(table, target / "index.parquet", content=_RUNS, overwrite=True)
 
 
 def _write_overview(table: pd.DataFrame, target: Path) -> None:

@@ -51,7 +51,7 @@ def write_overview(
     path : path-like
         File to write; links to reports are relative to its folder.
     effects : pandas.DataFrame, optional
-        Effects that diagnoses name, from `gyrostab.jobs.fleet_effects.list_effects`.
+        Effects that diagnoses name, from `gyrostab.jobs.fleet_table.list_effects`.
     overwrite : bool
         Replace an existing file.
 

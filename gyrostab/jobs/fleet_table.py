@@ -1,0 +1,205 @@
+"""Tables of a fleet: the files of its archive, its runs, and the effects their diagnoses name."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from gyrostab.jobs.archive import LogRun, read_diagnosis
+from gyrostab.schema import texts
+from gyrostab.store.output import new_output
+
+__all__ = [
+    "FILES",
+    "list_effects",
+    "make_table",
+    "read_rows",
+    "read_table",
+    "read_verdict",
+    "summarise_run",
+    "write_rows",
+    "write_table",
+]
+
+FILES, RUNS = "files", "runs"  # contents of tables
+#: Name of the metadata of a table of this package in a Parquet file.
+_METADATA = b"gyrostab"
+#: Content -> columns without which a table is not one of this package.
+_COLUMNS = {
+    FILES: ("file", "base", "bytes", "changed_ns", "options", "is_log", "format", "note"),
+    RUNS: ("run", "error", "report"),
+}
+_EFFECT_COLUMNS = (
+    "run", "tool", "start", "effect", "axes", "driver", "evidence [nats]", "parameter", "value",
+    "low", "high", "unit",
+)  # fmt: skip
+
+
+def write_table(table: pd.DataFrame, path: Path, *, content: str, overwrite: bool) -> None:
+    """Write a table as a Parquet file whose metadata names its content."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    made = pa.Table.from_pandas(table, preserve_index=False)
+    made = made.replace_schema_metadata({**(made.schema.metadata or {}), _METADATA: content})
+    with new_output(path, overwrite=overwrite) as temporary:
+        pq.write_table(made, temporary)
+
+
+def read_table(path: Path, *, content: str) -> pd.DataFrame | None:
+    """Read a table that `write_table` wrote; None for any other file, and one without rows."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.read_table(path)
+    except (OSError, pa.ArrowException):
+        return None
+    is_own = (table.schema.metadata or {}).get(_METADATA) == content.encode()
+    if not is_own or not len(table) or not set(_COLUMNS[content]) <= set(table.column_names):
+        return None
+    frame: pd.DataFrame = table.to_pandas()
+    return frame
+
+
+def summarise_run(product: xr.Dataset) -> dict[str, Any]:
+    """Summarise a product in one row of a table.
+
+    Parameters
+    ----------
+    product : xarray.Dataset
+        Product of a run.
+
+    Returns
+    -------
+    dict
+        Span, rate, windows, share of missing samples, worst window, and by axis the median of each
+        term where it is observed (NaN elsewhere), its median upper limit, and the misfit. Names of
+        columns end with the unit.
+
+    Examples
+    --------
+    >>> from gyrostab import davar, fit_noise, make_log
+    >>> noise = 6.0 * np.random.default_rng(1).standard_normal(60_000)
+    >>> noise[30_000:36_000] *= 3.0
+    >>> log = make_log(noise, rate=100.0, unit="deg/h")
+    >>> row = summarise_run(fit_noise(davar(log, window="1min", step="1min")))
+    >>> round(row["N_x [deg/sqrt(h)]"], 3), str(row["worst_window"])[11:19]
+    (0.01, '00:05:30')
+    """
+    from gyrostab.allan.summary import summarise_fit, summarise_terms
+
+    bounds = product["time_bounds"].values
+    row: dict[str, Any] = {
+        "start": bounds.min(),
+        "end": bounds.max(),
+        "span [s]": float((bounds.max() - bounds.min()) / np.timedelta64(1, "s")),
+        "rate [Hz]": float(product.attrs["sampling_rate_hz"]),
+        "windows": product.sizes["time"],
+        "missing_share": 1.0 - float(product["window_coverage"].mean()),
+        "notes": "\n".join(texts(product, "notes")),
+        **_find_worst_window(product),
+    }
+    for term in summarise_terms(product):
+        is_limit = term.status == "upper_limit_only"
+        name = f"{term.symbol}_{term.axis}"
+        row[f"{name} [{term.unit}]"] = np.nan if is_limit else term.value
+        row[f"{name}_upper [{term.unit}]"] = term.value if is_limit else np.nan
+    for fit in summarise_fit(product):
+        row[f"misfit_{fit.axis}"] = fit.chi2_per_dof
+    return row
+
+
+def _find_worst_window(product: xr.Dataset) -> dict[str, Any]:
+    """Find the window and axis whose Allan deviation is largest, relative to the median window.
+
+    Ratios are averaged over the averaging times on a logarithmic scale, with the equivalent degrees
+    of freedom as weights: the variance of the logarithm of an Allan variance is about 2 / edf.
+    """
+    known = product["avar"].where(product["avar"] > 0.0)
+    logs = known.copy(data=np.log(known.values))
+    change = logs - logs.median("time")
+    level = change.weighted(product["edf"].fillna(0.0)).mean("tau").transpose("axis", "time")
+    if not np.isfinite(level.values).any():
+        return {"worst_window": np.datetime64("NaT", "ns"), "worst_axis": "", "worst_ratio": np.nan}
+    axis, window = np.unravel_index(np.nanargmax(level.values), level.shape)
+    return {
+        "worst_window": product["time"].values[window],
+        "worst_axis": str(product["axis"].values[axis]),
+        "worst_ratio": float(np.exp(level.values[axis, window] / 2.0)),
+    }
+
+
+def read_rows(target: Path) -> dict[str, dict[str, Any]]:
+    """Read the rows of the runs of an earlier call, by name."""
+    table = read_table(target / "index.parquet", content=RUNS)
+    records: Any = [] if table is None else table.to_dict("records")
+    return {row["run"]: row for row in records}
+
+
+def make_table(rows: Mapping[str, Mapping[str, Any]], runs: Sequence[LogRun]) -> pd.DataFrame:
+    """Make the table of runs, with the verdicts of their diagnoses."""
+    diagnosed = {item.name: os.path.abspath(item.diagnosis) for item in runs if item.diagnosis}
+    first = ("run", "tool", "error", "files", "start", "end", "span [s]", "rate [Hz]", "windows")
+    return pd.DataFrame(
+        [
+            {
+                **dict.fromkeys(first),
+                **rows[name],
+                "verdict": read_verdict(diagnosed.get(name, "")),
+                "diagnosis": diagnosed.get(name, ""),
+            }
+            for name in sorted(rows)
+        ],
+        columns=None if rows else list(first),
+    )
+
+
+def write_rows(table: pd.DataFrame, target: Path) -> None:
+    """Write the table of the runs."""
+    write_table(table, target / "index.parquet", content=RUNS, overwrite=True)
+
+
+def read_verdict(folder: str) -> str:
+    """Read the verdict of a diagnosis; empty without one, ``not readable`` of a damaged one."""
+    if not folder:
+        return ""
+    content = read_diagnosis(Path(folder))
+    return "not readable" if content is None else str(content["verdict"])
+
+
+def list_effects(table: pd.DataFrame) -> pd.DataFrame:
+    """List the effects that the diagnoses of runs name.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        One row a run, with the columns run, tool, start and diagnosis (a folder, or empty).
+
+    Returns
+    -------
+    pandas.DataFrame
+        One row for each run, effect and parameter: axes, driver, evidence [nats], and value with
+        95 % interval in the unit of the row.
+    """
+    rows = []
+    for run in table.to_dict("records"):
+        content = read_diagnosis(Path(run["diagnosis"])) if run["diagnosis"] else None
+        for effect in content["effects"] if content else ():
+            known = {
+                **{name: run[name] for name in ("run", "tool", "start")},
+                "effect": effect["name"],
+                "axes": " ".join(effect["axes"]),
+                "driver": effect["driver"],
+                "evidence [nats]": effect["held_out_gain"]["nats"],
+            }
+            for parameter, size in (effect["parameters"] or {"": {}}).items():
+                numbers = {name: size.get(name) for name in ("value", "low", "high", "unit")}
+                rows.append({**known, "parameter": parameter, **numbers})
+    return pd.DataFrame(rows, columns=list(_EFFECT_COLUMNS))
