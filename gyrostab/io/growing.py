@@ -1,7 +1,8 @@
 """A product as a Zarr store that grows along time, window by window.
 
-Readers see a consistent store at any moment: they read the consolidated metadata, which is replaced
-last, and chunks beyond the number of windows that it declares do not exist for them.
+A reader can open the store at any moment: it reads the consolidated metadata, which is replaced
+last, and sees no window beyond the number that they declare. A window of the last chunks may be of
+the update before or after.
 """
 
 from __future__ import annotations

@@ -118,7 +118,7 @@ def to_iscwsa(
     SchemaError
         When `product` is not a product, has other axes, or shows neither N nor B nor K.
     OptionError
-        When an option makes no sense, or the suffix of the file is none of the three.
+        When an option makes no sense, or the suffix of the file is not one of the three.
     OutputError
         When the file exists, or cannot be written.
     """

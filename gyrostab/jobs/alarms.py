@@ -148,7 +148,7 @@ def check_alarms(alarms: Sequence[Alarm], window: Mapping[str, Any]) -> None:
             continue
         if alarm.name not in window["channels"]:
             known = ", ".join([*_UNITS, *window["channels"]])
-            raise OptionError(f"--alarm {alarm.text!r}: {alarm.name} is none of {known}")
+            raise OptionError(f"--alarm {alarm.text!r}: {alarm.name} is not one of {known}")
         units = window["channels"][alarm.name][1]
         if parse_unit(alarm.unit or "1", _quantity_of(units)).quantity != _quantity_of(units):
             raise OptionError(f"--alarm {alarm.text!r}: {alarm.name} is in {units}")

@@ -80,7 +80,7 @@ def read_attribute(path: Path, name: str) -> str:
             return ""
         with h5py.File(path, "r") as file:
             value = file.attrs.get(name, "")
-    return value.decode() if isinstance(value, bytes) else str(value)
+    return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
 
 
 def is_readable(path: Path, name: str, encoding: dict[Any, Any]) -> bool:

@@ -121,18 +121,26 @@ def list_urls(url: str) -> list[str]:
         return [filesystem.unstrip_protocol(name) for name in sorted(filesystem.glob(path))]
 
 
-@lru_cache(maxsize=2**10)
 def fetch_file(url: str) -> Path:
-    """Download a file to a temporary copy of the same name, once for the process."""
+    """Download a file to a temporary copy of the same name, again only after it has changed."""
     with reaching(url):
         filesystem, path = _open_filesystem(url)
-        if filesystem.info(path)["type"] == "directory":
+        filesystem.invalidate_cache(path)
+        info = filesystem.info(path)
+        if info["type"] == "directory":
             raise FormatError(f"{url}: is a folder, not a Zarr store; name the files in it")
-        folder = tempfile.TemporaryDirectory(prefix="gyrostab-")
-        _COPIES.append(folder)
-        target = Path(folder.name, path.rpartition("/")[2])
-        filesystem.get_file(path, str(target))
-        return target
+        return _download(url, repr(info))
+
+
+@lru_cache(maxsize=2**10)
+def _download(url: str, info: str) -> Path:
+    """Download a file that the store describes by `info`, once for the process."""
+    filesystem, path = _open_filesystem(url)
+    folder = tempfile.TemporaryDirectory(prefix="gyrostab-")
+    _COPIES.append(folder)
+    target = Path(folder.name, path.rpartition("/")[2])
+    filesystem.get_file(path, str(target))
+    return target
 
 
 #: Folders of downloaded files; removed when the process ends.

@@ -239,7 +239,7 @@ def test_alarms_that_cannot_be_read(text, says):
     ("text", "says"),
     [
         ("z:misfit>3", "there is no axis z"),
-        ("pressure>3 Pa", "is none of Q, N"),
+        ("pressure>3 Pa", "is not one of Q, N"),
         ("temperature>3 V", "in degree_Celsius"),
     ],
 )

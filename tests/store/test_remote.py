@@ -144,6 +144,8 @@ def test_files_of_other_formats_are_copied_and_read(log, tmp_path):
         stored = load_log([f"{address}/log.nc"])
         np.testing.assert_array_equal(stored["rate"].values, log["rate"].values)
         assert stored.attrs["source_files"] == ["log.nc"]
+        (tmp_path / "rows.csv").write_text("time [s],gyro_x [deg/h]\n0,1\n1,2\n2,3\n3,4\n")
+        assert load_log([f"{address}/rows.csv"]).rate.values.tolist() == [[1, 2, 3, 4]]
         with pytest.raises(FormatError, match="no such object"):
             load_log([f"{address}/none.csv"])
         server.shutdown()

@@ -11,6 +11,7 @@ ArduPilot, onboard message log messages.
 from __future__ import annotations
 
 import re
+import threading
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -18,11 +19,14 @@ from pathlib import Path
 import xarray as xr
 
 from gyrostab.ingest.formats.collect import Messages
+from gyrostab.ingest.formats.recognise import read_head
 from gyrostab.ingest.formats.tables import Table, library, read_tables, scan_tables
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
 __all__ = ["matches", "read", "scan"]
 
+#: Held while the standard streams of the process are redirected.
+_LOCK = threading.Lock()
 _BINARY = b"\xa3\x95\x80"
 _TEXT = re.compile(rb"^FMT, ?128, ?89, ?FMT,", re.MULTILINE)
 _GYRO = {f"Gyr{axis.upper()}": f"gyro_{axis} [rad/s]" for axis in "xyz"}
@@ -39,10 +43,7 @@ _MEANINGS = {
 
 def matches(path: Path) -> bool:
     """Return whether the file begins with the description of a message."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        head = file.read(4096)
+    head = read_head(path)
     return head.startswith(_BINARY) or bool(_TEXT.search(head))
 
 
@@ -59,10 +60,10 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
 def _read_messages(path: Path) -> list[Table]:
     """Return a table for each message and instance of a sensor."""
     reader = library("pymavlink.DFReader", path, extra="ardupilot")
-    with path.open("rb") as file:
-        binary = file.read(3) == _BINARY
+    binary = read_head(path).startswith(_BINARY)
     found: dict[tuple[str, int], Messages] = {}
-    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):  # it prints what it skips
+    # It prints what it skips, and the streams are those of the process.
+    with _LOCK, redirect_stdout(StringIO()), redirect_stderr(StringIO()):
         log = (reader.DFReader_binary if binary else reader.DFReader_text)(str(path))
         while (message := log.recv_match(type=list(_MEANINGS))) is not None:
             fields = message.to_dict()

@@ -10,13 +10,17 @@ American Petroleum Institute, Recommended Practice 66, version 1.
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import xarray as xr
 
 from gyrostab.ingest.columns.headers import is_time_unit
+from gyrostab.ingest.formats.recognise import begins_like
 from gyrostab.ingest.formats.tables import (
     Table,
     library,
@@ -29,13 +33,13 @@ from gyrostab.ingest.options import FileSummary, ReadOptions
 
 __all__ = ["matches", "read", "scan"]
 
+#: Held while the settings of the process are changed.
+_LOCK = threading.Lock()
+
 
 def matches(path: Path) -> bool:
     """Return whether the file has the label of a DLIS storage unit, or such a suffix."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return path.suffix.lower() == ".dlis" or file.read(15)[4:] == b"V1.00RECORD"
+    return begins_like(path, rb"(?s).{4}V1\.00RECORD", ".dlis")
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
@@ -51,10 +55,7 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
 def _read_frames(path: Path) -> list[Table]:
     """Return a table for each frame of each logical file."""
     dlis = library("dlisio.dlis", path, extra="dlis")
-    logging.getLogger("dlisio").setLevel(logging.ERROR)
-    common = library("dlisio.common", path, extra="dlis")
-    common.set_encodings(["utf-8", "latin1"])
-    with dlis.load(str(path)) as files:
+    with _process_settings(path), dlis.load(str(path)) as files:
         kept = [
             (frame, [one for one in frame.channels if one and list(one.dimension) == [1]])
             for logical in files
@@ -68,6 +69,22 @@ def _read_frames(path: Path) -> list[Table]:
             for frame, channels in kept
             if channels
         ]
+
+
+@contextlib.contextmanager
+def _process_settings(path: Path) -> Iterator[None]:
+    """Set encodings and level of messages, which dlisio has once a process, and restore them."""
+    common = library("dlisio.common", path, extra="dlis")
+    logger = logging.getLogger("dlisio")
+    with _LOCK:
+        encodings, level = common.get_encodings(), logger.level
+        common.set_encodings(["utf-8", "latin1"])
+        logger.setLevel(logging.ERROR)
+        try:
+            yield
+        finally:
+            common.set_encodings(encodings)
+            logger.setLevel(level)
 
 
 def _make_table(frame: Any, channels: list[Any], names: list[str]) -> Table:

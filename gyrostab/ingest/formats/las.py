@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.stamps import dates_to_ns
 from gyrostab.ingest.columns.typed import holds_dates
+from gyrostab.ingest.formats.recognise import read_head
 from gyrostab.ingest.formats.tables import Table, library, read_tables, scan_tables, sliced
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
@@ -31,10 +32,8 @@ _DATE_AND_TIME = re.compile(r"^(\S+?)[T_/:;-](\d{1,2}:\d\d:\d\d(?:\.\d+)?)Z?$")
 
 def matches(path: Path) -> bool:
     """Return whether the file is a ``.las`` well log, not a LAS point cloud."""
-    if not path.is_file() or path.suffix.lower() != ".las":
-        return False
-    with path.open("rb") as file:
-        return any(line.lstrip().startswith(b"~") for line in file.read(8192).splitlines())
+    lines = read_head(path).splitlines() if path.suffix.lower() == ".las" else ()
+    return any(line.lstrip().startswith(b"~") for line in lines)
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:

@@ -192,7 +192,7 @@ def _find_hdf_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterat
         if isinstance(name, bytes):  # h5py leaves a name that is not UTF-8 as it is
             name = name.decode("utf-8", "backslashreplace")
         text = item.attrs.get("MATLAB_class", b"double")
-        kind = text.decode() if isinstance(text, bytes) else str(text)
+        kind = _to_text(text)
         if "MATLAB_object_decode" in item.attrs and not name.startswith("#"):
             objects.append(f"a {kind} {name!r}")
             return

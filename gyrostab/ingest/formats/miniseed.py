@@ -16,6 +16,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.ingest.formats.recognise import begins_like
 from gyrostab.ingest.formats.tables import (
     ReadSlice,
     Table,
@@ -51,10 +52,7 @@ class _Trace:
 
 def matches(path: Path) -> bool:
     """Return whether the file begins like miniSEED 2 or 3, or has such a suffix."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return bool(_HEAD.match(file.read(8))) or path.suffix.lower() in SUFFIXES
+    return begins_like(path, _HEAD, *SUFFIXES)
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:

@@ -28,6 +28,7 @@ from gyrostab.ingest.formats.netcdf_variables import (
     with_default_fill,
 )
 from gyrostab.ingest.formats.packing import decode_variables
+from gyrostab.ingest.formats.recognise import begins_like
 from gyrostab.ingest.formats.stored import StoredColumn, StoredTable, plan_stored
 from gyrostab.ingest.limits import check_declared, check_stored
 from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
@@ -61,8 +62,7 @@ def matches(path: Path) -> bool:
     """Return whether the path is a NetCDF file, by suffix or first bytes, or a Zarr store."""
     if path.is_dir():
         return any((path / name).exists() for name in ("zarr.json", ".zgroup", ".zmetadata"))
-    with path.open("rb") as file:
-        return file.read(3) == b"CDF" or path.suffix.lower() in (".nc", ".nc4", ".cdf", ".netcdf")
+    return begins_like(path, b"CDF", ".nc", ".nc4", ".cdf", ".netcdf")
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:

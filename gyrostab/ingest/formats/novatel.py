@@ -17,6 +17,7 @@ import xarray as xr
 
 from gyrostab.ingest.columns.stamps import NAT
 from gyrostab.ingest.formats.collect import Messages
+from gyrostab.ingest.formats.recognise import read_head
 from gyrostab.ingest.formats.tables import Table, library, plain_names, read_tables, scan_tables
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
@@ -32,10 +33,7 @@ _WEEK = 604_800
 
 def matches(path: Path) -> bool:
     """Return whether the file begins with a message of a NovAtel receiver."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        head = file.read(4096)
+    head = read_head(path)
     return head.startswith(_SYNC) or bool(_TEXT.search(head))
 
 

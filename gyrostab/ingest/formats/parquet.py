@@ -19,6 +19,7 @@ from gyrostab.ingest.columns.typed import (
     holds_dates,
     summarise_columns,
 )
+from gyrostab.ingest.formats.recognise import begins_like
 from gyrostab.ingest.limits import check_stored
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.store.threads import map_in_order
@@ -32,10 +33,7 @@ _BUFFER_BYTES = 2**20
 
 def matches(path: Path) -> bool:
     """Return whether the file begins like Parquet or has such a suffix."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(4) == b"PAR1" or path.suffix.lower() in (".parquet", ".pq")
+    return begins_like(path, b"PAR1", ".parquet", ".pq")
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
@@ -91,7 +89,7 @@ def _open_parquet(path: Path, options: ReadOptions) -> tuple[Any, Plan]:
     schema = file.schema_arrow
     head = next(file.iter_batches(batch_size=50), None)
     units = {
-        index: text.decode()
+        index: text.decode(errors="replace")
         for index, entry in enumerate(schema)
         if (text := (entry.metadata or {}).get(b"units")) is not None
     }

@@ -18,6 +18,7 @@ from typing import Any
 import xarray as xr
 
 from gyrostab.ingest.formats.collect import Messages
+from gyrostab.ingest.formats.recognise import read_head
 from gyrostab.ingest.formats.tables import (
     Table,
     library,
@@ -48,8 +49,7 @@ def matches(path: Path) -> bool:
     """Return whether the file begins like a bag, or the folder is a ROS 2 bag."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file()
-    with path.open("rb") as file:
-        return file.read(16).startswith(_MAGICS)
+    return read_head(path).startswith(_MAGICS)
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:

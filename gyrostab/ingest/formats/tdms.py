@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.stamps import NAT, dates_to_ns
+from gyrostab.ingest.formats.recognise import begins_like
 from gyrostab.ingest.formats.tables import (
     ReadSlice,
     Table,
@@ -37,10 +38,7 @@ _FIRST_DATE = np.datetime64(
 
 def matches(path: Path) -> bool:
     """Return whether the file begins like TDMS or has such a suffix."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(4) == b"TDSm" or path.suffix.lower() == ".tdms"
+    return begins_like(path, b"TDSm", ".tdms")
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:

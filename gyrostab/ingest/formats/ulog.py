@@ -9,6 +9,7 @@ from pathlib import Path
 
 import xarray as xr
 
+from gyrostab.ingest.formats.recognise import begins_like
 from gyrostab.ingest.formats.tables import (
     Table,
     library,
@@ -26,10 +27,7 @@ MAGIC = b"ULog\x01\x12\x35"
 
 def matches(path: Path) -> bool:
     """Return whether the file begins like a PX4 log or has such a suffix."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(len(MAGIC)) == MAGIC or path.suffix.lower() == ".ulg"
+    return begins_like(path, MAGIC, ".ulg")
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:

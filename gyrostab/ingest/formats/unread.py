@@ -8,20 +8,16 @@ import zlib
 from pathlib import Path
 
 from gyrostab.errors import FormatError
+from gyrostab.ingest.formats.recognise import read_head
 
 __all__ = ["refuse_unread"]
 
-_HEAD_BYTES = 4096
 _R_DATA = (b"RDX2\n", b"RDX3\n", b"RDA2\n", b"RDA3\n", b"X\n\0\0\0")
 
 
 def refuse_unread(path: Path) -> None:
     """Raise an error for a file of a format that is recognised but not read."""
-    if not path.is_file():
-        return
-    with path.open("rb") as file:
-        head = file.read(_HEAD_BYTES)
-    if _decompress(head).startswith(_R_DATA):
+    if _decompress(read_head(path)).startswith(_R_DATA):
         raise FormatError(
             f"{path.name}: this is a file of R data, which is not read; save it as CSV in R: "
             "write.csv(as.data.frame(x), 'log.csv', row.names = FALSE)"

@@ -20,6 +20,7 @@ import xarray as xr
 
 from gyrostab.ingest.columns.stamps import NAT
 from gyrostab.ingest.formats.collect import Messages
+from gyrostab.ingest.formats.recognise import begins_like
 from gyrostab.ingest.formats.tables import Table, read_tables, scan_tables
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
@@ -32,10 +33,7 @@ _LONGEST_LINE = 1000
 
 def matches(path: Path) -> bool:
     """Return whether the file begins with a frame of items."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return bool(_HEAD.match(file.read(256)))
+    return begins_like(path, _HEAD)
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:

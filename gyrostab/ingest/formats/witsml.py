@@ -21,6 +21,7 @@ import xarray as xr
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.stamps import texts_to_ns
+from gyrostab.ingest.formats.recognise import begins_like
 from gyrostab.ingest.formats.tables import Table, read_tables, scan_tables, sliced
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
@@ -31,10 +32,7 @@ _HEAD = re.compile(rb"(?is)^(?:\xef\xbb\xbf)?\s*<.*witsml")
 
 def matches(path: Path) -> bool:
     """Return whether the file is an XML document that names WITSML near its beginning."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return bool(_HEAD.match(file.read(4096)))
+    return begins_like(path, _HEAD)
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
