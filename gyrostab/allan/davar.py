@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any
 
 import numpy as np
@@ -36,7 +36,7 @@ from gyrostab.kernels.workspace import Workspace
 from gyrostab.schema import attributes, log_channels
 from gyrostab.time.grid import first_stamp, grid_times
 
-__all__ = ["davar", "davar_part", "davar_parts"]
+__all__ = ["davar", "davar_part", "davar_parts", "davar_sample"]
 
 #: Smallest number of parts for the threads to share, if there are as many units of work.
 _MIN_PARTS = 4
@@ -211,14 +211,13 @@ def davar_part(
     *,
     part: slice,
     space: Workspace | None = None,
-    alone: bool = False,
     **options: Any,
 ) -> xr.Dataset:
     """Compute some windows of the surface of `davar`, immediately and in the calling thread.
 
     Only the samples of these windows are read, and dask computes nothing else, so that many parts
     can be computed in parallel, in threads, processes or on other machines. The numbers are those
-    of `davar`, bit for bit, unless `alone` is set.
+    of `davar`, bit for bit.
 
     Parameters
     ----------
@@ -227,9 +226,6 @@ def davar_part(
         without a step.
     space : gyrostab.kernels.workspace.Workspace, optional
         Working memory, reused by parts that one thread computes one after the other.
-    alone : bool
-        Read no sample outside these windows, nor channels; rounding may differ from that of
-        `davar`.
     **options
         Options of `davar`, with ``method="blocks"``.
 
@@ -247,19 +243,13 @@ def davar_part(
     True
     """
     log = as_log(log)
-    plan = make_plan(log, **options)
-    if alone:
-        log = log.drop_vars(log_channels(log))
-    if plan.attrs["method"] != "blocks":
-        raise OptionError(
-            f"method={plan.attrs['method']!r} is for whole logs; parts are computed with "
-            "method='blocks'"
-        )
+    plan = _plan_blocks(log, options)
     data, unit = plan.signal.data, plan.unit
     tables = make_noise_tables(plan)
-    units = [part] if alone else units_of_work(data.shape[1], unit)
     units = [
-        windows for windows in units if windows.start < part.stop and windows.stop > part.start
+        windows
+        for windows in units_of_work(data.shape[1], unit)
+        if windows.start < part.stop and windows.stop > part.start
     ]
     spans = [(windows.start * unit.step, last_sample(windows, unit)) for windows in units]
     space = space or Workspace()
@@ -271,13 +261,53 @@ def davar_part(
     )
 
 
+def davar_sample(log: xr.Dataset, *, numbers: Sequence[int], **options: Any) -> xr.Dataset:
+    """Compute single windows of the surface of `davar`, in order, as `davar_part` does.
+
+    No sample outside these windows is read, nor are channels. Rounding may differ from that of
+    `davar`.
+    """
+    log = as_log(log)
+    log = log.drop_vars(log_channels(log))
+    plan, space = _plan_blocks(log, options), Workspace()
+    data, unit = plan.signal.data, plan.unit
+    tables = make_noise_tables(plan)
+    found = []
+    for number in numbers:
+        span = number * unit.step, last_sample(slice(number, number + 1), unit)
+        found.append(
+            [compute_unit(x, unit, tables, space) for x in read_spans(data, [span], space)]
+        )
+    cells, means = join_units(list(chain.from_iterable(zip(*found, strict=True))), data.shape[0])
+    return _attach_labels(cells, means, log, plan, numbers=numbers)
+
+
+def _plan_blocks(log: xr.Dataset, options: dict[str, Any]) -> Plan:
+    """Plan windows of the block sums, which alone can be computed in parts."""
+    plan = make_plan(log, **options)
+    if plan.attrs["method"] != "blocks":
+        raise OptionError(
+            f"method={plan.attrs['method']!r} is for whole logs; parts are computed with "
+            "method='blocks'"
+        )
+    return plan
+
+
 def _attach_labels(
-    cells: Any, means: Any, log: xr.Dataset, plan: Plan, *, part: slice | None = None
+    cells: Any,
+    means: Any,
+    log: xr.Dataset,
+    plan: Plan,
+    *,
+    part: slice | None = None,
+    numbers: Sequence[int] | None = None,
 ) -> xr.Dataset:
     cube, plane = ("axis", "time", "tau"), ("axis", "time")
     signal, unit, rate, _ = plan
     start, begin = first_stamp(log), 0 if part is None else part.start
-    first = (begin + np.arange(means.shape[2])) * unit.step
+    first = (
+        begin + np.arange(means.shape[2]) if numbers is None else np.array(numbers)
+    ) * unit.step
     bounds = np.stack(
         [grid_times(start, rate, first), grid_times(start, rate, first + unit.window)], axis=-1
     )

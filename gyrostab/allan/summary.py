@@ -113,9 +113,10 @@ def summarise_terms(product: xr.Dataset) -> list[TermSummary]:
     ('N', 'observed', 0.01)
     """
     check_product(product)
+    terms = product[["observable", *LAWS, *(f"{symbol}_upper" for symbol in LAWS)]]
     return [
-        _summarise_term(product.sel(axis=axis), str(axis), symbol)
-        for axis in product["axis"].values
+        _summarise_term(part, str(axis), symbol)
+        for axis, part in ((axis, terms.sel(axis=axis)) for axis in product["axis"].values)
         for symbol in LAWS
     ]
 

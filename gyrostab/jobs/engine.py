@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.allan.band_limit import choose_windows
-from gyrostab.allan.davar import davar_part
+from gyrostab.allan.davar import davar_part, davar_sample
 from gyrostab.allan.fit import find_bands, fit_part
 from gyrostab.allan.plan import make_plan, units_of_work
 from gyrostab.io.datasets import to_netcdf, to_zarr
@@ -63,11 +63,8 @@ def find_record_bands(
         return None
     unit = make_plan(log, **windows).unit
     count = units_of_work(log.sizes["time"], unit)[-1].stop
-    sample = [
-        davar_part(log, part=slice(number, number + 1), alone=True, **windows)
-        for number in choose_windows(count, unit.window, unit.step).tolist()
-    ]
-    surface = xr.concat(sample, "time", data_vars="all").assign_attrs(step_samples=unit.window)
+    numbers = choose_windows(count, unit.window, unit.step).tolist()
+    surface = davar_sample(log, numbers=numbers, **windows).assign_attrs(step_samples=unit.window)
     return {**fitting, "bands": find_bands(surface, **fitting)}
 
 

@@ -48,6 +48,7 @@ from gyrostab.jobs.job import check_job_folder, job_folder, lock_job, remove_job
 from gyrostab.jobs.run import find_job_name, read_job_name, run
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool, run_calls
 from gyrostab.progress import Stage, no_stage
+from gyrostab.store.cf import from_disk
 from gyrostab.store.output import (
     check_output,
     protect_inputs,
@@ -55,6 +56,7 @@ from gyrostab.store.output import (
     replace_file,
     resolve_link,
 )
+from gyrostab.store.read import open_stored
 
 __all__ = ["process_run", "run_fleet", "write_file_table"]
 
@@ -420,11 +422,10 @@ def _make_folders(target: Path, folder: Path) -> None:
 
 def _finish_run(path: Path, report: Path | None, plotly: str) -> dict[str, Any]:
     """Write the report of a product, and return what the table says of it."""
-    from gyrostab.io.datasets import open_product
     from gyrostab.report import write_report
 
-    with open_product(path) as product:
-        product = product.load()
+    product = from_disk(open_stored(path, lazy=False), str(path))
+    product.close()
     if report is not None:
         report.parent.mkdir(parents=True, exist_ok=True)
         write_report(product, report, overwrite=True, plotly=plotly)

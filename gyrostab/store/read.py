@@ -44,6 +44,7 @@ def open_stored(
     *,
     strict: bool = False,
     check: Callable[[Path, xr.Dataset], None] | None = None,
+    lazy: bool = True,
 ) -> xr.Dataset:
     """Open a dataset as it is on disk: times not decoded, data lazy, chunks checked when read.
 
@@ -54,6 +55,8 @@ def open_stored(
     check : callable, optional
         Called with the path and the dataset before any of its values is read; it raises
         `FormatError` when the declared sizes are out of proportion.
+    lazy : bool
+        False loads a surface or product, without dask.
 
     Raises
     ------
@@ -65,7 +68,7 @@ def open_stored(
     if not path.exists():
         raise FormatError(f"{path}: there is no such file")
     with reading_of(path):
-        return _open_dataset(path, strict=strict, check=check)
+        return _open_dataset(path, strict=strict, check=check, lazy=lazy)
 
 
 def _open_remote(path: Path, url: str) -> xr.Dataset:
@@ -84,7 +87,7 @@ def _open_remote(path: Path, url: str) -> xr.Dataset:
 
 
 def _open_dataset(
-    path: Path, *, strict: bool, check: Callable[[Path, xr.Dataset], None] | None
+    path: Path, *, strict: bool, check: Callable[[Path, xr.Dataset], None] | None, lazy: bool
 ) -> xr.Dataset:
     engine: Any = "zarr" if path.is_dir() else "netcdf4"
     name = "Zarr" if path.is_dir() else "NetCDF"
@@ -110,7 +113,8 @@ def _open_dataset(
     long = _find_long_variables(stored, path, strict=strict) if is_log else {}
     if path.is_dir() and own.difference(long):
         check_blosc_chunks(path, skip=list(long))
-    opened = _make_variables_lazy(stored, long, path, small=MIN_LAZY_VALUES if is_log else 0)
+    small = MIN_LAZY_VALUES if is_log else 0 if lazy else sys.maxsize
+    opened = _make_variables_lazy(stored, long, path, small=small)
     if is_log:
         # opened again when needed: an archive of any length keeps only a few files open
         stored.close()
