@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from gyrostab.ingest import files, read_log
 from gyrostab.ingest.columns import pieces
 from gyrostab.ingest.columns.pieces import (
-    DecimalPiece,
+    CountsPiece,
     EvenStampsPiece,
     PiecewiseColumn,
     PlainPiece,
@@ -23,11 +23,11 @@ from gyrostab.ingest.columns.pieces import (
 )
 from gyrostab.ingest.combine import memory_bytes
 from gyrostab.ingest.formats import text
-from gyrostab.kernels.encoding.decimals import (
-    decimals_of,
+from gyrostab.kernels.encoding.compact import (
     even_steps,
-    from_decimals,
-    to_decimals,
+    find_grid,
+    pack_counts,
+    unpack_counts,
     unroll_steps,
 )
 from gyrostab.kernels.grid.stamps import NO_STAMP, new_state, place
@@ -56,7 +56,7 @@ def test_packed_decimals_equal_parsed_ones(wholes, digits, law, missing):
         + ([] if missing is None else [missing])
     )
     counts, (factor, offset) = np.empty(values.size, np.int32), law
-    fits, absent, low, high, whole = to_decimals(values, 10.0**digits, counts)
+    fits, absent, low, high, whole = pack_counts(values, 1.0, 10.0**digits, counts)
     known = values[np.isfinite(values)]
     assert fits
     assert absent == values.size - known.size
@@ -64,7 +64,7 @@ def test_packed_decimals_equal_parsed_ones(wholes, digits, law, missing):
     if known.size:
         assert (low, high) == (known.min(), known.max())
     back = np.empty(values.size)
-    from_decimals(counts, 10.0**digits, factor, offset, back)
+    unpack_counts(counts, 1.0, 10.0**digits, factor, offset, back)
     wanted = np.where(np.isfinite(values), values, np.nan) * factor + offset
     np.testing.assert_array_equal(
         bits(back[np.isfinite(values)]), bits(wanted[np.isfinite(values)])
@@ -75,8 +75,27 @@ def test_packed_decimals_equal_parsed_ones(wholes, digits, law, missing):
 @pytest.mark.parametrize("odd", [1 / 3, -0.0, 2.0**31, np.nextafter(0.25, 1), 1e300])
 def test_other_numbers_than_32_bit_decimals_are_not_packed(odd):
     values = np.array([1.0, odd, 2.5])
-    assert not to_decimals(values, 100.0, np.empty(3, np.int32))[0]
-    assert decimals_of(np.array([1.0, 2.5, np.nan])) == 10.0
+    assert not pack_counts(values, 1.0, 100.0, np.empty(3, np.int32))[0]
+    assert find_grid(np.array([1.0, 2.5, np.nan])) == (1.0, 10.0)
+
+
+@given(
+    st.lists(st.integers(-(2**24), 2**24), min_size=1, max_size=300),
+    st.floats(1e-12, 1e6),
+    st.booleans(),
+)
+def test_counts_times_any_scale_or_over_any_sensitivity_are_packed(counts, scale, is_divisor):
+    wholes = np.array([1, *counts], float)
+    values = wholes / scale if is_divisor else wholes * scale
+    grid = find_grid(values)
+    assert grid is not None
+    packed, back = np.empty(values.size, np.int32), np.empty(values.size)
+    fits, _, low, high, _ = pack_counts(values, *grid, packed)
+    assert fits or len(counts) > 256
+    if fits:
+        assert (low, high) == (values.min(), values.max())
+        unpack_counts(packed, *grid, 1.0, 0.0, back)
+        np.testing.assert_array_equal(back, values)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 400))
@@ -108,7 +127,7 @@ def test_pieces_of_every_kind_in_memory_and_on_disk(where):
     pieces = PiecewiseColumn(
         np.float64,
         [
-            DecimalPiece(np.array([15, -(2**31), 7], np.int32), 10.0, 3600.0, 1.0),
+            CountsPiece(np.array([15, -(2**31), 7], np.int32), (1.0, 10.0), 3600.0, 1.0),
             PlainPiece(bits(floats)),
         ],
     )

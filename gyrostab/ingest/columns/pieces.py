@@ -26,7 +26,7 @@ __all__ = [
     "CHUNK_ROWS",
     "SPILL_BYTES",
     "Buffers",
-    "DecimalPiece",
+    "CountsPiece",
     "EvenStampsPiece",
     "FilePiece",
     "InspectedRows",
@@ -166,19 +166,19 @@ class PlainPiece(Piece):
 
 
 @dataclass(frozen=True)
-class DecimalPiece(PlainPiece):
-    """Decimals stored as 32-bit integers (`kernels.encoding.decimals`), converted when read."""
+class CountsPiece(PlainPiece):
+    """Values on a grid, stored as 32-bit counts, converted when read."""
 
-    tens: float
+    grid: tuple[float, float]
     factor: float
     offset: float
 
     def read_into(self, first: int, out: NDArray[Any]) -> None:
         """Read the values from row `first` on into `out`."""
-        from gyrostab.kernels.encoding.decimals import from_decimals
+        from gyrostab.kernels.encoding.compact import unpack_counts
 
         counts = self.kept[first : first + out.size]
-        from_decimals(counts, self.tens, self.factor, self.offset, out)
+        unpack_counts(counts, *self.grid, self.factor, self.offset, out)
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,7 @@ class EvenStampsPiece(Piece):
 
     def read_into(self, first: int, out: NDArray[Any]) -> None:
         """Read the values from row `first` on into `out`."""
-        from gyrostab.kernels.encoding.decimals import unroll_steps
+        from gyrostab.kernels.encoding.compact import unroll_steps
 
         unroll_steps(self.table, first, out.view(np.int64))
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.pieces import (
     Buffers,
-    DecimalPiece,
+    CountsPiece,
     EvenStampsPiece,
     Piece,
     PiecewiseColumn,
@@ -73,9 +73,9 @@ class RawLogBuilder:
         if self.time is not None:
             dtypes[self.time.source] = np.int64
         self.buffers = Buffers(dtypes, rows_of=[column.source for column in self.gyro])
-        self.tens = {
-            column.source: 1.0 for column in [*self.gyro, *self.channels]
-        }  # power of ten to try when packing decimals; 0: not packed
+        self.grids: dict[int, tuple[float, float] | None] = {
+            column.source: (1.0, 1.0) for column in [*self.gyro, *self.channels]
+        }  # step and divisor to try when packing; None: not packed
         self.bad_rows = self.bad_cells = self.cells = self.cell_rows = 0
         self.bad_places: list[str] = []
         self.cell_places: list[str] = []
@@ -101,7 +101,7 @@ class RawLogBuilder:
         words : int
             Channel cells whose text is not a number (empty cells do not count).
         """
-        from gyrostab.kernels.encoding.decimals import even_steps
+        from gyrostab.kernels.encoding.compact import even_steps
 
         size = (
             len(next(iter(values.values()))) if values else len(stamps) if stamps is not None else 0
@@ -164,20 +164,21 @@ class RawLogBuilder:
         self, column: Column, values: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | Piece, tuple[int, float, float, bool]]:
         """Convert a column to the inner unit, packed or in place; return it and its range."""
-        from gyrostab.kernels.encoding.decimals import decimals_of, to_decimals
+        from gyrostab.kernels.encoding.compact import find_grid, pack_counts
         from gyrostab.kernels.encoding.rows import clean_column
 
-        tens = self.tens[column.source]
-        for _ in range(2):
-            counts = np.empty(values.size if tens else 0, np.int32)
-            if tens:
-                fits, missing, low, high, whole = to_decimals(values, tens, counts)
-                if fits:
-                    self.tens[column.source] = tens
-                    piece = DecimalPiece(counts, tens, column.factor, column.offset)
-                    return piece, (missing, low, high, whole)
-            tens = decimals_of(values) if tens else 0.0
-        self.tens[column.source] = 0.0  # not decimals: do not try later blocks
+        grid = self.grids[column.source]
+        for search in (True, False):
+            if grid is None:
+                break
+            counts = np.empty(values.size, np.int32)
+            fits, missing, low, high, whole = pack_counts(values, *grid, counts)
+            if fits:
+                self.grids[column.source] = grid
+                piece = CountsPiece(counts, grid, column.factor, column.offset)
+                return piece, (missing, low, high, whole)
+            grid = find_grid(values) if search else None
+        self.grids[column.source] = None  # not on a grid: do not try later blocks
         missing, low, high, whole = clean_column(values, column.factor, column.offset)
         return values, (missing, low, high, whole)
 

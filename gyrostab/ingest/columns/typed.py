@@ -119,7 +119,7 @@ def read_columns(
     builder = RawLogBuilder(plan.check(), options)
     stay = stay and 8 * rows * len(plan.columns) > builder.buffers.limit
     if stay:
-        builder.tens = dict.fromkeys(builder.tens, 0.0)  # nothing is packed
+        builder.grids = dict.fromkeys(builder.grids)  # nothing is packed
     step = batch_rows(len(plan.columns))
     spans = ((start, min(start + step, rows)) for start in range(0, rows, step))
     take = partial(_convert_span, builder, plan, options, fetch, stay)

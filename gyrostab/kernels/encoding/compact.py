@@ -1,8 +1,10 @@
-"""Compact columns: decimals as 32-bit integers, stamps as even runs; both restored bit for bit."""
+"""Compact columns: values as 32-bit counts, stamps as even runs; both restored bit for bit."""
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Iterator
 
 import numpy as np
 from numba import njit
@@ -10,7 +12,13 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import KERNEL
 
-__all__ = ["decimals_of", "even_steps", "from_decimals", "to_decimals", "unroll_steps"]
+__all__ = [
+    "even_steps",
+    "find_grid",
+    "pack_counts",
+    "unpack_counts",
+    "unroll_steps",
+]
 
 #: Stands for a value that is missing.
 _FILL = np.int32(np.iinfo(np.int32).min)
@@ -18,25 +26,28 @@ _LARGEST = float(np.iinfo(np.int32).max)
 _STRETCH = 4096
 _MOST_DECIMALS = 9
 _LOOKED_AT = 256
+#: Smaller remainders, as a share of the largest value, come from rounding: 2^-53, which Euclid's
+#: algorithm amplifies by the largest count, here up to 2^25.
+_ROUNDING = 2.0**-28
 
 
 @njit(**KERNEL)
-def to_decimals(values, tens, counts):  # type: ignore[no-untyped-def]
-    """Find integers that give exactly these values when divided by a power of ten, if they exist.
+def pack_counts(values, step, divisor, counts):  # type: ignore[no-untyped-def]
+    """Find 32-bit integers that give exactly these values on a grid, if they exist.
 
     Parameters
     ----------
     values : float64 (n,)
         Values; what is not finite is missing.
-    tens : float
-        The power of ten.
+    step, divisor : float
+        The grid: a value is exactly count * step / divisor, in double precision.
     counts : int32 (n,)
         Overwritten.
 
     Returns
     -------
     fits : bool
-        False if a value is not such a decimal, or is a negative zero; the rest is then undefined.
+        False if a value is not on the grid, or is a negative zero; the rest is then undefined.
     missing : int
         Values that are not finite.
     low, high : float
@@ -44,7 +55,7 @@ def to_decimals(values, tens, counts):  # type: ignore[no-untyped-def]
     whole : bool
         Whether the others are whole numbers.
     """
-    n = values.size
+    n, scale = values.size, divisor / step
     missing, smallest, largest, all_whole = (
         np.int64(0),
         np.int32(2147483647),
@@ -56,10 +67,10 @@ def to_decimals(values, tens, counts):  # type: ignore[no-untyped-def]
         for i in range(begin, min(begin + _STRETCH, n)):
             value = values[i]
             finite = value - value == 0.0
-            near = np.rint(value * tens)
+            near = np.rint(value * scale)
             inside = abs(near) < _LARGEST
             count = np.int32(near) if finite and inside else _FILL
-            back = np.float64(count) / tens
+            back = np.float64(count) * step / divisor
             same = back == value and (count != 0 or math.copysign(1.0, value) > 0.0)
             off += finite and not same
             absent += not finite
@@ -73,45 +84,72 @@ def to_decimals(values, tens, counts):  # type: ignore[no-untyped-def]
             return False, missing, 0.0, 0.0, False
     if missing == n:
         return True, missing, np.inf, -np.inf, True
-    return True, missing, smallest / tens, largest / tens, all_whole
+    return True, missing, smallest * step / divisor, largest * step / divisor, all_whole
 
 
 @njit(**KERNEL)
-def from_decimals(counts, tens, factor, offset, values):  # type: ignore[no-untyped-def]
-    """Restore the values of `to_decimals`, times a factor plus an offset; NaN where missing.
+def unpack_counts(counts, step, divisor, factor, offset, values):  # type: ignore[no-untyped-def]
+    """Restore the values of `pack_counts`, times a factor plus an offset; NaN where missing.
 
     Parameters
     ----------
     counts : int32 (n,)
-    tens, factor, offset : float
+    step, divisor, factor, offset : float
     values : float64 (n,)
         Overwritten.
     """
     same = factor == 1.0 and offset == 0.0
-    if tens == 1.0:
+    if divisor == 1.0:
         for i in range(counts.size):
-            value = np.float64(counts[i])
+            value = np.float64(counts[i]) * step
             values[i] = np.nan if counts[i] == _FILL else value * factor + offset
         return
     for i in range(counts.size):
-        value = np.float64(counts[i]) / tens
+        value = np.float64(counts[i]) * step / divisor
         value = value if same else value * factor + offset
         values[i] = np.nan if counts[i] == _FILL else value
 
 
-def decimals_of(values: NDArray[np.float64]) -> float:
-    """Find the smallest power of ten that makes the first values whole numbers; 0 without one.
+def find_grid(values: NDArray[np.float64]) -> tuple[float, float] | None:
+    """Find step and divisor of a grid that holds the first values.
+
+    Decimal fractions are counts divided by a power of ten; other loggers write their counts times a
+    scale factor, or divided by a sensitivity.
 
     Examples
     --------
-    >>> decimals_of(np.array([1.25, np.nan, -3.0])), decimals_of(np.array([np.pi]))
-    (100.0, 0.0)
+    >>> find_grid(np.array([1.25, np.nan, -3.0]))
+    (1.0, 100.0)
+    >>> find_grid(np.arange(-50, 50) / 16.4)
+    (1.0, 16.4)
+    >>> find_grid(np.array([np.pi, np.e])) is None
+    True
     """
     some = np.ascontiguousarray(values[np.isfinite(values)][:_LOOKED_AT])
     counts = np.empty(some.size, np.int32)
-    return next(
-        (10.0**n for n in range(_MOST_DECIMALS + 1) if to_decimals(some, 10.0**n, counts)[0]), 0.0
-    )
+    decimals = ((1.0, 10.0**n) for n in range(_MOST_DECIMALS + 1))
+    for grid in itertools.chain(decimals, _guess_grids(some)):
+        if pack_counts(some, *grid, counts)[0]:
+            return grid
+    return None
+
+
+def _guess_grids(values: NDArray[np.float64]) -> Iterator[tuple[float, float]]:
+    """Yield grids whose step is the greatest common divisor of the values, up to rounding."""
+    sizes = np.abs(values)
+    largest = float(sizes.max(initial=0.0))
+    divisor = 0.0
+    for size in sizes.tolist():
+        while size > largest * _ROUNDING:
+            divisor, size = size, abs(math.remainder(divisor, size))
+    count = float(np.rint(largest / divisor)) if divisor else 0.0
+    if not 0.0 < count < _LARGEST:
+        return
+    for steps in (0, 1, -1, 2, -2):  # value and quotient are rounded to half a unit each
+        for numerator, denominator in ((largest, count), (count, largest)):
+            ratio = numerator / denominator
+            ratio += steps * math.ulp(ratio)
+            yield (ratio, 1.0) if denominator == count else (1.0, ratio)
 
 
 @njit(**KERNEL)
