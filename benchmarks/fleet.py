@@ -1,22 +1,24 @@
 """What a fleet costs a run, and what 10 000 runs would take.
 
-    python benchmarks/fleet.py [--runs 100 400] [--output docs/scaling.md]
+    python benchmarks/fleet.py [--runs 100 1000] [--output docs/scaling.md]
 
 Synthetic runs of 10 min (three axes, 10 Hz, one NetCDF log each, fifty runs a tool) are analysed
 with windows of 1 min, one after the other in this process. Two numbers of runs give the fixed cost
 of a call and the cost of a run; from these 10 000 runs are extrapolated. Processor time counts,
 because the wall time depends on what else the machine does; the work of the runs divides over
-worker processes.
+worker processes. The peak of the memory is that of this process from its start.
 """
 
 from __future__ import annotations
 
 import argparse
+import resource
 import tempfile
 import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from page import machine, renew
@@ -40,14 +42,23 @@ def write_archive(folder: Path, runs: int) -> None:
         to_netcdf(log, place / "log.nc", overwrite=True)
 
 
-def measure(call: Callable[..., object], *arguments: object, **options: object) -> float:
-    """Return the processor time of a call [s]."""
-    begun = time.process_time()
+class Cost(NamedTuple):
+    """Processor time and elapsed time of a call [s], and the peak of the memory so far [MiB]."""
+
+    processor: float
+    elapsed: float
+    peak: float
+
+
+def measure(call: Callable[..., object], *arguments: object, **options: object) -> Cost:
+    """Measure a call in this process."""
+    begun = time.process_time(), time.monotonic()
     call(*arguments, scheduler="threads", **options)
-    return time.process_time() - begun
+    spent = time.process_time() - begun[0], time.monotonic() - begun[1]
+    return Cost(*spent, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
 
 
-def measure_all(archive: Path, output: Path) -> dict[str, float]:
+def measure_all(archive: Path, output: Path) -> dict[str, Cost]:
     """Measure the steps of a fleet, from the first look at the archive to a call without news."""
     from gyrostab.jobs.fleet import run_fleet, write_file_table
 
@@ -66,7 +77,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--runs", type=int, nargs=2, default=[100, 400])
+    parser.add_argument("--runs", type=int, nargs=2, default=[100, 1000])
     parser.add_argument("--output", type=Path)
     given = parser.parse_args()
     few, many = sorted(given.runs)
@@ -81,15 +92,23 @@ def main() -> None:
         page = sum(path.stat().st_size for path in output.glob("reports/*/*")) / many
     rows = []
     for step in found[0]:
-        before, after = (one[step] for one in found[1:])
+        before, after = (one[step].processor for one in found[1:])
         cost = (after - before) / (many - few)
         fixed = max(after - many * cost, 0.0)
         total = (fixed + TARGET * cost) / 60.0
-        rows.append(f"| {step} | {after:.2f} | {fixed:.2f} | {1e3 * cost:.1f} | {total:.1f} |")
-    head = f"| step | {many} runs [s] | fixed [s] | a run [ms] | {TARGET} runs [min] |"
-    text = "\n".join([head, "|---|---|---|---|---|", *rows])
+        _, elapsed, peak = found[-1][step]
+        rows.append(
+            f"| {step} | {after:.1f} | {elapsed:.1f} | {peak:.0f} "
+            f"| {fixed:.2f} | {1e3 * cost:.1f} | {total:.1f} |"
+        )
+    head = (
+        f"| step | {many} runs: processor [s] | elapsed [s] | peak [MiB] "
+        f"| fixed [s] | a run [ms] | {TARGET} runs [min] |"
+    )
+    text = "\n".join([head, "|---|---|---|---|---|---|---|", *rows])
     text += (
-        f"\n\nProcessor time with {few} and {many} runs of {MINUTES} min, and for {TARGET}. "
+        f"\n\nThe last three columns are processor time, from calls with {few} and {many} runs of "
+        f"{MINUTES} min. "
         f"A product takes {size / 1e3:.0f} kB, a report {page / 1e3:.0f} kB.\n\n{machine()}."
     )
     print(text)

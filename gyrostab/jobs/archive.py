@@ -44,6 +44,7 @@ FLEET_SCHEMA = "gyrostab.fleet/1"
 #: Names inside such a folder that are not runs.
 RESERVED_NAMES = (
     FLEET_MARK, "effects.parquet", "files.parquet", "index.html", "index.parquet", "reports",
+    "trends.parquet",
 )  # fmt: skip
 #: Format of a folder that ``gyrostab diagnose`` wrote, in the table of files.
 DIAGNOSIS = "diagnosis"

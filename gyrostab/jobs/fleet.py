@@ -2,8 +2,9 @@
 
 The output is a folder with a NetCDF file for each run, or a Zarr store with a group for each run.
 It also holds ``files.parquet`` (the files of the archive), ``index.parquet`` (one row a run),
-``effects.parquet`` (effects that diagnoses name), ``index.html`` and ``reports``. A run is computed
-by `gyrostab.jobs.run.run`, so that its finished parts survive a stop as well.
+``effects.parquet`` (effects that diagnoses name), ``trends.parquet`` (changes with age and
+temperature), ``index.html`` and ``reports``. A run is computed by `gyrostab.jobs.run.run`, so that
+its finished parts survive a stop as well.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from gyrostab.jobs.archive import (
 from gyrostab.jobs.checks import check_windows
 from gyrostab.jobs.fleet_table import (
     FILES,
+    find_trends,
     list_effects,
     make_table,
     read_rows,
@@ -436,8 +438,10 @@ def _write_overview(table: pd.DataFrame, target: Path) -> None:
     from gyrostab.report.fleet import write_overview
 
     effects = list_effects(table)
+    trends = find_trends(table, effects)
     write_table(effects, target / "effects.parquet", content="effects", overwrite=True)
-    write_overview(table, target / "index.html", effects=effects, overwrite=True)
+    write_table(trends, target / "trends.parquet", content="trends", overwrite=True)
+    write_overview(table, target / "index.html", effects=effects, trends=trends, overwrite=True)
 
 
 def _consolidate_metadata(target: Path, names: Sequence[str]) -> None:

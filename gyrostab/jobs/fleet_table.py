@@ -12,11 +12,15 @@ import pandas as pd
 import xarray as xr
 
 from gyrostab.jobs.archive import LogRun, read_diagnosis
+from gyrostab.noise import LAWS
 from gyrostab.schema import texts
 from gyrostab.store.output import new_output
+from gyrostab.units import DAY, INNER
 
 __all__ = [
     "FILES",
+    "TREND_COLUMNS",
+    "find_trends",
     "list_effects",
     "make_table",
     "read_rows",
@@ -39,6 +43,13 @@ _EFFECT_COLUMNS = (
     "run", "tool", "start", "effect", "axes", "driver", "evidence [nats]", "parameter", "value",
     "low", "high", "unit",
 )  # fmt: skip
+
+_TERMS = tuple(f"{symbol}_" for symbol in LAWS)
+TREND_COLUMNS = ("tool", "quantity", "against", "runs", "slope", "low", "high", "p_value")
+#: Kendall's test of fewer runs cannot reject at 5 %: its smallest p-value is 2 / n!.
+_MIN_TREND_RUNS = 5
+#: Of more runs, every second, third ... is used, as slopes are those of all pairs.
+_MAX_TREND_RUNS = 1000
 
 
 def write_table(table: pd.DataFrame, path: Path, *, content: str, overwrite: bool) -> None:
@@ -80,8 +91,8 @@ def summarise_run(product: xr.Dataset) -> dict[str, Any]:
     -------
     dict
         Span, rate, windows, share of missing samples, worst window, and by axis the median of each
-        term where it is observed (NaN elsewhere), its median upper limit, and the misfit. Names of
-        columns end with the unit.
+        term where it is observed (NaN elsewhere), its median upper limit, and the misfit, and the
+        median of each temperature. Names of columns end with the unit.
 
     Examples
     --------
@@ -113,6 +124,9 @@ def summarise_run(product: xr.Dataset) -> dict[str, Any]:
         row[f"{name}_upper [{term.unit}]"] = term.value if is_limit else np.nan
     for fit in summarise_fit(product):
         row[f"misfit_{fit.axis}"] = fit.chi2_per_dof
+    for label, channel in product.data_vars.items():
+        if channel.attrs.get("units") == INNER["temperature"]:
+            row[f"{label} [degC]"] = float(channel.median())
     return row
 
 
@@ -203,3 +217,56 @@ def list_effects(table: pd.DataFrame) -> pd.DataFrame:
                 numbers = {name: size.get(name) for name in ("value", "low", "high", "unit")}
                 rows.append({**known, "parameter": parameter, **numbers})
     return pd.DataFrame(rows, columns=list(_EFFECT_COLUMNS))
+
+
+def find_trends(table: pd.DataFrame, effects: pd.DataFrame) -> pd.DataFrame:
+    """Find how coefficients and sizes of effects change with age and temperature, by tool.
+
+    Each run is one point. Slopes are those of Theil and Sen, tests those of Kendall, which need no
+    error of a point and resist outliers.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        One row a run, from `make_table`.
+    effects : pandas.DataFrame
+        From `list_effects`.
+
+    Returns
+    -------
+    pandas.DataFrame
+        One row for each tool, quantity and driver (age in days, temperatures) with at least five
+        runs: slope with 95 % interval [unit of the quantity per unit of the driver], and p-value
+        times the number of rows (Bonferroni).
+
+    References
+    ----------
+    Sen 1968, doi:10.1080/01621459.1968.10480934.
+    """
+    from scipy.stats import kendalltau, theilslopes
+
+    done = table[table["error"] == ""]
+    columns = list(map(str, done.columns))
+    terms = [name for name in columns if name[:2] in _TERMS and "_upper [" not in name]
+    sizes = effects.assign(
+        quantity=effects["effect"] + " " + effects["parameter"] + " " + effects["axes"]
+        + " [" + effects["unit"] + "]"
+    ).drop_duplicates(["run", "quantity"], keep=False)  # fmt: skip
+    points = pd.concat(
+        [done.melt("run", terms, "quantity"), sizes[["run", "quantity", "value"]]]
+    ).dropna()
+    start = pd.to_datetime(done["start"])
+    drivers = {"age [d]": (start - start.min()).dt.total_seconds() / DAY}
+    drivers |= {name: done[name] for name in columns if name.endswith(" [degC]")}
+    points = points.merge(done[["run", "tool"]].assign(**drivers), on="run")
+    rows = []
+    for (tool, quantity), part in points.groupby(["tool", "quantity"]):
+        for driver in drivers:
+            known = part[[driver, "value"]].dropna().to_numpy(float)
+            x, y = known[:: -(-len(known) // _MAX_TREND_RUNS) or 1].T
+            if len(np.unique(x)) >= _MIN_TREND_RUNS:
+                slope, _, low, high = theilslopes(y, x)
+                p_value = kendalltau(x, y).pvalue
+                rows.append((tool, quantity, driver, x.size, slope, low, high, p_value))
+    found = pd.DataFrame(rows, columns=list(TREND_COLUMNS))
+    return found.assign(p_value=(found["p_value"] * len(found)).clip(upper=1.0))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -33,6 +33,7 @@ from gyrostab.units import HOUR
 __all__ = ["combine_effects", "write_overview"]
 
 _PANEL_MM = 45.0
+_MAX_CHANCE = 0.05  # probability that chance alone shows any trend
 
 
 def write_overview(
@@ -40,6 +41,7 @@ def write_overview(
     path: str | os.PathLike[str],
     *,
     effects: pd.DataFrame | None = None,
+    trends: pd.DataFrame | None = None,
     overwrite: bool = False,
 ) -> Path:
     """Write the overview of many runs as one self-contained HTML file.
@@ -52,6 +54,8 @@ def write_overview(
         File to write; links to reports are relative to its folder.
     effects : pandas.DataFrame, optional
         Effects that diagnoses name, from `gyrostab.jobs.fleet_table.list_effects`.
+    trends : pandas.DataFrame, optional
+        Changes with age and temperature, from `gyrostab.jobs.fleet_table.find_trends`.
     overwrite : bool
         Replace an existing file.
 
@@ -72,6 +76,8 @@ def write_overview(
             axes=axes,
             tools=[_describe_tool(str(tool), part, axes) for tool, part in done.groupby("tool")],
             effects=[] if effects is None else combine_effects(effects, done),
+            trend_count=0 if trends is None else len(trends),
+            trends=[] if trends is None else _describe_trends(trends),
             runs=[_describe_run(row, axes, Path(path).parent) for row in done.to_dict("records")],
             figures=[_make_figure(done, axes)] if len(done) and axes else [],
         )
@@ -140,6 +146,19 @@ def _describe_size(size: Mapping[Any, Any]) -> str:
         return text
     interval = "" if pd.isna(size["low"]) else f" ({size['low']:.3g} to {size['high']:.3g})"
     return f"{text}: {size['parameter']} {size['value']:.3g}{interval} {size['unit']}"
+
+
+def _describe_trends(trends: pd.DataFrame) -> list[dict[Hashable, Any]]:
+    """Describe the trends that are not chance, the clearest first."""
+    clear = trends[trends["p_value"] < _MAX_CHANCE].sort_values("p_value")
+    return [
+        {
+            **row,
+            "slope": f"{row['slope']:.3g} ({row['low']:.3g} to {row['high']:.3g})",
+            "p_value": f"{row['p_value']:.2g}",
+        }
+        for row in clear.to_dict("records")
+    ]
 
 
 def _describe_run(row: Mapping[Any, Any], axes: list[str], folder: Path) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from gyrostab.errors import FormatError, OutputError
 from gyrostab.jobs import fleet as fleet_module
 from gyrostab.jobs.archive import find_archive, find_runs
 from gyrostab.jobs.fleet import process_run, run_fleet, write_file_table
-from gyrostab.jobs.fleet_table import read_table, write_table
+from gyrostab.jobs.fleet_table import TREND_COLUMNS, read_table, write_table
 from gyrostab.jobs.run import run
 from gyrostab.report.fleet import write_overview
 
@@ -165,7 +165,12 @@ def test_the_overview_escapes_names_and_links_reports(done, tmp_path):
     assert "http" not in page.replace("http://www.w3.org", "")
     table = read_table(done / "index.parquet", content="runs")
     table["report"] = "reports/" + table["run"] + ".html"
-    text = write_overview(table, tmp_path / "index.html").read_text(encoding="utf-8")
+    row = ("<i>", "N_x [deg/sqrt(h)]", "age [d]", 9, 0.0333, 0.0111, 0.0444, 0.002)
+    trends = pd.DataFrame([row, (*row[:-1], 0.2)], columns=list(TREND_COLUMNS))
+    page = write_overview(table, tmp_path / "index.html", trends=trends)
+    text = page.read_text(encoding="utf-8")
+    assert text.count("0.0333 (0.0111 to 0.0444)") == 1
+    assert "<i>" not in text
     assert 'href="reports/tool%201/run%20%3Cb%3E.html"' in text
 
 

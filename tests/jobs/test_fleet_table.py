@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from gyrostab.jobs.archive import find_archive, find_runs
-from gyrostab.jobs.fleet_table import list_effects, read_verdict
+from gyrostab.jobs.fleet_table import find_trends, list_effects, read_verdict
 from gyrostab.report.fleet import combine_effects
 from tests.support.diagnosed import content
 
@@ -52,3 +53,58 @@ def test_a_damaged_diagnosis_is_that_of_the_run_above_it(text, tmp_path):
     (tmp_path / "a" / "found" / "diagnosis.json").write_text(text)
     (found,) = find_runs(find_archive([tmp_path]), table)
     assert read_verdict(str(found.diagnosis)) == "not readable"
+
+
+# ------------------------------------------------------------------------------
+# changes with age and temperature
+
+
+def make_runs(draw: np.random.Generator, count: int = 12) -> pd.DataFrame:
+    """Runs of one tool whose N rises by 0.1 a month, and whose B is noise."""
+    days = np.sort(draw.uniform(0.0, 360.0, count))
+    rows = {
+        "run": [f"tool/{number}" for number in range(count)],
+        "tool": "tool",
+        "error": "",
+        "start": pd.Timestamp("2026-01-01") + pd.to_timedelta(days, unit="D"),
+        "N_x [deg/sqrt(h)]": 3.0 + days / 300.0 + 0.1 * draw.standard_normal(count),
+        "N_x_upper [deg/sqrt(h)]": 1.0,
+        "B_x [deg/h]": draw.standard_normal(count),
+        "temperature [degC]": 20.0 + draw.standard_normal(count),
+    }
+    return pd.DataFrame(rows)
+
+
+def size_rows(table: pd.DataFrame, values: np.ndarray) -> pd.DataFrame:
+    known = {"effect": "bias", "parameter": "value", "axes": "x", "unit": "deg/h"}
+    return table[["run", "tool", "start"]].assign(value=values, **known)
+
+
+def test_a_coefficient_that_rises_with_age_is_a_trend():
+    table = make_runs(np.random.default_rng(1))
+    effects = size_rows(table, 2.0 * table["temperature [degC]"])
+    found = find_trends(table, effects).set_index(["quantity", "against"])
+    assert len(found) == 6
+    rising = found.loc[("N_x [deg/sqrt(h)]", "age [d]")]
+    assert (rising["runs"], rising["tool"]) == (12, "tool")
+    assert rising["low"] < 1.0 / 300.0 < rising["high"]
+    size = found.loc[("bias value x [deg/h]", "temperature [degC]")]
+    assert (size["low"], size["slope"], size["high"]) == pytest.approx((2.0, 2.0, 2.0))
+    assert set(found.index[found["p_value"] < 0.05]) == {rising.name, size.name}
+
+
+def test_trends_of_noise_are_rarely_found():
+    """The probability that chance shows any trend of a fleet is at most 5 %."""
+    draw = np.random.default_rng(2)
+    found = 0
+    for _ in range(60):
+        table = make_runs(draw, 8)
+        table["N_x [deg/sqrt(h)]"] = draw.standard_cauchy(8)
+        found += bool((find_trends(table, size_rows(table, np.nan))["p_value"] < 0.05).any())
+    assert found <= 8  # of 60 with 5 % each, in all but 1 % of cases
+
+
+def test_few_or_failed_runs_have_no_trends():
+    table = make_runs(np.random.default_rng(3), 4)
+    for part in (table, table.assign(error="failed", start=None)):
+        assert not len(find_trends(part, size_rows(part, np.nan)))
