@@ -48,7 +48,7 @@ _TERMS = tuple(f"{symbol}_" for symbol in LAWS)
 TREND_COLUMNS = ("tool", "quantity", "against", "runs", "slope", "low", "high", "p_value")
 #: Kendall's test of fewer runs cannot reject at 5 %: its smallest p-value is 2 / n!.
 _MIN_TREND_RUNS = 5
-#: Of more runs, every second, third ... is used, as slopes are those of all pairs.
+#: Largest number of runs in a trend; more are thinned evenly, as slopes are those of all pairs.
 _MAX_TREND_RUNS = 1000
 
 
