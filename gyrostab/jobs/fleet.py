@@ -38,8 +38,10 @@ from gyrostab.jobs.checks import check_windows
 from gyrostab.jobs.fleet_table import (
     FILES,
     find_trends,
+    is_zarr,
     list_effects,
     make_table,
+    product_path,
     read_rows,
     read_table,
     summarise_run,
@@ -235,21 +237,12 @@ def _find_foreign(folder: Path) -> str | None:
     return None if is_fleet(folder) else min(os.listdir(folder), default=None)
 
 
-def _is_zarr(target: Path) -> bool:
-    return target.suffix.lower() == ".zarr"
-
-
-def _product_path(target: Path, name: str) -> Path:
-    """Return the path of the product of a run."""
-    return target / (name if _is_zarr(target) else f"{name}.nc")
-
-
 def _begin_output(target: Path, *, reports: bool) -> None:
     from gyrostab.report.charts import plotly_script
 
     target.mkdir(exist_ok=True)
     _write_json(target / FLEET_MARK, {"schema": FLEET_SCHEMA})
-    if _is_zarr(target):
+    if is_zarr(target):
         _write_json(target / ".zgroup", {"zarr_format": 2})
     if reports:
         (target / "reports").mkdir(exist_ok=True)
@@ -299,7 +292,7 @@ def _compute_runs(
     rows = {
         name: row
         for name, row in before.items()
-        if name not in stale and _product_path(target, name).exists()
+        if name not in stale and product_path(target, name).exists()
     }
     work = partial(
         process_run, str(target.absolute()), json.dumps(options, default=str), reports, overwrite
@@ -325,7 +318,7 @@ def _compute_runs(
         table = make_table(rows, runs)
         write_rows(table, target)
         _write_overview(table, target)
-        if _is_zarr(target):
+        if is_zarr(target):
             _consolidate_metadata(target, list(rows))
     return table
 
@@ -348,7 +341,7 @@ def _is_current(
     """Whether row, product and report of a run are those of its files and options."""
     if row is None or row["error"] or (reports and not (target / str(row["report"])).is_file()):
         return False
-    made_by = read_job_name(_product_path(target, item.name))
+    made_by = read_job_name(product_path(target, item.name))
     return bool(row.get("job") == made_by == find_job_name(item.files, **options))
 
 
@@ -381,7 +374,7 @@ def process_run(
     """
     import dask
 
-    name, product = item["name"], _product_path(Path(target), item["name"])
+    name, product = item["name"], product_path(Path(target), item["name"])
     row = {
         "run": name,
         "tool": item["tool"],
@@ -401,7 +394,7 @@ def process_run(
                 workers=1,
                 resume=not overwrite,  # which does nothing if the product is complete
                 overwrite=True,
-                zarr=_is_zarr(Path(target)),
+                zarr=is_zarr(Path(target)),
             )
             report = Path(target, row["report"]) if reports else None
             row |= _finish_run(product, report, "../" * name.count("/") + PLOTLY_FILE)
@@ -415,7 +408,7 @@ def process_run(
 def _make_folders(target: Path, folder: Path) -> None:
     """Make the folders between the output and a run, in a Zarr store as groups."""
     folder.mkdir(parents=True, exist_ok=True)
-    for group in [folder, *folder.parents] if _is_zarr(target) else ():
+    for group in [folder, *folder.parents] if is_zarr(target) else ():
         if group == target:
             break
         if not (group / ".zgroup").exists():

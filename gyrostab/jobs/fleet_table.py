@@ -11,18 +11,23 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from gyrostab.jobs.archive import LogRun, read_diagnosis
+from gyrostab.jobs.archive import LogRun, is_fleet, read_diagnosis
 from gyrostab.noise import LAWS
 from gyrostab.schema import texts
+from gyrostab.store.cf import from_disk
 from gyrostab.store.output import new_output
+from gyrostab.store.read import open_stored
 from gyrostab.units import DAY, INNER
 
 __all__ = [
     "FILES",
     "TREND_COLUMNS",
     "find_trends",
+    "is_zarr",
     "list_effects",
     "make_table",
+    "open_fleet",
+    "product_path",
     "read_rows",
     "read_table",
     "read_verdict",
@@ -77,6 +82,44 @@ def read_table(path: Path, *, content: str) -> pd.DataFrame | None:
         return None
     frame: pd.DataFrame = table.to_pandas()
     return frame
+
+
+def is_zarr(target: Path) -> bool:
+    """Whether the products of an output are groups of a Zarr store."""
+    return target.suffix.lower() == ".zarr"
+
+
+def product_path(target: Path, name: str) -> Path:
+    """Return the path of the product of a run."""
+    return target / (name if is_zarr(target) else f"{name}.nc")
+
+
+def open_fleet(folder: Path) -> xr.Dataset | None:
+    """Open the windows of all runs of a fleet, or of those in a folder of it, as one product.
+
+    The surfaces are left out but for the longest averaging time of each run.
+
+    Returns
+    -------
+    xarray.Dataset or None
+        None if `folder` is neither a fleet nor a folder of runs in one.
+    """
+    folder = folder.absolute()
+    root = next((path for path in (folder, *folder.parents) if is_fleet(path)), None)
+    rows = {} if root is None else read_rows(root)
+    paths = [product_path(root, name) for name, row in rows.items() if root and not row["error"]]
+    products = []
+    for path in paths:
+        if folder in path.parents:
+            with from_disk(open_stored(path, lazy=False), str(path)) as product:
+                names = [name for name, item in product.data_vars.items() if "time" in item.dims]
+                products.append(product[names].isel(tau=slice(-1, None)))
+    if not products:
+        return None
+    whole = xr.concat(
+        products, "time", data_vars="all", join="outer", combine_attrs="drop_conflicts"
+    )
+    return whole.assign_attrs(source_files=[f"{len(products)} runs of {folder.name}"])
 
 
 def summarise_run(product: xr.Dataset) -> dict[str, Any]:

@@ -174,6 +174,18 @@ def test_the_overview_escapes_names_and_links_reports(done, tmp_path):
     assert 'href="reports/tool%201/run%20%3Cb%3E.html"' in text
 
 
+def test_survey_terms_are_those_of_the_windows_of_all_runs(done, tmp_path, capsys):
+    for folder in (done, done / "tool 1"):
+        call = ["export", str(folder), "--format", "iscwsa", "-o", str(tmp_path / "tool.csv")]
+        assert main([*call, "--overwrite"]) == 0
+        assert f"from 2 runs of {folder.name}, " in capsys.readouterr().out
+    runs = [open_product(done / "tool 1" / f"run {name}.nc").load() for name in ("a", "<b>")]
+    noise = np.concatenate([run["N"].values[0] for run in runs])
+    terms = pd.read_csv(tmp_path / "tool.csv", comment="#").set_index("code")
+    assert terms.loc["GXY-GRW", "value"] == pytest.approx(np.nanmedian(noise))
+    assert main(["export", str(tmp_path), "--format", "iscwsa", "-o", str(tmp_path / "a.csv")]) == 2
+
+
 # ------------------------------------------------------------------------------
 # the second call
 

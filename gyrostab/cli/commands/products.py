@@ -180,7 +180,8 @@ def export(
     Parameters
     ----------
     product
-        File written by gyrostab run or gyrostab fit.
+        File written by gyrostab run or gyrostab fit; for iscwsa also a folder written by gyrostab
+        fleet, or a folder of runs in it.
     output
         File or, for zarr, folder to write.
     format
@@ -193,6 +194,7 @@ def export(
     from gyrostab.io.datasets import open_log, open_product, to_zarr
     from gyrostab.io.kalibr import to_kalibr
     from gyrostab.io.survey_files import SUFFIXES, to_iscwsa
+    from gyrostab.jobs.fleet_table import open_fleet
     from gyrostab.store.output import check_output
 
     writers: dict[str, tuple[Any, list[str]]] = {
@@ -211,5 +213,8 @@ def export(
         options = {"log": open_log(log)}
     with show_stages(common) as stage:
         stage("writing", 0)
-        written = write(open_product(product), target, overwrite=common.overwrite, **options)
+        opened = open_fleet(product) if format == "iscwsa" else None
+        if opened is None:
+            opened = open_product(product)
+        written = write(opened, target, overwrite=common.overwrite, **options)
     print(*([written, ""] if format == "iscwsa" else []), target, sep="\n")
