@@ -12,7 +12,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.identify.equivalents import prefer_plainer
-from gyrostab.diagnose.identify.identification import Identification, Identifications, Unidentified
+from gyrostab.diagnose.identify.identification import (
+    Identification,
+    Identifications,
+    Selection,
+)
 from gyrostab.diagnose.identify.logger_filters import fit_filter_sizes
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
@@ -79,7 +83,7 @@ def fit_identifications(identifications: Identifications, baseline: xr.Dataset) 
     found: list[Fitted] = []
     for identification in identifications.identified:
         state = start
-        everything: list[Identification | Unidentified] = [
+        everything: list[Selection] = [
             *identifications.expected,
             *identifications.identified,
             *identifications.unknown,

@@ -11,7 +11,11 @@ import numpy as np
 
 from gyrostab.diagnose.evidence.telegraph import telegraph_evidence
 from gyrostab.diagnose.identify.effect_candidates import largest_size
-from gyrostab.diagnose.identify.identification import Identification, Unidentified, components_of
+from gyrostab.diagnose.identify.identification import (
+    Identification,
+    Selection,
+    components_of,
+)
 from gyrostab.diagnose.identify.jumps import event_nats, gradual_nats, scatter_nats
 from gyrostab.diagnose.identify.logger_filters import separate_axes_nats
 from gyrostab.diagnose.identify.steady import intermittent_nats
@@ -44,8 +48,8 @@ EQUIVALENTS = {"thermal_hysteresis": "temperature_bias"}
 
 
 def without_pulses(
-    chosen: Sequence[Identification | Unidentified], *, settings: Settings = DEFAULTS
-) -> list[Identification | Unidentified]:
+    chosen: Sequence[Selection], *, settings: Settings = DEFAULTS
+) -> list[Selection]:
     """Drop spikes on axes that have a comb of lines or a profile of the feedback ramp.
 
     A comb is a periodic pulse, and the outliers are the pulse itself. Bad samples would make no
@@ -56,7 +60,7 @@ def without_pulses(
         has_profile = component.statistic.is_phase_locked and not component.statistic.is_rotation
         weight = settings.min_comb_lines if has_profile else int(component.statistic.is_line)
         lines.update(dict.fromkeys(component.row, weight))
-    out: list[Identification | Unidentified] = []
+    out: list[Selection] = []
     for one in chosen:
         if isinstance(one, Identification) and one.effect == "spikes":
             kept = tuple(

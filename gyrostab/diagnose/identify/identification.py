@@ -21,6 +21,7 @@ __all__ = [
     "Identification",
     "Identifications",
     "Rejection",
+    "Selection",
     "Unidentified",
     "add_identification",
     "components_of",
@@ -98,6 +99,10 @@ class Unidentified:
     instead: Mapping[str, float] = field(default_factory=dict)
 
 
+#: What forward selection puts into the model.
+Selection = Identification | Unidentified
+
+
 class Rejection(NamedTuple):
     """An effect that was examined and not named.
 
@@ -166,7 +171,7 @@ class Identifications:
         return "partly explained" if self.unknown else "explained"
 
 
-def components_of(chosen: Iterable[Identification | Unidentified]) -> list[Component]:
+def components_of(chosen: Iterable[Selection]) -> list[Component]:
     """Return the components of several selections, in order."""
     return [component for one in chosen for component in one.components]
 
@@ -189,9 +194,7 @@ def remove_phase_locked(identifications: Identifications) -> tuple[Identificatio
     return replace(identifications, identified=tuple(kept)), evidence_nats
 
 
-def add_identification(
-    chosen: Sequence[Identification | Unidentified], one: Identification | Unidentified
-) -> list[Identification | Unidentified]:
+def add_identification(chosen: Sequence[Selection], one: Selection) -> list[Selection]:
     """Return the list with another selection; one of the same effect and channel is merged with it.
 
     Lines of other frequencies are not merged.
@@ -266,7 +269,7 @@ def find_unidentified(
 
 def form_error(
     components: Sequence[Component],
-    chosen: Sequence[Identification | Unidentified],
+    chosen: Sequence[Selection],
     *,
     settings: Settings = DEFAULTS,
 ) -> float:

@@ -12,6 +12,7 @@ from gyrostab.diagnose.identify.identifiability import find_better_form
 from gyrostab.diagnose.identify.identification import (
     Identification,
     Rejection,
+    Selection,
     Unidentified,
     form_error,
 )
@@ -27,7 +28,7 @@ _NOISE = "noise"
 
 def find_rejections(
     components: Mapping[str, Sequence[Component]],
-    chosen: Sequence[Identification | Unidentified],
+    chosen: Sequence[Selection],
     expected: Sequence[Identification],
     threshold: float,
     state: State,
@@ -81,7 +82,7 @@ def find_rejections(
 
 def _find_veto(
     components: Sequence[Component],
-    chosen: Sequence[Identification | Unidentified],
+    chosen: Sequence[Selection],
     state: State,
     folds: xr.DataArray,
     error: float,
@@ -107,7 +108,7 @@ def _find_veto(
     return _name_of(strongest), strongest.evidence_nats - sum_evidence(components)
 
 
-def _name_of(selection: Identification | Unidentified) -> str:
+def _name_of(selection: Selection) -> str:
     if isinstance(selection, Identification):
         return selection.effect
     return NUISANCE_ALTERNATIVES[selection.generic]

@@ -9,11 +9,6 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
-from gyrostab.diagnose.identify.completeness import (
-    excess_low_frequency_noise,
-    variance_fluctuation,
-    with_neighbouring_variants,
-)
 from gyrostab.diagnose.identify.components import (
     PLAIN_LINE,
     are_lines,
@@ -35,6 +30,7 @@ from gyrostab.diagnose.identify.identifiability import (
 from gyrostab.diagnose.identify.identification import (
     Identification,
     Rejection,
+    Selection,
     Unidentified,
     add_identification,
     components_of,
@@ -51,8 +47,9 @@ from gyrostab.diagnose.identify.switching import (
     put_followers_first,
     renew_component,
 )
+from gyrostab.diagnose.identify.withdrawal import Withdrawal, condition_on_selections
 from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
-from gyrostab.diagnose.predict.condition import condition_on, condition_on_components, refit_weights
+from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import compute_evidence, reusable_mean_evidence
 from gyrostab.diagnose.settings import DEFAULTS, Settings
@@ -63,12 +60,8 @@ __all__ = ["Search"]
 MAX_EFFECTS = 10
 #: Lines are counted apart: whatever rotates or switches makes combs of them.
 MAX_LINES = 40
-#: Effects that change the white variance of the means, which the calibration then misjudges.
-_SPECTRAL_SHAPES = ("logger_filter", "held_samples", "gauss_markov", "telegraph")
 #: Sample counts of zeros: a sample is zero for one reason only.
 _ZERO_COUNTS = {"stuck", "filled"}
-
-Selection = Identification | Unidentified
 
 
 @dataclass(frozen=True)
@@ -118,16 +111,20 @@ class Search:
         """
         selected, found = self._select_all(start)
         chosen = drop_explained_jumps(
-            selected, lambda some: self._condition(start, some), self._evidence, self.threshold
+            selected,
+            lambda some: condition_on_selections(start, some),
+            self._evidence,
+            self.threshold,
         )
         chosen = self._prune(start, without_pulses(chosen, settings=self.settings))
         chosen, identified = self._settle(start, chosen)
         unidentified = [one for one in chosen if isinstance(one, Unidentified)]
-        state = self._condition(start, [*identified, *unidentified])
-        kept, withdrawn = self._withdraw_incomplete(start, state, identified, unidentified)
+        state = condition_on_selections(start, [*identified, *unidentified])
+        withdrawal = Withdrawal(start, self.candidates, self.folds, self.threshold, self.settings)
+        kept, withdrawn = withdrawal.run(state, identified, unidentified)
         unidentified += withdrawn
         if len(kept) < len(identified) or withdrawn:
-            state = self._condition(start, [*kept, *unidentified])
+            state = condition_on_selections(start, [*kept, *unidentified])
         kept = sorted(kept, key=lambda one: -one.evidence_nats)
         is_unchanged = _variants_by_row(selected) == _variants_by_row([*kept, *unidentified])
         rejected = self._reject_others(
@@ -381,21 +378,6 @@ class Search:
             p_value,
         )
 
-    def _condition(
-        self, start: State, chosen: Sequence[Selection], without: Selection | None = None
-    ) -> State:
-        """Return the state with all selections but one in the model."""
-        state, has_new_lines = start, False
-        for selection in (one for one in chosen if one is not without):
-            if are_lines(selection.components):
-                # what lines add to the powers is fitted once for all of a comb
-                state = condition_on_components(state, selection.components)
-                has_new_lines = True
-                continue
-            state = refit_weights(state) if has_new_lines else state
-            state, has_new_lines = condition_on(state, list(selection.components)), False
-        return refit_weights(state) if has_new_lines else state
-
     def _prune(self, start: State, chosen: list[Selection]) -> list[Selection]:
         """Drop what fails the threshold with the others in the model, the weakest first.
 
@@ -408,7 +390,7 @@ class Search:
         ):
             if len(chosen) < 2:
                 break
-            state = self._condition(start, chosen, selection)
+            state = condition_on_selections(start, chosen, selection)
             again = group_components(
                 self._evidence(candidates_of(selection.components), state), settings=self.settings
             )
@@ -461,7 +443,7 @@ class Search:
         self, start: State, identification: Identification, chosen: Sequence[Selection]
     ) -> Identification:
         """Return an identification with its evidence and its rivals, all others in the model."""
-        state = self._condition(start, chosen, identification)
+        state = condition_on_selections(start, chosen, identification)
         key = identification.components[0].candidate.key
         on_axes, weighted = self._find_instead(identification, state)
         again = find_layers_again(
@@ -540,7 +522,7 @@ class Search:
                     one,
                     instead=_sum_by_key(
                         self._find_instead(
-                            one, self._condition(start, [*identified, *unidentified], one)
+                            one, condition_on_selections(start, [*identified, *unidentified], one)
                         )[0]
                     ),
                 )
@@ -559,88 +541,6 @@ class Search:
             self.folds,
         )
 
-    def _withdraw_incomplete(
-        self,
-        start: State,
-        state: State,
-        identified: list[Identification],
-        unidentified: Sequence[Unidentified],
-    ) -> tuple[list[Identification], list[Unidentified]]:
-        """Withdraw effects that leave structure in time, in the means or in the powers."""
-        kept, withdrawn = list(identified), []
-        for axis in state.axes:
-            kept, unexplained = self._withdraw_in_means(state, kept, unidentified, axis)
-            withdrawn += unexplained
-        for axis in state.axes:
-            on_axis = _identified_on(kept, axis, in_means=False)
-            if not on_axis:
-                continue
-            weak, _ = self._find_weak(
-                on_axis, variance_fluctuation(self._condition(start, kept), axis)
-            )
-            if weak:
-                kept = [one for one in kept if one not in weak]
-                rest = self._condition(start, [*kept, *unidentified])
-                withdrawn += self._find_fluctuation(rest, axis, weak)
-        return kept, withdrawn
-
-    def _withdraw_in_means(
-        self,
-        state: State,
-        kept: list[Identification],
-        unidentified: Sequence[Unidentified],
-        axis: str,
-    ) -> tuple[list[Identification], list[Unidentified]]:
-        """Withdraw effects on the means of an axis that leave more slow noise than calibrated."""
-        on_axis = _identified_on(kept, axis, in_means=True)
-        part_of_drift = _find_part_of_drift(on_axis, unidentified, axis)
-        kept = [one for one in kept if one not in part_of_drift]
-        has_alternative = any(
-            one.generic in ("~bias(t)", "~S(f)", "~cov") and axis in one.axes
-            for one in unidentified
-        )
-        has_shape = any(
-            component.candidate.effect in _SPECTRAL_SHAPES and axis in component.row
-            for component in components_of(kept)
-        )
-        if has_alternative or has_shape:
-            return kept, []
-        left = excess_low_frequency_noise(
-            with_neighbouring_variants(state, on_axis, axis), axis, self.folds
-        )
-        weak, strength = self._find_weak(on_axis, left)
-        if not weak and left <= self.threshold + self.settings.form_error_share * strength:
-            return kept, []
-        names = tuple(one.effect for one in weak)
-        unexplained = Unidentified("~red", (axis,), left, self.threshold, names)
-        return [one for one in kept if one not in weak], [unexplained]
-
-    def _find_weak(
-        self, identified: Sequence[Identification], left: float
-    ) -> tuple[list[Identification], float]:
-        """Return the effects that explain too little for what they leave [nats], and their sum."""
-        settings = self.settings
-        strength = sum(one.evidence_nats for one in identified)
-        most = settings.component_nats + settings.form_error_share * strength
-        share = settings.spectrum_error_share
-        return [one for one in identified if left > max(most, share * one.evidence_nats)], strength
-
-    def _find_fluctuation(
-        self, state: State, axis: str, weak: Sequence[Identification]
-    ) -> list[Unidentified]:
-        """Return what a free noise level explains on an axis, instead of withdrawn effects."""
-        free = [one for one in self.candidates if one.effect == "~N(t)"]
-        found = group_components(
-            compute_evidence(free, state.blocks, state, self.folds), settings=self.settings
-        )
-        components = [
-            component
-            for component in found.get("~N(t)", [])
-            if component.row == (axis,) and component.evidence_nats > self.threshold
-        ]
-        names = [one.effect for one in weak]
-        return [find_unidentified("~N(t)", components, self.threshold, names)] if components else []
-
 
 def _variants_by_row(chosen: Sequence[Selection]) -> set[tuple[str, tuple[str, ...], int]]:
     """Return what the selections put into the model: rows and identities of the variants."""
@@ -656,34 +556,6 @@ def _sum_by_key(components: Mapping[str, Sequence[Component]]) -> dict[str, floa
 
 def _positive_evidence(found: CandidateEvidence) -> float:
     return float(np.maximum(found.evidence_nats[0], 0.0).sum())
-
-
-def _identified_on(
-    identified: Sequence[Identification], axis: str, *, in_means: bool
-) -> list[Identification]:
-    """Return the identifications with a component in the means of an axis, or in its powers."""
-    return [
-        one
-        for one in identified
-        if any(
-            (component.statistic.is_linear_in_means if in_means else component.statistic.is_power)
-            and component.row == (axis,)
-            for component in one.components
-        )
-    ]
-
-
-def _find_part_of_drift(
-    on_axis: Sequence[Identification], unidentified: Sequence[Unidentified], axis: str
-) -> list[Identification]:
-    """Return effects without a channel that explain less than an unidentified drift of the axis.
-
-    They may be a piece of that drift.
-    """
-    drift = sum(
-        one.evidence_nats for one in unidentified if one.generic == "~bias(t)" and axis in one.axes
-    )
-    return [one for one in on_axis if not any(one.driver) and one.evidence_nats < drift]
 
 
 def _confirmed_components(components: Sequence[Component], state: State) -> list[Component]:

@@ -14,9 +14,8 @@ import numpy as np
 from gyrostab.diagnose.evidence.telegraph import telegraph_evidence
 from gyrostab.diagnose.identify.components import axes_of, evidence_of
 from gyrostab.diagnose.identify.identification import (
-    Identification,
     Identifications,
-    Unidentified,
+    Selection,
     components_of,
 )
 from gyrostab.diagnose.identify.jumps import is_free_jump
@@ -101,11 +100,11 @@ def identify_switching(
 
 
 def drop_explained_jumps(
-    chosen: Sequence[Identification | Unidentified],
-    state_with: Callable[[Sequence[Identification | Unidentified]], State],
+    chosen: Sequence[Selection],
+    state_with: Callable[[Sequence[Selection]], State],
     gains: Callable[[Sequence[Candidate], State], list[CandidateEvidence]],
     threshold: float,
-) -> list[Identification | Unidentified]:
+) -> list[Selection]:
     """Drop jumps that a telegraph bias on their axis explains when fitted without them.
 
     The first and the last of a few switches are jumps of the same step, and a telegraph bias that
@@ -162,16 +161,14 @@ def _block_evidence(component: Component, state: State) -> float:
     return float(evidence_nats[0])
 
 
-def _contains_all(
-    chosen: Sequence[Identification | Unidentified], components: Sequence[Component]
-) -> bool:
+def _contains_all(chosen: Sequence[Selection], components: Sequence[Component]) -> bool:
     known = components_of(chosen)
     return all(any(component is own for own in known) for component in components)
 
 
 def _replace_component(
-    identification: Identification | Unidentified, component: Component, instead: Component
-) -> Identification | Unidentified:
+    identification: Selection, component: Component, instead: Component
+) -> Selection:
     return replace(
         identification,
         components=tuple(instead if own is component else own for own in identification.components),
@@ -179,7 +176,7 @@ def _replace_component(
 
 
 def _jumps_on_axis(
-    component: Component, chosen: Sequence[Identification | Unidentified], state: State
+    component: Component, chosen: Sequence[Selection], state: State
 ) -> list[Component]:
     return [
         one
@@ -188,9 +185,7 @@ def _jumps_on_axis(
     ]
 
 
-def _drop_components(
-    chosen: Sequence[Identification | Unidentified], left_out: Sequence[Component]
-) -> list[Identification | Unidentified]:
+def _drop_components(chosen: Sequence[Selection], left_out: Sequence[Component]) -> list[Selection]:
     """Drop some components from the selections, and selections that lose all."""
     out = []
     for one in chosen:
