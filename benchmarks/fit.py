@@ -64,9 +64,8 @@ def measure(x: np.ndarray, taus: int, repeats: int) -> tuple[int, list[float]]:
     diagonal = combine_diagonal(*diagonal_products(window, ks, shifts))
     whole = best(lambda: fit_noise(surface), repeats)
     kernel = best(lambda: window_fit.run_kernel(flat, *trends, tables, 31), repeats)
-    block = best(
-        lambda: window_fit.fit_block(flat, *trends, tables, allowed=31, observed_only=True), repeats
-    )
+    options = {"white_error": np.zeros(trends[0].size), "allowed": 31, "observed_only": True}
+    block = best(lambda: window_fit.fit_block(flat, *trends, tables, **options), repeats)
     seconds = [
         whole,
         kernel,

@@ -63,7 +63,8 @@ def simulate_units(rng: np.random.Generator, trials: int, n: int, rate: float, s
             both = surface_of(records[a] + records[b] + lost, rate).avar
             cross = 0.5 * (both - alone[a].avar - alone[b].avar)
             parts[a, b] = cross / (units[a] * units[b])
-    trends = [surface.window_trend / unit for surface, unit in zip(alone, units, strict=True)]
+    names = ["window_trend", "difference_trend"]
+    trends = [surface[names] / unit for surface, unit in zip(alone, units, strict=True)]
     return alone[1], parts, trends
 
 
@@ -71,10 +72,7 @@ def mix(white_surface: xr.Dataset, parts, trends, squares: np.ndarray) -> xr.Dat
     roots = np.sqrt(squares)
     avar = sum((1 if a == b else 2) * roots[a] * roots[b] * parts[a, b] for a, b in PAIRS)
     trend = sum(root * part for root, part in zip(roots, trends, strict=True))
-    return white_surface.assign(
-        avar=white_surface.avar.copy(data=avar.data),
-        window_trend=white_surface.window_trend.copy(data=trend.data),
-    )
+    return white_surface.assign(avar=white_surface.avar.copy(data=avar.data), **trend.data_vars)
 
 
 def choose_squares(tables: window_fit.FitTables, mixture: str) -> np.ndarray:

@@ -115,6 +115,10 @@ VARIABLES: dict[str, dict[str, Any]] = {
         "as a share of the gap-free law",
         "units": "1",
     },
+    "difference_trend": {
+        "long_name": "slope of the rate that the second differences show through the gaps",
+        "units": "degree hour-2",
+    },
     "window_mean": {"long_name": "mean rotation rate of the window", "units": INNER["rate"]},
     "window_trend": {
         "long_name": "slope of the least-squares line through the rate of the window",

@@ -87,13 +87,14 @@ def cluster_cell(
     angles = -np.diff(
         design, axis=1, prepend=0.0, append=0.0
     )  # the same terms of an angle instead of its differences
-    pairs = design @ design.T
+    pairs, ramp = design @ design.T, design @ np.arange(x.size)
     return {
         "count": len(rows),
         "avar": float(((design @ values) ** 2).sum() / (2 * weight.sum())),
         "white_response": float((design**2).sum() / (2 * weight.sum()) * k),
         "quantization_response": float((angles**2).sum() / (2 * weight.sum()) * k**2 / 3),
-        "ramp_response": float(((design @ np.arange(x.size)) ** 2).sum() / (weight.sum() * k**2)),
+        "ramp_response": float((ramp**2).sum() / (weight.sum() * k**2)),
+        "slope": float((design @ values) @ ramp / (ramp @ ramp)),
         "coverage": float(weight.sum() / (offered * float(k) ** 2)),
         "edf": float(np.trace(pairs) ** 2 / (pairs**2).sum()),
     }
@@ -141,6 +142,7 @@ def fit_window_plainly(
         total = np.einsum("aij,bij,abij->ij", outer, outer, pairs)
         total += (
             s[4]
+            * trend[5]
             * tables.to_samples[4]
             * np.sqrt(np.multiply.outer(ramp, ramp))
             * np.einsum("aij,aij->ij", outer, ramps)

@@ -96,12 +96,13 @@ def compute_unit(
     if unit.angle:
         cells.avar[:] *= scale**2
     means[0] *= scale
+    cells.difference_trend[:] *= _trend_scale(unit)
     fields = [*cells, _cell_freedoms(cells, tables)]
     return fields, np.concatenate([means, _describe_windows(x, unit)])
 
 
 def _stack_unit(x: NDArray[np.generic], unit: Unit, tables: NoiseTables) -> tuple[Floats, Floats]:
-    """`compute_unit` with all fields in one array (9, n_windows, n_tau)."""
+    """`compute_unit` with all fields in one array (10, n_windows, n_tau)."""
     fields, means = compute_unit(x, unit, tables)
     return np.stack(np.broadcast_arrays(*fields)), means
 
@@ -140,9 +141,14 @@ def _describe_windows(
     count = (x.size - unit.window - unit.angle) // unit.step + 1 if windows is None else windows
     first = np.arange(count) * unit.step
     trends = window_trends(x, angle=unit.angle, window=unit.window, step=unit.step, n_windows=count)
-    trends[0] *= HOUR / unit.interval * (HOUR / unit.interval if unit.angle else 1.0)
+    trends[0] *= _trend_scale(unit)
     outliers = count_outliers(x, first, unit.window)
     return np.vstack([trends, outliers, gap_edge_ratio(x, first, unit.window)])
+
+
+def _trend_scale(unit: Unit) -> float:
+    """Slope per sample (for angles: of the angle per sample) to deg/h^2."""
+    return float((HOUR / unit.interval) ** (2 if unit.angle else 1))
 
 
 class NoiseTables(NamedTuple):
@@ -180,7 +186,7 @@ def _cached_noise_tables(
 def _cell_freedoms(cells: Cells, tables: NoiseTables) -> Floats:
     """Compute the degrees of freedom of cells (n_windows, n_tau) from a quick fit of the noise."""
     chosen, columns, weight, to_samples, diagonal = tables
-    seen = (cells.avar, *cells[5:], cells.gap_factor)
+    seen = (cells.avar, *cells[5:8], cells.gap_factor)
     few = [np.ascontiguousarray(field[:, chosen]) for field in seen]
     squares = identify_noise(*few, columns[chosen], weight[chosen], to_samples)
     return np.asarray(cell_freedoms(squares, *seen, columns, to_samples, diagonal))
@@ -252,7 +258,15 @@ def run_published_method(
             avar[coverage < unit.min_coverage] = np.nan
         one = np.ones_like(avar)
         cells = Cells(
-            avar, counts.astype(np.float64), coverage, coverage, STRICT * one, one, one, one
+            avar,
+            counts.astype(np.float64),
+            coverage,
+            coverage,
+            STRICT * one,
+            one,
+            one,
+            one,
+            np.nan * one,
         )
         means = window_means(x, unit)[:, :n_windows]
         means[0] *= HOUR if unit.angle else 1.0

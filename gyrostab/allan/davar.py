@@ -121,10 +121,10 @@ def davar(
     -------
     xarray.Dataset
         ``avar, count, coverage, edf, estimator, white_response, quantization_response,
-        ramp_response (axis, time, tau)``, ``window_mean, window_coverage, window_trend,
-        trend_response, outlier_count, gap_edge_ratio (axis, time)``, and every channel of the log
-        averaged over each window; ``time`` is the centre of the window, with ``time_bounds``;
-        ``tau`` [s]. Units are attributes of the variables.
+        ramp_response, difference_trend (axis, time, tau)``, ``window_mean, window_coverage,
+        window_trend, trend_response, outlier_count, gap_edge_ratio (axis, time)``, and every
+        channel of the log averaged over each window; ``time`` is the centre of the window, with
+        ``time_bounds``; ``tau`` [s]. Units are attributes of the variables.
 
     Raises
     ------

@@ -21,7 +21,7 @@ from gyrostab.allan.window_fit import FitTables, fit_block, fit_tables, run_kern
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.fit.covariance import STOCHASTIC
 from gyrostab.kernels.fit.least_squares import FIT_FIELDS
-from gyrostab.noise import LAWS, TERMS, avar_columns
+from gyrostab.noise import HOUR, LAWS, TERMS, avar_columns
 from gyrostab.schema import attributes, check_surface
 from gyrostab.time.durations import duration_seconds, thin
 
@@ -273,9 +273,9 @@ def find_bands(
         return {axis: BandLimit(float(tau[chosen[0]]), 0.0) for axis in axes}
     window = int(surface.attrs.get("window_samples", 1))
     step = int(surface.attrs.get("step_samples", window))
-    part = surface[[name for name in _FIT_VARIABLES if name in surface]]
+    part = surface[[name for name in (*_FIT_VARIABLES, "difference_trend") if name in surface]]
     part = part.isel(time=choose_windows(part.sizes["time"], window, step)).compute()
-    cells, tables, chosen = _prepare_fit(part, chosen)
+    cells, tables, chosen = _prepare_fit(part, chosen, _bits(wanted))
 
     def fit(
         rows: list[NDArray[np.float64]],
@@ -283,14 +283,14 @@ def find_bands(
         response: NDArray[np.float64],
         allowed: int,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        result, misfit, _ = run_kernel(rows, trend, response, tables, allowed)
+        result, misfit, _ = run_kernel(rows, trend, response, 0.0 * trend, tables, allowed)
         return result[:, FIT_FIELDS.index("square")], misfit
 
     return {
         axis: find_band_limit(
             tau[chosen],
             [cell[row][:, chosen] for cell in cells[:5]],
-            *(cell[row, :, 0] for cell in cells[5:]),
+            *(cell[row, :, 0] for cell in cells[5:7]),
             allowed=_bits(wanted),
             columns=tables.columns,
             fit=fit,
@@ -337,10 +337,16 @@ def _select_taus(tau: NDArray[np.float64], tau_min: Any, tau_max: Any) -> NDArra
     return chosen
 
 
-def _fit_inputs(surface: xr.Dataset) -> tuple[list[Any], NDArray[np.int64], float, int]:
+def _fit_inputs(
+    surface: xr.Dataset, allowed: int = 31
+) -> tuple[list[Any], NDArray[np.int64], float, int]:
     """Collect the cells as (axis, time, tau) arrays, averaging factors, rate and window length.
 
-    The last two arrays are the trend and its response, (axis, time, 1).
+    Trend and its response follow, and whether its product with the noise is removed (axis, time,
+    1). The line of slope b through a window of which the second differences show the slope s adds
+    ``b (2 s - b) tau^2 / 2`` to the Allan variance. Without gaps s is near b, and its scatter is
+    known (`gyrostab.kernels.fit.trend`). Through gaps it is not, but s is measured, and what
+    exceeds ``b^2 tau^2 / 2`` is removed here.
     """
     try:
         rate, window = (
@@ -361,7 +367,15 @@ def _fit_inputs(surface: xr.Dataset) -> tuple[list[Any], NDArray[np.int64], floa
             "it with gyrostab.davar"
         )
     cells = [surface[name].data for name in _FIT_VARIABLES]
-    return [*cells[:5], *(plane[..., None] for plane in cells[5:])], ks, rate, window
+    cells[5:] = [plane[..., None] for plane in cells[5:]]
+    if "difference_trend" in surface and allowed >> STOCHASTIC & 1:
+        trend, seen = cells[5], surface["difference_trend"].data
+        excess = cells[3] * (surface["tau"].values / HOUR) ** 2 * trend * (seen - trend)
+        cells[0] = cells[0] - np.nan_to_num(excess)
+        exact = np.isfinite(seen).any(axis=-1, keepdims=True)
+    else:
+        exact = np.zeros_like(cells[5], dtype=bool)
+    return [*cells, exact], ks, rate, window
 
 
 #: Variables of a surface that a fit uses: by averaging time, and the last two by window.
@@ -377,10 +391,10 @@ _FIT_VARIABLES = (
 
 
 def _prepare_fit(
-    surface: xr.Dataset, within: NDArray[np.int64]
+    surface: xr.Dataset, within: NDArray[np.int64], allowed: int
 ) -> tuple[list[Any], FitTables, NDArray[np.int64]]:
     """Return the cells of a surface, and tables and positions of the averaging times to fit."""
-    cells, ks, rate, window = _fit_inputs(surface)
+    cells, ks, rate, window = _fit_inputs(surface, allowed)
     chosen = within[thin_factors(ks[within])]
     shifts = thin(ks[chosen]) if surface.attrs.get("overlap") == "octave" else np.zeros_like(chosen)
     variance = surface.attrs.get("variance", "avar")
@@ -399,7 +413,7 @@ def _fit_gls(
 ) -> xr.Dataset:
     if surface.attrs.get("variance") == "hadamard":  # which does not see a ramp
         allowed &= ~(1 << STOCHASTIC)
-    cells, tables, chosen = _prepare_fit(surface, within)
+    cells, tables, chosen = _prepare_fit(surface, within, allowed)
     tau = surface["tau"].values
     tau_min, constant, error = (
         np.array(values)[:, None, None] for values in zip(*limits, strict=True)
@@ -415,16 +429,17 @@ def _fit_gls(
             np.ascontiguousarray(a[..., chosen].reshape(-1, chosen.size), dtype=np.float64)
             for a in arrays[:5]
         ]
-        trend, response, filtered, white_error = (
+        trend, response, exact, filtered, white_error = (
             np.asarray(a, dtype=np.float64).reshape(-1) for a in arrays[5:]
         )
-        fitted = np.empty((trend.size, width))
+        fitted = np.empty((filtered.size, width))
         for rows, terms in ((filtered == 0, allowed), (filtered > 0, allowed & ~_bits("Q"))):
             if rows.any():
                 fitted[rows] = fit_block(
                     [a[rows] for a in flat],
                     trend[rows],
                     response[rows],
+                    exact[rows],
                     tables,
                     white_error=white_error[rows],
                     allowed=terms,

@@ -127,6 +127,7 @@ def fit_block(
     flat: list[NDArray[np.float64]],
     trend: NDArray[np.float64],
     response: NDArray[np.float64],
+    exact: NDArray[np.float64],
     tables: FitTables,
     *,
     white_error: NDArray[np.float64],
@@ -135,9 +136,10 @@ def fit_block(
 ) -> NDArray[np.float64]:
     """Fit windows: coefficients, errors, limits, observability, chi2, dof and edf as columns.
 
+    `exact` is 1 where the product of ramp and noise is removed from the cells, else 0;
     `white_error` is the relative error of N that a window does not show.
     """
-    result, misfit, dof = run_kernel(flat, trend, response, tables, allowed)
+    result, misfit, dof = run_kernel(flat, trend, response, exact, tables, allowed)
     field = {name: result[:, i] for i, name in enumerate(FIT_FIELDS)}
     field["variance_square"][:, TERMS.index("N")] += (2.0 * white_error) ** 2
     fails = _widen_misfits(field, misfit)
@@ -162,17 +164,19 @@ def run_kernel(
     flat: list[NDArray[np.float64]],
     trend: NDArray[np.float64],
     response: NDArray[np.float64],
+    exact: NDArray[np.float64],
     tables: FitTables,
     allowed: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Run `fit_windows`, less the trend if a ramp is allowed; other terms are NaN."""
-    trends = np.zeros((trend.size, STOCHASTIC + 1))
+    trends = np.zeros((trend.size, STOCHASTIC + 2))
     pairs, ramps = tables.pairs, tables.ramps
     if allowed >> STOCHASTIC & 1:
         pairs, ramps = tables.trend.pairs, tables.trend.ramps
         trends[:, :STOCHASTIC] = tables.trend_variance
         trends[:, TERMS.index("N")] *= response
         trends[:, STOCHASTIC] = trend**2
+        trends[:, STOCHASTIC + 1] = 1.0 - exact
         trends = np.nan_to_num(trends)
     noise = allowed if allowed & 15 else allowed | 1 << TERMS.index("N")  # for a ramp alone
     result, misfit, dof = fit_windows(

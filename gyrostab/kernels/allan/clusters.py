@@ -124,9 +124,9 @@ def integrate_places(starts, stops, n):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _add_pairs(theta, places, mask, a, b, k, stride, row):  # type: ignore[no-untyped-def]
-    """Add the pairs of clusters in ``a <= m < b``: weight d^2, weight, responses, number."""
+    """Add the pairs of clusters in ``a <= m < b``: weight d^2, weight, responses, number, trend."""
     one = np.int64(1)
-    squares = weights = white = quantization = ramp = 0.0
+    squares = weights = white = quantization = ramp = slope = 0.0
     count = 0
     for m in range((a + stride - 1) // stride * stride, b, stride):
         row0, row1, row2 = np.uint64(m >> 6), np.uint64((m + k) >> 6), np.uint64((m + 2 * k) >> 6)
@@ -165,6 +165,7 @@ def _add_pairs(theta, places, mask, a, b, k, stride, row):  # type: ignore[no-un
         inverse = 1.0 / (f1 * f2)
         squares += d * d * inverse
         ramp += apart * apart * inverse
+        slope += apart * d * inverse
         weights += f1 * f2
         white += f1 + f2
         quantization += 2.0 * (r1 * f2 * f2 + r2 * f1 * f1) * inverse + 2.0 * cut1
@@ -175,6 +176,7 @@ def _add_pairs(theta, places, mask, a, b, k, stride, row):  # type: ignore[no-un
     row[3] += quantization
     row[4] += count
     row[5] += ramp
+    row[6] += slope
 
 
 @njit(**INNER)
@@ -197,17 +199,17 @@ def cluster_cells(theta, places, mask, window, step, k, stride, poor):  # type: 
 
     Returns
     -------
-    float64 (n_windows, 6)
+    float64 (n_windows, 7)
         Weighted mean of ``(mean2 - mean1)^2 / 2`` [square of the rate's unit]; responses to unit
         white and quantization noise, relative to the gap-free laws; weight used, as a share of the
         gap-free weight; number of pairs used, 0 without pairs or if the window is not computed;
-        response to a ramp.
+        response to a ramp; slope of the rate per sample that fits the pairs best.
     """
     length = window - 2 * k + 1
     whole = length // step
     head = length - whole * step
     n_windows = poor.size
-    heads, tails = np.zeros((n_windows + whole, 6)), np.zeros((n_windows + whole, 6))
+    heads, tails = np.zeros((n_windows + whole, 7)), np.zeros((n_windows + whole, 7))
     last = -1
     for j in range(n_windows):
         if poor[j]:
@@ -217,9 +219,9 @@ def cluster_cells(theta, places, mask, window, step, k, stride, poor):  # type: 
                 if block < n_windows + whole - 1:
                     _add_pairs(theta, places, mask, a + head, a + step, k, stride, tails[block])
             last = j + whole
-    sums = np.empty((n_windows, 6))
-    windows_from_blocks(heads, tails, np.full(6, whole), sums)
-    out = np.zeros((n_windows, 6))
+    sums = np.empty((n_windows, 7))
+    windows_from_blocks(heads, tails, np.full(7, whole), sums)
+    out = np.zeros((n_windows, 7))
     for j in range(n_windows):
         if poor[j] and sums[j, 4] > 0.0:
             offered = (j * step + length + stride - 1) // stride - (j * step + stride - 1) // stride
@@ -229,6 +231,7 @@ def cluster_cells(theta, places, mask, window, step, k, stride, poor):  # type: 
             out[j, 3] = sums[j, 1] / (offered * float(k) * k)
             out[j, 4] = sums[j, 4]
             out[j, 5] = sums[j, 5] / (sums[j, 1] * float(k) * k)
+            out[j, 6] = sums[j, 6] / sums[j, 5]
     return out
 
 

@@ -35,6 +35,7 @@ from gyrostab.kernels.allan.integrate import (
 )
 from gyrostab.kernels.allan.intervals import single_blocks, valid_intervals
 from gyrostab.kernels.allan.pairs import strict_gap_factors
+from gyrostab.kernels.allan.trend import difference_slopes
 from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.compiled import KERNEL
 from gyrostab.kernels.workspace import Workspace
@@ -114,6 +115,8 @@ class Cells(NamedTuple):
     white_response: Floats
     quantization_response: Floats
     ramp_response: Floats
+    #: Slope of the rate per sample as the second differences show it; NaN in windows without gaps.
+    difference_trend: Floats
 
 
 @njit(**KERNEL)
@@ -160,6 +163,7 @@ def _bridge_gaps(theta, starts, stops, window, step, ks, strides, poor, cells): 
                 cells[5, j, i] = bridged[j, 1]
                 cells[6, j, i] = bridged[j, 2]
                 cells[7, j, i] = bridged[j, 5]
+                cells[8, j, i] = bridged[j, 6]
 
 
 class _Present(NamedTuple):
@@ -367,7 +371,8 @@ def surface_unit(
         full = np.ascontiguousarray(np.broadcast_to(full, counts.shape))
         return _cells_with_gaps(x, unit, present, sums / scale, counts, full, space), means
     one = np.ones((1, unit.ks.size))
-    return Cells(sums / (scale * full), full, one, one, STRICT * one, one, one, one), means
+    others = one, STRICT * one, one, one, one, np.nan * one
+    return Cells(sums / (scale * full), full, one, *others), means
 
 
 def _empty_cells(n_windows: int, n_tau: int) -> tuple[Cells, Floats]:
@@ -375,7 +380,7 @@ def _empty_cells(n_windows: int, n_tau: int) -> tuple[Cells, Floats]:
     none, zero = np.full((1, n_tau), np.nan), np.zeros((1, n_tau))
     avar = np.full((n_windows, n_tau), np.nan)
     means = np.stack([np.full(n_windows, np.nan), np.zeros(n_windows)])
-    return Cells(avar, zero, zero, zero, NONE + zero, none, none, none), means
+    return Cells(avar, zero, zero, zero, NONE + zero, none, none, none, none), means
 
 
 def _cells_with_gaps(
@@ -398,6 +403,7 @@ def _cells_with_gaps(
         starts, stops, unit.angle, unit.window, unit.step, unit.ks, unit.shifts, *order, counts,
         full, cells,
     )  # fmt: skip
+    cells[8] = _find_slopes(x, unit, present, counts < full, space)
     poor = counts < unit.min_strict * full
     bridge = unit.order == 2 and not unit.zero_fill and not unit.angle
     if bridge and poor.any():
@@ -406,10 +412,32 @@ def _cells_with_gaps(
         _bridge_gaps(angle, starts, stops, unit.window, unit.step, unit.ks, strides, poor, cells)
     if not unit.zero_fill:
         blank = ~(cells[2] >= unit.min_coverage)
-        cells[0][blank] = cells[5][blank] = cells[6][blank] = cells[7][blank] = np.nan
+        cells[0][blank] = np.nan
+        cells[5:, blank] = np.nan
         cells[4][blank] = NONE
         cells[3][blank] = 0.0
     return Cells(*cells)
+
+
+def _find_slopes(
+    x: NDArray[np.generic],
+    unit: Unit,
+    present: _Present,
+    with_gaps: NDArray[np.bool_],
+    space: Workspace,
+) -> Floats:
+    """Find the slope of the rate that the second differences of windows with gaps show."""
+    if unit.order == 3 or unit.zero_fill:
+        return np.full(with_gaps.shape, np.nan)
+    starts, stops, offset = present
+    if unit.angle:
+        angle = _line_removed(x, starts, stops)
+    else:
+        angle = space.array("angle", x.size + 1)
+        integrate(x, offset, starts, stops, angle)
+    places = starts, stops, unit.window, unit.step, len(with_gaps)
+    slopes = difference_slopes(angle, *places, unit.ks, unit.points)
+    return np.where(with_gaps, slopes, np.nan)
 
 
 def _number_of_windows(x: NDArray[np.generic], unit: Unit) -> int:

@@ -1,4 +1,4 @@
-"""Least-squares trend of the rate in each window, from sums over blocks of one step."""
+"""Trend of the rate in each window: of its samples, and as its second differences see it."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gyrostab.kernels.allan.blocks import windows_from_blocks
+from gyrostab.kernels.allan.intervals import valid_intervals
 from gyrostab.kernels.compiled import INNER, KERNEL
 
-__all__ = ["window_trends"]
+__all__ = ["difference_slopes", "window_trends"]
 
 #: Moments of a block: present samples, their places, squares of these, rates, rates times places.
 _MOMENTS = 5
@@ -80,3 +81,65 @@ def window_trends(
         spread = np.where(count > 1, square - place**2 / count, np.nan)
         slope = (product - place * rate / count) / spread
     return np.stack([slope, window * (window**2 - 1.0) / 12.0 / spread])
+
+
+@njit(**INNER)
+def _sum_differences(sums, a, b, k):  # type: ignore[no-untyped-def]
+    """Sum the second differences from a to b, from the running sums of the angle."""
+    return (
+        (sums[b + 2 * k] - sums[a + 2 * k])
+        - 2.0 * (sums[b + k] - sums[a + k])
+        + (sums[b] - sums[a])
+    )
+
+
+@njit(**INNER)
+def _sum_before(m, begin, end, sums, totals, k):  # type: ignore[no-untyped-def]
+    """Count and sum the valid second differences before m; `totals` are those before intervals."""
+    v = np.searchsorted(end, m)
+    if v < begin.size and begin[v] < m:
+        return totals[v, 0] + m - begin[v], totals[v, 1] + _sum_differences(sums, begin[v], m, k)
+    return totals[v, 0], totals[v, 1]
+
+
+@njit(**KERNEL)
+def difference_slopes(theta, starts, stops, window, step, n_windows, ks, points):  # type: ignore[no-untyped-def]
+    """Average the second differences in unbroken runs of each window, as slopes of the rate.
+
+    Parameters
+    ----------
+    theta : float64 (n + 1,) or (n,)
+        Angle, finite.
+    starts, stops : int64 (n_runs,)
+        Runs of present samples, or of present angles.
+    window, step, n_windows : int
+        Windows start at samples 0, step, 2 step ...
+    ks : int64 (n_tau,)
+        Averaging factors.
+    points : int
+        As for `valid_intervals`.
+
+    Returns
+    -------
+    float64 (n_windows, n_tau)
+        Slope per sample as of `window_trends`; NaN without second differences.
+    """
+    out = np.empty((n_windows, ks.size))
+    sums = np.zeros(theta.size + 1)
+    sums[1:] = np.cumsum(theta)
+    for i in range(ks.size):
+        k = ks[i]
+        begin, end = valid_intervals(starts, stops, k, 2 * k, points)
+        totals = np.zeros((begin.size + 1, 2))
+        for v in range(begin.size):
+            totals[v + 1, 0] = totals[v, 0] + end[v] - begin[v]
+            totals[v + 1, 1] = totals[v, 1] + _sum_differences(sums, begin[v], end[v], k)
+        for j in range(n_windows):
+            a = j * step
+            count, total = _sum_before(a + window - 2 * k + 1, begin, end, sums, totals, k)
+            before, lower = _sum_before(a, begin, end, sums, totals, k)
+            slope = (
+                (total - lower) / (float(k) * k * (count - before)) if count > before else np.nan
+            )
+            out[j, i] = slope
+    return out

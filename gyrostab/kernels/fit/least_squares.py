@@ -192,7 +192,7 @@ def identify_noise(avar, white, quantization, ramp, factor, columns, weight, to_
     out = np.empty((n_windows, 5))
     cells, fit = _make_cells(n_tau), _Fit(eights(5), eights(5), eights(5), eights(4))
     normal, right, scratch = eights(25), eights(5), eights(75)
-    trend, valid = np.zeros((n_windows, 5)), np.empty(PLACES, np.int64)
+    trend, valid = np.zeros((n_windows, 6)), np.empty(PLACES, np.int64)
     allowed = np.int64(31 if columns[0, 4] > 0.0 else 15)  # some variances do not see a ramp
     for start in range(0, n_windows, PLACES):
         _observe_eight(
@@ -442,9 +442,10 @@ def fit_windows(  # type: ignore[no-untyped-def]
     ----------
     avar, white, quantization, ramp, gap_factor : float64 (n_windows, n_tau)
         Cells [degree2 hour-2], NaN where missing, and their responses to the gaps.
-    trend : float64 (n_windows, 5)
+    trend : float64 (n_windows, 6)
         Variance of the trend of the window per squared coefficient of Q, N, B and K, and the
-        squared trend [degree2 hour-4]; zeros if a ramp is not fitted.
+        squared trend [degree2 hour-4]; zeros if a ramp is not fitted. Last, 0 where the product of
+        ramp and noise is removed from the cells, else 1.
     columns : float64 (n_tau, 5)
         Allan variance per squared coefficient.
     to_samples : float64 (5,)

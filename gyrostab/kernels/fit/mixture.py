@@ -77,7 +77,8 @@ def observe(  # type: ignore[no-untyped-def]
 
     Design matrix and data, both less the part of the squared trend of the window, go to
     ``cells.system`` (row ``6 cell + column``). `trend` is the variance of the trend per squared
-    coefficient. What a unit of each squared coefficient is in sample units, as the cell sees it
+    coefficient (0 to 3), and 0 if the product of ramp and noise is removed from the cells, else 1
+    (5). What a unit of each squared coefficient is in sample units, as the cell sees it
     through the gaps, goes to ``cells.seen`` (``6 cell + row``), the Allan variance to
     ``cells.avar``, the reciprocal of `factor` to ``cells.inverse``. What the gaps add to
     quantization noise comes from the ends of many runs spread over each cluster, so it scatters
@@ -111,7 +112,7 @@ def observe(  # type: ignore[no-untyped-def]
         )
         seen[at + 3, place] = to_samples[2]
         seen[at + 4, place] = to_samples[3]
-        seen[at + 5, place] = ramp[i] * to_samples[4]
+        seen[at + 5, place] = trend[5] * ramp[i] * to_samples[4]
         cells.inverse[i, place] = 1.0 / factor[i]
         cells.excess[0, place] = max(cells.excess[0, place], seen[at + 2, place])
         n += 1

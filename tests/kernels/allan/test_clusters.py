@@ -101,6 +101,9 @@ def test_cells_equal_the_sum_over_their_terms(seed, data):
                 assert float(cell[name]) == pytest.approx(
                     want[name], rel=1e-6 if name == "avar" else 1e-10, abs=1e-12
                 ), name
+            assert float(cell.difference_trend) / 3600 == pytest.approx(
+                want["slope"], rel=1e-6, abs=1e-9
+            )
 
 
 @pytest.mark.parametrize("share", [0.05, 0.2])
