@@ -118,6 +118,22 @@ def judge(product: xr.Dataset, squares: np.ndarray) -> list[str]:
     return cells
 
 
+def summarise_claims(lines: list[str]) -> str:
+    """Tabulate how often a term is observed that is absent: mean and largest share of the rows."""
+    claims: dict[tuple[str, str], list[list[float]]] = {}
+    for line in lines[2:]:
+        window, missing, _, *cells = line.strip("| ").split(" | ")
+        own = claims.setdefault((window, missing), [[] for _ in TERMS])
+        for shares, cell in zip(own, cells, strict=True):
+            if cell.startswith("claimed"):
+                shares.append(float(cell.split()[1]))
+    out = ["| window | missing | Q | B | K | R |", "|---|---|---|---|---|---|"]
+    for (window, missing), own in claims.items():
+        cells = [f"{np.mean(shares):.1%}; {max(shares):.1%}" for shares in own if shares]
+        out.append(f"| {window} | {missing} | {' | '.join(cells)} |")
+    return "\n".join(out)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -149,6 +165,7 @@ def main() -> None:
                 print(lines[-1], flush=True)
     if options.output:
         renew(options.output, "coverage", "\n".join(lines))
+        renew(options.output, "claims", summarise_claims(lines))
 
 
 if __name__ == "__main__":
