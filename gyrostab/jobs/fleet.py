@@ -22,7 +22,7 @@ from typing import Any
 
 import pandas as pd
 
-from gyrostab.errors import FormatError, GyrostabError, WorkerError
+from gyrostab.errors import FormatError, GyrostabError, OptionError, WorkerError
 from gyrostab.jobs.archive import (
     DIAGNOSIS,
     FLEET_MARK,
@@ -61,6 +61,7 @@ from gyrostab.store.output import (
     resolve_link,
 )
 from gyrostab.store.read import open_stored
+from gyrostab.store.remote import find_url
 
 __all__ = ["process_run", "run_fleet", "write_file_table"]
 
@@ -103,6 +104,7 @@ def write_file_table(
         The table of `gyrostab.jobs.archive.index_files`.
     """
     scheduler = check_scheduler(scheduler)
+    _check_local(*paths, output)
     known = read_table(Path(output), content=FILES)
     check_output(output, suffixes=[".parquet"], overwrite=overwrite or known is not None)
     archive = find_archive(paths)
@@ -180,6 +182,7 @@ def run_fleet(
         When the output or an option is wrong.
     """
     scheduler = check_scheduler(scheduler)
+    _check_local(*paths, output)
     options = {
         "reading": dict(reading or {}),
         "windows": dict(windows or {}),
@@ -222,6 +225,14 @@ def run_fleet(
             f"{Path(output) / 'index.html'} lists the reasons"
         )
     return rows
+
+
+def _check_local(*paths: str | Path) -> None:
+    for url in filter(None, map(find_url, paths)):
+        raise OptionError(
+            f"{url}: a fleet is read from and written to folders; mount the store as one, or copy "
+            "with a tool such as aws s3 sync"
+        )
 
 
 def _open_workers(

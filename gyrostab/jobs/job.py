@@ -26,7 +26,7 @@ import numpy as np
 from gyrostab.errors import OutputError, ResumeError
 from gyrostab.store.output import describe_file, is_leftover, remove_leftovers, replace_file
 from gyrostab.store.output.content import read_json
-from gyrostab.store.remote import find_url
+from gyrostab.store.remote import find_url, full_name
 from gyrostab.store.system import lock_file, read_at, write_at
 
 __all__ = [
@@ -108,9 +108,7 @@ def _read_start(path: Path, count: int) -> bytes | None:
 
 def describe_inputs(paths: Sequence[Path]) -> list[dict[str, Any]]:
     """Describe each input by path, size [bytes] and time of change; a Zarr folder as a whole."""
-    return [
-        {"path": find_url(path) or os.path.abspath(path), **describe_file(path)} for path in paths
-    ]
+    return [{"path": full_name(path), **describe_file(path)} for path in paths]
 
 
 def make_fingerprint(paths: Sequence[Path], options: Mapping[str, Any]) -> dict[str, Any]:

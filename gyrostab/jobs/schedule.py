@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gyrostab.errors import GyrostabError, OptionError, WorkerError
+from gyrostab.store.remote import full_name
 
 __all__ = ["Pool", "check_scheduler", "open_pool", "run_calls"]
 
@@ -228,7 +229,7 @@ def _identity(value: Any) -> Any:
 
 def _check_workers(client: Any, address: str, files: Sequence[Path]) -> None:
     """Check that every worker has the same files and the same gyrostab."""
-    sizes = {os.path.abspath(path): _find_size(path) for path in files}
+    sizes = {full_name(path): _find_size(path) for path in files}
     found = _reach_scheduler(address, client.run, _inspect_files, list(sizes), on_error="return")
     from gyrostab import __version__
 

@@ -18,7 +18,10 @@ from typing import Any
 
 from gyrostab.errors import FormatError, GyrostabError, OptionError, OutputError
 
-__all__ = ["fetch_file", "find_store", "find_url", "is_taken", "list_urls", "reaching", "upload"]
+__all__ = [
+    "fetch_file", "find_store", "find_url", "full_name", "is_taken", "list_urls", "reaching",
+    "upload",
+]  # fmt: skip
 
 _URL = re.compile(r"([a-z][a-z0-9+.-]+):/+(.+)")  # a single letter is a drive of Windows
 #: Scheme -> the extra that installs its library.
@@ -38,6 +41,17 @@ def find_url(path: str | os.PathLike[str]) -> str | None:
     text = path.as_posix() if isinstance(path, PurePath) else os.fspath(path)
     match = _URL.fullmatch(text)
     return None if match is None else f"{match[1]}://{match[2]}"
+
+
+def full_name(path: str | os.PathLike[str]) -> str:
+    """Return the address that a path is, or the absolute local path.
+
+    Examples
+    --------
+    >>> full_name("s3://bucket/log.zarr")
+    's3://bucket/log.zarr'
+    """
+    return find_url(path) or os.path.abspath(path)
 
 
 @contextlib.contextmanager

@@ -15,7 +15,7 @@ import xarray as xr
 
 from gyrostab import make_log, open_product, to_netcdf
 from gyrostab.cli import main
-from gyrostab.errors import FormatError, OutputError
+from gyrostab.errors import FormatError, OptionError, OutputError
 from gyrostab.jobs import fleet as fleet_module
 from gyrostab.jobs.archive import find_archive, find_runs
 from gyrostab.jobs.fleet import process_run, run_fleet, write_file_table
@@ -251,6 +251,17 @@ def test_nothing_foreign_is_replaced(archive, tmp_path):
     with pytest.raises(OutputError, match=r"notes\.txt.*gyrostab did not make"):
         run_fleet([archive], output, overwrite=True)
     assert [path.name for path in output.iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize(
+    ("logs", "output"), [("s3://rig/run7", "fleet"), ("archive", "s3://rig/fleet.zarr")]
+)
+def test_fleets_of_an_object_store_are_refused(logs, output, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for call in (run_fleet, write_file_table):
+        with pytest.raises(OptionError, match=r"s3://rig/.*: a fleet is read from"):
+            call([logs], output)
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_command_line_tells_the_failures(archive, tmp_path, capfd):
