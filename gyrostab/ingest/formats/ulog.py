@@ -5,6 +5,7 @@ Stamps are microseconds since the start of the autopilot. The messages contain n
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import xarray as xr
@@ -42,9 +43,24 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
     return read_tables(path, tables, options, notes=notes)
 
 
+class _PaddedFile(io.BufferedReader):
+    """A file in which reading beyond the end moves the position as if there were more.
+
+    pyulog returns by the declared size of an unknown message to look for the next one, without
+    testing whether the file was shorter, and then reads the same bytes again for ever.
+    """
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        data = super().read(size)
+        if size is not None and len(data) < size:
+            self.seek(size - len(data), io.SEEK_CUR)
+        return data
+
+
 def _make_tables(path: Path) -> tuple[list[Table], list[str]]:
     pyulog = library("pyulog", path, extra="ulog")
-    log = pyulog.ULog(str(path))
+    with _PaddedFile(path.open("rb", buffering=0)) as file:
+        log = pyulog.ULog(file)
     found = []
     for message in log.data_list:
         name = message.name + (f"_{message.multi_id}" if message.multi_id else "")
