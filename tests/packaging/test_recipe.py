@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
+import shutil
+import subprocess
 import tomllib
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import yaml
@@ -32,9 +36,35 @@ def test_recipe_requires_what_the_package_requires(project, recipe) -> None:
     assert sorted(recipe["requirements"]["run"]) == sorted(found)
 
 
-def test_versions_agree(project, recipe) -> None:
-    version = project["version"]
+@pytest.fixture(scope="module")
+def version_module() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("version", ROOT / "packaging" / "version.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_versions_agree(recipe, version_module, tmp_path: Path) -> None:
+    shutil.copy(ROOT / "CHANGELOG.md", tmp_path)
+    version = version_module.find_version(tmp_path)
     assert recipe["package"]["version"] == version
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert citation["version"] == version
-    assert f"\n## [{version}] - " in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+
+
+def test_version_from_tag_changelog_or_source_archive(version_module, tmp_path: Path) -> None:
+    def run_git(*arguments: str) -> None:
+        identity = ["-c", "user.name=a", "-c", "user.email=a@b"]
+        subprocess.run(["git", *identity, *arguments], cwd=tmp_path, check=True)
+
+    (tmp_path / "CHANGELOG.md").write_text("## [Unreleased]\n## [1.2.3] - 2026-01-01\n")
+    assert version_module.find_version(tmp_path) == "1.2.3"
+    run_git("init", "--quiet")
+    run_git("commit", "--quiet", "--allow-empty", "-m", "first")
+    assert version_module.find_version(tmp_path) == "1.2.3"
+    run_git("tag", "v1.3.0")
+    assert version_module.find_version(tmp_path) == "1.3.0"
+    run_git("commit", "--quiet", "--allow-empty", "-m", "second")
+    assert version_module.find_version(tmp_path).startswith("1.3.1.dev1+g")
+    (tmp_path / "PKG-INFO").write_text("Metadata-Version: 2.4\nVersion: 1.3.0\n")
+    assert version_module.find_version(tmp_path) == "1.3.0"
