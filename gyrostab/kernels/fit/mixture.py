@@ -270,7 +270,8 @@ def compress_products(rows, units, seen, inverse, tables, roots, scaled, has_exc
     if not has_excess:
         return
     excess = roots[n * 5 : n * 6]
-    _add_products(rows, excess, excess, inverse, tables, 5, 1.0, scaled, out, 0)
+    own, at = np.int64(_TABLE[1][1]), np.int64(0)
+    _add_products(rows, excess, excess, inverse, tables, own, 1.0, scaled, out, at)
     for b in range(5):
         table, factor = _TABLE[1][b], 2.0 if b == 1 else 1.0
         second = roots[n * b : n * b + n]

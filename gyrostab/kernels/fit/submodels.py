@@ -333,7 +333,7 @@ def _judge_term(a, base, room, form, result):  # type: ignore[no-untyped-def]
         return
     mean, null = _average_term(a, room, form)
     linear = quadratic = 0.0
-    table = 0
+    table = np.int64(0)
     for b in range(4):
         for c in range(b, 5):
             value = _quadratic_form(form, room.products, table)
@@ -382,7 +382,7 @@ def _average_sets(room, base, result):  # type: ignore[no-untyped-def]
 @njit(**INNER)
 def _find_separations(allowed, members, room, result):  # type: ignore[no-untyped-def]
     """Find the share of the column of each term that the other terms cannot reproduce."""
-    inner, size = room.inner, 0
+    inner, size = room.inner, np.int64(0)
     for a in range(4):
         if allowed >> a & 1:
             members[size] = a
