@@ -306,10 +306,11 @@ def _measure_white_noise(log: xr.Dataset) -> dict[str, float]:
     for axis, means in zip(signal["axis"].values, values, strict=True):
         levels, factor = [], 1
         while means.size >= 100:
-            squares = np.diff(means) ** 2
-            if np.isfinite(squares).any():
-                levels.append(float(np.nanmean(squares)) / 2.0 * factor / rate / HOUR)
-            means = means[: means.size // 2 * 2].reshape(-1, 2).mean(axis=1)
+            with np.errstate(over="ignore", invalid="ignore"):
+                squares = np.diff(means) ** 2
+                if np.isfinite(squares).any():
+                    levels.append(float(np.nanmean(squares)) / 2.0 * factor / rate / HOUR)
+                means = means[: means.size // 2 * 2].reshape(-1, 2).mean(axis=1)
             factor *= 2
         found[str(axis)] = math.sqrt(min(levels, default=math.nan))
     return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from typing import TYPE_CHECKING, Literal
 
@@ -61,8 +62,9 @@ def _print_suggestions(readable: pd.DataFrame, noise: list[dict[str, float]]) ->
     """Print on stderr what windows of each length can observe on the axis with the least noise."""
     from gyrostab.allan.judgement import suggest_windows
 
-    levels = [level for axes in noise for level in axes.values() if level > 0]
-    span = (readable["end"].max() - readable["start"].min()).total_seconds()
+    levels = [level for axes in noise for level in axes.values() if 0 < level < math.inf]
+    # as numbers, because pandas has no difference of more than 292 years
+    span = readable["end"].max().timestamp() - readable["start"].min().timestamp()
     if levels:
         print(*suggest_windows(span, min(levels)), sep="\n", file=sys.stderr)
 
