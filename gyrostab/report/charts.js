@@ -2,7 +2,9 @@
 "use strict";
 (() => {
   const json = (id) => JSON.parse(document.getElementById(id).textContent);
-  const options = { responsive: true, displaylogo: false };
+  // On a narrow page the bar of buttons would cover the legend; fingers and double clicks do as much.
+  const displayModeBar = matchMedia("(max-width: 600px)").matches ? false : "hover";
+  const options = { responsive: true, displaylogo: false, displayModeBar };
   const charts = {};
   for (const place of document.querySelectorAll(".chart")) {
     const figure = json(`figure-${place.id}`);
