@@ -15,9 +15,11 @@ import threading
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import xarray as xr
 
+from gyrostab.errors import DamageError
 from gyrostab.ingest.formats.collect import Messages
 from gyrostab.ingest.formats.recognise import read_head
 from gyrostab.ingest.formats.tables import Table, library, read_tables, scan_tables
@@ -57,6 +59,23 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
     return read_tables(path, _read_messages(path), options)
 
 
+def _forward(reader: Any, path: Path) -> Any:
+    """Open a binary log; the library would read a message without length again for ever."""
+
+    class Forward(reader):  # type: ignore[misc]
+        def _parse_next(self) -> Any:
+            begin = self.offset
+            message = super()._parse_next()
+            if message is not None and self.offset <= begin:
+                raise DamageError(
+                    f"{path.name}: is damaged, the message at byte {begin} has no length; copy it "
+                    "again"
+                )
+            return message
+
+    return Forward(str(path))
+
+
 def _read_messages(path: Path) -> list[Table]:
     """Return a table for each message and instance of a sensor."""
     reader = library("pymavlink.DFReader", path, extra="ardupilot")
@@ -64,7 +83,7 @@ def _read_messages(path: Path) -> list[Table]:
     found: dict[tuple[str, int], Messages] = {}
     # It prints what it skips, and the streams are those of the process.
     with _LOCK, redirect_stdout(StringIO()), redirect_stderr(StringIO()):
-        log = (reader.DFReader_binary if binary else reader.DFReader_text)(str(path))
+        log = _forward(reader.DFReader_binary, path) if binary else reader.DFReader_text(str(path))
         while (message := log.recv_match(type=list(_MEANINGS))) is not None:
             fields = message.to_dict()
             kind, instance = message.get_type(), fields.pop("I", 0)
