@@ -24,9 +24,3 @@ KERNEL: dict[str, Any] = {
 #: A separate copy, which only the process that compiles it would call, may add in another order
 #: than the inlined ones: the last digits of a first run would differ.
 INNER: dict[str, Any] = {**KERNEL, "cache": False, "no_cpython_wrapper": True, "forceinline": True}
-try:
-    from gyrostab.kernels.inlined import InlinedCompiler
-
-    INNER["pipeline_class"] = InlinedCompiler
-except (ImportError, AttributeError):  # numba has moved its compiler: it works without, but longer
-    pass
