@@ -130,7 +130,7 @@ def _parse_layout(place: str, content: Mapping[str, Any]) -> Layout:
             )
     order = {"little": "<", "big": ">"}.get(str(content.get("byte_order", "little")))
     header = content.get("header_bytes", 0)
-    if order is None or not isinstance(header, int) or header < 0:
+    if order is None or type(header) is not int or header < 0:
         raise OptionError(
             f'{place}: byte_order is "little" or "big", and header_bytes a whole number; '
             "correct the layout"
@@ -167,7 +167,7 @@ def _parse_layout(place: str, content: Mapping[str, Any]) -> Layout:
 def _parse_field(item: Any, order: str, offset: int) -> Field | None:
     """Return a field, with neither name nor turn for skipped bytes; None if it is not usable."""
     keys = set(item) if isinstance(item, dict) else set()
-    if keys == {"skip"} and isinstance(item["skip"], int) and 0 < item["skip"] < 2**31:
+    if keys == {"skip"} and type(item["skip"]) is int and 0 < item["skip"] < 2**31:
         return Field("", np.dtype(f"V{item['skip']}"), offset)
     code = TYPES.get(str(item["type"])) if "type" in keys else None
     if code is None:
