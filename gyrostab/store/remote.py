@@ -143,11 +143,11 @@ def fetch_file(url: str) -> Path:
         info = filesystem.info(path)
         if info["type"] == "directory":
             raise FormatError(f"{url}: is a folder, not a Zarr store; name the files in it")
-        return _download(url, repr(info))
+        return _download_file(url, repr(info))
 
 
 @lru_cache(maxsize=2**10)
-def _download(url: str, info: str) -> Path:
+def _download_file(url: str, info: str) -> Path:
     """Download a file that the store describes by `info`, once for the process."""
     filesystem, path = _open_filesystem(url)
     folder = tempfile.TemporaryDirectory(prefix="gyrostab-")

@@ -59,7 +59,7 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
     return read_tables(path, _read_messages(path), options)
 
 
-def _forward(reader: Any, path: Path) -> Any:
+def _open_binary(reader: Any, path: Path) -> Any:
     """Open a binary log; the library would read a message without length again for ever."""
 
     class Forward(reader):  # type: ignore[misc]
@@ -83,7 +83,11 @@ def _read_messages(path: Path) -> list[Table]:
     found: dict[tuple[str, int], Messages] = {}
     # It prints what it skips, and the streams are those of the process.
     with _LOCK, redirect_stdout(StringIO()), redirect_stderr(StringIO()):
-        log = _forward(reader.DFReader_binary, path) if binary else reader.DFReader_text(str(path))
+        log = (
+            _open_binary(reader.DFReader_binary, path)
+            if binary
+            else reader.DFReader_text(str(path))
+        )
         while (message := log.recv_match(type=list(_MEANINGS))) is not None:
             fields = message.to_dict()
             kind, instance = message.get_type(), fields.pop("I", 0)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-__all__ = ["HEAD_BYTES", "begins_like", "read_head"]
+__all__ = ["begins_like", "read_head"]
 
 #: Bytes at the beginning of a file that decide its format.
-HEAD_BYTES = 8192
+_HEAD_BYTES = 8192
 
 
 def read_head(path: Path) -> bytes:
@@ -16,7 +16,7 @@ def read_head(path: Path) -> bytes:
     if not path.is_file():
         return b""
     with path.open("rb") as file:
-        return file.read(HEAD_BYTES)
+        return file.read(_HEAD_BYTES)
 
 
 def begins_like(path: Path, pattern: bytes | re.Pattern[bytes], *suffixes: str) -> bool:
