@@ -24,6 +24,7 @@ from gyrostab.plot.style import (
     embedded,
     new_figure,
     time_axis,
+    unit_label,
     unit_symbol,
 )
 from gyrostab.report.page import page_text
@@ -154,11 +155,18 @@ def _describe_trends(trends: pd.DataFrame) -> list[dict[Hashable, Any]]:
     return [
         {
             **row,
+            **{key: _show_unit(row[key]) for key in ("quantity", "against")},
             "slope": f"{row['slope']:.3g} ({row['low']:.3g} to {row['high']:.3g})",
             "p_value": f"{row['p_value']:.2g}",
         }
         for row in clear.to_dict("records")
     ]
+
+
+def _show_unit(column: str) -> str:
+    """Write the unit at the end of the name of a column with symbols."""
+    name, _, unit = column.partition(" [")
+    return f"{name} {unit_label(unit.rstrip(']') or None)}".strip()
 
 
 def _describe_run(row: Mapping[Any, Any], axes: list[str], folder: Path) -> dict[str, Any]:
