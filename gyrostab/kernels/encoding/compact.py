@@ -1,4 +1,7 @@
-"""Compact columns: values as 32-bit counts, stamps as even runs; both restored bit for bit."""
+"""Compact columns: values as 32-bit counts, stamps as even runs; both restored exactly.
+
+Only the sign of a zero is lost.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +50,7 @@ def pack_counts(values, step, divisor, counts):  # type: ignore[no-untyped-def]
     Returns
     -------
     fits : bool
-        False if a value is not on the grid, or is a negative zero; the rest is then undefined.
+        False if a value is not on the grid; the rest is then undefined.
     missing : int
         Values that are not finite.
     low, high : float
@@ -71,8 +74,7 @@ def pack_counts(values, step, divisor, counts):  # type: ignore[no-untyped-def]
             inside = abs(near) < _LARGEST
             count = np.int32(near) if finite and inside else _FILL
             back = np.float64(count) * step / divisor
-            same = back == value and (count != 0 or math.copysign(1.0, value) > 0.0)
-            off += finite and not same
+            off += finite and back != value
             absent += not finite
             odd += finite and np.rint(value) != value
             smallest = min(smallest, count if finite else np.int32(2147483647))
