@@ -100,11 +100,11 @@ def plot_correlation(
             ha="center",
             fontweight="bold",
         )
-    figure.supxlabel(label)
+    panels[-1][len(names) // 2].set_xlabel(label)
     figure.legend(
         handles=_legend_handles(driver, float(result.attrs.get("interval_level", 0.95))),
         loc="outside lower center",
-        ncols=1 if is_narrow(figure) else 3,
+        ncols=2 if is_narrow(figure) else 4,
         frameon=False,
     )
     return figure
@@ -208,6 +208,7 @@ def _legend_handles(driver: str, level: float) -> list[Any]:
             facecolor="#8c8c8c",
             alpha=0.3,
             edgecolor="black",
-            label=f"{level:.0%} interval of the slope; line: coupled",
+            label=f"{100 * level:.0f} % interval of the slope",
         ),
+        Line2D([], [], color="black", linewidth=1.2, label="slope where coupled"),
     ]

@@ -203,7 +203,7 @@ def plot_davar_3d(
     panel.set_zlabel("σ [deg/h]" if narrow else f"{variance_name(product)} deviation σ [deg/h]")
     for scale in (panel.yaxis, panel.zaxis):
         scale.set_major_locator(MaxNLocator(nbins=3 if narrow else 6, integer=True))
-        scale.set_major_formatter(FuncFormatter(lambda power, _: f"$10^{{{power:.0f}}}$"))
+        scale.set_major_formatter(FuncFormatter(lambda power, _: f"{10.0**power:g}"))
     # the steep side of short averaging times goes to the back, where it hides nothing
     panel.invert_yaxis()
     panel.view_init(elev=30, azim=-62)
