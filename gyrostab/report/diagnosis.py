@@ -23,7 +23,7 @@ from gyrostab.diagnose.result.text import (
 )
 from gyrostab.diagnose.statistics.wording import axes_text, length_text
 from gyrostab.noise import LAWS
-from gyrostab.plot.style import embedded
+from gyrostab.plot.style import embedded, unit_symbol
 from gyrostab.report.diagnosis_charts import diagnosis_charts
 from gyrostab.report.page import page_text
 from gyrostab.store.output import new_output
@@ -179,7 +179,7 @@ def _effect_card(
                 "name": name.replace("_", " "),
                 "value": _format_number(entry["value"]),
                 "range": f"{_format_number(entry['low'])} to {_format_number(entry['high'])}",
-                "unit": "" if entry["unit"] == "1" else entry["unit"],
+                "unit": unit_symbol(entry["unit"]),
             }
             for name, entry in effect["parameters"].items()
         ],
@@ -257,11 +257,11 @@ def _limit_rows(content: Mapping[str, Any]) -> list[dict[str, str]]:
         for one in content.get("rejected", [])
     }
     for name, entry in content["not_found"].items():
-        unit = "" if entry["unit"] in (None, "1") else f" {entry['unit']}"
+        unit = unit_symbol(entry["unit"])
         limit = (
             "–"
             if entry["upper_limit"] is None
-            else f"< {_format_number(entry['upper_limit'], 2)}{unit}"
+            else f"< {_format_number(entry['upper_limit'], 2)} {unit}".rstrip()
         )
         rows.append(
             {
@@ -292,7 +292,7 @@ def _noise_rows(content: Mapping[str, Any]) -> list[dict[str, str]]:
                     "axis": axis,
                     "term": f"{symbol}, {LAWS[symbol].name}",
                     "value": f"{_format_number(entry['value'])}{error}",
-                    "unit": entry["unit"],
+                    "unit": unit_symbol(entry["unit"]),
                 }
             )
     return rows
