@@ -83,7 +83,7 @@ def weigh_means(row: np.ndarray) -> xr.Dataset:
     """Compute the Allan variance of the means of what is present, as FAVAR does.
 
     The weight of a pair of neighbouring means is the product of their numbers of samples. Intervals
-    are those of a record without gaps, because FAVAR has none of its own.
+    are those of a record without gaps, because FAVAR gives no intervals.
     """
     surface = make_surface(interpolate(row))
     present = np.isfinite(row)
