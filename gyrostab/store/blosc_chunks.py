@@ -67,21 +67,47 @@ def check_blosc_chunks(folder: Path, *, skip: Collection[Any] = ()) -> None:
 
 
 def _find_blosc_arrays(folder: Path) -> Iterator[Path]:
-    """Find the folders of the arrays whose chunks are compressed with Blosc."""
+    """Find the arrays whose chunks are compressed with Blosc by their own metadata or the store's.
+
+    The library prefers the consolidated metadata of the store, which may differ if it is damaged.
+    """
+    consolidated = _read_consolidated(folder)
     for place, _, names in os.walk(folder):
-        try:
-            if ".zarray" in names:
-                compressor = json.loads(Path(place, ".zarray").read_bytes())["compressor"]
-                is_blosc = compressor["id"] == "blosc"
-            elif "zarr.json" in names:
-                codecs = json.loads(Path(place, "zarr.json").read_bytes())["codecs"]
-                is_blosc = codecs[-1]["name"] == "blosc"
-            else:
-                continue
-        except (OSError, ValueError, LookupError, TypeError):
-            continue  # a group, or metadata that the library refuses
-        if is_blosc:
+        known = [consolidated.get(Path(place).relative_to(folder).as_posix())]
+        known += [
+            _read_json(Path(place, name)) for name in (".zarray", "zarr.json") if name in names
+        ]
+        if any(map(_uses_blosc, known)):
             yield Path(place)
+
+
+def _read_consolidated(folder: Path) -> dict[str, Any]:
+    """Return the consolidated metadata of the arrays in a store of format 2 or 3."""
+    try:
+        if (folder / ".zmetadata").exists():
+            entries = _read_json(folder / ".zmetadata")["metadata"]
+            return {name.removesuffix("/.zarray"): entry for name, entry in entries.items()}
+        return dict(_read_json(folder / "zarr.json")["consolidated_metadata"]["metadata"])
+    except (LookupError, TypeError, ValueError, AttributeError):
+        return {}
+
+
+def _read_json(path: Path) -> Any:
+    """Return the content of a file of metadata; None if the library refuses it."""
+    try:
+        return json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return None
+
+
+def _uses_blosc(metadata: Any) -> bool:
+    """Whether chunks of an array with these metadata are compressed with Blosc."""
+    try:
+        if "compressor" in metadata:
+            return bool(metadata["compressor"]["id"] == "blosc")
+        return bool(metadata["codecs"][-1]["name"] == "blosc")
+    except (LookupError, TypeError):
+        return False
 
 
 def _find_chunks(array: Path) -> Iterator[Path]:

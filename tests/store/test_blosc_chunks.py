@@ -52,6 +52,20 @@ def test_cut_chunk_of_a_foreign_store_is_refused(
         call(path)
 
 
+@pytest.mark.parametrize("zarr_format", [2, 3])
+def test_consolidated_metadata_count_where_those_of_the_array_are_damaged(
+    zarr_format: int, tmp_path: Path
+) -> None:
+    path = tmp_path / "log.zarr"
+    write_foreign(path, zarr_format)
+    zarr.consolidate_metadata(path)
+    (path / "gyro_x" / (".zarray" if zarr_format == 2 else "zarr.json")).write_text("{")
+    chunk = chunk_files(path, "gyro_x")[1]
+    chunk.write_bytes(chunk.read_bytes()[:20])
+    with pytest.raises(FormatError, match=r"the chunk gyro_x.* cut short"):
+        check_blosc_chunks(path)
+
+
 def test_chunk_with_a_length_beyond_its_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "log.zarr"
     write_foreign(path, 2)
