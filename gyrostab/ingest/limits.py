@@ -203,10 +203,10 @@ def check_stored(
 
 
 def check_declared(
-    path: Path, stored: xr.Dataset, *, given: Mapping[str, float] | None = None
+    path: Path, variables: Mapping[Any, xr.Variable], *, given: Mapping[str, float] | None = None
 ) -> None:
-    """Refuse a dataset whose largest variable is out of proportion to the bytes of its file."""
-    shape = max((item.shape for item in stored.variables.values()), key=math.prod, default=())
+    """Refuse variables of which the largest is out of proportion to the bytes of its file."""
+    shape = max((item.shape for item in variables.values()), key=math.prod, default=())
     rows = max(shape, default=0)
     check_stored(path, rows, math.prod(shape) // max(rows, 1), given)
 

@@ -30,6 +30,7 @@ from gyrostab.store.attributes import (
     make_global_attributes,
 )
 from gyrostab.store.lazy import transpose_lazy
+from gyrostab.store.netcdf_log import StoredLog
 from gyrostab.store.private import close_function, is_in_memory
 from gyrostab.store.safe_names import (
     make_names_storable,
@@ -149,7 +150,7 @@ def _make_lazy(variable: xr.Variable) -> xr.Variable:
     return variable if ready else variable.chunk("auto")
 
 
-def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
+def from_disk(stored: xr.Dataset | StoredLog, where: str) -> xr.Dataset:
     """Decode a dataset that was opened without decoding times and without indexes.
 
     `where` names the file in messages.
@@ -160,8 +161,8 @@ def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
         if "bounds" in variable.attrs
     }
     variables: dict[Any, xr.Variable] = {}
-    grids = parse_time_grids(stored, where)
-    axes, close = make_time_axes(stored, grids, where), close_function(stored)
+    grids = parse_time_grids(stored.variables, where)
+    axes, close = make_time_axes(stored.sizes, grids, where), close_function(stored)
     dims: dict[Any, Any] = {index_dim(rule["dim"]): rule["dim"] for rule in grids.values()}
     for name, variable in stored.variables.items():
         if name in grids:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError, reading_of
 from gyrostab.kernels.encoding.checksum import fletcher32
 from gyrostab.store.blosc_chunks import is_blosc_cut
+from gyrostab.store.hdf5_heaps import check_global_heaps
 from gyrostab.store.private import library_lock
 
 __all__ = [
@@ -72,14 +73,20 @@ def read_attribute(path: Path, name: str) -> str:
     ------
     OSError
         When the file is damaged.
+    FormatError
+        When it is in a global heap that the library would not return from.
     """
-    import h5py
+    from h5py import AttributeManager, Group, h5a, h5f
 
     with library_lock():
-        if not h5py.is_hdf5(path):
+        if not h5f.is_hdf5(os.fsencode(path)):
             return ""
-        with h5py.File(path, "r") as file:
-            value = file.attrs.get(name, "")
+        file = h5f.open(os.fsencode(path), h5f.ACC_RDONLY)
+        if not h5a.exists(file, name.encode()):
+            return ""
+        if h5a.open(file, name.encode()).dtype.kind != "S":
+            check_global_heaps(path)  # which hold text of variable length
+        value = AttributeManager(Group(file))[name]
     return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
 
 

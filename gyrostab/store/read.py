@@ -9,8 +9,8 @@ import sys
 import threading
 import uuid
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from gyrostab.store.chunk_cache import ChunkCache
 from gyrostab.store.hdf5_heaps import check_global_heaps
 from gyrostab.store.layout import ChunkDamage, is_readable, read_chunk
 from gyrostab.store.lazy import FileVariable, RowSource, make_dask
+from gyrostab.store.netcdf_log import StoredLog, open_netcdf_log
 from gyrostab.store.private import close_function
 from gyrostab.store.remote import find_store, find_url, reaching
 from gyrostab.store.times import decode_stamps, index_dim, parse_time_grids, replace_stamps
@@ -33,6 +34,8 @@ from gyrostab.time.grid import grid_times
 
 __all__ = ["MIN_LAZY_VALUES", "make_variable_lazy", "open_stored"]
 
+#: Dataset as it is on disk.
+Stored = xr.Dataset | StoredLog
 #: Values from which a variable of a log is a dask array.
 MIN_LAZY_VALUES = 2**17
 #: Bytes of the cache of chunks of which only a part was requested.
@@ -43,9 +46,9 @@ def open_stored(
     path: Path,
     *,
     strict: bool = False,
-    check: Callable[[Path, xr.Dataset], None] | None = None,
+    check: Callable[[Path, Mapping[Any, xr.Variable]], None] | None = None,
     lazy: bool = True,
-) -> xr.Dataset:
+) -> Stored:
     """Open a dataset as it is on disk: times not decoded, data lazy, chunks checked when read.
 
     Parameters
@@ -53,7 +56,7 @@ def open_stored(
     strict : bool
         Raise `FormatError` for a damaged chunk of a log instead of leaving a gap.
     check : callable, optional
-        Called with the path and the dataset before any of its values is read; it raises
+        Called with the path and the variables before any of its values is read; it raises
         `FormatError` when the declared sizes are out of proportion.
     lazy : bool
         False loads a surface or product, without dask.
@@ -87,12 +90,22 @@ def _open_remote(path: Path, url: str) -> xr.Dataset:
 
 
 def _open_dataset(
-    path: Path, *, strict: bool, check: Callable[[Path, xr.Dataset], None] | None, lazy: bool
-) -> xr.Dataset:
+    path: Path,
+    *,
+    strict: bool,
+    check: Callable[[Path, Mapping[Any, xr.Variable]], None] | None,
+    lazy: bool,
+) -> Stored:
+    if path.is_file():
+        log = open_netcdf_log(path)
+        if log is not None:
+            if check is not None:
+                check(path, log.variables)
+            long = _find_long_variables(log, path, strict=strict)
+            return replace(log, variables=log.variables | long)
+        check_global_heaps(path)
     engine: Any = "zarr" if path.is_dir() else "netcdf4"
     name = "Zarr" if path.is_dir() else "NetCDF"
-    if path.is_file():
-        check_global_heaps(path)
     try:
         stored = xr.open_dataset(
             path, engine=engine, chunks=None, decode_times=False, create_default_indexes=False
@@ -102,11 +115,11 @@ def _open_dataset(
             f"{path}: is not {name}, or is damaged or cut short ({error}); make or copy it again"
         ) from error
     if check is not None:
-        check(path, stored)
+        check(path, stored.variables)
     is_log = stored.attrs.get("gyrostab_content") == "log"
     own = {name for name in stored.data_vars if is_log and _is_sampled(stored.variables[name])}
     if path.is_dir():
-        check_blosc_chunks(path, skip=own | set(parse_time_grids(stored, path)))
+        check_blosc_chunks(path, skip=own | set(parse_time_grids(stored.variables, path)))
     close = close_function(stored)
     stored = replace_stamps(stored, path)
     stored.set_close(close)
@@ -154,7 +167,7 @@ def make_variable_lazy(variable: xr.Variable, path: Path) -> xr.Variable:
     return xr.Variable(variable.dims, lazy, variable.attrs, variable.encoding)
 
 
-def _find_long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dict[Any, xr.Variable]:
+def _find_long_variables(stored: Stored, path: Path, *, strict: bool) -> dict[Any, xr.Variable]:
     """Find the long variables of a log, as arrays that handle damage."""
     labels = [str(label) for label in stored.variables["axis"].values]
     opened = uuid.uuid4().hex
@@ -203,12 +216,12 @@ def _is_sampled(variable: xr.Variable) -> bool:
 
 
 def _find_chunk_spans(
-    stored: xr.Dataset, dim: str, length: int, path: Path
+    stored: Stored, dim: str, length: int, path: Path
 ) -> dict[str, Any] | tuple[tuple[int, int], ...]:
     """Find the rule of a computed time axis, or the first and last stamp [ns] of each chunk."""
     rules = {
         name: rule
-        for rule in parse_time_grids(stored, path).values()
+        for rule in parse_time_grids(stored.variables, path).values()
         for name in (rule["dim"], index_dim(rule["dim"]))
     }
     if dim in rules:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ __all__ = [
     "encode_first_stamp",
     "encode_stamps",
     "find_time_grids",
+    "follows_rule",
     "has_whole_microseconds",
     "index_dim",
     "make_time_axes",
@@ -44,6 +46,7 @@ _STAMPS_CHUNK = 2**20
 _EPOCH = "1970-01-01T00:00:00"
 #: Units of stored stamps, by their length [ns].
 _UNITS = {1: f"nanoseconds since {_EPOCH}", 1000: f"microseconds since {_EPOCH}"}
+_STEPS = {units: step for step, units in _UNITS.items()}
 
 
 def time_attributes(divisor: int) -> dict[str, str]:
@@ -167,11 +170,13 @@ def encode_stamps(name: Any, variable: xr.Variable, divisor: int) -> NDArray[np.
     return to_nanoseconds(stamps) // divisor
 
 
-def parse_time_grids(stored: xr.Dataset, where: object) -> dict[str, dict[str, Any]]:
+def parse_time_grids(
+    variables: Mapping[Any, xr.Variable], where: object
+) -> dict[str, dict[str, Any]]:
     """Parse the rules of the computed time axes that a file declares, by name of the variable."""
     declared = {
         str(name): variable.attrs[GRID]
-        for name, variable in stored.variables.items()
+        for name, variable in variables.items()
         if GRID in variable.attrs
     }
     try:
@@ -220,13 +225,13 @@ def _parse_grid(text: Any) -> dict[str, Any]:
 
 
 def make_time_axes(
-    stored: xr.Dataset, grids: dict[str, dict[str, Any]], where: str
+    sizes: Mapping[Any, int], grids: dict[str, dict[str, Any]], where: str
 ) -> dict[str, xr.Coordinates]:
     """Make the coordinates of the computed time axes, by name of the declaring variable."""
     axes = {}
     for name, rule in grids.items():
         dim = rule["dim"]
-        size = stored.sizes.get(index_dim(dim), stored.sizes.get(dim, 0))
+        size = sizes.get(index_dim(dim), sizes.get(dim, 0))
         if size != rule["size"]:
             raise FormatError(
                 f"{where}: has {size} samples on {index_dim(dim)!r}, but was written with "
@@ -251,7 +256,7 @@ def replace_stamps(stored: xr.Dataset, where: object) -> xr.Dataset:
     A rule that another program has left unchanged with other stamps is dropped: `stored` then has
     an ordinary time coordinate.
     """
-    for name, rule in parse_time_grids(stored, where).items():
+    for name, rule in parse_time_grids(stored.variables, where).items():
         stamps = stored.variables[name]
         if not stamps.ndim:
             continue
@@ -274,13 +279,23 @@ def _has_stamps_of(rule: dict[str, Any], stamps: xr.Variable, folder: Path) -> b
     """
     if stamps.shape != (rule["size"],):
         return False
-    ends = np.unique([0, max(rule["size"] - 1, 0)])[: rule["size"]]
-    samples = rule["first"] + rule["stride"] * ends
     try:
         check_blosc_chunks(folder)
-        found = to_nanoseconds(decode_stamps(stamps[ends], stamps.attrs).values)
+        ends = stamps[np.unique([0, rule["size"] - 1])] if rule["size"] else stamps
+        return follows_rule(ends.values, stamps.attrs, rule)
     except Exception:  # damaged stamps, for which the libraries raise errors of many kinds
         return True
+
+
+def follows_rule(ends: NDArray[Any], attrs: dict[Any, Any], rule: dict[str, Any]) -> bool:
+    """Whether the first and last stamps, with their attributes, follow the rule of a time axis."""
+    samples = rule["first"] + rule["stride"] * np.array([0, rule["size"] - 1])[: ends.size]
+    step = _STEPS.get(str(attrs.get("units")))
+    found = (
+        ends * step
+        if step and ends.dtype.kind == "i"
+        else to_nanoseconds(decode_stamps(xr.Variable("end", ends), attrs).values)
+    )
     return np.array_equal(found, grid_times(rule["start_ns"], rule["rate_hz"], samples))
 
 
@@ -292,7 +307,7 @@ def decode_stamps(variable: xr.Variable, attrs: dict[Any, Any] | None = None) ->
     attrs = variable.attrs if attrs is None else attrs
     if " since " not in str(attrs.get("units", "")):
         return variable
-    step = {units: step for step, units in _UNITS.items()}.get(attrs["units"])
+    step = _STEPS.get(attrs["units"])
     if step and variable.dtype.kind == "i":  # as `to_disk` writes them; xarray is slower
         rest = {
             key: value for key, value in variable.attrs.items() if key not in ("units", "calendar")

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, SchemaError, TimeError
 from gyrostab.ingest.columns.stamps import names_epoch
+from gyrostab.ingest.concat.grid import log_span
 from gyrostab.ingest.formats.netcdf_classic import read_classic_header
 from gyrostab.ingest.formats.netcdf_variables import (
     StoredVariable,
@@ -103,10 +104,11 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
     """Open a regular log, of gyrostab or with a stamp for each sample; None for other files."""
     if path.is_file():
         read_classic_header(path)  # before the library allocates what a damaged header asks for
-        check_global_heaps(path)
     content = _content_kind(path)
     if content == "log":
         return _open_own(path, options)
+    if path.is_file():
+        check_global_heaps(path)
     if content in _OTHER_CONTENT and not options.channels_only:
         raise FormatError(
             f"{path.name}: is {_OTHER_CONTENT[content]} that gyrostab wrote, not a log; give the "
@@ -258,6 +260,7 @@ def _with_uniform_time(log: xr.Dataset) -> xr.Dataset:
 def _summarise_log(path: Path, log: xr.Dataset) -> FileSummary:
     channels = log_channels(log)
     signal = signal_name(log)
+    first, last = (np.datetime64(stamp, "ns") for stamp in log_span(log))
     axes = [
         ColumnSummary(str(axis), f"gyro_{axis}", "gyro", signal, SIGNAL_UNITS[signal])
         for axis in log["axis"].values
@@ -272,15 +275,11 @@ def _summarise_log(path: Path, log: xr.Dataset) -> FileSummary:
         columns=(*axes, *others),
         axes=tuple(str(axis) for axis in log["axis"].values),
         channels=tuple(channels),
-        first=_stamp_at(log, 0),
-        last=_stamp_at(log, -1),
+        first=first,
+        last=last,
         n_rows=log.sizes["time"],
         notes=tuple(log.attrs.get("notes", ())),
     )
-
-
-def _stamp_at(log: xr.Dataset, place: int) -> np.datetime64:
-    return np.datetime64(int(to_nanoseconds(log["time"][place].values)), "ns")
 
 
 def _plan_file(

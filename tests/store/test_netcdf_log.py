@@ -1,0 +1,64 @@
+"""NetCDF logs of gyrostab that are opened without xarray."""
+
+from __future__ import annotations
+
+import netCDF4
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab import make_log, open_log, to_netcdf
+from gyrostab.errors import FormatError
+from gyrostab.store import read
+from gyrostab.store.netcdf_log import open_netcdf_log
+
+
+def _write_log(path, **options):
+    values = np.random.default_rng(1).integers(-99, 99, (2, 5000)) * 0.01
+    values[1, 100:200] = np.nan
+    log = make_log(values, rate=100.0, unit="deg/h", start="2026-01-01")
+    log["rate"].encoding = {"dtype": "int16", "scale_factor": 0.01}
+    log["temperature"] = ("time", np.linspace(20.0, 30.0, 5000), {"units": "degree_Celsius"})
+    to_netcdf(log, path, **options)
+
+
+@pytest.mark.parametrize("stamps", [True, False])
+def test_a_log_is_that_which_xarray_opens(tmp_path, monkeypatch, stamps):
+    path = tmp_path / "log.nc"
+    _write_log(path, stamps=stamps)
+    assert open_netcdf_log(path) is not None
+    direct = open_log(path)
+    monkeypatch.setattr(read, "open_netcdf_log", lambda path: None)
+    slow = open_log(path)
+    xr.testing.assert_identical(direct, slow)
+    assert list(direct.variables) == list(slow.variables)
+    assert direct["rate"].encoding == slow["rate"].encoding
+    assert direct["rate"].dtype == slow["rate"].dtype
+
+
+def test_changed_stamps_are_left_to_xarray(tmp_path):
+    path = tmp_path / "log.nc"
+    _write_log(path)
+    with netCDF4.Dataset(path, "a") as file:
+        file["time"][:] += 3_600_000_000
+    assert open_netcdf_log(path) is None
+    assert str(open_log(path).time.values[0]).startswith("2026-01-01T01:00:00")
+
+
+def test_files_of_other_programs_are_left_to_xarray(tmp_path):
+    path = tmp_path / "log.nc"
+    _write_log(path)
+    with open_log(path) as log:
+        log.load().to_netcdf(tmp_path / "copy.nc")
+    assert open_netcdf_log(tmp_path / "copy.nc") is None
+
+
+def test_a_damaged_heap_is_found(tmp_path):
+    path = tmp_path / "log.nc"
+    _write_log(path)
+    data = bytearray(path.read_bytes())
+    begin = data.index(b"GCOL")
+    data[begin + 16 : begin + 32] = bytes(16)  # an object 0 of size 0
+    path.write_bytes(data)
+    with pytest.raises(FormatError, match="global heap"):
+        open_netcdf_log(path)
