@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
@@ -130,15 +131,22 @@ def _chunk_of_dask(
         for entry in _overlapping_runs(part, begin, end)
     ]
     if not found:
-        return da.full(end - begin, np.nan, chunks=end - begin)
-    pieces = [
-        da.asarray(array if array.ndim == 1 else array[row])[own : own + length]
-        for _, array, row, own, _, length in found
-    ]
-    plan, first = [], 0
-    for which, _, _, _, at, length in found:
-        plan.append((which, None, 0, first, at, length))
-        first += length
+        return _make_blank_chunk(end - begin)
+    # Neighbouring runs share a slice, because each slice of a dask array takes time.
+    slices: list[tuple[int, int, int]] = []  # number of the part, first sample and end
+    plan, before = [], 0
+    for which, _, _, own, at, length in found:
+        low, high = slices[-1][1:] if slices and slices[-1][0] == which else (0, -1)
+        if high < 0 or own < high or own + length - low > 2 * (end - begin):
+            before += slices[-1][2] - slices[-1][1] if slices else 0
+            low = own
+            slices.append((which, own, own))
+        slices[-1] = (which, low, own + length)
+        plan.append((which, None, 0, before + own - low, at, length))
+    pieces = []
+    for which, low, high in slices:
+        array, row, _ = parts[which]
+        pieces.append(da.asarray(array if array.ndim == 1 else array[row or 0])[low:high])
     return (
         da.concatenate(pieces)
         .rechunk(-1)
@@ -151,6 +159,13 @@ def _chunk_of_dask(
             chunks=((end - begin,),),
         )
     )
+
+
+@cache
+def _make_blank_chunk(size: int) -> Any:
+    import dask.array as da
+
+    return da.full(size, np.nan, chunks=size)
 
 
 def _place_pieces(
