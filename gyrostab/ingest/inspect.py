@@ -115,7 +115,7 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
         options,
         map=chosen,
         unit={},
-        rate=1.0,
+        rate=options.rate or 1.0,
         start=None,
         channels_only=True,
         channel=(),

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import shlex
+import shutil
 import sys
-from collections.abc import Mapping, Sequence
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -46,10 +48,34 @@ def next_command(paths: Sequence[str | Path], options: dict[str, Any]) -> str:
 
 
 def print_scan(table: pd.DataFrame) -> None:
-    """Print the table of `scan`: framed on a terminal, tab-separated otherwise."""
-    if not sys.stdout.isatty():
-        table.to_csv(sys.stdout, sep="\t", index=False)
-        return
+    """Print the table of `scan`, framed on a terminal, tab-separated otherwise, and its notes."""
+    if sys.stdout.isatty():
+        _print_framed(table)
+    else:
+        table.drop(columns="odd").to_csv(sys.stdout, sep="\t", index=False)
+    for _, row in table[table["odd"].fillna("") != ""].iterrows():
+        _print_wrapped([f"{row['file']}:"])
+        _print_wrapped([row["odd"].removeprefix(f"{Path(row['file']).name}: ")], indent="  ")
+
+
+def _print_wrapped(lines: Iterable[str], indent: str = "") -> None:
+    """Print lines within the width of the terminal, or 100; in a pipe each begins with ``#``."""
+    width = shutil.get_terminal_size((100, 24)).columns
+    indent = indent if sys.stdout.isatty() else f"# {indent}"
+    for line in lines:
+        print(
+            textwrap.fill(
+                line,
+                width,
+                initial_indent=indent,
+                subsequent_indent=f"{indent}  ",
+                break_long_words=False,
+                break_on_hyphens=False,
+            )
+        )
+
+
+def _print_framed(table: pd.DataFrame) -> None:
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -90,8 +116,6 @@ def print_scan(table: pd.DataFrame) -> None:
         )
         framed.add_row(*map(escape, cells))
     console.print(framed)
-    for _, row in table[table["odd"].fillna("") != ""].iterrows():
-        console.print(f"[bold]{escape(row['file'])}[/bold]: {escape(row['odd'])}", highlight=False)
 
 
 def _format_span(seconds: float) -> str:
@@ -157,6 +181,7 @@ def print_inspection(found: InspectedFile) -> None:
         *guess.reasons,
         *(f"check: {warning}" for warning in guess.warnings),
         *found.inspection.notes,
+        *(note for note in found.inspection.summary.notes if "no unit" not in note),  # as guessed
     ]
     if found.row is not None:
         read = found.row
@@ -170,8 +195,7 @@ def print_inspection(found: InspectedFile) -> None:
         print(f"# {found.paths[0]}: {len(rows)} columns, {found.inspection.rows} rows")
         for row in [INSPECTION_COLUMNS, *rows]:
             print("# " + "\t".join(row))
-        for text in lines:
-            print(f"# {text}")
+        _print_wrapped(lines)
         return
     from rich.console import Console
     from rich.markup import escape
@@ -186,10 +210,8 @@ def print_inspection(found: InspectedFile) -> None:
         )
     for row in rows:
         framed.add_row(*map(escape, row))
-    console = Console()
-    console.print(framed)
-    for text in lines:
-        console.print(escape(text), highlight=False)
+    Console().print(framed)
+    _print_wrapped(lines)
 
 
 def print_next(command: str, *, apart: bool = False) -> None:

@@ -26,6 +26,7 @@ from tests.ingest.field_files import (
     write_wits0,
     write_witsml,
 )
+from tests.support.command_line import call
 
 
 @pytest.fixture(params=WRITERS, scope="module")
@@ -135,6 +136,24 @@ def test_messages_of_known_sensors(tmp_path: Path, sensor: str) -> None:
     assert any(f"{lost + 1} messages were lost" in note for note in raw.attrs["notes"])
     gaps = gap_table(regularise(raw))
     assert gaps["samples"].tolist() == [lost, 1]
+
+
+def test_scan_shows_how_to_read_messages(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = Path("log.bin")
+    path.write_bytes(b"".join(kvh_message(n, RATES[:, n] * 1e-3, 40) for n in range(ROWS)))
+    hint = '--unit "gyro=1000 rad/s" for angles at 1000 Hz'
+    call("scan", path)
+    assert hint in capsys.readouterr().err
+    for options in ([], ["--unit", "gyro=rad/s"]):
+        assert call("scan", path, "--rate", "1000", *options) in (0, 2)
+        shown = capsys.readouterr().out
+        notes = [line for line in shown.splitlines() if "\t" not in line and "next:" not in line]
+        assert max(map(len, notes)) <= 100
+        assert all(line.startswith("# ") for line in notes)
+        assert hint in " ".join(line.lstrip("# ") for line in notes)
 
 
 def test_without_a_unit_or_a_rate_the_messages_are_refused(tmp_path: Path) -> None:

@@ -92,7 +92,7 @@ def _count_time(
     if options.rate is None:
         raise OptionError(
             f"{path.name}: the messages of {layout.place} are numbered; give their rate with "
-            "--rate HZ (and the time of the first with --epoch)"
+            f"--rate HZ (and the time of the first with --epoch){layout.note and '; '}{layout.note}"
         )
     counts = unwrap_counter(fetch(counter, 0, rows), counter.turn)
     steps, times = np.unique(np.diff(counts), return_counts=True)
