@@ -20,6 +20,18 @@ settings.register_profile("full", deadline=None, max_examples=100, print_blob=Tr
 settings.load_profile("fast")
 
 
+#: Tests that start first. The first file compiles most kernels that others share; the next ones
+#: need few of them, so that another worker does not compile the same kernels meanwhile.
+_FIRST = ("tests/allan/test_band_limit.py", "tests/ingest/")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    def place(item: pytest.Item) -> int:
+        return next((n for n, name in enumerate(_FIRST) if name in item.nodeid), len(_FIRST))
+
+    items.sort(key=place)
+
+
 @pytest.fixture(scope="session")
 def recordings() -> Callable[[str], Path]:
     """Path of a real recording, or a skip that says where it was looked for."""

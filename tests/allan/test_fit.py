@@ -189,7 +189,7 @@ def test_absent_terms_are_rarely_observed_and_their_limits_hold(share):
 
 
 @pytest.mark.parametrize(("term", "value"), [("B", 0.6), ("K", 45.0)])
-@pytest.mark.parametrize("share", [0.0, 0.3])
+@pytest.mark.parametrize("share", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
 def test_truth_exceeds_a_limit_in_5_percent_of_windows(term, value, share):
     """A term at the edge of visibility: 2 to 8 %, three standard deviations about 5."""
     rng = np.random.default_rng([7, int(share * 10)])

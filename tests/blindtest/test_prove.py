@@ -48,6 +48,15 @@ def small_plans(number: int, *, seed: int) -> list[dict]:
     return plans
 
 
+class NothingFound:
+    verdict = "no mismatch"
+    model: ClassVar = {"noise": {"x": {"N": 0.003}}}
+
+    def to_json(self) -> str:
+        found = {"mismatches": [], "effects": [], "unexplained": [], "held_out": {}}
+        return json.dumps({"verdict": self.verdict, **found})
+
+
 @pytest.fixture
 def small(monkeypatch):
     monkeypatch.setattr("gyrostab.blindtest.scenarios.plan.plan_cases", small_plans)
@@ -61,8 +70,16 @@ def finished(tmp_path_factory) -> tuple[Path, list[str], Proof]:
     def say(text: str) -> None:
         messages.append(f"{text} [{len(list((folder / 'diagnoses').glob('*.json')))} diagnosed]")
 
+    complete = diagnosing.diagnose
+
+    def diagnose_line(log, **options):
+        """Diagnose the recording with a line; the other gets a result without any effect."""
+        with_line = options["seed"] == int(case_name(5, 1)[:7], 16)
+        return complete(log, **options) if with_line else NothingFound()
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gyrostab.blindtest.scenarios.plan.plan_cases", small_plans)
+        patch.setattr(diagnosing, "diagnose", diagnose_line)
         proof = gyrostab.prove(folder, cases=2, seed=5, nulls=100, workers=0, say=say)
     return folder, messages, proof
 
@@ -227,38 +244,14 @@ def test_failed_diagnosis_is_reported_and_retried(small, tmp_path, monkeypatch):
     detected = proof.table.set_index("quantity").loc["detected, strength 1.5 or more"]
     assert (detected["n"], detected["value"]) == (1, 0.0)
 
-    class Found:
-        model: ClassVar = {"noise": {"x": {"N": 0.003}}}
+    class Unknown(NothingFound):
+        verdict = "unknown"
 
-        def to_json(self) -> str:
-            return json.dumps(
-                {
-                    "verdict": "unknown",
-                    "mismatches": [],
-                    "effects": [],
-                    "unexplained": [],
-                    "held_out": {},
-                }
-            )
-
-    monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: Found())
+    monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: Unknown())
     again = gyrostab.prove(tmp_path / "proof", workers=0, resume=True)
     assert again.failed == {}
     assert not list((tmp_path / "proof" / "failed").iterdir())
     assert again.table.set_index("quantity").loc["detected, strength 1.5 or more", "value"] == 1.0
-
-
-class NothingFound:
-    def to_json(self) -> str:
-        return json.dumps(
-            {
-                "verdict": "no mismatch",
-                "mismatches": [],
-                "effects": [],
-                "unexplained": [],
-                "held_out": {},
-            }
-        )
 
 
 @pytest.mark.slow

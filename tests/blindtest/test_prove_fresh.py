@@ -43,6 +43,7 @@ def plans_of_each_kind(number: int, *, seed: int) -> list[dict]:
     return [first[kind] for kind in KINDS][:number]
 
 
+@pytest.mark.slow
 def test_each_kind_of_case_is_committed_and_scored(tmp_path, monkeypatch):
     """All cases get the same diagnosis, with two effects of vibration."""
     monkeypatch.setattr("gyrostab.blindtest.scenarios.plan.plan_cases", plans_of_each_kind)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ EFFECTS: list[dict[str, Any]] = [
 ]
 
 
+@cache
 def environment() -> xr.Dataset:
     """Half an hour with a temperature that rises, a shake in the middle, and a ramp."""
     log = simulate({"noise": NOISE}, duration=SIZE / RATE, rate=RATE, seed=9).compute()
@@ -37,31 +39,38 @@ def environment() -> xr.Dataset:
     return log
 
 
-def recording_of(effect: dict[str, Any] | None) -> xr.Dataset:
-    """Simulate a recording with an effect; every tenth of a minute is lost."""
+def recording_of(*effects: dict[str, Any]) -> xr.Dataset:
+    """Simulate a recording with effects; a sample of each minute is lost."""
     like = environment()
-    model = {"noise": NOISE, "effect": [effect] if effect else []}
+    model = {"noise": NOISE, "effect": list(effects)}
     log = simulate(model, like=like, seed=1234).compute()
     log = log.assign({name: like[name] for name in ("temperature", "vibration", "ramp")})
     log["rate"][:, ::600] = np.nan
     return log
 
 
+@pytest.fixture(scope="module")
+def noise_alone() -> xr.Dataset:
+    return recording_of()
+
+
 @pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect["name"])
-def test_record_with_the_effect_is_nearer_only_if_the_recording_has_it(effect: dict[str, Any]):
+def test_record_with_the_effect_is_nearer_only_if_the_recording_has_it(
+    effect: dict[str, Any], noise_alone: xr.Dataset
+):
     model = {"noise": NOISE, "effect": [effect]}
     present = check_model(recording_of(effect), model)
     assert present["runs"]
     assert present["nats"] > 5.0
-    assert check_model(recording_of(None), model)["nats"] < -5.0
+    assert check_model(noise_alone, model)["nats"] < -5.0
 
 
-def test_equal_models_are_equally_near():
-    assert check_model(recording_of(None), {"noise": NOISE, "effect": []})["nats"] == 0.0
+def test_equal_models_are_equally_near(noise_alone: xr.Dataset):
+    assert check_model(noise_alone, {"noise": NOISE, "effect": []})["nats"] == 0.0
 
 
-def test_model_that_cannot_be_simulated_is_reported():
+def test_model_that_cannot_be_simulated_is_reported(noise_alone: xr.Dataset):
     model = {"noise": NOISE, "effect": [{"name": "light_power_noise", "thermal": 0.2}]}
-    found = check_model(recording_of(None), model)
+    found = check_model(noise_alone, model)
     assert not found["runs"]
     assert "light_power" in found["reason"]

@@ -187,7 +187,7 @@ def test_calibration_of_p_values_is_inverted_exactly():
     [
         pytest.param("white", "sine", True, marks=pytest.mark.slow),
         ("flicker", "sine", False),
-        ("walk", "ramps", True),
+        pytest.param("walk", "ramps", True, marks=pytest.mark.slow),
     ],
 )
 def test_intervals_have_their_coverage_and_agree_with_the_p_values(noises, heat, gap):
@@ -218,7 +218,9 @@ def test_intervals_have_their_coverage_and_agree_with_the_p_values(noises, heat,
     assert np.mean(hold) > 0.80  # 0.95 less three standard errors of 24 shares
 
 
-@pytest.mark.parametrize(("noises", "heat"), [("flicker", "sine"), ("slow", "walk")])
+@pytest.mark.parametrize(
+    ("noises", "heat"), [("flicker", "sine"), pytest.param("slow", "walk", marks=pytest.mark.slow)]
+)
 def test_false_alarms_are_rare(noises, heat):
     false_alarms = 0
     for seed in range(8):

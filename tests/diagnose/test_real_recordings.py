@@ -38,6 +38,7 @@ def named_effects(found: Any) -> list[str]:
     return [one["name"] for one in found.effects]
 
 
+@pytest.mark.slow
 def test_ramp_resets_are_named_before_their_lines(open_recording: Callable[..., Any]) -> None:
     found = gyrostab.diagnose(open_recording("fog-blueseis-ramp", end=180.0), nulls=100)
     first = found.effects[0]

@@ -55,7 +55,8 @@ def simulate_axes(seed: int, *names: str):
     return simulate(model, duration="25min", rate=10.0, seed=seed).compute()
 
 
-@pytest.mark.parametrize("seed", [11, pytest.param(12, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [11, 12])
 def test_steady_effects_of_the_simulation_are_not_mismatches(seed):
     names = ("shared_source", "line", "bump")
     found = gyrostab.diagnose(

@@ -92,7 +92,7 @@ def test_null_records_have_the_peaks_of_the_model():
     [
         (2, SIZE, SIZE, 0.0),
         pytest.param(3, SIZE, 0.0, SIZE, marks=pytest.mark.slow),
-        (4, 2 * SIZE, SIZE, 3**0.5 * SIZE),
+        pytest.param(4, 2 * SIZE, SIZE, 3**0.5 * SIZE, marks=pytest.mark.slow),
     ],
 )
 def test_power_beyond_the_model_is_named(seed, inside, known, left):

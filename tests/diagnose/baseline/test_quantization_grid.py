@@ -152,12 +152,13 @@ def test_samples_stuck_at_zero_are_missing_in_neighbouring_bins(zone: float) -> 
     assert not possibly_truncated_axes(blocks).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "zone", "names"),
     [
         (np.trunc, 0.0, ["rate_quantization"]),
         (np.rint, 1.0, ["dead_zone"]),
-        pytest.param(np.rint, 0.0, [], marks=pytest.mark.slow),
+        (np.rint, 0.0, []),
     ],
 )
 def test_truncation_and_dead_zone_are_distinguished(how, zone: float, names: list[str]) -> None:

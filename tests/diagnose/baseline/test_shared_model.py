@@ -116,7 +116,8 @@ def test_phases_and_signs_of_axes_are_in_the_cross_spectra():
     assert baseline["cross"].isel(band=band).mean("block").values[0].real < 0.0
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
 def test_common_noise_of_the_model_is_not_a_mismatch(seed):
     found = gyrostab.diagnose(
         log_of(seed, 0.0015), simulation={"noise": NOISE, "effect": [shared(0.0015)]}, nulls=100
@@ -124,6 +125,7 @@ def test_common_noise_of_the_model_is_not_a_mismatch(seed):
     assert found.verdict == "no mismatch", found.content["mismatches"]
 
 
+@pytest.mark.slow
 def test_common_noise_beyond_the_model_is_named_with_its_size():
     found = gyrostab.diagnose(
         log_of(3, 0.0015, 0.0012),

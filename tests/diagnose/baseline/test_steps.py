@@ -44,6 +44,7 @@ def jumped():
     return _make_log([JUMP], 2)
 
 
+@pytest.mark.slow
 def test_a_jump_within_a_block_explains_its_power(jumped):
     found = _diagnose_log(jumped)
     assert found.verdict == "explained"
@@ -75,6 +76,7 @@ def test_a_jump_does_not_explain_noise_in_other_blocks(jumped):
     assert any(begin < 1300 and end > 1200 for begin, end in spans)
 
 
+@pytest.mark.slow
 def test_a_telegraph_leaves_no_line_against_its_own_model():
     hops = {"name": "telegraph", "step": [1.0], "low": 200.0, "high": 200.0}
     found = _diagnose_log(_make_log([hops], 7), [hops])

@@ -54,7 +54,7 @@ def named(table: dict, *, axes: str = "xyz", mean: float = 0.0, seed: int = 1) -
             marks=pytest.mark.slow,
         ),
         ({"name": "held_samples", "per_hour": 60.0, "length": 0.4, "fill": "zero"}, {"axes": "x"}),
-        ({"name": "clipping", "limit": 0.6, "axes": ["y"]}, {}),
+        ({"name": "clipping", "limit": 0.6, "axes": ["y"]}, {"axes": "y"}),
         pytest.param(
             {"name": "clipping", "limit": 1.75, "axes": ["y"]}, {}, marks=pytest.mark.slow
         ),  # seven samples of 15 000
@@ -106,6 +106,7 @@ def on_quantization_grid(held: int, *, seed: int = 21, size: int = 15_000) -> xr
     return reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
 
 
+@pytest.mark.slow
 def test_zeros_of_a_quantization_grid_coincide_when_an_axis_is_lost():
     blocks = on_quantization_grid(0)
     zeros, samples = (blocks[name].sum("block").values for name in ("zeros", "samples"))
@@ -128,6 +129,7 @@ def test_zero_filled_samples_are_identified_when_an_axis_is_lost():
     assert float(blocks["filled"].sel(axis="x").sum()) == pytest.approx(120, abs=25)
 
 
+@pytest.mark.slow
 def test_axis_lost_early_keeps_blocks_with_anomalous_samples():
     """z has 20 of 92 blocks, with zeros in each: without them nothing would be left of it."""
     rng = np.random.default_rng(104)
@@ -146,7 +148,8 @@ def test_axis_lost_early_keeps_blocks_with_anomalous_samples():
     assert (identification.effect, identification.axes) == ("held_samples", ("x", "y", "z"))
 
 
-@pytest.mark.parametrize("fill", ["repeat", pytest.param("zero", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("fill", ["repeat", "zero"])
 def test_number_and_length_of_held_samples_are_estimated(fill):
     """Held stretches: 40 of 6 samples, and 20 of 2."""
     rng = np.random.default_rng(8)

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
@@ -68,6 +69,7 @@ def median_half_width(found: list[dict[str, Any]], name: str) -> float:
     return float(np.median([0.5 * (one[name].high - one[name].low) for one in found]))
 
 
+@pytest.mark.slow
 def test_intervals_of_a_slow_curved_supply_response():
     time, size = 45.0, 0.12
     second = np.arange(SECONDS)
@@ -88,6 +90,7 @@ def test_intervals_of_a_slow_curved_supply_response():
     assert median_half_width(found, "lag") < 0.5 * time
 
 
+@pytest.mark.slow
 def test_intervals_of_a_warm_up_faster_than_the_grid():
     time, size = 25.0, 1.0
     found = fit_records(
@@ -98,6 +101,7 @@ def test_intervals_of_a_warm_up_faster_than_the_grid():
     assert median_half_width(found, "time") < 0.6 * time
 
 
+@pytest.mark.slow
 def test_intervals_of_a_dead_band_between_grid_values():
     width, size = 0.9, 0.15
     heat = np.interp(np.arange(SECONDS), *np.transpose(HEAT))
@@ -115,6 +119,7 @@ def test_intervals_of_a_dead_band_between_grid_values():
     assert median_half_width(found, "sensitivity") < 0.4 * size
 
 
+@pytest.mark.slow
 def test_limit_of_an_effect_slower_than_the_grid():
     size, time = 0.25, 700.0
     heat = np.interp(np.arange(SECONDS), *np.transpose(HEAT))

@@ -53,7 +53,7 @@ def diagnose_against_model(effects, *, environment=(), more=(), axes="xyz", seed
         pytest.param([SPIKES, MEMORY, WALK], (SHAKE,), "xyz", marks=pytest.mark.slow),
         ([HELD], (), "xy"),
         pytest.param([SWAY], (), "xy", marks=pytest.mark.slow),
-        ([EARTH, SCALE], (TURN,), "xyz"),
+        pytest.param([EARTH, SCALE], (TURN,), "xyz", marks=pytest.mark.slow),
     ],
     ids=["spikes, memory, walk", "held samples", "sway", "turning"],
 )
@@ -62,6 +62,7 @@ def test_effects_of_the_model_are_not_mismatches(effects, environment, axes):
     assert found.verdict == "no mismatch", (found.effects, found.content["mismatches"])
 
 
+@pytest.mark.slow
 def test_effect_in_addition_to_expected_ones_is_identified():
     found = diagnose_against_model([SPIKES, MEMORY], more=[JUMP], axes="xy")
     assert [effect["name"] for effect in found.effects] == ["bias_jump"]

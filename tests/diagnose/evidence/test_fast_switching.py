@@ -82,6 +82,7 @@ def test_finds_switching_within_blocks_and_its_parameters(
     assert slope == pytest.approx(step, rel=0.1)
 
 
+@pytest.mark.slow
 def test_noise_with_the_same_spectrum_does_not_switch() -> None:
     """Gauss-Markov noise with the variance and correlation time of a telegraph, and high noise."""
     rng = np.random.default_rng(2)
@@ -103,6 +104,7 @@ def test_noise_with_the_same_spectrum_does_not_switch() -> None:
         assert found_in(bias, rng).evidence_nats < 3.0
 
 
+@pytest.mark.slow
 def test_waves_and_steps_of_any_height_are_not_two_levels() -> None:
     rng = np.random.default_rng(3)
     time = (np.arange(BLOCKS * PIECES) + 0.5) * STEP / PIECES
@@ -149,9 +151,10 @@ def test_switching_powers_match_those_of_the_samples() -> None:
     assert np.corrcoef(np.log(told[:, 1] + 1e-3), np.log(seen[:, 1] + 1e-3))[0, 1] > 0.99
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("low", "high", "deviations"),
-    [pytest.param(30.0, 3.0, 12.0, marks=pytest.mark.slow), (4.0, 4.0, 3.0)],
+    [(30.0, 3.0, 12.0), (4.0, 4.0, 3.0)],
 )
 def test_diagnosis_names_the_telegraph_with_its_parameters(
     low: float, high: float, deviations: float

@@ -91,6 +91,7 @@ def lines() -> tuple[Identification, ...]:
     return name_effects(blocks, baseline, records).identified
 
 
+@pytest.mark.slow
 def test_each_line_is_a_separate_identification(lines: tuple[Identification, ...]) -> None:
     assert [identification.effect for identification in lines] == ["spectral_line"] * 3
     assert all(identification.axes == ("x",) for identification in lines)

@@ -344,6 +344,7 @@ def switched(stays: Sequence[int], seed: int, *, step: float, scatter: float) ->
     return name_effects(blocks, *nulls(blocks, 40))
 
 
+@pytest.mark.slow
 def test_search_withdraws_jumps_that_are_switches(one_thread) -> None:
     """A noisy supply delays the switches; their last jump is named first, then withdrawn."""
     identifications = switched([0, 8, 1, 21, 1, 33, 21], 9, step=0.6, scatter=0.45)
@@ -369,6 +370,7 @@ def found():
     return diagnose(simulate(model, duration="30min", rate=5.0, seed=11), nulls=100, seed=1)
 
 
+@pytest.mark.slow
 def test_diagnosis_names_the_telegraph_with_its_parameters(found) -> None:
     assert [(one["name"], one["axes"]) for one in found.effects] == [("telegraph", ["y"])]
     numbers = found.effects[0]["parameters"]
@@ -379,6 +381,7 @@ def test_diagnosis_names_the_telegraph_with_its_parameters(found) -> None:
     assert found.content["held_out"]["log_likelihood_gain"] > 10.0
 
 
+@pytest.mark.slow
 def test_switching_is_in_the_model_but_not_in_its_noise(found) -> None:
     effect = next(one for one in found.model["effect"] if one["name"] == "telegraph")
     assert float(np.atleast_1d(effect["step"])[0]) == pytest.approx(0.4, rel=0.15)

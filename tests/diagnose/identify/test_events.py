@@ -65,9 +65,8 @@ def components_of(state: State, one: Candidate) -> list[Component]:
     )[one.key]
 
 
-@pytest.mark.parametrize(
-    "inside", [pytest.param(slice(0, 3), marks=pytest.mark.slow), slice(-4, None)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("inside", [slice(0, 3), slice(-4, None)])
 def test_temporary_noise_is_not_ageing(inside: slice) -> None:
     factor = np.ones(BLOCKS)
     factor[inside] = 3.0
@@ -81,9 +80,10 @@ def test_temporary_noise_is_not_ageing(inside: slice) -> None:
     assert abs(end - range(BLOCKS)[inside][-1] - 1) <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("first", "last", "named"),
-    [pytest.param(1.0, 1.3, ["ageing_noise"], marks=pytest.mark.slow), (1.3, 1.0, [])],
+    [(1.0, 1.3, ["ageing_noise"]), (1.3, 1.0, [])],
 )
 def test_ageing_noise_only_grows(first: float, last: float, named: list[str]) -> None:
     blocks = reduce_rates(noise_with_levels(np.sqrt(np.linspace(first**2, last**2, BLOCKS))))

@@ -40,6 +40,7 @@ def shaken():
     return identify(VIBRATION)
 
 
+@pytest.mark.slow
 def test_noise_has_no_identification():
     found = identify([], seed=2)
     assert found.verdict == "no mismatch"
@@ -106,31 +107,29 @@ def test_sizes_outside_the_registry_are_rejected(shaken):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("table", "environment", "others"),
     [
-        pytest.param(
+        (
             {"name": "vibration_rectification", "sensitivity": 0.005, "axes": ["y"]},
             "usual",
             {"g_sensitivity"},
-            marks=pytest.mark.slow,
         ),
-        pytest.param(
+        (
             {"name": "shupe", "sensitivity": 0.4, "axes": ["x"]},
             "usual",
             {"temperature_bias", "thermal_hysteresis", "warm_up"},
-            marks=pytest.mark.slow,
         ),
         (
             {"name": "shared_source", "N": [0.0012, 0.0012, -0.0012], "axes": ["x", "y", "z"]},
             "usual",
             set(),
         ),
-        pytest.param(
+        (
             {"name": "spikes", "per_hour": 100.0, "kind": "outlier", "size": 30.0, "axes": ["z"]},
             "usual",
             set(),
-            marks=pytest.mark.slow,
         ),
     ],
     ids=lambda value: value["name"] if isinstance(value, dict) else None,

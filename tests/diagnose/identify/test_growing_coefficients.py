@@ -19,6 +19,7 @@ from gyrostab.diagnose.result.tables import identified_mismatches
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.ingest.make_log import make_log
 from tests.conftest import ROOT
+from tests.support.diagnosed import diagnosis
 from tests.support.scripts import load_script
 
 SCRIPT = load_script("docs/generate/diagnose_p16.py")
@@ -65,6 +66,7 @@ def test_fit_of_the_paper_shows_growth_in_every_term() -> None:
         assert (fits["shaken"][term] > 5.0 * fits["still"][term]).all()
 
 
+@pytest.mark.slow
 def test_growing_coefficients_are_traced_to_their_causes(small) -> None:
     _, found = small
     named = {name for effect in found.effects for name in (effect["name"], *effect["alternatives"])}
@@ -87,6 +89,7 @@ def test_growing_coefficients_are_traced_to_their_causes(small) -> None:
     assert held["misfit_after"] == pytest.approx(1.0, abs=0.25)
 
 
+@pytest.mark.slow
 def test_every_effect_explains_a_mismatch(small) -> None:
     _, found = small
     assert found.verdict == "explained", str(found)
@@ -94,12 +97,12 @@ def test_every_effect_explains_a_mismatch(small) -> None:
     assert explained == {effect["name"] for effect in found.effects}
 
 
-def test_docs_contain_the_tables_of_the_script(small) -> None:
+def test_docs_contain_the_tables_of_the_script() -> None:
     text = (ROOT / "docs" / "diagnosis.md").read_text(encoding="utf-8")
     for name in ("fit", "found", "proof"):
         table = text.split(f"<!-- {name}: begin -->\n")[1].split(f"<!-- {name}: end -->")[0]
         assert table.count("\n") >= 4, "run docs/generate/diagnose_p16.py"
-    head = SCRIPT.found({"five": small[1]}).splitlines()[0]
+    head = SCRIPT.found({"five": diagnosis()}).splitlines()[0]
     assert head in text
     assert (ROOT / "docs" / "figures" / "diagnosis-p16.png").stat().st_size > 1000
 
@@ -238,6 +241,7 @@ def test_common_noise_of_the_model_is_not_a_mismatch(noisy_log) -> None:
     assert after < 8.0
 
 
+@pytest.mark.slow
 def test_anomalous_samples_count_in_the_held_out_evidence() -> None:
     model = {
         "log": {"axes": ["x"]},

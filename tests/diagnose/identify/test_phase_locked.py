@@ -71,6 +71,7 @@ def line_model(size: float, seconds: float) -> dict[str, Any]:
     }
 
 
+@pytest.mark.slow
 def test_evidence_of_a_rotation_line_follows_the_normal_law() -> None:
     size, seconds = 0.07, 1200.0
     found = diagnose(

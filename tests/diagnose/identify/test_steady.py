@@ -52,6 +52,7 @@ def test_intermittent_wander_is_rejected(size: float, share: float, steady: bool
     assert bool(is_physical(components, state)) == steady
 
 
+@pytest.mark.slow
 def test_chance_does_not_reject_steady_wander() -> None:
     assert all(
         intermittent_nats(components[0], state) == 0.0

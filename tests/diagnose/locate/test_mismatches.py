@@ -34,6 +34,7 @@ def _overlap_share(found, begin, end):
     return max(shared, 0.0) / (max(float(found["end"]), end) - min(float(found["begin"]), begin))
 
 
+@pytest.mark.slow
 def test_false_alarm_rate_is_that_of_the_level(base, null):
     """With all statistics, on other records than those that set the thresholds."""
     p = np.concatenate(

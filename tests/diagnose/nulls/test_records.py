@@ -261,7 +261,8 @@ def candidates(record: xr.Dataset) -> tuple[dict, dict]:
     return means, powers
 
 
-@pytest.mark.parametrize("lost", [0.3, pytest.param(0.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("lost", [0.3, 0.0])
 def test_largest_evidence_of_raw_logs_matches_null_records(lost):
     """The rank of raw records among null records of their separate calibrations is uniform."""
     count, records = 29, 16

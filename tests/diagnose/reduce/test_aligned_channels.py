@@ -289,6 +289,7 @@ def test_a_seismometer_with_its_own_stamps_is_compared_sample_by_sample():
     assert unused_channels(blocks, {"seismometer_z"}) == []
 
 
+@pytest.mark.slow
 def test_diagnosis_lists_the_channels_it_used(recwarn: pytest.WarningsRecorder):
     log = with_channel(kicked(1 / 3, size=30_000), "humidity", np.arange(300.0), np.arange(300.0))
     with pytest.warns(

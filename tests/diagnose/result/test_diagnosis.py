@@ -377,6 +377,7 @@ def test_page_has_all_figures_for_any_number_of_axes(tmp_path: Path, axes: str):
     assert page.read_text(encoding="utf-8").count("<img") == 5
 
 
+@plain_pages
 def test_command_report_accepts_the_folder(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
     write_diagnosis(diagnosis(), tmp_path / "found")
     assert (

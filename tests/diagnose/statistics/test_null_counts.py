@@ -90,6 +90,7 @@ def test_grid_hides_repeats_only_where_noise_is_not_normal():
     assert hidden_by_grid(coarse, "repeats").all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [1e-4, 0.5])
 def test_grid_alone_is_no_effect(step: float):
     found = gyrostab.diagnose(log_of(np.round(noise("white") / step) * step), nulls=100)
@@ -97,6 +98,7 @@ def test_grid_alone_is_no_effect(step: float):
     assert found.verdict == "no mismatch"
 
 
+@pytest.mark.slow
 def test_held_samples_are_named_on_a_coarse_grid():
     values = np.round(noise("white") / 0.5) * 0.5
     held = np.flatnonzero(np.random.default_rng(1).random(SIZE - 1) < 0.06) + 1
@@ -105,6 +107,7 @@ def test_held_samples_are_named_on_a_coarse_grid():
     assert [one["name"] for one in found.effects] == ["held_samples"]
 
 
+@pytest.mark.slow
 def test_dead_zone_is_named_on_a_coarse_grid():
     values = noise("white")
     values = np.round(np.where(np.abs(values) < 0.5, 0.0, values) / 0.3) * 0.3

@@ -141,6 +141,7 @@ def _shares_around_limit(make, limit, name, base, null):
     return shares
 
 
+@pytest.mark.slow
 def test_detection_limit_of_raised_noise(base, null):
     def burst(found, epsilon):
         found["power"][:, 0, EVENT] *= 1.0 + epsilon
