@@ -6,11 +6,12 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from gyrostab.allan.davar import davar_parts
+from gyrostab.allan.plan import make_plan
 from gyrostab.io.datasets import to_netcdf
 from gyrostab.jobs.engine import compute_part
 from gyrostab.jobs.run import load_log
@@ -29,8 +30,11 @@ def estimate_run(
     windows: Mapping[str, Any],
     fitting: Mapping[str, Any] | None,
     workers: int | None = None,
-) -> str:
+) -> Iterator[str]:
     """Describe what a run would do, without writing its output.
+
+    First the record, its windows and averaging times, which need few compiled kernels; then time,
+    memory and size of the output.
 
     The first part is computed on one core; the processor time and the size of the rest are taken to
     be in proportion to the number of windows. Cores that are busy with other programs need longer.
@@ -44,24 +48,28 @@ def estimate_run(
     """
     log = load_log(paths, **reading)
     opened = time.process_time()  # of the process, with its start
-    parts = davar_parts(log, **windows)
-    total, first = parts[-1].stop, parts[0]
-    _, base = _measure_part(log, slice(0, 1), windows, fitting)  # compiles or loads the kernels
+    plan, parts = make_plan(log, **windows), davar_parts(log, **windows)
+    rate = float(log.attrs["sampling_rate_hz"])
+    total, first, tau = parts[-1].stop, parts[0], plan.unit.ks / rate
+    yield "\n".join(
+        [
+            f"record     {log.sizes['time'] / rate:.6g} s at {rate:.6g} Hz, axes "
+            f"{', '.join(plan.signal['axis'].values)}",
+            f"windows    {total} of {plan.unit.window / rate:g} s, one every "
+            f"{plan.unit.step / rate:g} s, in {len(parts)} parts",
+            f"averaging  {tau.size} times from {tau[0]:.4g} to {tau[-1]:.4g} s",
+        ]
+    )
+    base = _measure_part(log, slice(0, 1), windows, fitting)  # compiles or loads the kernels
     opened += min(time.process_time() - opened, _MAX_LOADING_S)
     begun = time.process_time()
-    part, size = _measure_part(log, first, windows, fitting)
+    size = _measure_part(log, first, windows, fitting)
     share = total / first.stop
     cores = workers or os.cpu_count() or 1
     worked = (time.process_time() - begun) * share
     seconds = opened + worked / min(cores, len(parts))
-    tau = part["tau"].values
-    return "\n".join(
+    yield "\n".join(
         [
-            f"record     {log.sizes['time'] / log.attrs['sampling_rate_hz']:.6g} s at "
-            f"{log.attrs['sampling_rate_hz']:.6g} Hz, axes {', '.join(part['axis'].values)}",
-            f"windows    {total} of {part.attrs['window_s']:g} s, one every "
-            f"{part.attrs['step_s']:g} s, in {len(parts)} parts",
-            f"averaging  {tau.size} times from {tau[0]:.4g} to {tau[-1]:.4g} s",
             f"time       about {seconds:.2g} s on {cores} idle cores ({opened + worked:.2g} s of "
             "processor time)",
             f"memory     {_peak_mb():.0f} MB with one core",
@@ -70,11 +78,11 @@ def estimate_run(
     )
 
 
-def _measure_part(log: Any, part: slice, windows: Any, fitting: Any) -> tuple[Any, int]:
-    """Compute a part; return it and its size as a file [bytes]."""
+def _measure_part(log: Any, part: slice, windows: Any, fitting: Any) -> int:
+    """Compute a part; return its size as a file [bytes]."""
     found = compute_part(log, part, windows, fitting)
     with tempfile.TemporaryDirectory() as folder:
-        return found, to_netcdf(found, Path(folder) / "part.nc").stat().st_size
+        return to_netcdf(found, Path(folder) / "part.nc").stat().st_size
 
 
 def _peak_mb() -> float:

@@ -126,6 +126,13 @@ def test_a_dry_run_describes_the_product_and_writes_nothing(log, product, tmp_pa
     assert float(size) * 1e6 == pytest.approx(product.stat().st_size, rel=0.2)
 
 
+def test_a_dry_run_prints_the_windows_before_it_computes(log, tmp_path, monkeypatch, capsys):
+    """The first computation compiles, which takes longer than all the rest."""
+    monkeypatch.setattr("gyrostab.jobs.estimate.compute_part", lambda *_: 1 / 0)
+    assert call("run", log, "-o", tmp_path / "product.nc", *WINDOW, "--dry-run") == 1
+    assert "averaging" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("form", ["nc", "zarr"])
 @pytest.mark.parametrize(("option", "stored"), [((), True), (("--no-stamps",), False)])
 def test_ingest_stores_the_time_of_every_sample(log, tmp_path, form, option, stored):

@@ -49,10 +49,12 @@ def run(
         from gyrostab.jobs.estimate import estimate_run
 
         options = {"reading": reading.options(), "windows": windows.options()}
-        with show_stages(common) as stage:
-            stage("estimating", 0)
-            shown = estimate_run(logs, **options, fitting=fitting.options(), workers=common.workers)
-        print(shown)
+        shown = estimate_run(logs, **options, fitting=fitting.options(), workers=common.workers)
+        for step in ("reading", "estimating"):
+            with show_stages(common) as stage:
+                stage(step, 0)
+                text = next(shown)
+            print(text, flush=True)
         return
     target = _run_job(logs, output, windows, reading, running, common, fitting=fitting.options())
     _print_product(target)
