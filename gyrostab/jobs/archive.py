@@ -15,7 +15,7 @@ from typing import Any
 
 import pandas as pd
 
-from gyrostab.diagnose.result.content import check_diagnosis
+from gyrostab.diagnose.result.content import SCHEMA, check_diagnosis
 from gyrostab.errors import DamageError, FormatError, GyrostabError, OptionError, SchemaError
 from gyrostab.ingest.files import scan_file
 from gyrostab.ingest.options import ReadOptions
@@ -48,6 +48,8 @@ RESERVED_NAMES = (
 )  # fmt: skip
 #: Format of a folder that ``gyrostab diagnose`` wrote, in the table of files.
 DIAGNOSIS = "diagnosis"
+#: Bytes at the beginning of a diagnosis that contain the name of its schema, its first entry.
+_SCHEMA_BYTES = 256
 #: Files that a worker inspects in one call: a call of dask takes a millisecond.
 _FILES_PER_CALL = 50
 
@@ -87,6 +89,8 @@ class LogRun:
         Their size together.
     diagnosis : Path or None
         Folder of its diagnosis.
+    verdict : str
+        Verdict of the diagnosis; empty without one, ``not readable`` of a damaged one.
     """
 
     name: str
@@ -94,6 +98,7 @@ class LogRun:
     files: tuple[Path, ...]
     bytes: int
     diagnosis: Path | None
+    verdict: str
 
 
 def find_archive(paths: Sequence[str | Path]) -> Archive:
@@ -152,7 +157,7 @@ def _walk_folder(folder: Path, visited: set[str]) -> Iterator[tuple[str, Path]]:
             folders.clear()
             continue
         visited.add(place)
-        if "diagnosis.json" in names:
+        if "diagnosis.json" in names and _is_diagnosis(Path(place)):
             folders.clear()
             yield DIAGNOSIS, Path(place)
             continue
@@ -164,6 +169,15 @@ def _walk_folder(folder: Path, visited: set[str]) -> Iterator[tuple[str, Path]]:
                     yield "file", path
         folders.sort()
         yield from (("file", Path(place, name)) for name in names if not name.startswith("."))
+
+
+def _is_diagnosis(folder: Path) -> bool:
+    """Whether gyrostab wrote the diagnosis in a folder, also if it is damaged further on."""
+    try:
+        with (folder / "diagnosis.json").open("rb") as file:
+            return SCHEMA.encode() in file.read(_SCHEMA_BYTES)
+    except OSError:
+        return False
 
 
 def is_fleet(path: Path) -> bool:
@@ -325,7 +339,7 @@ def find_runs(
                 (match[0] if match else "") if pattern else above,
                 tuple(files),
                 sum(sizes[path] for path in files),
-                _find_diagnosis(files, diagnoses),
+                *_find_diagnosis(files, diagnoses),
             )
         )
     return sorted(runs, key=lambda run: run.name)
@@ -372,23 +386,26 @@ def read_diagnosis(folder: Path) -> Mapping[str, Any] | None:
     return dict(content)
 
 
-def _read_diagnosed_files(folders: Sequence[Path]) -> list[tuple[Path, set[str] | None]]:
-    """Read which files each diagnosis is of; None, at the end, for those that are damaged."""
-    found = []
+def _read_diagnosed_files(folders: Sequence[Path]) -> list[tuple[Path, set[str] | None, str]]:
+    """Read files and verdict of each diagnosis; no files, at the end, for those damaged."""
+    found: list[tuple[Path, set[str] | None, str]] = []
     for folder in folders:
         content = read_diagnosis(folder)
-        files = content["recording"]["files"] if content else ()
-        found.append((folder, {Path(name).name for name in files} if content else None))
+        if content is None:
+            found.append((folder, None, "not readable"))
+        else:
+            names = {Path(name).name for name in content["recording"]["files"]}
+            found.append((folder, names, str(content["verdict"])))
     return sorted(found, key=lambda item: item[1] is None)
 
 
 def _find_diagnosis(
-    files: Sequence[Path], diagnoses: Sequence[tuple[Path, set[str] | None]]
-) -> Path | None:
+    files: Sequence[Path], diagnoses: Sequence[tuple[Path, set[str] | None, str]]
+) -> tuple[Path | None, str]:
     """Find the diagnosis of these files in their folder or below; a damaged one may be of any."""
     names, folder = {path.name for path in files}, files[0].parent
-    for place, diagnosed in diagnoses:
+    for place, diagnosed, verdict in diagnoses:
         is_of_files = diagnosed is None or diagnosed & names
         if is_of_files and folder in Path(os.path.abspath(place)).parents:
-            return place
-    return None
+            return place, verdict
+    return None, ""

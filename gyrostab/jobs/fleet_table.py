@@ -30,7 +30,6 @@ __all__ = [
     "product_path",
     "read_rows",
     "read_table",
-    "read_verdict",
     "summarise_run",
     "write_rows",
     "write_table",
@@ -202,15 +201,18 @@ def read_rows(target: Path) -> dict[str, dict[str, Any]]:
 
 def make_table(rows: Mapping[str, Mapping[str, Any]], runs: Sequence[LogRun]) -> pd.DataFrame:
     """Make the table of runs, with the verdicts of their diagnoses."""
-    diagnosed = {item.name: os.path.abspath(item.diagnosis) for item in runs if item.diagnosis}
+    diagnosed = {
+        item.name: (item.verdict, os.path.abspath(item.diagnosis))
+        for item in runs
+        if item.diagnosis
+    }
     first = ("run", "tool", "error", "files", "start", "end", "span [s]", "rate [Hz]", "windows")
     return pd.DataFrame(
         [
             {
                 **dict.fromkeys(first),
                 **rows[name],
-                "verdict": read_verdict(diagnosed.get(name, "")),
-                "diagnosis": diagnosed.get(name, ""),
+                **dict(zip(("verdict", "diagnosis"), diagnosed.get(name, ("", "")), strict=True)),
             }
             for name in sorted(rows)
         ],
@@ -221,14 +223,6 @@ def make_table(rows: Mapping[str, Mapping[str, Any]], runs: Sequence[LogRun]) ->
 def write_rows(table: pd.DataFrame, target: Path) -> None:
     """Write the table of the runs."""
     write_table(table, target / "index.parquet", content=RUNS, overwrite=True)
-
-
-def read_verdict(folder: str) -> str:
-    """Read the verdict of a diagnosis; empty without one, ``not readable`` of a damaged one."""
-    if not folder:
-        return ""
-    content = read_diagnosis(Path(folder))
-    return "not readable" if content is None else str(content["verdict"])
 
 
 def list_effects(table: pd.DataFrame) -> pd.DataFrame:

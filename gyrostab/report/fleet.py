@@ -22,6 +22,7 @@ from gyrostab.plot.style import (
     draws_figure,
     duration,
     embedded,
+    label_log_axis,
     new_figure,
     time_axis,
     unit_label,
@@ -233,6 +234,7 @@ def _plot_noise(done: pd.DataFrame, axes: list[str]) -> Any:
             panel.plot(times[part], values[part], "o", color=colour, markersize=3, label=label)
         if np.nanmin(values, initial=np.inf) > 0 and np.isfinite(values).any():
             panel.set_yscale("log")
+            label_log_axis(panel.yaxis, *panel.get_ylim())
         panel.set_ylabel(f"N_{axis} [{unit_symbol(LAWS['N'].label)}]")
     time_axis(panels[-1], np.array([]))
     if any(common):

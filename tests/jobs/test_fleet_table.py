@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from gyrostab.jobs.archive import find_archive, find_runs
-from gyrostab.jobs.fleet_table import find_trends, list_effects, read_verdict
+from gyrostab.jobs.archive import find_archive, find_runs, read_diagnosis
+from gyrostab.jobs.fleet_table import find_trends, list_effects
 from gyrostab.report.fleet import combine_effects
 from tests.support.diagnosed import content
 
@@ -33,8 +33,8 @@ def test_effects_of_one_name_are_combined_over_the_runs_of_a_tool(tmp_path):
     damaged.write_text(damaged.read_text().replace('"nats"', '"gnats"'))
     table = pd.DataFrame({"run": names, "tool": "tool", "start": pd.Timestamp("2026-05-01")})
     table["diagnosis"] = [str(tmp_path / name) for name in names]
-    table["verdict"] = [read_verdict(folder) for folder in table["diagnosis"]]
-    assert list(table["verdict"]) == ["explained", "explained", "no mismatch", "not readable"]
+    assert read_diagnosis(damaged.parent) is None
+    table["verdict"] = ["explained", "explained", "no mismatch", "not readable"]
     effects = list_effects(table)
     assert list(effects["evidence [nats]"]) == [4.0, 8.5]
     (combined,) = combine_effects(effects, table)
@@ -43,7 +43,12 @@ def test_effects_of_one_name_are_combined_over_the_runs_of_a_tool(tmp_path):
     assert combined["sizes"][0] == "tool/a, x: white 0.00045 (0.000405 to 0.000495) deg/sqrt(h)/g"
 
 
-@pytest.mark.parametrize("text", ["{", "[" * 100_000, '{"recording": {"files": 5}}'])
+_OURS = '{"schema": "gyrostab.diagnosis/1", '
+
+
+@pytest.mark.parametrize(
+    "text", [_OURS, _OURS + "[" * 100_000, _OURS + '"recording": {"files": 5}}']
+)
 def test_a_damaged_diagnosis_is_that_of_the_run_above_it(text, tmp_path):
     table = pd.DataFrame(
         {"file": [str(tmp_path / "a" / "log.nc")], "bytes": 0, "is_log": True, "note": ""}
@@ -52,7 +57,17 @@ def test_a_damaged_diagnosis_is_that_of_the_run_above_it(text, tmp_path):
     (tmp_path / "a" / "log.nc").touch()
     (tmp_path / "a" / "found" / "diagnosis.json").write_text(text)
     (found,) = find_runs(find_archive([tmp_path]), table)
-    assert read_verdict(str(found.diagnosis)) == "not readable"
+    assert found.diagnosis == tmp_path / "a" / "found"
+    assert found.verdict == "not readable"
+
+
+@pytest.mark.parametrize("text", ["{", '{"schema": "hospital/1"}'])
+def test_a_diagnosis_of_another_program_hides_no_logs(tmp_path, text):
+    (tmp_path / "diagnosis.json").write_text(text)
+    (tmp_path / "log.csv").touch()
+    found = find_archive([tmp_path])
+    assert not found.diagnoses
+    assert [path.name for path in found.files] == ["diagnosis.json", "log.csv"]
 
 
 # ------------------------------------------------------------------------------
