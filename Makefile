@@ -39,7 +39,8 @@ test: $(VENV)/.installed-test  ## install, and run the tests
 	$(BIN)/python $(PYTEST)
 
 test-diagnoses: $(VENV)/.installed-test  ## the whole diagnoses and statistics that make test leaves out
-	$(BIN)/python $(PYTEST) -m slow tests/diagnose tests/allan tests/correlate
+	$(BIN)/python $(PYTEST) -m slow tests/diagnose tests/allan tests/correlate tests/pipelines \
+		tests/blindtest/test_prove.py
 
 test-install: $(VENV)/.installed-test  ## the README in a fresh checkout, and the wheel in a bare environment
 	$(BIN)/python -m pytest -n0 -m slow tests/packaging $(if $(ONLY),-k $(ONLY))

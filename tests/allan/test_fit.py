@@ -73,6 +73,7 @@ def test_95_percent_intervals_hold_the_truth(kind, share, block):
         assert float(hit.max()) <= 0.98
 
 
+@pytest.mark.slow
 def test_intervals_hold_where_tiny_gaps_raise_quantization_noise():
     rng = np.random.default_rng(18)
     x = white(rng, 1500, 2000, N=0.01, rate=RATE) + quantization(rng, 1500, 2000, Q=0.4, rate=RATE)
@@ -164,6 +165,7 @@ def test_flicker_noise_alone_gives_b():
     assert float(product.B.mean()) == pytest.approx(0.5, rel=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.2])
 def test_absent_terms_are_rarely_observed_and_their_limits_hold(share):
     """With white noise only, absent terms are observed in about 1 % of windows."""
@@ -188,8 +190,9 @@ def test_absent_terms_are_rarely_observed_and_their_limits_hold(share):
     assert limited.sum() > 300
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("term", "value"), [("B", 0.6), ("K", 45.0)])
-@pytest.mark.parametrize("share", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
+@pytest.mark.parametrize("share", [0.0, 0.3])
 def test_truth_exceeds_a_limit_in_5_percent_of_windows(term, value, share):
     """A term at the edge of visibility: 2 to 8 %, three standard deviations about 5."""
     rng = np.random.default_rng([7, int(share * 10)])

@@ -62,26 +62,26 @@ def small(monkeypatch):
     monkeypatch.setattr("gyrostab.blindtest.scenarios.plan.plan_cases", small_plans)
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory) -> tuple[Path, list[str], Proof]:
+def run_benchmark(folder: Path, **patches) -> tuple[Path, list[str], Proof]:
     """Run a benchmark of two small cases; return its folder, messages and result."""
-    folder, messages = tmp_path_factory.mktemp("finished") / "proof", []
+    messages: list[str] = []
 
     def say(text: str) -> None:
         messages.append(f"{text} [{len(list((folder / 'diagnoses').glob('*.json')))} diagnosed]")
 
-    complete = diagnosing.diagnose
-
-    def diagnose_line(log, **options):
-        """Diagnose the recording with a line; the other gets a result without any effect."""
-        with_line = options["seed"] == int(case_name(5, 1)[:7], 16)
-        return complete(log, **options) if with_line else NothingFound()
-
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gyrostab.blindtest.scenarios.plan.plan_cases", small_plans)
-        patch.setattr(diagnosing, "diagnose", diagnose_line)
+        for name, function in patches.items():
+            patch.setattr(diagnosing, name, function)
         proof = gyrostab.prove(folder, cases=2, seed=5, nulls=100, workers=0, say=say)
     return folder, messages, proof
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> tuple[Path, list[str], Proof]:
+    """A benchmark whose diagnoses find nothing."""
+    folder = tmp_path_factory.mktemp("finished") / "proof"
+    return run_benchmark(folder, diagnose=lambda *log, **options: NothingFound())
 
 
 def test_truths_are_committed_before_the_first_diagnosis(finished):
@@ -126,8 +126,9 @@ def test_recording_reveals_nothing_of_the_truth(finished):
             assert word not in content.lower()
 
 
-def test_every_case_is_scored(finished):
-    folder, _, proof = finished
+@pytest.mark.slow
+def test_every_case_is_scored(tmp_path):
+    folder, _, proof = run_benchmark(tmp_path / "proof")
     scores = pd.read_csv(folder / "scores.csv", keep_default_na=False, na_values=[""])
     assert list(scores["kind"]) == ["null", "single"]
     assert list(scores["effect"].fillna("")) == ["", "spectral_line"]

@@ -182,12 +182,13 @@ def test_calibration_of_p_values_is_inverted_exactly():
         assert uncalibrated(calibrated(p, chance), chance) == pytest.approx(p, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("noises", "heat", "gap"),
     [
-        pytest.param("white", "sine", True, marks=pytest.mark.slow),
+        ("white", "sine", True),
         ("flicker", "sine", False),
-        pytest.param("walk", "ramps", True, marks=pytest.mark.slow),
+        ("walk", "ramps", True),
     ],
 )
 def test_intervals_have_their_coverage_and_agree_with_the_p_values(noises, heat, gap):
@@ -218,9 +219,8 @@ def test_intervals_have_their_coverage_and_agree_with_the_p_values(noises, heat,
     assert np.mean(hold) > 0.80  # 0.95 less three standard errors of 24 shares
 
 
-@pytest.mark.parametrize(
-    ("noises", "heat"), [("flicker", "sine"), pytest.param("slow", "walk", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("noises", "heat"), [("flicker", "sine"), ("slow", "walk")])
 def test_false_alarms_are_rare(noises, heat):
     false_alarms = 0
     for seed in range(8):
@@ -420,6 +420,7 @@ def test_command_writes_legal_units_and_a_figure(stored, tmp_path, capsys):
     assert "All tests passed!" in done.stdout, done.stdout
 
 
+@pytest.mark.slow
 def test_pipeline_joins_another_teams_file(stored, tmp_path):
     plan = tomllib.loads(
         (ROOT / "pipelines" / "temperature_chain.toml").read_text(encoding="utf-8")

@@ -30,6 +30,7 @@ def test_same_model_has_no_mismatch():
     assert found.content["baseline"]["source"] == "simulation"
 
 
+@pytest.mark.slow
 def test_effect_missing_in_the_simulation_is_identified():
     found = gyrostab.diagnose(simulate_log(2, 0.0006), simulation=simulate_log(1), nulls=100)
     assert found.verdict == "explained"

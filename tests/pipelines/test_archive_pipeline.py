@@ -58,6 +58,7 @@ def test_it_is_short():
         assert len((ROOT / "pipelines" / name).read_text().splitlines()) <= 80
 
 
+@pytest.mark.slow
 def test_product_spans_the_days_and_finds_the_noise(archive):
     folder, said = archive
     with gyrostab.open_product(folder / "results" / "product.nc") as product:
@@ -78,6 +79,7 @@ def test_product_spans_the_days_and_finds_the_noise(archive):
         assert (night["observable"] == 0).all()
 
 
+@pytest.mark.slow
 def test_all_other_outputs_exist(archive):
     folder, said = archive
     results = folder / "results"
@@ -100,6 +102,7 @@ def test_all_other_outputs_exist(archive):
         assert gyrostab.gap_table(log)["samples"].tolist() == [4 * 3600 * HERTZ] * 2
 
 
+@pytest.mark.slow
 def test_a_damaged_file_is_left_out_and_named(archive):
     folder, _ = archive
     with gyrostab.open_product(folder / "results" / "product.nc") as product:

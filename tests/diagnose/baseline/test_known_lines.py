@@ -87,12 +87,13 @@ def test_null_records_have_the_peaks_of_the_model():
     assert float((seen[far] / drawn[far]).mean()) == pytest.approx(1.0, abs=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "inside", "known", "left"),
     [
         (2, SIZE, SIZE, 0.0),
-        pytest.param(3, SIZE, 0.0, SIZE, marks=pytest.mark.slow),
-        pytest.param(4, 2 * SIZE, SIZE, 3**0.5 * SIZE, marks=pytest.mark.slow),
+        (3, SIZE, 0.0, SIZE),
+        (4, 2 * SIZE, SIZE, 3**0.5 * SIZE),
     ],
 )
 def test_power_beyond_the_model_is_named(seed, inside, known, left):

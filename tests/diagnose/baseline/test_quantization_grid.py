@@ -104,9 +104,10 @@ def test_angle_share_is_that_of_simulated_counters(mean: float, scatter: float) 
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "names"),
-    [("rate", ["rate_quantization"]), pytest.param("angle", [], marks=pytest.mark.slow)],
+    [("rate", ["rate_quantization"]), ("angle", [])],
 )
 def test_only_a_rounded_rate_is_named(kind: str, names: list[str]) -> None:
     blocks = quantized_record(kind, 2.0, size=9_000)

@@ -47,13 +47,14 @@ def diagnose_against_model(effects, *, environment=(), more=(), axes="xyz", seed
     return gyrostab.diagnose(log, simulation={"noise": NOISE, "effect": list(effects)}, nulls=100)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effects", "environment", "axes"),
     [
-        pytest.param([SPIKES, MEMORY, WALK], (SHAKE,), "xyz", marks=pytest.mark.slow),
+        ([SPIKES, MEMORY, WALK], (SHAKE,), "xyz"),
         ([HELD], (), "xy"),
-        pytest.param([SWAY], (), "xy", marks=pytest.mark.slow),
-        pytest.param([EARTH, SCALE], (TURN,), "xyz", marks=pytest.mark.slow),
+        ([SWAY], (), "xy"),
+        ([EARTH, SCALE], (TURN,), "xyz"),
     ],
     ids=["spikes, memory, walk", "held samples", "sway", "turning"],
 )

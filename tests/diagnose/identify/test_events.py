@@ -203,9 +203,10 @@ def test_leak_must_exceed_time_shifted_surrogates(leak: float) -> None:
     assert beats == bool(leak)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("late", "named"),
-    [(0.0, ["vibration_rectification"]), pytest.param(0.7, [], marks=pytest.mark.slow)],
+    [(0.0, ["vibration_rectification"]), (0.7, [])],
 )
 def test_channel_that_fails_the_time_shift_test_is_not_named(late: float, named: list[str]) -> None:
     """A bias follows the squared vibration, or leads it by a ninth of a period: then half of all

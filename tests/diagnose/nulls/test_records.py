@@ -125,6 +125,7 @@ def test_covariance_of_neighbouring_bands_matches_raw_logs(lost):
     assert beside[0] > 0.01
 
 
+@pytest.mark.slow
 def test_covariance_of_the_lowest_bands_is_that_of_the_taper():
     record = reduce_log(
         simulate({"noise": {"N": 0.003}}, duration="1h", rate=10.0, seed=1).compute()

@@ -73,6 +73,7 @@ def test_gain_of_a_mean_follows_the_normal_law():
     assert result["misfit_after"] == pytest.approx(1.0, abs=0.12)
 
 
+@pytest.mark.slow
 def test_error_of_a_gain_is_its_scatter_over_records():
     gains, errors = [], []
     for seed in range(16):
