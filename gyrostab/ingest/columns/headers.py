@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 from gyrostab.errors import GyrostabError, UnitError
+from gyrostab.ingest.columns.dates import YEAR_FIRST
 from gyrostab.ingest.columns.stamps import parse_time_unit
 from gyrostab.units import known_units, parse_unit
 
@@ -70,7 +71,8 @@ class Header:
     calendar: str | None = None  # the CF calendar of that unit
     mapped: bool = False  # named by --map
     preset: bool = False  # named by the preset of the program that wrote the file
-    stamped: bool = False
+    stamped: bool = False  # holds dates
+    date_order: str | None = YEAR_FIRST  # of these dates; None if they can be read in two ways
     key: str = ""  # unique name for --map
 
     @property

@@ -67,6 +67,7 @@ def plan_columns(
     units: Mapping[int, str] | None = None,
     calendars: Mapping[int, str] | None = None,
     stamped: Collection[int] = (),
+    orders: Mapping[int, str | None] | None = None,
     rising: Callable[[int], bool] | None = None,
     above: Sequence[str] = (),
     is_filled: Callable[[int], bool] | None = None,
@@ -83,7 +84,10 @@ def plan_columns(
     calendars : mapping of int to str, optional
         CF calendars of those units that name an epoch.
     stamped : collection of int
-        Columns whose values are dates (ISO 8601 text, datetime types).
+        Columns whose values are dates (text, datetime types).
+    orders : mapping of int to str or None, optional
+        Order of day, month and year in columns of text: one of `gyrostab.ingest.columns.dates`, or
+        None if they can be read in two ways; the year comes first in others.
     rising : callable, optional
         Returns whether the first values of a column rise; decides between several candidates for
         the time column.
@@ -108,6 +112,7 @@ def plan_columns(
         units or {},
         calendars or {},
         frozenset(stamped),
+        orders or {},
         {**(coded or {}), **preset.columns},
     )
     named = resolve_duplicates(draft, named)

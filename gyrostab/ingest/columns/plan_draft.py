@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gyrostab.errors import FormatError, GyrostabError
+from gyrostab.ingest.columns.dates import YEAR_FIRST
 from gyrostab.ingest.columns.headers import (
     AXIS_PATTERN,
     Header,
@@ -37,7 +38,10 @@ MAX_HEADERS = 30
 
 @dataclass(frozen=True)
 class Column:
-    """A column to read, as ``value * factor + offset`` in `units`; stamps by `time_unit`."""
+    """A column to read, as ``value * factor + offset`` in `units`.
+
+    Stamps are numbers of `time_unit`, or dates if it is None.
+    """
 
     source: int
     header: str
@@ -48,6 +52,7 @@ class Column:
     factor: float = 1.0
     offset: float = 0.0
     time_unit: TimeUnit | None = None
+    date_order: str = YEAR_FIRST  # of stamps that are text
 
 
 class PlanDraft:
@@ -152,6 +157,7 @@ def name_columns(
     units: Mapping[int, str],
     calendars: Mapping[int, str],
     stamped: frozenset[int],
+    orders: Mapping[int, str | None],
     presets: Mapping[int, str],
 ) -> list[Header]:
     """Name the columns by ``--map``, then by the preset, and drop those that either drops."""
@@ -162,6 +168,7 @@ def name_columns(
         source = column.source
         column.stored, column.calendar = units.get(source), calendars.get(source)
         column.stamped = source in stamped
+        column.date_order = orders.get(source, YEAR_FIRST)
         texts = (column.key.lower(), column.header.lower(), column.low)
         key = next((wanted[text] for text in texts if text in wanted), None)
         if key is not None:

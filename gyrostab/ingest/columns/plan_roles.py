@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from gyrostab.errors import FormatError, GyrostabError, MissingUnitError, OptionError, UnitError
+from gyrostab.ingest.columns.dates import DAY_FIRST, MONTH_FIRST, NO_DATE, YEAR_FIRST, parse_order
 from gyrostab.ingest.columns.headers import (
     AXIS_PATTERN,
     GYRO_PATTERNS,
@@ -71,15 +72,31 @@ def find_time(draft: PlanDraft, named: list[Header]) -> Header | None:
         dropped = {id(other) for other in others}
         named[:] = [c for c in named if id(c) not in dropped]
     unit = None if column.stamped else _time_unit(draft, column)
+    order = _date_order(draft, column) if column.stamped else YEAR_FIRST
     draft.columns.append(
-        Column(column.source, column.header, "time", "time", "time", "ns", time_unit=unit)
+        Column(
+            column.source,
+            column.header,
+            "time",
+            "time",
+            "time",
+            "ns",
+            time_unit=unit,
+            date_order=order,
+        )
     )
     draft.add_summary(
         column,
         "time",
         "time",
         "time",
-        unit.text if unit else "ISO 8601" if column.stamped else None,
+        unit.text
+        if unit
+        else None
+        if not column.stamped
+        else "ISO 8601"
+        if order == YEAR_FIRST
+        else order,
     )
     if (
         unit is not None
@@ -100,7 +117,35 @@ def find_time(draft: PlanDraft, named: list[Header]) -> Header | None:
 def _may_be_time(column: Header) -> bool:
     written = column.unit or column.stored
     # An epoch that cannot be read is reported, not ignored.
-    return written is None or names_epoch(written) or is_time_unit(written)
+    return written is None or column.stamped or names_epoch(written) or is_time_unit(written)
+
+
+def _date_order(draft: PlanDraft, column: Header) -> str:
+    """Return the order of day, month and year: from the user, the header, or the dates."""
+    given = by_lower_name(draft.options.unit)
+    keys = [column.name, column.key, column.header, "time"]
+    for key in (given[low] for low in map(str.lower, keys) if low in given):
+        if order := parse_order(draft.options.unit[key]):
+            draft.used_units.add(key)
+            return order
+    order = parse_order(column.unit or "") or column.date_order
+    if order == NO_DATE:
+        draft.problems.append(
+            UnitError(
+                f"{draft.path.name}: the time column {column.header!r} holds times of day "
+                "without a date; write the date before the time, in this column or in one to its "
+                "left"
+            )
+        )
+    if order is None:
+        draft.problems.append(
+            UnitError(
+                f"{draft.path.name}: the dates in the time column {column.header!r} can be read in "
+                f"two ways; say which number is the day: --unit time={DAY_FIRST} or --unit "
+                f"time={MONTH_FIRST}"
+            )
+        )
+    return order or YEAR_FIRST
 
 
 def _time_unit(draft: PlanDraft, column: Header) -> TimeUnit | None:

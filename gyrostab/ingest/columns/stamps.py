@@ -19,6 +19,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import UnitError
+from gyrostab.ingest.columns.dates import YEAR_FIRST, as_iso
 from gyrostab.store.lazy import read_slice
 from gyrostab.time.grid import split_instant
 from gyrostab.time.stamps import to_nanoseconds
@@ -30,7 +31,6 @@ __all__ = [
     "dates_to_ns",
     "floats_to_ns",
     "integers_to_ns",
-    "looks_iso",
     "names_epoch",
     "parse_time_unit",
     "read_stamps",
@@ -55,9 +55,6 @@ _UNITS = {
     7 * 86400 * 10**9: ("week", "weeks"),
 }
 _NANOSECONDS = {spelling: ns for ns, spellings in _UNITS.items() for spelling in spellings}
-_ISO = re.compile(
-    r"^\s*\d{4}-?\d\d-?\d\d([T ]\d\d(:?\d\d){0,2}([.,]\d+)?\s*(Z|[+-]\d\d(:?\d\d)?)?)?\s*$"
-)
 _SINCE = re.compile(r"\bsince\b", re.IGNORECASE)
 #: Calendars in which a date is an instant; the others are calendars of climate models.
 _CALENDARS = {
@@ -168,11 +165,6 @@ def _epoch_ns(text: str, since: str, calendar: str | None) -> int:
     return int(days) * 86400 * 10**9 + nanoseconds
 
 
-def looks_iso(text: str) -> bool:
-    """Return whether a cell is an ISO 8601 date or time (a bare number of 8 digits is not)."""
-    return bool(_ISO.match(text)) and not text.strip().isdigit()
-
-
 def dates_to_ns(dates: NDArray[Any]) -> NDArray[np.int64]:
     """Convert datetime64 of any unit to nanoseconds since 1970.
 
@@ -260,10 +252,15 @@ def floats_to_ns(
     return np.where(usable & (stamps != NAT), stamps + part, NAT)
 
 
-def cells_to_ns(cells: Sequence[str], unit: TimeUnit | None, epoch: int) -> NDArray[np.int64]:
-    """Convert text cells to stamps, exact to the last decimal: numbers of `unit`, or ISO 8601."""
+def cells_to_ns(
+    cells: Sequence[str], unit: TimeUnit | None, epoch: int, order: str = YEAR_FIRST
+) -> NDArray[np.int64]:
+    """Convert text cells to stamps, exact to the last decimal: numbers of `unit`, or dates.
+
+    `order` is that of day, month and year in dates that are not ISO 8601.
+    """
     if unit is None:
-        return texts_to_ns([cell.strip() if looks_iso(cell) else None for cell in cells])
+        return texts_to_ns([as_iso(cell, order) for cell in cells])
     zero = epoch if unit.epoch is None else unit.epoch
     stamps = np.full(len(cells), NAT, dtype=np.int64)
     for index, cell in enumerate(cells):

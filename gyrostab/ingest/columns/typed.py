@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.ingest.columns.dates import is_iso
 from gyrostab.ingest.columns.pieces import EvenStampsPiece, FilePiece
 from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
@@ -19,7 +20,6 @@ from gyrostab.ingest.columns.stamps import (
     dates_to_ns,
     floats_to_ns,
     integers_to_ns,
-    looks_iso,
     signed_counts,
 )
 from gyrostab.ingest.options import FileSummary, ReadOptions
@@ -77,7 +77,10 @@ def to_stamps(values: Any, column: Column, options: ReadOptions) -> NDArray[np.i
         stamps = dates_to_ns(array)
     elif unit is None or array.dtype.kind not in "iuf":
         stamps = cells_to_ns(
-            ["" if value is None else str(value) for value in array], unit, options.epoch_ns
+            ["" if value is None else str(value) for value in array],
+            unit,
+            options.epoch_ns,
+            column.date_order,
         )
     elif array.dtype.kind == "f":
         stamps = floats_to_ns(array, unit, options.epoch_ns)
@@ -87,10 +90,10 @@ def to_stamps(values: Any, column: Column, options: ReadOptions) -> NDArray[np.i
 
 
 def holds_dates(values: Any) -> bool:
-    """Return whether sample values of a column are dates or text that looks like dates."""
+    """Return whether sample values of a column are dates, or text of ISO 8601."""
     array = np.asarray(values)
     return array.dtype.kind == "M" or (
-        array.dtype.kind in "OUST" and any(isinstance(v, str) and looks_iso(v) for v in array[:50])
+        array.dtype.kind in "OUST" and any(isinstance(v, str) and is_iso(v) for v in array[:50])
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import FormatError
+from gyrostab.ingest.columns.dates import find_order, holds_date
 from gyrostab.ingest.columns.plan import Plan, plan_columns
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder
 from gyrostab.ingest.columns.typed import (
@@ -93,12 +94,15 @@ def _open_parquet(path: Path, options: ReadOptions) -> tuple[Any, Plan]:
         for index, entry in enumerate(schema)
         if (text := (entry.metadata or {}).get(b"units")) is not None
     }
-    dates = [
-        index
-        for index in range(len(schema))
-        if head is not None and holds_dates(_to_numpy(head.column(index)))
-    ]
-    return file, plan_columns(path, schema.names, options, units=units, stamped=dates)
+    samples = [] if head is None else [_to_numpy(column) for column in head.columns]
+    texts = [[one for one in values if isinstance(one, str)] for values in samples]
+    orders = {
+        index: find_order(text) for index, text in enumerate(texts) if any(map(holds_date, text))
+    }
+    dates = [index for index, values in enumerate(samples) if holds_dates(values)]
+    return file, plan_columns(
+        path, schema.names, options, units=units, stamped={*dates, *orders}, orders=orders
+    )
 
 
 def _to_numpy(column: Any) -> Any:

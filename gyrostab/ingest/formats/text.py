@@ -21,9 +21,10 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
+from gyrostab.ingest.columns.dates import DAY_FIRST, find_order, holds_date, is_time_of_day
 from gyrostab.ingest.columns.plan import Column, Plan, plan_columns
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
-from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, looks_iso, texts_to_ns
+from gyrostab.ingest.columns.stamps import NAT, cells_to_ns
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.ingest.text.cells import VOID_CELLS, BlockParser
 from gyrostab.ingest.text.layout import (
@@ -31,7 +32,6 @@ from gyrostab.ingest.text.layout import (
     find_layout,
     is_number,
     is_text,
-    split_line,
     unit_of_duration,
 )
 from gyrostab.store.threads import map_in_order
@@ -64,10 +64,7 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
         size = path.stat().st_size
         with path.open("rb") as file:
             file.seek(max(layout.offset, size - 2**14))
-            ends = [
-                split_line(line, layout.separator)
-                for line in file.read().decode("latin-1").splitlines()
-            ]
+            ends = [layout.split_row(line) for line in file.read().decode("latin-1").splitlines()]
             if time is not None:
                 tail = _sample_stamps(
                     layout,
@@ -116,24 +113,22 @@ def _plan_file(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
             head += _read_chunk(path, file, size, size)
             size *= 2
         layout = find_layout(path, head, complete=len(head) < size, limits=options.limits)
-    stamped = [
-        column
+    rows = [row for row in layout.samples if len(row) == layout.width]
+    orders = {
+        column: find_order(row[column] for row in rows)
         for column in range(layout.width)
-        if any(looks_iso(row[column]) for row in layout.samples if len(row) == layout.width)
-    ]
+        if any(holds_date(row[column]) or is_time_of_day(row[column]) for row in rows)
+    }
     plan = plan_columns(
         path,
         layout.headers,
         options,
         units=_duration_units(layout),
-        stamped=stamped,
+        stamped=orders,
+        orders=orders,
         rising=partial(_is_rising, layout),
         above=layout.above,
-        is_filled=lambda column: any(
-            row[column].strip().lower() not in VOID_CELLS
-            for row in layout.samples
-            if len(row) == layout.width
-        ),
+        is_filled=lambda column: any(row[column].strip().lower() not in VOID_CELLS for row in rows),
     )
     return layout, plan
 
@@ -161,7 +156,7 @@ def _is_rising(layout: Layout, column: int) -> bool:
     if all(is_number(cell, comma=layout.decimal_comma) for cell in cells):
         steps = np.diff([float(cell.replace(",", ".")) for cell in cells])
     else:
-        stamps = texts_to_ns(cells)
+        stamps = cells_to_ns(cells, None, 0, find_order(cells) or DAY_FIRST)
         steps = np.diff(stamps[stamps != NAT])
     return bool(len(steps) and (steps >= 0).all() and steps.any())
 
@@ -172,7 +167,7 @@ def _sample_stamps(
     cells = [row[time.source] for row in rows if len(row) == layout.width]
     if layout.decimal_comma:
         cells = [cell.replace(",", ".") for cell in cells]
-    return cells_to_ns(cells, time.time_unit, options.epoch_ns)
+    return cells_to_ns(cells, time.time_unit, options.epoch_ns, time.date_order)
 
 
 def _is_solid(row: list[str], layout: Layout, time: int) -> bool:

@@ -8,10 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gyrostab.ingest.columns.dates import DAY_FIRST, YEAR_FIRST
 from gyrostab.ingest.columns.plan import Plan
 from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, integers_to_ns
 from gyrostab.ingest.options import ReadOptions
-from gyrostab.ingest.text.layout import BLANK, Layout, split_line
+from gyrostab.ingest.text.layout import BLANK, Layout
 
 __all__ = ["VOID_CELLS", "BlockParser", "ParsedBlock"]
 
@@ -33,7 +34,7 @@ class BlockParser:
     """Parse the rows of one file."""
 
     def __init__(self, layout: Layout, plan: Plan, options: ReadOptions):
-        from gyrostab.kernels.encoding.rows import ISO, NUMBER, NUMERIC_TIME, SKIPPED
+        from gyrostab.kernels.encoding import rows
 
         self.layout, self.epoch = layout, options.epoch_ns
         self.sources = sorted(column.source for column in plan.columns if column.role != "time")
@@ -42,10 +43,18 @@ class BlockParser:
         self.unit = plan.time.time_unit if plan.time else None
         digits = self.unit.digits if self.unit else None
         self.digits = digits if digits is not None and digits <= 9 else 0
-        self.roles = np.full(layout.width, SKIPPED, dtype=np.int64)
-        self.roles[self.sources] = NUMBER
+        self.order = plan.time.date_order if plan.time else YEAR_FIRST
+        self.roles = np.full(layout.width, rows.SKIPPED, dtype=np.int64)
+        self.roles[self.sources] = rows.NUMBER
         if self.time is not None:
-            self.roles[self.time] = NUMERIC_TIME if self.unit else ISO
+            dates = {YEAR_FIRST: rows.YEAR_FIRST, DAY_FIRST: rows.DAY_FIRST}
+            date = dates.get(self.order, rows.MONTH_FIRST)
+            self.roles[self.time] = rows.NUMERIC_TIME if self.unit else date
+        self.between = ord(" ")
+        if layout.paired is not None and layout.paired == self.time:
+            self.between = ord(layout.separator)
+        elif layout.paired is not None:  # two cells to skip
+            self.roles = np.insert(self.roles, layout.paired, rows.SKIPPED)
 
     def parse(self, block: bytes) -> ParsedBlock:
         """Parse whole lines; comments and empty lines do not count as rows."""
@@ -61,8 +70,9 @@ class BlockParser:
         row = at = 0
         while True:
             row, at = read_rows(
-                text, at, row, self.roles, separator, point, self.digits, values, counts, starts
-            )
+                text, at, row, self.roles, separator, point, self.digits, self.between, values,
+                counts, starts,
+            )  # fmt: skip
             if at == len(block):
                 break
             end = block.index(b"\n", at) + 1
@@ -112,14 +122,14 @@ class BlockParser:
                 cells = [cell.replace(",", ".") for cell in cells]
             if self.unit is not None:  # durations as MATLAB writes them
                 cells = [cell.strip().removesuffix(f" {self.unit.text}") for cell in cells]
-            stamps[at] = cells_to_ns(cells, self.unit, self.epoch)
+            stamps[at] = cells_to_ns(cells, self.unit, self.epoch, self.order)
         return words
 
     def _split_row(self, line: str) -> list[str] | None:
         """Split a row into cells; None if there are too few or too many."""
         width, separator = self.layout.width, self.layout.separator
         try:
-            cells = split_line(line, separator)
+            cells = self.layout.split_row(line)
         except csv.Error:
             return None
         if len(cells) > width and separator != BLANK and not any(cells[width:]):

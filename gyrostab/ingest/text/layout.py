@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.stamps import looks_iso
+from gyrostab.ingest.columns.dates import holds_date, is_time_of_day
 from gyrostab.ingest.limits import check_columns
 
 __all__ = [
@@ -51,11 +51,17 @@ class Layout:
     decimal_comma: bool = False
     notes: tuple[str, ...] = ()
     above: tuple[str, ...] = ()  # lines above the header
+    #: Column whose dates have their times of day in the next one; both are one column here.
+    paired: int | None = None
 
     @property
     def width(self) -> int:
         """Number of cells in a row."""
         return len(self.headers)
+
+    def split_row(self, line: str) -> list[str]:
+        """Split a data row into cells."""
+        return _join_pair(split_line(line, self.separator), self.paired)
 
 
 def is_number(text: str, *, comma: bool = False) -> bool:
@@ -123,7 +129,12 @@ def find_layout(
             "copy it again"
         )
     rows = [tuple(split_line(re.split("[#%]", line)[0], separator)) for line in data[:HEAD_LINES]]
+    paired = _find_pair(rows)
+    if paired is not None:
+        rows = [tuple(_join_pair(list(row), paired)) for row in rows]
     width = max((len(row) for row in rows), key=[len(row) for row in rows].count)
+    if header is not None and paired is not None and len(header) > width:
+        header = _join_pair(header, paired)
     headers = list(header) if header is not None else [str(column) for column in range(width)]
     if width == len(headers) + 1 and all(row[-1] == "" for row in rows if len(row) == width):
         headers.append("")  # every data row ends with a separator
@@ -138,8 +149,9 @@ def find_layout(
     comma = separator == ";" and _has_decimal_comma(rows)
     top = tuple(lines[:above]) if header is not None else ()
     return Layout(
-        tuple(headers), separator, offset, first + 1, tuple(rows[:50]), comma, tuple(notes), top
-    )
+        tuple(headers), separator, offset, first + 1, tuple(rows[:50]), comma, tuple(notes), top,
+        paired,
+    )  # fmt: skip
 
 
 def _decode_lines(path: Path, head: bytes, *, complete: bool) -> tuple[list[str], list[str]]:
@@ -172,6 +184,25 @@ def _decode_lines(path: Path, head: bytes, *, complete: bool) -> tuple[list[str]
     return text, notes
 
 
+def _find_pair(rows: Sequence[Sequence[str]]) -> int | None:
+    """Return the first column of dates that is followed by a column of times of day."""
+    known = [row for row in rows if any(row)]
+    for column in range(min(map(len, known), default=0) - 1):
+        if all(
+            holds_date(row[column]) and ":" not in row[column] and is_time_of_day(row[column + 1])
+            for row in known
+        ):
+            return column
+    return None
+
+
+def _join_pair(cells: list[str], paired: int | None) -> list[str]:
+    """Join a date and its time of day, or the names of their columns."""
+    if paired is not None and len(cells) > paired + 1:
+        cells[paired : paired + 2] = [" ".join(cells[paired : paired + 2])]
+    return cells
+
+
 def _is_utf8(line: bytes) -> bool:
     try:
         line.decode("utf-8")
@@ -200,12 +231,12 @@ def _is_data(cells: list[str], *, comma: bool) -> bool:
     values = [
         cell
         for cell in solid
-        if is_number(cell, comma=comma) or looks_iso(cell) or unit_of_duration(cell)
+        if is_number(cell, comma=comma) or holds_date(cell) or unit_of_duration(cell)
     ]
     return (
         bool(values)
         and 2 * len(values) >= len(solid)
-        and (is_number(cells[0], comma=comma) or looks_iso(cells[0]) or len(values) == len(solid))
+        and (is_number(cells[0], comma=comma) or holds_date(cells[0]) or len(values) == len(solid))
     )
 
 
@@ -225,6 +256,8 @@ def _find_header(
         rows = [(mark, split_line(line, mark)) for mark, line in following]
         solid = [(mark, row) for mark, row in rows if _is_data(row, comma=mark == ";")]
         widths = {len(row) for mark, row in solid or rows if mark == separator}
+        if _find_pair([row for _, row in solid]) is not None:
+            widths |= {width - 1 for width in widths}  # one name for date and time of day
         if (
             not following
             or len(names) in widths

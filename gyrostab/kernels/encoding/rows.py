@@ -1,8 +1,9 @@
 """Read rows of plain text into numbers and stamps, in the form that nearly all logs have.
 
-Cells are decimal numbers, ISO 8601 dates, empty, or words for missing values, quoted or not.
-Reading stops at the first row that holds anything else, and the caller reads that row in another
-way. Numbers are rounded as by `float`, to the last bit; stamps are whole nanoseconds.
+Cells are decimal numbers, dates of ten characters with the time, empty, or words for missing
+values, quoted or not. Reading stops at the first row that holds anything else, and the caller reads
+that row in another way. Numbers are rounded as by `float`, to the last bit; stamps are whole
+nanoseconds.
 """
 
 from __future__ import annotations
@@ -15,16 +16,17 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
 
-__all__ = ["BLANKS", "ISO", "NUMBER", "NUMERIC_TIME", "SKIPPED", "clean_column", "read_rows"]
+__all__ = ["BLANKS", "DAY_FIRST", "MONTH_FIRST", "NUMBER", "NUMERIC_TIME", "SKIPPED", "YEAR_FIRST",
+           "clean_column", "read_rows"]  # fmt: skip
 
 #: What a column holds.
-SKIPPED, NUMBER, NUMERIC_TIME, ISO = range(4)
+SKIPPED, NUMBER, NUMERIC_TIME, YEAR_FIRST, DAY_FIRST, MONTH_FIRST = range(6)
 #: Separator code of runs of blanks and tabs.
 BLANKS = 32
 
 _NAT = np.iinfo(np.int64).min
 _TAB, _LINE, _RETURN, _BLANK, _QUOTE, _HASH, _PERCENT = b'\t\n\r "#%'
-_PLUS, _MINUS, _POINT, _ZERO, _COLON, _T, _Z, _SMALL_E, _SMALL_N = b"+-.0:TZen"
+_PLUS, _MINUS, _POINT, _ZERO, _COLON, _T, _Z, _SMALL_E, _SMALL_N, _SLASH = b"+-.0:TZen/"
 # words for missing values, in lower case
 _NAN, _NA, _N_A, _NULL, _NONE = (
     int.from_bytes(word, "big") for word in (b"nan", b"na", b"n/a", b"null", b"none")
@@ -275,22 +277,33 @@ def _read_zone(text, at):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _read_iso_stamp(text, at, size):  # type: ignore[no-untyped-def]
-    """Read ``2026-01-02T03:04:05.678Z`` (a blank for the T, other zones): nanoseconds and end."""
+def _read_date_stamp(text, at, size, order, point, between):  # type: ignore[no-untyped-def]
+    """Read ``2026-01-02T03:04:05.678Z`` or a like form: nanoseconds and end.
+
+    Date and time are separated by T, a blank or `between`; points or slashes may take the place of
+    the first two dashes, and other zones that of the Z.
+    """
     none = (np.int64(0), np.int64(-1))
     if at + 19 >= size:  # for the caller
         return none
-    year = 100 * _read_pair(text, at) + _read_pair(text, at + 2)
+    year_at, month_at, day_at, mark_at = at, at + 5, at + 8, at + 4
+    if order != YEAR_FIRST:
+        year_at, mark_at = at + 6, at + 2
+        month_at, day_at = (at + 3, at) if order == DAY_FIRST else (at, at + 3)
+    year = 100 * _read_pair(text, year_at) + _read_pair(text, year_at + 2)
     month, day, hour, minute = (
-        _read_pair(text, at + 5), _read_pair(text, at + 8), _read_pair(text, at + 11),
+        _read_pair(text, month_at), _read_pair(text, day_at), _read_pair(text, at + 11),
         _read_pair(text, at + 14),
     )  # fmt: skip
     has_seconds = text[at + 16] == _COLON
     second = _read_pair(text, at + 17) if has_seconds else np.int64(0)
-    if text[at + 4] != _MINUS or text[at + 7] != _MINUS or text[at + 13] != _COLON:
-        return none
-    if (text[at + 10] != _T and text[at + 10] != _BLANK) or not (
-        1700 <= year < 2200 and 1 <= month <= 12 and day >= 1
+    mark, middle = text[mark_at], text[at + 10]
+    if (
+        (mark != _MINUS and mark != _SLASH and mark != _POINT)
+        or text[mark_at + 3] != mark
+        or (middle != _T and middle != _BLANK and middle != between)
+        or text[at + 13] != _COLON
+        or not (1700 <= year < 2200 and 1 <= month <= 12 and day >= 1)
     ):
         return none
     short = month == 4 or month == 6 or month == 9 or month == 11
@@ -299,7 +312,7 @@ def _read_iso_stamp(text, at, size):  # type: ignore[no-untyped-def]
     if day > last or hour > 23 or minute > 59 or second > 59:
         return none
     end, part = at + (19 if has_seconds else 16), np.uint64(0)
-    if has_seconds and text[end] == _POINT:
+    if has_seconds and (text[end] == _POINT or text[end] == point):
         part, stop = _read_digits(text, end + 1, size, np.uint64(0))
         length = stop - end - 1
         if not 0 < length <= 9:
@@ -376,7 +389,7 @@ def _past_void(text, at, separator):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _read_cell(text, at, size, role, separator, point, digits, may_quote):  # type: ignore[no-untyped-def]
+def _read_cell(text, at, size, role, separator, point, digits, between, may_quote):  # type: ignore[no-untyped-def]
     """Read number, stamp and end of a cell; the end is negative for other content."""
     quoted = False
     if role == SKIPPED:
@@ -391,10 +404,10 @@ def _read_cell(text, at, size, role, separator, point, digits, may_quote):  # ty
     if end < 0:
         if role == NUMBER:
             value, end = _read_number(text, at, size, point)
-        elif role == ISO:
-            stamp, end = _read_iso_stamp(text, at, size)
-        else:
+        elif role == NUMERIC_TIME:
             stamp, end = _count_of_time(text, at, size, point, digits)
+        else:
+            stamp, end = _read_date_stamp(text, at, size, role, point, between)
     if quoted and end >= 0:
         end = _past_blanks(text, end, separator)
         end = end + 1 if text[end] == _QUOTE else np.int64(-1)
@@ -417,7 +430,7 @@ def _next_row(text, at, size):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def read_rows(lines, at, row, roles, separator, point, digits, values, stamps, starts):  # type: ignore[no-untyped-def]
+def read_rows(lines, at, row, roles, separator, point, digits, between, values, stamps, starts):  # type: ignore[no-untyped-def]
     """Read rows up to the first with other content, which is for the caller to read.
 
     Parameters
@@ -427,17 +440,21 @@ def read_rows(lines, at, row, roles, separator, point, digits, values, stamps, s
     at, row : int
         Index of the beginning of the first line to read, and the number of its row.
     roles : int64 (width,)
-        What each column holds: `SKIPPED`, `NUMBER`, `NUMERIC_TIME`, `ISO`.
+        What each column holds: `SKIPPED`, `NUMBER`, `NUMERIC_TIME`, or dates: `YEAR_FIRST`,
+        `DAY_FIRST`, `MONTH_FIRST`.
     separator, point : int
         Codes of the separator (`BLANKS` for runs of them) and of the decimal point.
     digits : int
         Numeric times are rounded to this number of decimals and given as whole numbers of the last;
         with 0 they must be whole.
+    between : int
+        Code that may separate date and time of day, in addition to T and blank: the separator, if
+        each has a cell; they count as one column.
     values : float64 (numbers, n)
         Overwritten: one line for each column of numbers, NaN where empty. `n` is the number of
         lines or more.
     stamps : int64 (n,)
-        Overwritten: numeric times, or nanoseconds since 1970 for `ISO`; the smallest integer where
+        Overwritten: numeric times, or nanoseconds since 1970 of dates; the smallest integer where
         empty.
     starts : int64 (n,)
         Overwritten: index of the beginning of each row.
@@ -458,7 +475,7 @@ def read_rows(lines, at, row, roles, separator, point, digits, values, stamps, s
             first, role = _past_blanks(text, at, separator), roles[column]
             may_quote = cell == first and separator != BLANKS
             value, stamp, at = _read_cell(
-                text, first, size, role, separator, point, digits, may_quote
+                text, first, size, role, separator, point, digits, between, may_quote
             )
             if role == NUMBER:
                 values[number, row] = value

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 
 from gyrostab.errors import FormatError, UnitError
 from gyrostab.ingest import ReadOptions, read_log, scan_file
+from gyrostab.ingest.columns.dates import is_iso
 from gyrostab.ingest.columns.stamps import (
     NAT,
     cells_to_ns,
     floats_to_ns,
     integers_to_ns,
-    looks_iso,
     parse_time_unit,
 )
 from gyrostab.ingest.formats import text as text_reader
@@ -250,7 +250,7 @@ def test_cell_parser_refuses_text_that_is_not_a_number() -> None:
         NAT,
         0,
     ]
-    assert not looks_iso("20261120")
+    assert not is_iso("20261120")
     with pytest.raises(UnitError, match="time unit 'fortnight'"):
         parse_time_unit("fortnight")
 

@@ -11,10 +11,12 @@ from hypothesis import strategies as st
 from gyrostab.ingest.columns.stamps import NAT
 from gyrostab.kernels.encoding.rows import (
     BLANKS,
-    ISO,
+    DAY_FIRST,
+    MONTH_FIRST,
     NUMBER,
     NUMERIC_TIME,
     SKIPPED,
+    YEAR_FIRST,
     clean_column,
     read_rows,
 )
@@ -23,14 +25,22 @@ EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def rows_of(
-    text: str, roles: list[int], *, separator: str = ",", point: str = ".", digits: int = 9
+    text: str,
+    roles: list[int],
+    *,
+    separator: str = ",",
+    point: str = ".",
+    digits: int = 9,
+    between: str = " ",
 ):
     code = BLANKS if separator == " " else ord(separator)
     held = np.frombuffer(text.encode("latin-1"), dtype=np.uint8)
     lines, roles = text.count("\n"), np.array(roles)
     values = np.empty((np.count_nonzero(roles == NUMBER), lines))
     stamps, starts = np.empty(lines, np.int64), np.empty(lines, np.int64)
-    row, stop = read_rows(held, 0, 0, roles, code, ord(point), digits, values, stamps, starts)
+    row, stop = read_rows(
+        held, 0, 0, roles, code, ord(point), digits, ord(between), values, stamps, starts
+    )
     return values[:, :row], stamps[:row], stop
 
 
@@ -179,19 +189,19 @@ def test_decimal_comma_and_skipped_columns():
     [("Z", 0), ("+00:00", 0), ("+01", 60), ("-0530", -330), ("+13:45", 825), ("", 0)],
 )
 def test_zones_of_dates(zone, minutes):
-    stamps = rows_of(f"1970-01-02T00:00:00.5{zone},1\n", [ISO, NUMBER])[1]
+    stamps = rows_of(f"1970-01-02T00:00:00.5{zone},1\n", [YEAR_FIRST, NUMBER])[1]
     assert stamps.tolist() == [86_400_500_000_000 - minutes * 60 * 10**9]
 
 
 @pytest.mark.parametrize("zone", ["+", "+1", "+24:00", "-00:60", "+01:", "+1:30", "z", " Z"])
 def test_wrong_zones_are_not_read(zone):
-    assert rows_of(f"1970-01-02T00:00:00{zone},1\n", [ISO, NUMBER])[2] == 0
+    assert rows_of(f"1970-01-02T00:00:00{zone},1\n", [YEAR_FIRST, NUMBER])[2] == 0
 
 
 def test_rows_after_a_row_of_the_caller():
     text = np.frombuffer(b"1\n# said\n2\nword\n3\n", dtype=np.uint8)
     values, stamps, starts = np.zeros((1, 4)), np.empty(4, np.int64), np.zeros(4, np.int64)
-    options = np.array([NUMBER]), 44, 46, 0, values, stamps, starts
+    options = np.array([NUMBER]), 44, 46, 0, 32, values, stamps, starts
     assert read_rows(text, 0, 0, *options) == (2, 11)
     assert read_rows(text, 16, 3, *options) == (4, 18)
     assert values.tolist() == [[1.0, 2.0, 0.0, 3.0]]
@@ -223,7 +233,7 @@ def test_numeric_times_are_exact_and_halves_round_to_even(count, decimals, digit
 def test_dates_are_those_of_the_calendar(moment, digits, between, zone):
     fraction = f".{moment.microsecond:06d}000"[: digits + 1] if digits else ""
     text = f"{moment:%Y-%m-%d}".rjust(10, "0") + between + f"{moment:%H:%M:%S}{fraction}{zone}"
-    _, stamps, stop = rows_of(f"{text}\n", [ISO])
+    _, stamps, stop = rows_of(f"{text}\n", [YEAR_FIRST])
     whole = moment.replace(microsecond=0) - EPOCH
     part = int(fraction[1:].ljust(9, "0")) if fraction else 0
     assert stop == len(text) + 1
@@ -242,9 +252,9 @@ def test_dates_are_those_of_the_calendar(moment, digits, between, zone):
     ],
 )
 def test_dates_that_do_not_exist_are_not_read(text):
-    assert rows_of(f"{text}\n", [ISO])[2] == 0
-    assert rows_of("\n", [ISO])[1].tolist() == []
-    assert rows_of(",1\n", [ISO, NUMBER])[1].tolist() == [NAT]
+    assert rows_of(f"{text}\n", [YEAR_FIRST])[2] == 0
+    assert rows_of("\n", [YEAR_FIRST])[1].tolist() == []
+    assert rows_of(",1\n", [YEAR_FIRST, NUMBER])[1].tolist() == [NAT]
 
 
 @given(
@@ -267,5 +277,26 @@ def test_column_is_cleaned_as_with_numpy(values):
 
 
 def test_dates_to_the_minute():
-    stamps = rows_of("1970-01-02 00:01,1.5\n1970-01-02T00:02Z,1.5\n", [ISO, NUMBER])[1]
+    stamps = rows_of("1970-01-02 00:01,1.5\n1970-01-02T00:02Z,1.5\n", [YEAR_FIRST, NUMBER])[1]
     assert stamps.tolist() == [86_460 * 10**9, 86_520 * 10**9]
+
+
+@given(
+    st.datetimes(datetime(1700, 1, 1), datetime(2199, 12, 31)),
+    st.sampled_from("-/."),
+    st.sampled_from("T ,"),
+    st.sampled_from([YEAR_FIRST, DAY_FIRST, MONTH_FIRST]),
+)
+def test_dates_of_any_order_and_mark(stamp, mark, between, order):
+    parts = {YEAR_FIRST: "%Y|%m|%d", DAY_FIRST: "%d|%m|%Y", MONTH_FIRST: "%m|%d|%Y"}[order]
+    text = f"{stamp:{parts.replace('|', mark)}{between}%H:%M:%S.%f}"
+    stamps = rows_of(f"{text},1\n", [order, NUMBER], between=between)[1]
+    wanted = (stamp.replace(tzinfo=UTC) - EPOCH) // timedelta(microseconds=1) * 1000
+    assert stamps.tolist() == [wanted]
+    if between == ",":  # two cells only where the caller says so
+        assert rows_of(f"{text},1\n", [order, NUMBER])[2] == 0
+
+
+@pytest.mark.parametrize("text", ["2026-05/01 08:00:00", "2026-13-01 08:00:00", "1/5/2026 8:00:00"])
+def test_other_dates_are_left_to_the_caller(text):
+    assert rows_of(f"{text} ,1\n", [YEAR_FIRST, NUMBER])[2] == 0

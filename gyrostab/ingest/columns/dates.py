@@ -1,0 +1,144 @@
+"""Dates as text: ISO 8601, and what spreadsheets and loggers write in its place.
+
+The order of day and month follows from the form where it can: the year comes first, a month has a
+name, or points separate the numbers (DIN 5008, day first). ``05/01/2026`` can be read in two ways;
+its order follows from a day above 12, or from the user.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+
+__all__ = [
+    "DAY_FIRST",
+    "MONTH_FIRST",
+    "NO_DATE",
+    "YEAR_FIRST",
+    "as_iso",
+    "find_order",
+    "holds_date",
+    "is_iso",
+    "is_time_of_day",
+    "parse_order",
+]
+
+#: Orders of the parts of a date.
+YEAR_FIRST, DAY_FIRST, MONTH_FIRST = "YYYY/MM/DD", "DD/MM/YYYY", "MM/DD/YYYY"
+#: In place of an order: times of day without a date.
+NO_DATE = "hh:mm:ss"
+
+_CLOCK = r"(?P<hour>\d\d?):(?P<minute>\d\d)(?::(?P<second>\d\d)(?:[.,](?P<part>\d+))?)?"
+_ISO = re.compile(
+    r"^\s*\d{4}-?\d\d-?\d\d([T ]\d\d(:?\d\d){0,2}([.,]\d+)?\s*(Z|[+-]\d\d(:?\d\d)?)?)?\s*$"
+)
+_DATE = re.compile(
+    r"^\s*(?:(?P<year>\d{4})(?P<mark>[-/.])(?P<month>\d\d?)(?P=mark)(?P<day>\d\d?)"
+    r"|(?P<first>\d\d?)(?P<between>[-/. ])(?P<second_part>\d\d?|[A-Za-z]{3,9})(?P=between)"
+    r"(?P<last>\d{4}))"
+    rf"(?:[T,\s]\s*{_CLOCK}\s*(?P<half>[AaPp][Mm])?\s*(?P<zone>Z|[+-]\d\d(?::?\d\d)?)?)?\s*$"
+)
+_TIME_OF_DAY = re.compile(rf"^\s*{_CLOCK}\s*(?:[AaPp][Mm])?\s*$")
+_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+
+
+def is_iso(text: str) -> bool:
+    """Return whether a cell is an ISO 8601 date or time (a bare number of 8 digits is not)."""
+    return bool(_ISO.match(text)) and not text.strip().isdigit()
+
+
+def holds_date(text: str) -> bool:
+    """Return whether a cell is a date, with or without the time, in any form that is known.
+
+    Examples
+    --------
+    >>> [holds_date(text) for text in ("2026-05-01", "1.5.2026 08:00:00,5", "1.5", "08:00:00")]
+    [True, True, False, False]
+    """
+    return is_iso(text) or bool(_DATE.match(text))
+
+
+def is_time_of_day(text: str) -> bool:
+    """Return whether a cell is a time without a date, such as ``08:00:00.25``."""
+    return bool(_TIME_OF_DAY.match(text))
+
+
+def find_order(cells: Iterable[str]) -> str | None:
+    """Return the order of the parts of dates; None if they can be read in two ways.
+
+    It is `NO_DATE` if all cells are times of day.
+
+    Examples
+    --------
+    >>> find_order(["2026-05-01"]), find_order(["01.05.2026"]), find_order(["05/01/2026"])
+    ('YYYY/MM/DD', 'DD/MM/YYYY', None)
+    >>> find_order(["05/12/2026 23:59:59", "05/13/2026 00:00:00"])
+    'MM/DD/YYYY'
+    """
+    cells, pairs = list(cells), []
+    if all(map(is_time_of_day, cells)):
+        return NO_DATE
+    for cell in cells:
+        match = None if is_iso(cell) else _DATE.match(cell)
+        if match and match["first"]:
+            if match["between"] == "." or match["second_part"].isalpha():
+                return DAY_FIRST
+            pairs.append((int(match["first"]), int(match["second_part"])))
+    if not pairs:
+        return YEAR_FIRST
+    is_day_first = any(first > 12 for first, _ in pairs)
+    is_month_first = any(second > 12 for _, second in pairs)
+    if is_day_first == is_month_first:
+        return None
+    return DAY_FIRST if is_day_first else MONTH_FIRST
+
+
+def parse_order(text: str) -> str | None:
+    """Return the order that a text such as ``DD.MM.YYYY hh:mm:ss`` states; None for other texts.
+
+    Examples
+    --------
+    >>> parse_order("DD.MM.YYYY hh:mm:ss"), parse_order("m/d/yyyy"), parse_order("s")
+    ('DD/MM/YYYY', 'MM/DD/YYYY', None)
+    """
+    match = re.match(r"^\s*([dmy]+)[-/. ]([dmy]+)[-/. ]([dmy]+)\b", text, re.IGNORECASE)
+    letters = "".join(part[0].lower() for part in match.groups()) if match else ""
+    return {"ymd": YEAR_FIRST, "dmy": DAY_FIRST, "mdy": MONTH_FIRST}.get(letters)
+
+
+def as_iso(text: str, order: str) -> str | None:
+    """Return a date as ISO 8601; None if it is not a date of this order.
+
+    Examples
+    --------
+    >>> as_iso("5/1/2026 1:30:00.25 PM", "MM/DD/YYYY"), as_iso("01-May-2026 08:00", "DD/MM/YYYY")
+    ('2026-05-01T13:30:00.25', '2026-05-01T08:00:00')
+    """
+    text = text.strip()
+    if is_iso(text):
+        return text
+    match = _DATE.match(text)
+    if match is None:
+        return None
+    year, month, day = match["year"], match["month"], match["day"]
+    if year is None:
+        year, day, month = match["last"], match["first"], match["second_part"]
+        if month.isalpha():
+            short = month[:3].lower()
+            month = str(_MONTHS.index(short) + 1) if short in _MONTHS else "0"
+        elif order == MONTH_FIRST and match["between"] != ".":
+            day, month = month, day
+        elif order == YEAR_FIRST:
+            return None
+    date = f"{year}-{int(month):02d}-{int(day):02d}"
+    if match["hour"] is None:
+        return date
+    hour = int(match["hour"])
+    if match["half"]:
+        if not 1 <= hour <= 12:
+            return None
+        hour = hour % 12 + 12 * (match["half"].lower() == "pm")
+    part = f".{match['part']}" if match["part"] else ""
+    return (
+        f"{date}T{hour:02d}:{match['minute']}:{match['second'] or '00'}{part}{match['zone'] or ''}"
+    )

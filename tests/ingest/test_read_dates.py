@@ -1,0 +1,127 @@
+"""Dates in other forms than ISO 8601, and in two columns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gyrostab import read_log, scan
+from gyrostab.errors import UnitError
+from gyrostab.ingest.columns.dates import DAY_FIRST, MONTH_FIRST, YEAR_FIRST, as_iso, find_order
+from gyrostab.ingest.columns.stamps import NAT, cells_to_ns
+
+STAMPS = pd.date_range("2026-05-12 23:59:58.250", periods=200, freq="40ms")
+
+
+def write(path: Path, form: str, header: str = "time,gyro_x [deg/h]", separator: str = ",") -> Path:
+    lines = [
+        separator.join([stamp, str(n % 7 - 3)]) for n, stamp in enumerate(STAMPS.strftime(form))
+    ]
+    path.write_text("\n".join([header.replace(",", separator), *lines]) + "\n")
+    return path
+
+
+def stamps_of(raw: xr.Dataset) -> np.ndarray:
+    return np.asarray(raw["time"].values, dtype="datetime64[ns]")
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        "%Y/%m/%d %H:%M:%S.%f",
+        "%Y.%m.%d %H:%M:%S.%fZ",
+        "%d.%m.%Y %H:%M:%S.%f",
+        "%d-%b-%Y %H:%M:%S.%f",
+        "%d %B %Y %H:%M:%S.%f",
+        "%m/%d/%Y %I:%M:%S.%f %p",  # May 13 follows
+        "%m-%d-%Y %H:%M:%S.%f",
+    ],
+)
+def test_dates_of_one_meaning_are_read(form: str, tmp_path: Path) -> None:
+    raw = read_log(write(tmp_path / "log.csv", form))
+    np.testing.assert_array_equal(stamps_of(raw), STAMPS.values)
+    assert raw["rate"].values[0, :5].tolist() == [-3, -2, -1, 0, 1]
+
+
+@pytest.mark.parametrize(("separator", "header"), [
+    (",", "Date,Time,gyro_x [deg/h]"), ("\t", "Date,Time,gyro_x [deg/h]"),
+    (" ", "Date,Time,gyro_x[deg/h]"), (" ", "time,gyro_x[deg/h]"),
+])  # fmt: skip
+@pytest.mark.parametrize("form", ["%Y-%m-%d|%H:%M:%S.%f", "%d.%m.%Y|%H:%M:%S.%f"])
+def test_date_and_time_of_day_in_two_columns_are_one(
+    form: str, separator: str, header: str, tmp_path: Path
+) -> None:
+    path = write(tmp_path / "log.txt", form.replace("|", separator), header, separator)
+    raw = read_log(path)
+    np.testing.assert_array_equal(stamps_of(raw), STAMPS.values)
+    assert raw["rate"].values[0, :5].tolist() == [-3, -2, -1, 0, 1]
+    assert scan(path)["end"].iloc[0] == STAMPS[-1]
+
+
+def test_pair_that_is_not_the_time_is_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    rows = [f"{n / 10},2026-05-01,08:00:0{n},{n}" for n in range(9)]
+    path.write_text("\n".join(["time [s],Date,Clock,gyro_x [deg/h]", *rows]) + "\n")
+    raw = read_log(path)
+    assert raw["rate"].values[0].tolist() == list(range(9))
+    assert stamps_of(raw)[1] == np.datetime64("1970-01-01T00:00:00.1")
+
+
+def test_decimal_comma_in_seconds(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(
+        "Zeit;gyro_x [deg/h]\n01.05.2026 08:00:00,125;0,5\n01.05.2026 08:00:00,250;1,5\n"
+    )
+    raw = read_log(path)
+    assert stamps_of(raw)[0] == np.datetime64("2026-05-01T08:00:00.125")
+    assert raw["rate"].values[0].tolist() == [0.5, 1.5]
+
+
+def test_date_of_two_meanings_needs_the_order(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("time,gyro_x [deg/h]\n05/01/2026 08:00:00,1\n05/01/2026 08:00:01,2\n")
+    with pytest.raises(UnitError, match=r"log\.csv: the dates .* --unit time=DD/MM/YYYY or"):
+        read_log(path)
+    for order, first in ((DAY_FIRST, "2026-01-05"), ("m/d/yyyy", "2026-05-01")):
+        raw = read_log(path, unit={"time": order})
+        assert stamps_of(raw)[0] == np.datetime64(f"{first}T08:00:00")
+    path.write_text(path.read_text().replace("time", "time [MM/DD/YYYY hh:mm:ss]"))
+    assert stamps_of(read_log(path))[0] == np.datetime64("2026-05-01T08:00:00")
+
+
+def test_times_of_day_alone_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UnitError, match=r"'time' holds times of day without a date"):
+        read_log(write(tmp_path / "log.csv", "%H:%M:%S.%f"))
+
+
+@settings(max_examples=60)
+@given(
+    st.datetimes(
+        min_value=pd.Timestamp("1700-01-02").to_pydatetime(),
+        max_value=pd.Timestamp("2199-12-30").to_pydatetime(),
+    ),
+    st.sampled_from("-/."),
+    st.sampled_from([YEAR_FIRST, DAY_FIRST, MONTH_FIRST]),
+)
+def test_cells_in_any_order_give_the_same_stamp(stamp, mark, order):  # type: ignore[no-untyped-def]
+    if order == MONTH_FIRST and mark == ".":
+        return  # points mean that the day is first
+    form = {YEAR_FIRST: "%Y|%m|%d", DAY_FIRST: "%d|%m|%Y", MONTH_FIRST: "%m|%d|%Y"}[order]
+    cell = f"{stamp:{form.replace('|', mark)} %H:%M:%S.%f}"
+    if stamp.year < 1000:
+        return
+    wanted = np.datetime64(stamp, "ns").astype(np.int64)
+    assert cells_to_ns([cell], None, 0, order)[0] == wanted
+    assert find_order([cell]) in (order, None)
+
+
+@pytest.mark.parametrize("cell", ["31.02.2026", "2026/13/01", "1.5.2026 13:00 PM", "5 Mei 2026"])
+def test_impossible_dates_are_unreadable(cell: str) -> None:
+    assert as_iso("5/1/2026", YEAR_FIRST) is None
+    assert cells_to_ns([cell], None, 0, DAY_FIRST)[0] == NAT
