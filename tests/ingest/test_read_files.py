@@ -72,6 +72,23 @@ def test_patterns_and_repeated_paths(pair: list[Path]) -> None:
         read_log(folder)
 
 
+@pytest.mark.parametrize(
+    ("name", "head", "message"),
+    [
+        ("log.zip", b"PK\x03\x04", "log.zip: this file is packed; unpack it"),
+        ("log.csv.xz", b"\xfd7zXZ\0", "log.csv.xz: this file is packed"),
+        ("log.xlsx", b"PK\x03\x04", "log.xlsx: spreadsheets are not read; save the sheet"),
+        ("log.xls", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "log.xls: spreadsheets are not read"),
+    ],
+)
+def test_packed_files_and_spreadsheets_are_refused_with_advice(
+    name: str, head: bytes, message: str, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_bytes(head + bytes(100))
+    with pytest.raises(FormatError, match=message):
+        read_log(tmp_path / name)
+
+
 def test_many_files_are_moved_to_disk(pair: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
     expected = read_log(pair)
     monkeypatch.setattr(files, "SPILL_BYTES", 100)

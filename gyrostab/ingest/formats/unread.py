@@ -13,15 +13,26 @@ from gyrostab.ingest.formats.recognise import read_head
 __all__ = ["refuse_unread"]
 
 _R_DATA = (b"RDX2\n", b"RDX3\n", b"RDA2\n", b"RDA3\n", b"X\n\0\0\0")
+_PACKED = (b"PK\x03\x04", b"7z\xbc\xaf\x27\x1c", b"Rar!", b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd")
+_OLD_OFFICE = b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
+_SHEETS = (".xls", ".xlsx", ".xlsm", ".xlsb", ".ods")
 
 
 def refuse_unread(path: Path) -> None:
     """Raise an error for a file of a format that is recognised but not read."""
-    if _decompress(read_head(path)).startswith(_R_DATA):
+    head = read_head(path)
+    if _decompress(head).startswith(_R_DATA):
         raise FormatError(
             f"{path.name}: this is a file of R data, which is not read; save it as CSV in R: "
             "write.csv(as.data.frame(x), 'log.csv', row.names = FALSE)"
         )
+    if head.startswith((*_PACKED, _OLD_OFFICE)) and path.suffix.lower() in _SHEETS:
+        raise FormatError(
+            f"{path.name}: spreadsheets are not read; save the sheet with the log as CSV, with all "
+            "decimals of the time"
+        )
+    if head.startswith(_PACKED):
+        raise FormatError(f"{path.name}: this file is packed; unpack it and give the files in it")
 
 
 def _decompress(head: bytes) -> bytes:
