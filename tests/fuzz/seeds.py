@@ -125,6 +125,15 @@ def text_seeds() -> Iterator[Seed]:
         "log.csv",
         ("--rate", "10", "--start", "2026-03-01"),
     )
+    moments = list(zip(stamp, x, strict=True))
+    pair = "\n".join(
+        ["Date\tTime\tgyro_x [deg/h]", *(f"{s[:10]}\t{s[11:-1]}\t{a}" for s, a in moments)]
+    )
+    yield Seed("text", {"log.tsv": pair.encode()}, "log.tsv")
+    dates = "\n".join(
+        ["Zeit;gyro_x [deg/h]", *(f"1.3.2026 12:00:{s[-7:-1]};{a}" for s, a in moments)]
+    )
+    yield Seed("text", {"log.csv": dates.encode()}, "log.csv")
     yield Seed("text", {"log.csv.gz": gzip.compress(iso.encode(), mtime=0)}, "log.csv.gz")
 
 

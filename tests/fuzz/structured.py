@@ -65,6 +65,12 @@ TIMES = st.one_of(
         ]
     ),
     st.datetimes().map(lambda stamp: stamp.isoformat()),
+    st.datetimes().map(
+        lambda stamp: f"{stamp.day}.{stamp.month}.{stamp.year:04d} {stamp:%H:%M:%S.%f}"
+    ),
+    st.datetimes().map(
+        lambda stamp: f"{stamp.month}/{stamp.day}/{stamp.year:04d} {stamp:%I:%M:%S %p}"
+    ),
     st.text(max_size=8),
 )
 DURATIONS = st.one_of(
