@@ -49,6 +49,9 @@ LAGGED_CHANNEL_PREFIXES = ("temperature", "supply_voltage", "light_power")
 #: Sub-blocks of a block over which the axes are averaged. Design choice: fast switching.
 SUB_BLOCKS = 16
 _MIN_SPECTRUM_SHARE = 0.25  # of a block that must be present for its spectrum; design choice
+# Samples of a frame that was sent twice. In a block of 8000 samples of 2^16 equally likely values,
+# chance repeats as many in their order with a probability of 8000^2 / 2 / 2^48 = 1e-7.
+_MIN_RESENT = 3
 _NEIGHBOUR_TURNS = (1, 5)  # range, turns per block from an order at which its noise is measured
 _MIN_TURNS_APART = 0.9  # turns per block from a line that was removed; just below one DFT bin
 _MIN_GAP_S = 1.0  # shorter gaps are not listed; design choice
@@ -83,6 +86,7 @@ class Accumulator:
         bands = self.edges.size - 1
         self.moments = np.full((rows, block_count, 5), np.nan)
         self.counts = np.zeros((rows, block_count, 9), np.int64)
+        self.resent = np.zeros((self.axes, block_count, 2), np.int64)
         self.common_zeros = np.zeros((self.axes, block_count), np.int64)
         self.at_once: dict[tuple[bool, ...], NDArray[np.int64]] = {
             (True,) * self.axes: np.zeros(block_count, np.int64)
@@ -145,6 +149,12 @@ class Accumulator:
             )
             if row < self.axes:
                 found = find_peaks(batch.values[row], self.histogram[row, block_range])
+                is_sent = present[row] & (batch.values[row] != 0.0)
+                kernel.resent_samples(
+                    np.where(is_sent, batch.values[row].view(np.int64), 0),
+                    _MIN_RESENT,
+                    self.resent[row, block_range],
+                )
                 self.peaks[row].append(found._replace(block=found.block + batch.first))
         self._add_spectra(block_range, centred, present)
         self.common_zeros[:, block_range] = simultaneous_zeros(batch.values[: self.axes])

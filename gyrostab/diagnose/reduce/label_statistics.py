@@ -49,6 +49,8 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
             for row in range(work.axes)
         ]
     )
+    # on a quantization grid equal values are frequent by chance
+    resent = np.where(steps[:, None, None] > 0.0, 0, work.resent)
     widths = np.array([bin_widths(_kept_values(work, row), step) for row, step in enumerate(steps)])
     line_total, line_square = np.moveaxis(work.line_counts, -1, 0)
     weight = np.divide(
@@ -68,8 +70,8 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
         "peaks": peaks,
         "outliers": outliers,
         "adjacent": work.adjacent,
-        "repeats": _count_repeats(moments, counts),
-        "repeat_runs": counts[..., 7],
+        "repeats": _count_repeats(moments, counts) + resent[..., 0],
+        "repeat_runs": counts[..., 7] + resent[..., 1],
         "zero_runs": counts[..., 8],
         "extremes": _count_at_range_ends(moments, counts[..., 3], counts[..., 4]),
         "zeros": counts[..., 1],

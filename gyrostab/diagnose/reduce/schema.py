@@ -57,9 +57,13 @@ BLOCK_STATISTICS: dict[str, Variable] = {
     ),
     "adjacent": Variable(_BLOCK, "1", "samples with another one right before them in the block"),
     "repeats": Variable(
-        _BLOCK, "1", "samples equal to the one before, except zeros and range ends"
+        _BLOCK,
+        "1",
+        "samples equal to the one before, except zeros and range ends, or of a frame sent twice",
     ),
-    "repeat_runs": Variable(_BLOCK, "1", "runs of samples equal to the one before, except zeros"),
+    "repeat_runs": Variable(
+        _BLOCK, "1", "runs of samples equal to the one before, except zeros, and frames sent twice"
+    ),
     "zero_runs": Variable(_BLOCK, "1", "runs of samples that are exactly 0"),
     "extremes": Variable(_BLOCK, "1", "samples equal to the smallest or largest of the record"),
     "zeros": Variable(_BLOCK, "1", "samples that are exactly 0"),

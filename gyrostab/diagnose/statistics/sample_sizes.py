@@ -9,7 +9,7 @@ import xarray as xr
 
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.reduce.outliers import outlier_limit
-from gyrostab.diagnose.settings import Settings
+from gyrostab.diagnose.settings import INTERVAL_TAILS, Settings
 from gyrostab.units import HOUR
 
 __all__ = ["estimate_from_counts"]
@@ -19,7 +19,6 @@ __all__ = ["estimate_from_counts"]
 MEDIAN_DEPARTURE_SIGMA = 1.08
 VARIANCE_TOLERANCE_SHARE = 0.2  # by which chance may raise the variance of a single block
 MIN_CLEAN_BLOCKS = 5  # without an outlier, that determine the noise level
-Pair = tuple[float, float]
 
 
 def estimate_from_counts(
@@ -29,7 +28,7 @@ def estimate_from_counts(
     blocks: xr.Dataset,
     count_evidence: CountEvidence,
     settings: Settings,
-) -> dict[str, Pair]:
+) -> dict[str, tuple[float, ...]]:
     """Estimate the parameters of an effect on the sample distribution."""
     from scipy.stats import norm
 
@@ -68,9 +67,15 @@ def estimate_from_counts(
         length = (
             max(count / runs, 1.0) / rate
         )  # of a geometric law, whose standard deviation is its mean
+        low, high = _poisson_interval(runs)
         return {
-            "per_hour": (runs / hours, math.sqrt(runs) / hours),
-            "length": (length, length / math.sqrt(runs)),
+            "per_hour": (runs / hours, math.sqrt(runs) / hours, low / hours, high / hours),
+            "length": (
+                length,
+                length / math.sqrt(runs),
+                max(length * runs / high, 1.0 / rate),
+                length * runs / low,
+            ),
         }
     share = min(count / samples, 0.999)
     if effect == "clipping":
@@ -83,6 +88,14 @@ def estimate_from_counts(
             "width": (width, spread / (2.0 * float(norm.pdf(width / spread))) * error / samples)
         }
     return {}
+
+
+def _poisson_interval(count: float) -> tuple[float, float]:
+    """Return the exact 95 % interval of the mean of a Poisson law (Garwood, 1936)."""
+    from scipy.stats import chi2
+
+    tail, other = INTERVAL_TAILS
+    return float(chi2.ppf(tail, 2.0 * count)) / 2.0, float(chi2.ppf(other, 2.0 * count + 2.0)) / 2.0
 
 
 def _held_runs(blocks: xr.Dataset, axis: str, mark: str, usual: float) -> float:

@@ -31,6 +31,7 @@ __all__ = [
     "gap_spectra",
     "ordinates",
     "phase_profile",
+    "resent_samples",
     "shape_of_bands",
     "taper",
 ]
@@ -72,6 +73,52 @@ def band_edges(size: int, bands: int = 16) -> NDArray[np.int64]:
     """
     top = ordinates(size) + 1
     return np.unique(np.round(np.geomspace(1, top, bands + 1)).astype(np.int64))
+
+
+@njit(**KERNEL)
+def resent_samples(bits, least, out):  # type: ignore[no-untyped-def]
+    """Count the samples of each block that repeat earlier ones in their order.
+
+    Such samples belong to a run in which each equals the one at the same distance before, at least
+    two samples away. A value equal to the one right before it is in no run.
+
+    Parameters
+    ----------
+    bits : ndarray of int64, shape (block, sample)
+        Values as bit patterns; 0 where missing or exactly zero.
+    least : int
+        Samples that a run has at least.
+    out : ndarray of int64, shape (block, 2)
+        Overwritten with the samples in runs, and the runs.
+    """
+    size = bits.shape[1]
+    mask = 3
+    while mask < 2 * size:
+        mask = 2 * mask + 1
+    table = np.empty(mask + 1, np.int64)
+    for b in range(bits.shape[0]):
+        row = bits[b]
+        table[:] = -1
+        samples, runs, length, lag = 0, 0, 0, 0
+        for i in range(size):
+            value = row[i]
+            slot = (value ^ (value >> 23) ^ (value >> 41)) & mask
+            while table[slot] >= 0 and row[table[slot]] != value:
+                slot = (slot + 1) & mask
+            found = table[slot]
+            is_new = value == 0 or found < 0 or found == i - 1
+            if value != 0:
+                table[slot] = i
+            goes_on = not is_new and length > 0 and row[i - lag] == value
+            if not goes_on:
+                length, lag = 0, i - found
+            length = 0 if is_new else length + 1
+            if length == least:
+                samples += least
+                runs += 1
+            elif length > least:
+                samples += 1
+        out[b, 0], out[b, 1] = samples, runs
 
 
 @njit(**KERNEL)

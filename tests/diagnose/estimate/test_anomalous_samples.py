@@ -173,6 +173,21 @@ def test_number_and_length_of_held_samples_are_estimated(fill):
             assert one.parameters[name].low < true < one.parameters[name].high
 
 
+@pytest.mark.parametrize("number", [2, 20])
+def test_frames_that_are_sent_twice_are_held_samples(number: int) -> None:
+    noise = SCATTER * np.random.default_rng(8).standard_normal((3, 15_000))
+    for first in np.linspace(1_000, 14_000, number).astype(int):
+        noise[:, first : first + 4] = noise[:, first - 4 : first]
+    blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
+    baseline, records = nulls(blocks, 40)
+    found = fit_identifications(name_effects(blocks, baseline, records), baseline)
+    assert {one.identification.effect for one in found} == {"held_samples"}
+    hours = float(blocks["samples"].sel(axis="x").sum()) / 36_000.0
+    often = found[0].parameters["per_hour"]
+    assert 0.0 < often.low < number / hours < often.high
+    assert found[0].parameters["length"].value == pytest.approx(0.4)
+
+
 @pytest.mark.slow
 def test_burst_of_bit_errors_has_the_size_of_its_power():
     rng = np.random.default_rng(4)

@@ -81,6 +81,31 @@ def test_zeros_at_the_end_of_a_range_are_not_stuck():
     np.testing.assert_array_equal(blocks.extremes.sum("block"), (x == 0.0).sum(axis=1) + 1)
 
 
+@pytest.mark.parametrize("frame", [3, 25, 400])
+def test_frames_that_are_sent_twice_are_repeats(frame: int):
+    x = np.random.default_rng(3).standard_normal(60 * 1000)
+    x[5_500 : 5_500 + frame] = x[5_500 - frame : 5_500]
+    x[9_100:9_110] = x[9_099]
+    blocks = reduce_log(log_of(x), block="10s")
+    assert blocks.repeats.values[0, [5, 9]].tolist() == [frame, 10]
+    assert blocks.repeat_runs.values[0, [5, 9]].tolist() == [1, 1]
+    assert int(blocks.repeats.sum()) == frame + 10
+
+
+@pytest.mark.parametrize("values", ["single precision", "quantized", "too short"])
+def test_chance_is_no_frame_that_was_sent_twice(values: str):
+    x = np.random.default_rng(3).standard_normal(60 * 1000)
+    if values == "too short":
+        x[5_500:5_502] = x[5_490:5_492]
+    else:
+        x = x.astype(np.float32) if values == "single precision" else np.round(x, 1)
+    blocks = reduce_log(log_of(x), block="10s")
+    assert (int(blocks.repeats.sum()) == 0) == (values != "quantized")
+    within = x.reshape(60, 1000)
+    again = (np.diff(within) == 0.0) & (within[:, 1:] != 0.0)
+    assert int(blocks.repeats.sum()) == int(again.sum())
+
+
 def test_held_samples_do_not_make_outliers_of_the_others():
     rng = np.random.default_rng(9)
     x = rng.standard_normal(60 * 1000)
