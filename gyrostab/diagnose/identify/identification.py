@@ -12,8 +12,13 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
-from gyrostab.diagnose.identify.components import axes_of, sum_evidence
+from gyrostab.diagnose.identify.components import are_lines, axes_of, sum_evidence
 from gyrostab.diagnose.predict.candidates import Candidate, Component
+from gyrostab.diagnose.predict.condition import (
+    condition_on,
+    condition_on_components,
+    refit_weights,
+)
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
@@ -25,6 +30,7 @@ __all__ = [
     "Unidentified",
     "add_identification",
     "components_of",
+    "condition_on_selections",
     "find_unidentified",
     "form_error",
     "remove_phase_locked",
@@ -174,6 +180,22 @@ class Identifications:
 def components_of(chosen: Iterable[Selection]) -> list[Component]:
     """Return the components of several selections, in order."""
     return [component for one in chosen for component in one.components]
+
+
+def condition_on_selections(
+    start: State, chosen: Sequence[Selection], without: Selection | None = None
+) -> State:
+    """Return the state with all selections but one in the model."""
+    state, has_new_lines = start, False
+    for selection in (one for one in chosen if one is not without):
+        if are_lines(selection.components):
+            # what lines add to the powers is fitted once for all of a comb
+            state = condition_on_components(state, selection.components)
+            has_new_lines = True
+            continue
+        state = refit_weights(state) if has_new_lines else state
+        state, has_new_lines = condition_on(state, list(selection.components)), False
+    return refit_weights(state) if has_new_lines else state
 
 
 def remove_phase_locked(identifications: Identifications) -> tuple[Identifications, float]:

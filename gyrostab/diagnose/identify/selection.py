@@ -34,6 +34,7 @@ from gyrostab.diagnose.identify.identification import (
     Unidentified,
     add_identification,
     components_of,
+    condition_on_selections,
     find_unidentified,
     form_error,
     with_axes_of,
@@ -47,7 +48,7 @@ from gyrostab.diagnose.identify.switching import (
     put_followers_first,
     renew_component,
 )
-from gyrostab.diagnose.identify.withdrawal import Withdrawal, condition_on_selections
+from gyrostab.diagnose.identify.withdrawal import Withdrawal
 from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State

@@ -12,21 +12,20 @@ from gyrostab.diagnose.identify.completeness import (
     variance_fluctuation,
     with_neighbouring_variants,
 )
-from gyrostab.diagnose.identify.components import are_lines, group_components
+from gyrostab.diagnose.identify.components import group_components
 from gyrostab.diagnose.identify.identification import (
     Identification,
-    Selection,
     Unidentified,
     components_of,
+    condition_on_selections,
     find_unidentified,
 )
 from gyrostab.diagnose.predict.candidates import Candidate
-from gyrostab.diagnose.predict.condition import condition_on, condition_on_components, refit_weights
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
-__all__ = ["Withdrawal", "condition_on_selections"]
+__all__ = ["Withdrawal"]
 
 #: Effects that change the white variance of the means, which the calibration then misjudges.
 _SPECTRAL_SHAPES = ("logger_filter", "held_samples", "gauss_markov", "telegraph")
@@ -130,22 +129,6 @@ class Withdrawal:
         ]
         names = [one.effect for one in weak]
         return [find_unidentified("~N(t)", components, self.threshold, names)] if components else []
-
-
-def condition_on_selections(
-    start: State, chosen: Sequence[Selection], without: Selection | None = None
-) -> State:
-    """Return the state with all selections but one in the model."""
-    state, has_new_lines = start, False
-    for selection in (one for one in chosen if one is not without):
-        if are_lines(selection.components):
-            # what lines add to the powers is fitted once for all of a comb
-            state = condition_on_components(state, selection.components)
-            has_new_lines = True
-            continue
-        state = refit_weights(state) if has_new_lines else state
-        state, has_new_lines = condition_on(state, list(selection.components)), False
-    return refit_weights(state) if has_new_lines else state
 
 
 def _identified_on(
