@@ -230,8 +230,8 @@ def run_fleet(
 def _check_local(*paths: str | Path) -> None:
     for url in filter(None, map(find_url, paths)):
         raise OptionError(
-            f"{url}: a fleet is read from and written to folders; mount the store as one, or copy "
-            "with a tool such as aws s3 sync"
+            f"{url}: a fleet is read from and written to folders; mount the store as one, copy "
+            "with a tool such as aws s3 sync, or analyse each address with gyrostab run"
         )
 
 

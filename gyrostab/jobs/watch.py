@@ -9,6 +9,7 @@ which late rows fell.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import hashlib
 import json
 import re
@@ -276,6 +277,7 @@ class _View:
             if final and not self.state.exists:
                 raise
             self._show_note(f"waiting: {error}")
+        _release_memory()
         self.is_new_data = False
         spent = time.monotonic() - begun
         self.next_update = time.monotonic() + spent * (1.0 / _MAX_WORK_SHARE - 1.0)
@@ -387,6 +389,12 @@ class _View:
             for event in (event for alarm in self.alarms for event in alarm.update(window)):
                 if not is_known:
                     self.listener.show_alarm(event)
+
+
+def _release_memory() -> None:
+    """Return memory that is free in the C library to the system; glibc alone keeps it."""
+    with contextlib.suppress(TypeError, AttributeError):  # on Windows and without glibc
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def hash_samples(log: xr.Dataset, span: tuple[int, int], common: str) -> bytes:
