@@ -39,6 +39,7 @@ def stamps_of(raw: xr.Dataset) -> np.ndarray:
         "%d.%m.%Y %H:%M:%S.%f",
         "%d-%b-%Y %H:%M:%S.%f",
         "%d %B %Y %H:%M:%S.%f",
+        "%d-%b-%y %H:%M:%S.%f",
         "%m/%d/%Y %I:%M:%S.%f %p",  # May 13 follows
         "%m-%d-%Y %H:%M:%S.%f",
     ],

@@ -34,8 +34,8 @@ _ISO = re.compile(
 )
 _DATE = re.compile(
     r"^\s*(?:(?P<year>\d{4})(?P<mark>[-/.])(?P<month>\d\d?)(?P=mark)(?P<day>\d\d?)"
-    r"|(?P<first>\d\d?)(?P<between>[-/. ])(?P<second_part>\d\d?|[A-Za-z]{3,9})(?P=between)"
-    r"(?P<last>\d{4}))"
+    r"|(?P<first>\d\d?)(?P<between>[-/. ])(?:(?P<second_part>\d\d?)(?P=between)(?P<last>\d{4})"
+    r"|(?P<name>[A-Za-z]{3,9})(?P=between)(?P<short>\d{4}|\d\d)))"
     rf"(?:[T,\s]\s*{_CLOCK}\s*(?P<half>[AaPp][Mm])?\s*(?P<zone>Z|[+-]\d\d(?::?\d\d)?)?)?\s*$"
 )
 _TIME_OF_DAY = re.compile(rf"^\s*{_CLOCK}\s*(?:[AaPp][Mm])?\s*$")
@@ -81,7 +81,7 @@ def find_order(cells: Iterable[str]) -> str | None:
     for cell in cells:
         match = None if is_iso(cell) else _DATE.match(cell)
         if match and match["first"]:
-            if match["between"] == "." or match["second_part"].isalpha():
+            if match["between"] == "." or match["name"]:
                 return DAY_FIRST
             pairs.append((int(match["first"]), int(match["second_part"])))
     if not pairs:
@@ -111,7 +111,7 @@ def as_iso(text: str, order: str) -> str | None:
 
     Examples
     --------
-    >>> as_iso("5/1/2026 1:30:00.25 PM", "MM/DD/YYYY"), as_iso("01-May-2026 08:00", "DD/MM/YYYY")
+    >>> as_iso("5/1/2026 1:30:00.25 PM", "MM/DD/YYYY"), as_iso("01-May-26 08:00", "DD/MM/YYYY")
     ('2026-05-01T13:30:00.25', '2026-05-01T08:00:00')
     """
     text = text.strip()
@@ -123,9 +123,10 @@ def as_iso(text: str, order: str) -> str | None:
     year, month, day = match["year"], match["month"], match["day"]
     if year is None:
         year, day, month = match["last"], match["first"], match["second_part"]
-        if month.isalpha():
-            short = month[:3].lower()
+        if match["name"]:
+            short = match["name"][:3].lower()
             month = str(_MONTHS.index(short) + 1) if short in _MONTHS else "0"
+            year = f"20{match['short']}"[-4:]
         elif order == MONTH_FIRST and match["between"] != ".":
             day, month = month, day
         elif order == YEAR_FIRST:

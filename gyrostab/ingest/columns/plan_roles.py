@@ -158,11 +158,13 @@ def _time_unit(draft: PlanDraft, column: Header) -> TimeUnit | None:
     text = draft.find_unit(column, keys, written, is_time_unit, prefer_given=column.unit is None)
     if text is None:
         message = (
-            f"{draft.path.name}: the time column {column.header!r} holds numbers and "
-            "carries no unit"
+            f"{draft.path.name}: the time column {column.header!r} carries no unit, and holds no "
+            "dates in a form that is known (2026-05-01T08:00:00, 01.05.2026 8:00:00)"
         )
         draft.problems.append(
-            MissingUnitError(f"{message}; give it with --unit time=s (or ms, us, ns)")
+            MissingUnitError(
+                f"{message}; give the unit of numbers with --unit time=s (or ms, us, ns)"
+            )
         )
         return None
     try:

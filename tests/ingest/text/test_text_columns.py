@@ -184,7 +184,7 @@ def test_unknown_columns_are_kept_with_a_unit_and_left_out_without(tmp_path: Pat
             "time,gyro_x [deg/h]\n0,1\n1,2\n",
             {},
             MissingUnitError,
-            r"time column 'time' holds numbers.*--unit time=s",
+            r"time column 'time' carries no unit.*--unit time=s",
         ),
         (
             "time,gyro_x [deg/h]\n0,1\n1,2\n",
@@ -249,7 +249,8 @@ def test_unknown_columns_are_kept_with_a_unit_and_left_out_without(tmp_path: Pat
         (PLAIN, {}, FormatError, r"header \(line 1\) but no data row"),
         (PLAIN + "# end\n", {}, FormatError, r"no data row"),
         (PLAIN + "0,1\n", {}, FormatError, r"only one row of data"),
-        (b"PK\x03\x04" + bytes(range(256)) * 8, {}, FormatError, r"not text but binary"),
+        (b"PK\x03\x04" + bytes(range(256)) * 8, {}, FormatError, r"this file is packed; unpack it"),
+        (b"AB" + bytes(range(256)) * 8, {}, FormatError, r"not text but binary"),
         ("time,gyro_x\n".encode("utf-16"), {}, FormatError, r"UTF-16.*UTF-8"),
         (
             PLAIN + "0,1\n" + "x,y\n" * 3,
