@@ -112,7 +112,7 @@ def sigterm_as_interrupt() -> Iterator[None]:
 def relaxed_gc() -> Iterator[None]:
     """Run the garbage collector less often: by default it scans all modules four times at start."""
     before = gc.get_threshold()
-    gc.set_threshold(10_000, *before[1:])
+    gc.set_threshold(15 * before[0], *before[1:])
     try:
         yield
     finally:

@@ -92,16 +92,15 @@ def test_dates_of_every_unit_of_parquet(tmp_path, unit):
     np.testing.assert_array_equal(read_log(tmp_path / "zoned.parquet").time.values, stamps)
 
 
-@pytest.mark.parametrize("unit", ["D", "s", "ms", "us", "ns", "Y"])
+@pytest.mark.parametrize("unit", ["D", "s", "ms", "us", "Y"])
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_dates_are_never_wrapped_around(unit, order):
     stamps = np.array(
         ["1500-01-01", "2026-01-01", "2300-01-01", "NaT"], dtype="datetime64[s]"
     ).astype(f"{order}M8[{unit}]")
-    wanted = (
-        [NAT, 1_767_225_600 * 10**9, NAT, NAT] if unit != "ns" else dates_to_ns(stamps)[:].tolist()
-    )
-    assert dates_to_ns(stamps).tolist() == wanted
+    known = 1_767_225_600 * 10**9
+    assert dates_to_ns(stamps).tolist() == [NAT, known, NAT, NAT]
+    assert dates_to_ns(stamps[1:2].astype(f"{order}M8[ns]")).tolist() == [known]
 
 
 SAME_INSTANT = [

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.headers import (
@@ -151,18 +152,7 @@ def _flatten_struct(name: str, value: Any, objects: list[str]) -> Iterator[tuple
 
     fields = value.dtype.names if isinstance(value, np.ndarray) else None
     if isinstance(value, MatlabOpaque):
-        entry = value.reshape(-1)[0] if value.size else None
-        kind = (
-            _to_text(entry["s2"]) if entry is not None and fields and "s2" in fields else "object"
-        )
-        objects.append(
-            f"a {kind}"
-            + (
-                f" {_to_text(entry['s0'])!r}"
-                if entry is not None and fields and "s0" in fields
-                else ""
-            )
-        )
+        objects.append(_describe_opaque(name, value))
     elif isinstance(value, MatlabObject):
         objects.append(f"an object of class {value.classname!r}")
     elif fields and value.size == 1:
@@ -175,6 +165,17 @@ def _flatten_struct(name: str, value: Any, objects: list[str]) -> Iterator[tuple
                 yield f"{name}.{field}", np.array([cell.item() for cell in cells])
     elif isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
         yield name, value
+
+
+def _describe_opaque(name: str, value: NDArray[Any]) -> str:
+    """Return class and name of an object of a class that scipy does not read."""
+    fields = value.dtype.names or () if value.size else ()
+    entry = value.reshape(-1)[0] if value.size else None
+    if entry is not None and "_Class" in fields:  # scipy 1.18
+        return f"a {_to_text(entry['_Class'])} {name!r}"
+    kind = _to_text(entry["s2"]) if entry is not None and "s2" in fields else "object"
+    label = f" {_to_text(entry['s0'])!r}" if entry is not None and "s0" in fields else ""
+    return f"a {kind}{label}"
 
 
 def _to_text(value: Any) -> str:

@@ -67,11 +67,8 @@ def test_identification_keeps_axes_that_still_show_it():
         with_axes_of(identification, {key: [component(9.0), component(1.0, row="y")]}).components
         == components[:1]
     )
-    assert (
-        with_axes_of(identification, {key: [component(3.0), component(4.0, row="y")]})
-        == identification
-    )
-    assert with_axes_of(identification, {}) == identification
+    for others in ({key: [component(3.0), component(4.0, row="y")]}, {}):  # NaN is not equal to NaN
+        assert repr(with_axes_of(identification, others)) == repr(identification)
 
 
 @pytest.mark.slow
