@@ -48,11 +48,11 @@ def next_command(paths: Sequence[str | Path], options: dict[str, Any]) -> str:
 
 
 def print_scan(table: pd.DataFrame) -> None:
-    """Print the table of `scan`, framed on a terminal, tab-separated otherwise, and its notes."""
-    if sys.stdout.isatty():
-        _print_framed(table)
-    else:
-        table.drop(columns="odd").to_csv(sys.stdout, sep="\t", index=False)
+    """Print the table of `scan`: framed with notes below on a terminal, tab-separated otherwise."""
+    if not sys.stdout.isatty():
+        table.to_csv(sys.stdout, sep="\t", index=False)
+        return
+    _print_framed(table)
     for _, row in table[table["odd"].fillna("") != ""].iterrows():
         _print_wrapped([f"{row['file']}:"])
         _print_wrapped([row["odd"].removeprefix(f"{Path(row['file']).name}: ")], indent="  ")

@@ -65,6 +65,16 @@ def test_date_and_time_of_day_in_two_columns_are_one(
     assert scan(path)["end"].iloc[0] == STAMPS[-1]
 
 
+@pytest.mark.parametrize("damage", ["", "****,****,****", "2026-05-12", "2026-05-12,23:59:5", "a"])
+def test_damaged_row_does_not_part_date_and_time_of_day(damage: str, tmp_path: Path) -> None:
+    path = write(tmp_path / "log.csv", "%Y-%m-%d,%H:%M:%S.%f", "Date,Time,gyro_x [deg/h]")
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:3], damage, *lines[4:]]) + "\n")
+    raw = read_log(path)
+    kept = np.isfinite(raw["rate"].values[0])
+    np.testing.assert_array_equal(stamps_of(raw)[kept], np.delete(STAMPS.values, 2))
+
+
 def test_pair_that_is_not_the_time_is_left_out(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     rows = [f"{n / 10},2026-05-01,08:00:0{n},{n}" for n in range(9)]

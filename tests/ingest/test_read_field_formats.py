@@ -150,10 +150,10 @@ def test_scan_shows_how_to_read_messages(
     for options in ([], ["--unit", "gyro=rad/s"]):
         assert call("scan", path, "--rate", "1000", *options) in (0, 2)
         shown = capsys.readouterr().out
-        notes = [line for line in shown.splitlines() if "\t" not in line and "next:" not in line]
-        assert max(map(len, notes)) <= 100
-        assert all(line.startswith("# ") for line in notes)
-        assert hint in " ".join(line.lstrip("# ") for line in notes)
+        wrapped = [line for line in shown.splitlines() if "\t" not in line and "next:" not in line]
+        assert all(line.startswith("# ") and len(line) <= 100 for line in wrapped)
+        text = " ".join(line.lstrip("# ") for line in shown.splitlines())
+        assert hint in text.replace('""', '"')
 
 
 def test_without_a_unit_or_a_rate_the_messages_are_refused(tmp_path: Path) -> None:

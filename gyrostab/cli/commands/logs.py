@@ -54,7 +54,7 @@ def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common
     if len(lost):
         raise FormatError(
             f"{len(lost)} of {len(table)} files cannot be read: {', '.join(lost['file'])}; "
-            "the notes say why"
+            "the table says why"
         )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
@@ -161,7 +161,7 @@ def _chunk_of_dask(
     )
 
 
-@cache
+@lru_cache(maxsize=16)
 def _make_blank_chunk(size: int) -> Any:
     import dask.array as da
 

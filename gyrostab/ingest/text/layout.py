@@ -132,7 +132,7 @@ def find_layout(
     paired = _find_pair(rows)
     if paired is not None:
         rows = [tuple(_join_pair(list(row), paired)) for row in rows]
-    width = max((len(row) for row in rows), key=[len(row) for row in rows].count)
+    width = _commonest_width(rows)
     if header is not None and paired is not None and len(header) > width:
         header = _join_pair(header, paired)
     headers = list(header) if header is not None else [str(column) for column in range(width)]
@@ -186,14 +186,22 @@ def _decode_lines(path: Path, head: bytes, *, complete: bool) -> tuple[list[str]
 
 def _find_pair(rows: Sequence[Sequence[str]]) -> int | None:
     """Return the first column of dates that is followed by a column of times of day."""
-    known = [row for row in rows if any(row)]
-    for column in range(min(map(len, known), default=0) - 1):
-        if all(
+    width = _commonest_width(rows)
+    whole = [row for row in rows if len(row) == width]
+    for column in range(width - 1):
+        pairs = sum(
             holds_date(row[column]) and ":" not in row[column] and is_time_of_day(row[column + 1])
-            for row in known
-        ):
+            for row in whole
+        )
+        if 2 * pairs > len(whole):  # damaged rows are few
             return column
     return None
+
+
+def _commonest_width(rows: Sequence[Sequence[str]]) -> int:
+    """Return the number of cells that most rows have."""
+    widths = [len(row) for row in rows]
+    return max(widths, key=widths.count, default=0)
 
 
 def _join_pair(cells: list[str], paired: int | None) -> list[str]:
