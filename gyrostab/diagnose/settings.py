@@ -445,7 +445,7 @@ class Settings:
         0.1,
         "1",
         "Relative error of number and size of outliers, as the law of their sizes is unknown.",
-        "choice; at least half of the share of outliers that is not seen",
+        "choice; at least half of the logarithm of the share of outliers that is seen",
     )
     score_error_share: float = _make_setting(
         0.3,

@@ -17,6 +17,7 @@ from gyrostab.blindtest.generator.detection_limits import (
     NATS,
     amplitude_for,
     learned_nats,
+    learned_random_nats,
     mean_size,
     shared_size,
     variance_nats,
@@ -154,6 +155,31 @@ def test_fitted_noise_absorbs_a_slow_mean_only(frequency, least, most):
     share = learned_nats(scenario, mean) / (NATS * 64.0)
     assert least <= share <= most
     assert learned_nats(scenario, np.zeros_like(mean)) == 0.0
+
+
+def test_fitted_noise_absorbs_random_walk_and_not_a_fast_random_bias():
+    scenario = white_scenario()
+    shares = np.array([1.0, 0.0, 0.0])
+    assert learned_random_nats(scenario, shares, lambda f: 1e-5 / f**2) < 0.01
+    assert learned_random_nats(scenario, shares, lambda f: 1e-3 / f) < 0.01
+    found = []
+    for time in (0.2, 20.0):
+        rms = amplitude_for(
+            lambda rms, time=time: wander_size(scenario, shares, time=time, rms=rms)[0], 8.0
+        )
+        known = wander_size(scenario, shares, time=time, rms=rms)[1]
+        found.append(
+            learned_random_nats(
+                scenario,
+                shares,
+                lambda f, time=time, rms=rms: (
+                    2 * rms**2 * time / (1 + (2 * math.pi * f * time) ** 2)
+                ),
+            )
+            / known
+        )
+    fast, slow = found
+    assert 0.0 < slow < 0.1 < fast < 1.0
 
 
 def test_limit_of_a_mean_matches_simulated_likelihoods():

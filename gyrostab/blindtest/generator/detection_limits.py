@@ -32,6 +32,7 @@ __all__ = [
     "amplitude_for",
     "band_density",
     "learned_nats",
+    "learned_random_nats",
     "line_density_of",
     "mean_size",
     "shared_size",
@@ -119,17 +120,46 @@ def learned_nats(scenario: Scenario, mean: Array) -> float:
     mean : ndarray, shape (axis, time)
     """
     return sum(
-        _fit_noise_to_mean(f, power, scenario.noise[axis], scenario.rate)
+        _divergence_from_noise(scenario, axis, f, power)
         for axis, f, power in _mean_spectra(scenario, mean)
     )
 
 
-def _fit_noise_to_mean(f: Array, power: Array, noise: dict[str, float], rate: float) -> float:
-    """Compute the divergence [nats] of noise plus mean from the nearest N, B, K noise."""
+def learned_random_nats(
+    scenario: Scenario, shares: Array, density: Callable[[Array], Array]
+) -> float:
+    """Compute the evidence expected for random noise over noise fitted without it [nats].
+
+    Parameters
+    ----------
+    shares : ndarray, shape (axis,)
+        Factors of the axes.
+    density : callable
+        Two-sided density [(deg/h)2/Hz] of a share of 1 at frequencies [Hz].
+    """
+    f = np.arange(1, scenario.size) * scenario.rate / (2 * scenario.size)
+    seen = float((~scenario.missing).mean())
+    return sum(
+        _divergence_from_noise(scenario, axis, f, seen * share**2 * density(f), random=True)
+        for axis, share in enumerate(shares)
+        if share
+    )
+
+
+def _divergence_from_noise(
+    scenario: Scenario, axis: int, f: Array, power: Array, *, random: bool = False
+) -> float:
+    """Compute the divergence [nats] of noise plus signal from the nearest N, B, K noise.
+
+    `power` [(deg/h)2/Hz] is that of a known mean or, if `random`, a density.
+    """
+    noise, rate = scenario.noise[axis], scenario.rate
     first = np.unique(np.geomspace(1, f.size, _SPECTRUM_BANDS).astype(np.int64)) - 1
     count = np.diff(np.append(first, f.size))
     f, power = (np.add.reduceat(values, first) / count for values in (f, power))
     known = floor_psd(f, noise=noise, rate=rate)
+    if random:
+        known, power = known + power, np.zeros_like(power)
     alone = np.stack(
         [
             floor_psd(f, noise={"Q": noise.get("Q", 0.0)}, rate=rate),

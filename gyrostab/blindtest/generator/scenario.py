@@ -85,7 +85,8 @@ class Effect:
     `extra` (axis, time) [deg/h] is added noise; `white` (axis, time), of unit variance, replaces
     the white noise, and `common` is its part shared by the axes; `after` is applied to the finished
     record; `size` is in units of the closed-form limit; `nats` is the evidence expected with the
-    truth known; `form_differs` is set where the diagnosis fits another form; `also_accepted` holds
+    truth known, and `learned_nats` over fitted noise where `mean` is not known, but random;
+    `form_differs` is set where the diagnosis fits another form; `also_accepted` holds
     further names that are right for this case.
     """
 
@@ -97,6 +98,7 @@ class Effect:
     size: float
     nats: float
     tau: tuple[float, float]
+    learned_nats: float | None = None
     active: NDArray[np.bool_] | None = None
     mean: Array | None = None
     variance: Array | None = None

@@ -8,7 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from gyrostab.blindtest.generator.detection_limits import NATS, amplitude_for
+from gyrostab.blindtest.generator.detection_limits import (
+    NATS,
+    amplitude_for,
+    learned_random_nats,
+)
 from gyrostab.blindtest.generator.noise_floor import floor_psd
 from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario, to_samples
 from gyrostab.blindtest.generator.shapes import axes_with_share, draw_shares, make_mean_effect
@@ -42,11 +46,16 @@ def wander_size(
     seen = float((~scenario.missing).mean())
     size = nats = 0.0
     for share, noise in zip(shares, scenario.noise, strict=True):
-        density = 2 * (share * rms) ** 2 * time / (1 + (2 * math.pi * f * time) ** 2)
+        density = (share * rms) ** 2 * _lorentz_density(f, time)
         ratio = 1 + seen * density / floor_psd(f, noise=noise, rate=scenario.rate)
         size += float((np.log(ratio) ** 2).sum())
         nats += 0.5 * float((ratio - 1 - np.log(ratio)).sum())
     return math.sqrt(size / 4 / NATS), nats
+
+
+def _lorentz_density(f: Array, time: float) -> Array:
+    """Return the two-sided density [1/Hz] of a bias of unit variance."""
+    return 2 * time / (1 + (2 * math.pi * f * time) ** 2)
 
 
 def _make_random_bias(
@@ -59,7 +68,9 @@ def _make_random_bias(
     time: float,
     form: str,
     form_differs: bool,
+    normal: bool,
 ) -> Effect:
+    """Make a random bias; one of a normal law shows in its spectrum only."""
     shares = draw_shares(rng)
     rms = amplitude_for(
         lambda a: wander_size(scenario, shares, time=time, rms=a)[0], strength, first=1e-4
@@ -73,6 +84,11 @@ def _make_random_bias(
         form_differs=form_differs,
         size=size,
         nats=nats,
+        learned_nats=learned_random_nats(
+            scenario, shares, lambda f: rms**2 * _lorentz_density(f, time)
+        )
+        if normal and scenario.measured is None
+        else None,
         tau=(max(1.0, 0.2 * time), scenario.seconds / 3),
         mean=shares[:, None] * rms * to_samples(scenario, waveform)[None, :],
         parameters={"correlation_time": {"value": time, "unit": "s"}},
@@ -103,6 +119,7 @@ def gauss_markov(scenario: Scenario, rng: np.random.Generator, *, strength: floa
         time=time,
         form=form,
         form_differs=heavy,
+        normal=True,
     )
 
 
@@ -128,6 +145,7 @@ def telegraph(scenario: Scenario, rng: np.random.Generator, *, strength: float) 
         time=time,
         form=form,
         form_differs=gamma,
+        normal=False,
     )
 
 

@@ -201,11 +201,10 @@ def _block_means(scenario: Scenario, values: NDArray[np.float64]) -> list[float]
 
 
 def _learned_nats(scenario: Scenario, effect: Effect) -> float:
-    return float(
-        effect.nats
-        if effect.mean is None
-        else min(effect.nats, learned_nats(scenario, effect.mean))
-    )
+    learned = effect.learned_nats
+    if learned is None and effect.mean is not None:
+        learned = learned_nats(scenario, effect.mean)
+    return float(effect.nats if learned is None else min(effect.nats, learned))
 
 
 def _describe_effect(scenario: Scenario, effect: Effect, strength: float) -> dict[str, Any]:

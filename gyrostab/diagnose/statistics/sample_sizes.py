@@ -10,6 +10,7 @@ import xarray as xr
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.reduce.outliers import outlier_limit
 from gyrostab.diagnose.settings import INTERVAL_TAILS, Settings
+from gyrostab.noise import NORMAL_95
 from gyrostab.units import HOUR
 
 __all__ = ["estimate_from_counts"]
@@ -46,18 +47,7 @@ def estimate_from_counts(
         count = max(
             float(blocks["peaks"].sel(axis=axis).where(blocks[mark].sel(axis=axis) > 0).sum()), 1.0
         )
-        error = math.sqrt(count)
-        outliers = _estimate_outliers(blocks, axis)
-        if outliers is None:  # no block was steady enough to have a kurtosis
-            return {"per_hour": (count / hours, error / hours)}
-        seen, size, many = outliers
-        number = count / seen
-        law = max(settings.outlier_law_error, 0.5 * (1.0 - seen))
-        doubt = math.hypot(1.0 / math.sqrt(2.0 * many), law)
-        return {
-            "per_hour": (number / hours, number / hours * math.hypot(1.0 / error, law)),
-            "size": (size, doubt * size),
-        }
+        return _size_spikes(count, hours, _estimate_outliers(blocks, axis), settings)
     if effect == "held_samples":
         usual = (
             usual if float(blocks["quantization_step"].sel(axis=axis)) > 0.0 else 0.0
@@ -88,6 +78,38 @@ def estimate_from_counts(
             "width": (width, spread / (2.0 * float(norm.pdf(width / spread))) * error / samples)
         }
     return {}
+
+
+def _size_spikes(
+    count: float, hours: float, outliers: tuple[float, float, float] | None, settings: Settings
+) -> dict[str, tuple[float, ...]]:
+    """Return how often outliers occur, and their size, with intervals of positive quantities.
+
+    The number is that of the outliers seen, over the share of a normal law that is seen. Their true
+    law is unknown: the logarithm of that share has an error of half its size, so that the interval
+    begins where all outliers are seen.
+    """
+    low, high = _poisson_interval(count)
+    relative = 1.0 / math.sqrt(count)
+    if outliers is None:  # no block was steady enough to have a kurtosis
+        return {"per_hour": (count / hours, relative * count / hours, low / hours, high / hours)}
+    seen, size, many = outliers
+    law = max(settings.outlier_law_error, -0.5 * math.log(seen))
+    often, doubt = count / seen / hours, math.hypot(1.0 / math.sqrt(2.0 * many), law)
+    return {
+        "per_hour": (
+            often,
+            often * math.hypot(relative, law),
+            often * math.exp(-math.hypot(math.log(count / low), NORMAL_95 * law)),
+            often * math.exp(math.hypot(math.log(high / count), NORMAL_95 * law)),
+        ),
+        "size": (
+            size,
+            size * doubt,
+            size * math.exp(-NORMAL_95 * doubt),
+            size * math.exp(NORMAL_95 * doubt),
+        ),
+    }
 
 
 def _poisson_interval(count: float) -> tuple[float, float]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -11,10 +13,13 @@ from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.estimate.outlier_power import add_outlier_power
 from gyrostab.diagnose.estimate.recalibrate import recalibrate
+from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result import finish as conclude
+from gyrostab.diagnose.settings import Settings
+from gyrostab.diagnose.statistics.sample_sizes import estimate_from_counts
 from gyrostab.ingest.make_log import make_log
 from gyrostab.physics.registry import make_effect
 from tests.support.effect_bench import run
@@ -186,6 +191,40 @@ def test_frames_that_are_sent_twice_are_held_samples(number: int) -> None:
     often = found[0].parameters["per_hour"]
     assert 0.0 < often.low < number / hours < often.high
     assert found[0].parameters["length"].value == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(
+    ("number", "kind"), [(6, "normal"), (20, "normal"), (60, "normal"), (6, "bits"), (20, "bits")]
+)
+def test_intervals_of_outliers_exclude_zero_and_contain_the_truth(number: int, kind: str) -> None:
+    """Sizes of outliers of a normal law, and of flips of one of six bits, 7 times the noise.
+
+    Flips of the lower bits are not seen, and nothing shows how many there are.
+    """
+    rng, size, samples = np.random.default_rng(5), 7.0, 15_000
+    noise = SCATTER * rng.standard_normal((40, samples))
+    for row in noise:
+        places = rng.choice(samples, rng.poisson(number), replace=False)
+        if kind == "normal":
+            unit = rng.standard_normal(places.size)
+        else:
+            unit = rng.choice([-1.0, 1.0], places.size) * 2.0 ** rng.integers(0, 6, places.size)
+            unit /= math.sqrt((4**6 - 1) / 18)
+        row[places] += SCATTER * size * unit
+    axes = [f"a{index}" for index in range(len(noise))]
+    blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=axes))
+    truth = {"per_hour": number / (samples / 36_000.0), "size": SCATTER * size}
+    held = {name: [] for name in truth}
+    for axis in axes:
+        if float(blocks["peaks"].sel(axis=axis).sum()) < 3.0:  # too few to be identified
+            continue
+        sizes = estimate_from_counts("spikes", "peaks", axis, blocks, CountEvidence({}), Settings())
+        for name, (_, _, low, high) in sizes.items():
+            assert low > 0.0
+            held[name].append(low < truth[name] < high)
+    assert min(len(one) for one in held.values()) > 10
+    assert np.mean(held["size"]) > 0.9
+    assert np.mean(held["per_hour"]) > (0.9 if kind == "normal" else 0.7)
 
 
 @pytest.mark.slow
