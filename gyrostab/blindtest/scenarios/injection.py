@@ -113,16 +113,21 @@ def quantization_step(values: Array) -> float:
     if gaps.size == 0 or gaps.size > _MAX_LEVELS_PER_SAMPLE * values.size:
         return 0.0
     step = float(gaps.min())
+    step = float(np.ptp(levels)) / round(float(np.ptp(levels)) / step)
     return step if np.abs(gaps / step - np.rint(gaps / step)).max() < _MAX_STEP_ERROR else 0.0
 
 
 def _quantize_like(record: Array, added: Array, rng: np.random.Generator) -> Array:
-    """Add an effect to a record (axis, time), with stochastic rounding to the record's steps."""
+    """Add an effect to a record (axis, time), with stochastic rounding to the record's steps.
+
+    Steps are counted from the value nearest to zero, so that zeros remain exact.
+    """
     total = record + added
     for row, values in enumerate(record):
         step = quantization_step(values)
         if step > 0.0:
-            level = float(values[np.isfinite(values)][0])
+            good = values[np.isfinite(values)]
+            level = float(good[np.abs(good).argmin()])
             total[row] = level + step * np.floor(
                 (total[row] - level) / step + rng.random(values.size)
             )
