@@ -95,7 +95,9 @@ def unexplained_motion(
     """Find the moving blocks of axes without an effect that explains the means.
 
     An effect on the means must leave next to nothing of the motion. It is not enough that it adds
-    evidence: a step or a drifting channel also explains a part of an intermittent rotation.
+    evidence: a step or a drifting channel also explains a part of an intermittent rotation. Two
+    levels have their course from the means themselves, hence no error of form: they must leave the
+    axis at rest.
 
     Returns
     -------
@@ -110,19 +112,20 @@ def unexplained_motion(
     }
     moving = moving_blocks(blocks, settings=settings)
     for row, axis in enumerate(map(str, blocks["axis"].values)):
-        columns = [
-            column
+        own = [
+            component
             for component in components
             if component.statistic.is_in_means and component.row == (axis,)
-            for column in mean_columns(component.variant, row)
         ]
+        columns = [column for one in own for column in mean_columns(one.variant, row)]
         if axis in explained_axes or (
             columns
             and _is_explained(
                 blocks["mean"].sel(axis=axis).values,
                 moving[row],
                 np.stack(columns, axis=1),
-                settings.spectrum_error_share,
+                settings,
+                has_form=not any(one.statistic.is_switching for one in own),
             )
         ):
             moving[row] = False
@@ -130,9 +133,17 @@ def unexplained_motion(
 
 
 def _is_explained(
-    mean: Array, moving: NDArray[np.bool_], columns: Array, max_left_share: float
+    mean: Array,
+    moving: NDArray[np.bool_],
+    columns: Array,
+    settings: Settings,
+    *,
+    has_form: bool,
 ) -> bool:
-    """Return whether these columns leave next to nothing of a motion."""
+    """Return whether these columns leave next to nothing of a motion.
+
+    Without a form of its own, which may be wrong, they must leave the axis at rest.
+    """
     good = np.isfinite(mean)
     if not (good & moving).any():
         return True
@@ -140,9 +151,11 @@ def _is_explained(
     design /= np.maximum(np.abs(design).max(axis=0), 1e-300)
     size, *_ = np.linalg.lstsq(design, mean[good], rcond=None)
     left = mean[good] - design @ size
+    if not has_form and _moving_blocks_of_axis(left, settings).any():
+        return False
     away = mean[good] - np.median(mean[good & ~moving])
     is_moving = moving[good]
-    return float((left[is_moving] ** 2).sum()) <= max_left_share * float(
+    return float((left[is_moving] ** 2).sum()) <= settings.spectrum_error_share * float(
         (away[is_moving] ** 2).sum()
     )
 

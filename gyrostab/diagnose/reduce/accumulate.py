@@ -218,9 +218,20 @@ class Accumulator:
         )
 
     def _add_spectra(self, block_range: slice, centred: Array, present: NDArray[np.bool_]) -> None:
-        """Add band powers, cross-powers and line spectra."""
+        """Add band powers, cross-powers and line spectra.
+
+        A channel counts where a gyro sample is present: gaps spread a slow wave of the channel over
+        all bands, and would do so in its cross-powers only.
+        """
         inside = slice(1, kernel.ordinates(self.length) + 1)
         counts = self.counts[:, block_range, 0]
+        if self.channels:
+            received = present[: self.axes].any(axis=0)
+            present = np.concatenate([present[: self.axes], present[self.axes :] & received])
+            counts = np.count_nonzero(present, axis=-1)
+            centred = np.concatenate(
+                [centred[: self.axes], _centre(centred[self.axes :], present[self.axes :])]
+            )
         spectra = np.fft.rfft(centred * self.weights, axis=-1)[..., inside]
         used = counts >= max(_MIN_SPECTRUM_SHARE * self.length, 2)
         places, tables = [], []
@@ -249,7 +260,7 @@ class Accumulator:
             if differ.any():
                 joint = (present[a] & present[b])[differ]
                 cross[differ], self.cross_shape[number, block_range][differ] = self._joint_spectra(
-                    centred[[a, b]][:, differ], joint
+                    centred[[a, b]][:, differ], joint, self.power[[a, b], block_range][:, differ]
                 )
                 self.cross_neighbours[number, block_range][differ] = _neighbour_share(
                     joint, self.weights
@@ -308,26 +319,30 @@ class Accumulator:
             self.line_counts[row, part] += [middle.sum(), (middle**2).sum()]
 
     def _joint_spectra(
-        self, centred: Array, present: NDArray[np.bool_]
+        self, centred: Array, present: NDArray[np.bool_], power: Array
     ) -> tuple[NDArray[np.complex128], Array]:
-        """Return cross-periodogram and gamma shape of blocks over the samples of both signals."""
+        """Return cross-periodogram and gamma shape of blocks over the samples of both signals.
+
+        The coherency is that of the joint samples, `power` (2, block, band) that of each signal.
+        """
         out = np.full((present.shape[0], self.edges.size - 1), np.nan + 0j)
         shape = np.full(out.shape, np.nan)
         enough = present.sum(axis=-1) >= max(_MIN_SPECTRUM_SHARE * self.length, 2)
         if enough.any():
             present, centred = present[enough], centred[:, enough]
-            centred = np.where(
-                present,
-                centred - (centred * present).sum(-1, keepdims=True) / present.sum(-1)[:, None],
-                0.0,
-            )
+            centred = _centre(centred, present)
             one, other = np.fft.rfft(centred * self.weights, axis=-1)[
                 ..., 1 : kernel.ordinates(self.length) + 1
             ]
             expected, mask, squared = kernel.gap_spectra(present, self.weights)
-            out[enough] = kernel.band_powers(
-                one, other, expected, np.arange(present.shape[0]), self.edges, self.rate
+            cross, *own = (
+                kernel.band_powers(
+                    *pair, expected, np.arange(present.shape[0]), self.edges, self.rate
+                )
+                for pair in ((one, other), (one, one), (other, other))
             )
+            scale = power[:, enough].prod(axis=0) / (own[0].real * own[1].real)
+            out[enough] = cross * np.sqrt(scale)
             shape[enough] = kernel.shape_of_bands(
                 mask, squared, expected, present.sum(axis=-1), self.edges, self.length
             )
@@ -396,6 +411,13 @@ def _power_near_order(turned: NDArray[np.complex128], often: Array, harmonic: in
     free = (np.abs(place[..., None] - taken) >= _MIN_TURNS_APART).all(axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray((power * free).sum(axis=-1) / free.sum(axis=-1))
+
+
+def _centre(values: Array, present: NDArray[np.bool_]) -> Array:
+    """Subtract the mean of the samples present from each block; 0 where none is present."""
+    total = (values * present).sum(axis=-1, keepdims=True)
+    mean = total / np.maximum(present.sum(axis=-1), 1)[..., None]
+    return np.where(present, values - mean, 0.0)
 
 
 def _neighbour_share(present: NDArray[np.bool_], weights: Array) -> Array:

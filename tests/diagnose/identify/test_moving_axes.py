@@ -143,6 +143,27 @@ def test_identified_jump_is_not_motion(at_rest):
     assert not unexplained_motion(whole, named).any()
 
 
+def test_two_levels_explain_motion_only_if_they_leave_the_axis_at_rest(at_rest):
+    time = np.arange(at_rest.sizes["time"])
+    for rise in (1, 600):
+        steps, hump = (
+            400.0 * np.interp(time, [2000, 2000 + long, 8000, 8000 + long], [0.0, 1.0, 1.0, 0.0])
+            for long in (1, rise)
+        )
+        whole, levels = (
+            reduce_log(at_rest.assign(rate=at_rest["rate"] + xr.DataArray(added, dims="time")))
+            for added in (hump, steps)
+        )
+        moving = moving_blocks(whole)
+        assert moving.any(axis=1).all()
+        named = [
+            identification("telegraph", "telegraph", axis, course=levels["mean"].values[row])
+            for row, axis in enumerate("xyz")
+        ]
+        left = unexplained_motion(whole, named)
+        np.testing.assert_array_equal(left, moving & (rise > 1))
+
+
 def test_rest_is_found_in_less_than_half_of_the_time(at_rest):
     log = at_rest.copy(deep=True)
     rate = log["rate"].transpose("axis", "time").values

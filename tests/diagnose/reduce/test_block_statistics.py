@@ -86,7 +86,9 @@ def test_powers_match_their_definition(seed: int, size: int, lost: float, offset
         c = angle[:, both] * weights[both] - (angle[:, both] @ weights[both])[:, None] / both.sum()
         one, other = c @ y[0], c @ y[1]
         k = slice(edges[3], edges[4])
-        wanted = (one[k] * other[k].conj()).sum() / (np.abs(c[k]) ** 2).sum() / RATE
+        joint = (np.abs(one[k]) ** 2).sum() * (np.abs(other[k]) ** 2).sum()
+        coherency = (one[k] * other[k].conj()).sum() / np.sqrt(joint)
+        wanted = coherency * np.sqrt(blocks.power.values[:, number, 3].prod())
         assert blocks.cross.values[0, number, 3] == pytest.approx(wanted, rel=1e-6, abs=1e-12)
 
 
