@@ -142,7 +142,7 @@ def _is_explained(
 ) -> bool:
     """Return whether these columns leave next to nothing of a motion.
 
-    Without a form of its own, which may be wrong, they must leave the axis at rest.
+    Columns without a given form cannot have an error of form, and must leave the axis at rest.
     """
     good = np.isfinite(mean)
     if not (good & moving).any():

@@ -230,7 +230,7 @@ class Accumulator:
             present = np.concatenate([present[: self.axes], present[self.axes :] & received])
             counts = np.count_nonzero(present, axis=-1)
             centred = np.concatenate(
-                [centred[: self.axes], _centre(centred[self.axes :], present[self.axes :])]
+                [centred[: self.axes], _subtract_mean(centred[self.axes :], present[self.axes :])]
             )
         spectra = np.fft.rfft(centred * self.weights, axis=-1)[..., inside]
         used = counts >= max(_MIN_SPECTRUM_SHARE * self.length, 2)
@@ -330,7 +330,7 @@ class Accumulator:
         enough = present.sum(axis=-1) >= max(_MIN_SPECTRUM_SHARE * self.length, 2)
         if enough.any():
             present, centred = present[enough], centred[:, enough]
-            centred = _centre(centred, present)
+            centred = _subtract_mean(centred, present)
             one, other = np.fft.rfft(centred * self.weights, axis=-1)[
                 ..., 1 : kernel.ordinates(self.length) + 1
             ]
@@ -413,7 +413,7 @@ def _power_near_order(turned: NDArray[np.complex128], often: Array, harmonic: in
         return np.asarray((power * free).sum(axis=-1) / free.sum(axis=-1))
 
 
-def _centre(values: Array, present: NDArray[np.bool_]) -> Array:
+def _subtract_mean(values: Array, present: NDArray[np.bool_]) -> Array:
     """Subtract the mean of the samples present from each block; 0 where none is present."""
     total = (values * present).sum(axis=-1, keepdims=True)
     mean = total / np.maximum(present.sum(axis=-1), 1)[..., None]
