@@ -13,17 +13,21 @@ from gyrostab.diagnose.predict.grid_refinement import Point, refine_grid
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import Mixture, component_mixture
 from gyrostab.diagnose.settings import INTERVAL_TAILS
+from gyrostab.noise import NORMAL_95
 from gyrostab.physics.registry import effects
 
 __all__ = ["average_sizes", "plain_places"]
 
 Array = NDArray[np.float64]
 MAX_ZERO_LAG_S = 1e-2  # a lag that counts as zero
+#: Probability beyond the values that a grid supports. Design choice: a tenth of the tail of a 95 %
+#: interval, so that the interval of a single normal law stays as it is.
+SUPPORT_TAIL = 0.1 * INTERVAL_TAILS[0]
 
 
 def average_sizes(
     component: Component, state: State, candidates: Sequence[Candidate]
-) -> tuple[Array, Array, dict[str, tuple[float, ...]]]:
+) -> tuple[Array, Array, Array, dict[str, tuple[float, ...]]]:
     """Return the sizes of a component, averaged over the noise and the nuisance parameters.
 
     Exponents have their defaults and lags are zero unless other values are better by 3 nats and an
@@ -43,6 +47,10 @@ def average_sizes(
     mean : ndarray, shape (column,)
     covariance : ndarray, shape (column, column)
         About that mean.
+    ends : ndarray, shape (2, column)
+        Ends of the 95 % intervals: those of a normal law, but not beyond the values that the grid
+        supports. Sizes at neighbours on a coarse grid may differ by many standard errors, and the
+        scatter of the mean then reaches zero although none of them does.
     nuisance : dict of str to (float, float) or (float, float, float, float)
         Value and standard deviation of the nuisance parameters, with the ends of the 95 % interval
         if it is asymmetric; NaN as the standard deviation of one that is set but not measured.
@@ -60,7 +68,9 @@ def average_sizes(
     points = refine_grid(component, state, [grid[place] for place in usual])
     family = [point.variant for point in points]
     evidence = np.array([point.evidence for point in points])
-    mean, covariance = _merge_points(points).moments()
+    merged = _merge_points(points)
+    mean, covariance = merged.moments()
+    supported = [merged]
     at_once = _places_without_lag(family)
     without_lag = [
         place
@@ -71,8 +81,11 @@ def average_sizes(
         - state.settings.form_error_share * max(component.evidence_nats, 0.0)
     ]
     if without_lag:
-        middle, _ = _merge_points([points[place] for place in without_lag]).moments()
+        plain = _merge_points([points[place] for place in without_lag])
+        middle, _ = plain.moments()
         mean, covariance = middle, covariance + np.outer(middle - mean, middle - mean)
+        supported.append(plain)
+    ends = _size_interval(mean, covariance, supported)
     weighed = evidence + np.log([point.share for point in points])
     share = np.exp(weighed - np.logaddexp.reduce(weighed))
     nuisance: dict[str, tuple[float, ...]] = {}
@@ -96,7 +109,31 @@ def average_sizes(
             if has_no_lag
             else (middle_of, spread, *_interval_ends(tried, share, middle_of))
         )
-    return mean, covariance, nuisance
+    return mean, covariance, ends, nuisance
+
+
+def _size_interval(mean: Array, covariance: Array, supported: Sequence[Mixture]) -> Array:
+    """Return the ends of the 95 % intervals, (2, column), within what any of the mixtures allows.
+
+    Examples
+    --------
+    >>> grid = Mixture(np.log([0.9, 0.1]), np.array([[10.0], [40.0]]), np.ones((2, 1, 1)))
+    >>> mean, covariance = grid.moments()
+    >>> (mean - NORMAL_95 * np.sqrt(covariance[0])).round(1).tolist()
+    [-4.7]
+    >>> _size_interval(mean, covariance, [grid])[0].round(1).tolist()
+    [7.2]
+    """
+    half = NORMAL_95 * np.sqrt(np.diagonal(covariance))
+    low, high = (
+        extreme.reduce(bounds)
+        for extreme, bounds in zip(
+            (np.fmin, np.fmax),
+            np.stack([one.quantiles(SUPPORT_TAIL) for one in supported], axis=1),
+            strict=True,
+        )
+    )
+    return np.stack([np.fmax(mean - half, low), np.fmin(mean + half, high)])
 
 
 def _merge_points(points: Sequence[Point]) -> Mixture:

@@ -39,6 +39,31 @@ class Mixture:
         """Return the probabilities of the points."""
         return np.asarray(np.exp(self.log_weight - np.logaddexp.reduce(self.log_weight)))
 
+    def quantiles(self, tail: float) -> Array:
+        """Return the quantiles of each size at `tail` and ``1 - tail``, shape (2, size).
+
+        Examples
+        --------
+        >>> one = Mixture(np.zeros(2), np.array([[10.0], [40.0]]), np.ones((2, 1, 1)))
+        >>> one.quantiles(0.025).round(1).tolist()
+        [[8.4], [41.6]]
+        """
+        from scipy.special import ndtr
+
+        weight = self.weights()[:, None]
+        sd = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+        reach = 40.0 * sd.max(axis=0)
+        low, high = self.mean.min(axis=0) - reach, self.mean.max(axis=0) + reach
+        ends = []
+        for share in (tail, 1.0 - tail):
+            below, above = low.copy(), high.copy()
+            for _ in range(80):
+                middle = 0.5 * (below + above)
+                is_low = (weight * ndtr((middle - self.mean) / sd)).sum(axis=0) < share
+                below, above = np.where(is_low, middle, below), np.where(is_low, above, middle)
+            ends.append(0.5 * (below + above))
+        return np.array(ends)
+
     def moments(self) -> tuple[Array, Array]:
         """Return mean and covariance of the mixture."""
         weight = self.weights()

@@ -276,12 +276,13 @@ class Statistic:
         for component in fit.components:
             if component.variant.columns[:1] == ("any",):
                 continue
-            mean, covariance, nuisance = average_sizes(component, fit.state, fit.candidates)
+            mean, covariance, ends, nuisance = average_sizes(component, fit.state, fit.candidates)
             for number, name in enumerate(component.variant.columns):
                 value, sd = float(mean[number]), float(np.sqrt(covariance[number, number]))
+                size: tuple[float, ...] = (value, sd, *ends[:, number].tolist())
                 if component.variant.squared:
-                    value, sd = _square_root(value, sd)
-                out[name if len(fit.axes) == 1 else f"{name}.{component.row[0]}"] = (value, sd)
+                    size = _square_root(value, sd)
+                out[name if len(fit.axes) == 1 else f"{name}.{component.row[0]}"] = size
             out |= nuisance
         return out
 

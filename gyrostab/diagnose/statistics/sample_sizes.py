@@ -67,16 +67,19 @@ def estimate_from_counts(
                 length * runs / low,
             ),
         }
-    share = min(count / samples, 0.999)
+    low, high = (end - usual for end in _poisson_interval(count + usual))
+    share, least, most = (min(max(one, 0.0) / samples, 0.999) for one in (count, low, high))
     if effect == "clipping":
-        limit = spread * float(norm.isf(share / 2.0))
+        least = max(least, INTERVAL_TAILS[0] / samples)  # nothing bounds a limit without a count
+        limit, far, near = (spread * float(norm.isf(one / 2.0)) for one in (share, least, most))
         slope = spread / (2.0 * float(norm.pdf(limit / spread)))
-        return {"limit": (limit, slope * error / samples)}
+        return {"limit": (limit, slope * error / samples, near, far)}
     if effect == "dead_zone":
-        width = spread * float(norm.ppf(0.5 + share / 2.0))
-        return {
-            "width": (width, spread / (2.0 * float(norm.pdf(width / spread))) * error / samples)
-        }
+        width, narrow, wide = (
+            spread * float(norm.ppf(0.5 + one / 2.0)) for one in (share, least, most)
+        )
+        slope = spread / (2.0 * float(norm.pdf(width / spread)))
+        return {"width": (width, slope * error / samples, narrow, wide)}
     return {}
 
 

@@ -227,6 +227,36 @@ def test_intervals_of_outliers_exclude_zero_and_contain_the_truth(number: int, k
     assert np.mean(held["per_hour"]) > (0.9 if kind == "normal" else 0.7)
 
 
+@pytest.mark.parametrize(
+    ("effect", "mark", "name", "size"),
+    [
+        ("dead_zone", "zeros", "width", 0.0003),
+        ("dead_zone", "zeros", "width", 0.003),
+        ("clipping", "extremes", "limit", 1.8),
+    ],
+)
+def test_intervals_of_a_few_stuck_samples_contain_the_truth(
+    effect: str, mark: str, name: str, size: float
+) -> None:
+    noise = SCATTER * np.random.default_rng(3).standard_normal((40, 15_000))
+    if effect == "dead_zone":
+        noise[np.abs(noise) < size] = 0.0
+    else:
+        noise = np.clip(noise, -size, size)
+    axes = [f"a{index}" for index in range(len(noise))]
+    blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=axes))
+    held = []
+    for axis in axes:
+        if float(blocks[mark].sel(axis=axis).sum()) < 2.0:
+            continue
+        estimated = estimate_from_counts(effect, mark, axis, blocks, CountEvidence({}), Settings())
+        _, _, low, high = estimated[name]
+        assert 0.0 < low < high < math.inf
+        held.append(low < size < high)
+    assert len(held) > 20
+    assert np.mean(held) > 0.87
+
+
 @pytest.mark.slow
 def test_burst_of_bit_errors_has_the_size_of_its_power():
     rng = np.random.default_rng(4)
