@@ -82,10 +82,11 @@ def plot_coefficients(
         panel.set_ylabel(f"{symbol} {unit_label(law.label)}")
         panel.set_title(_title_panel(product, symbol, names), loc="left", pad=3, y=1.0)
         panel.grid(alpha=0.3)
+    keys = _legend_handles(product, names)
     figure.legend(
-        handles=_legend_handles(product, names),
+        handles=keys,
         loc="lower center",
-        ncols=3 if is_narrow(figure) else len(names) + 3,
+        ncols=3 if is_narrow(figure) else len(keys),
         frameon=False,
     )
     whose = f" of axis {names[0]}" if len(names) == 1 else ""
@@ -174,6 +175,7 @@ def _set_scale(panel: Axes, product: xr.Dataset, symbol: str, names: list[str]) 
 
 
 def _legend_handles(product: xr.Dataset, names: list[str]) -> list[Any]:
+    """List the axes, and of the other marks those that a panel shows."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -181,30 +183,15 @@ def _legend_handles(product: xr.Dataset, names: list[str]) -> list[Any]:
         Line2D([], [], **axis_style(product, name), label=f"axis {name}", markersize=4.0)
         for name in names
     ]
-    keys.append(
-        Line2D(
-            [],
-            [],
-            color="black",
-            marker="|",
-            linestyle="none",
-            markersize=9.0,
-            label="standard error",
-        )
-    )
-    keys.append(
-        Line2D(
-            [],
-            [],
-            color="black",
-            marker=upper_limit_marker(),
-            markerfacecolor="none",
-            linestyle="none",
-            markersize=9.0,
-            label="95 % upper limit",
-        )
-    )
-    keys.append(Patch(facecolor=GREY, alpha=0.5, label="not observable"))
+    state = product["observable"].sel(axis=names, term=list(LAWS)).values
+    mark: dict[str, Any] = {"color": "black", "linestyle": "none", "markersize": 9.0}
+    if (state == OBSERVED).any():
+        keys.append(Line2D([], [], **mark, marker="|", label="standard error"))
+    if (state == UPPER_LIMIT_ONLY).any():
+        limit = {"marker": upper_limit_marker(), "markerfacecolor": "none"}
+        keys.append(Line2D([], [], **mark, **limit, label="95 % upper limit"))
+    if (state == NOT_OBSERVABLE).any():
+        keys.append(Patch(facecolor=GREY, alpha=0.5, label="not observable"))
     return keys
 
 

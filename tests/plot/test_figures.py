@@ -109,6 +109,23 @@ def test_legend_omits_cells_without_estimate_if_there_are_none():
     ]
 
 
+def test_legend_of_coefficients_lists_what_is_drawn():
+    product = synthetic.product(axes="x").load()
+
+    def labels():
+        (legend,) = plot_coefficients(product).legends
+        return [text.get_text() for text in legend.get_texts()]
+
+    observed, limit, hidden = "standard error", "95 % upper limit", "not observable"
+    assert labels() == ["axis x", observed, limit, hidden]
+    product["observable"] = product.observable.where(product.observable != 0, 1)
+    assert labels() == ["axis x", observed, limit]
+    product["observable"] = product.observable * 0 + 2
+    assert labels() == ["axis x", observed]
+    product["observable"] = product.observable * 0
+    assert labels() == ["axis x", hidden]
+
+
 @pytest.mark.parametrize("spread", [1.0, 20.0, 1e4])
 def test_axis_labels_do_not_overlap_tick_labels(spread):
     product = synthetic.product(axes="x")
