@@ -407,7 +407,7 @@ class HeldSamples(Effect):
     Examples
     --------
     >>> print(HeldSamples(per_hour=30, length=0.5).say())
-    Samples are lost and filled with the last one on all axes, 30 times per hour for 0.5 s on
+    Samples are lost and filled with earlier ones on all axes, 30 times per hour for 0.5 s on
     average.
     """
 
@@ -473,7 +473,7 @@ class HeldSamples(Effect):
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Describe the effect in one sentence."""
-        what = "the last one" if self.fill == "repeat" else "zero"
+        what = "earlier ones" if self.fill == "repeat" else "zero"
         often, length = (
             self.quantity("per_hour", errors).removesuffix(" 1/h"),
             self.quantity("length", errors),

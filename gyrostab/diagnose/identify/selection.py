@@ -371,7 +371,7 @@ class Search:
         return Identification(
             first.effect,
             first.driver,
-            axes_of(components, list(map(str, self.folds.attrs.get("axes", ())))),
+            axes_of(components, ()),
             tuple(components),
             sum_evidence(components),
             threshold,
