@@ -14,7 +14,7 @@ export PYTHONDONTWRITEBYTECODE =
 # One file of tests stays on one worker, with what its tests share; files start in their order.
 PYTEST := -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo docs test test-diagnoses test-docs test-install test-full test-minimum fuzz lint bench prove prove-quick real-recordings interop baseline clean-kernels clean help
+.PHONY: demo docs test test-diagnoses test-install test-full test-minimum fuzz lint bench prove prove-quick real-recordings interop baseline clean-kernels clean help
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' Makefile | sed 's/:.*## /\t/' | expand -t 18
@@ -38,12 +38,9 @@ demo: $(VENV)/.installed  ## install, simulate a day of a gyro, and run the main
 test: $(VENV)/.installed-test  ## install, and run the tests
 	$(BIN)/python $(PYTEST)
 
-test-diagnoses: $(VENV)/.installed-test  ## the whole diagnoses and statistics that make test leaves out
-	$(BIN)/python $(PYTEST) -m slow tests/diagnose tests/allan tests/correlate tests/pipelines \
+test-diagnoses: $(VENV)/.installed-test  ## the whole diagnoses, the statistics and the reports in Chromium that make test leaves out
+	$(BIN)/python $(PYTEST) -m slow tests/diagnose tests/allan tests/correlate tests/pipelines tests/report \
 		tests/blindtest/test_prove.py
-
-test-docs: $(VENV)/.installed-test  ## the code cells of the tutorials, and the reports in Chromium where it is installed
-	$(BIN)/python $(PYTEST) -m slow tests/docs/test_tutorials.py tests/report -rs
 
 test-install: $(VENV)/.installed-test  ## the README in a fresh checkout, and the wheel in a bare environment
 	$(BIN)/python -m pytest -n0 -m slow tests/packaging $(if $(ONLY),-k $(ONLY))
@@ -67,7 +64,7 @@ $(VENV)/.installed-docs: $(VENV)/.installed
 	$(BIN)/pip install --quiet --disable-pip-version-check -e ".[docs]"
 	touch $@
 
-docs: $(VENV)/.installed-docs  ## build the site in docs/_build/html, with executed tutorials
+docs: $(VENV)/.installed-docs  ## build the site in docs/_build/html, with executed tutorials: stops at a cell that fails
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
 
 lint: $(VENV)/.installed-lint  ## style, types, imports and wording
