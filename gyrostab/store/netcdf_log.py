@@ -1,4 +1,7 @@
-"""Open NetCDF logs of gyrostab without xarray, which takes three times as long."""
+"""Open NetCDF logs of gyrostab without xarray, which takes 1.1 to 1.4 times as long.
+
+docs/scaling.md compares both. The difference counts where thousands of small files are opened.
+"""
 
 from __future__ import annotations
 
