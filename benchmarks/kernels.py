@@ -358,7 +358,7 @@ def processor() -> str:
 def report(quick: bool) -> Iterator[str]:
     repeats = 1 if quick else 5
     yield (
-        f"{processor()}; {date.today().isoformat()}; 1-minute load before the run "
+        f"{processor()}; {date.today().isoformat()}; 1-minute load before: "
         f"{os.getloadavg()[0]:.2f}; medians of {repeats}.\n"
     )
     roofs = rooflines()
