@@ -42,6 +42,8 @@ class Mixture:
     def quantiles(self, tail: float) -> Array:
         """Return the quantiles of each size at `tail` and ``1 - tail``, shape (2, size).
 
+        NaN for a size that is not determined.
+
         Examples
         --------
         >>> one = Mixture(np.zeros(2), np.array([[10.0], [40.0]]), np.ones((2, 1, 1)))
@@ -57,10 +59,11 @@ class Mixture:
         ends = []
         for share in (tail, 1.0 - tail):
             below, above = low.copy(), high.copy()
-            for _ in range(80):
-                middle = 0.5 * (below + above)
-                is_low = (weight * ndtr((middle - self.mean) / sd)).sum(axis=0) < share
-                below, above = np.where(is_low, middle, below), np.where(is_low, above, middle)
+            with np.errstate(invalid="ignore"):  # infinite errors
+                for _ in range(80):
+                    middle = 0.5 * (below + above)
+                    is_low = (weight * ndtr((middle - self.mean) / sd)).sum(axis=0) < share
+                    below, above = np.where(is_low, middle, below), np.where(is_low, above, middle)
             ends.append(0.5 * (below + above))
         return np.array(ends)
 

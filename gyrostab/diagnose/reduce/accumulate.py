@@ -341,7 +341,10 @@ class Accumulator:
                 )
                 for pair in ((one, other), (one, one), (other, other))
             )
-            scale = power[:, enough].prod(axis=0) / (own[0].real * own[1].real)
+            joint = own[0].real * own[1].real
+            scale = np.divide(
+                power[:, enough].prod(axis=0), joint, out=np.zeros_like(joint), where=joint > 0.0
+            )
             out[enough] = cross * np.sqrt(scale)
             shape[enough] = kernel.shape_of_bands(
                 mask, squared, expected, present.sum(axis=-1), self.edges, self.length
