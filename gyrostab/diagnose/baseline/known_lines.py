@@ -10,9 +10,10 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.predicted_effects import complex_factors, predict_effect
-from gyrostab.diagnose.evidence.spectral_lines import LEAK_LINES, expected_lines
+from gyrostab.diagnose.evidence.spectral_lines import expected_lines
 from gyrostab.diagnose.predict.linear_model import unspread_share
 from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.kernels.spectra.line_levels import LEAK_LINES
 from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
 from gyrostab.physics.base import Effect
 

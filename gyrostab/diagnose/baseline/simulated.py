@@ -12,11 +12,11 @@ from gyrostab.diagnose.evidence.spectral_lines import (
     expected_lines,
     line_evidence,
     line_skirt,
-    local_level,
 )
 from gyrostab.diagnose.predict.linear_model import band_widths, pair_rows, unspread_share
 from gyrostab.diagnose.reduce.schema import BASELINE, label_variables
 from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.kernels.spectra.line_levels import local_level
 
 __all__ = ["ExtraStatistics", "add_extra_statistics", "measure_extra_statistics", "worst_band"]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -11,23 +10,12 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.folds import FOLDS
 from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.kernels.spectra.line_levels import EDGE_LINES, LEAK_LINES, level_around, local_level
 
-__all__ = [
-    "LEAK_LINES",
-    "expected_lines",
-    "level_around",
-    "line_evidence",
-    "line_skirt",
-    "local_level",
-]
+__all__ = ["expected_lines", "line_evidence", "line_skirt"]
 
 Array = NDArray[Any]
-#: Lines on each side that a steady line leaks into; of the taper.
-LEAK_LINES = 3
-_LEVEL_LINES = 25  # lines on each side that define the level; design choice
-_SIDE_LINES = 8  # lines next to it, on either side, that a line must exceed; design choice
-_EDGE_LINES = 2  # lowest lines, without lines below them
-_MIN_LEVEL_RATIO = 1e-3  # of the median level, a lower limit of the level; design choice
+_MIN_LEVEL_RATIO = 1e-3  # of the spectrum, that known lines leave; design choice
 _MAX_SKIRT_LINES = 40  # design choice
 
 
@@ -85,50 +73,8 @@ def line_evidence(power: Array, weight: Array, expected: Array | None = None) ->
         evidence_nats += (
             share[:, held] * (ratio * excess / (1.0 + excess) - np.log1p(excess))
         ).sum(axis=2)
-    evidence_nats[..., :_EDGE_LINES] = -np.inf
+    evidence_nats[..., :EDGE_LINES] = -np.inf
     return np.asarray(evidence_nats - np.log(power.shape[3]))
-
-
-def level_around(power: Array) -> Array:
-    """Return the level around each line, (..., line), at least that of the adjacent lines."""
-    count = power.shape[-1]
-    level = local_level(power)
-    level = np.maximum(level, _MIN_LEVEL_RATIO * np.median(level, axis=-1, keepdims=True))
-    group_count = count // _SIDE_LINES
-    if group_count < 3:
-        return level
-    medians = np.median(
-        power[..., : group_count * _SIDE_LINES].reshape(
-            *power.shape[:-1], group_count, _SIDE_LINES
-        ),
-        axis=-1,
-    )
-    group = np.minimum(np.arange(count) // _SIDE_LINES, group_count - 1)
-    right = medians[..., np.minimum(group + 1, group_count - 1)]
-    left = medians[..., np.maximum(group - 1, 0)]
-    # The first lines have only the lines below them.
-    below = np.cumsum(power[..., :_SIDE_LINES], axis=-1) / np.arange(1, _SIDE_LINES + 1)
-    left[..., :_SIDE_LINES] = below[..., np.maximum(np.arange(_SIDE_LINES) - LEAK_LINES, 0)]
-    left[..., :_EDGE_LINES] = 0.0
-    last = group == group_count - 1
-    right[..., last] = 0.0
-    return np.asarray(np.maximum(level, np.maximum(left, right)))
-
-
-def local_level(total: Array) -> Array:
-    """Interpolate linearly between medians over intervals of lines."""
-    count = total.shape[-1]
-    ends = np.linspace(0, count, max(1, count // (2 * _LEVEL_LINES)) + 1).astype(int)
-    medians = np.stack(
-        [np.median(total[..., low:high], axis=-1) for low, high in pairwise(ends)], axis=-1
-    )
-    middle = (ends[1:] + ends[:-1] - 1) / 2.0
-    place = np.clip(
-        np.interp(np.arange(count), middle, np.arange(middle.size)), 0.0, middle.size - 1.0
-    )
-    low = np.minimum(place.astype(int), max(middle.size - 2, 0))
-    high = np.minimum(low + 1, middle.size - 1)
-    return np.asarray(medians[..., low] + (place - low) * (medians[..., high] - medians[..., low]))
 
 
 def line_skirt(

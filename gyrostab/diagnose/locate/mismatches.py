@@ -9,13 +9,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.evidence.spectral_lines import LEAK_LINES
 from gyrostab.diagnose.locate.regions import merge_regions, merge_wandering_regions
 from gyrostab.diagnose.nulls.scores import NullScores, null_scores, standardise
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS, Statistic
 from gyrostab.diagnose.statistics.mean import region_mean
 from gyrostab.errors import OptionError
+from gyrostab.kernels.spectra.line_levels import LEAK_LINES
 
 __all__ = ["FIELDS", "locate_mismatches"]
 

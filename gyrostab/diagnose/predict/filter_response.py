@@ -10,8 +10,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.evidence.spectral_lines import local_level
 from gyrostab.diagnose.predict.windows import make_windows
+from gyrostab.kernels.spectra.line_levels import local_level
 from gyrostab.physics.base import Effect
 from gyrostab.physics.registry import effects
 

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from scipy.special import log_ndtr
 
-from gyrostab.diagnose.evidence.spectral_lines import expected_lines, local_level
+from gyrostab.diagnose.evidence.spectral_lines import expected_lines
 from gyrostab.diagnose.statistics.base import Statistic
 from gyrostab.diagnose.statistics.scores import (
     SINE_TAU_CYCLES,
@@ -21,6 +21,7 @@ from gyrostab.diagnose.statistics.scores import (
     statistic_dataset,
 )
 from gyrostab.diagnose.statistics.wording import axes_text
+from gyrostab.kernels.spectra.line_levels import local_level
 
 __all__ = ["DriftingLine"]
 

@@ -11,7 +11,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.held_out import LinearModel
-from gyrostab.diagnose.evidence.spectral_lines import LEAK_LINES
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect, Variant
 from gyrostab.diagnose.predict.condition import free_shape
 from gyrostab.diagnose.predict.linear_model import State, given_columns, records_last, stack_designs
@@ -28,6 +27,7 @@ from gyrostab.diagnose.statistics.scores import (
     window_set,
 )
 from gyrostab.diagnose.statistics.wording import axes_text
+from gyrostab.kernels.spectra.line_levels import LEAK_LINES
 from gyrostab.physics.phase import fold
 
 __all__ = ["LENGTHS", "RampPhase"]

@@ -10,11 +10,9 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.evidence.spectral_lines import (
-    LEAK_LINES,
     expected_lines,
     line_evidence,
     line_skirt,
-    local_level,
 )
 from gyrostab.diagnose.predict.candidates import (
     Candidate,
@@ -38,6 +36,7 @@ from gyrostab.diagnose.statistics.scores import (
     sum_over_windows,
 )
 from gyrostab.diagnose.statistics.wording import axes_text
+from gyrostab.kernels.spectra.line_levels import LEAK_LINES, local_level
 
 __all__ = ["SpectralLine"]
 
