@@ -185,6 +185,7 @@ def remove_known_lines(
     ).any(axis=-1)
     freed = noise + np.where(exceeds | (largest < error * noise), above, 0.0)
     freed = np.where(known > 0.0, np.maximum(freed, 0.0), power.values)
-    return blocks.assign(
-        line_power=power.copy(data=np.where(np.isfinite(power.values), freed, np.nan))
-    )
+    out = {"line_power": power.copy(data=np.where(np.isfinite(power.values), freed, np.nan))}
+    if "sine_nats" in blocks:
+        out["sine_nats"] = blocks["sine_nats"].where(largest[:, 0] < error * noise[:, 0], -np.inf)
+    return blocks.assign(out)

@@ -17,6 +17,7 @@ from gyrostab.diagnose.reduce.outliers import (
     simultaneous_samples,
     simultaneous_zeros,
 )
+from gyrostab.diagnose.reduce.steady_sines import SineSearch
 from gyrostab.errors import UnitError
 from gyrostab.kernels.spectra import periodogram as kernel
 from gyrostab.kernels.spectra.outliers import HISTOGRAM
@@ -105,6 +106,7 @@ class Accumulator:
         self.line_sum = np.zeros((self.axes, RECORD_PARTS, kernel.ordinates(length)))
         self.line_expected = np.zeros_like(self.line_sum)
         self.line_counts = np.zeros((self.axes, RECORD_PARTS, 2))
+        self.sines = SineSearch(self.axes, block_count, length, rate)
         self.sub_blocks = np.zeros(
             (2, self.axes, block_count, SUB_BLOCKS)
         )  # sums and numbers of samples
@@ -157,6 +159,7 @@ class Accumulator:
                 )
                 self.peaks[row].append(found._replace(block=found.block + batch.first))
         self._add_spectra(block_range, centred, present)
+        self.sines.add(batch.values[: self.axes].reshape(self.axes, -1))
         self.common_zeros[:, block_range] = simultaneous_zeros(batch.values[: self.axes])
         for kind, number in simultaneous_samples(present[: self.axes]).items():
             self.at_once.setdefault(kind, np.zeros(self.block_count, np.int64))[block_range] = (

@@ -85,6 +85,7 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
         "bin_width": widths[:, 0],
         "bin_width_stderr": widths[:, 1],
     }
+    arrays |= work.sines.strongest(_line_frequencies(work))
     variables = (
         label_variables(
             arrays
@@ -307,6 +308,11 @@ def _gap_table(work: Accumulator, log: xr.Dataset, restart: float) -> dict[str, 
     }
 
 
+def _line_frequencies(work: Accumulator) -> Array:
+    """Return the frequencies of the lines of a block [Hz]."""
+    return np.asarray(np.arange(1, work.line_sum.shape[-1] + 1) * (work.rate / work.length))
+
+
 def _make_coordinates(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
     """Return the coordinates of the block statistics."""
     ends = np.arange(work.block_count + 1) * work.length
@@ -325,7 +331,7 @@ def _make_coordinates(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
         "frequency": (work.edges[:-1] + work.edges[1:] - 1) / 2.0 * step,
         "band_low": (work.edges[:-1] - 0.5) * step,
         "band_high": (work.edges[1:] - 0.5) * step,
-        "line_frequency": np.arange(1, work.line_sum.shape[-1] + 1) * step,
+        "line_frequency": _line_frequencies(work),
     }
     if work.channels:
         arrays["reference"] = np.array(work.channels, dtype=object)

@@ -38,7 +38,7 @@ _RATE, _POWER = INNER["rate"], "degree2 hour-2 Hz-1"
 _BLOCK, _BAND = ("axis", "block"), ("axis", "block", "band")
 _PAIR, _PAIR_BAND = ("pair", "block"), ("pair", "block", "band")
 _SUB_BLOCK, _HARMONIC = ("axis", "block", "sub_block"), ("axis", "block", "harmonic")
-_PHASE = ("axis", "block", "phase")
+_PHASE, _LINE = ("axis", "block", "phase"), ("axis", "line")
 
 #: Variables of the block statistics. Channels have ``channel_<name>(block)`` and
 #: ``fine_<name>(block, block_part)`` in addition, and statistics measured before blocks were left
@@ -80,6 +80,13 @@ BLOCK_STATISTICS: dict[str, Variable] = {
     "line_weight": Variable(
         ("axis", "part"), "1", "equivalent number of equal blocks in each mean"
     ),
+    "sine_nats": Variable(
+        _LINE, "1", "evidence of the strongest sine nearest to a line, of constant phase", False
+    ),
+    "sine_frequency": Variable(("line",), "Hz", "frequency of this sine", False),
+    "sine_resolution": Variable(("line",), "Hz", "resolution of the spectrum that shows it", False),
+    "sine_square": Variable(_LINE, "degree2 hour-2", "square of its amplitude", False),
+    "sine_square_stderr": Variable(_LINE, "degree2 hour-2", "standard error of it", False),
     "bin_width": Variable(
         ("axis", "bin"), "1", "width of the zero bin and of its neighbours, in quantization steps"
     ),
@@ -157,9 +164,7 @@ COORDINATES: dict[str, Variable] = {
 
 _NOISE_UNITS = ", ".join(f"{term} in {LAWS[term].label}" for term in TERMS)
 _SQUARES = f"square of {_NOISE_UNITS}"
-_TERM, _SQUARE, _GRID, _LINE = (
-    ("axis", "term"), ("axis", "noise"), ("axis", "grid"), ("axis", "line"),
-)  # fmt: skip
+_TERM, _SQUARE, _GRID = ("axis", "term"), ("axis", "noise"), ("axis", "grid")
 
 #: Variables of a baseline. Those from `cross` on are there only if model or simulation have them.
 BASELINE: dict[str, Variable] = {

@@ -109,11 +109,16 @@ class SpectralLine(Statistic):
         yield Variant({}, tuple(case.seen.spectrum), np.empty(0), squared=True)
 
     def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
-        """Compute the evidence of one steady line on all axes."""
+        """Compute the evidence of one line on all axes, of any phase or of constant phase.
+
+        Null records have no sines: in noise alone their evidence is below zero.
+        """
         power = trial.data["line_power"].values
         power = power if power.ndim == 4 else power[None]
         expected = expected_lines(trial.state.baseline, trial.state.blocks["line_frequency"].values)
         evidence_nats = line_evidence(power, trial.state.blocks["line_weight"].values, expected)
+        if "record" not in trial.data["line_power"].dims and "sine_nats" in trial.data:
+            evidence_nats = np.logaddexp(evidence_nats, trial.data["sine_nats"].values) - np.log(2)
         taken = trial.state.given.get(("line", "all"), [])
         for mask in taken:
             evidence_nats = np.where(mask, -np.inf, evidence_nats)
@@ -267,20 +272,35 @@ def estimate_line(
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Estimate amplitude [degree hour-1] and frequency [Hz] of a line, each with its error.
 
-    The amplitude follows from the power about the line that exceeds the local level.
+    The amplitude follows from the power about the line that exceeds the local level, in the whole
+    record if a sine of constant phase has more evidence than a line, and else in blocks.
     """
-    lines = blocks["line_frequency"].values
-    weight = blocks["line_weight"].sel(axis=axis).values
-    power = blocks["line_power"].sel(axis=axis).values
+    here = blocks.sel(axis=axis)
+    lines, power, weight = (
+        here[name].values for name in ("line_frequency", "line_power", "line_weight")
+    )
+    if "sine_nats" in here:
+        sine = here.isel(line=place)
+        if sine["sine_nats"] > line_evidence(power[None, None], weight[None])[0, 0, place]:
+            return _amplitude(float(sine["sine_square"]), float(sine["sine_square_stderr"])), (
+                float(sine["sine_frequency"]),
+                0.5 * float(sine["sine_resolution"]),
+            )
     good = (weight > 0) & np.isfinite(power).all(axis=1)
     total = (power[good] * weight[good, None]).sum(axis=0) / weight[good].sum()
     level = local_level(total[None, None])[0, 0]
     near = line_skirt(blocks, axis, place, settings)
     step = float(np.diff(lines[:2])[0])
     above = total[near] - level[near]
-    square = 4.0 * max(float(above.sum()) * step, 0.0)
-    noise = 4.0 * step * float(np.sqrt((level[near] * total[near]).sum() / weight[good].sum()))
-    amplitude = math.sqrt(square)
+    # Power N and a line S have the variance N^2 + 2 N S.
+    variance = level[near] * np.maximum(2.0 * total[near] - level[near], level[near])
+    noise = 4.0 * step * float(np.sqrt(variance.sum() / weight[good].sum()))
     positive = np.maximum(above, 0.0)
     frequency = float((positive * lines[near]).sum() / max(positive.sum(), 1e-300))
-    return (amplitude, noise / (2.0 * max(amplitude, math.sqrt(noise)))), (frequency, 0.5 * step)
+    return _amplitude(4.0 * float(above.sum()) * step, noise), (frequency, 0.5 * step)
+
+
+def _amplitude(square: float, stderr: float) -> tuple[float, float]:
+    """Return the amplitude and its error from its square."""
+    amplitude = math.sqrt(max(square, 0.0))
+    return amplitude, stderr / (2.0 * max(amplitude, math.sqrt(stderr)))

@@ -1,0 +1,186 @@
+"""Search for sines of constant phase, at the resolution of the whole record.
+
+A mean of periodograms of blocks loses the phase from block to block: a sine that gains 0.3 nats in
+each of 200 blocks would gain 60 nats in one periodogram of them all, and gains 9 in their mean.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaincinv, logsumexp
+
+from gyrostab.kernels.spectra.line_levels import LEAK_LINES, level_around
+from gyrostab.kernels.spectra.periodogram import ordinates, taper
+
+__all__ = ["SineSearch", "sine_factors"]
+
+Array = NDArray[np.float64]
+_MAX_SAMPLES = 2**21  # of a segment; bounds memory
+#: Segments are transformed whole, and in parts, for lines whose phase wanders.
+_PARTS = (1, 8)
+#: Frequencies per line: a sine between two lines is 2.1 times weaker in both, with two 1.2 times.
+_FINER = 2
+_LEVEL_LINES = 512  # of a whole segment that define a level, to 6 %; design choice
+_SIDE_LINES = 128  # of a whole segment, on either side; design choice
+_MIN_LEVELS = 4  # intervals of `_LEVEL_LINES` that a spectrum must have
+_MIN_SHARE = 0.25  # of a transformed length that must be present; design choice
+#: Expected nats of a sine of known frequency and phase, a sample of its prior.
+_STRENGTHS = 3.0 * 3.0 ** np.arange(12)
+
+
+class _Spectrum(NamedTuple):
+    """Sum of periodograms of one length."""
+
+    size: int  # samples of each
+    taper: Array
+    total: Array  # (axis, frequency) [degree2 hour-2 Hz-1]
+    used: NDArray[np.int64]  # (axis,), their number
+
+
+class SineSearch:
+    """Periodograms of long segments of the axes of a log, filled block by block."""
+
+    def __init__(self, axes: int, block_count: int, length: int, rate: float):
+        segments = -(-block_count * length // _MAX_SAMPLES)
+        blocks = block_count // segments
+        self.rate, self.length = rate, length
+        self.segment = np.full((axes, blocks * length), np.nan)
+        self.filled = 0
+        sizes = [blocks // parts * length for parts in _PARTS if blocks >= 2 * parts]
+        self.spectra = [
+            _Spectrum(
+                size,
+                taper(size),
+                np.zeros((axes, ordinates(_FINER * size))),
+                np.zeros(axes, np.int64),
+            )
+            for size in sizes
+        ]
+
+    def add(self, values: Array) -> None:
+        """Add the samples (axis, sample) that follow; NaN where missing."""
+        while values.shape[1]:
+            taken = min(values.shape[1], self.segment.shape[1] - self.filled)
+            self.segment[:, self.filled : self.filled + taken] = values[:, :taken]
+            self.filled, values = self.filled + taken, values[:, taken:]
+            if self.filled == self.segment.shape[1]:
+                self._add_periodograms()
+                self.filled = 0
+
+    def _add_periodograms(self) -> None:
+        for size, weights, total, used in self.spectra:
+            for begin in range(0, self.segment.shape[1] - size + 1, size):
+                for axis, values in enumerate(self.segment[:, begin : begin + size]):
+                    present = np.isfinite(values)
+                    if np.count_nonzero(present) < _MIN_SHARE * size:
+                        continue
+                    centred = np.where(present, values - values[present].mean(), 0.0) * weights
+                    power = np.abs(np.fft.rfft(centred, _FINER * size)[1 : total.shape[1] + 1]) ** 2
+                    total[axis] += power / ((weights**2 * present).sum() * self.rate)
+                    used[axis] += 1
+
+    def strongest(self, lines: Array) -> dict[str, Any]:
+        """Return the strongest sine nearest to each line (frequencies [Hz], evenly spaced).
+
+        Returns
+        -------
+        dict of str to ndarray
+            ``sine_nats (axis, line)``, minus infinity without a search; ``sine_frequency`` and
+            ``sine_resolution (line,)`` [Hz]; ``sine_square`` and ``sine_square_stderr (axis,
+            line)`` [degree2 hour-2], the square of the amplitude.
+        """
+        axes = self.segment.shape[0]
+        out: dict[str, Any] = {
+            "sine_nats": np.full((axes, lines.size), -np.inf),
+            "sine_frequency": lines.copy(),
+            "sine_resolution": np.full(lines.size, np.nan),
+            "sine_square": np.full((axes, lines.size), np.nan),
+            "sine_square_stderr": np.full((axes, lines.size), np.nan),
+        }
+        best = np.full(lines.size, -np.inf)
+        for spectrum in self.spectra:
+            found = self._search(spectrum, lines)
+            if found is None:
+                continue
+            place, total, arrays = found
+            better = total > best[place]
+            best[place[better]] = total[better]
+            for name, values in arrays.items():
+                out[name][..., place[better]] = values[..., better]
+        return out
+
+    def _search(
+        self, spectrum: _Spectrum, lines: Array
+    ) -> tuple[NDArray[np.int64], Array, dict[str, Array]] | None:
+        """Return lines, the nats of all axes, and the results of `strongest`; None if too short."""
+        split = self.segment.shape[1] // spectrum.size
+        step = self.rate / (_FINER * spectrum.size)
+        frequency = step * np.arange(1, spectrum.total.shape[1] + 1)
+        inside = frequency >= 2.0 * lines[0]  # lower ones are in the means of blocks
+        frequency = frequency[inside]
+        width, side = (_FINER * number // split for number in (_LEVEL_LINES, _SIDE_LINES))
+        usable = spectrum.used > 0
+        if frequency.size < _MIN_LEVELS * width or not usable.any():
+            return None
+        count = np.maximum(spectrum.used, 1)[:, None]
+        power = np.where(usable[:, None], spectrum.total[:, inside] / count, 1.0)
+        level = level_around(power, width, side) / (gammaincinv(count, 0.5) / count)
+        factor = np.where(usable[:, None], sine_factors(power / level, count), -np.inf)
+        place = np.clip(np.rint(frequency / lines[0]).astype(np.int64) - 1, 0, lines.size - 1)
+        # An axis has the sine or not; one frequency of all that were tried.
+        cost = math.log(frequency.size * len(self.spectra))
+        total = np.logaddexp(0.0, factor).sum(axis=0) - math.log(2.0) * len(factor) - cost
+        total[:side] = -np.inf  # they define the level of the next
+        order = np.lexsort((total, place))
+        last = np.append(np.flatnonzero(np.diff(place[order])), order.size - 1)
+        chosen = order[last]
+        gains = factor[:, chosen] - math.log(2.0)
+        sharing = np.maximum((gains > 0.0).sum(axis=0), 1)
+        near = np.clip(
+            chosen[:, None] + np.arange(-_FINER * LEAK_LINES, _FINER * LEAK_LINES + 1),
+            0,
+            frequency.size - 1,
+        )
+        above = power[:, near] - level[:, near]  # (axis, line, near)
+        # Power N and a sine S have the variance N^2 + 2 N S; frequencies within a line are one.
+        variance = np.maximum(2.0 * power[:, near] - level[:, near], level[:, near])
+        noise = np.sqrt(_FINER * (level[:, near] * variance).sum(axis=-1) / count)
+        weights = np.maximum(above, 0.0).sum(axis=0)
+        centre = (weights * frequency[near]).sum(axis=-1) / np.maximum(weights.sum(axis=-1), 1e-300)
+        arrays = {
+            "sine_nats": gains - cost / sharing,
+            "sine_frequency": centre,
+            "sine_resolution": np.full(chosen.size, _FINER * step),
+            "sine_square": 4.0 * step * above.sum(axis=-1),
+            "sine_square_stderr": 4.0 * step * noise,
+        }
+        return place[chosen], total[chosen], arrays
+
+
+def sine_factors(ratio: Array, count: Array | int) -> Array:
+    r"""Return the log Bayes factor of a sine from mean periodograms relative to noise.
+
+    With a sine of random phase whose expected gain is E nats, each of n periodograms is 1 + E / n
+    times an exponential variable, so that their mean r has the likelihood ratio
+    :math:`\exp(n r x / (1 + x)) / (1 + x)^n` for x = E / n. It is averaged over strengths from 3 to
+    half a million nats, evenly spaced in log.
+
+    Parameters
+    ----------
+    ratio : ndarray
+        Mean of `count` periodograms over the density of the noise.
+
+    Examples
+    --------
+    >>> sine_factors(np.array([1.0, 40.0]), 1).round(1).tolist()  # noise, and a sine of 39 nats
+    [-2.6, 33.8]
+    """
+    each = [
+        count * (ratio * strength / (count + strength) - np.log1p(strength / count))
+        for strength in _STRENGTHS
+    ]
+    return np.asarray(logsumexp(each, axis=0) - math.log(len(_STRENGTHS)))

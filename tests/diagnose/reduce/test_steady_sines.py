@@ -1,0 +1,140 @@
+"""The search for sines of constant phase, against simulated noise and closed forms."""
+
+import numpy as np
+import pytest
+from scipy.special import gammaln
+
+from gyrostab.diagnose.evidence.spectral_lines import line_evidence
+from gyrostab.diagnose.identify.forward_search import name_effects
+from gyrostab.diagnose.reduce import steady_sines
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.reduce.steady_sines import SineSearch, sine_factors
+from gyrostab.diagnose.statistics.spectral_line import estimate_line
+from gyrostab.ingest.make_log import make_log
+from tests.support.named import nulls
+
+RATE, LENGTH, BLOCKS = 10.0, 200, 90
+SIZE = LENGTH * BLOCKS
+LINES = RATE / LENGTH * np.arange(1, LENGTH // 2)
+
+
+def search(values, *, batch=LENGTH):
+    found = SineSearch(len(values), values.shape[1] // LENGTH, LENGTH, RATE)
+    for begin in range(0, values.shape[1], batch):
+        found.add(values[:, begin : begin + batch])
+    return found.strongest(LINES)
+
+
+def wave(frequency, amplitude, size=SIZE, phase=0.7):
+    return amplitude * np.sin(2.0 * np.pi * frequency * np.arange(size) / RATE + phase)
+
+
+@pytest.mark.parametrize("count", [1, 8])
+def test_bayes_factor_of_noise_has_mean_one(count):
+    ratio = np.geomspace(1e-8, 1e9, 400_001)
+    log_density = (
+        (count - 1) * np.log(ratio) - count * ratio + count * np.log(count) - gammaln(count)
+    )
+    mean = np.trapezoid(np.exp(log_density + sine_factors(ratio, count)), ratio)
+    assert mean == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("case", ["white", "lost", "walk", "quantized"])
+def test_noise_has_no_sine(case):
+    rng = np.random.default_rng([1, len(case)])
+    largest = []
+    for _ in range(60):
+        noise = rng.standard_normal((3, SIZE))
+        if case == "lost":
+            noise[:, rng.random(SIZE) < 0.4] = np.nan
+            noise[:, 5000:7000] = np.nan
+        elif case == "walk":
+            noise = 0.1 * noise + np.cumsum(0.03 * rng.standard_normal((3, SIZE)), axis=1)
+        elif case == "quantized":
+            noise = np.round(noise)
+        largest.append(search(noise)["sine_nats"].max(axis=1).max())
+    # A Bayes factor of e^2 is reached in at most e^-2 of the records; 8 nats name an effect.
+    assert np.mean(np.array(largest) > 2.0) <= 0.05
+    assert max(largest) < 5.0
+
+
+@pytest.mark.parametrize("frequency", [0.70713, 1.3, 4.61])
+def test_finds_a_sine_that_blocks_do_not_show(frequency):
+    rng = np.random.default_rng(2)
+    amplitude = np.sqrt(4.0 * 60.0 / SIZE)  # 60 nats in white noise of variance 1
+    noise = rng.standard_normal((3, SIZE))
+    noise[:2] += wave(frequency, amplitude)
+    noise[:, rng.random(SIZE) < 0.1] = np.nan
+    blocks = reduce_log(make_log(noise, rate=RATE, unit="deg/h"))
+    place = int(np.argmin(np.abs(blocks["line_frequency"].values - frequency)))
+    by_blocks = line_evidence(blocks["line_power"].values[None], blocks["line_weight"].values)[0]
+    assert by_blocks[:, place].max() < 10.0
+    found = blocks.isel(line=place)
+    assert (found["sine_nats"][:2].values > 12.0).all()
+    assert found["sine_nats"][2] < 0.0
+    assert abs(found["sine_frequency"] - frequency) < 0.3 * RATE / SIZE
+    assert blocks["sine_nats"].drop_isel(line=[place - 1, place, place + 1]).max() < 2.0
+
+
+def test_finds_a_line_whose_phase_wanders():
+    rng = np.random.default_rng(3)
+    drift = np.cumsum(rng.normal(0.0, np.sqrt(36.0 / SIZE), SIZE))  # 6 rad in the record
+    amplitude = np.sqrt(4.0 * 120.0 / SIZE)
+    phase = 2.0 * np.pi * 1.303 * np.arange(SIZE) / RATE + drift
+    noise = rng.standard_normal((1, SIZE)) + amplitude * np.sin(phase)
+    found = search(noise)
+    place = int(found["sine_nats"][0].argmax())
+    assert found["sine_nats"][0, place] > 10.0
+    assert abs(found["sine_frequency"][place] - 1.303) < 2.0 * found["sine_resolution"][place]
+    assert found["sine_resolution"][place] > 2.0 * RATE / SIZE  # seen in the parts of the record
+
+
+def test_amplitude_has_the_error_it_states():
+    rng = np.random.default_rng(4)
+    amplitude, errors = np.sqrt(4.0 * 60.0 / SIZE), []
+    for _ in range(200):
+        frequency = rng.uniform(1.0, 4.0)
+        noise = rng.standard_normal((1, SIZE)) + wave(
+            frequency, amplitude, phase=rng.uniform(0.0, 6.0)
+        )
+        found = search(noise)
+        place = int(found["sine_nats"][0].argmax())
+        square, stderr = found["sine_square"][0, place], found["sine_square_stderr"][0, place]
+        errors.append((square - amplitude**2) / stderr)
+    assert abs(np.mean(errors)) < 0.25
+    assert 0.75 < np.std(errors) < 1.2
+
+
+def test_depends_neither_on_batches_nor_much_on_segments(monkeypatch):
+    rng = np.random.default_rng(5)
+    noise = rng.standard_normal((2, SIZE)) + wave(2.2, 0.15)
+    whole, by_parts = search(noise), search(noise, batch=1_700)
+    for name, values in whole.items():
+        np.testing.assert_array_equal(values, by_parts[name])
+    monkeypatch.setattr(steady_sines, "_MAX_SAMPLES", SIZE // 3)
+    cut = search(noise)
+    place = int(whole["sine_nats"].sum(axis=0).argmax())
+    assert cut["sine_resolution"][place] == pytest.approx(3.0 * whole["sine_resolution"][place])
+    assert cut["sine_nats"][0, place] > 0.6 * whole["sine_nats"][0, place]
+
+
+def test_short_records_and_silent_axes_have_no_search():
+    assert np.isneginf(search(np.zeros((1, 24 * LENGTH // 20)))["sine_nats"]).all()
+    noise = np.random.default_rng(6).standard_normal((2, SIZE))
+    noise[1] = np.nan
+    found = search(noise)["sine_nats"]
+    assert np.isneginf(found[1]).all()
+    assert np.isfinite(found[0]).any()
+
+
+def test_weak_sine_is_named_with_frequency_and_amplitude():
+    rng = np.random.default_rng(7)
+    amplitude = np.sqrt(4.0 * 60.0 / SIZE)
+    noise = rng.standard_normal((1, SIZE)) + wave(1.7321, amplitude)
+    blocks = reduce_log(make_log(noise, rate=RATE, unit="deg/h"))
+    found = name_effects(blocks, *nulls(blocks, 40)).identified
+    assert [one.effect for one in found] == ["spectral_line"]
+    place = found[0].components[0].place
+    (size, stderr), (frequency, error) = estimate_line(blocks, "x", place)
+    assert abs(size - amplitude) < 3.0 * stderr < 0.5 * amplitude
+    assert abs(frequency - 1.7321) < 2.0 * error < 0.002
