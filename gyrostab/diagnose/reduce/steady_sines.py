@@ -103,7 +103,7 @@ class SineSearch:
         }
         best = np.full(lines.size, -np.inf)
         for spectrum in self.spectra:
-            found = self._search(spectrum, lines)
+            found = self._search_spectrum(spectrum, lines)
             if found is None:
                 continue
             place, total, arrays = found
@@ -113,7 +113,7 @@ class SineSearch:
                 out[name][..., place[better]] = values[..., better]
         return out
 
-    def _search(
+    def _search_spectrum(
         self, spectrum: _Spectrum, lines: Array
     ) -> tuple[NDArray[np.int64], Array, dict[str, Array]] | None:
         """Return lines, the nats of all axes, and the results of `strongest`; None if too short."""

@@ -282,7 +282,7 @@ def estimate_line(
     if "sine_nats" in here:
         sine = here.isel(line=place)
         if sine["sine_nats"] > line_evidence(power[None, None], weight[None])[0, 0, place]:
-            return _amplitude(float(sine["sine_square"]), float(sine["sine_square_stderr"])), (
+            return _root_of_square(float(sine["sine_square"]), float(sine["sine_square_stderr"])), (
                 float(sine["sine_frequency"]),
                 0.5 * float(sine["sine_resolution"]),
             )
@@ -297,10 +297,10 @@ def estimate_line(
     noise = 4.0 * step * float(np.sqrt(variance.sum() / weight[good].sum()))
     positive = np.maximum(above, 0.0)
     frequency = float((positive * lines[near]).sum() / max(positive.sum(), 1e-300))
-    return _amplitude(4.0 * float(above.sum()) * step, noise), (frequency, 0.5 * step)
+    return _root_of_square(4.0 * float(above.sum()) * step, noise), (frequency, 0.5 * step)
 
 
-def _amplitude(square: float, stderr: float) -> tuple[float, float]:
+def _root_of_square(square: float, stderr: float) -> tuple[float, float]:
     """Return the amplitude and its error from its square."""
     amplitude = math.sqrt(max(square, 0.0))
     return amplitude, stderr / (2.0 * max(amplitude, math.sqrt(stderr)))
