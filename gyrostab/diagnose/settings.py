@@ -101,8 +101,8 @@ class Settings:
         3.0,
         "standard error",
         "Distance from its allowed range at which a size is impossible, from the earlier level at "
-        "which the level after an event is another one, and from noise at which a cell belongs to "
-        "the mismatch next to it.",
+        "which the level after an event is another one, from noise at which a cell belongs to the "
+        "mismatch next to it, and from a known sine at which a stronger one is another.",
         "two-sided P = 0.0027 for a normal error",
     )
     visible_sigma: float = _make_setting(

@@ -125,6 +125,13 @@ def resonance_density(
     return np.asarray(tapered[fine.size + finer :: finer])
 
 
+def _sum_near(lines: Array) -> Array:
+    """Sum over each line (axis, line) and those that it leaks into."""
+    padded = np.pad(lines, ((0, 0), (LEAK_LINES, LEAK_LINES)))
+    near = np.lib.stride_tricks.sliding_window_view(padded, 2 * LEAK_LINES + 1, axis=-1)
+    return np.asarray(near.sum(axis=-1))
+
+
 def average_in_bands(density: Array, blocks: xr.Dataset) -> Array:
     """Average a density over the lines of every band."""
     edges = band_edges(int(blocks.attrs["block_samples"])) - 1
@@ -187,5 +194,9 @@ def remove_known_lines(
     freed = np.where(known > 0.0, np.maximum(freed, 0.0), power.values)
     out = {"line_power": power.copy(data=np.where(np.isfinite(power.values), freed, np.nan))}
     if "sine_nats" in blocks:
-        out["sine_nats"] = blocks["sine_nats"].where(largest[:, 0] < error * noise[:, 0], -np.inf)
+        square, stderr = (blocks[f"sine_square{end}"].values for end in ("", "_stderr"))
+        step = float(blocks["line_frequency"][0])
+        most = 4.0 * step * _sum_near(largest[:, 0])
+        exceeds = square - most > error * most + settings.clear_sigma * stderr
+        out["sine_nats"] = blocks["sine_nats"].where(exceeds | (most == 0.0), -np.inf)
     return blocks.assign(out)

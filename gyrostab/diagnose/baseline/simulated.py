@@ -34,9 +34,10 @@ class ExtraStatistics(NamedTuple):
     coherency: NDArray[np.complex128]  # (pair, band): coherency of the axes; 0 if not significant
     #: (pair, band): standard deviation of its real and imaginary parts; 0 if it is 0.
     coherency_error: Array
-    #: (axis, line): power of steady lines, and other power missing in the noise terms near
-    #: unexplained bands [degree2 hour-2 Hz-1].
+    #: (axis, line): power of steady lines, at most, and other power missing in the noise terms
+    #: near unexplained bands [degree2 hour-2 Hz-1].
     lines: Array
+    lines_most: Array
     peaks: Array
 
 
@@ -84,8 +85,13 @@ def measure_extra_statistics(
     coherency, error = _measure_coherency(
         simulated, expected * form[:, None], settings.coherency_probability
     )
-    lines, peaks = _measure_lines(simulated, expected, unexplained, settings)
-    return ExtraStatistics(form, form_shape, coherency, error, lines, peaks)
+    return ExtraStatistics(
+        form,
+        form_shape,
+        coherency,
+        error,
+        *_measure_lines(simulated, expected, unexplained, settings),
+    )
 
 
 def _spectral_form(simulated: xr.Dataset, expected: Array) -> tuple[Array, Array]:
@@ -133,18 +139,19 @@ def _measure_coherency(
 
 def _measure_lines(
     simulated: xr.Dataset, expected: Array, unexplained: NDArray[np.bool_], settings: Settings
-) -> tuple[Array, Array]:
-    """Return the power of significant lines, with leakage, and of peaks near unexplained bands."""
+) -> tuple[Array, Array, Array]:
+    """Return the power of significant lines and the most it may be, and of unexplained peaks."""
     power, weight = simulated["line_power"].values, simulated["line_weight"].values
+    frequency = simulated["line_frequency"].values
     slope = expected_lines(
         xr.Dataset(
             {"spectrum": (("axis", "block", "band"), expected)},
             coords={"axis": simulated["axis"], "frequency": simulated["frequency"]},
         ),
-        simulated["line_frequency"].values,
+        frequency,
     )
     evidence_nats = line_evidence(power[None], weight, slope)[0]
-    lines, peaks = np.zeros(evidence_nats.shape), np.zeros(evidence_nats.shape)
+    lines, most, peaks = (np.zeros(evidence_nats.shape) for _ in range(3))
     inside, near = _lines_in_bands(simulated), unexplained.copy()
     near[:, 1:] |= unexplained[:, :-1]
     near[:, :-1] |= unexplained[:, 1:]
@@ -161,13 +168,22 @@ def _measure_lines(
         mean = np.average(power[row][good], axis=0, weights=weight[row][good])
         level = np.where(known, local_level(mean[None])[0], mean)
         lines[row] = np.maximum(mean - level, 0.0)
+        if "sine_nats" in simulated:
+            weak = (simulated["sine_nats"].values[row] > settings.line_nats) & ~known
+            square, stderr = (
+                simulated[f"sine_square{end}"].values[row] / (4.0 * frequency[0])
+                for end in ("", "_stderr")
+            )
+            lines[row] = np.where(weak, square, lines[row])
+            most[row] = np.where(weak, square + settings.clear_sigma * stderr, 0.0)
+        most[row] = np.maximum(most[row], lines[row])
         smooth = np.convolve(
             np.pad(level, _SMOOTHING_LINES // 2, mode="edge"),
             np.full(_SMOOTHING_LINES, 1.0 / _SMOOTHING_LINES),
             "valid",
         )
         peaks[row] = np.where(inside[near[row]].any(axis=0), smooth - slope[row], 0.0)
-    return lines, peaks
+    return lines, most, peaks
 
 
 def _lines_in_bands(blocks: xr.Dataset) -> NDArray[np.bool_]:
@@ -209,5 +225,5 @@ def add_extra_statistics(
             / band_widths(blocks)
         )
         arrays["line_spectrum"] = line_power * unspread_share(blocks).mean(axis=1)[:, None]
-        arrays |= {"lines": extra.lines, "lines_most": extra.lines, "peaks": extra.peaks}
+        arrays |= {"lines": extra.lines, "lines_most": extra.lines_most, "peaks": extra.peaks}
     return baseline.assign(label_variables(arrays, BASELINE))

@@ -10,6 +10,7 @@ import xarray as xr
 
 import gyrostab
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
+from gyrostab.diagnose.baseline.from_simulation import baseline_from_simulation
 from gyrostab.diagnose.baseline.known_lines import remove_known_lines
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines, line_evidence
 from gyrostab.diagnose.nulls.records import null_records
@@ -107,3 +108,26 @@ def test_power_beyond_the_model_is_named(seed, inside, known, left):
             left, rel=0.1
         )
     assert found.effects[0]["parameters"]["frequency"]["value"] == pytest.approx(PLACE, abs=0.03)
+
+
+@pytest.mark.parametrize("amplitude", [0.07, 0.3])
+@pytest.mark.parametrize("frequency", [1.3, 1.312, 1.325])
+def test_a_known_sine_is_no_sine_of_the_recording(amplitude, frequency):
+    line = {"name": "spectral_line", "amplitude": amplitude, "frequency": frequency}
+    made = {"noise": NOISE, "effect": [line], "log": {"axes": ["x"]}}
+    blocks = reduce_log(simulate(made, duration="30min", rate=10.0, seed=8).compute())
+    assert float(blocks["sine_nats"].max()) > 10.0
+    known = remove_known_lines(blocks, baseline_from_model(blocks, made))
+    assert float(known["sine_nats"].max()) < 3.0
+    weaker = made | {"effect": [line | {"amplitude": amplitude / 4.0}]}
+    too_small = remove_known_lines(blocks, baseline_from_model(blocks, weaker))
+    assert float(too_small["sine_nats"].max()) > 10.0
+
+
+def test_a_weak_sine_of_a_simulated_log_is_known():
+    recorded, simulated = (reduce_log(log_of(seed, size)) for seed, size in ((9, 0.06), (10, 0.06)))
+    plain = reduce_log(log_of(11, 0.0))
+    with_sine = remove_known_lines(recorded, baseline_from_simulation(recorded, simulated))
+    without = remove_known_lines(recorded, baseline_from_simulation(recorded, plain))
+    assert float(with_sine["sine_nats"].max()) < 3.0
+    assert float(without["sine_nats"].max()) > 10.0
