@@ -198,5 +198,7 @@ def remove_known_lines(
         step = float(blocks["line_frequency"][0])
         most = 4.0 * step * _sum_near(largest[:, 0])
         exceeds = square - most > error * most + settings.clear_sigma * stderr
-        out["sine_nats"] = blocks["sine_nats"].where(exceeds | (most == 0.0), -np.inf)
+        in_peak = _sum_near(baseline["peaks"].values) > error * noise[:, 0]
+        new = (exceeds | (most == 0.0)) & ~in_peak
+        out["sine_nats"] = blocks["sine_nats"].where(new, -np.inf)
     return blocks.assign(out)
