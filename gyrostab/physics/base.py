@@ -103,6 +103,8 @@ class Chunk:
     true : mapping of str to ndarray, shape (size,)
         True rotation rate of every axis of the log [degree hour-1], including axes that the effect
         does not act on; complete after "motion".
+    recorded : mapping of str to ndarray, shape (size,)
+        Recorded rate of the axes of `Effect.recorded_axes` [degree hour-1], without NaN.
     signal : ndarray, shape (axes, size)
         Signal before the effect [degree hour-1]; for the stages "sensor" and later.
     level : mapping of str to ndarray, shape (axes, size)
@@ -114,6 +116,7 @@ class Chunk:
     size: int
     drivers: Mapping[str, Array] = field(default_factory=dict)
     true: Mapping[str, Array] = field(default_factory=dict)
+    recorded: Mapping[str, Array] = field(default_factory=dict)
     signal: Array = field(default_factory=lambda: np.empty((0, 0)))
     level: Mapping[str, Array] = field(default_factory=dict)
 
@@ -223,9 +226,20 @@ class Effect:
         }
         return replace(self, **{name: zero[name] for name in self.size_parameters})
 
+    def refer_noise_to(self, drivers: Mapping[str, float]) -> Self:
+        """Make the same change of noise for a model whose noise is that at these channel values.
+
+        The effect itself if it does not depend on where the noise of the model is measured.
+        """
+        return self
+
     def needs(self) -> tuple[str, ...]:
         """List the channels (of `channels`) that *generate* requires with these parameters."""
         return tuple(self.channels)
+
+    def recorded_axes(self) -> tuple[str, ...]:
+        """List the axes whose rate *generate* takes from the recording that a log is made like."""
+        return ()
 
     def channel_names(self) -> dict[str, str]:
         """Map each channel of `channels` to its name in the log."""

@@ -72,7 +72,7 @@ class SpectralLine(Effect):
     )
     phase: tuple[float, ...] = parameter(
         "deg",
-        "phase of a steady line at the start of the log",
+        "phase of a steady line at the start of the log; drawn, for all axes alike, if not given",
         default=(),
         low=-1e6,
         high=1e6,
@@ -80,10 +80,11 @@ class SpectralLine(Effect):
     )
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """Draw the stationary state of the oscillator; None for a steady line."""
+        """Draw the stationary state of the oscillator, or the phases of a steady line [radian]."""
         if math.isinf(self.quality):
-            self.each("phase", setup.axes)
-            return None
+            if self.phase:
+                return np.radians(self.each("phase", setup.axes))
+            return np.full(len(setup.axes), rng.uniform(0.0, 2.0 * math.pi))
         from gyrostab.kernels.random.coloured import draw_state, oscillator
 
         reading = oscillator(self.frequency, self.quality, setup.rate)
@@ -92,13 +93,13 @@ class SpectralLine(Effect):
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Compute the rate contribution [degree hour-1] of every sample."""
         amplitude = self.each("amplitude", chunk.setup.axes)[:, None]
-        if state is None:
+        if isinstance(state, np.ndarray):
             cycles = self.frequency / chunk.rate
             middle: Array = (
                 np.arange(chunk.first, chunk.first + chunk.size, dtype=np.float64) + 0.5
             ) * cycles
-            phase = np.radians(self.each("phase", chunk.setup.axes))[:, None] - math.pi / 2.0
-            return np.asarray(amplitude * turn_means(middle, np.full(1, cycles), phase)), None
+            phase = state[:, None] - math.pi / 2.0
+            return np.asarray(amplitude * turn_means(middle, np.full(1, cycles), phase)), state
         from gyrostab.kernels.random.coloured import read_process
 
         reading, rng, position = state

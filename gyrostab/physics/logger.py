@@ -16,6 +16,11 @@ from gyrostab.units import HOUR
 __all__ = ["HeldSamples", "LoggerFilter", "RateQuantization", "Spikes"]
 
 
+#: Mean lengths of a frame sent twice, to which its geometric law is cut: longer ones have a
+#: probability of 2e-9.
+_FRAME_LENGTHS = 20.0
+
+
 def _whole_number(effect: Effect, name: str) -> int:
     """Read a parameter that must be a whole number."""
     value = float(getattr(effect, name))
@@ -387,15 +392,17 @@ class Spikes(Effect):
 
 @dataclass(frozen=True, kw_only=True)
 class HeldSamples(Effect):
-    """Lost samples that are silently replaced by the last good one, or by zero.
+    """Lost samples that are silently replaced by earlier ones, or by zero.
 
     At random times, on all axes together, a geometric number of samples with the mean `length` (at
-    least one) is replaced.
+    least one) is replaced: by the last good one (``repeat``), by zero, or by as many samples just
+    before (``frame``, a frame of telemetry that is sent twice).
 
     *DAVAR*: ``repeat``: smaller at one sample, by the share of held ones; larger at long times,
     where one sample counts several times: N^2 grows by the factor ``1 + 2 p m^2`` for m samples
-    with probability p. ``zero``: pulses of the size of the rate. *Window mean*: biased towards zero
-    by "zero". *Spectrum*: less at the top, more below. *Axes*: the same samples.
+    with probability p, and by ``1 + 2 p m`` for a frame. ``zero``: pulses of the size of the rate.
+    *Window mean*: biased towards zero by "zero". *Spectrum*: less at the top, more below. *Axes*:
+    the same samples.
 
     Confused with logger_filter and small noise (no runs), clipping (runs at the limit only) and
     real gaps: check for runs of equal values, which noise does not produce.
@@ -424,7 +431,12 @@ class HeldSamples(Effect):
     length: float = parameter(
         "s", "mean length of a loss; at least a sample", default=0.5, low=0.0, high=1e6
     )
-    fill: str = parameter("text", "replacement", default="repeat", choices=("repeat", "zero"))
+    fill: str = parameter(
+        "text",
+        "replacement: the last sample, zero, or the frame before",
+        default="repeat",
+        choices=("repeat", "zero", "frame"),
+    )
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """Draw the first loss, [first sample, one past the last]; no good sample is known yet."""
@@ -437,11 +449,20 @@ class HeldSamples(Effect):
         if self.per_hour == 0.0:
             return None
         first = after + int(rng.geometric(min(1.0, self.per_hour / HOUR / rate)))
-        return first, first + int(rng.geometric(1.0 / max(1.0, self.length * rate)))
+        count = int(rng.geometric(1.0 / max(1.0, self.length * rate)))
+        if self.fill == "frame":
+            count = min(count, first, self._longest_frame(rate))
+        return first, first + count
+
+    def _longest_frame(self, rate: float) -> int:
+        """Return the samples that are kept for a frame to be sent twice."""
+        return math.ceil(_FRAME_LENGTHS * max(1.0, self.length * rate))
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Replace lost samples of the signal [degree hour-1]."""
         rng, loss, last = state
+        if self.fill == "frame":
+            return self._send_frames_twice(chunk, rng, loss, last)
         end = chunk.first + chunk.size
         source = np.arange(chunk.size)
         held = np.zeros(chunk.size, bool)
@@ -459,6 +480,23 @@ class HeldSamples(Effect):
         signal = known[:, source + 1]
         return signal, (rng, loss, signal[:, -1:].copy())
 
+    def _send_frames_twice(
+        self, chunk: Chunk, rng: np.random.Generator, loss: tuple[int, int] | None, last: Any
+    ) -> tuple[Array, Any]:
+        """Replace each loss by as many samples before it, of which `last` are known."""
+        kept = self._longest_frame(chunk.rate)
+        before = np.zeros((chunk.signal.shape[0], kept)) if last is None else last
+        known = np.concatenate([before, chunk.signal], axis=1)
+        end, offset = chunk.first + chunk.size, kept - chunk.first
+        while loss is not None and loss[0] < end:
+            low, high = max(loss[0], chunk.first) + offset, min(loss[1], end) + offset
+            count = loss[1] - loss[0]
+            known[:, low:high] = known[:, low - count : high - count]
+            if loss[1] > end:
+                break
+            loss = self._draw_loss(rng, loss[1], chunk.rate)
+        return known[:, kept:], (rng, loss, known[:, known.shape[1] - kept :].copy())
+
     def explain(self, windows: Windows) -> Prediction:
         """Predict a larger N, or window means biased towards zero."""
         count = max(1.0, self.length * windows.rate)
@@ -466,14 +504,14 @@ class HeldSamples(Effect):
             share = count / windows.rate / HOUR
             own = np.stack([windows.own[axis] for axis in windows.axes])
             return Prediction(mean={"per_hour": -share * own}, marks=("filled",))
-        growth = 2.0 * count**2 / (HOUR * windows.rate)
+        growth = 2.0 * (count if self.fill == "frame" else count**2) / (HOUR * windows.rate)
         return Prediction(
             level={("N", "per_hour"): np.full(windows.begin.size, growth)}, marks=("repeats",)
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Describe the effect in one sentence."""
-        what = "earlier ones" if self.fill == "repeat" else "zero"
+        what = {"repeat": "earlier ones", "zero": "zero", "frame": "the frame before"}[self.fill]
         often, length = (
             self.quantity("per_hour", errors).removesuffix(" 1/h"),
             self.quantity("length", errors),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -88,6 +88,23 @@ class TemperatureNoise(Effect):
     reference: float = parameter(
         "degC", "temperature of the model's N", default=25.0, low=-273.15, high=500.0
     )
+
+    def refer_noise_to(self, drivers: Mapping[str, float]) -> TemperatureNoise:
+        """Take the polynomial about another temperature, without its value there.
+
+        Examples
+        --------
+        >>> cold = TemperatureNoise(linear=0.01, quadratic=0.001)
+        >>> warm = cold.refer_noise_to({"temperature": 35.0})
+        >>> warm.reference, warm.linear, warm.quadratic
+        (35.0, 0.03, 0.001)
+        """
+        at = drivers["temperature"]
+        return replace(
+            self,
+            reference=at,
+            linear=self.linear + 2.0 * self.quadratic * (at - self.reference),
+        )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
         """Compute squared N for every sample."""
@@ -171,6 +188,22 @@ class LightPowerNoise(Effect):
                 f"effect {self.name!r}: thermal + shot are {total:g} of N^2; "
                 "give shares with a sum of 1 or less"
             )
+
+    def refer_noise_to(self, drivers: Mapping[str, float]) -> LightPowerNoise:
+        """Take another light power as nominal; there all of N^2 is that of detector and shots.
+
+        Examples
+        --------
+        >>> full = LightPowerNoise(thermal=0.1, shot=0.2)
+        >>> full.refer_noise_to({"light_power": 5e-5})
+        LightPowerNoise(axes=(), driver=(), thermal=0.4, shot=0.4, nominal=5e-05)
+        """
+        loss = self.nominal / drivers["light_power"]
+        thermal, shot = self.thermal * loss**2, self.shot * loss
+        most = max(thermal + shot, 1.0)
+        return replace(
+            self, thermal=thermal / most, shot=shot / most, nominal=drivers["light_power"]
+        )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
         """Compute squared N for every sample."""

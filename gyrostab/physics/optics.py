@@ -20,6 +20,7 @@ __all__ = ["DeadZone", "FeedbackReset", "SharedSource"]
 
 _NRAD_PER_S = math.degrees(1e-9) * HOUR  # deg/h
 _HARMONICS = 40
+_PARTS_OF_BIN = 32  # of the phase of the ramp, over which a prediction is averaged
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,9 +256,15 @@ class FeedbackReset(Effect):
         return before * samples * -math.expm1(-1.0 / samples) + size * (resets - ages), left[:, -1:]
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """List decay times near the sampling interval, and diameters (from a recorded ramp)."""
-        decay = np.array([0.5, 1.0, 2.0, 4.0, 8.0]) / windows.rate
+        """List decay times from the sampling interval to half a turn, and diameters.
+
+        Diameters follow from a recorded ramp, and so does a turn; without one, decays have at most
+        8 samples.
+        """
         turns = float(np.nanmean(windows.turns)) if np.isfinite(windows.turns).any() else 0.0
+        longest = 0.5 / abs(turns) if turns else 0.0
+        count = max(math.floor(math.log2(max(2.0 * longest * windows.rate, 1.0))) + 1, 5)
+        decay: Array = np.ldexp(0.5, np.arange(count)) / windows.rate
         rates = np.array(
             [
                 np.nanmean(windows.own[axis])
@@ -305,26 +312,39 @@ class FeedbackReset(Effect):
         )
 
     def _predict_profiles(self, windows: Windows) -> dict[str, Array]:
-        """Predict the error by phase of the ramp at the end of the sample."""
+        """Predict the error by phase of the ramp at the end of the sample, averaged over the bins.
+
+        The rate and thus the turns of the ramp in a sample are taken as constant.
+        """
         if not windows.phase.size:
             return {}
         own = np.stack([windows.own[axis] for axis in windows.axes])
         if not np.isfinite(own).any():
             return {}
         moved = np.nanmedian(own) / (self.turn * _NRAD_PER_S * windows.rate)
-        step = max(abs(moved), 1.0 / windows.phase.size)
-        since = windows.phase if moved * self.full >= 0 else 1.0 - windows.phase
-        kick = (since < step) * (_NRAD_PER_S * windows.rate) * np.sign(moved)
-        seconds = since / max(abs(moved), 1e-9) / windows.rate
-        cycle = 1.0 / max(abs(moved), 1e-9) / windows.rate / self.decay
-        tail = (
-            np.exp(-seconds / self.decay)
-            / self.decay
-            / -np.expm1(-cycle)
-            * _NRAD_PER_S
-            * np.sign(moved)
+        step, direction = max(abs(moved), 1e-9), 1.0 if moved >= 0.0 else -1.0
+        place = (np.arange(windows.phase.size * _PARTS_OF_BIN) + 0.5) / (
+            windows.phase.size * _PARTS_OF_BIN
         )
-        return {"kick": kick, "tail": tail, "sawtooth": 1.0 - 2.0 * windows.phase}
+        turns = place if self.full > 0.0 else 1.0 - place
+        end = turns if direction > 0.0 else 1.0 - turns  # turns since the last reset
+        begin, decay = end - step, step * self.decay * windows.rate
+
+        def lost_slowly(at: Array) -> Array:
+            whole = np.floor(at)
+            return np.asarray(whole + np.expm1((whole - at) / decay) / np.expm1(-1.0 / decay))
+
+        angle = direction * _NRAD_PER_S * windows.rate
+        sawtooth = _sawtooth_means(np.stack([turns - direction * step, turns], axis=-1))[:, 0]
+        fine = {
+            "kick": angle * (np.floor(end) - np.floor(begin)),
+            "tail": angle * (lost_slowly(end) - lost_slowly(begin)),
+            "sawtooth": sawtooth,
+        }
+        return {
+            name: values.reshape(windows.phase.size, -1).mean(axis=1)
+            for name, values in fine.items()
+        }
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Describe the effect in one sentence."""

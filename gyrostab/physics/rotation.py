@@ -138,7 +138,8 @@ class Misalignment(Effect):
 
     ``e = m_x w_x + m_y w_y + m_z w_z``, without the rate of the axis itself, where w are the true
     rates of the log's axes x, y and z. The same model must contain their motion (real_motion,
-    earth_rate).
+    earth_rate), or with ``motion = "recorded"`` they are the rates of the recording that the log is
+    simulated like. A diagnosis writes the latter: it compares the axes of a recording.
 
     *DAVAR*: a copy of the other axis's motion, scaled: 1 mrad of 180 r/min is 3900 deg/h. *Window
     mean*: follows the other axis. *Spectrum*: lines and motion of the other axis only. *Axes*:
@@ -174,23 +175,38 @@ class Misalignment(Effect):
     z: float = parameter(
         "mrad", "misalignment angle towards axis z", default=0.0, typical=0.5, low=-1e3, high=1e3
     )
+    motion: str = parameter(
+        "text",
+        "rates of the other axes: the true ones of the model, or those of the recording",
+        default="true",
+        choices=("true", "recorded"),
+    )
+
+    def recorded_axes(self) -> tuple[str, ...]:
+        """List the axes that leak in, if their recorded rates do."""
+        return (
+            tuple(name for name in self.size_parameters if getattr(self, name))
+            if self.motion == "recorded"
+            else ()
+        )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Compute the rate contribution [degree hour-1] of every sample."""
         error = np.zeros(chunk.shape)
+        rates = chunk.recorded if self.motion == "recorded" else chunk.true
         for source in self.size_parameters:
             size = getattr(self, source)
             if not size:
                 continue
-            if source not in chunk.true:
+            if source not in rates:
                 raise SchemaError(
                     f"effect {self.name!r} needs the rate of axis {source!r}, which the log does "
-                    f"not have; it has {', '.join(chunk.true)}; "
+                    f"not have; it has {', '.join(rates)}; "
                     f"set {source} = 0 or name the axes x, y, z"
                 )
             for row, axis in enumerate(chunk.setup.axes):
                 if axis != source:
-                    error[row] += size * _MRAD * chunk.true[source]
+                    error[row] += size * _MRAD * rates[source]
         return error, state
 
     def explain(self, windows: Windows) -> Prediction:

@@ -46,6 +46,8 @@ class Plan:
     turning: str  # axis that feels the channel ``rotation_rate``; empty when none does
     #: (n, 2): samples of the log that are missing, [first, one past last], rising.
     gaps: NDArray[np.int64]
+    recorded: Mapping[str, str] = field(default_factory=dict)  # axis -> source of its recorded rate
+    bias: tuple[float, ...] = ()  # constant rate of each axis [degree hour-1]
 
 
 @dataclass
@@ -109,7 +111,12 @@ def next_block(
             for role in step.effect.needs()
         }
         chunk = Chunk(
-            setup=step.setup, first=first * (factor // skip), size=size, drivers=drivers, **given
+            setup=step.setup,
+            first=first * (factor // skip),
+            size=size,
+            drivers=drivers,
+            recorded={axis: channels[name][::skip] for axis, name in plan.recorded.items()},
+            **given,
         )
         values, state.effects[number] = step.effect.generate(chunk, state.effects[number])
         return step, values
@@ -179,7 +186,7 @@ def _add_noise(
             state.noise.get(axis, {}),
             ramp=plan.coefficients[row]["R"],
         )
-        signal[row] = noise + true[axis]
+        signal[row] = noise + (true[axis] + (plan.bias[row] if plan.bias else 0.0))
     return signal
 
 

@@ -30,7 +30,7 @@ from gyrostab.schema import (
 )
 from gyrostab.simulate.block import BlockState, Plan, Step, check_effects
 from gyrostab.simulate.channels import combine
-from gyrostab.simulate.drivers import make_source
+from gyrostab.simulate.drivers import Source, make_source
 from gyrostab.simulate.lazy import lazy_rates
 from gyrostab.simulate.model import PROFILES, Model, read_model
 from gyrostab.simulate.noise import begin_noise, stream
@@ -44,6 +44,7 @@ __all__ = ["simulate"]
 
 #: Samples of the instrument in one block of the lazy log.
 BLOCK = 2**17
+_RECORDED = "recorded rate of "  # source of an effect, in front of the name of the axis
 _RESTART = GAP_CAUSES.index("restart")
 
 
@@ -117,7 +118,7 @@ def simulate(
     environment = _make_world(made, frame, like, environment)
     table = _gap_table(environment, frame)
     steps = _list_steps(made, frame, table)
-    plan = _make_plan(made, frame, environment, table, steps)
+    plan = _make_plan(made, frame, environment, table, steps, like)
     starts = [
         begin_noise(
             frame.seed,
@@ -340,6 +341,7 @@ def _make_plan(
     environment: xr.Dataset,
     table: NDArray[np.int64],
     steps: list[Step],
+    like: xr.Dataset | None,
 ) -> Plan:
     present = log_channels(environment)
     steps = [
@@ -358,6 +360,7 @@ def _make_plan(
         )
     if turning:
         needed.add("rotation_rate")
+    recorded = _recorded_rates(model, frame, steps, like)
     return Plan(
         rate=frame.rate,
         oversampling=frame.oversampling,
@@ -365,10 +368,37 @@ def _make_plan(
         axes=frame.axes,
         coefficients=tuple(model.coefficients(axis) for axis in frame.axes),
         steps=tuple(steps),
-        sources={name: make_source(environment, name) for name in sorted(needed)},
+        sources={
+            **{name: make_source(environment, name) for name in sorted(needed)},
+            **{f"{_RECORDED}{axis}": source for axis, source in recorded.items()},
+        },
         turning=turning,
         gaps=table[:, :2],
+        recorded={axis: f"{_RECORDED}{axis}" for axis in recorded},
+        bias=tuple(model.bias.get(axis, 0.0) for axis in frame.axes),
     )
+
+
+def _recorded_rates(
+    model: Model, frame: _Frame, steps: list[Step], like: xr.Dataset | None
+) -> dict[str, Source]:
+    """The recorded rates that effects need, by axis."""
+    found: dict[str, Source] = {}
+    for effect in (step.effect for step in steps):
+        for axis in effect.recorded_axes():
+            if like is None or signal_name(like) != "rate":
+                raise SchemaError(
+                    f"effect {effect.name!r} follows the recorded rate of axis {axis!r}; give a "
+                    "recording of rates as like (--like RECORDING), or a model with the motion and "
+                    'motion = "true"'
+                )
+            if axis not in frame.axes:
+                raise SchemaError(
+                    f"{model.source}: effect {effect.name!r} needs the rate of axis {axis!r}, "
+                    f"which the log does not have; it has {', '.join(frame.axes)}"
+                )
+            found[axis] = make_source(like["rate"].sel(axis=axis).to_dataset(name="rate"), "rate")
+    return found
 
 
 def _noise_terms(plan: Plan, row: int) -> str:

@@ -87,6 +87,8 @@ class Model:
         Axis (or "" for all others) -> symbol -> coefficient [unit of the noise table].
     flicker_band : (float, float)
         Lowest and highest frequency of B [Hz].
+    bias : mapping of str to float
+        Constant rate of axes [deg/h]; 0 for others.
     effects : tuple of Effect
     environment : tuple of (str, mapping)
         Function of `PROFILES` and its arguments.
@@ -101,6 +103,7 @@ class Model:
     axes: tuple[str, ...] = ()
     noise: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     flicker_band: tuple[float, float] = (FLICKER_LOW, math.inf)
+    bias: Mapping[str, float] = field(default_factory=dict)
     effects: tuple[Effect, ...] = ()
     environment: tuple[tuple[str, Mapping[str, Any]], ...] = ()
     log: Mapping[str, Any] = field(default_factory=dict)
@@ -118,7 +121,7 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
     Parameters
     ----------
     model : path-like or mapping
-        The file, or its tables ``log``, ``noise``, ``environment`` and ``effect`` as in
+        The file, or its tables ``log``, ``noise``, ``bias``, ``environment``, ``effect`` as in
         ``docs/simulate.md``. Numbers are in the units of the coefficients (Q [urad], N
         [deg/sqrt(h)], B [deg/h], K [deg/h^1.5], R [deg/h^2]) and of the parameters of the effects;
         text carries its unit.
@@ -152,12 +155,12 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
             raise FormatError(f"{path}: cannot be read ({error.strerror})") from error
         except (ValueError, RecursionError) as error:
             raise FormatError(f"{path}: not a TOML file ({error})") from error
-    known = ("log", "noise", "effect", "environment")
+    known = ("log", "noise", "bias", "effect", "environment")
     for key, table in tables.items():
         if key not in known:
             raise OptionError(
                 f"{where}: there is no section {key!r}{close_to(key, known)}; "
-                "there are [log], [noise], [[effect]], [[environment]]"
+                "there are [log], [noise], [bias], [[effect]], [[environment]]"
             )
         if not isinstance(table, list if key in ("effect", "environment") else Mapping):
             raise OptionError(
@@ -182,7 +185,17 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
     ]
     log = _read_log_section(tables.get("log", {}), where)
     axes = tuple(log.pop("axes", ())) or _list_axes(noise, effects)
-    found = Model(axes, noise, band, tuple(effects), tuple(profiles), log, source=where, text=text)
+    found = Model(
+        axes,
+        noise,
+        band,
+        _read_bias(tables.get("bias", {}), where),
+        tuple(effects),
+        tuple(profiles),
+        log,
+        source=where,
+        text=text,
+    )
     _check_axes(found)
     return found
 
@@ -212,6 +225,23 @@ def _read_noise(
         else:
             noise.setdefault("", {})[key] = _read_coefficient(key, value, f"{where}, [noise]")
     return noise, band
+
+
+def _read_bias(table: Mapping[str, Any], where: str) -> dict[str, float]:
+    found = {}
+    for axis, value in table.items():
+        number = amount(value, "deg/h", f"{where}: bias of {axis}")
+        if (
+            isinstance(number, bool)
+            or not isinstance(number, int | float)
+            or not abs(number) <= _MAX_COEFFICIENT
+        ):
+            raise OptionError(
+                f"{where}, [bias]: {axis} = {value!r} is not a number; give one in deg/h for an "
+                "axis of the log"
+            )
+        found[axis] = float(number)
+    return found
 
 
 def _read_coefficient(term: str, value: Any, where: str) -> float:

@@ -10,7 +10,11 @@ import pytest
 import xarray as xr
 
 from gyrostab import simulate
-from gyrostab.blindtest.scoring.resimulation import check_model
+from gyrostab.blindtest.scoring.resimulation import (
+    check_model,
+    likelihood_ratio,
+    record_statistics,
+)
 
 RATE, SIZE = 10.0, 18_000
 NOISE = {axis: {"N": 0.003, "B": 0.002} for axis in "xy"}
@@ -21,6 +25,10 @@ EFFECTS: list[dict[str, Any]] = [
     {"name": "spectral_line", "frequency": 1.7, "amplitude": 0.3},
     {"name": "telegraph", "step": [0.5], "low": 40.0, "high": 60.0},
     {"name": "held_samples", "per_hour": 200.0},
+    {"name": "held_samples", "per_hour": 12.0, "length": 3.0},
+    {"name": "held_samples", "per_hour": 100.0, "length": 0.5, "fill": "frame"},
+    {"name": "rate_quantization", "step": 0.5},
+    {"name": "rotation_line", "amplitude": [0.05], "phase": [40.0]},
     {"name": "dead_zone", "width": 0.05},
     {"name": "shared_source", "N": [0.002]},
     {"name": "feedback_reset", "kick": 60.0, "phase": "channel"},
@@ -29,13 +37,16 @@ EFFECTS: list[dict[str, Any]] = [
 
 @cache
 def environment() -> xr.Dataset:
-    """Half an hour with a temperature that rises, a shake in the middle, and a ramp."""
+    """Half an hour: temperature rises, shake in the middle, ramp, rotation on its own stamps."""
     log = simulate({"noise": NOISE}, duration=SIZE / RATE, rate=RATE, seed=9).compute()
     seconds = np.arange(SIZE) / RATE
     log["temperature"] = ("time", 25.0 + seconds / 60.0, {"units": "degree_Celsius"})
     shake = np.where(abs(seconds - 900.0) < 300.0, 1.0, 0.01)
     log["vibration"] = ("time", shake, {"units": "g"})
     log["ramp"] = ("time", np.mod(seconds * 0.417, 1.0), {"units": "1"})
+    log = log.assign_coords(time_rotation_rate=log["time"].values + np.timedelta64(20, "ms"))
+    turning = np.where(abs(seconds - 900.0) < 600.0, 100.0, 0.0)
+    log["rotation_rate"] = ("time_rotation_rate", turning, {"units": "degree s-1"})
     return log
 
 
@@ -44,7 +55,8 @@ def recording_of(*effects: dict[str, Any]) -> xr.Dataset:
     like = environment()
     model = {"noise": NOISE, "effect": list(effects)}
     log = simulate(model, like=like, seed=1234).compute()
-    log = log.assign({name: like[name] for name in ("temperature", "vibration", "ramp")})
+    channels = ("temperature", "vibration", "ramp", "rotation_rate")
+    log = log.assign({name: like[name] for name in channels})
     log["rate"][:, ::600] = np.nan
     return log
 
@@ -54,7 +66,9 @@ def noise_alone() -> xr.Dataset:
     return recording_of()
 
 
-@pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect["name"])
+@pytest.mark.parametrize(
+    "effect", EFFECTS, ids=lambda effect: f"{effect['name']} {effect.get('fill', '')}".strip()
+)
 def test_record_with_the_effect_is_nearer_only_if_the_recording_has_it(
     effect: dict[str, Any], noise_alone: xr.Dataset
 ):
@@ -74,3 +88,64 @@ def test_model_that_cannot_be_simulated_is_reported(noise_alone: xr.Dataset):
     found = check_model(noise_alone, model)
     assert not found["runs"]
     assert "light_power" in found["reason"]
+
+
+#: An effect of a recording, and what of it is wrong in a model.
+WRONG_MODELS: list[tuple[dict[str, Any], dict[str, Any]]] = [
+    *((EFFECTS[0], {"sensitivity": size}) for size in (0.0015, 0.006, -0.003)),
+    *((EFFECTS[1], {"linear": size}) for size in (0.01, 0.04, -0.02)),
+    *((EFFECTS[2], {"white": size}) for size in (0.001, 0.004)),
+    *((EFFECTS[3], {"amplitude": size}) for size in (0.15, 0.6)),
+    (EFFECTS[3], {"frequency": 1.75}),
+    *((EFFECTS[5], {"per_hour": size}) for size in (100.0, 400.0)),
+    (EFFECTS[7], {"fill": "repeat"}),
+    *((EFFECTS[8], {"step": size}) for size in (0.25, 1.0)),
+    *((EFFECTS[9], {"amplitude": [size]}) for size in (0.025, 0.1)),
+    (EFFECTS[9], {"phase": [220.0]}),
+    *(
+        ({"name": "bias_jump", "step": [0.2], "at": 600.0}, wrong)
+        for wrong in ({"step": [0.1]}, {"step": [0.4]}, {"step": [-0.2]}, {"at": 1200.0})
+    ),
+    *((EFFECTS[-1], {"kick": size}) for size in (30.0, 120.0, -60.0)),
+]
+
+
+@pytest.mark.parametrize(
+    ("effect", "wrong"),
+    WRONG_MODELS,
+    ids=lambda one: " ".join(str(value) for value in one.values()),
+)
+def test_wrong_model_loses_against_the_right_one(effect: dict[str, Any], wrong: dict[str, Any]):
+    """Half or twice the size, the wrong sign, another instant, frequency or replacement."""
+    recording = recording_of(effect)
+    right = check_model(recording, {"noise": NOISE, "effect": [effect]})["nats"]
+    assert right > 5.0
+    assert check_model(recording, {"noise": NOISE, "effect": [effect | wrong]})["nats"] < right - 3
+
+
+def test_means_are_compared_across_gaps():
+    """No difference is lost in a gap: what begins at a restart shows against the time before."""
+    recording = recording_of()
+    recording["rate"][:, 9000:9300] = np.nan
+    found = record_statistics(recording["rate"].values, recording)
+    means = {name: values for name, values in found.items() if name.startswith("means")}
+    assert means
+    assert all(np.isfinite(values).all() for values in means.values())
+
+
+def test_amplitudes_locked_to_the_rotation_are_measured_where_the_tool_turns():
+    """The channel has stamps of its own; at rest, all orders would show the mean."""
+    recording = recording_of(EFFECTS[9])
+    found = record_statistics(recording["rate"].values, recording)["order 1/0"].reshape(2, -1)
+    assert np.isfinite(found).all(axis=0).sum() == pytest.approx(32 * 1200 / 1800, abs=2)
+    assert 2.0 * abs(np.nanmean(found[0] + 1j * found[1])) == pytest.approx(0.05, abs=0.01)
+
+
+def test_rare_large_values_do_not_widen_the_law_of_all():
+    """Held stretches, at other places in each record: most means are those of noise alone."""
+    rng = np.random.default_rng(3)
+    draws = {rare: rng.standard_normal((9, 1000)) for rare in (False, True)}
+    draws[True][rng.random((9, 1000)) < 0.005] += 30.0
+    several = [[{"means": one} for one in draws[rare][1:]] for rare in (True, False)]
+    assert likelihood_ratio({"means": draws[True][0]}, *several) > 10.0
+    assert abs(likelihood_ratio({"means": draws[False][0]}, *several)) < 5.0

@@ -215,6 +215,34 @@ def test_resets_of_a_real_gyro_match_the_model(recordings):
     assert abs(np.polyfit(saw, by_phase(measured - model), 1)[0]) < 0.003
 
 
+@pytest.mark.parametrize("full", [7.0, -7.0])
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+@pytest.mark.parametrize("decay", [0.0005, 0.01, 0.3])
+def test_profile_over_the_ramp_is_the_generated_one(decay, direction, full):
+    """Decays much shorter than a sample, of one, and of many: each bin is averaged exactly."""
+    bins, turns = 16, direction * 0.0137 * np.arange(1, 60_001)
+    phase = turns % 1.0 if full > 0.0 else 1.0 - turns % 1.0
+    for part in ("kick", "tail", "sawtooth"):
+        effect = make_effect(
+            {"name": "feedback_reset", part: 3.0, "decay": decay, "phase": "channel", "full": full}
+        )
+        rate = direction * 0.0137 * 100.0 * effect.turn * NRAD_PER_S
+        drivers = {"ramp": phase * abs(full)}
+        error = run(effect, size=turns.size, rate=100.0, axes="x", drivers=drivers)[0]
+        place = np.minimum((phase[20_000:] * bins).astype(int), bins - 1)
+        found = np.bincount(place, error[20_000:], bins) / np.bincount(place, minlength=bins)
+        windows = windows_of(
+            1000,
+            100.0,
+            10.0,
+            own={"x": np.array([rate])},
+            phase=(np.arange(bins) + 0.5) / bins,
+            turns=np.array([math.copysign(1.37, rate * full)]),
+        )
+        expected = 3.0 * effect.explain(windows).phase_locked[part]
+        np.testing.assert_allclose(found, expected, atol=0.02 * np.abs(expected).max())
+
+
 def test_ramp_from_rate_and_from_channel_agree():
     common = {"name": "feedback_reset", "kick": 3.0, "tail": 5.0, "sawtooth": 0.2}
     own = make_effect(common)

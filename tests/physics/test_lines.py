@@ -81,6 +81,22 @@ def test_a_resonance_has_the_allan_variance_of_its_density_and_one_motion():
     np.testing.assert_allclose(sigma(x, 20.0, taus)[0] ** 2, expected, rtol=0.08)
 
 
+def test_phase_of_a_steady_line_is_drawn_unless_given():
+    line = {"name": "spectral_line", "amplitude": [0.2, -0.4], "axes": ["x", "z"], "frequency": 1.0}
+    instants = np.exp(-2j * np.pi * (np.arange(1000) + 0.5) / 100.0)
+
+    def phases(seed, **given):
+        values = run(make_effect(line | given), size=1000, rate=100.0, seed=seed)
+        return np.angle(values @ instants)
+
+    drawn = np.array([phases(seed) for seed in range(1, 9)])
+    turned = np.angle(np.exp(1j * (drawn[:, 1] - drawn[:, 0] - np.pi)))
+    np.testing.assert_allclose(turned, 0.0, atol=1e-9)  # one motion, of the other sign
+    assert len(np.unique(drawn[:, 0].round(6))) == 8
+    assert abs(np.exp(1j * drawn[:, 0]).mean()) < 0.8
+    np.testing.assert_allclose(phases(1, phase=[30.0]), phases(2, phase=[30.0]))
+
+
 def test_lines_lock_to_a_changing_rotation():
     fast, factor = 50 * 64, 64
     speed = 90.0 + 6.0 * (np.arange(60 * fast) // factor) / 50  # held inside each sample

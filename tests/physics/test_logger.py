@@ -339,3 +339,21 @@ def test_large_clock_error_is_refused():
     assert make_effect({"name": "clock_error", "error": -50, "drift": 1}).say() == (
         "The clock of the samples is slow by 50 ppm, more by 1 ppm/h on all axes."
     )
+
+
+def test_a_frame_sent_twice_repeats_the_samples_before_it():
+    effect = make_effect({"name": "held_samples", "per_hour": 60.0, "length": 0.6, "fill": "frame"})
+    size = 200_000
+    numbers = np.tile(np.arange(float(size)), (2, 1))
+    found = run(effect, size=size, rate=10.0, axes="xy", signal=numbers)
+    np.testing.assert_array_equal(found[0], found[1])
+    late = numbers[0] - found[0]
+    edges = np.flatnonzero(np.diff(late, prepend=0.0, append=0.0))
+    runs = [(low, high) for low, high in pairwise(edges) if late[low] > 0.0]
+    assert len(runs) == pytest.approx(333, abs=60)
+    as_before = [(late[low:high] == high - low).all() for low, high in runs]
+    assert np.mean(as_before) > 0.95  # the others repeat a repeated sample
+    assert np.mean([high - low for low, high in runs]) == pytest.approx(6.0, rel=0.2)
+    cut = run(effect, size=size, rate=10.0, axes="xy", signal=numbers, cuts=[3, 777, 778, 90_000])
+    np.testing.assert_array_equal(cut, found)
+    assert "filled with the frame before on all axes" in effect.say()

@@ -90,6 +90,23 @@ def test_misalignment_leaks_the_rotation_of_the_tool():
     np.testing.assert_allclose(log.rate.isel(time=5).values, [3888.0, 0.0, 3.888e6], rtol=1e-9)
 
 
+def test_misalignment_leaks_the_recorded_rate_of_other_axes():
+    recording = simulate({"noise": {"N": 0.003}}, duration="20s", rate=10.0, seed=5).compute()
+    recording["rate"][2] += 4000.0 * np.sin(np.arange(200) / 7.0)
+    recording["rate"][2, 50:60] = np.nan  # the rate that leaks is interpolated here
+    effect = {"name": "misalignment", "z": 2.0, "axes": ["x"], "motion": "recorded"}
+    found = simulate({"noise": {}, "effect": [effect]}, like=recording, chunk=37).compute()
+    present = np.isfinite(recording["rate"].values[2])
+    np.testing.assert_allclose(
+        found["rate"].values[0, present], 2e-3 * recording["rate"].values[2, present], rtol=1e-9
+    )
+    assert not found["rate"].values[1:, present].any()
+    with pytest.raises(SchemaError, match="follows the recorded rate of axis 'z'; give a record"):
+        simulate({"noise": {"N": 0.003}, "effect": [effect]}, duration="20s", rate=10.0)
+    with pytest.raises(SchemaError, match="needs the rate of axis 'z', which the log does not"):
+        simulate({"noise": {}, "effect": [effect]}, like=recording.sel(axis=["x", "y"]))
+
+
 def tool_axes(inclination, azimuth, toolface):
     """Compute x, y, z in north, east, down: rotate by azimuth, inclination and toolface."""
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gyrostab.allan.davar import davar
-from gyrostab.errors import SchemaError
+from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.grid.regularise import gap_table
 from gyrostab.ingest.make_log import make_log
 from gyrostab.io.datasets import open_log, to_netcdf
@@ -51,6 +51,18 @@ def test_simulated_log_has_the_schema_of_a_log():
     assert missing.sum() == 3 * 110
     assert missing[:, 200:210].all()
     assert missing[:, 800:900].all()
+
+
+def test_constant_rate_of_an_axis_is_rounded_and_clipped_with_the_noise():
+    tables = {"noise": {"N": 0.003}, "log": {"rate": 10.0, "duration": "60s"}}
+    plain = simulate(tables).rate.values
+    biased = simulate(tables | {"bias": {"y": "0.002 deg/s"}}).rate.values
+    np.testing.assert_allclose(biased - plain, [[0.0], [7.2], [0.0]] * np.ones(600), atol=1e-12)
+    step = {"name": "rate_quantization", "step": 3.0}
+    rounded = simulate(tables | {"bias": {"y": 7.2}, "effect": [step]}).rate.values
+    np.testing.assert_array_equal(rounded, 3.0 * np.rint(biased / 3.0))
+    with pytest.raises(OptionError, match=r"\[bias\]: y = 'much' is not a number|bias of y"):
+        simulate(tables | {"bias": {"y": "much"}})
 
 
 def test_simulated_log_is_written_and_analysed(tmp_path):

@@ -9,6 +9,7 @@ the same seeds and thus the same noise: statistics that no effect changes cancel
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Mapping
 from itertools import combinations
@@ -28,7 +29,10 @@ _SEGMENTS = 32  # of a record, for statistics that change over time
 _MEANS = 1024  # of a record, from which differences of all lengths are taken
 _BANDS, _LINES = 10, 512  # octaves below half of the rate; frequencies of the mean spectrum
 _RAMP_BINS = 36
+_MIN_TURNS = 2.0  # in a segment, of which an amplitude at multiples of the rotation is measured
+_MIN_CHANNEL_SHARE = 0.9  # values per sample of a channel that is compared sample by sample
 _TAIL_FREEDOM = 5.0  # of Student's law, which bounds what a single statistic decides
+_ROUNDS = 50  # of the iteration for the scale
 _OUTLIER_SIGMA = 6.0
 #: Least scatter of roots of counts: that of a Poisson count is 1/2.
 _MIN_SCATTER = {"count": 0.5, "ramp": 1e-6, "levels": 0.02}
@@ -83,13 +87,30 @@ def likelihood_ratio(
         good = np.isfinite(drawn).all(axis=(0, 1)) & np.isfinite(values)
         logs = []
         for ensemble in drawn[..., good] if good.any() else ():
-            variance = ensemble.var(axis=0, ddof=1).mean() * (1.0 + 1.0 / len(ensemble))
-            scatter = max(float(np.sqrt(variance)), _MIN_SCATTER.get(name.split("/")[0], 1e-12))
-            z = (values[good] - ensemble.mean(axis=0)) / scatter
+            least = _MIN_SCATTER.get(re.split("[ /]", name)[0], 1e-12)
+            scatter = max(_fit_scatter(ensemble), least)
+            z = (values[good] - np.median(ensemble, axis=0)) / scatter
             logs.append(-np.log(scatter) - (_TAIL_FREEDOM + 1) / 2 * np.log1p(z**2 / _TAIL_FREEDOM))
         if logs:
             total += float((logs[0] - logs[1]).sum())
     return total
+
+
+def _fit_scatter(ensemble: Array) -> float:
+    """Return the scale of Student's law of new values about the medians of an ensemble.
+
+    It is the most likely one. Mean and variance would be far too large for most values where a few
+    records, at random, have a large one: the tails of the law describe these.
+    """
+    count = len(ensemble)
+    square = (ensemble - np.median(ensemble, axis=0)) ** 2 * (count + 0.5 * np.pi) / (count - 1.0)
+    scale = max(float(square.mean()), 1e-300)
+    for _ in range(_ROUNDS):
+        scale = max(
+            float(((_TAIL_FREEDOM + 1.0) * square / (_TAIL_FREEDOM + square / scale)).mean()),
+            1e-300,
+        )
+    return float(np.sqrt(scale))
 
 
 def record_statistics(rate: Array, log: xr.Dataset) -> dict[str, Array]:
@@ -126,13 +147,15 @@ def _cut_segments(values: Array, count: int) -> Array:
 
 
 def _mean_differences(values: Array) -> dict[str, Array]:
-    """Return differences of adjacent means, by the length of the means."""
-    means = np.nanmean(_cut_segments(values, min(_MEANS, max(values.size // 16, 2))), axis=1)
+    """Return differences of adjacent means, by the number of means; across gaps where they are."""
+    segments = _cut_segments(values, min(_MEANS, max(values.size // 16, 2)))
+    count = np.isfinite(segments).sum(axis=1)
+    means = np.nanmean(segments[count >= max(count.max() / 2.0, 1.0)], axis=1)
     out = {}
     while means.size >= 2:
         pairs = means[: means.size // 2 * 2].reshape(-1, 2)
         out[f"means {means.size}"] = pairs[:, 1] - pairs[:, 0]
-        means = np.nanmean(pairs, axis=1)
+        means = pairs.mean(axis=1)
     return out
 
 
@@ -166,33 +189,34 @@ def _measure_coherencies(one: NDArray[Any], other: NDArray[Any]) -> Array:
 
 
 def _sample_counts(values: Array) -> dict[str, Array]:
-    """Return roots of counts of zeros, repeats, range ends and outliers; log number of levels."""
+    """Return roots of counts: zeros, repeats, range ends, outliers, copies; log number of levels.
+
+    They are of the whole record. Losses are drawn at other instants in each simulated record, so
+    that most segments have none and few have many: a common scatter would not describe them.
+    """
     steps = np.diff(values, append=np.nan)
     good = values[np.isfinite(values)]
     scatter = 1.4826 * np.nanmedian(np.abs(values - np.nanmedian(values))) + 1e-300
-    odd = [
-        values == 0.0,
-        (steps == 0.0) & (values != 0.0),
-        (values == good.min()) | (values == good.max()),
-        np.abs(steps) > _OUTLIER_SIGMA * np.nanmedian(np.abs(steps)) + _OUTLIER_SIGMA * scatter,
-    ]
-    counts = [_cut_segments(one, _SEGMENTS).sum(axis=1) for one in odd]
+    counts = {
+        "zeros": (values == 0.0).sum(),
+        "repeats": ((steps == 0.0) & (values != 0.0)).sum(),
+        "ends": ((good == good.min()) | (good == good.max())).sum(),
+        "outliers": (
+            np.abs(steps) > _OUTLIER_SIGMA * np.nanmedian(np.abs(steps)) + _OUTLIER_SIGMA * scatter
+        ).sum(),
+        "copies": good.size - np.unique(good).size,
+    }
     return {
-        "count": np.sqrt(np.concatenate(counts) + 0.375),
+        **{f"count {name}": np.sqrt([count + 0.375]) for name, count in counts.items()},
         "levels": np.array([np.log(np.unique(good[:20_000]).size)]),
     }
 
 
 def _channel_couplings(values: Array, log: xr.Dataset, hertz: float) -> dict[str, Array]:
     """Return the coupling to ramp, rotation, and sample by sample to other channels."""
-    from gyrostab.schema import log_channels
-
     out = {}
     centred = values - np.nanmean(values)
-    for name in log_channels(log):
-        if log[name].dims != ("time",):
-            continue
-        channel = log[name].values.astype(np.float64)
+    for name, channel in _channels_at_samples(log).items():
         if name == "ramp":
             low, high = np.nanmin(channel), np.nanmax(channel)
             place = np.nan_to_num((channel - low) / max(high - low, 1e-300) * _RAMP_BINS)
@@ -203,12 +227,31 @@ def _channel_couplings(values: Array, log: xr.Dataset, hertz: float) -> dict[str
             out["ramp"] = total / np.maximum(count, 1)
         elif name == "rotation_rate":
             turned = np.cumsum(np.nan_to_num(channel)) / hertz / 360.0
+            turns = np.abs(np.diff(_cut_segments(turned, _SEGMENTS)[:, [0, -1]], axis=1)[:, 0])
             for order in (1, 2, 3):
                 wave = np.exp(-2j * np.pi * order * turned) * np.nan_to_num(centred)
                 sums = _cut_segments(wave, _SEGMENTS).mean(axis=1)
+                sums[turns < _MIN_TURNS] = np.nan  # at rest it is the mean
                 out[f"order {order}"] = np.concatenate([sums.real, sums.imag])
         else:
             products = np.diff(channel) * np.diff(values)
             sums = np.nanmean(_cut_segments(products, _SEGMENTS), axis=1)
             out[f"coupling {name}"] = sums
     return out
+
+
+def _channels_at_samples(log: xr.Dataset) -> dict[str, Array]:
+    """Return the channels with a value for each sample of the rate, whatever their stamps."""
+    from gyrostab.schema import log_channels
+
+    at = log["time"].values.astype("datetime64[ns]").astype(np.int64)
+    found = {}
+    for name in log_channels(log):
+        channel = log[name]
+        if channel.ndim != 1 or channel.size < _MIN_CHANNEL_SHARE * at.size:
+            continue
+        known = channel[channel.dims[0]].values.astype("datetime64[ns]").astype(np.int64)
+        nearest = np.clip(np.searchsorted(known, at), 1, known.size - 1)
+        nearest -= at - known[nearest - 1] < known[nearest] - at
+        found[name] = channel.values.astype(np.float64)[nearest]
+    return found

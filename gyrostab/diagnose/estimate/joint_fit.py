@@ -25,6 +25,7 @@ from gyrostab.diagnose.reduce.zero_bin import truncated_axes
 from gyrostab.diagnose.statistics import Statistic
 from gyrostab.diagnose.statistics.base import SizeFit
 from gyrostab.diagnose.statistics.rotation_order import fit_amplitude, harmonic_sets, is_reversed
+from gyrostab.diagnose.statistics.spectral_line import line_quality
 from gyrostab.errors import GyrostabError
 from gyrostab.noise import NORMAL_95
 from gyrostab.physics.base import Effect
@@ -57,14 +58,19 @@ class Fitted:
     axes: tuple[str, ...]
     #: Keys are ``name``, or ``name.axis`` for a size of each of several axes.
     parameters: Mapping[str, Estimate]
-    effect: Effect | None  # with these sizes, as a model takes it; None where they make no effect
+    #: As a model takes it, with values that belong together: those at the likeliest point of a grid
+    #: where the sizes are averages over it. None where they make no effect.
+    effect: Effect | None
     note: str = ""  # what the sizes do not show
+    shown: Effect | None = None  # the same with the sizes, if they differ
 
     def say(self) -> str:
         """Describe the effect with its sizes in one sentence; empty without sizes."""
         if self.effect is None or not self.parameters:
             return ""
-        text = self.effect.say({name: one.stderr for name, one in self.parameters.items()})
+        text = (self.shown or self.effect).say(
+            {name: one.stderr for name, one in self.parameters.items()}
+        )
         return f"{text} {self.note}" if self.note else text
 
 
@@ -190,6 +196,7 @@ def _fit_components(
     kind = effects()[identification.effect]
     units = {item.name: item.unit for item in kind.parameters()}
     values: dict[str, Any] = {}
+    likeliest: dict[str, Any] = {}
     estimates: dict[str, Estimate] = {}
     by_statistic: dict[Statistic, list[Component]] = {}
     for component in components:
@@ -205,7 +212,9 @@ def _fit_components(
     if filtered:
         sizes, values = fit_filter_sizes(by_statistic[statistic], state)
     else:
-        own = _estimate_sizes(by_statistic[statistic], axes, state, identifications)
+        own, together = _estimate_sizes(by_statistic[statistic], axes, state, identifications)
+        for name, value in together.items():
+            _store_value(likeliest, name, value, axes)
         sizes = {
             **_sizes_on_other_axes(by_statistic, statistic, axes, state, identifications),
             **own,
@@ -226,13 +235,19 @@ def _fit_components(
         for name, value in by_statistic[statistic][0].variant.values.items()
         if name not in values
     }
-    values |= _model_settings(identification, by_statistic[statistic][0], state)
+    settings = _model_settings(identification, by_statistic[statistic][0], state)
+    if settings.get("phase") == "channel":
+        rising = (values | likeliest).get("full", 1.0)  # a sign, or an average of signs
+        settings["full"] = math.copysign(_ramp_height(state), rising)
+    averaged = _make_effect(kind, values | settings, axes, identification.driver)
+    effect = _make_effect(kind, values | likeliest | settings, axes, identification.driver)
     return Fitted(
         identification,
         axes,
         estimates,
-        _make_effect(kind, values, axes, identification.driver),
+        averaged if effect is None else effect,
         next((note for _, note in plain if note), ""),
+        averaged,
     )
 
 
@@ -252,7 +267,7 @@ def _sizes_on_other_axes(
     ):
         lacking = {axis for component in by_statistic[other] for axis in component.row} - seen
         if lacking:
-            sizes = _estimate_sizes(by_statistic[other], axes, state, identifications)
+            sizes, _ = _estimate_sizes(by_statistic[other], axes, state, identifications)
             found |= {
                 name: size for name, size in sizes.items() if name.partition(".")[2] in lacking
             }
@@ -265,12 +280,12 @@ def _estimate_sizes(
     axes: tuple[str, ...],
     state: State,
     identifications: Identifications,
-) -> Mapping[str, tuple[float, ...]]:
-    """Return parameters with their errors from components in one statistic."""
+) -> tuple[Mapping[str, tuple[float, ...]], Mapping[str, float | str]]:
+    """Return parameters with their errors from components in one statistic, and likely values."""
     fit = SizeFit(
         components, axes, state, identifications.candidates, identifications.count_evidence
     )
-    return components[0].statistic.estimate(fit)
+    return components[0].statistic.estimate(fit), fit.likeliest
 
 
 def _is_positive(kind: type[Effect], name: str) -> bool:
@@ -279,7 +294,7 @@ def _is_positive(kind: type[Effect], name: str) -> bool:
     )
 
 
-def _store_value(values: dict[str, Any], name: str, value: float, axes: tuple[str, ...]) -> None:
+def _store_value(values: dict[str, Any], name: str, value: Any, axes: tuple[str, ...]) -> None:
     """Store a value by its name; ``name.axis`` goes to its place in a list."""
     base, _, axis = name.partition(".")
     if not axis:
@@ -295,14 +310,19 @@ def _model_settings(
     """Return settings that the model needs in addition to the sizes."""
     if identification.effect == "rotation_line":
         return {"harmonics": 1.0}
-    if identification.effect == "feedback_reset" and "ramp_turns" in state.blocks:
-        low, high = (float(state.blocks["ramp_turns"].attrs[name]) for name in ("low", "high"))
+    if identification.effect == "spectral_line" and component.statistic.is_line:
         return {
-            "phase": "channel",
-            "full": float(component.variant.values.get("full", 1.0)) * (high - low),
+            "quality": line_quality(state.blocks, state.baseline, component.row[0], component.place)
         }
+    if identification.effect == "feedback_reset" and "ramp_turns" in state.blocks:
+        return {"phase": "channel"}
     if identification.effect == "held_samples":
-        return {"fill": "zero" if component.variant.columns[0] == "filled" else "repeat"}
+        return {"fill": _fill_of(component, state)}
+    if identification.effect == "clipping":
+        own = state.blocks.sel(axis=component.row[0])
+        return {"centre": float(own["mean"].weighted(own["samples"]).mean())}
+    if identification.effect == "misalignment":
+        return {"motion": "recorded"}
     if (
         identification.effect == "rate_quantization"
         and truncated_axes(state.blocks)[state.axes.index(component.row[0])]
@@ -314,6 +334,20 @@ def _model_settings(
         off, around = np.degrees(EarthRate.example().directions(identification.axes))
         return {"off": list(off), "around": list(-around)}
     return {}
+
+
+def _ramp_height(state: State) -> float:
+    """Return the channel's reading of a full ramp."""
+    low, high = (float(state.blocks["ramp_turns"].attrs[name]) for name in ("low", "high"))
+    return high - low
+
+
+def _fill_of(component: Component, state: State) -> str:
+    """Return what lost samples are replaced by."""
+    if component.variant.columns[0] == "filled":
+        return "zero"
+    own = state.blocks.sel(axis=component.row[0])
+    return "frame" if 2.0 * float(own["resent"].sum()) > float(own["repeats"].sum()) else "repeat"
 
 
 def _make_effect(

@@ -36,7 +36,7 @@ from gyrostab.diagnose.predict.windows import make_windows, rebuild_variant
 from gyrostab.diagnose.reduce.block_statistics import MIN_BLOCKS
 from gyrostab.physics.base import Effect
 
-__all__ = ["recalibrate", "remove_fast_switching", "with_noise"]
+__all__ = ["recalibrate", "refer_to_kept_noise", "remove_fast_switching", "with_noise"]
 
 Array = NDArray[np.float64]
 LEVEL_GROUPS = 150  # of blocks of similar level, over which powers are averaged
@@ -149,6 +149,35 @@ def remove_fast_switching(identifications: Identifications, baseline: xr.Dataset
     alone = replace(identifications, identified=switching, unknown=())
     noise = recalibrate(alone, baseline, fit_identifications(alone, baseline))
     return noise if noise is baseline else noise.assign_attrs(recalibrated=[])
+
+
+def refer_to_kept_noise(
+    fitted: Sequence[Fitted], noise: xr.Dataset, blocks: xr.Dataset
+) -> list[Fitted]:
+    """Refer changes of the noise to the channels at rest, on axes that keep their noise.
+
+    The noise of such an axis is that of its quiescent blocks. Where the channel is far from the
+    default reference of an effect, the noise there is not known, and neither is its share.
+    """
+    if noise.attrs.get("source") != "calibrated":
+        return list(fitted)
+    recalibrated = noise.attrs.get("recalibrated", ())
+    quiet = dict(zip(noise["axis"].values.tolist(), noise["quiet"].values, strict=True))
+    out = []
+    for one in fitted:
+        kept = [axis for axis in one.axes if axis not in recalibrated]
+        if one.effect is None or one.effect.stage != "noise" or not kept:
+            out.append(one)
+            continue
+        at_rest = quiet[kept[0]]
+        means = {
+            role: float(np.nanmean(blocks[f"channel_{name}"].values[at_rest]))
+            for role, name in find_drivers(one.effect).items()
+        }
+        effect = one.effect.refer_noise_to(means)
+        shown = None if one.shown is None else one.shown.refer_noise_to(means)
+        out.append(replace(one, effect=effect, shown=shown))
+    return out
 
 
 def _kept_posterior(baseline: xr.Dataset, row: int) -> Posterior:

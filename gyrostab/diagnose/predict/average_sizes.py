@@ -27,7 +27,7 @@ SUPPORT_TAIL = 0.1 * INTERVAL_TAILS[0]
 
 def average_sizes(
     component: Component, state: State, candidates: Sequence[Candidate]
-) -> tuple[Array, Array, Array, dict[str, tuple[float, ...]]]:
+) -> tuple[Array, Array, Array, dict[str, tuple[float, ...]], tuple[Array, Variant]]:
     """Return the sizes of a component, averaged over the noise and the nuisance parameters.
 
     Exponents have their defaults and lags are zero unless other values are better by 3 nats and an
@@ -54,6 +54,9 @@ def average_sizes(
     nuisance : dict of str to (float, float) or (float, float, float, float)
         Value and standard deviation of the nuisance parameters, with the ends of the 95 % interval
         if it is asymmetric; NaN as the standard deviation of one that is set but not measured.
+    likeliest : (ndarray, Variant)
+        Sizes at the likeliest point of the grid, and that point. These values belong together;
+        sizes at some value of a nuisance parameter may be far from the effect with both averages.
     """
     grid = [
         Point(variant, component_mixture(component, state, variant))
@@ -109,7 +112,9 @@ def average_sizes(
             if has_no_lag
             else (middle_of, spread, *_interval_ends(tried, share, middle_of))
         )
-    return mean, covariance, ends, nuisance
+    at_best = max(without_lag or range(len(points)), key=lambda place: evidence[place])
+    best, _ = points[at_best].sizes.moments()
+    return mean, covariance, ends, nuisance, (best, family[at_best])
 
 
 def _size_interval(mean: Array, covariance: Array, supported: Sequence[Mixture]) -> Array:

@@ -72,6 +72,7 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
         "adjacent": work.adjacent,
         "repeats": _count_repeats(moments, counts) + resent[..., 0],
         "repeat_runs": counts[..., 7] + resent[..., 1],
+        "resent": resent[..., 0],
         "zero_runs": counts[..., 8],
         "extremes": _count_at_range_ends(moments, counts[..., 3], counts[..., 4]),
         "zeros": counts[..., 1],

@@ -64,6 +64,7 @@ BLOCK_STATISTICS: dict[str, Variable] = {
     "repeat_runs": Variable(
         _BLOCK, "1", "runs of samples equal to the one before, except zeros, and frames sent twice"
     ),
+    "resent": Variable(_BLOCK, "1", "samples of frames sent twice"),
     "zero_runs": Variable(_BLOCK, "1", "runs of samples that are exactly 0"),
     "extremes": Variable(_BLOCK, "1", "samples equal to the smallest or largest of the record"),
     "zeros": Variable(_BLOCK, "1", "samples that are exactly 0"),

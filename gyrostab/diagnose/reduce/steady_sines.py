@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincinv
+from scipy.special import gammaincinv, logsumexp
 
 from gyrostab.kernels.spectra.line_levels import LEAK_LINES, level_around
 from gyrostab.kernels.spectra.periodogram import ordinates, taper
@@ -19,7 +19,7 @@ from gyrostab.kernels.spectra.periodogram import ordinates, taper
 __all__ = ["SineSearch", "sine_factors"]
 
 Array = NDArray[np.float64]
-_MAX_SAMPLES = 2**20  # of a segment; bounds memory
+_MAX_SAMPLES = 2**21  # of a segment; bounds memory
 #: Segments are transformed whole, and in parts, for lines whose phase wanders.
 _PARTS = (1, 8)
 #: Frequencies per line: a sine between two lines is 2.1 times weaker in both, with two 1.2 times.
@@ -179,8 +179,8 @@ def sine_factors(ratio: Array, count: Array | int) -> Array:
     >>> sine_factors(np.array([1.0, 40.0]), 1).round(1).tolist()  # noise, and a sine of 39 nats
     [-2.6, 33.8]
     """
-    total = np.full(np.shape(ratio), -np.inf)
-    for strength in _STRENGTHS:  # one after the other, which bounds memory
-        gain = count * (ratio * strength / (count + strength) - np.log1p(strength / count))
-        np.logaddexp(total, gain, out=total)
-    return np.asarray(total - math.log(len(_STRENGTHS)))
+    each = [
+        count * (ratio * strength / (count + strength) - np.log1p(strength / count))
+        for strength in _STRENGTHS
+    ]
+    return np.asarray(logsumexp(each, axis=0) - math.log(len(_STRENGTHS)))

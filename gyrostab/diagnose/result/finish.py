@@ -16,7 +16,7 @@ from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.estimate.expected_effects import expected_baseline, fit_expected
 from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_identifications
 from gyrostab.diagnose.estimate.outlier_power import add_outlier_power
-from gyrostab.diagnose.estimate.recalibrate import recalibrate, with_noise
+from gyrostab.diagnose.estimate.recalibrate import recalibrate, refer_to_kept_noise, with_noise
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
 from gyrostab.diagnose.identify.identification import (
     Identification,
@@ -94,10 +94,16 @@ def finish_diagnosis(task: Task, comparison: Comparison, started: float) -> Diag
     diagnosis = Diagnosis(
         plain(content),
         _make_surfaces_with_outliers(blocks, fit, before, after),
-        model_tables(fit.noise, fit.fitted, own),
+        model_tables(fit.noise, fit.fitted, own, blocks, _turning_axis(task)),
     )
     check_diagnosis(diagnosis.content)
     return diagnosis
+
+
+def _turning_axis(task: Task) -> str:
+    """Return the axis that feels the channel ``rotation_rate``; empty without one."""
+    channel = task.log.get("rotation_rate")
+    return "" if channel is None else str(channel.attrs.get("rotation_axis", ""))
 
 
 def _used_channels(identifications: Identifications) -> set[str]:
@@ -141,13 +147,19 @@ def refit_with_noise(
 ) -> Fit:
     """Calibrate the noise with the effects of the `first` fit in the model, and fit them again."""
     noise = recalibrate(identifications, baseline, first)
+    blocks = identifications.state.blocks
     if noise is baseline:
-        return Fit(identifications, baseline, first, fit_expected(identifications, baseline))
+        return Fit(
+            identifications,
+            baseline,
+            refer_to_kept_noise(first, baseline, blocks),
+            fit_expected(identifications, baseline),
+        )
     identifications = with_noise(identifications, noise)
     return Fit(
         identifications,
         noise,
-        fit_identifications(identifications, noise),
+        refer_to_kept_noise(fit_identifications(identifications, noise), noise, blocks),
         fit_expected(identifications, baseline),
     )
 

@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.estimate.constant_rate import constant_rates, noise_lost_by_truncation
 from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.estimate.upper_limits import UpperLimit
 from gyrostab.diagnose.identify.components import are_lines
@@ -37,6 +38,7 @@ from gyrostab.diagnose.statistics.wording import axes_text
 from gyrostab.noise import LAWS
 from gyrostab.physics.base import Effect
 from gyrostab.simulate.model import Model
+from gyrostab.units import HOUR
 
 __all__ = [
     "baseline_table",
@@ -398,9 +400,21 @@ def rejected_tables(identifications: Identifications) -> list[dict[str, Any]]:
 
 
 def model_tables(
-    baseline: xr.Dataset, fitted: Sequence[Fitted], own: Model | None
+    baseline: xr.Dataset,
+    fitted: Sequence[Fitted],
+    own: Model | None,
+    blocks: xr.Dataset,
+    turning: str = "",
 ) -> dict[str, Any]:
-    """Return the tables of the model with the effects added; `own` is the model that was given."""
+    """Return the tables of the model with the effects added.
+
+    Parameters
+    ----------
+    own : Model or None
+        The model that was given.
+    turning : str
+        Axis that feels the channel ``rotation_rate``, if any.
+    """
     noise = {
         str(axis): {
             str(term): float(f"{float(baseline['coefficient'].sel(axis=axis, term=term)):.6g}")
@@ -410,6 +424,11 @@ def model_tables(
     }
     before = list(own.effects) if own is not None else []
     found = [one.effect for one in fitted if one.effect is not None]
+    if baseline.attrs.get("source") == "calibrated":
+        rate = float(blocks.attrs["sampling_rate_hz"])
+        for axis, variance in noise_lost_by_truncation(blocks, found).items():
+            square = max(noise[axis]["N"] ** 2 + variance / (HOUR * rate), 0.0)
+            noise[axis]["N"] = float(f"{math.sqrt(square):.6g}")
     instrument = max(
         [
             int(own.log.get("oversampling", 1)) if own is not None else 1,
@@ -417,7 +436,13 @@ def model_tables(
         ]
     )
     log = {"log": {"oversampling": instrument}} if instrument > 1 else {}
-    return {**log, "noise": noise, "effect": [effect_table(effect) for effect in [*before, *found]]}
+    rates = constant_rates(blocks, [*before, *found], turning)
+    return {
+        **log,
+        "noise": noise,
+        "bias": {axis: float(f"{rate:.6g}") for axis, rate in rates.items()},
+        "effect": [effect_table(effect) for effect in [*before, *found]],
+    }
 
 
 def _instrument_samples(effect: Effect) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -49,7 +50,8 @@ class NullDraw(NamedTuple):
     sample_sd: Array
 
 
-class SizeFit(NamedTuple):
+@dataclass(frozen=True)
+class SizeFit:
     """What the sizes of an effect are estimated from."""
 
     components: Sequence[Component]  # of one effect, all in one statistic
@@ -58,6 +60,8 @@ class SizeFit(NamedTuple):
     #: All that were tried; they have the grids of nuisance parameters.
     candidates: Sequence[Candidate]
     counts: CountEvidence  # expected sample counts
+    #: Filled by an estimate that averages over a grid: the values at its likeliest point.
+    likeliest: dict[str, float | str] = field(default_factory=dict)
 
 
 class Statistic:
@@ -273,17 +277,28 @@ class Statistic:
             ``name``, or ``name.axis``.
         """
         out: dict[str, tuple[float, ...]] = {}
+        points: list[dict[str, float | str]] = []
         for component in fit.components:
             if component.variant.columns[:1] == ("any",):
                 continue
-            mean, covariance, ends, nuisance = average_sizes(component, fit.state, fit.candidates)
+            mean, covariance, ends, nuisance, (best, variant) = average_sizes(
+                component, fit.state, fit.candidates
+            )
             for number, name in enumerate(component.variant.columns):
                 value, sd = float(mean[number]), float(np.sqrt(covariance[number, number]))
                 size: tuple[float, ...] = (value, sd, *ends[:, number].tolist())
+                likeliest = float(best[number])
                 if component.variant.squared:
                     size = _square_root(value, sd)
-                out[name if len(fit.axes) == 1 else f"{name}.{component.row[0]}"] = size
+                    likeliest = float(np.sqrt(max(likeliest, 0.0)))
+                key = name if len(fit.axes) == 1 else f"{name}.{component.row[0]}"
+                out[key], fit.likeliest[key] = size, likeliest
             out |= nuisance
+            points.append(dict(variant.values))
+        if all(one == points[0] for one in points):
+            fit.likeliest.update(points[0] if points else {})
+        else:  # axes that differ in a common parameter
+            fit.likeliest.clear()
         return out
 
     # ---------------------------------------------------------------------- explanation

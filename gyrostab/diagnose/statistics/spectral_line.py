@@ -24,6 +24,7 @@ from gyrostab.diagnose.predict.candidates import (
 from gyrostab.diagnose.predict.condition import bands_at, free_covariance
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import Trial
+from gyrostab.diagnose.reduce.block_statistics import MIN_BLOCKS
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics.base import SizeFit, Sizes, Statistic
 from gyrostab.diagnose.statistics.scores import (
@@ -41,6 +42,8 @@ from gyrostab.kernels.spectra.line_levels import LEAK_LINES, local_level
 __all__ = ["SpectralLine"]
 
 _LEAK_LINES = 2  # lines on either side that a line leaks into
+_CERTAIN_SIGMA = 3.0  # by which the power of a line varies more than that of noise; design choice
+_MAX_COHERENCE_BLOCKS = 3.0  # longest coherence time that the scatter of block powers determines
 _AROUND_LINES = 40  # lines on either side that define the level; design choice
 
 
@@ -279,13 +282,12 @@ def estimate_line(
     lines, power, weight = (
         here[name].values for name in ("line_frequency", "line_power", "line_weight")
     )
-    if "sine_nats" in here:
+    if _has_constant_phase(here, place):
         sine = here.isel(line=place)
-        if sine["sine_nats"] > line_evidence(power[None, None], weight[None])[0, 0, place]:
-            return _root_of_square(float(sine["sine_square"]), float(sine["sine_square_stderr"])), (
-                float(sine["sine_frequency"]),
-                0.5 * float(sine["sine_resolution"]),
-            )
+        return _root_of_square(float(sine["sine_square"]), float(sine["sine_square_stderr"])), (
+            float(sine["sine_frequency"]),
+            0.5 * float(sine["sine_resolution"]),
+        )
     good = (weight > 0) & np.isfinite(power).all(axis=1)
     total = (power[good] * weight[good, None]).sum(axis=0) / weight[good].sum()
     level = local_level(total[None, None])[0, 0]
@@ -300,7 +302,53 @@ def estimate_line(
     return _root_of_square(4.0 * float(above.sum()) * step, noise), (frequency, 0.5 * step)
 
 
+def _has_constant_phase(axis_blocks: xr.Dataset, place: int) -> bool:
+    """Return whether a sine of constant phase has more evidence than a line of this axis."""
+    if "sine_nats" not in axis_blocks:
+        return False
+    power, weight = (axis_blocks[name].values for name in ("line_power", "line_weight"))
+    evidence = line_evidence(power[None, None], weight[None])[0, 0, place]
+    return bool(axis_blocks["sine_nats"].values[place] > evidence)
+
+
 def _root_of_square(square: float, stderr: float) -> tuple[float, float]:
     """Return the amplitude and its error from its square."""
     amplitude = math.sqrt(max(square, 0.0))
     return amplitude, stderr / (2.0 * max(amplitude, math.sqrt(stderr)))
+
+
+def line_quality(blocks: xr.Dataset, baseline: xr.Dataset, axis: str, place: int) -> float:
+    """Estimate the quality of a line from how much its power varies from block to block.
+
+    The power of a steady line is constant. That of an oscillator driven by noise, averaged over
+    blocks of the length T, has the relative variance ``x - x^2 / 2 (1 - exp(-2 / x))`` for x = t /
+    T and the coherence time t = Q / (pi f).
+
+    Returns
+    -------
+    float
+        Infinite for a sine of constant phase, a line whose power varies no more than noise of the
+        band does, and one that is weaker than that noise.
+    """
+    if _has_constant_phase(blocks.sel(axis=axis), place):
+        return math.inf
+    frequency = float(blocks["line_frequency"].values[place])
+    band = int(np.abs(np.log(blocks["frequency"].values / frequency)).argmin())
+    power, shape = (blocks[name].sel(axis=axis).values[:, band] for name in ("power", "shape"))
+    noise = baseline["spectrum"].sel(axis=axis).values[:, band]
+    good = np.isfinite(power) & (shape > 0.0)
+    if good.sum() < MIN_BLOCKS:
+        return math.inf
+    power, shape = power[good], shape[good]
+    line = float(power.mean() - noise[good].mean())
+    if not line > 0.5 * power.mean():
+        return math.inf
+    by_chance = float((power.mean() ** 2 / shape).mean())
+    error = math.sqrt(2.0 / power.size) * by_chance
+    excess = float(power.var(ddof=1)) - by_chance
+    if excess < _CERTAIN_SIGMA * error:
+        return math.inf
+    ratios = np.geomspace(1e-3, _MAX_COHERENCE_BLOCKS, 200)
+    variance = ratios + 0.5 * ratios**2 * np.expm1(-2.0 / ratios)
+    coherence = float(np.interp(excess / line**2, variance, ratios))
+    return math.pi * frequency * coherence * float(blocks.attrs["block_s"])

@@ -191,6 +191,7 @@ def test_frames_that_are_sent_twice_are_held_samples(number: int) -> None:
     often = found[0].parameters["per_hour"]
     assert 0.0 < often.low < number / hours < often.high
     assert found[0].parameters["length"].value == pytest.approx(0.4)
+    assert {one.effect.fill for one in found if one.effect} == {"frame"}
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.settings import DEFAULTS
-from gyrostab.diagnose.statistics.spectral_line import estimate_line
+from gyrostab.diagnose.statistics.spectral_line import estimate_line, line_quality
 from gyrostab.simulate import simulate
 from tests.support.named import COEFFICIENT, record
 
@@ -241,13 +241,28 @@ def test_effects_not_found_have_a_limit_or_a_reason(shaken):
 
 
 def test_size_of_a_line():
-    table = {"name": "spectral_line", "amplitude": 0.4, "frequency": 2.345, "axes": ["x"]}
+    table = {"name": "spectral_line", "amplitude": 0.4, "frequency": 2.345, "phase": 0.0}
+    table["axes"] = ["x"]
     blocks = record([table])
     power = blocks["line_power"].sel(axis="x").mean("part")
     place = int(power.values.argmax())
     (amplitude, error), (frequency, _) = estimate_line(blocks, "x", place)
     assert amplitude == pytest.approx(0.4, abs=max(4 * error, 0.04))
     assert frequency == pytest.approx(2.345, abs=0.03)
+
+
+def test_quality_of_a_line_follows_from_the_scatter_of_its_power():
+    """A resonance narrower than a line of the spectrum looks steady, but its power scatters."""
+    line = {"name": "spectral_line", "amplitude": 0.8, "frequency": 2.345, "axes": ["x"]}
+    found = {}
+    for quality in (np.inf, 150.0, 60.0):
+        given = {} if np.isinf(quality) else {"quality": quality}
+        blocks = record([line | given])
+        place = int(blocks["line_power"].sel(axis="x").mean("part").values.argmax())
+        found[quality] = line_quality(blocks, calibrate_noise(record([])), "x", place)
+    assert np.isinf(found[np.inf])
+    assert 75.0 < found[150.0] < 300.0
+    assert 30.0 < found[60.0] < 120.0
 
 
 def test_line_frequency_is_known_to_one_bin():

@@ -11,6 +11,7 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
+from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.physics.registry import make_effect
 from tests.diagnose.estimate.test_joint_fit import identify_by_hand
 from tests.support.named import record
@@ -95,6 +96,30 @@ def test_determined_lag_is_estimated(noise_only):
     assert found.parameters["lag"].low > 100.0
     assert found.parameters["lag"].value == pytest.approx(475.5, rel=0.2)
     assert found.parameters["sensitivity"].value == pytest.approx(0.3, rel=0.1)
+
+
+def test_values_of_the_model_belong_together(noise_only):
+    """Averages over two lags are not the effect with the average lag."""
+    found = fit_effect(
+        noise_only,
+        "shupe",
+        "mean",
+        "sensitivity",
+        true={"lag": 475.5, "sensor_lag": 0.0},
+        size=0.06,
+        named={"lag": 475.5, "sensor_lag": 0.0},
+    )
+    effect, lag = found.effect, found.parameters["lag"]
+    assert effect.lag != pytest.approx(lag.value, rel=0.01)
+    assert lag.low < effect.lag < lag.high
+    assert f"a lag of {lag.value:.4g} ±" in found.say()
+    blocks, _ = noise_only
+    windows = make_windows(blocks, {"temperature": "temperature"})
+    made, true = (
+        one.sensitivity * one.explain(windows).mean["sensitivity"]
+        for one in (effect, replace(effect, sensitivity=0.06, lag=475.5, sensor_lag=0.0))
+    )
+    assert np.std(made - true) < 0.3 * np.std(true)
 
 
 def test_exponent_of_the_model_is_that_of_the_size(noise_only):

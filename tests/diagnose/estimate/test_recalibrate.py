@@ -125,6 +125,29 @@ def test_relative_size_refers_to_the_recalibrated_noise():
     assert growth == pytest.approx(0.05 * 0.003**2, rel=0.1)
 
 
+def test_noise_that_changes_far_from_its_reference_has_the_level_of_the_record():
+    """Nothing determines N at 25 degrees: the model keeps that of the record at its temperature."""
+    heat = {
+        "profile": "ramps",
+        "channel": "temperature",
+        "unit": "degC",
+        "points": [[0, 58], [600, 58], [601, 62], [1200, 62], [1201, 66], [1800, 66]],
+    }
+    truth = {"name": "temperature_noise", "linear": 0.12, "reference": 62.0, "axes": ["x"]}
+    blocks = reduce_simulation(truth, environment=[heat])
+    baseline = calibrate_noise(blocks)
+    identifications = identify_by_hand(blocks, baseline, "temperature_noise", "power", ("linear",))
+    fit = conclude.refit_with_noise(
+        identifications, baseline, fit_identifications(identifications, baseline)
+    )
+    assert "x" not in fit.noise.attrs.get("recalibrated", ())
+    effect, level = fit.fitted[0].effect, noise_coefficient(fit.noise, "N")[0] ** 2
+    for degrees in (58.0, 62.0, 66.0):
+        found = level * (1.0 + effect.linear * (degrees - effect.reference))
+        assert found == pytest.approx(0.003**2 * (1.0 + 0.12 * (degrees - 62.0)), rel=0.12)
+    assert "around 58 degC" in fit.fitted[0].say()
+
+
 def test_axis_without_an_effect_keeps_its_noise(shaken):
     _, baseline, after = shaken
     for name in ("coefficient", "spectrum", "square", "grid_calibrated", "mean_variance"):
