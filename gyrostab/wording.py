@@ -1,10 +1,11 @@
-"""Lists in sentences."""
+"""Lists and numbers in sentences."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
-__all__ = ["join_words", "list_some"]
+__all__ = ["format_value", "join_words", "list_some", "value_digits"]
 
 
 def join_words(words: Sequence[str]) -> str:
@@ -28,3 +29,28 @@ def list_some(words: Sequence[str], most: int = 3) -> str:
     """
     more = len(words) - most
     return ", ".join(filter(None, words[:most])) + (f" and {more} more" if more > 0 else "")
+
+
+def format_value(value: float, error: float | None = None) -> str:
+    """Format a value to the second digit of its error; to four digits without an error.
+
+    Examples
+    --------
+    >>> format_value(0.71696402, 0.00027), format_value(40.2, 5.1), format_value(0.71696402)
+    ('0.71696', '40.2', '0.717')
+    """
+    return f"{value:.{value_digits(value, error)}g}"
+
+
+def value_digits(value: float | None, error: float | None) -> int:
+    """Return the number of digits that show a value to the second digit of its error; or 4.
+
+    Examples
+    --------
+    >>> value_digits(0.71696402, 0.00027), value_digits(0.71696402, None)
+    (5, 4)
+    """
+    if not (value and error and math.isfinite(value) and math.isfinite(error)):
+        return 4
+    beyond = math.floor(math.log10(abs(value))) - math.floor(math.log10(abs(error)))
+    return min(max(beyond + 2, 2), 15)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.physics.parameters import Parameter, parameter
 from gyrostab.physics.prediction import Array, Prediction, Windows
-from gyrostab.wording import join_words
+from gyrostab.wording import format_value, join_words
 
 __all__ = [
     "STAGES",
@@ -315,10 +315,11 @@ class Effect:
         """Format a parameter with its error and unit: ``"0.4 ± 0.1 deg/h"``."""
         unit = next(known.unit for known in self.parameters() if known.name == name)
         value = getattr(self, name)
-        numbers = [f"{one:.4g}" for one in (value if isinstance(value, tuple) else (value,))]
-        text = join_words(numbers)
-        if errors and name in errors:
-            text += f" ± {errors[name]:.2g}"
+        error = (errors or {}).get(name)
+        values = value if isinstance(value, tuple) else (value,)
+        text = join_words([format_value(one, error) for one in values])
+        if error is not None:
+            text += f" ± {error:.2g}"
         return text if unit in ("1", "text") else f"{text} {unit}"
 
 

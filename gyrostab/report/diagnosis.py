@@ -27,6 +27,7 @@ from gyrostab.plot.style import embedded, unit_symbol
 from gyrostab.report.diagnosis_charts import diagnosis_charts
 from gyrostab.report.page import page_text
 from gyrostab.store.output import new_output
+from gyrostab.wording import value_digits
 
 __all__ = ["write_diagnosis_report"]
 
@@ -97,6 +98,10 @@ def _format_number(value: Any, digits: int = 3) -> str:
     if value is None or not np.isfinite(value):
         return "–"
     return f"{value:.{digits}g}" if abs(value) < 10**digits else f"{value:.0f}"
+
+
+def _format_parameter(entry: Mapping[str, Any], key: str) -> str:
+    return _format_number(entry[key], value_digits(entry["value"], entry["stderr"]))
 
 
 def _format_time(text: str) -> str:
@@ -177,8 +182,8 @@ def _effect_card(
         "rows": [
             {
                 "name": name.replace("_", " "),
-                "value": _format_number(entry["value"]),
-                "range": f"{_format_number(entry['low'])} to {_format_number(entry['high'])}",
+                "value": _format_parameter(entry, "value"),
+                "range": f"{_format_parameter(entry, 'low')} to {_format_parameter(entry, 'high')}",
                 "unit": unit_symbol(entry["unit"]),
             }
             for name, entry in effect["parameters"].items()
