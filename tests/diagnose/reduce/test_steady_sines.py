@@ -43,7 +43,7 @@ def test_bayes_factor_of_noise_has_mean_one(count):
 def test_noise_has_no_sine(case):
     rng = np.random.default_rng([1, len(case)])
     largest = []
-    for _ in range(60):
+    for _ in range(30):
         noise = rng.standard_normal((3, SIZE))
         if case == "lost":
             noise[:, rng.random(SIZE) < 0.4] = np.nan
@@ -92,7 +92,7 @@ def test_finds_a_line_whose_phase_wanders():
 def test_amplitude_has_the_error_it_states():
     rng = np.random.default_rng(4)
     amplitude, errors = np.sqrt(4.0 * 60.0 / SIZE), []
-    for _ in range(200):
+    for _ in range(100):
         frequency = rng.uniform(1.0, 4.0)
         noise = rng.standard_normal((1, SIZE)) + wave(
             frequency, amplitude, phase=rng.uniform(0.0, 6.0)
@@ -101,8 +101,8 @@ def test_amplitude_has_the_error_it_states():
         place = int(found["sine_nats"][0].argmax())
         square, stderr = found["sine_square"][0, place], found["sine_square_stderr"][0, place]
         errors.append((square - amplitude**2) / stderr)
-    assert abs(np.mean(errors)) < 0.25
-    assert 0.75 < np.std(errors) < 1.2
+    assert abs(np.mean(errors)) < 0.35
+    assert 0.7 < np.std(errors) < 1.3
 
 
 def test_depends_neither_on_batches_nor_much_on_segments(monkeypatch):
