@@ -217,10 +217,10 @@ def index_files(
     Returns
     -------
     pandas.DataFrame
-        One row a file: file, base (of the archive), bytes, changed_ns, options (of reading, as
-        JSON), is_log, format, start, end (UTC), rate [Hz], axes, channels, rows, note. A file in
-        which no gyro is found is not a log; a damaged one counts as a log, whose time is a gap of
-        its run.
+        One row a file: file, base (of the archive), bytes, changed_ns, listing (digest of the files
+        of a Zarr store), options (of reading, as JSON), is_log, format, start, end (UTC), rate
+        [Hz], axes, channels, rows, note. A file in which no gyro is found is not a log; a damaged
+        one counts as a log, whose time is a gap of its run.
     """
     options = json.dumps(dict(reading), sort_keys=True, default=str)
     records: Any = [] if known is None else known.to_dict("records")
@@ -234,6 +234,7 @@ def index_files(
             "base": str(archive.base),
             "bytes": found["bytes"],
             "changed_ns": found["changed_ns"],
+            "listing": found.get("listing", ""),
             "options": options,
         }
         old = before.get(row["file"], {})

@@ -13,9 +13,10 @@ import pandas as pd
 import pytest
 import xarray as xr
 
-from gyrostab import make_log, open_product, to_netcdf
+from gyrostab import make_log, open_product, to_netcdf, to_zarr
 from gyrostab.cli import main
 from gyrostab.errors import FormatError, OptionError, OutputError
+from gyrostab.ingest.files import scan_file
 from gyrostab.jobs import fleet as fleet_module
 from gyrostab.jobs.archive import find_archive, find_runs
 from gyrostab.jobs.fleet import process_run, run_fleet, write_file_table
@@ -223,6 +224,30 @@ def test_a_table_of_files_takes_the_place_of_the_archive(archive, tmp_path, monk
         run_fleet([table], tmp_path / "fleet", **OPTIONS, reading={"max_gap": "10D"})
     rows = read_table(tmp_path / "fleet" / "index.parquet", content="runs")
     assert list(rows["run"]) == ["tool 1/run <b>", "tool 1/run a", "tool 2/broken"]
+
+
+def test_a_store_whose_files_have_other_names_is_listed_again(tmp_path, monkeypatch):
+    store, table = tmp_path / "archive" / "log.zarr", tmp_path / "files.parquet"
+    store.parent.mkdir()
+    to_zarr(make_log(np.ones((1, 600)), rate=RATE, unit="deg/h"), store)
+    command = ["index", str(store.parent), "-o", str(table), "--quiet-progress"]
+    command += ["--scheduler", "threads"]
+    assert main(command) == 0
+    read: list[str] = []
+
+    def count(name, options):
+        read.append(name)
+        return scan_file(name, options)
+
+    monkeypatch.setattr("gyrostab.jobs.archive.scan_file", count)
+    assert main(command) == 0
+    assert read == []
+    chunk = max(
+        (one for one in store.rglob("*") if one.is_file()), key=lambda one: one.stat().st_size
+    )
+    chunk.rename(chunk.with_name("7"))  # as large, and as old, as before
+    assert main(command) == 0
+    assert len(read) == 1
 
 
 @pytest.mark.parametrize(
