@@ -123,7 +123,7 @@ class SineSearch:
         inside = frequency >= 2.0 * lines[0]  # lower ones are in the means of blocks
         frequency = frequency[inside]
         width, side = (_FINER * number // split for number in (_LEVEL_LINES, _SIDE_LINES))
-        usable = spectrum.used > 0
+        usable = (spectrum.used > 0) & spectrum.total.any(axis=1)  # a constant axis has no noise
         if frequency.size < _MIN_LEVELS * width or not usable.any():
             return None
         count = np.maximum(spectrum.used, 1)[:, None]

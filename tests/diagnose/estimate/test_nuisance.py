@@ -13,6 +13,7 @@ from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.physics.registry import make_effect
+from gyrostab.wording import format_value
 from tests.diagnose.estimate.test_joint_fit import identify_by_hand
 from tests.support.named import record
 
@@ -112,7 +113,7 @@ def test_values_of_the_model_belong_together(noise_only):
     effect, lag = found.effect, found.parameters["lag"]
     assert effect.lag != pytest.approx(lag.value, rel=0.01)
     assert lag.low < effect.lag < lag.high
-    assert f"a lag of {lag.value:.4g} ±" in found.say()
+    assert f"a lag of {format_value(lag.value, lag.stderr)} ± " in found.say()
     blocks, _ = noise_only
     windows = make_windows(blocks, {"temperature": "temperature"})
     made, true = (

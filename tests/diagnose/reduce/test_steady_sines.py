@@ -58,6 +58,15 @@ def test_noise_has_no_sine(case):
     assert max(largest) < 5.0
 
 
+def test_constant_axis_has_no_sine():
+    noise = np.random.default_rng(4).standard_normal((3, SIZE))
+    expected = search(noise[:2])["sine_nats"]
+    noise[2] = 5.0
+    found = search(noise)["sine_nats"]
+    assert np.isneginf(found[2]).all()
+    np.testing.assert_allclose(found[:2], expected, atol=1e-6)
+
+
 @pytest.mark.parametrize("frequency", [0.70713, 1.3, 4.61])
 def test_finds_a_sine_that_blocks_do_not_show(frequency):
     rng = np.random.default_rng(2)
