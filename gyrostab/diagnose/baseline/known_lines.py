@@ -170,7 +170,7 @@ def _line_leakage(size: int, apart: float = 0.0) -> tuple[Array, Array, Array]:
 def remove_known_lines(
     blocks: xr.Dataset, baseline: xr.Dataset, *, settings: Settings = DEFAULTS
 ) -> xr.Dataset:
-    """Subtract the known steady lines from the line spectrum.
+    """Subtract the known steady lines from the line spectrum and from the sines.
 
     The excess over a known line stays if it exceeds the model error of an effect and the scatter of
     the noise.
@@ -196,9 +196,10 @@ def remove_known_lines(
     if "sine_nats" in blocks:
         square, stderr = (blocks[f"sine_square{end}"].values for end in ("", "_stderr"))
         step = float(blocks["line_frequency"][0])
-        most = 4.0 * step * _sum_near(largest[:, 0])
+        average, most = (4.0 * step * _sum_near(lines[:, 0]) for lines in (known, largest))
         exceeds = square - most > error * most + settings.clear_sigma * stderr
         in_peak = _sum_near(baseline["peaks"].values) > error * noise[:, 0]
         new = (exceeds | (most == 0.0)) & ~in_peak
         out["sine_nats"] = blocks["sine_nats"].where(new, -np.inf)
+        out["sine_square"] = blocks["sine_square"] - average
     return blocks.assign(out)

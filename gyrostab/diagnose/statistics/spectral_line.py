@@ -155,19 +155,27 @@ class SpectralLine(Statistic):
         return state.with_columns("line", "all", [skirt])
 
     def estimate(self, fit: SizeFit) -> Sizes:
-        """Estimate amplitudes and the frequency, from the power about the line."""
-        name = {"real_motion": "sway"}.get(
-            fit.components[0].candidate.effect, fit.components[0].variant.columns[0]
-        )
+        """Estimate amplitudes and the frequency, from the power about the line.
+
+        A sample is the mean over its interval, which attenuates the line by sinc(f / fs). The size
+        of real rotation is the rms rate, not the amplitude.
+        """
+        blocks = fit.state.blocks
+        is_sway = fit.components[0].candidate.effect == "real_motion"
+        name = "sway" if is_sway else fit.components[0].variant.columns[0]
         out: dict[str, tuple[float, float]] = {}
         for component in sorted(
             fit.components, key=lambda component: component.evidence_nats
         ):  # the strongest of several lines of an axis is last
             amplitude, frequency = estimate_line(
-                fit.state.blocks, component.row[0], component.place, fit.state.settings
+                blocks, component.row[0], component.place, fit.state.settings
             )
-            label = "" if len(fit.axes) == 1 or name == "sway" else f".{component.row[0]}"
-            out[f"{name}{label}"], out["frequency"] = amplitude, frequency
+            response = np.sinc(frequency[0] / float(blocks.attrs["sampling_rate_hz"]))
+            if is_sway:
+                response *= math.sqrt(2.0)
+            label = "" if len(fit.axes) == 1 or is_sway else f".{component.row[0]}"
+            out[f"{name}{label}"] = (amplitude[0] / response, amplitude[1] / response)
+            out["frequency"] = frequency
         return out
 
     def can_explain(

@@ -122,6 +122,9 @@ def test_a_known_sine_is_no_sine_of_the_recording(amplitude, frequency):
     weaker = made | {"effect": [line | {"amplitude": amplitude / 4.0}]}
     too_small = remove_known_lines(blocks, baseline_from_model(blocks, weaker))
     assert float(too_small["sine_nats"].max()) > 10.0
+    place = int(too_small["sine_nats"].values[0].argmax())
+    left, all_of_it = (float(one["sine_square"][0, place]) for one in (too_small, blocks))
+    assert all_of_it - left == pytest.approx((amplitude / 4.0) ** 2, rel=0.1)
 
 
 def test_a_weak_sine_of_a_simulated_log_is_known():

@@ -265,7 +265,8 @@ def test_quality_of_a_line_follows_from_the_scatter_of_its_power():
     assert 30.0 < found[60.0] < 120.0
 
 
-def test_line_frequency_is_known_to_one_bin():
+def test_line_has_its_frequency_to_one_bin_and_the_amplitude_of_the_rate():
+    """Samples are means over 0.1 s, in which a sine of 4 Hz is a quarter weaker."""
     true = 4.013
     blocks = record([{"name": "spectral_line", "amplitude": 0.4, "frequency": true, "axes": ["x"]}])
     baseline = calibrate_noise(blocks)
@@ -285,6 +286,7 @@ def test_line_frequency_is_known_to_one_bin():
     step = float(np.diff(blocks["line_frequency"].values[:2])[0])
     assert found.low < true < found.high
     assert found.high - found.low < 2.0 * step
+    assert fitted.parameters["amplitude"].value == pytest.approx(0.4, rel=0.06)
 
 
 def test_model_with_identified_effects_runs(shaken):
