@@ -19,7 +19,7 @@ from page import renew
 from gyrostab.blindtest.runner.folder import FIRST_PUBLIC_SEED
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-FIGURES = ("completeness", "reliability")
+FIGURES = ("completeness", "reliability", "calibration")
 
 
 def main() -> None:

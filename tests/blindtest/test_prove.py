@@ -136,7 +136,7 @@ def test_every_case_is_scored(tmp_path):
     assert bool(line["detected"])
     found = json.loads((folder / "diagnoses" / f"{line['name']}.json").read_text())
     assert line["verdict"] == found["verdict"]
-    assert [name for name, _ in json.loads(line["identifications"])] == [
+    assert [one["name"] for one in json.loads(line["identifications"])] == [
         effect["name"] for effect in found["effects"]
     ]
     check = json.loads(line["model_check"])
@@ -153,7 +153,7 @@ def test_every_case_is_scored(tmp_path):
     detected = proof.table.set_index("quantity").loc["detected, strength 1.5 or more"]
     assert detected["n"] == 1
     assert detected["value"] == pytest.approx(scores["detected"][1:].mean())
-    for name in ("completeness.png", "reliability.png"):
+    for name in ("completeness.png", "reliability.png", "calibration.png"):
         assert (folder / name).read_bytes()[:4] == b"\x89PNG"
 
 

@@ -97,7 +97,7 @@ def check_run(folder: Path, proof: Proof, *, cases: int) -> pd.DataFrame:
         )
         assert set(mine["verdict"]) == {found["verdict"]}
         assert {
-            identification[0] for identification in json.loads(mine.iloc[0]["identifications"])
+            identification["name"] for identification in json.loads(mine.iloc[0]["identifications"])
         } == {effect["name"] for effect in found["effects"]}
 
     assert list(proof.table["quantity"][:10]) == list(
@@ -112,6 +112,6 @@ def check_run(folder: Path, proof: Proof, *, cases: int) -> pd.DataFrame:
     page = (folder / "table.md").read_text()
     assert str(proof.seed) in page
     assert proof.commitment in page
-    for name in ("completeness.png", "reliability.png"):
+    for name in ("completeness.png", "reliability.png", "calibration.png"):
         assert (folder / name).read_bytes()[:4] == b"\x89PNG"
     return rows

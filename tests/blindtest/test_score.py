@@ -41,6 +41,7 @@ def identification(
         "parameters": parameters or {},
         "held_out_gain": {"nats": nats, "stderr": 1.0, "threshold": 5.7},
         "alternatives": list(alternatives),
+        "probability": 0.9,
         "statement": "",
     }
 
@@ -163,7 +164,9 @@ def test_name_on_three_axes_counts_once_with_a_parameter_for_each():
         for axis, size in (("x", 0.45), ("y", -0.9), ("z", 0.1))
     ]
     row = score_one(diagnosis(*tables), known_truth)
-    assert row["identifications"] == [("shupe", True)]
+    assert row["identifications"] == [
+        {"name": "shupe", "probability": 0.9, "right": True, "exact": True}
+    ]
     assert [entry["covered"] for entry in row["parameter_scores"]] == [True, False, True]
     row = score_one(diagnosis(*tables), truth("spikes"))
     assert (row["wrong"], row["wrong_names"]) == (1, ["shupe"])
@@ -273,7 +276,7 @@ def test_null_record_is_one_row_and_any_name_a_false_alarm():
         score_one(diagnosis(identification("shupe")), truth(kind="null")),
     )
     assert not silent["detected"]
-    assert alarm["identifications"] == [("shupe", False)]
+    assert [one["right"] for one in alarm["identifications"]] == [False]
     table = score_table([silent | {"index": 1}, alarm | {"index": 2}]).set_index("quantity")
     assert table.loc["false alarms: effect named on a null record", "value"] == 0.5
 

@@ -1,4 +1,4 @@
-"""Figures of a benchmark: completeness against strength, and reliability of each name."""
+"""Figures of a benchmark: completeness, reliability of each name, and its probability."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
 
-__all__ = ["draw_completeness", "draw_reliability"]
+__all__ = ["draw_calibration", "draw_completeness", "draw_reliability"]
 
 _COLUMNS = 5
 _POOL_LIMITS = (1.5, 4.0)  # detection is not required below the first
@@ -126,4 +126,41 @@ def draw_reliability(reliability: pd.DataFrame) -> Callable[[Path], None]:
     panel.set_ylim(max(len(identifications), 1) - 0.4, -0.6)
     panel.set_xlim(0, 1)
     panel.set_xlabel("share of the identifications (number)\nthat are correct, with 95 % interval")
+    return lambda target: save_png(figure, target, colours=64)
+
+
+def draw_calibration(curve: pd.DataFrame, risk: pd.DataFrame) -> Callable[[Path], None]:
+    """Plot the share of right names against their probability, and the risk of the likeliest."""
+    from gyrostab.plot import COLOURS, MARKERS, new_figure, save_png
+
+    figure = new_figure(7.0, 3.2)
+    panels: Any = figure.subplots(1, 2)
+    calibration, coverage = panels
+    right = curve["right"].to_numpy()
+    calibration.plot([0, 1], [0, 1], color="#8c8c8c", linewidth=0.7, linestyle=":")
+    calibration.errorbar(
+        curve["stated"].to_numpy(),
+        right,
+        yerr=[
+            (right - curve["low"].to_numpy()).clip(min=0.0),
+            (curve["high"].to_numpy() - right).clip(min=0.0),
+        ],
+        color=COLOURS[0],
+        marker=MARKERS[0],
+        linewidth=1.2,
+        elinewidth=0.7,
+    )
+    calibration.set(
+        xlim=(0, 1),
+        ylim=(0, 1.02),
+        xlabel="stated probability of the name",
+        ylabel="share of names that are right,\nwith 95 % interval",
+    )
+    coverage.plot(risk["coverage"].to_numpy(), risk["risk"].to_numpy(), color=COLOURS[1])
+    coverage.set(
+        xlim=(0, 1),
+        ylim=(0, None),
+        xlabel="share of the names, most probable first",
+        ylabel="share of these that are wrong",
+    )
     return lambda target: save_png(figure, target, colours=64)

@@ -48,6 +48,7 @@ _FILES = (
     "table.md",
     "completeness.png",
     "reliability.png",
+    "calibration.png",
     "lock",
 )
 

@@ -11,10 +11,15 @@ from typing import Any
 
 import pandas as pd
 
-from gyrostab.blindtest.runner.figures import draw_completeness, draw_reliability
+from gyrostab.blindtest.runner.figures import (
+    draw_calibration,
+    draw_completeness,
+    draw_reliability,
+)
 from gyrostab.blindtest.runner.folder import FIRST_PUBLIC_SEED, write_text
 from gyrostab.blindtest.scoring.curves import by_effect, curves, reliability
 from gyrostab.blindtest.scoring.injections import injection_differences, injection_table
+from gyrostab.blindtest.scoring.probability import calibration_curve, risk_coverage
 from gyrostab.blindtest.scoring.score import score_case
 from gyrostab.blindtest.scoring.table import list_missed, markdown
 from gyrostab.store.output import replace_file
@@ -61,7 +66,7 @@ def write_outcome(
     commitment: str,
     failed: Mapping[str, str],
 ) -> list[Path]:
-    """Write ``scores.csv``, ``table.md``, ``completeness.png`` and ``reliability.png``."""
+    """Write ``scores.csv``, ``table.md`` and the figures."""
     plain = [
         {
             key: json.dumps(value) if isinstance(value, list | dict | tuple) else value
@@ -69,16 +74,15 @@ def write_outcome(
         }
         for row in rows
     ]
-    targets = [
-        folder / name for name in ("scores.csv", "table.md", "completeness.png", "reliability.png")
-    ]
+    figures = {
+        "completeness.png": draw_completeness(curves(rows)),
+        "reliability.png": draw_reliability(reliability(rows)),
+        "calibration.png": draw_calibration(calibration_curve(rows), risk_coverage(rows)),
+    }
+    targets = [folder / name for name in ("scores.csv", "table.md", *figures)]
     write_text(targets[0], pd.DataFrame(plain).to_csv(index=False))
     write_text(targets[1], page_text(rows, table, job=job, commitment=commitment, failed=failed))
-    for target, draw in zip(
-        targets[2:],
-        (draw_completeness(curves(rows)), draw_reliability(reliability(rows))),
-        strict=True,
-    ):
+    for target, draw in zip(targets[2:], figures.values(), strict=True):
         with replace_file(target) as temporary:
             draw(temporary)
     return targets
@@ -114,6 +118,10 @@ def page_text(
         "given in all cases, and the share of these that is *right*. *parameters*: parameters that "
         "can be compared, and the share *covered* by their 95 % intervals.",
         markdown(by_effect(rows)),
+        "### Probability of the names",
+        "Identifications in groups of similar probability: the mean probability *stated*, and the "
+        "share of names that are *right*: true themselves, not only a member of the ambiguity set.",
+        markdown(calibration_curve(rows)),
         "### Wrong names",
         _format_list(
             [_describe_wrong_name(row) for row in _first_rows(drawn) if row["wrong"]], "none"

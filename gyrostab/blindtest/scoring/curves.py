@@ -8,7 +8,8 @@ from typing import Any
 import pandas as pd
 
 from gyrostab.blindtest.scoring.proportions import wilson
-from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH, first_rows
+from gyrostab.blindtest.scoring.score import first_rows
+from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH
 
 __all__ = ["by_effect", "curves", "reliability"]
 
@@ -64,8 +65,8 @@ def reliability(rows: Sequence[Row]) -> pd.DataFrame:
     """Compute the share of correct identifications by name, with Wilson's interval."""
     correct: dict[str, list[bool]] = {}
     for row in first_rows([row for row in rows if row["kind"] not in ("injected", "control")]):
-        for name, right in row["identifications"]:
-            correct.setdefault(name, []).append(right)
+        for identification in row["identifications"]:
+            correct.setdefault(identification["name"], []).append(identification["right"])
     out = []
     for name, flags in sorted(correct.items()):
         low, high = wilson(sum(flags), len(flags))

@@ -56,7 +56,7 @@ def injection_differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def _names_given(row: Row) -> set[str]:
-    return {name for name, _ in row["identifications"]}
+    return {identification["name"] for identification in row["identifications"]}
 
 
 def _merged_names(row: Row) -> set[str]:

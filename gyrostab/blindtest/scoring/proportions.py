@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["NO_TARGET", "Target", "median", "share", "spread", "wilson"]
+__all__ = ["NO_TARGET", "Line", "Target", "make_line", "median", "share", "spread", "wilson"]
 
 Line = dict[str, Any]
 
@@ -66,15 +66,16 @@ def wilson(hits: int, total: int) -> tuple[float, float]:
     return float(interval.low), float(interval.high)
 
 
-def _make_line(
+def make_line(
     name: str, value: float, low: float, high: float, number: int, target: Target
 ) -> Line:
+    """Make a line of the table."""
     state = target.state(value, low, high)
     return {
         "quantity": name,
-        "value": value,
-        "low": low,
-        "high": high,
+        "value": float(value),
+        "low": float(low),
+        "high": float(high),
         "n": number,
         "target": target.text,
         "state": state,
@@ -85,7 +86,7 @@ def share(name: str, flags: Iterable[bool], target: Target = NO_TARGET) -> Line:
     """Make the line of a share of cases, with Wilson's interval."""
     found = [bool(flag) for flag in flags]
     hits, total = sum(found), len(found)
-    return _make_line(
+    return make_line(
         name,
         hits / total if total else math.nan,
         *(wilson(hits, total) if total else (math.nan, math.nan)),
@@ -98,7 +99,7 @@ def median(name: str, values: Iterable[float | None], target: Target = NO_TARGET
     """Make the line of a median, with its order-statistic interval."""
     found = np.sort([value for value in values if value is not None and math.isfinite(value)])
     if found.size == 0:
-        return _make_line(name, math.nan, math.nan, math.nan, 0, target)
+        return make_line(name, math.nan, math.nan, math.nan, 0, target)
     reach = 0.98 * math.sqrt(found.size)
     low, high = math.floor((found.size - 1) / 2 - reach), math.ceil((found.size - 1) / 2 + reach)
     ends = (
@@ -106,7 +107,7 @@ def median(name: str, values: Iterable[float | None], target: Target = NO_TARGET
         if found.size < 6
         else (found[max(0, low)], found[min(found.size - 1, high)])
     )
-    return _make_line(
+    return make_line(
         name, float(np.median(found)), float(ends[0]), float(ends[1]), found.size, target
     )
 
@@ -115,10 +116,10 @@ def spread(name: str, pulls: Iterable[float | None], target: Target = NO_TARGET)
     """Make the line of the 68 % quantile of normalised errors, 1 where these are right."""
     found = np.abs([pull for pull in pulls if pull is not None and math.isfinite(pull)])
     if found.size == 0:
-        return _make_line(name, math.nan, math.nan, math.nan, 0, target)
+        return make_line(name, math.nan, math.nan, math.nan, 0, target)
     value = float(np.quantile(found, 0.6827))
     off = 0.96 / math.sqrt(found.size)  # 95 % interval of the share, by the binomial law
     low, high = (
         float(np.quantile(found, min(max(0.6827 + step, 0.0), 1.0))) for step in (-off, off)
     )
-    return _make_line(name, value, low, high, found.size, target)
+    return make_line(name, value, low, high, found.size, target)

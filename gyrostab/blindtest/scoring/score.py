@@ -12,7 +12,7 @@ from gyrostab.blindtest.generator.catalogue import merge_ambiguous
 from gyrostab.blindtest.generator.detection_limits import NATS
 from gyrostab.errors import SchemaError
 
-__all__ = ["intersection_over_union", "score_case"]
+__all__ = ["first_rows", "intersection_over_union", "score_case"]
 
 Intervals = Sequence[Sequence[str]]
 
@@ -172,6 +172,14 @@ def _check_diagnosis(diagnosis: Mapping[str, Any]) -> None:
         )
 
 
+def first_rows(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Keep one row per case."""
+    seen: dict[Any, Mapping[str, Any]] = {}
+    for i, row in enumerate(rows):
+        seen.setdefault(row["index"] if row["index"] is not None else ("no number", i), row)
+    return list(seen.values())
+
+
 def score_case(
     diagnosis: Mapping[str, Any],
     truth: Mapping[str, Any],
@@ -197,7 +205,8 @@ def score_case(
         ``in_set``, ``set_size``, ``wrong`` (number of wrong names), ``unidentified``, ``iou``,
         ``tau_hit``, ``parameter_scores``, ``gain``, ``oracle``, ``learned`` (the oracle's with
         fitted noise), ``model_check`` (of `check_model`), ``seconds``, ``identifications`` and
-        more. A name counts once, on however many axes it is identified.
+        more. A name counts once, on however many axes it is identified: with its ``probability``,
+        whether its ambiguity set is ``right``, and whether it is a true name itself (``exact``).
 
     Raises
     ------
@@ -235,7 +244,12 @@ def score_case(
             and (diagnosis["verdict"] in ("unknown", "partly explained") or not identifications)
         ),
         "identifications": [
-            (identification["name"], bool(_ambiguity_set(identification) & standing))
+            {
+                "name": identification["name"],
+                "probability": identification["tables"][0].get("probability"),
+                "right": bool(_ambiguity_set(identification) & standing),
+                "exact": identification["name"] in accepted.union(true),
+            }
             for identification in identifications
         ],
         "gain": float((diagnosis["held_out"] or {}).get("log_likelihood_gain") or 0.0),

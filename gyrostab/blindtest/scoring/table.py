@@ -9,23 +9,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gyrostab.blindtest.scoring.proportions import Target, median, share, spread
+from gyrostab.blindtest.scoring.probability import probability_lines
+from gyrostab.blindtest.scoring.proportions import Line, Target, median, share, spread
+from gyrostab.blindtest.scoring.score import first_rows
 
-__all__ = ["CLEAR_STRENGTH", "first_rows", "list_missed", "markdown", "score_table"]
+__all__ = ["CLEAR_STRENGTH", "list_missed", "markdown", "score_table"]
 
 Row = Mapping[str, Any]
-Line = dict[str, Any]
 
 #: Strength from which an effect should be detected and named.
 CLEAR_STRENGTH = 1.5
-
-
-def first_rows(rows: Sequence[Row]) -> list[Row]:
-    """Keep one row per case."""
-    seen: dict[Any, Row] = {}
-    for i, row in enumerate(rows):
-        seen.setdefault(row["index"] if row["index"] is not None else ("no number", i), row)
-    return list(seen.values())
 
 
 def score_table(rows: Sequence[Row]) -> pd.DataFrame:
@@ -50,6 +43,7 @@ def score_table(rows: Sequence[Row]) -> pd.DataFrame:
         _out_of_catalogue_lines,
         _degraded_driver_lines,
         _parameter_lines,
+        probability_lines,
         _model_lines,
         _baseline_lines,
     )

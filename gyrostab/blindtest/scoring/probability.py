@@ -1,0 +1,152 @@
+"""Check the probabilities of identifications against how often these are right."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from gyrostab.blindtest.scoring.proportions import NO_TARGET, Line, Target, make_line, wilson
+from gyrostab.blindtest.scoring.score import first_rows
+
+__all__ = [
+    "calibration_curve",
+    "expected_calibration_error",
+    "probability_lines",
+    "risk_coverage",
+]
+
+Row = Mapping[str, Any]
+Array = NDArray[np.float64]
+
+_GROUPS = 5  # of about equal size, in the curve and in the calibration error
+_RESAMPLINGS = 1000  # of the identifications, for intervals
+_LEAST_PROBABILITY = 1e-3  # in the log score, which is infinite for a wrong certain answer
+_SEED = 0  # of the resamplings
+_INTERVAL = (0.025, 0.975)
+
+
+def _collect_probabilities(rows: Sequence[Row]) -> tuple[Array, Array]:
+    """Return the probability of each identification, and 1 where its name is right."""
+    pairs = [
+        (one["probability"], one["exact"])
+        for row in first_rows([row for row in rows if row["kind"] not in ("injected", "control")])
+        for one in row["identifications"]
+        if one["probability"] is not None
+    ]
+    stated, right = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
+    return stated, right
+
+
+def _split_groups(stated: Array) -> list[NDArray[np.intp]]:
+    """Split identifications by probability into groups of about equal size."""
+    order = np.argsort(stated, kind="stable")
+    return [group for group in np.array_split(order, _GROUPS) if group.size]
+
+
+def expected_calibration_error(stated: Array, right: Array) -> float:
+    """Compute the mean distance of stated probability and share that is right, over groups.
+
+    Examples
+    --------
+    >>> expected_calibration_error(np.full(10, 0.75), np.ones(10))
+    0.25
+    """
+    groups = _split_groups(stated)
+    return float(
+        sum(abs(stated[group].sum() - right[group].sum()) for group in groups) / stated.size
+    )
+
+
+def calibration_curve(rows: Sequence[Row]) -> pd.DataFrame:
+    """Compute the share of right names in groups of similar probability.
+
+    Returns
+    -------
+    pandas.DataFrame
+        ``stated`` (mean probability of the group), ``n``, ``right``, and ``low`` and ``high``,
+        Wilson's 95 % interval.
+    """
+    stated, right = _collect_probabilities(rows)
+    lines = []
+    for group in _split_groups(stated):
+        low, high = wilson(int(right[group].sum()), group.size)
+        lines.append(
+            {
+                "stated": float(stated[group].mean()),
+                "n": int(group.size),
+                "right": float(right[group].mean()),
+                "low": low,
+                "high": high,
+            }
+        )
+    return pd.DataFrame(lines, columns=["stated", "n", "right", "low", "high"])
+
+
+def risk_coverage(rows: Sequence[Row]) -> pd.DataFrame:
+    """Compute the share of wrong names among the most probable ones.
+
+    Returns
+    -------
+    pandas.DataFrame
+        One line for each identification, the most probable first: ``coverage`` (share of the
+        identifications so far) and ``risk`` (share of these that is wrong).
+    """
+    stated, right = _collect_probabilities(rows)
+    order = np.argsort(-stated, kind="stable")
+    number = np.arange(1, order.size + 1)
+    return pd.DataFrame(
+        {"coverage": number / max(order.size, 1), "risk": np.cumsum(1.0 - right[order]) / number}
+    )
+
+
+def probability_lines(rows: Sequence[Row]) -> list[Line]:
+    """Make the lines of the calibration, with intervals from resampled identifications.
+
+    A sample of exact probabilities has a calibration error too; a line gives its mean.
+    """
+    stated, right = _collect_probabilities(rows)
+    scores: dict[str, tuple[Callable[[Array, Array], float], Target]] = {
+        "probability of a name: expected calibration error": (
+            expected_calibration_error,
+            Target("<= 0.05", most=0.05),
+        ),
+        "Brier score of the probabilities": (_brier_score, NO_TARGET),
+        "Brier score of one probability for all names": (_constant_brier_score, NO_TARGET),
+        "log score of the probabilities, nats per name": (_log_score, NO_TARGET),
+    }
+    exact = "calibration error of exact probabilities in as many names, mean and 95 % range"
+    if not stated.size:
+        nothing = (math.nan, math.nan, math.nan, 0)
+        return [
+            *(make_line(name, *nothing, target) for name, (_, target) in scores.items()),
+            make_line(exact, *nothing, NO_TARGET),
+        ]
+    rng = np.random.default_rng(_SEED)
+    chosen = rng.integers(stated.size, size=(_RESAMPLINGS, stated.size))
+    lines = []
+    for name, (score, target) in scores.items():
+        resampled = [score(stated[several], right[several]) for several in chosen]
+        low, high = np.quantile(resampled, _INTERVAL)
+        lines.append(make_line(name, score(stated, right), low, high, stated.size, target))
+    outcomes = (rng.random(chosen.shape) < stated).astype(float)
+    by_chance = [expected_calibration_error(stated, outcome) for outcome in outcomes]
+    low, high = np.quantile(by_chance, _INTERVAL)
+    return [*lines, make_line(exact, np.mean(by_chance), low, high, stated.size, NO_TARGET)]
+
+
+def _brier_score(stated: Array, right: Array) -> float:
+    return float(np.mean((stated - right) ** 2))
+
+
+def _constant_brier_score(stated: Array, right: Array) -> float:
+    return _brier_score(np.full(stated.size, right.mean()), right)
+
+
+def _log_score(stated: Array, right: Array) -> float:
+    of_outcome = np.maximum(np.where(right > 0.0, stated, 1.0 - stated), _LEAST_PROBABILITY)
+    return float(-np.log(of_outcome).mean())
