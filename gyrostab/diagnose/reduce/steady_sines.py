@@ -120,9 +120,10 @@ class SineSearch:
         split = self.segment.shape[1] // spectrum.size
         step = self.rate / (_FINER * spectrum.size)
         frequency = step * np.arange(1, spectrum.total.shape[1] + 1)
-        inside = frequency >= 2.0 * lines[0]  # lower ones are in the means of blocks
-        frequency = frequency[inside]
         width, side = (_FINER * number // split for number in (_LEVEL_LINES, _SIDE_LINES))
+        # Lower ones are in the means of blocks; the first `side` only define the level of the next.
+        inside = frequency >= 2.0 * lines[0] - side * step
+        frequency = frequency[inside]
         usable = (spectrum.used > 0) & spectrum.total.any(axis=1)  # a constant axis has no noise
         if frequency.size < _MIN_LEVELS * width or not usable.any():
             return None
@@ -134,7 +135,7 @@ class SineSearch:
         # An axis has the sine or not; one frequency of all that were tried.
         cost = math.log(frequency.size * len(self.spectra))
         total = np.logaddexp(0.0, factor).sum(axis=0) - math.log(2.0) * len(factor) - cost
-        total[:side] = -np.inf  # they define the level of the next
+        total[:side] = -np.inf
         order = np.lexsort((total, place))
         last = np.append(np.flatnonzero(np.diff(place[order])), order.size - 1)
         chosen = order[last]
