@@ -17,6 +17,7 @@ from gyrostab.diagnose.result.text import (
     family_text,
     next_measurement,
     plain_name,
+    probability_text,
     rejection_text,
     summary,
     without_chance,
@@ -193,6 +194,7 @@ def _effect_card(
             f"(threshold {_format_number(evidence['threshold'], 2)})"
         ),
         "alternatives": [f"{plain_name(name)} ({name})" for name in effect["alternatives"]],
+        "probability": probability_text(effect),
         "next": next_measurement(effect["name"], effect["alternatives"]),
         "nats": max(float(evidence["nats"]), 0.0),
         "threshold": max(float(evidence["threshold"]), 0.0),

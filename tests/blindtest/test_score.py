@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from gyrostab.blindtest.generator.catalogue import AMBIGUITY, CATALOGUE, merge_ambiguous
-from gyrostab.blindtest.scoring.curves import by_effect, curves, reliability
+from gyrostab.blindtest.scoring.curves import by_effect, curves, names_given, reliability
 from gyrostab.blindtest.scoring.injections import injection_differences, injection_table
 from gyrostab.blindtest.scoring.proportions import Target, spread, wilson
 from gyrostab.blindtest.scoring.score import intersection_over_union, score_case
@@ -432,6 +432,29 @@ def test_by_effect_has_a_line_for_every_effect():
     assert table.loc["shupe", "named"] == pytest.approx(2 / 3)
     assert table.loc["spikes", ["n", "identifications", "right"]].tolist() == [0, 1, 0.0]
     assert table.loc["spikes", "named"] is None
+
+
+def test_names_given_to_a_single_effect_are_counted():
+    found = [
+        diagnosis(identification("shupe")),
+        diagnosis(identification("warm_up", nats=30.0), identification("shupe")),
+        diagnosis(verdict="unknown"),
+        diagnosis(),
+    ]
+    rows = [
+        row
+        for number, one in enumerate(found)
+        for row in score_case(one, truth("shupe", index=number))
+    ]
+    (line,) = names_given([*rows, *score_case(found[0], truth(kind="null"))]).to_dict("records")
+    assert line == {
+        "effect": "shupe",
+        "n": 4,
+        "itself": 1,
+        "other names": "warm_up 1",
+        "unidentified": 1,
+        "nothing": 1,
+    }
 
 
 def test_68_percent_of_normal_errors_are_within_one_sigma():

@@ -102,6 +102,7 @@ def test_simulated_effect_is_identified(
     (effect,) = content["effects"]
     assert "vibration_noise" in [effect["name"], *effect["alternatives"]]
     assert effect["driver"] == "vibration"
+    assert 0.0 < effect["probability"] < 1.0
     region = next(region for region in content["mismatches"] if region["view"] == "davar")
     assert effect["name"] in region["explained_by"]
     begin, end = (np.datetime64(region[name].removesuffix("Z")) for name in ("start", "end"))

@@ -121,6 +121,7 @@ def content() -> dict[str, Any]:
                 },
                 "held_out_gain": {"nats": 31.0, "stderr": 6.0, "threshold": 5.7},
                 "alternatives": others,
+                "probability": 0.62,
                 "statement": effect_statement(said, alternatives=others),
             }
         )  # fmt: skip

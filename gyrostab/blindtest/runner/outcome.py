@@ -17,7 +17,7 @@ from gyrostab.blindtest.runner.figures import (
     draw_reliability,
 )
 from gyrostab.blindtest.runner.folder import FIRST_PUBLIC_SEED, write_text
-from gyrostab.blindtest.scoring.curves import by_effect, curves, reliability
+from gyrostab.blindtest.scoring.curves import by_effect, curves, names_given, reliability
 from gyrostab.blindtest.scoring.injections import injection_differences, injection_table
 from gyrostab.blindtest.scoring.probability import calibration_curve, risk_coverage
 from gyrostab.blindtest.scoring.score import score_case
@@ -118,6 +118,10 @@ def page_text(
         "given in all cases, and the share of these that is *right*. *parameters*: parameters that "
         "can be compared, and the share *covered* by their 95 % intervals.",
         markdown(by_effect(rows)),
+        "### Names given to single effects",
+        "Records with one effect of any strength, by their strongest name: the effect *itself*, "
+        "*other names*, something *unidentified*, or *nothing* detected.",
+        markdown(names_given(rows)),
         "### Probability of the names",
         "Identifications in groups of similar probability: the mean probability *stated*, and the "
         "share of names that are *right*: true themselves, not only a member of the ambiguity set.",

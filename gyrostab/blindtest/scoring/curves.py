@@ -1,7 +1,8 @@
-"""Completeness against strength and by effect, and reliability of each name."""
+"""Completeness against strength and by effect, names given, and reliability of each name."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,7 +12,7 @@ from gyrostab.blindtest.scoring.proportions import wilson
 from gyrostab.blindtest.scoring.score import first_rows
 from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH
 
-__all__ = ["by_effect", "curves", "reliability"]
+__all__ = ["by_effect", "curves", "names_given", "reliability"]
 
 Row = Mapping[str, Any]
 
@@ -80,6 +81,37 @@ def reliability(rows: Sequence[Row]) -> pd.DataFrame:
             }
         )
     return pd.DataFrame(out, columns=["name", "n", "right", "low", "high"])
+
+
+def names_given(rows: Sequence[Row]) -> pd.DataFrame:
+    """Count the strongest name of each record with a single effect.
+
+    Returns
+    -------
+    pandas.DataFrame
+        ``effect``, ``n``, and the counts of the right name (``itself``), of ``other names`` with
+        their counts in words, of records in which something was ``unidentified``, and in which
+        ``nothing`` was detected.
+    """
+    out = []
+    single = [row for row in rows if row["kind"] in ("single", "sub_threshold")]
+    for effect in sorted({row["effect"] for row in single}):
+        here = [row for row in single if row["effect"] == effect]
+        names = Counter(row["identifications"][0]["name"] for row in here if row["identifications"])
+        nothing = sum(not row["detected"] for row in here)
+        out.append(
+            {
+                "effect": effect,
+                "n": len(here),
+                "itself": names.pop(effect, 0),
+                "other names": ", ".join(f"{name} {n}" for name, n in names.most_common()),
+                "unidentified": sum(not row["identifications"] for row in here) - nothing,
+                "nothing": nothing,
+            }
+        )
+    return pd.DataFrame(
+        out, columns=["effect", "n", "itself", "other names", "unidentified", "nothing"]
+    )
 
 
 def by_effect(rows: Sequence[Row]) -> pd.DataFrame:

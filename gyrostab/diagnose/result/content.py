@@ -130,6 +130,7 @@ class NamedEffect(_Table):
     parameters: dict[str, Size]
     held_out_gain: HeldOutGain
     alternatives: list[str]
+    probability: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
     family: str | None = None
     statement: str
 

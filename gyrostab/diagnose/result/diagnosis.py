@@ -16,6 +16,7 @@ from gyrostab.diagnose.result.text import (
     chance_share,
     family_text,
     next_measurement,
+    probability_text,
     summary,
     without_chance,
 )
@@ -81,6 +82,8 @@ class Diagnosis:
                 f"  evidence: held-out data are predicted better by {evidence['nats']:.3g} nats "
                 f"(threshold against chance: {evidence['threshold']:.2g} nats)"
             )
+            if sure := probability_text(effect):
+                lines.append(f"  {sure}")
             if step := next_measurement(effect["name"], effect["alternatives"]):
                 lines.append(f"  {step}")
         lines += [

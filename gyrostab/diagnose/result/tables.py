@@ -23,6 +23,7 @@ from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
 from gyrostab.diagnose.result.diagnosis import effect_table
 from gyrostab.diagnose.result.families import find_families
+from gyrostab.diagnose.result.probability import name_probability
 from gyrostab.diagnose.result.text import (
     chance,
     effect_statement,
@@ -348,6 +349,7 @@ def effect_tables(
                     "threshold": identification.threshold,
                 },
                 "alternatives": list(identification.alternatives),
+                "probability": round(name_probability(identification, settings=settings), 3),
                 "family": family,
                 "statement": effect_statement(
                     one.say() or unsized_statement(identification.effect, one.axes),

@@ -26,6 +26,7 @@ __all__ = [
     "named_statement",
     "next_measurement",
     "plain_name",
+    "probability_text",
     "rejection_text",
     "span_text",
     "summary",
@@ -250,6 +251,19 @@ def effect_statement(
         names = ", or ".join(plain_name(name) for name in alternatives)
         sentences.append(f"This record cannot distinguish it from {names}.")
     return " ".join(sentences)
+
+
+def probability_text(effect: Mapping[str, Any]) -> str:
+    """Say how probable the name of an effect is; empty for a diagnosis without probabilities.
+
+    Examples
+    --------
+    >>> probability_text({"name": "shupe", "probability": 0.9314})
+    'The name is right with a probability of 93 %.'
+    """
+    if effect.get("probability") is None:
+        return ""
+    return f"The name is right with a probability of {100 * effect['probability']:.0f} %."
 
 
 def family_text(strongest: Mapping[str, Any], others: Sequence[Mapping[str, Any]]) -> str:

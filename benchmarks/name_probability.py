@@ -1,0 +1,144 @@
+"""Calibrate the probability that an identified name is right, on finished blind tests.
+
+    python benchmarks/name_probability.py proof-tuning [MORE ...]
+
+Fits `set_probability` and `alternative_weight` of `gyrostab.diagnose.settings` to the names of
+the diagnoses in these folders by maximum likelihood (`gyrostab.diagnose.result.probability` has the
+law), prints them with their standard errors, and the log score of ten cross-validated parts
+against that of one probability for all names. Seeds of `gyrostab prove` below 1 000 000 are for
+such tuning.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.special import expit
+
+from gyrostab.blindtest.scoring.score import score_case
+
+Array = NDArray[np.float64]
+PARTS = 10
+#: Standard deviation of the two log odds of the fit about zero, which bounds them.
+PRIOR_SD = 3.0
+STEP = 1e-3
+
+
+class Names(NamedTuple):
+    """Identified names."""
+
+    rivals: Array  # sum of exp(evidence of an alternative - evidence) over the alternatives
+    right: NDArray[np.bool_]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("runs", type=Path, nargs="+", help="folders of blind tests")
+    names = collect_names(parser.parse_args().runs)
+    best = fit_law(names)
+    errors = np.sqrt(np.diagonal(np.linalg.inv(curvature(best, names))))
+    ends = np.column_stack([best - errors, best + errors])
+    print(f"{names.right.size} names, {names.right.mean():.3f} right")
+    alone = names.rivals == 0.0
+    print(f"{alone.sum()} without alternatives, {names.right[alone].mean():.3f} right")
+    for label, value, (low, high) in zip(
+        ("set_probability", "alternative_weight"),
+        (expit(best[0]), math.exp(best[1])),
+        (expit(ends[0]), np.exp(ends[1])),
+        strict=True,
+    ):
+        print(f"{label}: {value:.3f} ({low:.3f} to {high:.3f})")
+    stated, constant = cross_validate(names)
+    print(f"log score in {PARTS} held-out parts: {log_score(stated, names.right):.3f} nats")
+    print(f"one probability for all names: {log_score(constant, names.right):.3f} nats")
+
+
+def collect_names(runs: list[Path]) -> Names:
+    """Read the diagnoses and ground truths of blind tests."""
+    rivals, right = [], []
+    for run in runs:
+        for path in sorted((run / "diagnoses").glob("*.json")):
+            diagnosis = json.loads(path.read_text(encoding="utf-8"))
+            truth = json.loads((run / "truth" / path.name).read_text(encoding="utf-8"))
+            found = score_case(diagnosis, truth)[0]["identifications"]
+            for one in found:
+                rivals.append(sum_rivals(one["name"], diagnosis))
+                right.append(one["exact"])
+    return Names(np.array(rivals), np.array(right))
+
+
+def sum_rivals(name: str, diagnosis: dict[str, Any]) -> float:
+    """Sum exp(evidence of an alternative - evidence); without a difference it is equal."""
+    table = max(
+        (table for table in diagnosis["effects"] if table["name"] == name),
+        key=lambda table: table["held_out_gain"]["nats"],
+    )
+    differences = {
+        one["name"]: one["nats"] or 0.0 for one in diagnosis["rejected"] if one["beaten_by"] == name
+    }
+    return sum(math.exp(-max(differences.get(one, 0.0), 0.0)) for one in table["alternatives"])
+
+
+def probabilities(law: Array, rivals: Array) -> Array:
+    """Return the probability of each name; `law` has the log odds and the log of the weight."""
+    return np.asarray(expit(law[0]) / (1.0 + np.exp(law[1]) * rivals))
+
+
+def fit_law(names: Names) -> Array:
+    """Fit the law by penalised maximum likelihood."""
+    return np.asarray(minimize(penalised_loss, np.zeros(2), args=(names,)).x)
+
+
+def penalised_loss(law: Array, names: Names) -> float:
+    """Return the negative log-likelihood with the prior of the law [nats]."""
+    loss = log_score(probabilities(law, names.rivals), names.right) * names.right.size
+    return float(loss + 0.5 * (law**2).sum() / PRIOR_SD**2)
+
+
+def curvature(law: Array, names: Names) -> Array:
+    """Return the second derivatives of the loss."""
+    steps = STEP * np.eye(2)
+    return np.array(
+        [
+            [
+                sum(
+                    sign * penalised_loss(law + first + sign * second, names)
+                    - sign * penalised_loss(law - first + sign * second, names)
+                    for sign in (1.0, -1.0)
+                )
+                / (4.0 * STEP**2)
+                for second in steps
+            ]
+            for first in steps
+        ]
+    )
+
+
+def cross_validate(names: Names) -> tuple[Array, Array]:
+    """Return probabilities fitted without a part, and the share that is right in the others."""
+    part = np.random.default_rng(0).permutation(names.right.size) % PARTS
+    stated, constant = np.empty(part.size), np.empty(part.size)
+    for number in range(PARTS):
+        others, here = part != number, part == number
+        law = fit_law(Names(names.rivals[others], names.right[others]))
+        stated[here] = probabilities(law, names.rivals[here])
+        constant[here] = (names.right[others].sum() + 0.5) / (others.sum() + 1.0)
+    return stated, constant
+
+
+def log_score(stated: Array, right: NDArray[np.bool_]) -> float:
+    """Return the mean negative log-probability of what is true."""
+    return float(-np.log(np.where(right, stated, 1.0 - stated)).mean())
+
+
+if __name__ == "__main__":
+    main()

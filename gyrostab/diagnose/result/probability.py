@@ -1,0 +1,39 @@
+"""Probability that the name of an identification is right."""
+
+from __future__ import annotations
+
+import math
+
+from gyrostab.diagnose.identify.identification import Identification
+from gyrostab.diagnose.settings import DEFAULTS, Settings
+
+__all__ = ["name_probability"]
+
+
+def name_probability(identification: Identification, *, settings: Settings = DEFAULTS) -> float:
+    r"""Return the probability that the record contains this effect, and not an alternative.
+
+    With the evidence :math:`E` of the effect [nats], and :math:`E_k` of its alternatives in its
+    place, it is :math:`p / (1 + w \sum_k \exp(E_k - E))`: p is the probability that one of them is
+    right, and w the prior weight of an alternative. An alternative that predicts the same data has
+    the same evidence. Blind tests calibrate both numbers (`benchmarks/name_probability.py`).
+
+    Examples
+    --------
+    >>> alone = Identification("shupe", ("temperature",), ("x",), (), 20.0, 8.0)
+    >>> name_probability(alone) == DEFAULTS.set_probability
+    True
+    """
+    rivals = sum(
+        math.exp(min(evidence_instead(identification, name) - identification.evidence_nats, 0.0))
+        for name in identification.alternatives
+    )
+    return settings.set_probability / (1.0 + settings.alternative_weight * rivals)
+
+
+def evidence_instead(identification: Identification, effect: str) -> float:
+    """Return the evidence of an alternative in the place of an effect [nats]."""
+    found = [
+        nats for key, nats in identification.instead.items() if key.partition("(")[0] == effect
+    ]
+    return max(found, default=identification.evidence_nats)

@@ -1,0 +1,48 @@
+"""The probability of a name falls with the evidence of its alternatives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from gyrostab.diagnose.identify.identification import Identification
+from gyrostab.diagnose.result.probability import name_probability
+from gyrostab.diagnose.settings import Settings
+
+SETTINGS = Settings(set_probability=0.9, alternative_weight=0.5)
+ALONE = Identification("shupe", ("temperature",), ("x",), (), 20.0, 8.0)
+
+
+def probability(*alternatives: str, **instead: float) -> float:
+    with_rivals = replace(ALONE, alternatives=alternatives, instead=instead)
+    return name_probability(with_rivals, settings=SETTINGS)
+
+
+def test_an_alternative_takes_its_share():
+    assert probability() == 0.9
+    # one that predicts the same data: half of the weight of the name
+    assert probability("thermal_gradient") == pytest.approx(0.9 / 1.5)
+    assert probability("thermal_gradient", thermal_gradient=20.0) == pytest.approx(0.9 / 1.5)
+    assert probability("thermal_gradient", "ageing_bias") == pytest.approx(0.9 / 2.0)
+
+
+def test_evidence_against_an_alternative_raises_the_probability():
+    found = [probability("warm_up", warm_up=nats) for nats in (20.0, 19.0, 17.0, 10.0)]
+    assert found == sorted(found)
+    assert found[-1] == pytest.approx(0.9, abs=1e-4)
+    # a simpler effect may be named although another has more evidence
+    assert probability("warm_up", warm_up=22.0) == found[0]
+
+
+def test_the_channel_with_most_evidence_counts():
+    named = replace(
+        ALONE,
+        alternatives=("supply_bias",),
+        instead={"supply_bias(supply_voltage)": 19.0, "supply_bias(light_power)": 12.0},
+    )
+    assert name_probability(named, settings=SETTINGS) == probability("warm_up", warm_up=19.0)
+
+
+def test_an_effect_that_was_not_an_alternative_does_not_count():
+    assert probability(ageing_bias=19.9) == 0.9
