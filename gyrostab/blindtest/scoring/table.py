@@ -17,6 +17,8 @@ __all__ = ["CLEAR_STRENGTH", "list_missed", "markdown", "score_table"]
 
 Row = Mapping[str, Any]
 
+#: Half width of a central interval of the normal law, by its probability [%].
+_NORMAL_INTERVALS = {50: 0.6745, 68: 0.9945, 90: 1.6449}
 #: Strength from which an effect should be detected and named.
 CLEAR_STRENGTH = 1.5
 
@@ -224,6 +226,13 @@ def _parameter_lines(rows: Sequence[Row]) -> list[Line]:
             (number["covered"] for row, number in found if not row["form_differs"]),
         ),
         share("of those, without shared_source", others),
+        *(
+            share(
+                f"errors within the {level} % interval of a normal law",
+                (abs(number["pull"]) <= sigma for _, number in found if number["pull"] is not None),
+            )
+            for level, sigma in _NORMAL_INTERVALS.items()
+        ),
         spread(
             "errors in standard errors, 68 % quantile",
             (number["pull"] for _, number in found),
