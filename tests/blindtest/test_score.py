@@ -434,6 +434,20 @@ def test_by_effect_has_a_line_for_every_effect():
     assert table.loc["spikes", "named"] is None
 
 
+def test_a_pair_counts_if_both_of_its_strong_effects_are_named():
+    rows = []
+    named = (("shupe", "spikes"), ("shupe",), ("shupe",))
+    for number, (names, strength) in enumerate(zip(named, (3.0, 3.0, 2.0), strict=True)):
+        pair = truth("shupe", "spikes", index=number, kind="pair")
+        found = diagnosis(*map(identification, names))
+        rows += [row | {"learned_strength": strength} for row in score_case(found, pair)]
+    table = score_table(rows).set_index("quantity")
+    pairs = table.loc["both effects of a pair named correctly, each of that strength"]
+    assert (pairs["value"], pairs["n"]) == (0.5, 2)
+    assert table.loc["detected, 3 times the limit in fitted noise or more", "n"] == 4
+    assert table.loc["named correctly, 3 times the limit in fitted noise or more", "value"] == 0.75
+
+
 def test_names_given_to_a_single_effect_are_counted():
     found = [
         diagnosis(identification("shupe")),
