@@ -52,7 +52,7 @@ def sizes(effect):
 def found(runs):
     """Table of the effects that every run names."""
     rows = [
-        ["against", "verdict", "named", "axes", "size, 95 %", "gain [nats]", "cannot be told from"]
+        ["against", "verdict", "named", "axes", "size, 95 %", "gain [nats]", "alternatives"]
     ]
     for name, run in runs.items():
         for effect in run.effects or [{}]:

@@ -26,8 +26,8 @@ class RandomProcess(BlockMeanStatistic):
     """A random process in the block means, which widens their scatter.
 
     No null record, score or evidence is its own: the flicker and random walk of the noise are free
-    in the evidence of means, so that a random process cannot be told from them there. It takes part
-    in the model of the simulation, and in the explanation of mismatches.
+    in the evidence of means, so that they cannot be distinguished from a random process there. It
+    takes part in the model of the simulation, and in the explanation of mismatches.
     """
 
     name = "random_process"
