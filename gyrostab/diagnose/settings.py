@@ -473,12 +473,6 @@ class Settings:
         "Probability that an identified effect or one of its alternatives is right.",
         "calibrated on 68 names: 0.952, standard error 0.03 (benchmarks/name_probability.py)",
     )
-    alternative_weight: float = _make_setting(
-        0.2,
-        "1",
-        "Prior probability of an alternative of equal evidence, over that of the named effect.",
-        "calibrated with `set_probability`: 0.18, from 0.06 to 0.5 at one standard error",
-    )
 
     def __post_init__(self) -> None:
         """Check the numbers."""

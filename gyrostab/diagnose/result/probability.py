@@ -14,9 +14,9 @@ def name_probability(identification: Identification, *, settings: Settings = DEF
     r"""Return the probability that the record contains this effect, and not an alternative.
 
     With the evidence :math:`E` of the effect [nats], and :math:`E_k` of its alternatives in its
-    place, it is :math:`p / (1 + w \sum_k \exp(E_k - E))`: p is the probability that one of them is
-    right, and w the prior weight of an alternative. An alternative that predicts the same data has
-    the same evidence. Blind tests calibrate both numbers (`benchmarks/name_probability.py`).
+    place, it is :math:`p / (1 + \sum_k \exp(E_k - E))`: p is the probability that one of them is
+    right, and all are equally probable beforehand. An alternative that predicts the same data has
+    the same evidence. `benchmarks/name_probability.py` compares it with blind tests.
 
     Examples
     --------
@@ -25,13 +25,13 @@ def name_probability(identification: Identification, *, settings: Settings = DEF
     True
     """
     rivals = sum(
-        math.exp(min(evidence_instead(identification, name) - identification.evidence_nats, 0.0))
+        math.exp(_evidence_instead(identification, name) - identification.evidence_nats)
         for name in identification.alternatives
     )
-    return settings.set_probability / (1.0 + settings.alternative_weight * rivals)
+    return settings.set_probability / (1.0 + rivals)
 
 
-def evidence_instead(identification: Identification, effect: str) -> float:
+def _evidence_instead(identification: Identification, effect: str) -> float:
     """Return the evidence of an alternative in the place of an effect [nats]."""
     found = [
         nats for key, nats in identification.instead.items() if key.partition("(")[0] == effect

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.result.probability import name_probability
 from gyrostab.diagnose.settings import Settings
 
-SETTINGS = Settings(set_probability=0.9, alternative_weight=0.5)
+SETTINGS = Settings(set_probability=0.9)
 ALONE = Identification("shupe", ("temperature",), ("x",), (), 20.0, 8.0)
 
 
@@ -21,18 +22,18 @@ def probability(*alternatives: str, **instead: float) -> float:
 
 def test_an_alternative_takes_its_share():
     assert probability() == 0.9
-    # one that predicts the same data: half of the weight of the name
-    assert probability("thermal_gradient") == pytest.approx(0.9 / 1.5)
-    assert probability("thermal_gradient", thermal_gradient=20.0) == pytest.approx(0.9 / 1.5)
-    assert probability("thermal_gradient", "ageing_bias") == pytest.approx(0.9 / 2.0)
+    # one that predicts the same data
+    assert probability("thermal_gradient") == pytest.approx(0.45)
+    assert probability("thermal_gradient", thermal_gradient=20.0) == pytest.approx(0.45)
+    assert probability("thermal_gradient", "ageing_bias") == pytest.approx(0.3)
 
 
 def test_evidence_against_an_alternative_raises_the_probability():
-    found = [probability("warm_up", warm_up=nats) for nats in (20.0, 19.0, 17.0, 10.0)]
+    found = [probability("warm_up", warm_up=nats) for nats in (22.0, 20.0, 19.0, 17.0, 10.0)]
     assert found == sorted(found)
     assert found[-1] == pytest.approx(0.9, abs=1e-4)
-    # a simpler effect may be named although another has more evidence
-    assert probability("warm_up", warm_up=22.0) == found[0]
+    # a plainer effect may be named although another has more evidence
+    assert found[0] == pytest.approx(0.9 / (1.0 + np.exp(2.0)))
 
 
 def test_the_channel_with_most_evidence_counts():
