@@ -385,7 +385,6 @@ def shade_spans(
     *,
     label: str | None = None,
     alpha: float = 0.35,
-    hatch: str | None = None,
 ) -> None:
     """Shade the spans from `starts` to `ends` (datetime64) over the full height of the panel."""
     from matplotlib.dates import date2num
@@ -396,10 +395,9 @@ def shade_spans(
         (0.0, 1.0),
         transform=ax.get_xaxis_transform(),
         facecolor=GREY,
-        edgecolor="#5a5a5a" if hatch else "none",
+        edgecolor="none",
         linewidth=0.0,
         alpha=alpha,
-        hatch=hatch,
         label=label,
         zorder=0.5,
     )

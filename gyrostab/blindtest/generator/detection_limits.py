@@ -83,14 +83,14 @@ def line_density_of(scenario: Scenario, *, axis: int) -> Array:
     return floor_psd(f, noise=scenario.noise[axis], rate=scenario.rate)
 
 
-def band_density(scenario: Scenario, *, bands: int = BANDS) -> Array:
+def band_density(scenario: Scenario) -> Array:
     """Compute the two-sided density [(deg/h)2/Hz] of N and Q in equal bands, shape (axis, band).
 
     For the noise of a real recording, return its typical density.
     """
     if scenario.measured is not None:
         return scenario.measured.level
-    f = (np.arange(bands) + 0.5) * scenario.rate / 2 / bands
+    f = (np.arange(BANDS) + 0.5) * scenario.rate / 2 / BANDS
     return np.stack(
         [floor_psd(f, noise={k: n[k] for k in "NQ"}, rate=scenario.rate) for n in scenario.noise]
     )
@@ -250,12 +250,9 @@ def variance_nats(scenario: Scenario, ratio: Array, *, quiescent: bool = True) -
     return float((weight * (ratio - 1 - np.log(ratio))).sum()) / 2
 
 
-def shared_size(scenario: Scenario, correlations: Array, *, band: float = 1.0) -> float:
-    """Compute the size of common white noise from the correlations of the pairs xy, xz, yz.
-
-    `band` is the share of the frequencies that it fills.
-    """
-    n = float((~scenario.missing).sum()) * band
+def shared_size(scenario: Scenario, correlations: Array) -> float:
+    """Compute the size of common white noise from the correlations of the pairs xy, xz, yz."""
+    n = float((~scenario.missing).sum())
     worth = np.asarray(correlations) ** 2
     if scenario.measured is not None:  # the coherence falls where an axis has more than white noise
         white = np.array([white_level(noise["N"]) ** 2 for noise in scenario.noise])

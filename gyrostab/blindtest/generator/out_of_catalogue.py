@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from gyrostab.blindtest.generator.environment import lag
@@ -19,8 +18,6 @@ from gyrostab.blindtest.generator.shapes import (
 )
 
 __all__ = ["breathing_noise", "chirped_line", "informative_gaps", "slow_memory", "three_levels"]
-
-Array = NDArray[np.float64]
 
 
 def breathing_noise(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from gyrostab.diagnose.identify.equivalents import prefer_plainer
 from gyrostab.diagnose.identify.identification import (
@@ -34,7 +33,6 @@ from gyrostab.physics.rotation import EarthRate
 
 __all__ = ["Estimate", "Fitted", "fit_identifications"]
 
-Array = NDArray[np.float64]
 _ANGLE = "deg"
 _PLACE = "frequency"  # of a line: where it is does not depend on what makes it
 

@@ -94,9 +94,9 @@ class Statistic:
         Whether the baseline with the effects contains what an effect contributes.
     is_in_means, is_linear_in_means, is_switching : bool
         Whether effects move the block means; by columns; by two levels of free course.
-    is_power, is_pairwise, is_rotation, is_transfer, is_line, is_count, is_random : bool
+    is_power, is_pairwise, is_rotation, is_transfer, is_line, is_count : bool
         Whether effects add power, covariance of two axes, amplitudes at multiples of the rotation,
-        what follows a reference channel, a spectral line, anomalous samples, a random process.
+        what follows a reference channel, a spectral line, anomalous samples.
     explains_motion : bool
         Whether an effect explains a moving mean although it has no columns in the means.
     has_course, has_size : bool
@@ -128,7 +128,6 @@ class Statistic:
     is_transfer = False
     is_line = False
     is_count = False
-    is_random = False
     has_course = False
     explains_motion = False
     has_size = True

@@ -35,7 +35,6 @@ class RandomProcess(BlockMeanStatistic):
     contained_in = ()
     nuisance_alternative = "~red"
     error_shows_in = ("random_process",)
-    is_random = True
     explains_motion = True
     has_course = True
     has_size = False

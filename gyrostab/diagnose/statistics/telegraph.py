@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.fast_switching import (
     SwitchingEvidence,
@@ -34,8 +32,6 @@ from gyrostab.diagnose.predict.search import Trial
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.statistics.base import SizeFit, Sizes
 from gyrostab.diagnose.statistics.mean import BlockMeanStatistic, condition_means
-
-Array = NDArray[Any]
 
 _MAX_NULL_BLOCKS = 20_000  # of null records that are searched for two levels; limits time
 

@@ -173,9 +173,9 @@ class _Clock:
             f"({self.grid.size / self.grid.rate:.6g} s)"
         )
 
-    def sample_of(self, value: Any, option: str, *, last: int, example: str = _EXAMPLE) -> int:
+    def sample_of(self, value: Any, option: str, *, last: int) -> int:
         """Return the first sample at or after an instant, which must lie in the record."""
-        sample = self.first_at(value, option, example=example)
+        sample = self.first_at(value, option)
         if sample < 0 or sample > last:
             raise OptionError(f"{option} {value} lies outside the record; {self.describe()}")
         return sample
