@@ -45,21 +45,22 @@ def level_tables(low: Array, high: Array, parts: int) -> tuple[Array, Array]:
     stay = np.exp(-(1.0 / low + 1.0 / high) / parts)
     up = high / (low + high) * (1.0 - stay)
     down = low / (low + high) * (1.0 - stay)
-    move = ((1.0 - up, up), (down, 1.0 - down))
-    chance, rises = np.zeros((2, low.size, 2, 2, parts + 1))
-    chance[:, 0, 0, 0] = chance[:, 1, 1, 0] = 1.0
+    to_low, to_high = (
+        np.stack(move)[:, :, None, None] for move in ((1.0 - up, down), (up, 1.0 - down))
+    )
+    # by level at the end; chance and rises; then as they are returned
+    low_end, high_end = np.zeros((2, 2, low.size, 2, parts + 1))
+    low_end[0, :, 0, 0] = high_end[0, :, 1, 0] = 1.0
     for _ in range(parts):
-        before, counted = chance.copy(), rises.copy()
-        chance[:], rises[:] = 0.0, 0.0
-        for old in range(2):
-            for new in range(2):
-                by = move[old][new][:, None, None]
-                come, fell = (
-                    before[:, :, old, : parts + 1 - new],
-                    counted[:, :, old, : parts + 1 - new],
-                )
-                chance[:, :, new, new:] += come * by
-                rises[:, :, new, new:] += (fell + (come if new > old else 0.0)) * by
+        stepped = low_end.copy()
+        stepped[1] += low_end[0]
+        low_end, moved = (
+            low_end * to_low[0] + high_end * to_low[1],
+            stepped * to_high[0] + high_end * to_high[1],
+        )
+        high_end[..., 1:] = moved[..., :-1]
+        high_end[..., 0] = 0.0
+    chance, rises = np.stack([low_end, high_end], axis=3)
     return chance, rises
 
 
