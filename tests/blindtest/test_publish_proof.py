@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
+import runpy
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -20,7 +19,15 @@ def docs(tmp_path):
     return tmp_path / "docs"
 
 
-def run(folder: Path, docs: Path, *, seed: int = 2_000_003) -> subprocess.CompletedProcess[str]:
+@pytest.fixture
+def publish(monkeypatch):
+    """The script, as it is called in its folder."""
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    return runpy.run_path(str(ROOT / "benchmarks" / "publish_proof.py"))["main"]
+
+
+def finish_run(folder: Path, docs: Path, monkeypatch, *, seed: int = 2_000_003) -> None:
+    """Write the files of a finished run, and name it on the command line."""
     folder.mkdir(exist_ok=True)
     (folder / "benchmark.json").write_text(json.dumps({"seed": seed}))
     (folder / "table.md").write_text(
@@ -28,36 +35,31 @@ def run(folder: Path, docs: Path, *, seed: int = 2_000_003) -> subprocess.Comple
     )
     for name in ("completeness", "reliability"):
         (folder / f"{name}.png").write_bytes(name.encode())
-    command = [
-        sys.executable,
-        str(ROOT / "benchmarks" / "publish_proof.py"),
-        str(folder),
-        "--docs",
-        str(docs),
-    ]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    monkeypatch.setattr("sys.argv", ["publish_proof.py", str(folder), "--docs", str(docs)])
 
 
-def test_figures_are_replaced_and_handwritten_text_stays(tmp_path, docs):
+def test_figures_are_replaced_and_handwritten_text_stays(
+    tmp_path, docs, publish, monkeypatch, capsys
+):
     before = (docs / "proof.md").read_text(encoding="utf-8")
-    done = run(tmp_path / "proof", docs)
-    assert done.returncode == 0, done.stderr
+    finish_run(tmp_path / "proof", docs, monkeypatch)
+    publish()
     after = (docs / "proof.md").read_text(encoding="utf-8")
     by_hand = before.split("<!-- proof: begin -->")[0]
     assert "## What failed, and why" in by_hand
     assert after.startswith(by_hand)
     assert "| detected | 0.123 |" in after
     assert (docs / "figures" / "proof-completeness.png").read_bytes() == b"completeness"
-    assert "What failed, and why" in done.stdout  # which describes another run
-    again = run(tmp_path / "proof", docs)
+    assert "What failed, and why" in capsys.readouterr().out  # which describes another run
+    publish()
     assert (docs / "proof.md").read_text(encoding="utf-8") == after
-    assert again.stdout == ""
+    assert capsys.readouterr().out == ""
 
 
-def test_tuning_seed_is_refused_without_changes(tmp_path, docs):
+def test_tuning_seed_is_refused_without_changes(tmp_path, docs, publish, monkeypatch):
     before = (docs / "proof.md").read_bytes()
-    done = run(tmp_path / "proof", docs, seed=7)
-    assert done.returncode != 0
-    assert "for tuning" in done.stderr
+    finish_run(tmp_path / "proof", docs, monkeypatch, seed=7)
+    with pytest.raises(SystemExit, match="for tuning"):
+        publish()
     assert (docs / "proof.md").read_bytes() == before
     assert not list((docs / "figures").iterdir())

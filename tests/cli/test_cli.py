@@ -342,7 +342,9 @@ def test_cycles_are_looked_for_seldom_and_afterwards_as_before(monkeypatch):
     assert gc.get_threshold() == before
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+@pytest.mark.parametrize(
+    "name", ["SIGINT", "SIGTERM", pytest.param("SIGHUP", marks=pytest.mark.slow)]
+)
 def test_a_real_interrupt_leaves_nothing_behind(tmp_path, name):
     path = write_log(tmp_path / "long.csv")
     code = (

@@ -35,7 +35,11 @@ def address(tmp_path_factory):
     """Start a scheduler and two workers of one thread each as separate programs, as a user does."""
     folder = tmp_path_factory.mktemp("cluster")
     where = folder / "scheduler.json"
-    environment = {**os.environ, "DASK_DISTRIBUTED__WORKER__DAEMON": "False"}
+    environment = {
+        **os.environ,
+        "DASK_DISTRIBUTED__WORKER__DAEMON": "False",
+        "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1",  # each starts a worker again
+    }
     scheduler = ["scheduler", "--host", "127.0.0.1", "--port", "0"]
     worker = [
         "worker",

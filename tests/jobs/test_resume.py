@@ -190,7 +190,7 @@ def test_workers_that_share_the_parts_end_at_about_the_same_time(hours, workers)
 
 def test_a_run_makes_what_the_functions_make(log, whole, tmp_path):
     (tmp_path / "run.nc").write_bytes(whole)
-    product = fit_noise(davar(open_log(log), **WINDOW))
+    product = fit_noise(davar(open_log(log), **WINDOW)).compute()
     with open_product(tmp_path / "run.nc") as made:
         assert made.attrs["gyrostab_job"].startswith("sha256:")
         assert set(made.variables) == set(product.variables)

@@ -90,16 +90,14 @@ def test_expected_powers_are_those_of_simulated_noise(term, size):
 def test_coefficients_are_within_their_errors(lost):
     noise = {"Q": 0.5, "N": 0.003, "B": 0.004, "K": 0.1}
     axes = tuple("abcdefghijkl")
-    baseline = calibrate_noise(reduce_log(log(noise, axes=axes, duration="2h", lost=lost, seed=3)))
+    blocks = reduce_log(log(noise, axes=axes, duration="2h", lost=lost, seed=3))
+    baseline = calibrate_noise(blocks)
     for term, value in noise.items():
         z = ((baseline["coefficient"] - value) / baseline["stderr"]).sel(term=term).values
         assert (np.abs(z) < 2.0).mean() > 0.7, term
         assert np.abs(z.mean()) < 1.2, term
     assert float(baseline["stderr"].sel(term="N").max()) < 0.05 * noise["N"]
-    level = (
-        reduce_log(log(noise, axes=axes, duration="2h", lost=lost, seed=3))["power"]
-        / baseline["spectrum"]
-    ).mean(["axis", "block"])
+    level = (blocks["power"] / baseline["spectrum"]).mean(["axis", "block"])
     np.testing.assert_allclose(level, 1.0, atol=0.12)
 
 

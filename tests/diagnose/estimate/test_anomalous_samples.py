@@ -178,7 +178,7 @@ def test_number_and_length_of_held_samples_are_estimated(fill):
             assert one.parameters[name].low < true < one.parameters[name].high
 
 
-@pytest.mark.parametrize("number", [2, 20])
+@pytest.mark.parametrize("number", [2, pytest.param(20, marks=pytest.mark.slow)])
 def test_frames_that_are_sent_twice_are_held_samples(number: int) -> None:
     noise = SCATTER * np.random.default_rng(8).standard_normal((3, 15_000))
     for first in np.linspace(1_000, 14_000, number).astype(int):

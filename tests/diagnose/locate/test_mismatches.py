@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -65,11 +67,16 @@ def test_level_sets_the_threshold(base, null):
             locate_mismatches(found, base, null, level=level)
 
 
+@cache
+def _baseline_and_null(missing):
+    base = baseline(missing=missing)
+    return base, null_scores(base, chunks(base, 75, np.random.default_rng(23), missing=missing))
+
+
 @pytest.mark.parametrize("missing", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
 @pytest.mark.parametrize("share", [0.25, 0.5])
 def test_burst_of_noise_has_a_region(share, missing):
-    base = baseline(missing=missing)
-    null = null_scores(base, chunks(base, 75, np.random.default_rng(23), missing=missing))
+    base, null = _baseline_and_null(missing)
     overlaps = []
     for seed in range(9):
         found = records(base, 1, np.random.default_rng(seed), missing=missing).isel(record=0)
@@ -195,12 +202,11 @@ def test_pieces_of_one_region_are_merged_and_others_are_not():
 # --------------------------------------------------------------------------------
 
 
-def _make_log_with(seed, effect, missing=0.0):
+@cache
+def _reduce_log_with(seed, effect):
     rng = np.random.default_rng(seed)
     rate = SIGMA * rng.standard_normal((3, SIZE))
     effect(rate, np.arange(SIZE) / RATE, rng)
-    if missing:
-        rate[:, rng.random(SIZE) < missing] = np.nan
     return reduce_log(make_log(rate, rate=RATE, unit="deg/h"))
 
 
@@ -273,7 +279,7 @@ def _draw_nulls(blocks, base, count, rng):
 
 @pytest.fixture(scope="module")
 def raw():
-    blocks = _make_log_with(1, _add_nothing)
+    blocks = _reduce_log_with(1, _add_nothing)
     base = _baseline_of(blocks)
     return (
         base,
@@ -311,7 +317,7 @@ def _add_spikes(rate, t, rng):
 )
 def test_effects_in_samples_are_located(raw, effect, statistic, axes, begin, end):
     base, null, _ = raw
-    regions = locate_mismatches(_make_log_with(2, effect), base, null)
+    regions = locate_mismatches(_reduce_log_with(2, effect), base, null)
     regions = regions.sel(mismatch=regions["view"] == statistic)
     assert regions.sizes["mismatch"] >= 1
     first = regions.isel(mismatch=0)
@@ -331,7 +337,7 @@ def test_samples_without_an_effect_have_no_region(raw):
 
 def test_table_has_the_fields_of_the_json(raw):
     base, null, _ = raw
-    regions = locate_mismatches(_make_log_with(2, _add_vibration), base, null)
+    regions = locate_mismatches(_reduce_log_with(2, _add_vibration), base, null)
     assert regions["mismatch"].values[0] == 1
     assert np.all(np.diff(regions["p_value"].values) >= 0)
     start = regions["start_time"].values[0] - np.datetime64(0, "ns")
