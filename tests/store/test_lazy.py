@@ -22,9 +22,11 @@ from gyrostab.jobs import checkpoint
 from gyrostab.jobs.run import load_log, run
 from gyrostab.store import netcdf_compression, write
 from gyrostab.store.lazy import (
+    InMemory,
     can_read_directly,
     concatenate_columns,
     find_source,
+    make_dask,
     make_lazy,
     read_box,
     read_into,
@@ -70,6 +72,25 @@ def test_joined_samples_are_those_of_dask(made, data):
         found = np.full(data.draw(st.integers(0, size - begin)), 7.0)
         read_into(joined, row, begin, found)
         np.testing.assert_array_equal(found, expected[begin : begin + found.size])
+
+
+def test_runs_that_follow_each_other_are_read_with_one_slice():
+    reads = []
+
+    class Counting(InMemory):
+        def read_into(self, row, begin, out):
+            reads.append((begin, out.size))
+            super().read_into(row, begin, out)
+
+    values = np.arange(300.0)
+    array = make_dask(Counting(values), 300)
+    runs = np.array([[4 * number, 3 * number, 3] for number in range(100)])
+    joined = place_on_grid([[(array, None, runs)]], 400, 400)
+    found = np.empty(400)
+    read_into(joined, 0, 0, found)
+    assert np.isnan(found[3::4]).all()
+    np.testing.assert_array_equal(found[np.isfinite(found)], values)
+    assert reads == [(0, 300)]
 
 
 def test_what_is_derived_from_an_array_is_not_read_past_dask():

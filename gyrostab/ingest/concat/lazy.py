@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any
@@ -26,6 +26,8 @@ __all__ = ["GridSource", "PlacedArray", "chunk_of", "place_on_grid"]
 PlacedArray = tuple[Any, int | None, NDArray[np.int64]]
 
 _MIN_CHUNK_SAMPLES, _MAX_CHUNK_SAMPLES = 2**16, 2**22
+#: Samples of an array that are read at once where a gap of the grid divides them; bounds memory.
+_READ_AHEAD_SAMPLES = 2**16
 
 
 def chunk_of(arrays: Sequence[Any]) -> int:
@@ -194,7 +196,7 @@ def _fill(
         for (_, stop), (start, _) in pairwise([(0, 0), *ends, (out.size, 0)]):
             out[stop:start] = np.nan
     taken: dict[int, list[tuple[int, int]]] = {}  # by part: the runs of one part do not overlap
-    for number, array, own_row, own, at, length in found:
+    for number, array, own_row, own, at, length in _read_ahead(found):
         here = out[at : at + length]
         earlier = (run for other, runs in taken.items() if other != number for run in runs)
         if any(at < stop and start < at + length for start, stop in earlier):
@@ -204,6 +206,35 @@ def _fill(
         else:
             read_into(array, own_row, own, here)
         taken.setdefault(number, []).append((at, at + length))
+
+
+def _read_ahead(
+    found: Sequence[tuple[int, Any, int, int, int, int]],
+) -> Iterator[tuple[int, Any, int, int, int, int]]:
+    """Yield the runs; short ones that follow each other in a file come from one slice of it.
+
+    Each slice of a file takes milliseconds, and a log with many gaps has many runs.
+    """
+    begin = 0
+    while begin < len(found):
+        number, array, row, own, *_, length = found[begin]
+        stop, end = begin + 1, own + length
+        while (
+            not isinstance(array, np.ndarray)
+            and stop < len(found)
+            and (found[stop][0], found[stop][3]) == (number, end)
+            and end + found[stop][5] - own <= _READ_AHEAD_SAMPLES
+        ):
+            end += found[stop][5]
+            stop += 1
+        if stop > begin + 1:
+            array, row, first = np.empty(end - own), 0, own
+            read_into(found[begin][1], found[begin][2], own, array)
+        else:
+            first = 0
+        for _, _, _, at_source, at, length in found[begin:stop]:
+            yield number, array, row, at_source - first, at, length
+        begin = stop
 
 
 def _overlapping_runs(
