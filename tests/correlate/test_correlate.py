@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import tomllib
@@ -27,6 +26,7 @@ from gyrostab.kernels.regression.coupling import (
     uncalibrated,
 )
 from tests.support import coupled, synthetic
+from tests.support.cf_checker import assert_follows_cf
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -404,20 +404,7 @@ def test_command_writes_legal_units_and_a_figure(stored, tmp_path, capsys):
     with gyrostab.open_product(target) as found:
         units = found["window_mean_per_temperature"].attrs["units"]
         assert cf_units.Unit(units) == cf_units.Unit("degree hour-1") / cf_units.Unit("K")
-    checker = Path(sys.executable).with_name("compliance-checker")
-    offline = {
-        **os.environ,
-        "http_proxy": "http://127.0.0.1:9",
-        "https_proxy": "http://127.0.0.1:9",
-    }
-    done = subprocess.run(
-        [checker, "-t", "cf:1.11", "-c", "strict", target],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=offline,
-    )
-    assert "All tests passed!" in done.stdout, done.stdout
+    assert_follows_cf(target)
 
 
 @pytest.mark.slow

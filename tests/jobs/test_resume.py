@@ -430,7 +430,8 @@ def test_two_runs_of_one_output_at_once(log, tmp_path, capfd):
     assert call(log, "-o", output) == 0
 
 
-def test_killed_before_changes_of_the_disk_and_at_random(log, tmp_path):
+@pytest.mark.parametrize(("calls", "kills"), [(4, 2), pytest.param(16, 8, marks=pytest.mark.slow)])
+def test_killed_before_changes_of_the_disk_and_at_random(log, tmp_path, calls, kills):
     seed = random.SystemRandom().randrange(10**6)
     print(f"seed {seed}")
     command = [
@@ -440,8 +441,8 @@ def test_killed_before_changes_of_the_disk_and_at_random(log, tmp_path):
         str(tmp_path),
         str(log),
         str(seed),
-        "8",
-        "4",
+        str(calls),
+        str(kills),
     ]
     done = subprocess.run(
         command, capture_output=True, text=True, timeout=250, cwd=Path(__file__).parents[2]
@@ -451,4 +452,4 @@ def test_killed_before_changes_of_the_disk_and_at_random(log, tmp_path):
     print(result)
     assert result["wrong"] == []
     assert result["calls"] > 3 * PARTS
-    assert result["kills"] >= 8
+    assert result["kills"] >= calls

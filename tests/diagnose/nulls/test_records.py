@@ -71,7 +71,7 @@ def close(one: xr.DataArray, other: xr.DataArray, *, rel: float) -> None:
     assert float(one.std()) == pytest.approx(scale, rel=rel)
 
 
-@pytest.mark.parametrize("lost", [0.0, 0.3])
+@pytest.mark.parametrize("lost", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
 def test_statistics_match_those_of_raw_logs(lost):
     found, nulls = both(lost)
     for name in ("power", "mean", "cross", "line_power", "kurtosis"):

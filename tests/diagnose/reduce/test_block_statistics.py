@@ -92,7 +92,9 @@ def test_powers_match_their_definition(seed: int, size: int, lost: float, offset
         assert blocks.cross.values[0, number, 3] == pytest.approx(wanted, rel=1e-6, abs=1e-12)
 
 
-@pytest.mark.parametrize("gaps", ["none", "random", "stretches"])
+@pytest.mark.parametrize(
+    "gaps", [pytest.param("none", marks=pytest.mark.slow), "random", "stretches"]
+)
 def test_powers_of_white_noise_are_gamma_distributed(gaps: str):
     rng = np.random.default_rng(4)
     x = with_gaps(3.0 * rng.standard_normal(3000 * 400), gaps, rng)
