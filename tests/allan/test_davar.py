@@ -270,7 +270,15 @@ class TestInvariance:
         with pytest.raises(AssertionError, match="the log was computed"):
             surface.avar.compute(scheduler="sync")
 
-    @pytest.mark.parametrize("dtype", [np.float32, np.int16, np.int32, np.int64])
+    @pytest.mark.parametrize(
+        "dtype",
+        [
+            np.float32,
+            np.int16,
+            pytest.param(np.int32, marks=pytest.mark.slow),  # each type is compiled
+            pytest.param(np.int64, marks=pytest.mark.slow),
+        ],
+    )
     def test_narrow_types_are_summed_in_double(self, dtype):
         x = (np.random.default_rng(8).standard_normal(5000) * 50 + 2000).astype(dtype)
         narrow = davar(log_of(x), window="1000samples", step="100samples")

@@ -172,7 +172,6 @@ def test_all_figures_of_a_product(tmp_path, capsys):
     assert main(["plot", source, "-o", str(target)]) == 2
     assert "--overwrite" in capsys.readouterr().err
     assert not (target / "davar.png").exists()
-    assert main(["plot", source, "-o", str(target), "--overwrite"]) == 0
 
 
 def test_unusual_axis_names_and_single_windows_are_drawn(tmp_path):

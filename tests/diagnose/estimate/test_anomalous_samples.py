@@ -195,7 +195,14 @@ def test_frames_that_are_sent_twice_are_held_samples(number: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "kind"), [(6, "normal"), (20, "normal"), (60, "normal"), (6, "bits"), (20, "bits")]
+    ("number", "kind"),
+    [
+        (6, "normal"),
+        pytest.param(20, "normal", marks=pytest.mark.slow),
+        pytest.param(60, "normal", marks=pytest.mark.slow),
+        pytest.param(6, "bits", marks=pytest.mark.slow),
+        (20, "bits"),
+    ],
 )
 def test_intervals_of_outliers_exclude_zero_and_contain_the_truth(number: int, kind: str) -> None:
     """Sizes of outliers of a normal law, and of flips of one of six bits, 7 times the noise.

@@ -277,7 +277,7 @@ def test_anomalous_samples_do_not_raise_the_noise(size):
     assert error < 0.05 * value
 
 
-@pytest.mark.parametrize("lost", [0.0, 0.3])
+@pytest.mark.parametrize("lost", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
 @pytest.mark.parametrize(
     ("table", "grid"),
     [

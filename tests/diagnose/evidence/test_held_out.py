@@ -328,6 +328,7 @@ def test_wrong_designs_and_tiers_are_refused():
         mean_evidence(data, baseline, {"one": [np.ones(30)]}, axis="x", tier="hard")
 
 
+@pytest.mark.slow
 def test_evidence_of_many_records_takes_seconds():
     n = 180
     data, baseline = mean_case(n, records=400)
