@@ -12,11 +12,13 @@ from functools import cache
 from types import MappingProxyType
 from typing import Any
 
+import pandas as pd
+
 from gyrostab.errors import OptionError, UnitError
 from gyrostab.physics.base import Effect, Parameter
 from gyrostab.units import DAY, HOUR, parse_unit
 
-__all__ = ["amount", "close_to", "effects", "make_effect"]
+__all__ = ["amount", "close_to", "effect_table", "effects", "make_effect"]
 
 
 @cache
@@ -167,3 +169,41 @@ def amount(value: Any, unit: str, where: str) -> Any:
         if source.quantity == wanted.quantity:
             return (number * source.factor + source.offset - wanted.offset) / wanted.factor
     raise OptionError(f"{where}: the unit {given!r} is not known here; give the number in {unit}")
+
+
+def effect_table() -> pd.DataFrame:
+    """Tabulate the parameters of all effects.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Columns effect, parameter, unit, required, default, typical, low, high, meaning, source.
+
+    Examples
+    --------
+    >>> table = effect_table()
+    >>> table[table.effect == "temperature_bias"][["parameter", "unit", "required"]].head(1)
+         parameter        unit  required
+    ...  sensitivity  deg/h/degC      True
+    """
+    rows = []
+    for name, kind in effects().items():
+        must = kind.required()
+        for item in kind.parameters():
+            rows.append(
+                {
+                    "effect": name,
+                    "parameter": item.name,
+                    "unit": item.unit,
+                    "required": item.name in must,
+                }
+                | _describe_parameter(item)
+            )
+    return pd.DataFrame(rows)
+
+
+def _describe_parameter(item: Parameter) -> dict[str, Any]:
+    return {
+        key: getattr(item, key)
+        for key in ("default", "typical", "low", "high", "meaning", "source")
+    }

@@ -9,7 +9,7 @@ import pytest
 
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.physics.base import STAGES, Effect, Prediction, Windows
-from gyrostab.physics.registry import effects, make_effect
+from gyrostab.physics.registry import effect_table, effects, make_effect
 from gyrostab.simulate import simulate
 from gyrostab.units import INNER
 from tests.support.effect_bench import random_cuts, run, same_whatever_the_cuts
@@ -243,6 +243,16 @@ def test_units_are_converted():
     assert make_effect(
         {"name": "temperature_bias", "sensitivity": "0.1 deg/h/degC", "reference": "300 K"}
     ).reference == pytest.approx(26.85)
+
+
+def test_table_lists_every_parameter_of_every_effect():
+    table = effect_table()
+    assert set(table["effect"]) == set(effects())
+    row = table[
+        (table["effect"] == "temperature_bias") & (table["parameter"] == "sensitivity")
+    ].iloc[0]
+    assert row["unit"] == "deg/h/degC"
+    assert row["required"]
 
 
 # --------------------------------------------------------------------------------
