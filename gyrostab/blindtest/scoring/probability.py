@@ -136,7 +136,8 @@ def probability_lines(rows: Sequence[Row]) -> list[Line]:
     outcomes = (rng.random(chosen.shape) < stated).astype(float)
     by_chance = [expected_calibration_error(stated, outcome) for outcome in outcomes]
     low, high = np.quantile(by_chance, _INTERVAL)
-    return [*lines, make_line(exact, np.mean(by_chance), low, high, stated.size, NO_TARGET)]
+    mean = float(np.mean(by_chance))
+    return [*lines, make_line(exact, mean, low, high, stated.size, NO_TARGET)]
 
 
 def _brier_score(stated: Array, right: Array) -> float:
