@@ -36,6 +36,10 @@ TYPICAL_RATE_HZ, RATE_DECADES = 100.0, 1.0
 #: Smallest score of a group of columns that is taken for the gyro: one sign in its name, or a unit.
 MIN_SCORE = 1.5
 
+#: Steps of angles below this share of their standard deviation are those of a cumulative angle: the
+#: steps of a random walk of n rows are sqrt(6 / n) of it, those of white increments all of it.
+CUMULATIVE_STEP_SHARE = 0.1
+
 _STRONG = re.compile(
     r"gyr|omega|ang(ular)?[ _.]?(rate|vel)|rot(ation)?[ _.]?(rate|vel)|turn[ _.]?rate|uncompgyro"
 )
@@ -77,8 +81,9 @@ class Guess:
     """Guessed roles of the columns of a file, with the reasons.
 
     `axes` are the columns of the gyro by axis (empty if no column looks like one); `unit` is the
-    unit to give for them, None if they carry one; `time` and `time_unit` likewise; `rate` [Hz] is
-    set for a file without time. `sampling_rate_hz` is the rate that the guess is based on.
+    unit to give for them, None if they carry one; `time` and `time_unit` likewise; `kind` is the
+    kind to give for angles; `rate` [Hz] is set for a file without time. `sampling_rate_hz` is the
+    rate that the guess is based on.
     """
 
     axes: dict[str, ColumnInspection]
@@ -90,6 +95,7 @@ class Guess:
     reasons: tuple[str, ...]
     warnings: tuple[str, ...]
     sampling_rate_hz: float = math.nan
+    kind: str | None = None
 
 
 def guess_columns(
@@ -97,7 +103,7 @@ def guess_columns(
     *,
     rate: float | None = None,
     rate_hint: float | None = None,
-    angles: bool = False,
+    kind: str | None = None,
 ) -> Guess:
     """Guess what the columns of a file are.
 
@@ -107,8 +113,8 @@ def guess_columns(
         Sampling rate given by the user [Hz].
     rate_hint : float, optional
         Sampling rate that a text in the file contains [Hz].
-    angles : bool
-        Whether the gyro columns are angles.
+    kind : {"rate", "angle"}, optional
+        Kind of angle columns given by the user.
     """
     reasons: list[str] = []
     warnings: list[str] = []
@@ -132,9 +138,14 @@ def guess_columns(
         )
     )
     axes = _guess_axes(inspection, time, reasons)
+    group = list(axes.values())
+    angles = kind == "angle" or any(
+        given_unit(column, "angle") or column.name.lower().startswith("angle_") for column in group
+    )
     unit = None
-    if axes and not all(given_unit(column) for column in axes.values()):
+    if not all(given_unit(column, "angle" if angles else "rate") for column in group):
         unit = guess_unit(inspection, axes, sampling, reasons, warnings, angles=angles)
+    guessed_kind = _guess_kind(group, warnings) if angles and kind is None else None
     if not axes:
         warnings.append(
             "no column looks like a gyro; if one is, name it: --map NAME=gyro_x --unit gyro=deg/s"
@@ -144,7 +155,16 @@ def guess_columns(
         (c for c in inspection.columns if c.key not in taken and _is_temperature(c)), None
     )
     return Guess(
-        axes, unit, time, time_unit, assumed, temperature, tuple(reasons), tuple(warnings), sampling
+        axes,
+        unit,
+        time,
+        time_unit,
+        assumed,
+        temperature,
+        tuple(reasons),
+        tuple(warnings),
+        sampling,
+        guessed_kind,
     )
 
 
@@ -333,6 +353,18 @@ def _gyro_score(
     if all(column.scatter < 0.01 * column.std for column in group):
         score -= 1.0  # a smooth curve, such as a position or an angle
     return score
+
+
+def _guess_kind(group: Sequence[ColumnInspection], warnings: list[str]) -> str:
+    """Guess whether angles are cumulative or increments, by their steps, and add a warning."""
+    cumulative = all(column.scatter < CUMULATIVE_STEP_SHARE * column.std for column in group)
+    kind, meaning = ("angle", "cumulative") if cumulative else ("rate", "increments of each row")
+    other = "rate if they are increments" if cumulative else "angle if they are cumulative"
+    warnings.append(
+        f"--kind {kind}, {meaning}, is a guess from the size of the steps between rows; give "
+        f"--kind {other}"
+    )
+    return kind
 
 
 def _mean_over_scatter(group: Sequence[ColumnInspection]) -> float:

@@ -39,9 +39,9 @@ MAX_RATE_DPH = 4000.0 * HOUR
 TYPICAL_ARW, ARW_DECADES = 0.3, 1.0
 
 
-def given_unit(column: ColumnInspection) -> bool:
-    """Return whether the header gives a unit of rates."""
-    return column.unit is not None and is_unit_of(column.unit, ("rate",))
+def given_unit(column: ColumnInspection, quantity: str = "rate") -> bool:
+    """Return whether the header gives a unit of rates, or of another quantity."""
+    return column.unit is not None and is_unit_of(column.unit, (quantity,))
 
 
 def name_unit(column: ColumnInspection, quantity: str) -> str | None:

@@ -28,6 +28,10 @@ MAX_MISSING_SHARE = 0.1
 #: Samples from which the noise is estimated: 8 MB for each axis, an estimate within 1 %.
 _MAX_NOISE_SAMPLES = 2**20
 
+#: Options that place or cut the samples of a log; the others are those of `ReadOptions`.
+_CUTTING = ("time_from", "time_to", "exclude")
+_PLACING = ("max_gap", "on_file", *_CUTTING)
+
 #: Columns of the table: span [s], rate [Hz], share of missing samples between start and end.
 COLUMNS = (
     "file",
@@ -158,9 +162,7 @@ def _inspect_once(
     from gyrostab.ingest.guess import guess_columns
     from gyrostab.ingest.inspect import inspect_file
 
-    options = ReadOptions(
-        **{name: value for name, value in reading.items() if name not in ("max_gap", "on_file")}
-    )
+    options = ReadOptions(**_select_reading(reading))
     try:
         headers = tuple(
             (column.header, column.role, column.unit) for column in scan_file(path, options).columns
@@ -168,9 +170,8 @@ def _inspect_once(
         if headers not in inspected:
             inspected[headers] = None
             inside = inspect_file(path, options)
-            angles = options.kind == "angle"
             guess = guess_columns(
-                inside, rate=options.rate, rate_hint=_named_rate(path), angles=angles
+                inside, rate=options.rate, rate_hint=_named_rate(path), kind=options.kind
             )
             inspected[headers] = _try_guess(path, inside, guess, reading)
     except GyrostabError:
@@ -208,6 +209,8 @@ def _try_guess(
         )
     if guess.rate is not None:
         options["rate"] = guess.rate
+    if guess.kind is not None:
+        options["kind"] = guess.kind
     options = {name: value for name, value in options.items() if value != {}}
     tries = [options]
     if "rate" not in options and math.isfinite(inspection.rate_hz):
@@ -229,6 +232,11 @@ def _try_guess(
     return best or InspectedFile([path], inspection, guess, options, None, reason)
 
 
+def _select_reading(options: dict[str, Any]) -> dict[str, Any]:
+    """Return the options that are those of `ReadOptions`."""
+    return {name: value for name, value in options.items() if name not in _PLACING}
+
+
 def _named_rate(path: Path) -> float | None:
     """Find a sampling rate such as ``100 Hz`` in the text at the beginning of a file."""
     from gyrostab.ingest.formats.text import read_head
@@ -246,10 +254,8 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
     from gyrostab.schema import log_channels, signal_name, texts
 
     max_gap = reading.get("max_gap", "10D")
-    cut = {name: reading[name] for name in ("time_from", "time_to", "exclude") if name in reading}
-    reading = {
-        name: value for name, value in reading.items() if name not in ("max_gap", "on_file", *cut)
-    }
+    cut = {name: reading[name] for name in _CUTTING if name in reading}
+    reading = _select_reading(reading)
     summary = scan_file(path, ReadOptions(**reading))
     raw = read_log([path], **reading)
     regular = "sampling_rate_hz" in raw.attrs  # a log that gyrostab wrote

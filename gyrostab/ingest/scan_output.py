@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 __all__ = ["next_command", "print_inspection", "print_next", "print_scan"]
 
+#: Options whose flag on the command line has another name.
+_FLAGS = {"limits": "--limit", "time_from": "--from", "time_to": "--to"}
+
 
 def next_command(paths: Sequence[str | Path], options: dict[str, Any]) -> str:
     """Return the complete command that makes a product of logs.
@@ -33,7 +36,7 @@ def next_command(paths: Sequence[str | Path], options: dict[str, Any]) -> str:
         number, target = number + 1, Path(f"product_{number}.nc")
     words = ["gyrostab", "run", *map(str, paths), "-o", str(target)]
     for name, value in options.items():
-        flag = {"limits": "--limit"}.get(name, f"--{name.replace('_', '-')}")
+        flag = _FLAGS.get(name, f"--{name.replace('_', '-')}")
         if isinstance(value, Mapping):
             for key, text in value.items():
                 words += [flag, f"{key}={text}"]

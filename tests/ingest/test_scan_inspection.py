@@ -187,6 +187,38 @@ def test_options_are_part_of_the_command_and_wrong_ones_exit_with_2(
     assert call(*words, "--quiet-progress") == 0
 
 
+@pytest.mark.parametrize("columns", [{"time [s]": TIME, "gyro_x [deg/s]": GX}, {"wx": GX}])
+def test_spans_of_time_are_part_of_the_command(
+    tmp_path: Path, monkeypatch, capsys, columns: Columns
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "log.csv", columns)
+    spans = ["--from", "2s", "--to", "20s", "--exclude", "5s/6s"]
+    call("scan", "log.csv", *spans)
+    shown = capsys.readouterr()
+    words = next_command(shown.out + shown.err)
+    assert " ".join(spans) in " ".join(words)
+    assert call(*words, "--quiet-progress") == 0
+
+
+@pytest.mark.parametrize(("kind", "values"), [("rate", GX), ("angle", np.cumsum(GX))])
+def test_angles_get_a_kind_in_the_command_and_keep_their_unit(
+    tmp_path: Path, monkeypatch, capsys, kind: str, values: NDArray[np.float64]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "log.csv", {"time [s]": TIME, "angle_x [arcsec]": values * 3600 / RATE})
+    assert call("scan", "log.csv") == 0
+    shown = capsys.readouterr().out
+    assert f"check: --kind {kind}" in shown
+    words = next_command(shown)
+    assert "--unit" not in words
+    assert call(*words, "--quiet-progress") == 0
+    capsys.readouterr()
+    with open_product("product.nc") as product:
+        found = float(product.window_mean.mean())
+    assert found == pytest.approx(3600 * GX.mean(), abs=5 * 3600 * GX.std() / np.sqrt(ROWS))
+
+
 def test_a_header_with_an_equals_sign_can_be_mapped(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     write(
