@@ -164,7 +164,8 @@ class Effect:
     axes : tuple of str
         Axes of the log that it acts on; empty for all.
     driver : tuple of str
-        Names of its channels in the log, in the order of `channels`; empty if unchanged.
+        Names of its channels in the log, in the order of `channels`; empty if unchanged. Names for
+        the channels of `needs` alone are completed.
     """
 
     name: ClassVar[str] = ""
@@ -185,6 +186,10 @@ class Effect:
         for name in ("axes", "driver"):
             value = getattr(self, name)
             object.__setattr__(self, name, (value,) if isinstance(value, str) else tuple(value))
+        if self.driver and len(self.driver) == len(self.needs()):
+            renamed = dict(zip(self.needs(), self.driver, strict=True))
+            names = tuple(renamed.get(channel, channel) for channel in self.channels)
+            object.__setattr__(self, "driver", names)
         if self.driver and len(self.driver) != len(self.channels):
             needs = ", ".join(self.channels) or "no channel"
             raise OptionError(

@@ -239,6 +239,15 @@ def test_a_wrong_table_is_explained(table, words):
     assert str(error.value).startswith("model.toml, effect 2")
 
 
+def test_a_driver_may_name_the_needed_channels_alone():
+    effect = make_effect({"name": "supply_bias", "power": 1e-3, "driver": "laser_power"})
+    assert effect.channel_names() == {
+        "supply_voltage": "supply_voltage",
+        "light_power": "laser_power",
+    }
+    assert effect.switched_off().channel_names()["light_power"] == "laser_power"
+
+
 def test_units_are_converted():
     assert make_effect(
         {"name": "temperature_bias", "sensitivity": "0.1 deg/h/degC", "reference": "300 K"}
