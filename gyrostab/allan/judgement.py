@@ -234,8 +234,9 @@ def _judge_terms(product: xr.Dataset, absences: dict[tuple[str, str], list[str]]
     where = f"in windows of {format_duration(window)}" if np.isfinite(window) else "in any window"
     if not hidden:
         return f"All five terms are observed {where}{_list_absences(product, absences)}."
-    verb, pronoun = ("is", "it") if len(hidden) == 1 else ("are", "them")
-    text = f"{join_words(hidden)} {verb} not observed {where}"
+    if len(hidden) == len(LAWS):  # the terms do not describe the record, which has a sentence
+        return f"No term is observed {where}."
+    text = f"{join_words(hidden)} {'is' if len(hidden) == 1 else 'are'} not observed {where}"
     white = float(product["N"].where(product["observable"].sel(term="N") == OBSERVED).median())
     if hidden == ["Q"]:
         return f"{text}: N hides it; a higher sampling rate would show it."
@@ -243,7 +244,8 @@ def _judge_terms(product: xr.Dataset, absences: dict[tuple[str, str], list[str]]
     span = float((bounds[1] - bounds[0]) / np.timedelta64(1, "s")) + np.nan_to_num(window)
     longer = [length for length in SUGGESTED_WINDOWS_S if window < length <= span / 4]
     if not longer:
-        return f"{text}; only a longer record could show {pronoun}."
+        slow = join_words([term for term in hidden if term != "Q"])
+        return f"{text}; only a longer record could show {slow}."
     limits = smallest_observable(longer[-1], white)
     sizes = [
         f"{term} from {limits[term]:.2g} {LAWS[term].label}"

@@ -71,6 +71,14 @@ def test_unobserved_terms_come_with_a_longer_window_or_a_longer_record():
     assert "sampling rate" in judge_product(_make_product({"Q": UPPER_LIMIT_ONLY}))[1]
 
 
+def test_a_longer_record_is_not_advised_for_what_it_cannot_show():
+    short = slice(0, 4)
+    product = _make_product({"Q": NOT_OBSERVABLE, "K": UPPER_LIMIT_ONLY}).isel(time=short)
+    assert judge_product(product)[1].endswith("; only a longer record could show K.")
+    product = _make_product(dict.fromkeys("QNBKR", UPPER_LIMIT_ONLY)).isel(time=short)
+    assert judge_product(product)[1] == "No term is observed in windows of 6s."
+
+
 def test_suggested_windows_fit_the_record():
     lines = suggest_windows(86400.0, WHITE)
     assert "N is about 0.01 deg/sqrt(h)" in lines[0]
