@@ -287,6 +287,7 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
         else _count_runs(signal.isnull().all("axis")),
         "missing_share": 1.0 - count_present(signal.data) / signal.size,
         "odd": "; ".join(notes),
+        "notes": tuple(notes),
         "white_noise": _measure_white_noise(log),
     }
 

@@ -184,7 +184,7 @@ def print_inspection(found: InspectedFile) -> None:
         *guess.reasons,
         *(f"check: {warning}" for warning in guess.warnings),
         *found.inspection.notes,
-        *(note for note in found.inspection.summary.notes if "no unit" not in note),  # as guessed
+        *(found.inspection.summary.notes if found.row is None else found.row["notes"]),
     ]
     if found.row is not None:
         read = found.row

@@ -231,6 +231,16 @@ def test_a_header_with_an_equals_sign_can_be_mapped(tmp_path: Path, monkeypatch,
     assert call(*words, "--quiet-progress") == 0
 
 
+def test_what_the_guess_settles_is_not_a_note(tmp_path: Path, capsys) -> None:
+    path = write(tmp_path / "log.csv", {"t": TIME, "HHZ": AX, "wx": GX, "wy": GY, "wz": GZ})
+    assert call("scan", path) == 0
+    lines = "\n".join(
+        line for line in capsys.readouterr().out.splitlines() if line.startswith("# ")
+    )
+    assert "no gyro column" not in lines
+    assert "left out, as they carry no unit: HHZ" in lines
+
+
 def test_file_without_a_gyro_is_inspected(tmp_path: Path, capsys) -> None:
     path = write(
         tmp_path / "weather.csv", {"time [s]": TIME, "humidity": 50 + 0.01 * TIME, "wind": AX}
