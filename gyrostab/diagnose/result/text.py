@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -355,13 +356,23 @@ def summary(content: Mapping[str, Any]) -> str:
 
 
 def _list_effects(named: Sequence[Mapping[str, Any]]) -> str:
-    """List the effects, each once for the axes that it acts on, and each family once."""
-    texts = [
-        f"{plain_name(effect['name'])}, on {axes_text(effect['axes'])}"
-        + (f" ({effect['family']}, {len(others) + 1} lines)" if others else "")
-        for effect, *others in group_families(named)
-    ]
-    counts = {text: texts.count(text) for text in texts}
-    return "; ".join(
-        text if count == 1 else f"{text} ({count} times)" for text, count in counts.items()
-    )
+    """List the effects, each once for the axes that it acts on, and each family once.
+
+    Examples
+    --------
+    >>> _list_effects([{"name": "warm_up", "axes": [axis], "family": None} for axis in "xy"])
+    'warm-up after power-on, on axes x and y'
+    """
+    found: dict[tuple[str, str], list[Sequence[str]]] = {}
+    for effect, *others in group_families(named):
+        lines = f" ({effect['family']}, {len(others) + 1} lines)" if others else ""
+        found.setdefault((plain_name(effect["name"]), lines), []).append(effect["axes"])
+    texts = []
+    for (name, lines), axes in found.items():
+        together = [axis for several in axes for axis in several]
+        if len(set(together)) == len(together):
+            texts.append(f"{name}, on {axes_text(sorted(together))}{lines}")
+            continue
+        for where, count in Counter(map(axes_text, axes)).items():
+            texts.append(f"{name}, on {where}{lines}" + f" ({count} times)" * (count > 1))
+    return "; ".join(texts)
