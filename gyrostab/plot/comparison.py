@@ -167,7 +167,7 @@ def _draw_curves(panel: Axes, logs: Any, pair: Any, moments: list[float]) -> Non
         curve = np.sqrt(pair[1]["avar"].values[np.abs(centres - when).argmin()])
         panel.loglog(tau, curve, dashes, color=colour, lw=1.3, label=f"with, at {when:g} {word}")
     label_log_axis(panel.yaxis, *panel.get_ylim())
-    panel.legend(frameon=False, loc="lower left")
+    panel.legend(framealpha=0.9, edgecolor="none", loc="lower left")
     panel.set(xlabel="averaging time [s]", ylabel="[deg/h]")
 
 
@@ -225,7 +225,7 @@ def _draw_means(panel: Axes, logs: Any, pair: Any, *, difference: bool) -> None:
         xlabel=f"time [{word}]",
         ylabel="[deg/h]",
     )
-    panel.legend(frameon=False)
+    panel.legend(framealpha=0.9, edgecolor="none")
 
 
 def _draw_channel(panel: Axes, log: xr.Dataset, driver: str) -> None:
@@ -285,7 +285,7 @@ def _draw_coherency(panel: Axes, logs: Any) -> None:
         ratio = cross / np.sqrt(welch(x, **how)[1] * welch(y, **how)[1])
         panel.semilogx(f[1:], ratio.imag[1:], "--", color=quadrature, lw=0.9, label="in quadrature")
         panel.semilogx(f[1:], ratio.real[1:], **style | {"lw": style["lw"] * 0.8}, label="in phase")
-    panel.legend(handles=panel.get_lines()[:1:-1], frameon=False)
+    panel.legend(handles=panel.get_lines()[:1:-1], framealpha=0.9, edgecolor="none")
     panel.set(
         title=f"Coherency of {_join_axis_names(logs[0])}", xlabel="frequency [Hz]", ylim=(-1.1, 1.1)
     )
