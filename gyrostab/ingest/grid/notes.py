@@ -10,7 +10,7 @@ from gyrostab.ingest.gap_table import describe_break, format_duration
 from gyrostab.ingest.grid.fill import samples_of
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.rate import RateEstimate
-from gyrostab.ingest.grid.scan_pass import ScanPass, file_of
+from gyrostab.ingest.grid.scan_pass import ScanPass, file_of, record_name
 from gyrostab.kernels.grid.stamps import DUPLICATE, OUT_OF_ORDER, RESTART
 from gyrostab.schema import GAP_CAUSES, log_channels
 from gyrostab.time.grid import grid_times
@@ -59,7 +59,7 @@ def describe_rate(
     placement: Placement,
 ) -> list[str]:
     """Return notes on the sampling rate."""
-    where = file_of(raw)[0]
+    where = record_name(raw)
     notes = []
     why = (
         "many rows share one stamp"
@@ -130,7 +130,7 @@ def _describe_breaks(raw: xr.Dataset, placement: Placement) -> list[str]:
         notes.append(f"{file}: {describe_break(f' at row {local}', cause, before, after, 'rows')}")
     if len(events) > _MAX_NAMED:
         notes.append(
-            f"{file_of(raw)[0]}: {len(events) - _MAX_NAMED} more restarts and steps of the clock "
+            f"{record_name(raw)}: {len(events) - _MAX_NAMED} more restarts and steps of the clock "
             "are in the table of gaps"
         )
     return notes
@@ -159,7 +159,7 @@ def _describe_missing(
         total = int(holes[:, 2].sum())
         share = total / placement.size
         notes.append(
-            f"{file_of(raw)[0]}: missing: {_count_of(total, 'sample')} "
+            f"{record_name(raw)}: missing: {_count_of(total, 'sample')} "
             f"({format_duration(total / rate)}, {100 * share:.2g} % of the log) "
             f"in {_count_of(len(holes), 'place')}; "
             "all are in the table of gaps"
@@ -167,26 +167,31 @@ def _describe_missing(
     return notes
 
 
+def _name_row(raw: xr.Dataset, row: int) -> str:
+    """Name a row by its number, and by its file if the record has several."""
+    file, local = file_of(raw, row)
+    return f"row {local}" if file == record_name(raw) else f"row {local} of {file}"
+
+
 def describe_placement(
     raw: xr.Dataset, scanned: ScanPass, placement: Placement, table: NDArray[np.int64], rate: float
 ) -> list[str]:
     """Return notes on gaps, restarts, and rows and cells that were dropped or moved."""
-    where = file_of(raw)[0]
+    where = record_name(raw)
     notes = [*_describe_breaks(raw, placement), *_describe_missing(raw, placement, table, rate)]
     events = placement.events
     twice = events[events[:, 0] == DUPLICATE]
     if len(twice):
-        file, local = file_of(raw, int(twice[:, 2].min()))
         notes.append(
-            f"{file}: dropped as their sample is taken: {_count_of(len(twice), 'row')}, first "
-            f"row {local}"
+            f"{where}: dropped as their sample is taken: {_count_of(len(twice), 'row')}, first "
+            f"{_name_row(raw, int(twice[:, 2].min()))}"
         )
     late = events[events[:, 0] == OUT_OF_ORDER]
     if len(late):
         kept = int((samples_of(placement, late[:, 2]) >= 0).sum())
-        file, local = file_of(raw, int(late[:, 2].min()))
         notes.append(
-            f"{file}: out of order: {_count_of(len(late), 'row')}, first row {local}; "
+            f"{where}: out of order: {_count_of(len(late), 'row')}, first "
+            f"{_name_row(raw, int(late[:, 2].min()))}; "
             f"{kept} were put in their place, {len(late) - kept} dropped"
         )
     lost = (

@@ -19,7 +19,7 @@ from gyrostab.store.lazy import find_source, read_slice
 from gyrostab.store.row_inspection import RowInspection, inspect_rows
 from gyrostab.store.threads import map_in_order
 
-__all__ = ["BLOCK_ROWS", "ScanPass", "file_of", "scan_rows", "stamp_blocks"]
+__all__ = ["BLOCK_ROWS", "ScanPass", "file_of", "record_name", "scan_rows", "stamp_blocks"]
 
 #: Rows in memory at one time.
 BLOCK_ROWS = 1 << 20
@@ -159,6 +159,14 @@ def _read_stamp_blocks(
 
 def _source_names(raw: xr.Dataset) -> list[str]:
     return texts(raw, "source_files") or ["the raw log"]
+
+
+def record_name(raw: xr.Dataset) -> str:
+    """Return the source file of a record, or the first one and the number of the others."""
+    first, *others = dict.fromkeys(_source_names(raw))
+    if not others:
+        return first
+    return f"{first} and {len(others)} more file{'s' * (len(others) > 1)}"
 
 
 def file_of(raw: xr.Dataset, row: int = 0) -> tuple[str, int]:

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.errors import FormatError, OptionError, TimeError
+from gyrostab.ingest.files import read_log
 from gyrostab.ingest.grid.fill import rows_on_grid
 from gyrostab.ingest.grid.place import place_by_stamp
 from gyrostab.ingest.grid.regularise import gap_table, regularise
@@ -314,3 +315,18 @@ def test_channel_of_another_day_is_noted():
             )
             is told
         )
+
+
+def test_notes_on_the_whole_record_do_not_name_one_of_its_files(tmp_path):
+    for number, name in enumerate("ab"):
+        rows = [
+            f"{(n + 100 * number) / 10:.1f},{n % 7}\n" for n in range(100) if n not in (40, 41, 70)
+        ]
+        late = rows.pop(20)
+        rows.insert(22, late)
+        (tmp_path / f"{name}.csv").write_text(f"time [s],gyro_x [deg/h]\n{''.join(rows)}")
+    notes = regularise(read_log(sorted(tmp_path.glob("*.csv")))).attrs["notes"]
+    (missing,) = [note for note in notes if "missing:" in note]
+    assert missing.startswith("a.csv and 1 more file: missing: 6 samples")
+    (late,) = [note for note in notes if "out of order" in note]
+    assert late.startswith("a.csv and 1 more file: out of order: 2 rows, first row 22 of a.csv; ")
