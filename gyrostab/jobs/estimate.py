@@ -56,7 +56,7 @@ def estimate_run(
             f"record     {log.sizes['time'] / rate:.6g} s at {rate:.6g} Hz, axes "
             f"{', '.join(plan.signal['axis'].values)}",
             f"windows    {total} of {plan.unit.window / rate:g} s, one every "
-            f"{plan.unit.step / rate:g} s, in {len(parts)} parts",
+            f"{plan.unit.step / rate:g} s, in {len(parts)} part{'s' * (len(parts) > 1)}",
             f"averaging  {tau.size} times from {tau[0]:.4g} to {tau[-1]:.4g} s",
         ]
     )
