@@ -11,6 +11,8 @@ from typing import Any, Protocol
 __all__ = ["Stage", "no_stage", "show_progress"]
 
 _COMPILING = "compiling, once after installation"
+#: Events of numba: it compiles, or `gyrostab.kernels.compile_ahead` waits for another process.
+_COMPILER_EVENTS = ("numba:compile", "gyrostab:compile")
 
 
 class Stage(Protocol):
@@ -57,7 +59,7 @@ def show_progress(*, quiet: bool = False) -> Iterator[Stage]:
 
 @contextmanager
 def _watch_compiler(show: Callable[[bool], None]) -> Iterator[Callable[[], None]]:
-    """Call `show` when numba starts to compile, and when it ends.
+    """Call `show` when numba starts to compile, here or in another process, and when it ends.
 
     Yields
     ------
@@ -86,7 +88,8 @@ def _watch_compiler(show: Callable[[bool], None]) -> Iterator[Callable[[], None]
                     show(False)
 
         installed.append(Compiler())
-        event.register("numba:compile", installed[0])
+        for kind in _COMPILER_EVENTS:
+            event.register(kind, installed[0])
 
     try:
         yield watch
@@ -94,7 +97,8 @@ def _watch_compiler(show: Callable[[bool], None]) -> Iterator[Callable[[], None]
         if installed:
             from numba.core import event
 
-            event.unregister("numba:compile", installed[0])
+            for kind in _COMPILER_EVENTS:
+                event.unregister(kind, installed[0])
 
 
 def _format_speed(amount: float, seconds: float, unit: str) -> str:

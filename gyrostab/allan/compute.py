@@ -31,11 +31,13 @@ __all__ = [
     "FIELD_TYPES",
     "PLANE_FIELDS",
     "compute_unit",
+    "estimate_freedoms",
     "join_units",
     "make_noise_tables",
     "read_spans",
     "run_published_method",
     "run_units",
+    "tabulate_noise",
 ]
 
 Floats = NDArray[np.float64]
@@ -97,7 +99,7 @@ def compute_unit(
         cells.avar[:] *= scale**2
     means[0] *= scale
     cells.difference_trend[:] *= _trend_scale(unit)
-    fields = [*cells, _cell_freedoms(cells, tables)]
+    fields = [*cells, estimate_freedoms(cells, tables)]
     return fields, np.concatenate([means, _describe_windows(x, unit)])
 
 
@@ -162,16 +164,17 @@ class NoiseTables(NamedTuple):
 
 
 def make_noise_tables(plan: Plan) -> NoiseTables:
-    """Make the tables for the degrees of freedom, once for all parts of a log."""
+    """Make the tables for the degrees of freedom of a plan."""
     unit = plan.unit
     factors, thinning = tuple(unit.ks.tolist()), tuple(unit.shifts.tolist())
-    return _cached_noise_tables(unit.window, factors, thinning, plan.rate, unit.variance)
+    return tabulate_noise(unit.window, factors, thinning, plan.rate, unit.variance)
 
 
 @lru_cache(maxsize=4)
-def _cached_noise_tables(
+def tabulate_noise(
     window: int, factors: tuple[int, ...], thinning: tuple[int, ...], rate: float, variance: str
 ) -> NoiseTables:
+    """Make the tables for the degrees of freedom, once for all parts of a log."""
     ks, shifts = np.array(factors, dtype=np.int64), np.array(thinning, dtype=np.int64)
     columns = variance_columns(variance, ks, rate)
     if variance == "avar":
@@ -183,7 +186,7 @@ def _cached_noise_tables(
     return NoiseTables(thin_factors(ks), columns, weight, sample_squares(rate), diagonal)
 
 
-def _cell_freedoms(cells: Cells, tables: NoiseTables) -> Floats:
+def estimate_freedoms(cells: Cells, tables: NoiseTables) -> Floats:
     """Compute the degrees of freedom of cells (n_windows, n_tau) from a quick fit of the noise."""
     chosen, columns, weight, to_samples, diagonal = tables
     seen = (cells.avar, *cells[5:8], cells.gap_factor)
@@ -271,5 +274,5 @@ def run_published_method(
         means = window_means(x, unit)[:, :n_windows]
         means[0] *= HOUR if unit.angle else 1.0
         plane = np.concatenate([means, _describe_windows(x, unit, n_windows)])
-        results.append(([*cells, _cell_freedoms(cells, tables)], plane))
+        results.append(([*cells, estimate_freedoms(cells, tables)], plane))
     return join_units(results, len(results))

@@ -11,6 +11,7 @@ from scipy.special import gammaincc, gammaincinv
 
 from gyrostab.allan.variance import variance_columns, white_freedoms
 from gyrostab.kernels.allan.variances import VARIANCES
+from gyrostab.kernels.compile_ahead import await_compilation
 from gyrostab.kernels.fit.covariance import STOCHASTIC, product_tables
 from gyrostab.kernels.fit.least_squares import FIT_FIELDS, combine_diagonal, fit_windows
 from gyrostab.kernels.fit.limits import cell_limits, estimate_bounds
@@ -179,6 +180,7 @@ def run_kernel(
         trends[:, STOCHASTIC + 1] = 1.0 - exact
         trends = np.nan_to_num(trends)
     noise = allowed if allowed & 15 else allowed | 1 << TERMS.index("N")  # for a ramp alone
+    await_compilation()
     result, misfit, dof = fit_windows(
         *flat,
         trends,

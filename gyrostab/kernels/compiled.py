@@ -9,14 +9,31 @@ from __future__ import annotations
 
 from typing import Any
 
+from numba import njit
+
 __all__ = ["INNER", "KERNEL"]
+
+
+def _has_cache() -> bool:
+    """Whether numba finds a folder for compiled code.
+
+    It looks for ``NUMBA_CACHE_DIR``, the folder of the package and that of the user. An account
+    without a home that uses a package of another account has none of them, and compiles in every
+    process.
+    """
+    try:
+        njit(cache=True)(_has_cache)
+    except RuntimeError:
+        return False
+    return True
+
 
 #: Options of a function that Python calls. A division by zero gives infinity or NaN; a test for it
 #: would prevent vectorisation. A literal integer in a call, such as 0, makes numba compile the
 #: callee again for this number; `np.int64(0)` does not.
 KERNEL: dict[str, Any] = {
     "nogil": True,
-    "cache": True,
+    "cache": _has_cache(),
     "error_model": "numpy",
     "no_cfunc_wrapper": True,
 }

@@ -63,3 +63,15 @@ def test_the_process_that_compiles_gets_the_same_bits_as_those_that_load(tmp_pat
     )
     assert any(tmp_path.rglob("*.nbi"))
     assert first == second
+
+
+#: An account without a home that uses a package of another account.
+NO_FOLDER = """
+from numba.core import caching
+name = "CacheImpl" if hasattr(caching, "CacheImpl") else "_CacheImpl"
+getattr(caching, name)._locator_classes = []
+"""
+
+
+def test_kernels_work_where_nothing_can_be_cached() -> None:
+    subprocess.run([sys.executable, "-c", NO_FOLDER + SOLVE], check=True)

@@ -26,8 +26,10 @@ def demo(*, output: Output = Path("gyrostab-demo"), common: Common = Common()) -
     """
     with show_stages(common) as stage:
         stage("loading the libraries")
+        from gyrostab.allan.compile_fit import compile_fit_ahead
         from gyrostab.jobs.demo import format_summary, run_demo
 
+        compile_fit_ahead()
         product, files = run_demo(output, overwrite=common.overwrite, stage=stage)
     print("written:", *(f"  {file}" for file in files), sep="\n", end="\n\n")
     print(format_summary(product))

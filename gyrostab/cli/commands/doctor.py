@@ -103,4 +103,6 @@ def _describe_kernels() -> str:
     files = [*folder.rglob("*.nbi"), *folder.rglob("*.nbc")]
     size = sum(file.stat().st_size for file in files) / 1e6
     state = f"{len(files)} files of {size:.0f} MB" if files else "none yet, compiled when first run"
-    return f"{state}, in {folder}" + ", which is read-only" * (not os.access(folder, os.W_OK))
+    if os.access(folder, os.W_OK):
+        return f"{state}, in {folder}"
+    return f"{state}, in {folder}, which is read-only; set NUMBA_CACHE_DIR to a folder to write to"

@@ -45,6 +45,9 @@ def run(
         Print the windows and averaging times, and the time, memory and size of the output as
         estimated from the first part, and write nothing.
     """
+    from gyrostab.allan.compile_fit import compile_fit_ahead
+
+    compile_fit_ahead()
     if dry_run:
         from gyrostab.jobs.estimate import estimate_run
 

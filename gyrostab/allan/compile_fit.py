@@ -1,0 +1,48 @@
+"""Compile the kernels of `gyrostab.kernels.fit`: ``python -m gyrostab.allan.compile_fit``."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gyrostab.allan.compute import estimate_freedoms, tabulate_noise
+from gyrostab.allan.window_fit import fit_block, fit_tables
+from gyrostab.kernels.allan.surface import Cells
+from gyrostab.kernels.compile_ahead import start_compilation
+from gyrostab.kernels.fit.least_squares import fit_windows
+
+__all__ = ["compile_fit", "compile_fit_ahead"]
+
+
+def compile_fit_ahead() -> None:
+    """Compile the kernels in another process, unless they are compiled already.
+
+    A command calls this before it reads its logs.
+    """
+    start_compilation("gyrostab.allan.compile_fit", fit_windows)
+
+
+def compile_fit() -> None:
+    """Fit two windows of white noise, with the kernels that `davar` and `fit_noise` call.
+
+    The kernels of `davar` come first, because it is the first to need them.
+    """
+    window, rate, factors = 1000, 1.0, tuple(2**power for power in range(9))
+    shifts = (0,) * len(factors)
+    ones, zero = np.ones((2, len(factors))), np.zeros(2)
+    avar = ones / factors
+    tables = tabulate_noise(window, factors, shifts, rate, "avar")
+    estimate_freedoms(Cells(avar, *[ones] * 8), tables)
+    fit_block(
+        [avar, ones, ones, ones, ones],
+        zero,
+        zero + 1.0,
+        zero,
+        fit_tables(factors, shifts, rate, window),
+        white_error=zero,
+        allowed=31,
+        observed_only=True,
+    )
+
+
+if __name__ == "__main__":
+    compile_fit()

@@ -1,0 +1,61 @@
+"""Compilation of kernels in another process, while this one reads and computes.
+
+numba compiles one function at a time in a process. What another process compiles is loaded from the
+cache afterwards. If that process fails, this one compiles what it needs.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from numba.core import event
+
+__all__ = ["WAITING", "await_compilation", "start_compilation"]
+
+#: Event of numba that is triggered while this process waits for the other.
+WAITING = "gyrostab:compile"
+
+_running: list[subprocess.Popen[bytes]] = []
+
+
+def start_compilation(module: str, kernel: Any) -> None:
+    """Run a module that compiles kernels in another process, unless the cache has `kernel`.
+
+    Nothing is started on a single processor core, or where numba has no cache to write to.
+
+    Parameters
+    ----------
+    module : str
+        Module to run, as with ``python -m``.
+    kernel : numba dispatcher
+        Kernel that it compiles last.
+    """
+    stats = getattr(kernel, "stats", None)  # absent where numba is switched off
+    folder = stats and stats.cache_path
+    pattern = f"*.{kernel.__name__}-*.py{sys.version_info[0]}{sys.version_info[1]}.nbi"
+    if not folder or (os.cpu_count() or 1) < 2 or any(Path(folder).glob(pattern)):
+        return
+    nothing = subprocess.DEVNULL
+    command = [sys.executable, "-P", "-m", module]
+    try:
+        process = subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing)
+    except OSError:
+        return
+    _running.append(process)
+    atexit.register(process.terminate)  # of a command that stops before it needs the kernels
+
+
+def await_compilation() -> None:
+    """Wait for the process that `start_compilation` started, and notify listeners of `WAITING`."""
+    while _running:
+        process = _running[0]
+        if process.poll() is None:
+            with event.trigger_event(WAITING):
+                process.wait()
+        if process in _running:  # another thread may have waited too
+            _running.remove(process)
