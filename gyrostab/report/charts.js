@@ -3,13 +3,36 @@
 (() => {
   const json = (id) => JSON.parse(document.getElementById(id).textContent);
   // On a narrow page the bar of buttons would cover the legend; fingers and double clicks do as much.
-  const displayModeBar = matchMedia("(max-width: 600px)").matches ? false : "hover";
-  const options = { responsive: true, displaylogo: false, displayModeBar };
+  const narrow = matchMedia("(max-width: 600px)").matches;
+  const options = { responsive: true, displaylogo: false, displayModeBar: narrow ? false : "hover" };
+  // The colour scale above instead of at the side, and fewer labels, which would run into each other.
+  const fitNarrowPage = ({ data, layout }) => {
+    for (const name of Object.keys(layout).filter((key) => key.startsWith("xaxis"))) {
+      const [from, to] = layout[name].domain ?? [0, 1];
+      Object.assign(layout[name], { nticks: to - from < 0.6 ? 2 : 3, tickangle: 0 });
+    }
+    if (layout.scene) layout.scene.yaxis.dtick = 1;
+    const scales = [...data, layout.coloraxis ?? {}].filter((item) => item.colorbar);
+    for (const { colorbar } of scales) {
+      Object.assign(colorbar, { orientation: "h", yref: "container", y: 1, yanchor: "top", thickness: 12 });
+      layout.margin = { ...layout.margin, t: 90 };
+    }
+    for (const note of layout.annotations ?? []) note.font = { ...note.font, size: 12 };
+  };
+  const thinLogLabels = (chart) => {
+    for (const [name, axis] of Object.entries(chart.layout)) {
+      if (!name.startsWith("xaxis") || axis.type !== "log") continue;
+      const decades = Math.abs(axis.range[1] - axis.range[0]);
+      if (decades > 2) Plotly.relayout(chart, `${name}.dtick`, Math.ceil(decades / 6));
+    }
+  };
   const charts = {};
   for (const place of document.querySelectorAll(".chart")) {
     const figure = json(`figure-${place.id}`);
     charts[place.id] = place;
-    Plotly.newPlot(place, figure.data, figure.layout, options);
+    if (narrow) fitNarrowPage(figure);
+    const drawn = Plotly.newPlot(place, figure.data, figure.layout, options);
+    if (narrow) drawn.then(thinLogLabels);
   }
   const source = document.getElementById("window-data");
   if (!source) return;

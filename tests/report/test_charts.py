@@ -193,6 +193,16 @@ const probe = {
     }
     return rows;
   },
+  crowded() {
+    return Array.from(document.querySelectorAll(".xaxislayer-above")).flatMap((layer) => {
+      const labels = Array.from(layer.querySelectorAll("text"))
+        .map((label) => ({ text: label.textContent, place: label.getBoundingClientRect() }))
+        .filter(({ place }) => place.width > 0)
+        .sort((a, b) => a.place.left - b.place.left);
+      return labels.slice(1).filter(({ place }, i) => place.left < labels[i].place.right + 2)
+        .map(({ text }) => text);
+    });
+  },
   tables() {
     return Array.from(document.querySelectorAll("table"))
       .filter((table) => table.checkVisibility()).map((table) => {
@@ -209,7 +219,8 @@ window.addEventListener("load", () => setTimeout(() => {
   parent.postMessage(JSON.stringify({ ...linked,
     drawn: document.querySelectorAll(".chart .main-svg").length,
     wide: root.scrollWidth, seen: root.clientWidth, body: document.body.scrollWidth,
-    controls: probe.controls(), texts: probe.texts(), tables: probe.tables() }), "*");
+    controls: probe.controls(), texts: probe.texts(), tables: probe.tables(),
+    crowded: probe.crowded() }), "*");
 }, 3000));
 </script></body>"""
 
@@ -250,6 +261,7 @@ def _check_access(state, width):
     assert len(state["texts"]) > 100
     assert not [row for row in state["texts"] if row["contrast"] < 4.5]  # WCAG 2.2, level AA
     assert not [row for row in state["texts"] if row["size"] < 12]
+    assert not state["crowded"]  # labels of the lower axes run into each other
 
 
 @pytest.mark.slow
