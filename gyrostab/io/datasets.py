@@ -52,6 +52,7 @@ __all__ = [
 CHUNK_VALUES = 2**17
 #: Samples from which a log is stored without the time of each sample by default.
 MAX_STAMPED_SAMPLES = 10**7
+_STAMPS_PER_CHUNK = 2**13  # of a computed time axis in NetCDF
 
 
 def to_netcdf(
@@ -188,6 +189,8 @@ def _netcdf_encoding(stored: xr.Dataset, filters: dict[str, Any]) -> dict[Any, d
             )
         if variable.ndim and variable.size and not text:
             encoding[name] |= {**filters, "chunksizes": _plan_chunks(variable, _find_rate(stored))}
+            if _has_rule(variable):  # both ends are read whenever the file is opened
+                encoding[name]["chunksizes"] = (min(variable.size, _STAMPS_PER_CHUNK),)
     return encoding
 
 
@@ -378,7 +381,7 @@ def _plan_chunks(variable: xr.Variable, rate: float | None) -> tuple[int, ...]:
     most = max(1, CHUNK_VALUES // max(1, inner))
     if rate is not None:
         on_time = variable.dims[-1] in ("time", index_dim("time")) and not _has_rule(variable)
-        most = chunk_samples(rate if on_time else 0.0)  # a few stamps are read on opening
+        most = chunk_samples(rate if on_time else 0.0)
     last = max(1, min(variable.shape[-1], most))
     return tuple(
         last if dim == variable.dims[-1] else 1 if dim in ("axis", "term") else size

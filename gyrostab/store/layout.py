@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError, reading_of
 from gyrostab.kernels.encoding.checksum import fletcher32
 from gyrostab.store.blosc_chunks import is_blosc_cut
-from gyrostab.store.hdf5_heaps import check_global_heaps
 from gyrostab.store.private import library_lock
 
 __all__ = [
@@ -31,7 +30,6 @@ __all__ = [
     "find_zarr_codecs",
     "has_known_filters",
     "is_readable",
-    "read_attribute",
     "read_chunk",
     "read_written_chunk",
 ]  # fmt: skip
@@ -64,30 +62,6 @@ class _ZarrLayout:
     dtype: np.dtype[Any]
     codecs: tuple[Any, ...]
     separator: str
-
-
-def read_attribute(path: Path, name: str) -> str:
-    """Read an attribute of a NetCDF file; empty when there is none or the format is older.
-
-    Raises
-    ------
-    OSError
-        When the file is damaged.
-    FormatError
-        When it is in a global heap that the library would not return from.
-    """
-    from h5py import AttributeManager, Group, h5a, h5f
-
-    with library_lock():
-        if not h5f.is_hdf5(os.fsencode(path)):
-            return ""
-        file = h5f.open(os.fsencode(path), h5f.ACC_RDONLY)
-        if not h5a.exists(file, name.encode()):
-            return ""
-        if h5a.open(file, name.encode()).dtype.kind != "S":
-            check_global_heaps(path)  # which hold text of variable length
-        value = AttributeManager(Group(file))[name]
-    return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
 
 
 def is_readable(path: Path, name: str, encoding: dict[Any, Any]) -> bool:

@@ -1,6 +1,11 @@
-"""Open NetCDF logs of gyrostab without xarray, which takes 1.1 to 1.4 times as long.
+"""Open NetCDF logs of gyrostab with h5py alone, which takes less time than the NetCDF library.
 
-docs/scaling.md compares both. The difference counts where thousands of small files are opened.
+That library reads 4 MiB of every file, and xarray does more with what it reads. docs/scaling.md
+compares them. The difference counts where thousands of files are opened.
+
+References
+----------
+NetCDF users guide, "NetCDF-4 file format": how dimensions and attributes are stored in HDF5.
 """
 
 from __future__ import annotations
@@ -22,10 +27,17 @@ from gyrostab.store.layout import has_known_filters
 from gyrostab.store.private import library_lock
 from gyrostab.store.times import GRID, follows_rule, parse_time_grids
 
-__all__ = ["StoredLog", "open_netcdf_log"]
+__all__ = ["StoredLog", "open_netcdf_log", "read_content"]
+
+_CONTENT = b"gyrostab_content"
 
 #: Attributes of a variable that xarray moves to its encoding.
 _ENCODED = ("_FillValue", "scale_factor")
+#: Attributes of the library: dimensions, by number, and the name of one that is a dimension itself.
+_FIRST_DIMENSION, _DIMENSIONS, _NAME = "_Netcdf4Dimid", "_Netcdf4Coordinates", "NAME"
+_UNREAD = {b"CLASS", b"DIMENSION_LIST", b"REFERENCE_LIST", b"_NCProperties"}
+#: How the name of a dataset begins that is only a dimension.
+_NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
 #: Attributes that change what values or coordinates mean; gyrostab writes none of them in a log.
 _FOREIGN = {"_Unsigned", "add_offset", "coordinates", "dtype", "missing_value"}
 _MAX_READ_VALUES = 2**17
@@ -60,20 +72,15 @@ def open_netcdf_log(path: Path) -> StoredLog | None:
     FormatError
         When the library would not return from a global heap.
     """
-    import netCDF4
-
     try:
         with library_lock():
-            values = _open_values(path)
-            if values is None:
+            file = _open_file(path)
+            if file is None:
                 return None
+            values = _open_values(file)
             check_global_heaps(path, skip=_find_data(values.values()))
-            with netCDF4.Dataset(path) as stored:
-                attrs = stored.__dict__
-                variables = {
-                    name: _open_variable(variable, values[name])
-                    for name, variable in stored.variables.items()
-                }
+            attrs = _read_attributes(file)
+            variables = _open_variables(values)
             for name, rule in parse_time_grids(variables, path).items():
                 if variables[name].ndim:
                     start = _reduce_stamps(variables.pop(name), rule, values[name])
@@ -92,17 +99,89 @@ def open_netcdf_log(path: Path) -> StoredLog | None:
     )
 
 
-def _open_values(path: Path) -> dict[str, Any] | None:
-    """Open the values of the variables in a file; None for anything but a log of gyrostab."""
-    from h5py import h5a, h5d, h5f
+def read_content(path: Path) -> str:
+    """Read the attribute that says what gyrostab wrote; empty for other files and formats.
+
+    Raises
+    ------
+    OSError
+        When the file is damaged.
+    FormatError
+        When it is in a global heap that the library would not return from.
+    """
+    from h5py import h5f
+
+    with library_lock():
+        if not h5f.is_hdf5(os.fsencode(path)):
+            return ""
+        attribute = _open_content(h5f.open(os.fsencode(path), h5f.ACC_RDONLY))
+        if attribute is None:
+            return ""
+        if _has_variable_length(attribute):
+            check_global_heaps(path)
+        return str(_read_value(attribute))
+
+
+def _open_file(path: Path) -> Any:
+    """Open a file; None for anything but a log of gyrostab."""
+    from h5py import h5f
 
     file = h5f.open(os.fsencode(path), h5f.ACC_RDONLY)
-    attribute = h5a.open(file, b"gyrostab_content")
-    content = np.zeros((), attribute.dtype)
-    if content.dtype.kind != "S":
+    attribute = _open_content(file)
+    if attribute is None or _has_variable_length(attribute):
         return None  # text of variable length is in a heap that is not checked yet
-    attribute.read(content)
-    return {name.decode(): h5d.open(file, name) for name in file} if content == b"log" else None
+    return file if _read_value(attribute) == "log" else None
+
+
+def _open_content(file: Any) -> Any:
+    from h5py import h5a
+
+    return h5a.open(file, _CONTENT) if h5a.exists(file, _CONTENT) else None
+
+
+def _open_values(file: Any) -> dict[str, Any]:
+    """Open the values of the variables in a file, in the order in which they were made."""
+    from h5py import h5, h5d
+
+    names: list[bytes] = []
+    file.links.iterate(names.append, idx_type=h5.INDEX_CRT_ORDER)
+    return {name.decode(): h5d.open(file, name) for name in names}
+
+
+def _read_attributes(place: Any) -> dict[str, Any]:
+    """Read the attributes of a file or variable, in the order in which they were made."""
+    from h5py import h5, h5a
+
+    names: list[bytes] = []
+    h5a.iterate(place, names.append, index_type=h5.INDEX_CRT_ORDER)
+    return {
+        name.decode(): _read_value(h5a.open(place, name)) for name in names if name not in _UNREAD
+    }
+
+
+def _has_variable_length(attribute: Any) -> bool:
+    kind = attribute.get_type()
+    return not hasattr(kind, "is_variable_str") or bool(kind.is_variable_str())
+
+
+def _read_value(attribute: Any) -> Any:
+    """Read an attribute as a text, a number or an array of numbers; `ValueError` for others."""
+    kind, size = attribute.get_type(), attribute.get_storage_size()
+    is_text = hasattr(kind, "is_variable_str")
+    if is_text and not size:
+        return ""
+    if is_text and not kind.is_variable_str():
+        text = np.empty((), f"S{size}")  # its dtype would take longer to find
+        attribute.read(text, kind)
+        return text.item().replace(b"\0", b"").decode()
+    value = np.empty(attribute.shape, kind.dtype)
+    if not is_text and value.dtype.kind not in "iuf":
+        raise ValueError(f"attribute of type {value.dtype}")
+    attribute.read(value)  # with the type of the file, the library would put pointers into objects
+    if is_text:
+        content = value.item()
+        return content.decode() if isinstance(content, bytes) else str(content)
+    return value.ravel()[0] if value.size == 1 else value
 
 
 def _find_data(values: Iterable[Any]) -> list[tuple[int, int]]:
@@ -116,10 +195,23 @@ def _find_data(values: Iterable[Any]) -> list[tuple[int, int]]:
     return sorted(found)
 
 
-def _open_variable(stored: Any, values: Any) -> xr.Variable:
-    """Open a variable; `ValueError` when its values must be decoded, or are laid out otherwise."""
-    attrs, dims = stored.__dict__, stored.dimensions
-    encoding = {name: attrs.pop(name) for name in _ENCODED if name in attrs}
+def _open_variables(values: dict[str, Any]) -> dict[Any, xr.Variable]:
+    """Open the variables; `ValueError` when one must be decoded, or is laid out otherwise."""
+    attributes = {name: _read_attributes(item) for name, item in values.items()}
+    names = {attrs[_FIRST_DIMENSION]: name for name, attrs in attributes.items() if _NAME in attrs}
+    variables = {}
+    for name, attrs in attributes.items():
+        attrs.pop(_FIRST_DIMENSION, None)
+        if not attrs.pop(_NAME, "").startswith(_NO_VARIABLE):
+            dims = tuple(names[number] for number in np.ravel(attrs.pop(_DIMENSIONS, ())))
+            variables[name] = _open_variable(name, dims, attrs, values[name])
+    return variables
+
+
+def _open_variable(
+    name: str, dims: tuple[str, ...], attrs: dict[str, Any], values: Any
+) -> xr.Variable:
+    encoding = {key: attrs.pop(key) for key in _ENCODED if key in attrs}
     dtype, is_packed = values.dtype, "scale_factor" in encoding
     if GRID in attrs and dims:
         data = np.broadcast_to(dtype.type(0), values.shape)
@@ -128,13 +220,13 @@ def _open_variable(stored: Any, values: Any) -> xr.Variable:
         chunks = plist.get_chunk()
         missing = encoding["scale_factor"] * np.nan if is_packed else dtype.type(np.nan)
         if not has_known_filters(plist) or max(chunks[:-1], default=1) > 1:
-            raise ValueError(stored.name)
+            raise ValueError(name)
         if is_packed and (missing.dtype != np.float64 or "_FillValue" not in encoding):
-            raise ValueError(stored.name)
+            raise ValueError(name)
         encoding |= {"dtype": dtype, "chunksizes": chunks}
         data = np.broadcast_to(missing, values.shape)
     elif encoding or _FOREIGN & set(attrs) or math.prod(values.shape) > _MAX_READ_VALUES:
-        raise ValueError(stored.name)
+        raise ValueError(name)
     else:
         data = _read_part(values, (0,) * len(dims), values.shape)
     if dtype == "S1":  # letters of labels
@@ -142,7 +234,7 @@ def _open_variable(stored: Any, values: Any) -> xr.Variable:
         dims = dims[:-1]
         data = np.char.decode(data.view(f"S{data.shape[-1]}")[..., 0], "utf-8")
     elif dtype.kind not in "iuf":
-        raise ValueError(stored.name)
+        raise ValueError(name)
     return xr.Variable(dims, data, attrs, encoding)
 
 

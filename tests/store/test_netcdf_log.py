@@ -9,6 +9,8 @@ import xarray as xr
 
 from gyrostab import make_log, open_log, to_netcdf
 from gyrostab.errors import FormatError
+from gyrostab.ingest.files import scan_file
+from gyrostab.ingest.formats import netcdf
 from gyrostab.store import read
 from gyrostab.store.netcdf_log import open_netcdf_log
 
@@ -19,6 +21,7 @@ def _write_log(path, **options):
     log = make_log(values, rate=100.0, unit="deg/h", start="2026-01-01")
     log["rate"].encoding = {"dtype": "int16", "scale_factor": 0.01}
     log["temperature"] = ("time", np.linspace(20.0, 30.0, 5000), {"units": "degree_Celsius"})
+    log["temperature"].attrs |= {"long_name": "Kühler", "comment": "", "place_m": [0.1, 0.2]}
     to_netcdf(log, path, **options)
 
 
@@ -34,6 +37,16 @@ def test_a_log_is_that_which_xarray_opens(tmp_path, monkeypatch, stamps):
     assert list(direct.variables) == list(slow.variables)
     assert direct["rate"].encoding == slow["rate"].encoding
     assert direct["rate"].dtype == slow["rate"].dtype
+
+
+@pytest.mark.parametrize("stamps", [True, False])
+def test_a_log_has_the_summary_of_its_samples(tmp_path, monkeypatch, stamps):
+    path = tmp_path / "log.nc"
+    _write_log(path, stamps=stamps)
+    direct = scan_file(path)
+    monkeypatch.setattr(netcdf, "open_netcdf_log", lambda path: None)
+    assert direct == scan_file(path)
+    assert (direct.n_rows, direct.channels) == (5000, ("temperature",))
 
 
 def test_changed_stamps_are_left_to_xarray(tmp_path):

@@ -38,8 +38,8 @@ from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name
 from gyrostab.store.blosc_chunks import check_blosc_chunks
 from gyrostab.store.cf import from_disk
 from gyrostab.store.hdf5_heaps import check_global_heaps
-from gyrostab.store.layout import read_attribute
-from gyrostab.store.read import open_stored
+from gyrostab.store.netcdf_log import open_netcdf_log, read_content
+from gyrostab.store.read import Stored, open_stored
 from gyrostab.store.remote import find_url
 from gyrostab.time.grid import grid_times, time_coordinate
 from gyrostab.time.stamps import to_nanoseconds
@@ -68,7 +68,7 @@ def matches(path: Path) -> bool:
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Summarise variables, sizes, and first and last stamps."""
-    log = _open_remote(path) if find_url(path) else _open_log(path, options)
+    log = _open_remote(path) if find_url(path) else _open_log(path, options, values=False)
     if log is not None:
         with log:
             return _summarise_log(path, log)
@@ -100,13 +100,17 @@ def _open_remote(path: Path) -> xr.Dataset:
     return log
 
 
-def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
-    """Open a regular log, of gyrostab or with a stamp for each sample; None for other files."""
+def _open_log(path: Path, options: ReadOptions, *, values: bool = True) -> xr.Dataset | None:
+    """Open a regular log, of gyrostab or with a stamp for each sample; None for other files.
+
+    The samples of a log of gyrostab may be NaN without `values`.
+    """
     if path.is_file():
         read_classic_header(path)  # before the library allocates what a damaged header asks for
-    content = _content_kind(path)
+    stored = None if values or path.is_dir() else open_netcdf_log(path)
+    content = _content_kind(path) if stored is None else "log"
     if content == "log":
-        return _open_own(path, options)
+        return _open_own(path, options, stored)
     if path.is_file():
         check_global_heaps(path)
     if content in _OTHER_CONTENT and not options.channels_only:
@@ -116,11 +120,11 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
         )
     if path.is_dir():
         check_blosc_chunks(path)
-    stored = _open_regular(path)
-    if stored is None:
+    regular = _open_regular(path)
+    if regular is None:
         return None
-    log = _as_in_memory(path, decode_variables(path, stored))  # an index would load every stamp
-    log.set_close(stored.close)
+    log = _as_in_memory(path, decode_variables(path, regular))  # an index would load every stamp
+    log.set_close(regular.close)
     check_stored(path, log.sizes.get("time", 0), log.sizes.get("axis", 1), options.limits)
     try:
         return _with_uniform_time(log)
@@ -214,15 +218,19 @@ def _content_kind(path: Path) -> str:
     try:
         if path.is_dir():
             return str(json.loads((path / ".zattrs").read_bytes()).get("gyrostab_content", ""))
-        return read_attribute(path, "gyrostab_content")
+        return read_content(path)
     except Exception:  # whatever the libraries raise on damaged bytes
         return ""
 
 
-def _open_own(path: Path, options: ReadOptions) -> xr.Dataset:
-    """Open a log that gyrostab wrote."""
+def _open_own(path: Path, options: ReadOptions, stored: Stored | None) -> xr.Dataset:
+    """Open a log that gyrostab wrote, or take it as it is on disk if it is open."""
     check = partial(check_declared, given=options.limits)
-    log = from_disk(open_stored(path, strict=options.strict, check=check), path.name)
+    if stored is None:
+        stored = open_stored(path, strict=options.strict, check=check)
+    else:
+        check(path, stored.variables)
+    log = from_disk(stored, path.name)
     try:
         log = as_uniform(log)
     except SchemaError as error:
