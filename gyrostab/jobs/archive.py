@@ -23,6 +23,15 @@ from gyrostab.jobs.schedule import Pool, run_calls
 from gyrostab.progress import Stage
 from gyrostab.store.output import describe_file, read_json
 from gyrostab.store.output.content import is_store
+from gyrostab.store.remote import (
+    find_store,
+    find_url,
+    full_name,
+    is_folder,
+    list_urls,
+    remove_copies,
+    walk_address,
+)
 
 __all__ = [
     "DIAGNOSIS",
@@ -107,8 +116,9 @@ def find_archive(paths: Sequence[str | Path]) -> Archive:
     Parameters
     ----------
     paths : sequence of path
-        Folders, which are searched with all folders below, files, Zarr stores and patterns. Hidden
-        items and fleets that gyrostab wrote are left out.
+        Folders, which are searched with all folders below, files, Zarr stores and patterns, or
+        addresses of them. Hidden items and fleets that gyrostab wrote are left out, at addresses
+        also diagnoses.
 
     Returns
     -------
@@ -123,13 +133,22 @@ def find_archive(paths: Sequence[str | Path]) -> Archive:
     diagnoses: dict[Path, None] = {}
     visited: set[str] = set()
     bases = []
+    is_remote = any(map(find_url, paths))
+    if is_remote and not all(map(find_url, paths)):
+        raise OptionError("an archive is either at addresses or in folders; give one of them")
     for item in map(str, paths):
+        url = find_url(item)
         is_pattern = glob.has_magic(item) and not os.path.lexists(item)
-        matching = sorted(glob.iglob(item, recursive=True)) if is_pattern else [item]
+        if not is_pattern:
+            matching = [item]
+        else:
+            matching = list_urls(url) if url else sorted(glob.iglob(item, recursive=True))
         for path in map(Path, matching):
-            if not path.exists():
+            if url:
+                found.update(dict.fromkeys(map(Path, _list_address(find_url(path) or url))))
+            elif not path.exists():
                 raise FormatError(f"{path}: there is no such file or folder")
-            if path.is_dir() and not (is_store(path) or is_fleet(path)):
+            elif path.is_dir() and not (is_store(path) or is_fleet(path)):
                 for kind, inside in _walk_folder(path, visited):
                     (diagnoses if kind == DIAGNOSIS else found)[inside] = None
             elif not (is_pattern and _is_inside_output(path)):
@@ -137,7 +156,7 @@ def find_archive(paths: Sequence[str | Path]) -> Archive:
         bases.append(_find_base(item, is_pattern=is_pattern, alone=len(paths) == 1))
     if not found:
         raise FormatError(f"{', '.join(map(str, paths))}: there are no files")
-    base = os.path.commonpath([os.path.abspath(base) for base in bases])
+    base = os.path.commonpath([base if is_remote else os.path.abspath(base) for base in bases])
     return Archive(Path(base), sorted(found), sorted(diagnoses))
 
 
@@ -147,7 +166,28 @@ def _find_base(item: str, *, is_pattern: bool, alone: bool) -> Path:
     if is_pattern:
         fixed = itertools.takewhile(lambda part: not glob.has_magic(part), path.parts)
         return Path(*fixed)
-    return path if alone and path.is_dir() and not is_store(path) else path.parent
+    url = find_url(item)
+    if url:
+        is_archive = is_folder(url) and not find_store(url)
+    else:
+        is_archive = path.is_dir() and not is_store(path)
+    return path if alone and is_archive else path.parent
+
+
+def _list_address(url: str) -> Iterator[str]:
+    """Yield the files and Zarr stores at an address and below, without fleets and diagnoses."""
+    if not is_folder(url):
+        yield url
+        return
+    for place, folders, names, is_zarr in walk_address(url):
+        is_output = FLEET_MARK in names or "diagnosis.json" in names
+        if is_zarr and not is_output:
+            yield place
+        for name in list(folders):
+            if is_zarr or is_output or name.startswith("."):
+                del folders[name]
+        if not (is_zarr or is_output):
+            yield from (f"{place}/{name}" for name in names if not name.startswith("."))
 
 
 def _walk_folder(folder: Path, visited: set[str]) -> Iterator[tuple[str, Path]]:
@@ -230,7 +270,7 @@ def index_files(
     for path in [*archive.files, *archive.diagnoses]:
         found = describe_file(path)
         row = {
-            "file": os.path.abspath(path),
+            "file": full_name(path),
             "base": str(archive.base),
             "bytes": found["bytes"],
             "changed_ns": found["changed_ns"],
@@ -242,7 +282,7 @@ def index_files(
         rows[row["file"]] = old if is_same else row
         if not is_same:
             changed.append(row["file"])
-    diagnosed = {os.path.abspath(path) for path in archive.diagnoses}
+    diagnosed = {full_name(path) for path in archive.diagnoses}
     for name in diagnosed:
         rows[name] |= {"is_log": False, "format": DIAGNOSIS, "note": ""}
     names = [name for name in changed if name not in diagnosed]
@@ -267,7 +307,8 @@ def _describe_log(name: str, reading: Mapping[str, Any]) -> dict[str, Any]:
         ("format", "start", "end", "rate [Hz]", "axes", "channels", "rows")
     )
     try:
-        summary = scan_file(name, ReadOptions(**kept))
+        with remove_copies():
+            summary = scan_file(name, ReadOptions(**kept))
     except FormatError as error:
         return {**row, "is_log": isinstance(error, DamageError), "note": str(error)}
     except (GyrostabError, OSError) as error:

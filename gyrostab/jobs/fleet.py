@@ -61,7 +61,7 @@ from gyrostab.store.output import (
     resolve_link,
 )
 from gyrostab.store.read import open_stored
-from gyrostab.store.remote import find_url
+from gyrostab.store.remote import find_url, full_name, remove_copies
 
 __all__ = ["process_run", "run_fleet", "write_file_table"]
 
@@ -87,7 +87,7 @@ def write_file_table(
     Parameters
     ----------
     paths : sequence of path
-        Folders, files, Zarr stores and patterns.
+        Folders, files, Zarr stores and patterns, or addresses of them.
     output : path
         Parquet file. An earlier table is brought up to date: files that have not changed are not
         opened again.
@@ -104,7 +104,7 @@ def write_file_table(
         The table of `gyrostab.jobs.archive.index_files`.
     """
     scheduler = check_scheduler(scheduler)
-    _check_local(*paths, output)
+    _check_local(output)
     known = read_table(Path(output), content=FILES)
     check_output(output, suffixes=[".parquet"], overwrite=overwrite or known is not None)
     archive = find_archive(paths)
@@ -144,7 +144,8 @@ def run_fleet(
     Parameters
     ----------
     paths : sequence of path
-        Folders, files, Zarr stores and patterns; or one table of `write_file_table`.
+        Folders, files, Zarr stores and patterns, or addresses of them; or one table of
+        `write_file_table`.
     output : path
         Folder to write, or to bring up to date; a Zarr store if its name ends in ``.zarr``.
     per : {"folder", "file"}
@@ -182,7 +183,7 @@ def run_fleet(
         When the output or an option is wrong.
     """
     scheduler = check_scheduler(scheduler)
-    _check_local(*paths, output)
+    _check_local(output)
     options = {
         "reading": dict(reading or {}),
         "windows": dict(windows or {}),
@@ -227,11 +228,11 @@ def run_fleet(
     return rows
 
 
-def _check_local(*paths: str | Path) -> None:
-    for url in filter(None, map(find_url, paths)):
+def _check_local(output: str | Path) -> None:
+    if url := find_url(output):
         raise OptionError(
-            f"{url}: a fleet is read from and written to folders; mount the store as one, copy "
-            "with a tool such as aws s3 sync, or analyse each address with gyrostab run"
+            f"{url}: the output of a fleet is a local folder; give one, and copy it with a tool "
+            "such as aws s3 sync"
         )
 
 
@@ -357,7 +358,7 @@ def _is_current(
 
 
 def _pack_run(item: LogRun) -> dict[str, Any]:
-    return {**asdict(item), "files": [os.path.abspath(path) for path in item.files]}
+    return {**asdict(item), "files": [full_name(path) for path in item.files]}
 
 
 def process_run(
@@ -397,7 +398,7 @@ def process_run(
     try:
         _make_folders(Path(target), product.parent)
         row["job"] = find_job_name(item["files"], **given)
-        with dask.config.set(scheduler="synchronous"):
+        with dask.config.set(scheduler="synchronous"), remove_copies():
             run(
                 item["files"],
                 product,

@@ -8,9 +8,11 @@ library of each store reads them.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import re
 import tempfile
+import threading
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path, PurePath
@@ -19,8 +21,8 @@ from typing import Any
 from gyrostab.errors import FormatError, GyrostabError, OptionError, OutputError
 
 __all__ = [
-    "fetch_file", "find_store", "find_url", "full_name", "is_taken", "list_urls", "reaching",
-    "upload",
+    "describe_address", "fetch_file", "find_store", "find_url", "full_name", "is_folder",
+    "is_taken", "list_urls", "reaching", "remove_copies", "upload", "walk_address",
 ]  # fmt: skip
 
 _URL = re.compile(r"([a-z][a-z0-9+.-]+):/+(.+)")  # a single letter is a drive of Windows
@@ -28,6 +30,11 @@ _URL = re.compile(r"([a-z][a-z0-9+.-]+):/+(.+)")  # a single letter is a drive o
 _EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs", "http": "http", "https": "http"}
 #: Names without which a store cannot be opened; they are uploaded last.
 _ROOT_METADATA = (".zgroup", ".zattrs", ".zmetadata", "zarr.json")
+#: What libraries call size, time of change and checksum of an object.
+_CHANGES = {
+    "size", "ETag", "etag", "md5Hash", "content_md5", "Content-MD5", "LastModified",
+    "Last-Modified", "last_modified", "updated", "mtime", "created",
+}  # fmt: skip
 
 
 def find_url(path: str | os.PathLike[str]) -> str | None:
@@ -135,6 +142,62 @@ def list_urls(url: str) -> list[str]:
         return [filesystem.unstrip_protocol(name) for name in sorted(filesystem.glob(path))]
 
 
+def is_folder(url: str) -> bool:
+    """Whether there is a folder at an address; a Zarr store is one.
+
+    Raises
+    ------
+    FormatError
+        When there is nothing at the address, or it cannot be reached.
+    """
+    with reaching(url):
+        filesystem, path = _open_filesystem(url)
+        if not filesystem.exists(path):
+            raise FileNotFoundError(url)
+        return bool(filesystem.isdir(path))
+
+
+def walk_address(url: str) -> Iterator[tuple[str, dict[str, Any], list[str], bool]]:
+    """Walk the folders at an address, as `os.walk` does.
+
+    Yields
+    ------
+    tuple
+        Address of the folder, folders in it (those removed are not visited), names of files, and
+        whether the folder is a Zarr store.
+    """
+    with reaching(url):
+        filesystem, path = _open_filesystem(url)
+        filesystem.invalidate_cache()
+        for place, folders, files in filesystem.walk(path, detail=True):
+            is_store = any(name in files for name in _ROOT_METADATA)
+            yield filesystem.unstrip_protocol(place), folders, sorted(files), is_store
+
+
+def describe_address(url: str) -> dict[str, Any]:
+    """Describe a file, or a Zarr store by its metadata: size [bytes], and a digest of its state.
+
+    The digest changes when the object is replaced: it is made from the size, time of change and
+    checksum that the store knows. Both are None where nothing can be reached.
+    """
+    found = []
+    try:
+        filesystem, path = _open_filesystem(url)
+        filesystem.invalidate_cache(path)
+        names = [path, *(f"{path}/{name}" for name in _ROOT_METADATA)]
+        for name in names[1:] if filesystem.isdir(path) else names[:1]:
+            with contextlib.suppress(FileNotFoundError):
+                found.append(filesystem.info(name))
+    except Exception:  # libraries raise exceptions of many kinds; reading says what is wrong
+        return {"bytes": None, "changed_ns": None}
+    states = [sorted((key, str(info[key])) for key in _CHANGES & set(info)) for info in found]
+    return {
+        "bytes": sum(int(info.get("size") or 0) for info in found),
+        "changed_ns": 0,
+        "listing": hashlib.sha256(repr(states).encode()).hexdigest(),
+    }
+
+
 def fetch_file(url: str) -> Path:
     """Download a file to a temporary copy of the same name, again only after it has changed."""
     with reaching(url):
@@ -151,14 +214,28 @@ def _download_file(url: str, info: str) -> Path:
     """Download a file that the store describes by `info`, once for the process."""
     filesystem, path = _open_filesystem(url)
     folder = tempfile.TemporaryDirectory(prefix="gyrostab-")
-    _COPIES.append(folder)
+    _COPIES.setdefault(threading.get_ident(), []).append(folder)
     target = Path(folder.name, path.rpartition("/")[2])
     filesystem.get_file(path, str(target))
     return target
 
 
-#: Folders of downloaded files; removed when the process ends.
-_COPIES: list[tempfile.TemporaryDirectory[str]] = []
+#: Folders of downloaded files by thread; removed when the process ends.
+_COPIES: dict[int, list[tempfile.TemporaryDirectory[str]]] = {}
+
+
+@contextlib.contextmanager
+def remove_copies() -> Iterator[None]:
+    """Remove the copies of files that this thread has downloaded in the block, at its end."""
+    copies = _COPIES.setdefault(threading.get_ident(), [])
+    before = len(copies)
+    try:
+        yield
+    finally:
+        if len(copies) > before:
+            _download_file.cache_clear()
+        while len(copies) > before:
+            copies.pop().cleanup()
 
 
 @contextlib.contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import tempfile
 import time
 import warnings
 from pathlib import Path
@@ -13,7 +14,7 @@ import pandas as pd
 import pytest
 import xarray as xr
 
-from gyrostab import make_log, open_product, to_netcdf, to_zarr
+from gyrostab import make_log, open_log, open_product, to_netcdf, to_zarr
 from gyrostab.cli import main
 from gyrostab.errors import FormatError, OptionError, OutputError
 from gyrostab.ingest.files import scan_file
@@ -23,6 +24,7 @@ from gyrostab.jobs.fleet import process_run, run_fleet, write_file_table
 from gyrostab.jobs.fleet_table import TREND_COLUMNS, read_table, write_table
 from gyrostab.jobs.run import run
 from gyrostab.report.fleet import write_overview
+from gyrostab.store.remote import find_url
 
 RATE = 10.0
 WINDOWS = {"window": "60s", "step": "30s", "taus": "12"}
@@ -278,14 +280,76 @@ def test_nothing_foreign_is_replaced(archive, tmp_path):
     assert [path.name for path in output.iterdir()] == ["notes.txt"]
 
 
-@pytest.mark.parametrize(
-    ("logs", "output"), [("s3://rig/run7", "fleet"), ("archive", "s3://rig/fleet.zarr")]
-)
-def test_fleets_of_an_object_store_are_refused(logs, output, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture
+def memory(archive):
+    """An archive in an object store: two NetCDF logs of one run, a Zarr log, and a text."""
+    store = pytest.importorskip("fsspec").filesystem("memory")
+    store.store.clear()
+    store.pseudo_dirs[:] = [""]
+    for name in ("1.nc", "2.nc"):
+        store.put(str(archive / "tool 1" / "run a" / name), f"/rig/tool 1/run a/{name}")
+    with open_log(archive / "tool 1" / "run <b>" / "log.nc") as log:
+        to_zarr(log, "memory://rig/tool 1/run b/log.zarr")
+    store.pipe("/rig/tool 1/README.txt", b"Logs of the spring campaign.")
+    store.pipe("/rig/tool 1/diagnosis/diagnosis.json", b"{}")
+    store.pipe("/rig/old/fleet.json", b"{}")
+    store.pipe("/rig/old/run.nc", b"a product")
+    return store
+
+
+@pytest.mark.parametrize("paths", [["memory://rig"], ["memory://rig/tool*"]])
+def test_a_fleet_of_an_object_store_is_that_of_its_folder(paths, memory, done, tmp_path):
+    found = find_archive(paths)
+    assert [find_url(path) for path in found.files] == [
+        "memory://rig/tool 1/README.txt",
+        "memory://rig/tool 1/run a/1.nc",
+        "memory://rig/tool 1/run a/2.nc",
+        "memory://rig/tool 1/run b/log.zarr",
+    ]
+    table = run_fleet(paths, tmp_path / "fleet", **OPTIONS)
+    assert list(table["run"]) == ["tool 1/run a", "tool 1/run b"]
+    for name, local in (("run a", "run a"), ("run b", "run <b>")):
+        with (
+            open_product(tmp_path / "fleet" / "tool 1" / f"{name}.nc") as remote,
+            open_product(done / "tool 1" / f"{local}.nc") as other,
+        ):
+            xr.testing.assert_equal(remote, other)
+
+
+def test_a_fleet_of_an_object_store_is_brought_up_to_date(memory, tmp_path, computed, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    table = tmp_path / "files.parquet"
+    for _ in range(2):
+        write_file_table(["memory://rig"], table, scheduler="threads")
+        run_fleet([table], tmp_path / "fleet", **OPTIONS)
+    assert computed == ["tool 1/run a", "tool 1/run b"]
+    log = make_log(np.arange(3000.0) % 7, rate=RATE, unit="deg/h", start="2026-05-01")
+    memory.rm("/rig/tool 1/run b/log.zarr", recursive=True)
+    to_zarr(log, "memory://rig/tool 1/run b/log.zarr")
+    run_fleet(["memory://rig"], tmp_path / "fleet", **OPTIONS)
+    assert computed[2:] == ["tool 1/run b"]
+    assert not list(tmp_path.glob("gyrostab-*"))  # copies of the NetCDF logs are removed
+
+
+def test_a_fleet_is_read_from_a_web_server(archive, done, tmp_path, serve_folder):
+    address = serve_folder(archive / "tool 1" / "run a")
+    table = run_fleet([address], tmp_path / "fleet", **OPTIONS)
+    assert table["files"].tolist() == [2]
+    with (
+        open_product(tmp_path / "fleet" / f"{table['run'][0]}.nc") as remote,
+        open_product(done / "tool 1" / "run a.nc") as local,
+    ):
+        xr.testing.assert_equal(remote, local)
+
+
+def test_what_a_fleet_does_not_do_at_addresses_is_said(archive, tmp_path, memory):
     for call in (run_fleet, write_file_table):
-        with pytest.raises(OptionError, match=r"s3://rig/.*: a fleet is read from"):
-            call([logs], output)
+        with pytest.raises(OptionError, match=r"s3://rig/.*: the output of a fleet is a local"):
+            call([archive], "s3://rig/fleet.zarr")
+    with pytest.raises(OptionError, match="either at addresses or in folders"):
+        find_archive(["memory://rig", archive])
+    with pytest.raises(FormatError, match=r"memory://none: there is no such object"):
+        find_archive(["memory://none"])
     assert not list(tmp_path.iterdir())
 
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import http.server
 import sys
-import threading
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -129,26 +126,18 @@ def test_an_interrupted_upload_leaves_nothing_that_opens(log, monkeypatch):
     assert open_log("memory://archive/cut.zarr").sizes == log.sizes
 
 
-def test_files_of_other_formats_are_copied_and_read(log, tmp_path):
-    class Quiet(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, *_):
-            pass
-
+def test_files_of_other_formats_are_copied_and_read(log, tmp_path, serve_folder):
     to_netcdf(log, tmp_path / "log.nc")
     (tmp_path / "rows.csv").write_text("time [s],gyro_x [deg/h]\n0,1\n1,2\n2,3\n")
-    handler = partial(Quiet, directory=str(tmp_path))
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        address = f"http://127.0.0.1:{server.server_port}"
-        assert load_log([f"{address}/rows.csv"]).rate.values.tolist() == [[1, 2, 3]]
-        stored = load_log([f"{address}/log.nc"])
-        np.testing.assert_array_equal(stored["rate"].values, log["rate"].values)
-        assert stored.attrs["source_files"] == ["log.nc"]
-        (tmp_path / "rows.csv").write_text("time [s],gyro_x [deg/h]\n0,1\n1,2\n2,3\n3,4\n")
-        assert load_log([f"{address}/rows.csv"]).rate.values.tolist() == [[1, 2, 3, 4]]
-        with pytest.raises(FormatError, match="no such object"):
-            load_log([f"{address}/none.csv"])
-        server.shutdown()
+    address = serve_folder(tmp_path)
+    assert load_log([f"{address}/rows.csv"]).rate.values.tolist() == [[1, 2, 3]]
+    stored = load_log([f"{address}/log.nc"])
+    np.testing.assert_array_equal(stored["rate"].values, log["rate"].values)
+    assert stored.attrs["source_files"] == ["log.nc"]
+    (tmp_path / "rows.csv").write_text("time [s],gyro_x [deg/h]\n0,1\n1,2\n2,3\n3,4\n")
+    assert load_log([f"{address}/rows.csv"]).rate.values.tolist() == [[1, 2, 3, 4]]
+    with pytest.raises(FormatError, match="no such object"):
+        load_log([f"{address}/none.csv"])
 
 
 def test_what_cannot_be_done_is_said(log, monkeypatch):

@@ -17,6 +17,7 @@ from typing import Any
 
 from gyrostab.errors import FormatError
 from gyrostab.store.output.content import is_store
+from gyrostab.store.remote import describe_address, find_url
 
 __all__ = [
     "check_unchanged",
@@ -36,7 +37,12 @@ _PROTECTED: ContextVar[dict[Path, dict[str, Any] | None] | None] = ContextVar(
 
 
 def describe_file(path: Path) -> dict[str, Any]:
-    """Describe a file by size [bytes] and time of change; a folder (Zarr) by those of its files."""
+    """Describe a file by size [bytes] and time of change; a folder (Zarr) by those of its files.
+
+    Objects at addresses are described by `gyrostab.store.remote.describe_address`.
+    """
+    if url := find_url(path):
+        return describe_address(url)
     try:
         if not path.is_dir():
             found = path.stat()
