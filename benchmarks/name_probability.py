@@ -75,8 +75,10 @@ def collect_names(runs: list[Path]) -> Names:
         for path in sorted((run / "diagnoses").glob("*.json")):
             diagnosis = json.loads(path.read_text(encoding="utf-8"))
             truth = json.loads((run / "truth" / path.name).read_text(encoding="utf-8"))
-            found = score_case(diagnosis, truth)[0]["identifications"]
-            for one in found:
+            case = score_case(diagnosis, truth)[0]
+            if case["kind"] in ("injected", "control"):  # real recordings have unknown effects
+                continue
+            for one in case["identifications"]:
                 rivals.append(sum_rivals(one["name"], diagnosis))
                 right.append(one["exact"])
     return Names(np.array(rivals), np.array(right))
