@@ -60,6 +60,16 @@ def test_risk_falls_with_the_coverage(drawn):
     assert risk["risk"].iloc[99] < 0.5 * risk["risk"].iloc[-1]
 
 
+def test_names_of_equal_probability_are_one_group():
+    stated = np.repeat([0.5, 0.95], [20, 80])
+    right = np.concatenate([np.arange(20) < 10, np.arange(80) < 76])
+    curve = calibration_curve(rows_of(stated, right))
+    assert curve[["n", "right"]].to_numpy().tolist() == [[20, 0.5], [80, 0.95]]
+    assert expected_calibration_error(stated, right.astype(float)) == pytest.approx(0.0)
+    risk = risk_coverage(rows_of(stated, right))
+    assert risk.to_numpy() == pytest.approx(np.array([[0.8, 0.05], [1.0, 0.14]]))
+
+
 def test_a_diagnosis_without_probabilities_has_no_figures():
     rows = rows_of(np.ones(2), np.ones(2, np.bool_))
     for row in rows:

@@ -156,7 +156,13 @@ def draw_calibration(curve: pd.DataFrame, risk: pd.DataFrame) -> Callable[[Path]
         xlabel="stated probability of the name",
         ylabel="share of names that are right,\nwith 95 % interval",
     )
-    coverage.plot(risk["coverage"].to_numpy(), risk["risk"].to_numpy(), color=COLOURS[1])
+    coverage.plot(
+        risk["coverage"].to_numpy(),
+        risk["risk"].to_numpy(),
+        color=COLOURS[1],
+        marker=MARKERS[1],
+        markersize=3,
+    )
     coverage.set(
         xlim=(0, 1),
         ylim=(0, None),

@@ -43,9 +43,11 @@ def _collect_probabilities(rows: Sequence[Row]) -> tuple[Array, Array]:
 
 
 def _split_groups(stated: Array) -> list[NDArray[np.intp]]:
-    """Split identifications by probability into groups of about equal size."""
-    order = np.argsort(stated, kind="stable")
-    return [group for group in np.array_split(order, _GROUPS) if group.size]
+    """Split identifications into groups of about equal size; equal probabilities stay together."""
+    from scipy.stats import rankdata
+
+    number = np.floor((rankdata(stated) - 0.5) * _GROUPS / max(stated.size, 1))
+    return [np.flatnonzero(number == group) for group in np.unique(number)]
 
 
 def expected_calibration_error(stated: Array, right: Array) -> float:
@@ -93,14 +95,15 @@ def risk_coverage(rows: Sequence[Row]) -> pd.DataFrame:
     Returns
     -------
     pandas.DataFrame
-        One line for each identification, the most probable first: ``coverage`` (share of the
-        identifications so far) and ``risk`` (share of these that is wrong).
+        One line for each probability, the largest first: ``coverage`` (share of the
+        identifications that have at least this probability) and ``risk`` (share of these that is
+        wrong).
     """
     stated, right = _collect_probabilities(rows)
-    order = np.argsort(-stated, kind="stable")
-    number = np.arange(1, order.size + 1)
+    above = stated >= np.unique(stated)[::-1, None]
+    number = above.sum(axis=1)
     return pd.DataFrame(
-        {"coverage": number / max(order.size, 1), "risk": np.cumsum(1.0 - right[order]) / number}
+        {"coverage": number / max(stated.size, 1), "risk": above @ (1.0 - right) / number}
     )
 
 
