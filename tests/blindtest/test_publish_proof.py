@@ -33,7 +33,7 @@ def finish_run(folder: Path, docs: Path, monkeypatch, *, seed: int = 2_000_003) 
     (folder / "table.md").write_text(
         f"Seed {seed}, to be repeated.\n\n| quantity | value |\n|---|---|\n| detected | 0.123 |\n"
     )
-    for name in ("completeness", "reliability"):
+    for name in ("completeness", "reliability", "calibration"):
         (folder / f"{name}.png").write_bytes(name.encode())
     monkeypatch.setattr("sys.argv", ["publish_proof.py", str(folder), "--docs", str(docs)])
 
@@ -49,7 +49,8 @@ def test_figures_are_replaced_and_handwritten_text_stays(
     assert "## What failed, and why" in by_hand
     assert after.startswith(by_hand)
     assert "| detected | 0.123 |" in after
-    assert (docs / "figures" / "proof-completeness.png").read_bytes() == b"completeness"
+    for name in ("completeness", "calibration"):
+        assert (docs / "figures" / f"proof-{name}.png").read_bytes() == name.encode()
     assert "What failed, and why" in capsys.readouterr().out  # which describes another run
     publish()
     assert (docs / "proof.md").read_text(encoding="utf-8") == after
