@@ -275,6 +275,18 @@ def _share_text(share: float) -> str:
     return "all" if share == 1.0 else f"{share:.0%}"
 
 
+def _count_windows(affected: NDArray[np.bool_]) -> str:
+    """Return the number of affected windows in words.
+
+    Examples
+    --------
+    >>> _count_windows(np.array([True, False])), _count_windows(np.array([True, True]))
+    ('1 window', '2 windows')
+    """
+    count = int(np.count_nonzero(affected))
+    return f"{count} window{'s' * (count > 1)}"
+
+
 def _describe_misfit(product: xr.Dataset) -> list[str]:
     fits = [summary for summary in summarise_fit(product) if summary.windows]
     if not fits:
@@ -323,7 +335,7 @@ def _describe_outliers(product: xr.Dataset) -> list[str]:
         str(axis): product["outlier_count"].sel(axis=axis).values for axis in product["axis"].values
     }
     affected = [
-        f"{axis} in {np.count_nonzero(counts)} windows (at most {int(counts.max())} in one)"
+        f"{axis} in {_count_windows(counts > 0)} (at most {int(counts.max())} in one)"
         for axis, counts in worst.items()
         if counts.size and counts.max() > 0
     ]
@@ -362,11 +374,10 @@ def _describe_motion(product: xr.Dataset) -> list[str]:
     for axis in product["axis"].values:
         mean = product["window_mean"].sel(axis=axis).values
         away = np.abs(mean - np.nanmedian(mean)) if np.isfinite(mean).any() else np.zeros(1)
-        count = int(np.count_nonzero(away > _MAX_CHANGE_AT_REST_DPH))
-        if count:
-            moved.append(
-                f"{axis} in {count} windows (up to {_number_text(float(np.nanmax(away)))} deg/h)"
-            )
+        moving = away > _MAX_CHANGE_AT_REST_DPH
+        if moving.any():
+            largest = _number_text(float(np.nanmax(away)))
+            moved.append(f"{axis} in {_count_windows(moving)} (up to {largest} deg/h)")
     if not moved:
         return []
     reason = "motion or a drifting bias; leave such times out with --exclude"
