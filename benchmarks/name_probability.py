@@ -93,7 +93,7 @@ def sum_rivals(name: str, diagnosis: dict[str, Any]) -> float:
     differences = {
         one["name"]: one["nats"] or 0.0 for one in diagnosis["rejected"] if one["beaten_by"] == name
     }
-    return sum(math.exp(-differences.get(one, 0.0)) for one in table["alternatives"])
+    return sum(float(np.exp(-differences.get(one, 0.0))) for one in table["alternatives"])
 
 
 def probabilities(law: Array, rivals: Array) -> Array:

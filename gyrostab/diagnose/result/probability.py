@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import numpy as np
 
 from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.settings import DEFAULTS, Settings
@@ -24,11 +24,10 @@ def name_probability(identification: Identification, *, settings: Settings = DEF
     >>> name_probability(alone) == DEFAULTS.set_probability
     True
     """
-    rivals = sum(
-        math.exp(_evidence_instead(identification, name) - identification.evidence_nats)
-        for name in identification.alternatives
-    )
-    return settings.set_probability / (1.0 + rivals)
+    own = identification.evidence_nats
+    others = [_evidence_instead(identification, name) for name in identification.alternatives]
+    share = np.exp(own - np.logaddexp.reduce([own, *others]))  # E_k - E may be any number of nats
+    return float(settings.set_probability * share)
 
 
 def _evidence_instead(identification: Identification, effect: str) -> float:

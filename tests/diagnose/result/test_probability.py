@@ -34,6 +34,7 @@ def test_evidence_against_an_alternative_raises_the_probability():
     assert found[-1] == pytest.approx(0.9, abs=1e-4)
     # a plainer effect may be named although another has more evidence
     assert found[0] == pytest.approx(0.9 / (1.0 + np.exp(2.0)))
+    assert probability("rate_quantization", rate_quantization=7e5) == 0.0
 
 
 def test_the_channel_with_most_evidence_counts():
