@@ -44,7 +44,7 @@ def show(product):
         part = product[["N", "observable", "window_coverage"]].sel(axis=axis).load()
         observed = part["N"].where(part["observable"].sel(term="N") == 2)
         recorded, median = float(part["window_coverage"].mean()), float(observed.median())
-        print(f"axis {axis}: {recorded:.0%} recorded, median N {median:.3g} deg/sqrt(h)")
+        print(f"axis {axis}: {100 * recorded:.0f} % recorded, median N {median:.3g} deg/sqrt(h)")
 
 
 def main(plan_file):

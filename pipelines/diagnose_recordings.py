@@ -31,7 +31,7 @@ def row(name, found):
         for one in found.effects
     ]
     coverage = [found.content["held_out"][f"coverage95_{when}"] for when in ("before", "after")]
-    shares = " | ".join(f"{share:.0%}" for share in coverage)
+    shares = " | ".join(f"{100 * share:.0f} %" for share in coverage)
     return f"| {name} | {found.verdict} | {'; '.join(named)} | {shares} |"
 
 

@@ -74,7 +74,7 @@ def confidence_interval(surface: xr.Dataset, *, level: float = 0.95) -> xr.Datas
         )
         out[name] = limit.assign_attrs(
             units=surface["avar"].attrs["units"],
-            long_name=f"{end} end of the {level:.0%} interval of the Allan variance",
+            long_name=f"{end} end of the {100 * level:.0f} % interval of the Allan variance",
         )
     return out
 

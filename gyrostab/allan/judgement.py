@@ -221,7 +221,7 @@ def _judge_steadiness(product: xr.Dataset) -> str:
         return f"N varies (95 % over 5 % quantile): {'; '.join(changing)}."
     return (
         "N is steady: it varies by "
-        + ", ".join(f"{share:.0%} on {axis}" for axis, share, *_ in spreads)
+        + ", ".join(f"{100 * share:.0f} % on {axis}" for axis, share, *_ in spreads)
         + " (half of the range from 5 % to 95 %)."
     )
 

@@ -272,7 +272,7 @@ def _number_text(value: float) -> str:
 
 
 def _share_text(share: float) -> str:
-    return "all" if share == 1.0 else f"{share:.0%}"
+    return "all" if share == 1.0 else f"{100 * share:.0f} %"
 
 
 def _count_windows(affected: NDArray[np.bool_]) -> str:
@@ -360,7 +360,7 @@ def _describe_losses(product: xr.Dataset) -> list[str]:
         present = float(np.median(part["window_coverage"].values[judged]))
         if ratio > _MAX_EDGE_RATIO:
             low = 1.0 - 1.0 / np.sqrt(present + (1.0 - present) * ratio**2)
-            affected.append(f"{axis} {_number_text(ratio)} times (N may be {low:.0%} low)")
+            affected.append(f"{axis} {_number_text(ratio)} times (N may be {100 * low:.0f} % low)")
     if not affected:
         return []
     return [

@@ -154,8 +154,8 @@ def _limit_flags(
 def _slope_label(key: str, level: float) -> str:
     ends = {
         "stderr": "standard error",
-        "low": f"lower end of the {level:.0%} interval",
-        "high": f"upper end of the {level:.0%} interval",
+        "low": f"lower end of the {100 * level:.0f} % interval",
+        "high": f"upper end of the {100 * level:.0f} % interval",
     }
     ramps = {
         f"{way}{end}": f"while it {verb}{text}"

@@ -115,7 +115,7 @@ def _print_framed(table: pd.DataFrame) -> None:
             row["channels"],
             f"{row['rows']:,.0f}",
             f"{row['gaps']:,.0f}",
-            f"{row['missing_share']:.2%}",
+            f"{100 * row['missing_share']:.2f} %",
         )
         framed.add_row(*map(escape, cells))
     console.print(framed)
@@ -190,7 +190,7 @@ def print_inspection(found: InspectedFile) -> None:
         read = found.row
         lines.append(
             f"read so: {_format_span(read['span_s'])} at {read['rate_hz']:.6g} Hz, axes "
-            f"{read['axes']}, {read['missing_share']:.2%} missing"
+            f"{read['axes']}, {100 * read['missing_share']:.2f} % missing"
         )
     if found.error is not None and guess.axes:
         lines.append(f"not readable by this guess: {found.error}")

@@ -224,7 +224,7 @@ def _describe_fit(fit: FitSummary) -> str:
         )
     if fit.fails:
         text += (
-            f"; the noise terms do NOT describe {fit.failing_share:.0%} of them: "
+            f"; the noise terms do NOT describe {100 * fit.failing_share:.0f} % of them: "
             "fit again with a longer --fit-from"
         )
     return text
@@ -240,9 +240,9 @@ def _format_entry(key: str, found: KalibrValue, *, indent: str) -> list[str]:
     symbol, _, unit = (KEYS | ACCELEROMETER_KEYS)[key]
     said = {
         "observed": f"{unit}; {symbol}, {LAWS[symbol].name}, "
-        f"observed in {found.share:.0%} of the windows",
+        f"observed in {100 * found.share:.0f} % of the windows",
         "upper_limit_only": f"{unit}; 95 % UPPER LIMIT of {symbol} ({LAWS[symbol].name}), "
-        f"in {found.share:.0%} of the windows",
+        f"in {100 * found.share:.0f} % of the windows",
         "not_observable": f"{unit}; not observable in any window: "
         f"a longer --window may show {symbol} ({LAWS[symbol].name})",
     }[found.meaning]

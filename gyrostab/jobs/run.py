@@ -355,7 +355,7 @@ def _add_resume_advice(job: _Job, what: str) -> str:
         )
     parts = before["parts"]
     return (
-        f"{what}; {kept} of {parts} parts ({kept / parts:.0%}) are kept, "
+        f"{what}; {kept} of {parts} parts ({100 * kept / parts:.0f} %) are kept, "
         "and the same command with --resume continues"
     )
 
@@ -487,7 +487,7 @@ def _write_product(job: _Job, blocks: Blocks, *, overwrite: bool, stage: Stage) 
     for axis, share in find_constant_shares(product).items():
         if share > 0.0:
             warnings.warn(
-                f"gyro axis {axis} is constant in {share:.0%} of the windows: "
+                f"gyro axis {axis} is constant in {100 * share:.0f} % of the windows: "
                 "is the sensor stuck, or its column a filler?",
                 stacklevel=2,
             )

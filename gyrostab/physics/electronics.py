@@ -398,8 +398,8 @@ class ClockError(Effect):
         growth = (self.error + self.drift * times / HOUR) * _PPM
         if np.abs(growth).max() > 0.3:
             raise OptionError(
-                f"effect {self.name!r}: the clock error reaches {np.abs(growth).max():.0%}; "
-                "make error and drift smaller"
+                f"effect {self.name!r}: the clock error reaches "
+                f"{100 * np.abs(growth).max():.0f} %; make error and drift smaller"
             )
         keep = math.ceil(float(self.slip(times, duration).max()) * setup.rate) + 3
         if keep > _MAX_KEPT_SAMPLES:

@@ -32,9 +32,10 @@ def _raise_noise(effect: Effect, chunk: Chunk, share: Array) -> dict[str, Array]
     if share.size and float(share.min()) < LEAST_SHARE - 1.0:
         driver = effect.channel_names()[next(iter(chunk.drivers))]
         warnings.warn(
-            f"effect {effect.name!r}: its law gives less than {LEAST_SHARE:.0%} of N^2 at some "
-            f"values of {driver}, and negative values beyond; {LEAST_SHARE:.0%} is taken there. "
-            "Give smaller coefficients or another reference for another law",
+            f"effect {effect.name!r}: its law gives less than {100 * LEAST_SHARE:.0f} % of N^2 at "
+            f"some values of {driver}, and negative values beyond; "
+            f"{100 * LEAST_SHARE:.0f} % is taken there. Give smaller "
+            "coefficients or another reference for another law",
             stacklevel=2,
         )
         share = np.maximum(share, LEAST_SHARE - 1.0)

@@ -45,7 +45,7 @@ def _make_product(states: dict[str, int], vibration: list[float] | None = None):
 
 def test_a_steady_product_is_called_steady():
     steady, terms = judge_product(_make_product({}))
-    assert steady.startswith("N is steady: it varies by 0% on x, 0% on y, 0% on z")
+    assert steady.startswith("N is steady: it varies by 0 % on x, 0 % on y, 0 % on z")
     assert terms.startswith("All five terms are observed")
 
 

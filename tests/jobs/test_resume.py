@@ -132,7 +132,7 @@ def stopped(log, after_two, tmp_path, capfd, monkeypatch) -> Path:
     output = tmp_path / "product.nc"
     assert call(log, "-o", output) == 3
     message = one_message(capfd.readouterr())
-    assert f"2 of {PARTS} parts (40%) are kept" in message
+    assert f"2 of {PARTS} parts (40 %) are kept" in message
     assert "--resume" in message
     assert not output.exists()
     monkeypatch.setattr(engine, "write_block", checkpoint.write_block)

@@ -334,7 +334,7 @@ def test_large_clock_error_is_refused():
     rng = np.random.default_rng(1)
     with pytest.raises(OptionError, match="slip reaches 28800003 samples; make the log shorter"):
         make_effect({"name": "clock_error", "error": 1e5}).begin(setup, rng)
-    with pytest.raises(OptionError, match="error reaches 210%"):
+    with pytest.raises(OptionError, match="error reaches 210 %"):
         make_effect({"name": "clock_error", "error": 1e5, "drift": 1e4}).begin(setup, rng)
     assert make_effect({"name": "clock_error", "error": -50, "drift": 1}).say() == (
         "The clock of the samples is slow by 50 ppm, more by 1 ppm/h on all axes."

@@ -32,7 +32,7 @@ def test_squared_noise_is_a_polynomial_of_temperature():
     found = level(table, drivers={"temperature": [20, 30, 70, 0, 20]}, N=[0.1, 0.2, 0.3])["N"]
     shares = [1.0, 1 + 0.1 - 0.01, 1 + 0.5 - 0.25, 1 - 0.2 - 0.04, 1.0]
     np.testing.assert_allclose(found, np.outer([0.01, 0.04, 0.09], shares), rtol=1e-12)
-    with pytest.warns(UserWarning, match=r"less than 1% of N\^2 at some values of temperature"):
+    with pytest.warns(UserWarning, match=r"less than 1 % of N\^2 at some values of temperature"):
         found = level(table, drivers={"temperature": [20, 20, 20, -90, 20]}, N=0.1)["N"]
     np.testing.assert_allclose(found, [[0.01, 0.01, 0.01, 0.0001, 0.01]] * 3, rtol=1e-12)
 

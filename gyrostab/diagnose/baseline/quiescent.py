@@ -248,8 +248,8 @@ def _is_usable(blocks: xr.Dataset, chosen: NDArray[np.bool_], better_count: int)
     enough = count * size >= _MIN_GIVEN_SAMPLES
     if enough and spectra.min() >= _MIN_GIVEN_BANDS:
         lack = (
-            f"N is known to {_white_error(count * size):.1%} at best, and drift slower than "
-            f"{count * step:g} s not at all, so that slow mismatches may be missed; "
+            f"N is known to {100 * _white_error(count * size):.1f} % at best, and drift slower "
+            f"than {count * step:g} s not at all, so that slow mismatches may be missed; "
             f"{better_count * step:g} s or more are better"
         )
         usable = True

@@ -64,7 +64,10 @@ def _describe_problem(name: str, blocks: xr.Dataset) -> str:
     values = blocks[variable].values
     share = float(np.isfinite(values).mean())
     if share < MIN_BLOCK_SHARE:
-        return f"it has values in {share:.0%} of the blocks, and {MIN_BLOCK_SHARE:.0%} are needed"
+        return (
+            f"it has values in {100 * share:.0f} % of the blocks, and "
+            f"{100 * MIN_BLOCK_SHARE:.0f} % are needed"
+        )
     unit, wanted = str(blocks[variable].attrs.get("units", "")), _wanted_units(name)
     if wanted and unit not in wanted:
         return (

@@ -46,8 +46,8 @@ def failed_checks(held: Mapping[str, Any], *, settings: Settings = DEFAULTS) -> 
         failed.append(f"the forecast of the last 30 % is worse ({held['forecast_gain']:.3g} nats)")
     if not _has_coverage(held, settings.coverage_tolerance):
         failed.append(
-            f"fewer cells lie inside their 95 % band ({held['coverage95_after']:.1%}, before "
-            f"{held['coverage95_before']:.1%})"
+            f"fewer cells lie inside their 95 % band ({100 * held['coverage95_after']:.1f} %, "
+            f"before {100 * held['coverage95_before']:.1f} %)"
         )
     return failed
 

@@ -229,8 +229,8 @@ class RawLogBuilder:
                 "in the years 1678 to 2262)"
             )
             raise FormatError(
-                f"{name}: {share:.0%} of {rows} rows are unreadable, the first is {first}; look "
-                f"at it, and check {what}"
+                f"{name}: {100 * share:.0f} % of {rows} rows are unreadable, the first is {first}; "
+                f"look at it, and check {what}"
             )
         columns = self.buffers.finish()
         stamps = self._finish_stamps(columns)

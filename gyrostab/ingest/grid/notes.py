@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from gyrostab.ingest.gap_table import describe_break, format_duration
 from gyrostab.ingest.grid.fill import samples_of
+from gyrostab.ingest.grid.jitter import MIN_SIGMA
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.rate import RateEstimate
 from gyrostab.ingest.grid.scan_pass import ScanPass, file_of, record_name
@@ -75,7 +76,7 @@ def describe_rate(
         )
         notes.append(f"{where}: {why}: rows are placed by their count at {rate:.10g} Hz{reach}")
     jitter = estimate.jitter
-    if jitter is not None and jitter.group >= 2:
+    if jitter is not None and (jitter.group >= 2 or jitter.sigma < MIN_SIGMA):
         notes.append(
             f"{where}: {why}: rows are placed in their order at {rate:.10g} Hz; samples are "
             "missing where a group comes late"

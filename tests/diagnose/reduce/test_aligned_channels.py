@@ -259,7 +259,7 @@ def test_reason_of_an_effect_names_the_unused_channel():
             "temperature",
             "degree_Celsius",
             np.where(np.arange(600) < 200, np.arange(600.0), np.nan),
-            "% of the blocks, and 50% are needed",
+            " % of the blocks, and 50 % are needed",
         ),
     ],
 )

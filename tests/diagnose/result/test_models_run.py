@@ -94,7 +94,7 @@ def test_falling_noise_stops_at_a_tenth():
     log = recording(kind, 3)
     log["temperature"] = ("time", np.linspace(25.0, 65.0, SIZE), {"units": "degree_Celsius"})
     model = {"noise": {"N": 0.003}, "effect": [{"name": "temperature_noise", "linear": -0.05}]}
-    with pytest.warns(UserWarning, match=r"less than 1% of N\^2 at some values of temperature"):
+    with pytest.warns(UserWarning, match=r"less than 1 % of N\^2 at some values of temperature"):
         changed = simulate(model, like=log, seed=1).compute()
     plain = simulate(model | {"effect": []}, like=log, seed=1).compute()
     ratio = changed["rate"].values / plain["rate"].values

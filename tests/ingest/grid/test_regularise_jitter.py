@@ -165,6 +165,14 @@ def test_jitter_is_noted():
     )
 
 
+def test_shared_stamps_are_not_said_to_scatter():
+    samples = np.delete(np.arange(20_000), [11, 9000])
+    log = regularise(raw_log(START + samples // 2 * 20_000_000))
+    notes = " ".join(log.attrs["notes"])
+    assert "many rows share one stamp: rows are placed in their order at 100 Hz" in notes
+    assert "scatter" not in notes
+
+
 def test_clock_set_back_with_jitter_is_a_restart():
     random = np.random.default_rng(4)
     times = np.concatenate([np.arange(4000), np.arange(4000)]) + random.normal(0, 0.4, 8000)
