@@ -27,6 +27,8 @@ _MIN_RATIO = 1.5
 _MIN_WINDOWS = 3
 #: Share of windows from which a term counts as observed in a state, and up to which as absent.
 _MOST, _FEW = 0.5, 0.1
+#: Share of windows that may observe a term that is absent (docs/statistics.md).
+_FALSE_ALARMS = 0.03
 #: A channel whose range is a smaller share of its largest magnitude is taken as constant.
 _MIN_RANGE_SHARE = 0.3
 
@@ -227,9 +229,9 @@ def _judge_steadiness(product: xr.Dataset) -> str:
 
 
 def _judge_terms(product: xr.Dataset, absences: dict[tuple[str, str], list[str]]) -> str:
-    """Say which terms no axis observes, and which windows would observe them."""
-    seen = (product["observable"] == OBSERVED).any(("axis", "time"))
-    hidden = [term for term in LAWS if not bool(seen.sel(term=term))]
+    """Say which terms no axis observes more often than by chance, and which windows would."""
+    seen = (product["observable"] == OBSERVED).mean("time").max("axis")
+    hidden = [term for term in LAWS if seen.sel(term=term) <= _FALSE_ALARMS]
     window = float(product.attrs.get("window_s", np.nan))
     where = f"in windows of {format_duration(window)}" if np.isfinite(window) else "in any window"
     if not hidden:
@@ -237,6 +239,8 @@ def _judge_terms(product: xr.Dataset, absences: dict[tuple[str, str], list[str]]
     if len(hidden) == len(LAWS):  # the terms do not describe the record, which has a sentence
         return f"No term is observed {where}."
     text = f"{join_words(hidden)} {'is' if len(hidden) == 1 else 'are'} not observed {where}"
+    if seen.sel(term=hidden).any():
+        text += f" more often than by chance (in up to {100 * _FALSE_ALARMS:.0f} % of them)"
     white = float(product["N"].where(product["observable"].sel(term="N") == OBSERVED).median())
     if hidden == ["Q"]:
         return f"{text}: N hides it; a higher sampling rate would show it."

@@ -71,6 +71,16 @@ def test_unobserved_terms_come_with_a_longer_window_or_a_longer_record():
     assert "sampling rate" in judge_product(_make_product({"Q": UPPER_LIMIT_ONLY}))[1]
 
 
+def test_terms_observed_as_often_as_by_chance_count_as_unobserved():
+    product = _make_product({"B": UPPER_LIMIT_ONLY}).isel(time=np.zeros(60, dtype=int))
+    product["time"] = np.datetime64("2026-03-14", "ns") + np.arange(60) * np.timedelta64(10, "m")
+    product["observable"].loc[{"term": "B", "time": product["time"][7]}] = OBSERVED
+    text = judge_product(product)[1]
+    assert text.startswith("B is not observed in windows of 6s more often than by chance (in up to")
+    product["observable"].loc[{"term": "B", "time": product["time"][7:9]}] = OBSERVED
+    assert judge_product(product)[1].startswith("All five terms are observed")
+
+
 def test_a_longer_record_is_not_advised_for_what_it_cannot_show():
     short = slice(0, 4)
     product = _make_product({"Q": NOT_OBSERVABLE, "K": UPPER_LIMIT_ONLY}).isel(time=short)
