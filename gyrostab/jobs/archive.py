@@ -326,7 +326,7 @@ def _describe_log(name: str, reading: Mapping[str, Any]) -> dict[str, Any]:
         "axes": " ".join(summary.axes),
         "channels": " ".join(summary.channels),
         "rows": summary.n_rows,
-        "note": "; ".join(summary.notes) if summary.axes else "no gyro axis is found",
+        "note": "; ".join(summary.notes if summary.axes else summary.notes[-1:]),
     }
 
 

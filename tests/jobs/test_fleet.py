@@ -228,6 +228,27 @@ def test_a_table_of_files_takes_the_place_of_the_archive(archive, tmp_path, monk
     assert list(rows["run"]) == ["tool 1/run <b>", "tool 1/run a", "tool 2/broken"]
 
 
+def test_files_that_are_not_read_are_named(tmp_path, capsys):
+    write_log(tmp_path / "runs" / "log.nc", 5)
+    (tmp_path / "runs" / "raw.csv").write_text("time [s],wx\n0,1\n1,2\n2,3\n")
+    output = tmp_path / "fleet"
+    command = [
+        "fleet",
+        str(tmp_path / "runs"),
+        "-o",
+        str(output),
+        "--window",
+        "1min",
+        "--no-reports",
+    ]
+    assert main([*command, "--scheduler", "threads", "--quiet-progress"]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.startswith("1 run of 1 tool\n")
+    assert "1 of 2 files are logs\nnote: not logs, or not without options: raw.csv;" in printed.err
+    notes = read_table(output / "files.parquet", content="files").set_index("format")["note"]
+    assert "no gyro column" in notes["text"]
+
+
 def test_a_store_whose_files_have_other_names_is_listed_again(tmp_path, monkeypatch):
     store, table = tmp_path / "archive" / "log.zarr", tmp_path / "files.parquet"
     store.parent.mkdir()

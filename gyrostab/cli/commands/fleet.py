@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from gyrostab.cli.frame import Output, app, show_stages
 from gyrostab.cli.options import Common, Fitting, Reading, Windows
+from gyrostab.wording import list_some
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -58,7 +59,7 @@ def index(
             workers=common.workers,
             stage=stage,
         )
-    _print_left_out(table)
+    _print_left_out(table, output)
     print(output)
 
 
@@ -104,6 +105,7 @@ def fleet(
         tcp://cluster:8786, or threads: one run after the other in this process.
     """
     from gyrostab.jobs.fleet import run_fleet
+    from gyrostab.jobs.fleet_table import FILES, read_table
 
     with show_stages(common) as stage:
         table = run_fleet(
@@ -120,14 +122,22 @@ def fleet(
             workers=common.workers,
             stage=stage,
         )
-    print(f"{len(table)} runs of {table['tool'].nunique()} tools")
+    files = read_table(output / "files.parquet", content=FILES)
+    if files is not None:
+        _print_left_out(files, output / "files.parquet")
+    tools = table["tool"].nunique()
+    print(f"{len(table)} run{'s'[: len(table) != 1]} of {tools} tool{'s'[: tools != 1]}")
     print(output / "index.html", output, sep="\n")
 
 
-def _print_left_out(table: pd.DataFrame) -> None:
-    """Print on stderr how many files are logs, and the first of those that are not."""
-    others: Any = table[~table["is_log"].astype(bool) & (table["format"] != "diagnosis")]
+def _print_left_out(table: pd.DataFrame, path: Path) -> None:
+    """Print on stderr how many files of a table are logs, and which are not."""
     print(f"{int(table['is_log'].sum())} of {len(table)} files are logs", file=sys.stderr)
+    others: Any = table[~table["is_log"].astype(bool) & (table["format"] != "diagnosis")]
     if len(others):
-        first = others.iloc[0]
-        print(f"note: not a log: {first['file']} ({first['note']})", file=sys.stderr)
+        names = list_some([Path(name).name for name in others["file"]])
+        print(
+            f"note: not logs, or not without options: {names}; {path} lists them with the reasons, "
+            "and gyrostab scan FILE prints the options that a file needs",
+            file=sys.stderr,
+        )
