@@ -12,7 +12,13 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from gyrostab.blindtest.generator.catalogue import AMBIGUITY, CATALOGUE, merge_ambiguous
-from gyrostab.blindtest.scoring.curves import by_effect, curves, names_given, reliability
+from gyrostab.blindtest.scoring.curves import (
+    by_effect,
+    curves,
+    fitted_noise_curve,
+    names_given,
+    reliability,
+)
 from gyrostab.blindtest.scoring.injections import injection_differences, injection_table
 from gyrostab.blindtest.scoring.proportions import Target, spread, wilson
 from gyrostab.blindtest.scoring.score import intersection_over_union, score_case
@@ -388,6 +394,19 @@ def test_curves_and_reliability():
     right = reliability(rows).set_index("name")
     assert right.loc["shupe", "right"] == 1.0
     assert right.loc["spikes", ["right", "n"]].tolist() == [0.0, 11]
+
+
+def test_completeness_against_strength_in_fitted_noise():
+    rows = []
+    for i, (strength, name) in enumerate(((0.4, "spikes"), (2.0, "shupe"), (2.9, "spikes"))):
+        rows += score_case(diagnosis(identification(name)), truth("shupe", index=i))
+        rows[-1]["learned_strength"] = strength
+    line = fitted_noise_curve(rows).set_index("strength")
+    assert line["n"].to_dict() == {"0 to 0.5": 1, "2 to 3": 2}
+    assert line["named"].tolist() == [0.0, 0.5]
+    assert line["detected"].tolist() == [1.0, 1.0]
+    assert line.loc["2 to 3", "named_high"] > 0.9
+    assert fitted_noise_curve([]).empty
 
 
 def test_an_effect_out_of_catalogue_counts_as_named_when_left_unidentified():

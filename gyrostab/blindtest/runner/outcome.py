@@ -17,7 +17,13 @@ from gyrostab.blindtest.runner.figures import (
     draw_reliability,
 )
 from gyrostab.blindtest.runner.folder import FIRST_PUBLIC_SEED, write_text
-from gyrostab.blindtest.scoring.curves import by_effect, curves, names_given, reliability
+from gyrostab.blindtest.scoring.curves import (
+    by_effect,
+    curves,
+    fitted_noise_curve,
+    names_given,
+    reliability,
+)
 from gyrostab.blindtest.scoring.injections import injection_differences, injection_table
 from gyrostab.blindtest.scoring.probability import calibration_curve, risk_coverage
 from gyrostab.blindtest.scoring.score import score_case
@@ -112,6 +118,8 @@ def page_text(
         "Shares of all catalogue effects with an undisturbed driver; strength in units of the "
         "closed-form limit.",
         markdown(every.drop(columns="effect")) if len(every) else "no effects among these cases",
+        "The same against the strength in *fitted* noise:",
+        markdown(fitted_noise_curve(rows)),
         "### Effect by effect",
         "*n*: cases of strength 1.5 or more, and the shares of them that were *detected*, *named* "
         "(ambiguity sets merged) and named *exactly*. *identifications*: how often the name was "

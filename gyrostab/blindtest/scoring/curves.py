@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import pandas as pd
 
 from gyrostab.blindtest.scoring.proportions import wilson
 from gyrostab.blindtest.scoring.score import first_rows
-from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH
+from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH, SURE_STRENGTH
 
-__all__ = ["by_effect", "curves", "names_given", "reliability"]
+__all__ = ["by_effect", "curves", "fitted_noise_curve", "names_given", "reliability"]
 
 Row = Mapping[str, Any]
+
+_CURVES = [f"{key}{end}" for key in ("detected", "named") for end in ("", "_low", "_high")]
+#: Limits between ranges of strength in fitted noise.
+_FITTED_LIMITS = (0.5, 1.0, CLEAR_STRENGTH, 2.0, SURE_STRENGTH, 5.0)
 
 
 def curves(rows: Sequence[Row]) -> pd.DataFrame:
@@ -48,13 +54,43 @@ def curves(rows: Sequence[Row]) -> pd.DataFrame:
             ]
             if not part:
                 continue
-            line: dict[str, Any] = {"effect": effect, "strength": strength, "n": len(part)}
-            for key in ("detected", "named"):
-                hits = sum(bool(row[_column_of(row, key)]) for row in part)
-                low, high = wilson(hits, len(part))
-                line |= {key: hits / len(part), f"{key}_low": low, f"{key}_high": high}
-            out.append(line)
+            out.append({"effect": effect, "strength": strength, **_count_shares(part)})
     return pd.DataFrame(out)
+
+
+def fitted_noise_curve(rows: Sequence[Row]) -> pd.DataFrame:
+    """Compute the shares detected and named against strength in fitted noise.
+
+    Returns
+    -------
+    pandas.DataFrame
+        ``strength`` (range), ``n``, and the shares as in `curves`, of catalogue effects with an
+        undisturbed driver.
+    """
+    here = [
+        (row, row["learned_strength"])
+        for row in rows
+        if row["kind"] in ("single", "pair", "triple", "sub_threshold")
+        and row["effect"]
+        and row.get("learned_strength") is not None
+    ]
+    out = []
+    for low, high in pairwise((0.0, *_FITTED_LIMITS, math.inf)):
+        part = [row for row, strength in here if low <= strength < high]
+        if part:
+            name = f"{low:g} to {high:g}" if high < math.inf else f"{low:g} and more"
+            out.append({"strength": name, **_count_shares(part)})
+    return pd.DataFrame(out, columns=["strength", "n", *_CURVES])
+
+
+def _count_shares(part: Sequence[Row]) -> dict[str, Any]:
+    """Return the shares detected and named of some rows, with Wilson's intervals."""
+    line: dict[str, Any] = {"n": len(part)}
+    for key in ("detected", "named"):
+        hits = sum(bool(row[_column_of(row, key)]) for row in part)
+        low, high = wilson(hits, len(part))
+        line |= {key: hits / len(part), f"{key}_low": low, f"{key}_high": high}
+    return line
 
 
 def _column_of(row: Row, key: str) -> str:

@@ -13,7 +13,7 @@ from gyrostab.blindtest.scoring.probability import probability_lines
 from gyrostab.blindtest.scoring.proportions import Line, Target, median, share, spread
 from gyrostab.blindtest.scoring.score import first_rows
 
-__all__ = ["CLEAR_STRENGTH", "list_missed", "markdown", "score_table"]
+__all__ = ["CLEAR_STRENGTH", "SURE_STRENGTH", "list_missed", "markdown", "score_table"]
 
 Row = Mapping[str, Any]
 
