@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -227,9 +228,15 @@ def test_limits_of_noise_effects_match_closed_forms():
     assert amplitude_for(lambda a: a**1.5, 8.0) == pytest.approx(4.0, rel=1e-3)
 
 
+@cache
+def case_of(name: str) -> tuple[xr.Dataset, dict]:
+    """Return a small case of an effect, made once."""
+    return make_case(small(name))
+
+
 @pytest.mark.parametrize("name", EVERY)
 def test_every_effect_gives_a_case_of_its_strength(name):
-    log, truth = make_case(small(name))
+    log, truth = case_of(name)
     check_log(log)
     (effect,) = truth["effects"]
     assert effect["name"] == name
@@ -366,21 +373,16 @@ def test_recordings_hold_nothing_of_the_truth(tmp_path):
         "seed",
         "commitment",
     ]
-    plans = [small(name, index=i) for i, name in enumerate(EVERY)] + [small(None, index=90)]
-    plans += [
-        small("shupe", index=91 + i, kind="degraded_driver", degradation=how)
+    cases = [case_of(name) for name in EVERY] + [make_case(small(None, index=90))]
+    cases += [
+        make_case(small("shupe", index=91 + i, kind="degraded_driver", degradation=how))
         for i, how in enumerate(("withheld", "substituted", "lagged", "confounded"))
     ]
     attributes, dimensions = set(), set()
-    for plan in plans:
-        log, truth = make_case(plan)
-        digest = commit_case(log, truth, tmp_path, name=f"{plan['index']:04d}")
-        assert (
-            open_truth(tmp_path / "truth" / f"{plan['index']:04d}.json", sha256=digest)["plan"][
-                "names"
-            ]
-            == plan["names"]
-        )
+    for number, (log, truth) in enumerate(cases):
+        digest = commit_case(log, truth, tmp_path, name=f"{number:04d}")
+        found = open_truth(tmp_path / "truth" / f"{number:04d}.json", sha256=digest)
+        assert found["plan"]["names"] == truth["plan"]["names"]
         attributes.add(tuple(sorted(log.attrs)))
         dimensions |= set(map(str, log.variables))
     assert attributes == {("kind", "sampling_rate_hz")}

@@ -21,7 +21,13 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import GyrostabError
 
-__all__ = ["check_model", "likelihood_ratio", "record_statistics"]
+__all__ = [
+    "check_model",
+    "likelihood_ratio",
+    "record_statistics",
+    "measure_statistics",
+    "simulate_statistics",
+]
 
 Array = NDArray[np.float64]
 _RECORDS = 8  # simulated with and without effects; limits time
@@ -54,22 +60,38 @@ def check_model(log: xr.Dataset, model: Mapping[str, Any]) -> dict[str, Any]:
         ``runs``: whether the model can be simulated; ``nats``: log-likelihood ratio of the
         recording under the model with its effects over that without them; or ``reason``.
     """
-    from gyrostab import read_model, simulate
+    from gyrostab import read_model
 
     models = [read_model(dict(model)), read_model({**model, "effect": []})]
+    try:
+        ensembles = [simulate_statistics(log, one) for one in models]
+    except GyrostabError as error:
+        return {"runs": False, "reason": str(error)}
+    return {"runs": True, "nats": likelihood_ratio(measure_statistics(log), *ensembles)}
+
+
+def simulate_statistics(log: xr.Dataset, model: Any) -> list[dict[str, Array]]:
+    """Compute the statistics of records simulated from a model like a recording.
+
+    They have the stamps, channels and lost samples of the recording.
+    """
+    from gyrostab import simulate
+
     lost = ~np.isfinite(log["rate"].values)
-    ensembles: list[list[dict[str, Array]]] = [[], []]
+    found = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        try:
-            for seed in range(1, _RECORDS + 1):
-                for one, ensemble in zip(models, ensembles, strict=True):
-                    rate = simulate(one, like=log, seed=seed)["rate"].values
-                    ensemble.append(record_statistics(np.where(lost, np.nan, rate), log))
-        except GyrostabError as error:
-            return {"runs": False, "reason": str(error)}
-        recorded = record_statistics(log["rate"].values, log)
-    return {"runs": True, "nats": likelihood_ratio(recorded, *ensembles)}
+        for seed in range(1, _RECORDS + 1):
+            rate = simulate(model, like=log, seed=seed)["rate"].values
+            found.append(record_statistics(np.where(lost, np.nan, rate), log))
+    return found
+
+
+def measure_statistics(log: xr.Dataset) -> dict[str, Array]:
+    """Compute the statistics of a recording."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return record_statistics(log["rate"].values, log)
 
 
 def likelihood_ratio(
