@@ -13,7 +13,6 @@ otherwise. `ALLOWED` lists the exceptions with their reasons.
 
 from __future__ import annotations
 
-import ast
 import io
 import re
 import sys
@@ -190,13 +189,19 @@ def find_names(path: Path, name: str) -> Iterator[Finding]:
     old_words = OLD_NAME_WORDS | (
         OLD_NAME_WORDS_OF_DIAGNOSIS if name.startswith(DIAGNOSIS) else set()
     )
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            words = {word.lower() for word in re.findall(r"[a-z]+|[A-Z][a-z]*", node.name)}
-            if any(node.name == allowed.phrase for allowed in ALLOWED):
-                continue
-            for word in sorted(words & old_words):
-                yield Finding(name, node.lineno, f"name {node.name}", f"without {word!r}")
+    for line, defined in defined_names(path):
+        words = {word.lower() for word in re.findall(r"[a-z]+|[A-Z][a-z]*", defined)}
+        if any(defined == allowed.phrase for allowed in ALLOWED):
+            continue
+        for word in sorted(words & old_words):
+            yield Finding(name, line, f"name {defined}", f"without {word!r}")
+
+
+def defined_names(path: Path, kind: str = "def|class") -> Iterator[tuple[int, str]]:
+    """Names of the functions and classes of a file, each with its line."""
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+        if match := re.match(rf"\s*(?:{kind}) (\w+)", line):
+            yield number, match[1]
 
 
 def find_long_lines(path: Path, name: str) -> Iterator[Finding]:
@@ -233,11 +238,11 @@ def find_all(places: list[str]) -> list[Finding]:
 def single_word_share(folder: Path) -> tuple[int, int]:
     """How many private functions have a name of one word, and how many there are."""
     names = [
-        node.name.strip("_")
+        name.strip("_")
         for path in files_in([str(folder)])
         if path.suffix == ".py"
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.FunctionDef) and re.match(r"_[^_]", node.name)
+        for _, name in defined_names(path, "def")
+        if re.match(r"_[^_]", name)
     ]
     return sum("_" not in name for name in names), len(names)
 
