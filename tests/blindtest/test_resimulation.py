@@ -14,8 +14,8 @@ from gyrostab import simulate
 from gyrostab.blindtest.scoring.resimulation import (
     check_model,
     likelihood_ratio,
-    record_statistics,
     measure_statistics,
+    record_statistics,
     simulate_statistics,
 )
 

@@ -73,5 +73,17 @@ getattr(caching, name)._locator_classes = []
 """
 
 
+#: A kernel of a single loop.
+CLEAN = """
+import numpy as np
+from gyrostab.kernels.encoding.rows import clean_column
+
+values = np.array([1.0, 2.0])
+clean_column(values, 10.0, 1.0)
+assert values.tolist() == [11.0, 21.0]
+assert not clean_column.stats.cache_path
+"""
+
+
 def test_kernels_work_where_nothing_can_be_cached() -> None:
-    subprocess.run([sys.executable, "-c", NO_FOLDER + SOLVE], check=True)
+    subprocess.run([sys.executable, "-c", NO_FOLDER + CLEAN], check=True)

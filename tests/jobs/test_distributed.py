@@ -31,8 +31,11 @@ PARTS = 5
 
 
 @pytest.fixture(scope="module")
-def address(tmp_path_factory):
-    """Start a scheduler and two workers of one thread each as separate programs, as a user does."""
+def cluster(tmp_path_factory):
+    """Start a scheduler and two workers of one thread each as separate programs, as a user does.
+
+    Yields the address of the scheduler, and its process.
+    """
     folder = tmp_path_factory.mktemp("cluster")
     where = folder / "scheduler.json"
     environment = {
@@ -53,7 +56,7 @@ def address(tmp_path_factory):
         "0",
     ]
     with ExitStack() as stack:
-        for command in (scheduler, [*worker, "--local-directory", str(folder)]):
+        process, _ = (
             stack.enter_context(
                 _program(
                     "dask",
@@ -64,11 +67,18 @@ def address(tmp_path_factory):
                     env=environment,
                 )
             )
+            for command in (scheduler, [*worker, "--local-directory", str(folder)])
+        )
         _wait_for(where)
         with distributed.Client(scheduler_file=str(where)) as client:
             client.wait_for_workers(2, timeout=60)
             found = client.scheduler.address
-        yield found
+        yield found, process
+
+
+@pytest.fixture
+def address(cluster):
+    return cluster[0]
 
 
 @contextmanager
@@ -288,95 +298,11 @@ def test_a_scheduler_without_workers(monkeypatch):
         pass
 
 
-def test_distributed_is_not_installed(log, tmp_path):
-    code = (
-        "import sys; sys.modules['distributed'] = None; from gyrostab.cli import main; "
-        f"sys.exit(main(['run', {str(log)!r}, '-o', {str(tmp_path / 'p.nc')!r}, '--scheduler', 'tcp://127.0.0.1:1']))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
-    assert done.returncode == 2
-    assert "pip install 'gyrostab[distributed]'" in done.stderr
-
-
-def test_a_scheduler_that_dies_is_explained_and_resume_goes_on(
-    log, whole, tmp_path, monkeypatch, capfd
-):
-    """Finished parts survive the death of the scheduler, and threads compute the rest."""
-    where = tmp_path / "scheduler.json"
-    options = [
-        "--window",
-        WINDOW["window"],
-        "--step",
-        WINDOW["step"],
-        "--taus",
-        WINDOW["taus"],
-        "--quiet-progress",
-    ]
-    common = ["--scheduler-file", str(where), "--no-dashboard"]
-    worker = [
-        "worker",
-        "--host",
-        "127.0.0.1",
-        "--nworkers",
-        "1",
-        "--nthreads",
-        "1",
-        "--local-directory",
-        str(tmp_path / "worker"),
-    ]
-    output = tmp_path / "out" / "product.nc"
-    output.parent.mkdir()
-    with ExitStack() as stack:
-        scheduler = stack.enter_context(
-            _program(
-                "dask",
-                "scheduler",
-                "--host",
-                "127.0.0.1",
-                "--port",
-                "0",
-                *common,
-                env=dict(os.environ),
-            )
-        )
-        stack.enter_context(
-            _program(
-                "dask",
-                *worker,
-                *common,
-                env={**os.environ, "DASK_DISTRIBUTED__WORKER__DAEMON": "False"},
-            )
-        )
-        _wait_for(where)
-        with distributed.Client(scheduler_file=str(where)) as client:
-            client.wait_for_workers(1, timeout=60)
-            found = client.scheduler.address
-
-        def write(*arguments, **given):
-            if scheduler.poll() is None:
-                os.killpg(scheduler.pid, signal.SIGKILL)
-                scheduler.wait()
-            return checkpoint.write_block(*arguments, **given)
-
-        monkeypatch.setattr(engine, "write_block", write)
-        monkeypatch.setattr(engine, "_MAX_HELD_SECONDS", 0.0)
-        monkeypatch.setattr(schedule, "_CONNECT_TIMEOUT_S", 8.0)  # also that of a reconnection
-        begun = time.monotonic()
-        assert main(["run", str(log), "-o", str(output), "--scheduler", found, *options]) == 2
-        assert time.monotonic() - begun < 60
-    shown = capfd.readouterr().err
-    assert "the dask scheduler" in shown
-    assert "--resume continues" in shown
-    assert "please report" not in shown
-    assert "Traceback" not in shown
-    monkeypatch.setattr(engine, "write_block", checkpoint.write_block)
-    assert main(["run", str(log), "-o", str(output), "--resume", *options]) == 0
-    (tmp_path / "whole.nc").write_bytes(whole)
-    expected, made = open_arrays(tmp_path / "whole.nc"), open_arrays(output)
-    assert made.keys() == expected.keys()
-    for name, values in made.items():
-        np.testing.assert_array_equal(values, expected[name], err_msg=name)
-    assert [path.name for path in output.parent.iterdir()] == [output.name]
+def test_distributed_is_not_installed(log, tmp_path, capfd, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    arguments = ["run", str(log), "-o", str(tmp_path / "p.nc"), "--scheduler", "tcp://127.0.0.1:1"]
+    assert main(arguments) == 2
+    assert "pip install 'gyrostab[distributed]'" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["thread", "cluster", ""])
@@ -424,3 +350,50 @@ def test_worker_processes_end_with_a_killed_parent(tmp_path):
             return
         time.sleep(0.05)
     pytest.fail("the worker lives on")
+
+
+def test_a_scheduler_that_dies_is_explained_and_resume_goes_on(
+    cluster, log, whole, tmp_path, monkeypatch, capfd
+):
+    """Finished parts survive the death of the scheduler, and threads compute the rest.
+
+    This is the last test of the file, because it ends the scheduler of the others.
+    """
+    options = [
+        "--window",
+        WINDOW["window"],
+        "--step",
+        WINDOW["step"],
+        "--taus",
+        WINDOW["taus"],
+        "--quiet-progress",
+    ]
+    output = tmp_path / "out" / "product.nc"
+    output.parent.mkdir()
+    address, scheduler = cluster
+
+    def write(*arguments, **given):
+        if scheduler.poll() is None:
+            os.killpg(scheduler.pid, signal.SIGKILL)
+            scheduler.wait()
+        return checkpoint.write_block(*arguments, **given)
+
+    monkeypatch.setattr(engine, "write_block", write)
+    monkeypatch.setattr(engine, "_MAX_HELD_SECONDS", 0.0)
+    monkeypatch.setattr(schedule, "_CONNECT_TIMEOUT_S", 4.0)  # also that of a reconnection
+    begun = time.monotonic()
+    assert main(["run", str(log), "-o", str(output), "--scheduler", address, *options]) == 2
+    assert time.monotonic() - begun < 60
+    shown = capfd.readouterr().err
+    assert "the dask scheduler" in shown
+    assert "--resume continues" in shown
+    assert "please report" not in shown
+    assert "Traceback" not in shown
+    monkeypatch.setattr(engine, "write_block", checkpoint.write_block)
+    assert main(["run", str(log), "-o", str(output), "--resume", *options]) == 0
+    (tmp_path / "whole.nc").write_bytes(whole)
+    expected, made = open_arrays(tmp_path / "whole.nc"), open_arrays(output)
+    assert made.keys() == expected.keys()
+    for name, values in made.items():
+        np.testing.assert_array_equal(values, expected[name], err_msg=name)
+    assert [path.name for path in output.parent.iterdir()] == [output.name]

@@ -41,6 +41,6 @@ def assert_follows_cf(path: Path) -> None:
 
 
 def _remember_result(search: Callable[[Any], list[str]]) -> Callable[[Any], list[str]]:
-    """Call a search once for each open file; its result is copied, because callers may change it."""
+    """Search an open file once; every caller gets a copy of the result, which it may change."""
     remembered = cache(search)
     return lambda dataset: list(remembered(dataset))
