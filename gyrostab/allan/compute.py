@@ -17,7 +17,14 @@ from gyrostab.errors import OptionError
 from gyrostab.kernels.allan.gap_edges import gap_edge_ratio
 from gyrostab.kernels.allan.outlier_count import count_outliers
 from gyrostab.kernels.allan.reference import direct_sums, recursive_sums, reference_theta
-from gyrostab.kernels.allan.surface import STRICT, Cells, Unit, surface_unit, window_means
+from gyrostab.kernels.allan.surface import (
+    STRICT,
+    Cells,
+    Unit,
+    convert_to_native,
+    surface_unit,
+    window_means,
+)
 from gyrostab.kernels.allan.trend import window_trends
 from gyrostab.kernels.fit.covariance import diagonal_products
 from gyrostab.kernels.fit.least_squares import cell_freedoms, combine_diagonal, identify_noise
@@ -90,7 +97,6 @@ def compute_unit(
     x: NDArray[np.generic], unit: Unit, tables: NoiseTables, space: Workspace | None = None
 ) -> tuple[list[Floats], Floats]:
     """Compute one unit: the fields of the cells, see `Cells`, and plane fields (6, n_windows)."""
-    x = np.ascontiguousarray(x)
     cells, means = surface_unit(x, unit, space)
     scale = (
         HOUR if unit.angle else 1.0
@@ -140,6 +146,7 @@ def _describe_windows(
     x: NDArray[np.generic], unit: Unit, windows: int | None = None
 ) -> NDArray[np.float64]:
     """Compute the plane fields from the trend on, (4, n_windows)."""
+    x = convert_to_native(x)
     count = (x.size - unit.window - unit.angle) // unit.step + 1 if windows is None else windows
     first = np.arange(count) * unit.step
     trends = window_trends(x, angle=unit.angle, window=unit.window, step=unit.step, n_windows=count)

@@ -25,7 +25,7 @@ __all__ = [
 TAUS = "--taus 40 (how many), octave, all or 0.1s,1s,10s"
 _SAMPLE_COUNT = re.compile(r"^\s*(\d{1,18})\s*samples?\s*$", re.ASCII)
 _COUNT = re.compile(r"^\d{1,18}$", re.ASCII)
-_NUMBER = re.compile(r"^\s*[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?\s*$", re.IGNORECASE)
+_NUMBER = re.compile(r"^\s*[-+]?(\d+(\.\d*)?|\.\d+)(e[-+]?\d+)?\s*$", re.IGNORECASE)
 
 
 def duration_seconds(value: Any, option: str, *, example: str = "10min, 30s or 2h") -> float:

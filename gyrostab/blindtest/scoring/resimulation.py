@@ -24,8 +24,8 @@ from gyrostab.errors import GyrostabError
 __all__ = [
     "check_model",
     "likelihood_ratio",
-    "record_statistics",
     "measure_statistics",
+    "record_statistics",
     "simulate_statistics",
 ]
 
@@ -143,12 +143,13 @@ def record_statistics(rate: Array, log: xr.Dataset) -> dict[str, Array]:
     """
     out: dict[str, Array] = {}
     hertz = float(log.attrs["sampling_rate_hz"])
+    channels = _channels_at_samples(log)
     for row, values in enumerate(rate):
         for group, numbers in {
             **_mean_differences(values),
             **_octave_powers(values),
             **_sample_counts(values),
-            **_channel_couplings(values, log, hertz),
+            **_channel_couplings(values, channels, hertz),
         }.items():
             out[f"{group}/{row}"] = numbers
     spectra = [_segment_spectra(values, 8) for values in rate]
@@ -234,11 +235,13 @@ def _sample_counts(values: Array) -> dict[str, Array]:
     }
 
 
-def _channel_couplings(values: Array, log: xr.Dataset, hertz: float) -> dict[str, Array]:
+def _channel_couplings(
+    values: Array, channels: Mapping[str, Array], hertz: float
+) -> dict[str, Array]:
     """Return the coupling to ramp, rotation, and sample by sample to other channels."""
     out = {}
     centred = values - np.nanmean(values)
-    for name, channel in _channels_at_samples(log).items():
+    for name, channel in channels.items():
         if name == "ramp":
             low, high = np.nanmin(channel), np.nanmax(channel)
             place = np.nan_to_num((channel - low) / max(high - low, 1e-300) * _RAMP_BINS)

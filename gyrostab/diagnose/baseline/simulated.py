@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.special import chdtrc
 
 from gyrostab.diagnose.evidence.spectral_lines import (
     expected_lines,
@@ -114,8 +115,6 @@ def _measure_coherency(
     simulated: xr.Dataset, expected: Array, p_value: float
 ) -> tuple[NDArray[np.complex128], Array]:
     """Return the coherency of the axes and its error, 0 if not significant."""
-    from scipy.stats import chi2
-
     if "cross" not in simulated:
         return np.zeros((0, expected.shape[2]), np.complex128), np.zeros((0, expected.shape[2]))
     axes = [str(axis) for axis in simulated["axis"].values]
@@ -129,7 +128,7 @@ def _measure_coherency(
     found, known = _weighted_mean(cross / geometric_mean, shape)
     total = 2.0 * (np.abs(found) ** 2 * known).sum(axis=1, keepdims=True)
     significant = (known > 0.0) & (
-        chi2.sf(total, 2.0 * (known > 0.0).sum(axis=1, keepdims=True)) < p_value
+        chdtrc(2.0 * (known > 0.0).sum(axis=1, keepdims=True), total) < p_value
     )
     with np.errstate(divide="ignore"):
         return np.where(significant, found, 0.0), np.where(

@@ -314,9 +314,17 @@ def _sum_products(products: Sequence[Products], like: Products | None = None) ->
     """Add products; zeros like `like` if there are none."""
     if not products and like is not None:
         return Products(*[np.zeros_like(array) for array in _product_arrays(like)])
-    return Products(
-        *[np.sum(several, axis=0) for several in zip(*map(_product_arrays, products), strict=True)]
-    )
+    return Products(*map(_add_arrays, zip(*map(_product_arrays, products), strict=True)))
+
+
+def _add_arrays(arrays: Sequence[Array]) -> Array:
+    """Add arrays in order, but single numbers pairwise, as `numpy.sum` does on a copy of all."""
+    if arrays[0].size == 1:
+        return np.asarray(np.sum(arrays, axis=0))
+    total = arrays[0].copy()
+    for array in arrays[1:]:
+        total += array
+    return total
 
 
 def _fill_free_precision(precision: Array, square: Array) -> Array:

@@ -10,10 +10,17 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
+from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import compute_evidence
-from gyrostab.diagnose.predict.windows import rebuild_variant
+from gyrostab.diagnose.predict.windows import (
+    driver_names,
+    fill_linearly,
+    make_windows,
+    rebuild_variant,
+)
+from gyrostab.diagnose.reduce.block_statistics import measured
+from gyrostab.physics.prediction import Windows
 
 __all__ = ["TIME_SHIFTS", "TimeShifts", "passes_time_shift_test"]
 
@@ -67,7 +74,7 @@ def passes_time_shift_test(
     valid = np.ones(shifts.size, np.bool_)
     limit = state.settings.surrogate_correlation
     for component in own:
-        surrogates = [_make_surrogate(component, state, int(shift)) for shift in shifts]
+        surrogates = _make_surrogates(component, state, shifts)
         row = state.axes.index(component.row[0])
         for number, surrogate in enumerate(surrogates):
             if surrogate is None or _max_correlation(surrogate, component.variant, row) > limit:
@@ -104,23 +111,37 @@ def _follows_channel(component: Component, state: State) -> bool:
     )
 
 
-def _make_surrogate(component: Component, state: State, shift: int) -> Variant | None:
-    """Return the variant for channels that are rotated in time, end to start."""
-    candidate: Candidate = component.candidate
-    blocks = state.blocks.copy()
-    for name in filter(None, candidate.driver):
-        for key in {f"channel_{name}", f"fine_{name}"} & set(map(str, blocks.data_vars)):
-            blocks[key] = blocks[key].copy(data=np.roll(blocks[key].values, shift, axis=0))
-    for key in (
-        {"mean", "measured_mean"} & set(map(str, blocks.data_vars))
-        if candidate.effect in _FOLLOWING_AXES
-        else ()
-    ):
-        blocks[key] = blocks[key].copy(
-            data=np.roll(blocks[key].values, shift, axis=list(blocks[key].dims).index("block"))
+def _make_surrogates(
+    component: Component, state: State, shifts: NDArray[np.int64]
+) -> list[Variant | None]:
+    """Return the variant for channels that are rotated in time by each shift, end to start."""
+    candidate, blocks = component.candidate, state.blocks
+    drivers = driver_names(candidate)
+    windows = make_windows(blocks, drivers)
+    channels = {inner: blocks[f"channel_{name}"].values for inner, name in drivers.items()}
+    means = measured(blocks, "mean").values
+
+    def shift_windows(shift: int) -> Windows:
+        def rotate(values: NDArray[Any]) -> NDArray[Any]:
+            return np.roll(values, shift, axis=0)
+
+        shifted = replace(
+            windows,
+            drivers={inner: fill_linearly(rotate(values)) for inner, values in channels.items()},
+            fine={inner: rotate(values) for inner, values in windows.fine.items()},
         )
-    made = rebuild_variant(candidate, component.variant, blocks, state.baseline["coefficient"])
-    return made
+        if candidate.effect not in _FOLLOWING_AXES:
+            return shifted
+        own = (fill_linearly(rotate(mean)) for mean in means)
+        return replace(shifted, own=dict(zip(windows.axes, own, strict=True)))
+
+    coefficient = state.baseline["coefficient"]
+    return [
+        rebuild_variant(
+            candidate, component.variant, blocks, coefficient, shift_windows(int(shift))
+        )
+        for shift in shifts
+    ]
 
 
 def _max_correlation(surrogate: Variant, true: Variant, row: int) -> float:

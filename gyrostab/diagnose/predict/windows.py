@@ -21,6 +21,8 @@ __all__ = [
     "TIME_PARAMETER",
     "channel_units",
     "distinct_variants",
+    "driver_names",
+    "fill_linearly",
     "make_windows",
     "predict_exogenous",
     "rebuild_variant",
@@ -51,7 +53,7 @@ def make_windows(blocks: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
         Channels of the log by channel of the effect.
     """
     axes = tuple(str(axis) for axis in blocks["axis"].values)
-    own = dict(zip(axes, map(_fill_linearly, measured(blocks, "mean").values), strict=True))
+    own = dict(zip(axes, map(fill_linearly, measured(blocks, "mean").values), strict=True))
 
     def spans(name: str) -> Array:
         if f"{name}_begin" not in blocks:
@@ -67,7 +69,7 @@ def make_windows(blocks: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
         rate=float(blocks.attrs["sampling_rate_hz"]),
         axes=axes,
         drivers={
-            inner: _fill_linearly(blocks[f"channel_{name}"].values)
+            inner: fill_linearly(blocks[f"channel_{name}"].values)
             for inner, name in drivers.items()
         },
         fine={
@@ -99,7 +101,7 @@ def _rms_band(channel: xr.DataArray) -> tuple[float, float] | None:
     return (low, high) if 0.0 <= low < high < np.inf else None
 
 
-def _fill_linearly(values: Array) -> Array:
+def fill_linearly(values: Array) -> Array:
     """Interpolate missing values linearly."""
     good = np.isfinite(values)
     if good.all() or not good.any():
@@ -133,15 +135,27 @@ def predict_exogenous(effect: Effect, windows: Windows) -> Prediction:
     return replace(full, mean=mean)
 
 
+def driver_names(candidate: Candidate) -> dict[str, str]:
+    """Return the channels of the log that a candidate follows, by channel of its effect."""
+    channels = effects()[candidate.effect].channels
+    return {inner: name for inner, name in zip(channels, candidate.driver, strict=False) if name}
+
+
 def rebuild_variant(
-    candidate: Candidate, variant: Variant, blocks: xr.Dataset, coefficient: xr.DataArray
+    candidate: Candidate,
+    variant: Variant,
+    blocks: xr.Dataset,
+    coefficient: xr.DataArray,
+    windows: Windows | None = None,
 ) -> Variant | None:
-    """Rebuild a variant for other channels or parameter values; None if it vanishes."""
-    kind = effects()[candidate.effect]
-    drivers = {
-        inner: name for inner, name in zip(kind.channels, candidate.driver, strict=False) if name
-    }
-    prediction = predict_exogenous(kind.example(**variant.values), make_windows(blocks, drivers))
+    """Rebuild a variant for other parameter values or windows; None if it vanishes.
+
+    The windows are those of the blocks by default.
+    """
+    if windows is None:
+        windows = make_windows(blocks, driver_names(candidate))
+    effect = effects()[candidate.effect].example(**variant.values)
+    prediction = predict_exogenous(effect, windows)
     built = candidate.statistic.design(
         Prospect(dict(variant.values), prediction, blocks, coefficient)
     )

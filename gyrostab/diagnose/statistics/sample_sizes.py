@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import xarray as xr
+from scipy.special import gammaincinv, ndtr, ndtri
 
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.reduce.outliers import outlier_limit
@@ -31,8 +33,6 @@ def estimate_from_counts(
     settings: Settings,
 ) -> dict[str, tuple[float, ...]]:
     """Estimate the parameters of an effect on the sample distribution."""
-    from scipy.stats import norm
-
     samples = max(float(blocks["samples"].sel(axis=axis).sum()), 1.0)
     rate = float(blocks.attrs["sampling_rate_hz"])
     hours = samples / rate / HOUR
@@ -71,14 +71,14 @@ def estimate_from_counts(
     share, least, most = (min(max(one, 0.0) / samples, 0.999) for one in (count, low, high))
     if effect == "clipping":
         least = max(least, INTERVAL_TAILS[0] / samples)  # nothing bounds a limit without a count
-        limit, far, near = (spread * float(norm.isf(one / 2.0)) for one in (share, least, most))
-        slope = spread / (2.0 * float(norm.pdf(limit / spread)))
+        limit, far, near = (spread * -float(ndtri(one / 2.0)) for one in (share, least, most))
+        slope = spread / (2.0 * float(_normal_density(limit / spread)))
         return {"limit": (limit, slope * error / samples, near, far)}
     if effect == "dead_zone":
         width, narrow, wide = (
-            spread * float(norm.ppf(0.5 + one / 2.0)) for one in (share, least, most)
+            spread * float(ndtri(0.5 + one / 2.0)) for one in (share, least, most)
         )
-        slope = spread / (2.0 * float(norm.pdf(width / spread)))
+        slope = spread / (2.0 * float(_normal_density(width / spread)))
         return {"width": (width, slope * error / samples, narrow, wide)}
     return {}
 
@@ -115,12 +115,15 @@ def _size_spikes(
     }
 
 
+def _normal_density(x: Any) -> Any:
+    """Return the density of the standard normal law."""
+    return np.exp(-(x**2) / 2.0) / math.sqrt(2.0 * math.pi)
+
+
 def _poisson_interval(count: float) -> tuple[float, float]:
     """Return the exact 95 % interval of the mean of a Poisson law (Garwood, 1936)."""
-    from scipy.stats import chi2
-
     tail, other = INTERVAL_TAILS
-    return float(chi2.ppf(tail, 2.0 * count)) / 2.0, float(chi2.ppf(other, 2.0 * count + 2.0)) / 2.0
+    return float(gammaincinv(count, tail)), float(gammaincinv(count + 1.0, other))
 
 
 def _held_runs(blocks: xr.Dataset, axis: str, mark: str, usual: float) -> float:
@@ -143,8 +146,6 @@ def _estimate_outliers(blocks: xr.Dataset, axis: str) -> tuple[float, float, flo
     deviation of the law is taken to be at least the smallest one seen: below that, the number of
     those not seen is undetermined.
     """
-    from scipy.stats import norm
-
     count, excess, samples = (
         blocks[name].sel(axis=axis).values.astype(np.float64)
         for name in ("peaks", "kurtosis", "samples")
@@ -178,9 +179,9 @@ def _estimate_outliers(blocks: xr.Dataset, axis: str) -> tuple[float, float, flo
     square = float((share * samples[good]).sum() / many.sum())
     limit = MEDIAN_DEPARTURE_SIGMA * outlier_limit(float(samples.sum()))
     ends = np.geomspace(1.0, 1e-4, 400)  # the least size that is seen, over the rms size
-    seen_squares = (limit / ends) ** 2 * (1.0 + ends * norm.pdf(ends) / norm.sf(ends))
+    seen_squares = (limit / ends) ** 2 * (1.0 + ends * _normal_density(ends) / ndtr(-ends))
     size = limit / float(np.interp(square, seen_squares, ends))
-    return float(2.0 * norm.sf(limit / size)), size * math.sqrt(usual), float(many.sum())
+    return float(2.0 * ndtr(-limit / size)), size * math.sqrt(usual), float(many.sum())
 
 
 def _sample_deviation(blocks: xr.Dataset, axis: str) -> float:

@@ -40,14 +40,23 @@ from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.compiled import KERNEL
 from gyrostab.kernels.workspace import Workspace
 
-__all__ = ["NONE", "STRICT", "WEIGHTED", "Cells", "Unit", "surface_unit", "window_means"]
+__all__ = [
+    "NONE",
+    "STRICT",
+    "WEIGHTED",
+    "Cells",
+    "Unit",
+    "convert_to_native",
+    "surface_unit",
+    "window_means",
+]
 
 NONE, STRICT, WEIGHTED = 0, 1, 2
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# Types that are summed as they are; others become double first.
-_NATIVE = tuple(np.dtype(kind) for kind in (np.float64, np.float32, np.int32, np.int16))
+# Types that are summed as they are; others become double first, since each type is compiled anew.
+_NATIVE = np.dtype(np.float64), np.dtype(np.float32)
 
 
 class Unit(NamedTuple):
@@ -321,7 +330,8 @@ def _third_blocks(
     blocks[:] = single_blocks(high, low, places, starts, stops, *order, *cut)[: len(blocks)]
 
 
-def _to_native(x: NDArray[np.generic]) -> NDArray[np.generic]:
+def convert_to_native(x: NDArray[np.generic]) -> NDArray[np.floating[Any]]:
+    """Convert samples to a contiguous array of a type for which the kernels are compiled."""
     return np.ascontiguousarray(x if x.dtype in _NATIVE else x.astype(np.float64))
 
 
@@ -349,7 +359,7 @@ def surface_unit(
         As `window_means`.
     """
     counts_only = np.issubdtype(x.dtype, np.integer)
-    x, space = _to_native(x), space or Workspace()
+    x, space = convert_to_native(x), space or Workspace()
     n_windows = _number_of_windows(x, unit)
     if np.isnan(first_present(x)):
         return _empty_cells(n_windows, unit.ks.size)
@@ -485,5 +495,5 @@ def window_means(x: NDArray[np.generic], unit: Unit) -> Floats:
         Mean [unit of the rate; for angles: of angle per second], NaN where nothing is present;
         share of samples present.
     """
-    x = _to_native(x)
+    x = convert_to_native(x)
     return _average_windows(x, unit, _number_of_windows(x, unit))[0]
