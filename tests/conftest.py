@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -22,6 +23,14 @@ settings.register_profile(
 )
 settings.register_profile("full", deadline=None, max_examples=100, print_blob=True)
 settings.load_profile("fast")
+
+
+# Garbage collection searches all modules and tests again and again; they are never garbage.
+gc.set_threshold(15 * gc.get_threshold()[0], *gc.get_threshold()[1:])
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
 
 
 #: Tests that start first. The first file compiles most kernels that others share; the next ones
