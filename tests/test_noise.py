@@ -183,6 +183,8 @@ def test_shared_numbers_are_written_once():
     for name, source in modules_that_share_the_laws():
         if name in HOMES or name in WHOLE_SECONDS:
             continue
+        if not any(number in source for number in SHARED_NUMBERS):
+            continue  # tokens take time
         for token in tokenize.generate_tokens(io.StringIO(source).readline):
             number = token.string.removesuffix(".0")
             in_braces = token.type == tokenize.STRING and re.search(
