@@ -457,8 +457,9 @@ class SharedSource(Effect):
         return 1.0 / (2.0 * math.pi * self.bandwidth)
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """List low-passes within the band, and none."""
-        return {"bandwidth": np.append(windows.rate / np.array([40.0, 20.0, 10.0, 5.0]), math.inf)}
+        """List low-passes from the narrowest that the band resolves to its upper end, and none."""
+        parts = np.array([80.0, 40.0, 20.0, 10.0, 5.0, 2.5, 1.5])
+        return {"bandwidth": np.append(windows.rate / parts, math.inf)}
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict a spectrum of one process on all axes."""

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 DRAWS = 1000  # of the posterior: 25 beyond each end of a 95 % interval
 FACTOR_ROUNDS = 50  # of the iteration for a matrix of rank 1
 # Grid of low-passes: bandwidths as parts of the sampling rate, their number, and interpolation.
-WIDEST_PART, NARROWEST_PART, BANDWIDTHS, FINE_STEPS = 1.5, 40.0, 11, 12
+WIDEST_PART, NARROWEST_PART, BANDWIDTHS, FINE_STEPS = 1.5, 80.0, 13, 12
 ORDER_ERROR = 0.05  # relative change of the level below a low-pass if it has two poles
 
 
