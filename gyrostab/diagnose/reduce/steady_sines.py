@@ -122,7 +122,7 @@ class SineSearch:
         frequency = step * np.arange(1, spectrum.total.shape[1] + 1)
         width, side = (_FINER * number // split for number in (_LEVEL_LINES, _SIDE_LINES))
         # Lower ones are in the means of blocks; the first `side` only define the level of the next.
-        inside = frequency >= 2.0 * lines[0] - side * step
+        inside = frequency >= lines[0] - side * step
         frequency = frequency[inside]
         usable = (spectrum.used > 0) & spectrum.total.any(axis=1)  # a constant axis has no noise
         if frequency.size < _MIN_LEVELS * width or not usable.any():

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from gyrostab.physics.prediction import Windows
 from gyrostab.physics.optics import SharedSource
+from gyrostab.physics.prediction import Windows
 
 RATE = 10.0
 FREQUENCY = (np.arange(400) + 0.5) / 400 * RATE / 2.0

@@ -67,7 +67,7 @@ def test_constant_axis_has_no_sine():
     np.testing.assert_allclose(found[:2], expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("frequency", [0.1043, 0.70713, 1.3, 4.61])
+@pytest.mark.parametrize("frequency", [0.0721, 0.1043, 0.70713, 1.3, 4.61])
 def test_finds_a_sine_that_blocks_do_not_show(frequency):
     rng = np.random.default_rng(2)
     amplitude = np.sqrt(4.0 * 60.0 / SIZE)  # 60 nats in white noise of variance 1
