@@ -17,6 +17,7 @@ from gyrostab.blindtest.generator.catalogue import CATALOGUE, OUT_OF_CATALOGUE
 from gyrostab.blindtest.generator.detection_limits import (
     NATS,
     amplitude_for,
+    learned_filter_nats,
     learned_nats,
     learned_random_nats,
     mean_size,
@@ -181,6 +182,24 @@ def test_fitted_noise_absorbs_random_walk_and_not_a_fast_random_bias():
         )
     fast, slow = found
     assert 0.0 < slow < 0.1 < fast < 1.0
+
+
+@pytest.mark.parametrize(
+    ("quantization", "least", "most"), [(0.0, 0.98, 1.0), (0.02, 0.3, 0.9), (0.2, 0.0, 0.01)]
+)
+def test_less_quantization_noise_looks_like_a_filter_of_two_neighbours(quantization, least, most):
+    """`quantization` is 1.5 times the share of Q in the variance of a sample."""
+    white = white_scenario()
+    step = math.sqrt(quantization / 3.0) * 60.0 / math.sqrt(white.rate)
+    urad = math.degrees(1e-6) * 3600.0
+    scenario = replace(
+        white,
+        noise=tuple(noise | {"Q": step * noise["N"] / urad} for noise in white.noise),
+    )
+    effect = CATALOGUE["logger_filter"].make(scenario, stream(1, "filter"), strength=4.0)
+    assert effect.learned_nats is not None
+    assert least <= effect.learned_nats / effect.nats <= most
+    assert learned_filter_nats(scenario, np.ones(200)) < 1e-6
 
 
 def test_limit_of_a_mean_matches_simulated_likelihoods():

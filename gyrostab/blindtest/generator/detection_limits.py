@@ -31,6 +31,7 @@ __all__ = [
     "NATS",
     "amplitude_for",
     "band_density",
+    "learned_filter_nats",
     "learned_nats",
     "learned_random_nats",
     "line_density_of",
@@ -143,6 +144,50 @@ def learned_random_nats(
         _divergence_from_noise(scenario, axis, f, seen * share**2 * density(f), random=True)
         for axis, share in enumerate(shares)
         if share
+    )
+
+
+def learned_filter_nats(scenario: Scenario, gain: Array) -> float:
+    """Compute the evidence expected for a filter of all noise over fitted white noise and Q [nats].
+
+    To first order a short filter takes away what a smaller Q takes away. A filter of weight a is
+    therefore seen only where Q has less than about 2 a of the variance of a sample.
+
+    Parameters
+    ----------
+    gain : ndarray, shape (frequency,)
+        Power gain at frequencies that divide (0, rate / 2) equally.
+    """
+    f = (np.arange(gain.size) + 0.5) / gain.size * scenario.rate / 2
+    count = float((~scenario.missing).sum())
+    return sum(
+        _filter_divergence(
+            floor_psd(f, noise={term: noise.get(term, 0.0) for term in "NQ"}, rate=scenario.rate)
+            * gain,
+            np.stack([floor_psd(f, noise={term: 1.0}, rate=scenario.rate) for term in "NQ"]),
+        )
+        * count
+        / 2
+        for noise in scenario.noise
+    )
+
+
+def _filter_divergence(density: Array, alone: Array) -> float:
+    """Return twice the least divergence, per sample, of two noise terms from a density [nats]."""
+
+    def apart(logarithms: Array) -> float:
+        ratio = density / (np.exp(logarithms) @ alone)
+        return float((ratio - 1 - np.log(ratio)).mean())
+
+    level = np.log(density.mean() / alone.mean(axis=1))
+    options = {"maxiter": 800, "xatol": 1e-6, "fatol": 1e-14}
+    return min(
+        float(
+            minimize(
+                apart, level + np.array([0.0, share]), method="Nelder-Mead", options=options
+            ).fun
+        )
+        for share in (-12.0, -4.0, -1.0)
     )
 
 

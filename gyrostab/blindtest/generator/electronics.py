@@ -11,7 +11,11 @@ from scipy import fft
 from scipy.signal import lfilter
 
 from gyrostab.blindtest.generator import light, loop, telemetry
-from gyrostab.blindtest.generator.detection_limits import NATS, shared_size
+from gyrostab.blindtest.generator.detection_limits import (
+    NATS,
+    learned_filter_nats,
+    shared_size,
+)
 from gyrostab.blindtest.generator.environment import lag
 from gyrostab.blindtest.generator.noise_floor import white_level
 from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario, to_samples
@@ -229,9 +233,12 @@ def logger_filter(scenario: Scenario, rng: np.random.Generator, *, strength: flo
 
     f = (np.arange(200) + 0.5) / 200 * math.pi
 
-    def ratio(a: float) -> Array:
+    def power_gain(a: float) -> Array:
         response = np.exp(-1j * f[:, None] * np.arange(taps(a).size)) @ taps(a)
-        gain = np.maximum(np.abs(response) ** 2, 1e-12)
+        return np.asarray(np.maximum(np.abs(response) ** 2, 1e-12))
+
+    def ratio(a: float) -> Array:
+        gain = power_gain(a)
         return np.asarray(
             np.tile(gain / np.exp(np.log(gain).mean()), (3, 1, 1))
         )  # the level before the filter is unknown
@@ -265,7 +272,10 @@ def logger_filter(scenario: Scenario, rng: np.random.Generator, *, strength: flo
             "unit": "Hz",
             "unless": ["length"],
         }
-    return replace(effect, after=after, parameters=parameters)
+    learned = (
+        learned_filter_nats(scenario, power_gain(amplitude)) if scenario.measured is None else None
+    )
+    return replace(effect, after=after, parameters=parameters, learned_nats=learned)
 
 
 def _sample_sd(scenario: Scenario, axis: int) -> float:
