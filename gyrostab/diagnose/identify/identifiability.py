@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from gyrostab.diagnose.evidence.telegraph import telegraph_evidence
+from gyrostab.diagnose.evidence.visits import compare_visits
 from gyrostab.diagnose.identify.effect_candidates import largest_size
 from gyrostab.diagnose.identify.identification import (
     Identification,
@@ -119,6 +120,7 @@ def _find_other_course(
         ("a gradual change", lambda: gradual_nats(components, state, error=error)),
         ("an event that ends", lambda: event_nats(components, state)),
         ("means that scatter for a while", lambda: scatter_nats(components, state)),
+        ("levels that differ", lambda: _unequal_levels_nats(components, state, error=error)),
     )
     return next(((name, nats) for name, find in forms if (nats := find())), None)
 
@@ -255,6 +257,36 @@ def _further_level_nats(component: Component, state: State) -> float:
         state.blocks, state.baseline, axis=axis, given=given, settings=settings
     )
     return float(evidence_nats[0]) if evidence_nats[0] > allowed else 0.0
+
+
+def _unequal_levels_nats(components: Sequence[Component], state: State, *, error: float) -> float:
+    """Return by how much levels that differ at each visit explain more than two levels [nats].
+
+    Zero if two levels explain clearly more, with enough switches. Otherwise the bias may follow
+    something that was not recorded. Axes of one course show the same visits: that these are equal
+    counts once.
+    """
+    levels = [component for component in components if component.statistic.is_switching]
+    if not levels:
+        return 0.0
+    unequal = np.array([_unequal_nats(component, state) for component in levels])
+    nats = float(unequal.min() + np.maximum(unequal, 0.0)[unequal > unequal.min()].sum())
+    return max(nats + error + state.settings.ambiguous_nats, 0.0)
+
+
+def _unequal_nats(component: Component, state: State) -> float:
+    """Return the evidence of an axis for levels that differ [nats], 0 with too few switches."""
+    variant, axis = component.variant, component.row[0]
+    found = compare_visits(
+        state.blocks["mean"].sel(axis=axis).values,
+        state.baseline,
+        variant.inside if variant.inside.size else variant.design[0, 0],
+        axis=axis,
+        block_s=float(state.blocks.attrs["block_s"]),
+        given=state.given_to("mean", axis),
+    )
+    is_known = found.switch_count >= state.settings.min_switches
+    return found.unequal_nats if is_known else max(found.unequal_nats, 0.0)
 
 
 def _is_moving(axis: str, state: State) -> bool:

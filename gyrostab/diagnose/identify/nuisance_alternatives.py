@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 #: Name -> description.
 NUISANCE_ALTERNATIVES = {
     "~bias(t)": "the bias wanders",
+    "~levels": "the bias steps between levels that differ",
     "~N(t)": "the noise level changes",
     "~burst": "the noise level is higher for a while",
     "~S(f)": "the spectrum has another shape",
@@ -85,6 +86,7 @@ def nuisance_alternatives(blocks: xr.Dataset) -> list[Candidate]:
             (),
             (Variant({}, _numbered_columns(len(hats)), hats[:, None, :]),),
         ),
+        Candidate("~levels", find_statistic("telegraph"), (), (Variant({}, ("0",), np.empty(0)),)),
         Candidate(
             "~N(t)",
             find_statistic("power"),

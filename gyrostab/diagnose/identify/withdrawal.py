@@ -29,6 +29,8 @@ __all__ = ["Withdrawal"]
 
 #: Effects that change the white variance of the means, which the calibration then misjudges.
 _SPECTRAL_SHAPES = ("logger_filter", "held_samples", "gauss_markov", "telegraph")
+#: Arbitrary courses of the bias.
+_DRIFTS = ("~bias(t)", "~levels")
 
 
 @dataclass(frozen=True)
@@ -85,8 +87,7 @@ class Withdrawal:
         part_of_drift = _find_part_of_drift(on_axis, unidentified, axis)
         kept = [one for one in kept if one not in part_of_drift]
         has_alternative = any(
-            one.generic in ("~bias(t)", "~S(f)", "~cov") and axis in one.axes
-            for one in unidentified
+            one.generic in (*_DRIFTS, "~S(f)", "~cov") and axis in one.axes for one in unidentified
         )
         has_shape = any(
             component.candidate.effect in _SPECTRAL_SHAPES and axis in component.row
@@ -154,6 +155,6 @@ def _find_part_of_drift(
     They may be a piece of that drift.
     """
     drift = sum(
-        one.evidence_nats for one in unidentified if one.generic == "~bias(t)" and axis in one.axes
+        one.evidence_nats for one in unidentified if one.generic in _DRIFTS and axis in one.axes
     )
     return [one for one in on_axis if not any(one.driver) and one.evidence_nats < drift]

@@ -62,8 +62,8 @@ Array = NDArray[np.float64]
 FAST_INSTRUMENT_SAMPLES = 16
 #: Nuisance alternative -> `view` in `diagnosis.json`.
 _NUISANCE_VIEWS = {
-    "~bias(t)": "mean", "~red": "mean", "~N(t)": "davar", "~burst": "davar", "~S(f)": "davar",
-    "~cov": "cross_axis", "~outliers": "distribution",
+    "~bias(t)": "mean", "~levels": "mean", "~red": "mean", "~N(t)": "davar", "~burst": "davar",
+    "~S(f)": "davar", "~cov": "cross_axis", "~outliers": "distribution",
 }  # fmt: skip
 MAX_LINES = 4000  # bins of the line spectrum in `diagnosis.nc`: enough for a page, small on disk
 

@@ -19,6 +19,7 @@ from gyrostab.diagnose.evidence.telegraph import (
     TelegraphCourses,
     telegraph_evidence,
 )
+from gyrostab.diagnose.evidence.visits import compare_visits
 from gyrostab.diagnose.predict.candidates import (
     Candidate,
     CandidateEvidence,
@@ -33,6 +34,7 @@ from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.statistics.base import SizeFit, Sizes
 from gyrostab.diagnose.statistics.mean import BlockMeanStatistic, condition_means
 
+_LEVELS = "~levels"  # nuisance alternative: an arbitrary course
 _MAX_NULL_BLOCKS = 20_000  # of null records that are searched for two levels; limits time
 
 
@@ -80,7 +82,7 @@ class Telegraph(BlockMeanStatistic):
             if within is not None:
                 evidence_nats[0, row] = max(within.evidence_nats, evidence_nats[0, row])
             courses.append((course, within))
-        return [
+        found = [
             CandidateEvidence(
                 candidate,
                 rows,
@@ -91,6 +93,10 @@ class Telegraph(BlockMeanStatistic):
                 ),
             )
             for candidate in group
+        ]
+        return [
+            _with_free_levels(one, trial) if one.candidate.effect == _LEVELS else one
+            for one in found
         ]
 
     def condition(self, state: State, component: Component) -> State:
@@ -198,6 +204,36 @@ def _search_sub_blocks(data: xr.Dataset, state: State, axis: str) -> SwitchingEv
         given=state.given_to("sub_block", axis),
         settings=state.settings,
     )
+
+
+def _with_free_levels(found: CandidateEvidence, trial: Trial) -> CandidateEvidence:
+    """Return the evidence of an arbitrary course of levels instead of two [nats].
+
+    Each visit to a level has its own height. In null records it is that of two levels.
+    """
+    if "record" in trial.data.dims:
+        return found
+    evidence_nats, best = found.evidence_nats.copy(), list(found.best)
+    for row, (axis,) in enumerate(found.rows):
+        if not np.isfinite(evidence_nats[0, row]):
+            continue
+        inside = best[row].inside
+        visits = compare_visits(
+            trial.data["mean"].sel(axis=axis).values,
+            trial.state.baseline,
+            inside if inside.size else best[row].design[0, 0],
+            axis=axis,
+            block_s=float(trial.state.blocks.attrs["block_s"]),
+            given=trial.state.given_to("mean", axis),
+        )
+        evidence_nats[0, row] += visits.unequal_nats
+        best[row] = replace(
+            best[row],
+            columns=tuple(str(number) for number in range(len(visits.columns))),
+            # the sum of all visits is the course itself
+            design=np.concatenate([best[row].design, visits.columns[:-1, None]]),
+        )
+    return replace(found, evidence_nats=evidence_nats, best=tuple(best))
 
 
 def _variant_with_course(

@@ -288,6 +288,7 @@ def test_nuisance_alternatives_have_the_axes_of_the_record(plain):
     assert {one.statistic.name for one in nuisance_alternatives(plain)} == {
         "mean",
         "power",
+        "telegraph",
         "cross_spectrum",
         "sample_counts",
     }

@@ -1,0 +1,158 @@
+"""Evidence in block means that a bias does not return to the same levels.
+
+A bias that follows something that was not recorded also steps up and down, but what drives it
+seldom has the same size twice. An arbitrary course of levels, in which each visit to a level has
+its own height, therefore competes with two levels. With few visits, or small ones, the means cannot
+tell.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.evidence.products import Products, marginalise, mean_products
+from gyrostab.diagnose.evidence.wandering import expected_processes
+
+__all__ = ["Visits", "compare_visits", "visit_columns"]
+
+Array = NDArray[np.float64]
+#: Standard deviation of the heights of an arbitrary course over its step. Design choice.
+_SCATTER = 0.5
+
+
+class Visits(NamedTuple):
+    """Visits to the levels of a bias.
+
+    Attributes
+    ----------
+    unequal_nats : float
+        Log Bayes factor of different heights over equal ones [nats]; minus infinity with more
+        visits than blocks, whose heights cannot be known.
+    switch_count : int
+        Number of switches between visits that have more than half of some block or part.
+    columns : ndarray, shape (column, block)
+        Visits to the level whose heights differ more.
+    """
+
+    unequal_nats: float
+    switch_count: int
+    columns: Array
+
+
+def visit_columns(share: Array) -> Array:
+    """Split the share of each block on a level into the visits to it, (visit, block).
+
+    A visit has more than half of some block. What is left between two visits belongs to the nearer.
+
+    Examples
+    --------
+    >>> visit_columns(np.array([0.0, 0.9, 1.0, 0.2, 0.0, 0.8])).tolist()
+    [[0.0, 0.9, 1.0, 0.2, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, 0.0, 0.8]]
+    """
+    inside = np.concatenate([[False], share > 0.5, [False]])
+    begin, end = np.flatnonzero(np.diff(inside)).reshape(-1, 2).T
+    if not begin.size:
+        return np.empty((0, share.size))
+    border = (end[:-1] + begin[1:]) / 2.0
+    visit = np.searchsorted(border, np.arange(share.size) + 0.5)
+    return np.where(visit == np.arange(begin.size)[:, None], share, 0.0)
+
+
+def compare_visits(
+    mean: Array,
+    baseline: xr.Dataset,
+    share: Array,
+    *,
+    axis: str,
+    block_s: float,
+    given: Array | None = None,
+) -> Visits:
+    """Compute the evidence that the visits to one of the levels have different heights.
+
+    Both levels are equally likely to be that level.
+
+    Parameters
+    ----------
+    mean : ndarray, shape (block,)
+        Means of the blocks [degree hour-1].
+    share : ndarray, shape (block,) or (block, part)
+        Share of each block, or part of it, on the upper level.
+    block_s : float
+        Length of a block [s].
+    baseline, axis, given
+        As in `gyrostab.diagnose.evidence.telegraph.telegraph_evidence`.
+    """
+    y = mean - baseline["known_mean"].sel(axis=axis).values
+    present = np.isfinite(y)
+    parts = share.reshape(y.size, -1)
+    levels = [
+        visit_columns(one.ravel()).reshape(-1, *parts.shape).mean(axis=2)
+        for one in (parts, 1.0 - parts)
+    ]
+    switch_count = max(sum(len(one) for one in levels) - 1, 0)
+    course = parts.mean(axis=1)
+    if switch_count > y.size:
+        return Visits(-np.inf, switch_count, course[None])
+    known = np.empty((y.size, 0)) if given is None else np.where(np.isfinite(given), given, 0.0)
+    size = np.abs(known).max(axis=0, initial=0.0)
+    columns = np.column_stack(
+        [course, known / np.where(size > 0.0, size, 1.0), *(one.T for one in levels)]
+    )
+    grid: dict[str, Any] = {
+        name: baseline[f"grid_{name}"].sel(axis=axis).values for name in ("K", "B")
+    }
+    products = mean_products(
+        np.where(present, y, 0.0)[:, None],
+        np.where(present[:, None], columns, 0.0),
+        variance=baseline["mean_variance"].sel(axis=axis).values,
+        step=block_s,
+        present=present,
+        wander=expected_processes(baseline, axis),
+        **grid,
+    )
+    own, log_weight = 1 + known.shape[1], baseline["grid_prior"].sel(axis=axis).values
+    same, step = _log_evidence(products, np.arange(own), own, 0.0, log_weight)
+    first = own + np.cumsum([0, *(len(one) for one in levels)])
+    free = [
+        _log_evidence(
+            products,
+            np.concatenate([np.arange(own), np.arange(begin, end)]),
+            own,
+            (_SCATTER * step) ** 2,
+            log_weight,
+        )[0]
+        for begin, end in pairwise(first)
+    ]
+    evidence_nats = float(np.logaddexp.reduce(free) - np.log(len(free)) - same)
+    return Visits(evidence_nats, switch_count, levels[int(np.argmax(free))])
+
+
+def _log_evidence(
+    products: Products, chosen: NDArray[np.int64], own: int, variance: float, log_weight: Array
+) -> tuple[float, float]:
+    """Return the log evidence of columns, those after `own` with a prior variance; and the step."""
+    part = Products(
+        products.square,
+        products.cross[:, chosen],
+        products.gram[:, chosen[:, None], chosen],
+        products.log_determinant,
+    )
+    width = chosen.size - own
+    if width:
+        part = marginalise(part, width, np.eye(width) / variance)
+    ridge = 1e-9 * (1.0 + np.trace(part.gram, axis1=1, axis2=2))[:, None, None] * np.eye(own)
+    gram = part.gram + ridge
+    mean = np.linalg.solve(gram, part.cross)[:, :, 0]
+    log = log_weight - 0.5 * (
+        part.square[:, 0]
+        - (mean * part.cross[:, :, 0]).sum(axis=1)
+        + part.log_determinant
+        + np.linalg.slogdet(gram)[1]
+    )
+    total = float(np.logaddexp.reduce(log))
+    return total, float(np.exp(log - total) @ mean[:, 0])
