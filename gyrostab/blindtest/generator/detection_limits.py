@@ -180,11 +180,13 @@ def _filter_divergence(density: Array, alone: Array) -> float:
         return float((ratio - 1 - np.log(ratio)).mean())
 
     level = np.log(density.mean() / alone.mean(axis=1))
-    options = {"maxiter": 800, "xatol": 1e-6, "fatol": 1e-14}
     return min(
         float(
             minimize(
-                apart, level + np.array([0.0, share]), method="Nelder-Mead", options=options
+                apart,
+                np.array([level[0], level[1] + share]),
+                method="Nelder-Mead",
+                options={"maxiter": 800, "xatol": 1e-6, "fatol": 1e-14},
             ).fun
         )
         for share in (-12.0, -4.0, -1.0)

@@ -82,7 +82,7 @@ class Telegraph(BlockMeanStatistic):
             if within is not None:
                 evidence_nats[0, row] = max(within.evidence_nats, evidence_nats[0, row])
             courses.append((course, within))
-        found = [
+        by_candidate = [
             CandidateEvidence(
                 candidate,
                 rows,
@@ -96,7 +96,7 @@ class Telegraph(BlockMeanStatistic):
         ]
         return [
             _with_free_levels(one, trial) if one.candidate.effect == _LEVELS else one
-            for one in found
+            for one in by_candidate
         ]
 
     def condition(self, state: State, component: Component) -> State:
