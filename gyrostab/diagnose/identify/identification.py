@@ -198,8 +198,10 @@ def condition_on_selections(
     return refit_weights(state) if has_new_lines else state
 
 
-def remove_phase_locked(identifications: Identifications) -> tuple[Identifications, float]:
-    """Drop phase-locked components, and return their held-out evidence [nats].
+def remove_phase_locked(
+    identifications: Identifications, blocks: xr.Dataset
+) -> tuple[Identifications, float]:
+    """Drop phase-locked components and slow sines, and return their held-out evidence [nats].
 
     The band powers show how large such a component is, but not its phase. In them it would gain a
     small part of its evidence, and lose in every band that it leaves. Therefore its own statistic
@@ -207,9 +209,10 @@ def remove_phase_locked(identifications: Identifications) -> tuple[Identificatio
     """
     kept, evidence_nats = [], 0.0
     for one in identifications.identified:
-        rest = tuple(part for part in one.components if not part.statistic.is_phase_locked)
+        locked = [part.statistic.is_only_in_phase(part, blocks) for part in one.components]
+        rest = tuple(part for part, out in zip(one.components, locked, strict=True) if not out)
         evidence_nats += sum(
-            part.evidence_nats for part in one.components if part.statistic.is_phase_locked
+            part.evidence_nats for part, out in zip(one.components, locked, strict=True) if out
         )
         if rest:
             kept.append(replace(one, components=rest) if len(rest) < len(one.components) else one)

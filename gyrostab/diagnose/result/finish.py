@@ -176,7 +176,7 @@ def measure_evidence(
     telegraph biases and phase-locked components are in none of these: their evidence is added.
     """
     without_telegraph, telegraph_nats = remove_telegraph_bias(identifications)
-    judged, phase_locked_nats = remove_phase_locked(without_telegraph)
+    judged, phase_locked_nats = remove_phase_locked(without_telegraph, blocks)
     identified = without_telegraph.identified
     count_nats = sum(
         component.evidence_nats

@@ -258,6 +258,10 @@ class Statistic:
         """Return whether only the effect itself, and no column, gives the power of a component."""
         return False
 
+    def is_only_in_phase(self, component: Component, blocks: xr.Dataset) -> bool:
+        """Return whether the band powers show only a small part of the evidence of a component."""
+        return self.is_phase_locked
+
     # ---------------------------------------------------------------------- sizes
 
     def mixture(

@@ -44,6 +44,7 @@ __all__ = ["SpectralLine"]
 _LEAK_LINES = 2  # lines on either side that a line leaks into
 _CERTAIN_SIGMA = 3.0  # by which the power of a line varies more than that of noise; design choice
 _MAX_COHERENCE_BLOCKS = 3.0  # longest coherence time that the scatter of block powers determines
+_SLOW_CYCLES = 2.0  # in a block, below which slow noise has the power of a sine; design choice
 _AROUND_LINES = 40  # lines on either side that define the level; design choice
 
 
@@ -153,6 +154,18 @@ class SpectralLine(Statistic):
             state = free_covariance(state, (axis,), column)
         skirt = line_skirt(state.blocks, axis, component.place, state.settings)
         return state.with_columns("line", "all", [skirt])
+
+    def is_only_in_phase(self, component: Component, blocks: xr.Dataset) -> bool:
+        """Return whether the component is a sine below two cycles a block, of constant phase.
+
+        In the lowest bands, the slow noise is fitted to its power.
+        """
+        here, place = blocks.sel(axis=component.row[0]), component.place
+        return (
+            place >= 0
+            and _has_constant_phase(here, place)
+            and float(here["sine_frequency"][place]) < _SLOW_CYCLES / float(blocks.attrs["block_s"])
+        )
 
     def estimate(self, fit: SizeFit) -> Sizes:
         """Estimate amplitudes and the frequency, from the power about the line.

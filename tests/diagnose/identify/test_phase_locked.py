@@ -53,7 +53,7 @@ def test_only_phase_locked_components_are_removed() -> None:
         None,
         xr.DataArray(),
     )  # type: ignore[arg-type]
-    left, evidence_nats = remove_phase_locked(identifications)
+    left, evidence_nats = remove_phase_locked(identifications, xr.Dataset())
     assert evidence_nats == 27.0
     assert [one.components for one in left.identified] == [(mean,), (mean,)]
     assert left.identified[1] is identifications.identified[2]

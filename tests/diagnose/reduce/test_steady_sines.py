@@ -6,9 +6,11 @@ from scipy.special import gammaln
 
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence
 from gyrostab.diagnose.identify.forward_search import name_effects
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.reduce import steady_sines
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.reduce.steady_sines import SineSearch, sine_factors
+from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.diagnose.statistics.spectral_line import estimate_line
 from gyrostab.ingest.make_log import make_log
 from tests.support.named import nulls
@@ -147,3 +149,18 @@ def test_weak_sine_is_named_with_frequency_and_amplitude():
     (size, stderr), (frequency, error) = estimate_line(blocks, "x", place)
     assert abs(size - amplitude) < 3.0 * stderr < 0.5 * amplitude
     assert abs(frequency - 1.7321) < 2.0 * error < 0.002
+
+
+@pytest.mark.parametrize(("frequency", "slow"), [(0.0721, True), (0.1543, False)])
+def test_a_slow_sine_counts_by_its_phase(frequency, slow):
+    """Slow noise is fitted to the power of a sine below two cycles a block."""
+    noise = np.random.default_rng(5).standard_normal((1, SIZE))
+    noise += wave(frequency, np.sqrt(4.0 * 60.0 / SIZE))
+    blocks = reduce_log(make_log(noise, rate=RATE, unit="deg/h", axis=["x"]))
+    place = int(blocks["sine_nats"].values[0].argmax())
+    line = find_statistic("spectral_line")
+    variant = Variant({}, ("amplitude",), np.empty(0), squared=True)
+    found = Component(
+        Candidate("spectral_line", line, (), (variant,)), variant, ("x",), 50.0, place
+    )
+    assert line.is_only_in_phase(found, blocks) is slow
