@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.telegraph import telegraph_evidence
 from gyrostab.diagnose.evidence.visits import compare_visits
@@ -38,6 +39,8 @@ __all__ = [
     "without_pulses",
 ]
 
+Array = NDArray[np.float64]
+_JUMP_CHANGES = 2  # from block to block, in the column of a jump within a block
 #: Effect -> effects that look the same in block statistics, whatever the excitation.
 OBSERVATIONALLY_EQUIVALENT: dict[str, tuple[str, ...]] = {
     "gauss_markov": ("telegraph",),
@@ -275,15 +278,36 @@ def _unequal_levels_nats(components: Sequence[Component], state: State, *, error
 
 
 def _unequal_nats(component: Component, state: State) -> float:
-    """Return the evidence of an axis for levels that differ [nats], 0 with too few switches."""
+    """Return the evidence of an axis for levels that differ [nats], 0 or more with few switches.
+
+    Jumps that were named first may be switches. The switches are therefore also found without them.
+    """
     variant, axis = component.variant, component.row[0]
+    given = state.given.get(("mean", axis), [])
+    share = variant.inside if variant.inside.size else variant.design[0, 0]
+    courses = [(share, given)]
+    others = [column for column in given if np.count_nonzero(np.diff(column)) > _JUMP_CHANGES]
+    if len(others) < len(given) and not variant.inside.size:
+        _, found = telegraph_evidence(
+            state.blocks,
+            state.baseline,
+            axis=axis,
+            given=np.stack(others, axis=-1) if others else None,
+            settings=state.settings,
+        )
+        courses.append((found.share[0], others))
+    return min(_compare_course(one, axis, columns, state) for one, columns in courses)
+
+
+def _compare_course(share: Array, axis: str, given: Sequence[Array], state: State) -> float:
+    """Return the evidence of a course for levels that differ, at least 0 with few switches."""
     found = compare_visits(
         state.blocks["mean"].sel(axis=axis).values,
         state.baseline,
-        variant.inside if variant.inside.size else variant.design[0, 0],
+        share,
         axis=axis,
         block_s=float(state.blocks.attrs["block_s"]),
-        given=state.given_to("mean", axis),
+        given=np.stack(given, axis=-1) if given else None,
     )
     is_known = found.switch_count >= state.settings.min_switches
     return found.unequal_nats if is_known else max(found.unequal_nats, 0.0)
