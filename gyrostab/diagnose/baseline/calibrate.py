@@ -46,14 +46,24 @@ Array = NDArray[np.float64]
 DRAWS = 512
 #: Values of K and B on the coarse grid, as multiples of the calibrated ones. Design choice.
 _FACTORS = {"K": (0.0, 1.0 / 3.0, 1.0, 3.0, 10.0, 30.0), "B": (0.0, 1.0, 3.0, 10.0)}
+#: Bands that the noise terms are fitted to, with any spectral shape.
+MIN_BANDS = 6
 _MIN_LOW_SHAPE = 20.0  # of the lowest bands, which define the white noise of a block mean
 
 
-def _mean_noise_excess(power: Array, shape: Array, spectrum: Array, settings: Settings) -> Array:
+def _mean_noise_excess(
+    power: Array, shape: Array, spectrum: Array, quiet: NDArray[np.bool_], settings: Settings
+) -> Array:
     """Return the excess factor of the white variance of each mean, from the lowest bands.
 
+    Bands that the noise does not explain in quiescent blocks tell nothing of the noise of a mean.
     Inputs (block, band).
     """
+    known = np.where(np.isfinite(power) & np.isfinite(shape) & quiet[:, None], shape, 0.0)
+    off = (known * np.nan_to_num(power / spectrum - 1.0)).sum(axis=0)
+    explained = np.abs(off) <= settings.excess_sigma * np.sqrt(known.sum(axis=0))
+    if explained.sum() >= MIN_BANDS:
+        power, shape, spectrum = power[:, explained], shape[:, explained], spectrum[:, explained]
     count = np.nan_to_num(shape).sum(axis=0) / max(1, int(np.isfinite(shape).all(axis=1).sum()))
     low = max(2, int(np.searchsorted(np.cumsum(count), _MIN_LOW_SHAPE)) + 1)
     level, deviation = noise_level_excess(
@@ -150,7 +160,10 @@ def calibrate_axes(
                 "too few to calibrate on; "
                 "name other quiet time, or diagnose a part of the record with fewer gaps"
             )
-        fit = _reduce_weights(fit, shape[row][use], rest[row][use], common[row][use])
+        fit = _keep_explained_bands(
+            _reduce_weights(fit, shape[row][use], rest[row][use], common[row][use]),
+            min_sigma=settings.excess_sigma,
+        )
         square = np.maximum(fit_squares(fit)[0], [0.0, floor_square(fit), 0.0, 0.0])
         variance = white_variance(blocks, np.tile(square, (len(mean), 1)))[row]
         present = use & np.isfinite(mean[row])
@@ -167,6 +180,25 @@ def calibrate_axes(
             )
         )
     return posteriors
+
+
+def _keep_explained_bands(fit: Fit, *, min_sigma: float) -> Fit:
+    """Drop the bands that the noise terms do not explain, the worst first.
+
+    Lines and humps would raise the noise in all other bands.
+    """
+    while fit.power.size > MIN_BANDS:
+        off = np.abs(fit.power / (fit.columns @ fit_squares(fit)[0]) - 1.0) * np.sqrt(fit.weight)
+        worst = int(off.argmax())
+        if off[worst] <= min_sigma:
+            break
+        fit = fit._replace(
+            **{
+                name: np.delete(getattr(fit, name), worst, axis=0)
+                for name in ("power", "columns", "weight")
+            }
+        )
+    return fit
 
 
 def _reduce_weights(fit: Fit, shape: Array, rest: Array, common: Array) -> Fit:
@@ -214,7 +246,7 @@ def assemble_baseline(
     variance = white * np.stack(
         [
             _mean_noise_excess(*arrays, settings)
-            for arrays in zip(power, shape, expected, strict=True)
+            for arrays in zip(power, shape, expected, quiet, strict=True)
         ]
     )
     span = blocks.sizes["block"] * float(blocks.attrs["block_s"])

@@ -330,3 +330,40 @@ def test_fit_maximises_the_likelihood_even_without_a_good_fit():
     )
     square, _ = fit_squares(fit)
     assert worse(np.log(np.maximum(square, 1e-12))) < best + 0.1
+
+
+# --------------------------------------------------------------------------------
+# noise that five terms do not describe
+
+
+def with_sines(record: xr.Dataset, amplitudes: dict[float, float]) -> xr.Dataset:
+    """Add sines, frequency [Hz] -> amplitude [deg/h]."""
+    second = np.arange(record.sizes["time"]) / float(record.attrs["sampling_rate_hz"])
+    waves = sum(size * np.sin(2.0 * np.pi * f * second) for f, size in amplitudes.items())
+    return record.assign(rate=record["rate"] + waves)
+
+
+def test_strong_lines_do_not_raise_the_noise_of_the_other_bands():
+    plain = log({"N": 0.003}, rate=100.0, duration="30min")
+    comb = {4.17 * order: 0.5 for order in range(1, 8)}
+    without, given = (
+        calibrate_noise(reduce_log(one)).sel(axis="x") for one in (plain, with_sines(plain, comb))
+    )
+    error = (given["coefficient"].sel(term="N") - 0.003) / given["stderr"].sel(term="N")
+    assert abs(error) < 4.0
+    ratio = given["mean_variance"].mean() / without["mean_variance"].mean()
+    assert abs(ratio - 1.0) < 0.05
+
+
+def test_a_hump_within_blocks_does_not_raise_the_noise_of_their_means():
+    plain = log({"N": 0.003}, rate=100.0, duration="30min")
+    rng = np.random.default_rng(4)
+    sway = np.convolve(
+        rng.standard_normal(plain.sizes["time"]),
+        np.sin(2.0 * np.pi * 3.0 * np.arange(100) / 100.0) * np.hanning(100),
+        "same",
+    )
+    shaken = plain.assign(rate=plain["rate"] + sway)
+    baseline = calibrate_noise(reduce_log(shaken)).sel(axis="x")
+    white = 3600.0 * 0.003**2 / float(reduce_log(plain).attrs["block_s"])
+    assert 0.8 < float(baseline["mean_variance"].median()) / white < 1.3
