@@ -9,9 +9,14 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.identify.identification import Identification, Identifications, components_of
+from gyrostab.diagnose.identify.identification import (
+    Identification,
+    Identifications,
+    components_of,
+    conditioned_states,
+)
 from gyrostab.diagnose.predict.candidates import Component
-from gyrostab.diagnose.predict.condition import MIN_POWER_RATIO, condition_on, power_shares
+from gyrostab.diagnose.predict.condition import MIN_POWER_RATIO, power_shares
 from gyrostab.diagnose.predict.linear_model import (
     State,
     cross_column,
@@ -61,8 +66,8 @@ def predict_baseline(
     # for each column in the model, whether it belongs to an effect that is left out
     is_left_out: dict[tuple[str, str], list[bool]] = {}
     identified = (*identifications.expected, *identifications.identified)
-    for identification in identified:
-        state = condition_on(state, list(identification.components))
+    states = conditioned_states(state, identified)
+    for identification, state in zip(identified, states, strict=True):
         for place, columns in state.given.items():
             known_of = is_left_out.setdefault(place, [])
             known_of += [any(identification is one for one in left_out)] * (

@@ -11,8 +11,11 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_identifications
-from gyrostab.diagnose.identify.identification import Identification, Identifications
-from gyrostab.diagnose.predict.condition import condition_on
+from gyrostab.diagnose.identify.identification import (
+    Identification,
+    Identifications,
+    condition_on_selections,
+)
 from gyrostab.diagnose.predict.linear_model import initial_state
 
 __all__ = ["expected_baseline", "fit_expected", "without_expected"]
@@ -47,8 +50,6 @@ def without_expected(
     """Drop the blocks in which expected effects leave anomalous samples or move the rate."""
     if not expected:
         return blocks
-    state = initial_state(blocks, baseline)
-    for identification in expected:
-        state = condition_on(state, list(identification.components))
+    state = condition_on_selections(initial_state(blocks, baseline), expected)
     moved = xr.DataArray(state.masked, dims=("axis", "block"))
     return state.blocks.assign(power=state.blocks["power"].where(~moved))

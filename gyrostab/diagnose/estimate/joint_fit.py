@@ -15,10 +15,10 @@ from gyrostab.diagnose.identify.identification import (
     Identification,
     Identifications,
     Selection,
+    condition_on_selections,
 )
 from gyrostab.diagnose.identify.logger_filters import fit_filter_sizes
 from gyrostab.diagnose.predict.candidates import Component
-from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.reduce.zero_bin import truncated_axes
 from gyrostab.diagnose.statistics import Statistic
@@ -86,17 +86,15 @@ def fit_identifications(identifications: Identifications, baseline: xr.Dataset) 
     )
     found: list[Fitted] = []
     for identification in identifications.identified:
-        state = start
         everything: list[Selection] = [
             *identifications.expected,
             *identifications.identified,
             *identifications.unknown,
         ]
-        for one in everything:
-            if one is not identification:
-                state = condition_on(state, list(one.components))
         state = replace(
-            state, weight=identifications.state.weight, masked=identifications.state.masked
+            condition_on_selections(start, everything, identification),
+            weight=identifications.state.weight,
+            masked=identifications.state.masked,
         )
         found += _fit_identification(identification, state, identifications)
     return found

@@ -27,9 +27,12 @@ from gyrostab.diagnose.baseline.posterior import (
 )
 from gyrostab.diagnose.baseline.predicted_effects import find_drivers
 from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_identifications
-from gyrostab.diagnose.identify.identification import Identifications, components_of
+from gyrostab.diagnose.identify.identification import (
+    Identifications,
+    components_of,
+    condition_on_selections,
+)
 from gyrostab.diagnose.predict.candidates import Component
-from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import State, initial_state, spread_by_gaps
 from gyrostab.diagnose.predict.windows import make_windows, rebuild_variant
@@ -84,8 +87,7 @@ def recalibrate(
     blocks = identifications.state.blocks
     use = np.ones(blocks.sizes["block"], np.bool_) if known is None else np.asarray(known, np.bool_)
     state = initial_state(blocks, baseline, settings=identifications.state.settings)
-    for identification in identifications.identified:
-        state = condition_on(state, list(identification.components))
+    state = condition_on_selections(state, identifications.identified)
     found: list[Posterior] = []
     power = baseline["spectrum"].values.copy()
     columns = noise_powers(blocks)

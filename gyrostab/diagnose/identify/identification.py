@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -14,11 +14,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.components import are_lines, axes_of, sum_evidence
 from gyrostab.diagnose.predict.candidates import Candidate, Component
-from gyrostab.diagnose.predict.condition import (
-    condition_on,
-    condition_on_components,
-    refit_weights,
-)
+from gyrostab.diagnose.predict.condition import condition_on_components, refit_weights
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
@@ -31,6 +27,7 @@ __all__ = [
     "add_identification",
     "components_of",
     "condition_on_selections",
+    "conditioned_states",
     "find_unidentified",
     "form_error",
     "remove_phase_locked",
@@ -186,16 +183,21 @@ def condition_on_selections(
     start: State, chosen: Sequence[Selection], without: Selection | None = None
 ) -> State:
     """Return the state with all selections but one in the model."""
-    state, has_new_lines = start, False
-    for selection in (one for one in chosen if one is not without):
-        if are_lines(selection.components):
-            # what lines add to the powers is fitted once for all of a comb
-            state = condition_on_components(state, selection.components)
-            has_new_lines = True
-            continue
-        state = refit_weights(state) if has_new_lines else state
-        state, has_new_lines = condition_on(state, list(selection.components)), False
-    return refit_weights(state) if has_new_lines else state
+    return [start, *conditioned_states(start, [one for one in chosen if one is not without])][-1]
+
+
+def conditioned_states(start: State, chosen: Sequence[Selection]) -> Iterator[State]:
+    """Yield the state with the first selection in the model, with the first two, and so on.
+
+    What consecutive lines add to the powers is fitted once for all of them, after the last.
+    """
+    state = start
+    of_lines = [are_lines(selection.components) for selection in chosen]
+    for number, selection in enumerate(chosen):
+        state = condition_on_components(state, selection.components)
+        if not all(of_lines[number : number + 2]) or number + 1 == len(chosen):
+            state = refit_weights(state)
+        yield state
 
 
 def remove_phase_locked(

@@ -52,7 +52,7 @@ from gyrostab.diagnose.identify.withdrawal import Withdrawal
 from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.search import compute_evidence, reusable_mean_evidence
+from gyrostab.diagnose.predict.search import compute_evidence, reusable_evidence
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
 __all__ = ["Search"]
@@ -147,8 +147,8 @@ class Search:
         }
         effects_left, lines_left = MAX_EFFECTS, MAX_LINES
         found: list[CandidateEvidence] = []
-        while effects_left and lines_left:
-            known = reusable_mean_evidence(found, before, state)
+        while effects_left:
+            known = reusable_evidence(found, before, state)
             found, before = self._score_candidates(state, barred, known), state
             selected = self._select_next(found, state, chosen)
             if selected is None:
@@ -157,6 +157,7 @@ class Search:
             barred |= rejected
             if selection is not None and are_lines(selection.components):
                 lines_left -= 1
+                barred |= set() if lines_left else {PLAIN_LINE}
             else:
                 effects_left -= 1
             if selection is not None:
@@ -210,7 +211,8 @@ class Search:
             *self._evidence(sought, state),
         ]
         weighted = [one.candidate for one in found if one.candidate.statistic.is_power_weighted]
-        for _ in range(2):
+        is_new = any(candidate.statistic.is_power_weighted for candidate in sought)
+        for _ in range(2 if is_new else 0):
             powers = [one for one in found if one.candidate.statistic.is_power]
             strongest = max(powers, key=_positive_evidence, default=None)
             if (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,11 +20,12 @@ __all__ = [
     "combine_rows",
     "compute_evidence",
     "evidence_by_effect",
-    "reusable_mean_evidence",
+    "reusable_evidence",
 ]
 
 Array = NDArray[np.float64]
 _TAIL_VARIABLES = ("kurtosis", "outliers")  # not used by the evidence of means
+_MEAN_STATISTICS = ("mean", "sub_block")  # that the evidence of means uses
 _MIN_ROW_NATS = 1.5  # that another axis or statistic must add; design choice
 
 
@@ -70,17 +71,22 @@ def compute_evidence(
     ]
 
 
-def reusable_mean_evidence(
+def reusable_evidence(
     found: Sequence[CandidateEvidence], before: State, now: State
 ) -> list[CandidateEvidence]:
-    """Return the evidence from means that is still valid in another state, if its means are equal.
+    """Return the evidence that is still valid in another state.
 
-    A line, for example, changes nothing in them.
+    A line changes nothing in the means, and in a band that is free already nothing but lines.
     """
-    if before.baseline is not now.baseline or _given_mean_columns(before) != _given_mean_columns(
-        now
-    ):
+    if before.baseline is not now.baseline or not _is_given_alike(before, now, _MEAN_STATISTICS):
         return []
+    is_same_model = (
+        _is_given_alike(before, now, {name for name, _ in (*before.given, *now.given)} - {"line"})
+        and np.array_equal(before.weight, now.weight)
+        and np.array_equal(before.masked, now.masked)
+    )
+    if is_same_model and before.blocks.equals(now.blocks):
+        return [one for one in found if not one.candidate.statistic.is_line]
     left, right = (
         state.blocks.drop_vars(_TAIL_VARIABLES, errors="ignore") for state in (before, now)
     )
@@ -91,13 +97,17 @@ def reusable_mean_evidence(
     )
 
 
-def _given_mean_columns(state: State) -> dict[tuple[str, str], list[int]]:
-    """Return the identities of the columns given to the means."""
-    return {
-        key: [id(column) for column in columns]
-        for key, columns in state.given.items()
-        if key[0] in ("mean", "sub_block") and columns
-    }
+def _is_given_alike(before: State, now: State, statistics: Collection[str]) -> bool:
+    """Return whether the same columns are given to some statistics in two states."""
+    left, right = (
+        {
+            key: [id(column) for column in columns]
+            for key, columns in state.given.items()
+            if key[0] in statistics and columns
+        }
+        for state in (before, now)
+    )
+    return left == right
 
 
 def evidence_by_effect(found: Sequence[CandidateEvidence]) -> dict[str, Array]:

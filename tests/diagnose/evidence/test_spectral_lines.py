@@ -11,6 +11,7 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence, line_skirt
+from gyrostab.diagnose.identify import selection
 from gyrostab.diagnose.identify.components import group_components, merge_lines
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.forward_search import name_effects
@@ -19,7 +20,7 @@ from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.filter_response import undo_filter
 from gyrostab.diagnose.predict.linear_model import initial_state
-from gyrostab.diagnose.predict.search import compute_evidence, reusable_mean_evidence
+from gyrostab.diagnose.predict.search import compute_evidence, reusable_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.diagnose.statistics.spectral_line import estimate_line
@@ -59,15 +60,24 @@ def test_a_steady_line_is_found_under_a_changing_noise_level() -> None:
 
 
 def sines(
-    amplitudes: dict[float, float], *, wander: float = 0.0, size: int = 18_000, axes: int = 2
+    amplitudes: dict[float, float],
+    *,
+    wander: float = 0.0,
+    size: int = 18_000,
+    axes: int = 2,
+    jump: float = 0.0,
 ) -> xr.Dataset:
-    """White noise of 0.57 deg/h with sines of wandering phase [rad] on the first axis."""
+    """White noise of 0.57 deg/h with sines of wandering phase [rad] on the first axis.
+
+    The last axis may have a jump [deg/h] in the middle.
+    """
     rng = np.random.default_rng(2)
     t = np.arange(size) / 10.0
     rates = 0.57 * rng.standard_normal((axes, size))
     for frequency, amplitude in amplitudes.items():
         phase = np.cumsum(rng.normal(0.0, wander / np.sqrt(size), size))
         rates[0] += amplitude * np.sin(2.0 * np.pi * frequency * t + phase)
+    rates[-1, size // 2 :] += jump
     return reduce_log(make_log(rates, rate=10.0, unit="deg/h"))
 
 
@@ -114,14 +124,42 @@ def test_a_line_does_not_change_the_evidence_of_means() -> None:
     line, jump = (group_components(found)[effect][0] for effect in ("spectral_line", "bias_jump"))
     assert line.evidence_nats > 10.0
     named = condition_on(state, [line])
-    kept = reusable_mean_evidence(found, state, named)
+    kept = reusable_evidence(found, state, named)
     assert {one.candidate.statistic.name for one in kept} == {"mean", "telegraph"}
     again = compute_evidence([one.candidate for one in kept], named.blocks, named, folds)
     for one, other in zip(kept, again, strict=True):
         np.testing.assert_array_equal(one.evidence_nats, other.evidence_nats)
-    assert not reusable_mean_evidence(found, state, condition_on(state, [jump]))
+    assert not reusable_evidence(found, state, condition_on(state, [jump]))
     lost = replace(state, blocks=blocks.assign(mean=blocks["mean"].where(blocks["begin"] > 0.0)))
-    assert not reusable_mean_evidence(found, state, lost)
+    assert not reusable_evidence(found, state, lost)
+
+
+def test_another_line_in_a_free_band_changes_the_evidence_of_lines_only() -> None:
+    blocks = sines({0.7: 0.4}, size=9_000, axes=2)
+    state, folds = initial_state(blocks, calibrate_noise(blocks)), fold_blocks(blocks)
+    candidates, _ = effect_candidates(blocks, state.baseline["coefficient"])
+    line = group_components(compute_evidence(candidates, blocks, state, folds))["spectral_line"][0]
+    first = condition_on(state, [line])
+    second = condition_on(first, [replace(line, place=line.place + 1)])
+    found = compute_evidence(candidates, blocks, first, folds)
+    kept = reusable_evidence(found, first, second)
+    assert {one.candidate.statistic.name for one in found} - {
+        one.candidate.statistic.name for one in kept
+    } == {"spectral_line"}
+    again = compute_evidence([one.candidate for one in kept], second.blocks, second, folds)
+    for one, other in zip(kept, again, strict=True):
+        np.testing.assert_array_equal(one.evidence_nats, other.evidence_nats)
+
+
+def test_more_lines_than_are_named_do_not_end_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(selection, "MAX_LINES", 1)
+    blocks = sines({0.7: 0.3, 2.03: 0.25}, size=12_000, jump=0.25)
+    baseline, records = nulls(blocks, 40)
+    found = name_effects(blocks, baseline, records).identified
+    assert sorted(one.effect for one in found) == ["bias_jump", "spectral_line"]
+    line = next(one for one in found if one.effect == "spectral_line")
+    jump = next(one for one in found if one.effect == "bias_jump")
+    assert line.evidence_nats > jump.evidence_nats
 
 
 # --------------------------------------------------------------------------------
