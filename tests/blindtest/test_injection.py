@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 
 from gyrostab.blindtest.generator.detection_limits import (
     NATS,
+    learned_nats,
     mean_size,
     shared_size,
     variance_size,
@@ -54,6 +55,10 @@ def test_measured_limits_match_closed_forms_in_white_noise():
     wave = np.zeros((3, plain.size))
     wave[2] = 0.1 * np.sin(np.arange(plain.size))
     assert mean_size(real, wave) == pytest.approx(mean_size(plain, wave), rel=0.25)
+    for values in (mean, wave):  # a fit takes some of a slow mean, and little of a wave
+        assert learned_nats(real, values) == pytest.approx(learned_nats(plain, values), rel=0.25)
+    assert learned_nats(real, mean) < 0.7 * NATS * mean_size(real, mean) ** 2
+    assert learned_nats(real, wave) > 0.7 * NATS * mean_size(real, wave) ** 2
     assert variance_size(real, bursts()) == pytest.approx(variance_size(plain, bursts()), rel=0.2)
     pairs = np.array([0.05, -0.03, 0.0])
     assert shared_size(real, pairs) == pytest.approx(shared_size(plain, pairs), rel=0.1)

@@ -115,6 +115,8 @@ def learned_nats(scenario: Scenario, mean: Array) -> float:
 
     The fit without the mean attributes a slow mean to angle random walk, bias instability and rate
     random walk in part, which reduces the evidence compared with noise that is known beforehand.
+    In measured noise the fit may scale the measured spectrum, and add bias instability and rate
+    random walk.
 
     Parameters
     ----------
@@ -200,19 +202,21 @@ def _divergence_from_noise(
 
     `power` [(deg/h)2/Hz] is that of a known mean or, if `random`, a density.
     """
-    noise, rate = scenario.noise[axis], scenario.rate
+    noise, rate, measured = scenario.noise[axis], scenario.rate, scenario.measured
     first = np.unique(np.geomspace(1, f.size, _SPECTRUM_BANDS).astype(np.int64)) - 1
     count = np.diff(np.append(first, f.size))
     f, power = (np.add.reduceat(values, first) / count for values in (f, power))
-    known = floor_psd(f, noise=noise, rate=rate)
+    terms = {term: floor_psd(f, noise={term: 1.0}, rate=rate) for term in "NBK"}
+    if measured is None:
+        known = floor_psd(f, noise=noise, rate=rate)
+        alone = np.stack(
+            [floor_psd(f, noise={"Q": noise.get("Q", 0.0)}, rate=rate), *terms.values()]
+        )
+    else:
+        known = np.add.reduceat(measured.lines[axis], first) / count
+        alone = np.stack([np.zeros_like(known), known, terms["B"], terms["K"]])
     if random:
         known, power = known + power, np.zeros_like(power)
-    alone = np.stack(
-        [
-            floor_psd(f, noise={"Q": noise.get("Q", 0.0)}, rate=rate),
-            *(floor_psd(f, noise={term: 1.0}, rate=rate) for term in "NBK"),
-        ]
-    )
 
     def apart(logarithms: Array) -> float:
         ratio = known / (alone[0] + np.exp(logarithms) @ alone[1:])

@@ -165,7 +165,9 @@ def _describe_injections(rows: Sequence[Mapping[str, Any]]) -> list[str]:
             "cases."
         ]
     lines = [
-        f"{line['recording']}, {line['effect']} at {line['strength']:g}: "
+        f"{line['recording']}, {line['effect']} at {line['strength']:g}"
+        + (f" ({line['learned_strength']:.2g} in fitted noise)" if line["learned_strength"] else "")
+        + ": "
         + ("named" if line["named"] else "not named")
         + (", as in the untouched copy" if line["there_before"] else "")
         + "".join(

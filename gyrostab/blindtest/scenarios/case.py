@@ -208,10 +208,6 @@ def _learned_nats(scenario: Scenario, effect: Effect) -> float:
 
 
 def _describe_effect(scenario: Scenario, effect: Effect, strength: float) -> dict[str, Any]:
-    # Five terms do not describe real noise, so no learned noise either.
-    learned = (
-        {} if scenario.measured is not None else {"learned_nats": _learned_nats(scenario, effect)}
-    )
     waveform = {}
     if effect.mean is not None:
         waveform = {
@@ -228,7 +224,7 @@ def _describe_effect(scenario: Scenario, effect: Effect, strength: float) -> dic
         "strength": float(strength),
         "size": float(effect.size),
         "expected_nats": float(effect.nats),
-        **learned,
+        "learned_nats": _learned_nats(scenario, effect),
         "tau_min_s": float(effect.tau[0]),
         "tau_max_s": float(effect.tau[1]),
         "localised": effect.active is not None,

@@ -9,7 +9,7 @@ import pandas as pd
 
 from gyrostab.blindtest.generator.catalogue import merge_ambiguous
 from gyrostab.blindtest.scoring.proportions import share
-from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH
+from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH, SURE_STRENGTH
 
 __all__ = ["injection_differences", "injection_table"]
 
@@ -22,7 +22,8 @@ def injection_differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
     Returns
     -------
     list of dict
-        ``index``, ``recording``, ``effect``, ``strength``; ``before``: names in the untouched copy;
+        ``index``, ``recording``, ``effect``, ``strength``, ``learned_strength`` (in fitted noise;
+        None for truths without it); ``before``: names in the untouched copy;
         ``there_before``: the effect's ambiguity set is among them; ``named``: it is named in the
         injected copy; ``others``: other names added by the injection; ``flipped`` and ``reversed``:
         names added by reversing sign or time, sets merged.
@@ -44,6 +45,7 @@ def injection_differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
                 "recording": injected["recording"],
                 "effect": injected["effect"],
                 "strength": injected["strength"],
+                "learned_strength": injected["learned_strength"],
                 "before": sorted(_names_given(copies["untouched"])),
                 "there_before": bool(_names_given(copies["untouched"]) & mine),
                 "named": bool(_names_given(injected) & mine),
@@ -76,6 +78,11 @@ def injection_table(rows: Sequence[Row]) -> pd.DataFrame:
         share(
             f"injections of strength {CLEAR_STRENGTH:g} or more: named correctly",
             (line["named"] for line in new if line["strength"] >= CLEAR_STRENGTH),
+        ),
+        share(
+            f"injections of {SURE_STRENGTH:g} times the limit in fitted noise or more: named "
+            "correctly",
+            (line["named"] for line in new if (line["learned_strength"] or 0.0) >= SURE_STRENGTH),
         ),
         share("injection adds another name", (bool(line["others"]) for line in found)),
         share("reversing the sign adds a name", (bool(line["flipped"]) for line in found)),
