@@ -47,6 +47,17 @@ def bursts() -> np.ndarray:
     return ratio
 
 
+def test_the_stop_band_of_an_anti_alias_filter_does_not_count():
+    record = white(0)
+    lines = fft.rfft(record, axis=1)
+    lines[:, round(0.9 * lines.shape[1]) :] *= 1e-3
+    plain, real = (draw_both(values)[1] for values in (record, fft.irfft(lines, axis=1)))
+    plain, real = (replace(one, noise=scenario_of(record).noise) for one in (plain, real))
+    assert 0.8 < variance_size(real, bursts()) / variance_size(plain, bursts()) < 1.3
+    pairs = np.array([0.05, -0.03, 0.0])
+    assert 0.8 < shared_size(real, pairs) / shared_size(plain, pairs) < 1.3
+
+
 def test_measured_limits_match_closed_forms_in_white_noise():
     plain, real = draw_both(white(0))
     mean = np.zeros((3, plain.size))

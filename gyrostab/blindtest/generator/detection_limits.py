@@ -46,6 +46,7 @@ Array = NDArray[np.float64]
 #: Log-likelihood at the limit.
 NATS = 5.7
 _SPECTRUM_BANDS = 400  # of the spectrum
+_MAX_WHITE_SHARE = 2.0  # of a level; both are estimates, and more than twice is no white noise
 
 
 def mean_size(scenario: Scenario, mean: Array, *, white: bool = False) -> float:
@@ -276,11 +277,21 @@ def _measured_nats(scenario: Scenario, ratio: Array) -> float:
             "already; inject an effect that varies in time"
         )
     if ratio.ndim == 2:  # only white noise can be added
-        white = np.array([white_level(noise["N"]) ** 2 for noise in scenario.noise])
         more = ratio / ratio.min(axis=1, keepdims=True) - 1
-        ratio = 1 + more[:, :, None] * (white[:, None] / scenario.measured.level)[:, None, :]
+        ratio = 1 + more[:, :, None] * _white_shares(scenario)[:, None, :]
     change = scenario.measured.blocks(np.log(ratio))
     return sum(scenario.measured.change_nats(rows, axis=axis) for axis, rows in enumerate(change))
+
+
+def _white_shares(scenario: Scenario) -> Array:
+    """Compute the share (axis, band) that white noise has of the measured level, at most 2.
+
+    Behind the anti-alias filter of a logger there is less than white noise. Noise that is added to
+    a recording shows there as the noise of no gyro would.
+    """
+    assert scenario.measured is not None
+    white = np.array([white_level(noise["N"]) ** 2 for noise in scenario.noise])
+    return np.minimum(white[:, None] / scenario.measured.level, _MAX_WHITE_SHARE)
 
 
 def variance_nats(scenario: Scenario, ratio: Array, *, quiescent: bool = True) -> float:
@@ -306,8 +317,7 @@ def shared_size(scenario: Scenario, correlations: Array) -> float:
     n = float((~scenario.missing).sum())
     worth = np.asarray(correlations) ** 2
     if scenario.measured is not None:  # the coherence falls where an axis has more than white noise
-        white = np.array([white_level(noise["N"]) ** 2 for noise in scenario.noise])
-        part = white[:, None] / scenario.measured.level
+        part = _white_shares(scenario)
         worth = worth * np.array([(part[i] * part[j]).mean() for i, j in ((0, 1), (0, 2), (1, 2))])
     return math.sqrt(n * float(worth.sum()) / 2 / NATS)
 

@@ -1,4 +1,4 @@
-"""Group spectral lines into families: harmonics of a fundamental, and side bands of a line."""
+"""Group spectral lines into families: harmonics, side bands of a line, a shaped spectrum."""
 
 from __future__ import annotations
 
@@ -10,11 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc
 
-__all__ = ["find_families", "group_families"]
+__all__ = ["find_families", "group_families", "group_unrelated"]
 
 Array = NDArray[np.float64]
 #: Probability that lines without relation form a family, below which they are one.
 MAX_CHANCE = 0.05
+#: More lines without a family are one shaped spectrum, not as many findings. Design choice.
+MAX_UNRELATED_LINES = 3
+#: Family of the lines of a shaped spectrum.
+UNRELATED = "lines without a common spacing"
 _MAX_LOWEST_HARMONIC = 4  # the lowest line of a family may be this multiple of the fundamental
 
 
@@ -95,6 +99,20 @@ def _collect_multiples(
             if any(orders):
                 spacing = float(np.dot(orders, distance[members]) / np.dot(orders, orders))
     return spacing, members
+
+
+def group_unrelated(families: Sequence[str | None]) -> list[str | None]:
+    """Make one family of the lines without a family if they are more than three.
+
+    Examples
+    --------
+    >>> group_unrelated([None, "harmonics of 10 Hz", None])
+    [None, 'harmonics of 10 Hz', None]
+    >>> group_unrelated([None] * 4)[0]
+    'lines without a common spacing'
+    """
+    is_shaped = sum(family is None for family in families) > MAX_UNRELATED_LINES
+    return [family or (UNRELATED if is_shaped else None) for family in families]
 
 
 def group_families(effects: Sequence[Mapping[str, Any]]) -> list[list[Mapping[str, Any]]]:

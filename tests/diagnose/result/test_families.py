@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gyrostab.diagnose.result.families import MAX_CHANCE, find_families
+from gyrostab.diagnose.result.families import MAX_CHANCE, find_families, group_unrelated
 from gyrostab.report import write_diagnosis_report
 from tests.support.diagnosed import content, diagnosis
 
@@ -36,6 +36,17 @@ def test_unrelated_lines_are_rarely_a_family():
     rng = np.random.default_rng(1)
     wrong = sum(any(find_families(rng.uniform(0.1, 50.0, 5), **SPECTRUM)) for _ in range(200))
     assert wrong <= 200 * MAX_CHANCE
+
+
+def test_many_lines_without_a_family_are_one_finding():
+    comb = [10.0, 20.0, 30.0, 40.0]
+    unrelated = [7.013, 13.77, 23.31, 36.9]
+    few, many = (
+        group_unrelated(find_families([*comb, *some], **SPECTRUM))
+        for some in (unrelated[:3], unrelated)
+    )
+    assert few[4:] == [None] * 3
+    assert set(many) == {"harmonics of 10 Hz", "lines without a common spacing"}
 
 
 def test_a_family_is_one_finding_in_text_and_report(
