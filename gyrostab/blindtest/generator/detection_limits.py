@@ -46,7 +46,7 @@ Array = NDArray[np.float64]
 #: Log-likelihood at the limit.
 NATS = 5.7
 _SPECTRUM_BANDS = 400  # of the spectrum
-_MAX_WHITE_SHARE = 2.0  # of a level; both are estimates, and more than twice is no white noise
+_MAX_WHITE_SHARE = 2.0  # of a level; above 1 only because both are estimates
 
 
 def mean_size(scenario: Scenario, mean: Array, *, white: bool = False) -> float:
