@@ -58,6 +58,20 @@ def test_the_stop_band_of_an_anti_alias_filter_does_not_count():
     assert 0.8 < shared_size(real, pairs) / shared_size(plain, pairs) < 1.3
 
 
+def test_added_noise_passes_through_the_anti_alias_filter():
+    record = white(0)
+    lines = fft.rfft(record, axis=1)
+    lines[:, round(0.9 * lines.shape[1]) :] *= 1e-3
+    stop = slice(round(0.96 * lines.shape[1]), None)  # the last of 24 bands
+    log = make_log(fft.irfft(lines, axis=1), {}, start=0, rate=RATE)
+    copies = inject_effect(log, "temperature_noise", 8.0, np.random.default_rng(5))
+    before, after = (
+        np.abs(fft.rfft(copies[name][0]["rate"].values, axis=1)[:, stop]) ** 2
+        for name in ("untouched", "injected")
+    )
+    assert 1.0 < after.sum() / before.sum() < 3.0
+
+
 def test_measured_limits_match_closed_forms_in_white_noise():
     plain, real = draw_both(white(0))
     mean = np.zeros((3, plain.size))

@@ -39,6 +39,7 @@ __all__ = [
     "shared_size",
     "variance_nats",
     "variance_size",
+    "white_shares",
 ]
 
 Array = NDArray[np.float64]
@@ -278,16 +279,16 @@ def _measured_nats(scenario: Scenario, ratio: Array) -> float:
         )
     if ratio.ndim == 2:  # only white noise can be added
         more = ratio / ratio.min(axis=1, keepdims=True) - 1
-        ratio = 1 + more[:, :, None] * _white_shares(scenario)[:, None, :]
+        ratio = 1 + more[:, :, None] * white_shares(scenario)[:, None, :]
     change = scenario.measured.blocks(np.log(ratio))
     return sum(scenario.measured.change_nats(rows, axis=axis) for axis, rows in enumerate(change))
 
 
-def _white_shares(scenario: Scenario) -> Array:
+def white_shares(scenario: Scenario) -> Array:
     """Compute the share (axis, band) that white noise has of the measured level, at most 2.
 
-    Behind the anti-alias filter of a logger there is less than white noise. Noise that is added to
-    a recording shows there as the noise of no gyro would.
+    Behind the anti-alias filter of a logger there is less than white noise, and noise that is
+    added to the recording passes through the same filter.
     """
     assert scenario.measured is not None
     white = np.array([white_level(noise["N"]) ** 2 for noise in scenario.noise])
@@ -317,7 +318,7 @@ def shared_size(scenario: Scenario, correlations: Array) -> float:
     n = float((~scenario.missing).sum())
     worth = np.asarray(correlations) ** 2
     if scenario.measured is not None:  # the coherence falls where an axis has more than white noise
-        part = _white_shares(scenario)
+        part = white_shares(scenario)
         worth = worth * np.array([(part[i] * part[j]).mean() for i, j in ((0, 1), (0, 2), (1, 2))])
     return math.sqrt(n * float(worth.sum()) / 2 / NATS)
 

@@ -9,9 +9,12 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy import fft
 
 from gyrostab.blindtest.generator.catalogue import CATALOGUE
-from gyrostab.blindtest.generator.measured_noise import MeasuredNoise, measure_noise
+from gyrostab.blindtest.generator.detection_limits import white_shares
+from gyrostab.blindtest.generator.measured_noise import BANDS, MeasuredNoise, measure_noise
+from gyrostab.blindtest.generator.noise_floor import white_level
 from gyrostab.blindtest.generator.record import add_channels, make_channels, make_gap_variables
 from gyrostab.blindtest.generator.scenario import Effect, Scenario, draw_scenario, to_samples
 from gyrostab.blindtest.scenarios.case import describe_truth
@@ -85,13 +88,25 @@ def _compute_addition(scenario: Scenario, effect: Effect, rng: np.random.Generat
         if part is not None:
             total += part
     sd = [60.0 * noise["N"] * math.sqrt(scenario.rate) for noise in scenario.noise]
+    added = np.zeros_like(total)
     if effect.variance is not None:
         for i, ratio in enumerate(effect.variance):
             more = np.sqrt(to_samples(scenario, ratio / ratio.min()) - 1 + 1e-15)
-            total[i] += more * sd[i] * rng.standard_normal(scenario.size) if np.ptp(ratio) else 0.0
+            added[i] += more * sd[i] * rng.standard_normal(scenario.size) if np.ptp(ratio) else 0.0
     if effect.common is not None:
-        total += effect.common * np.array(sd)[:, None]
-    return total
+        added += effect.common * np.array(sd)[:, None]
+    return total + _filter_like_record(scenario, added)
+
+
+def _filter_like_record(scenario: Scenario, noise: Array) -> Array:
+    """Remove from white noise (axis, time) what the logger's filter removed from the record."""
+    assert scenario.measured is not None
+    level = scenario.measured.level
+    white = np.array([white_level(one["N"]) ** 2 for one in scenario.noise])
+    response = np.minimum(white_shares(scenario) * level / white[:, None], 1.0)
+    lines = fft.rfft(noise, axis=1)
+    band = np.minimum(np.arange(lines.shape[1]) * BANDS // lines.shape[1], BANDS - 1)
+    return np.asarray(fft.irfft(lines * np.sqrt(response[:, band]), noise.shape[1], axis=1))
 
 
 def quantization_step(values: Array) -> float:
