@@ -60,8 +60,9 @@ def _mean_noise_excess(
     Inputs (block, band).
     """
     known = np.where(np.isfinite(power) & np.isfinite(shape) & quiet[:, None], shape, 0.0)
-    off = (known * np.nan_to_num(power / spectrum - 1.0)).sum(axis=0)
-    explained = np.abs(off) <= settings.excess_sigma * np.sqrt(known.sum(axis=0))
+    total = known.sum(axis=0)
+    ratio = (known * np.nan_to_num(power / spectrum)).sum(axis=0) / np.maximum(total, 1e-300)
+    explained = ~_is_foreign(ratio, total, settings)
     if explained.sum() >= MIN_BANDS:
         power, shape, spectrum = power[:, explained], shape[:, explained], spectrum[:, explained]
     count = np.nan_to_num(shape).sum(axis=0) / max(1, int(np.isfinite(shape).all(axis=1).sum()))
@@ -162,7 +163,7 @@ def calibrate_axes(
             )
         fit = _keep_explained_bands(
             _reduce_weights(fit, shape[row][use], rest[row][use], common[row][use]),
-            min_sigma=settings.excess_sigma,
+            settings,
         )
         square = np.maximum(fit_squares(fit)[0], [0.0, floor_square(fit), 0.0, 0.0])
         variance = white_variance(blocks, np.tile(square, (len(mean), 1)))[row]
@@ -182,15 +183,29 @@ def calibrate_axes(
     return posteriors
 
 
-def _keep_explained_bands(fit: Fit, *, min_sigma: float) -> Fit:
+def _is_foreign(ratio: Array, weight: Array, settings: Settings) -> NDArray[np.bool_]:
+    """Return whether the larger part of a power, or of its expected value, is not in the other.
+
+    `ratio` is power over expected power, with a gamma distribution of the shape `weight`.
+    """
+    off = np.abs(ratio - 1.0) * np.sqrt(weight) > settings.excess_sigma
+    return np.asarray(
+        off & ((ratio < settings.majority_share) | (ratio * settings.majority_share > 1.0))
+    )
+
+
+def _keep_explained_bands(fit: Fit, settings: Settings) -> Fit:
     """Drop the bands that the noise terms do not explain, the worst first.
 
-    Lines and humps would raise the noise in all other bands.
+    Lines and humps would raise the noise in all other bands. A spectrum that the terms describe to
+    a factor of two keeps all bands: a filter of the logger would otherwise seem to differ by axis.
     """
+    if not _is_foreign(_misfit(fit), fit.weight, settings).any():
+        return fit
     while fit.power.size > MIN_BANDS:
-        off = np.abs(fit.power / (fit.columns @ fit_squares(fit)[0]) - 1.0) * np.sqrt(fit.weight)
+        off = np.abs(_misfit(fit) - 1.0) * np.sqrt(fit.weight)
         worst = int(off.argmax())
-        if off[worst] <= min_sigma:
+        if off[worst] <= settings.excess_sigma:
             break
         fit = fit._replace(
             **{
@@ -199,6 +214,11 @@ def _keep_explained_bands(fit: Fit, *, min_sigma: float) -> Fit:
             }
         )
     return fit
+
+
+def _misfit(fit: Fit) -> Array:
+    """Return the powers over those of the noise terms that fit them best."""
+    return np.asarray(fit.power / (fit.columns @ fit_squares(fit)[0]))
 
 
 def _reduce_weights(fit: Fit, shape: Array, rest: Array, common: Array) -> Fit:
