@@ -135,7 +135,7 @@ def test_a_line_does_not_change_the_evidence_of_means() -> None:
 
 
 def test_another_line_in_a_free_band_changes_the_evidence_of_lines_only() -> None:
-    blocks = sines({0.7: 0.4}, size=9_000, axes=2)
+    blocks = sines({3.4: 0.4}, size=9_000, axes=2)
     state, folds = initial_state(blocks, calibrate_noise(blocks)), fold_blocks(blocks)
     candidates, _ = effect_candidates(blocks, state.baseline["coefficient"])
     line = group_components(compute_evidence(candidates, blocks, state, folds))["spectral_line"][0]
