@@ -301,8 +301,8 @@ class Settings:
         4.0,
         "standard deviation",
         "Excess above which the noise of the mean of a block is raised, and difference from the "
-        "noise terms above which a band is left out of the calibration, or of a simulation has a "
-        "separate form.",
+        "noise terms above which a band does not count in the noise of means, or has a separate "
+        "form in a simulation.",
         "P = 6e-5 a block of 1000 lines, 0.4 of 6000 blocks, and then by the excess itself "
         "(benchmarks/settings_derivations.py)",
     )

@@ -161,11 +161,9 @@ def calibrate_axes(
                 "too few to calibrate on; "
                 "name other quiet time, or diagnose a part of the record with fewer gaps"
             )
-        fit = _keep_explained_bands(
-            _reduce_weights(fit, shape[row][use], rest[row][use], common[row][use]),
-            settings,
-        )
-        square = np.maximum(fit_squares(fit)[0], [0.0, floor_square(fit), 0.0, 0.0])
+        fit = _reduce_weights(fit, shape[row][use], rest[row][use], common[row][use])
+        explained = _keep_explained_bands(fit, settings)
+        square = np.maximum(fit_squares(explained)[0], [0.0, floor_square(explained), 0.0, 0.0])
         variance = white_variance(blocks, np.tile(square, (len(mean), 1)))[row]
         present = use & np.isfinite(mean[row])
         posteriors.append(
@@ -178,7 +176,7 @@ def calibrate_axes(
                 draws=DRAWS,
                 rng=np.random.default_rng(row),
                 max_disagreement_nats=settings.disagreement_nats,
-            )
+            )._replace(of_means=None if explained is fit else square)
         )
     return posteriors
 
@@ -197,8 +195,8 @@ def _is_foreign(ratio: Array, weight: Array, settings: Settings) -> NDArray[np.b
 def _keep_explained_bands(fit: Fit, settings: Settings) -> Fit:
     """Drop the bands that the noise terms do not explain, the worst first.
 
-    Lines and humps would raise the noise in all other bands. A spectrum that the terms describe to
-    a factor of two keeps all bands: a filter of the logger would otherwise seem to differ by axis.
+    Lines and humps would raise the noise of block means, to which they add nothing. A spectrum
+    that the terms describe to a factor of two keeps all bands.
     """
     if not _is_foreign(_misfit(fit), fit.weight, settings).any():
         return fit
@@ -256,17 +254,23 @@ def assemble_baseline(
     expected = noise if spectrum is None else spectrum
     power, shape = blocks["power"].values, blocks["shape"].values
     floor = np.array([1e-3 * levels.min() / HOUR for levels in expected])
-    white = white_variance(
-        blocks,
-        np.stack(
-            [square[:, 0], np.maximum(square[:, 1], floor), square[:, 2], square[:, 3]], axis=1
-        ),
+    of_means = np.stack(
+        [
+            posterior.square if posterior.of_means is None else posterior.of_means
+            for posterior in posteriors
+        ]
     )
+    of_means[:, 1] = np.maximum(of_means[:, 1], floor)
+    white = white_variance(blocks, of_means)
     white = white * np.maximum(expected[..., 0] / noise[..., 0], 0.1)
+    known = expected.copy()
+    for row, posterior in enumerate(posteriors):
+        if posterior.of_means is not None:
+            known[row] *= columns[row] @ posterior.of_means / noise[row]
     variance = white * np.stack(
         [
             _mean_noise_excess(*arrays, settings)
-            for arrays in zip(power, shape, expected, quiet, strict=True)
+            for arrays in zip(power, shape, known, quiet, strict=True)
         ]
     )
     span = blocks.sizes["block"] * float(blocks.attrs["block_s"])

@@ -73,6 +73,8 @@ class Posterior(NamedTuple):
     #: (draw, 2): squares of B and K in the block means; the same as in `draws` when `joined`.
     slow: Array
     joined: bool  # whether band powers and means agree about B and K
+    #: (4,): squares that fit the bands best which the noise terms explain; None if these are all.
+    of_means: Array | None = None
 
 
 def average_blocks(power: Array, shape: Array, columns: Array) -> Fit:
