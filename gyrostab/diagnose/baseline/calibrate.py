@@ -313,7 +313,15 @@ def assemble_baseline(
     return xr.Dataset(
         label_variables(variables, BASELINE),
         coords={**coordinates, "term": list(TERMS), "noise": list(NOISE), "slow": ["B", "K"]},
-        attrs={**attrs, "slow_noise_apart": not_joined},
+        attrs={
+            **attrs,
+            "slow_noise_apart": not_joined,
+            "white_noise_of_means_apart": [
+                str(axis)
+                for axis, posterior in zip(blocks["axis"].values, posteriors, strict=True)
+                if posterior.of_means is not None
+            ],
+        },
     )
 
 

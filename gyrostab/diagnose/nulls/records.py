@@ -338,6 +338,8 @@ def _draw_means(setup: _NullSetup, squares: Array, slow: Array, rng: np.random.G
     level = np.divide(
         drawn, usual, out=np.ones_like(drawn), where=np.broadcast_to(usual > 0.0, drawn.shape)
     )
+    apart = np.isin(blocks["axis"].values, baseline.attrs.get("white_noise_of_means_apart", ()))
+    level[:, apart] = 1.0  # the draws are of the noise of the powers
     white = np.sqrt(baseline["mean_variance"].values * level)
     times = flicker_times(1.0 / step, low=1.0 / (2.0 * np.pi * 8.0 * n * step))
     drawn = (

@@ -362,6 +362,10 @@ def test_a_hump_within_blocks_does_not_raise_the_noise_of_their_means():
         "same",
     )
     shaken = plain.assign(rate=plain["rate"] + sway)
-    baseline = calibrate_noise(reduce_log(shaken)).sel(axis="x")
-    white = 3600.0 * 0.003**2 / float(reduce_log(plain).attrs["block_s"])
+    blocks = reduce_log(shaken)
+    baseline = calibrate_noise(blocks)
+    white = 3600.0 * 0.003**2 / float(blocks.attrs["block_s"])
     assert 0.8 < float(baseline["mean_variance"].median()) / white < 1.3
+    (nulls,) = null_records(blocks, baseline, count=20, rng=rng)
+    scatter = 0.5 * nulls["mean"].diff("block").var()
+    assert 0.7 < float(scatter) / white < 1.6
