@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 import xarray as xr
@@ -253,6 +255,10 @@ class Search:
         if not passing:
             return None
         rivals = self._order_rivals(passing, components, state)
+        pair = None if rivals else self._find_pair(passing, components, required, state)
+        if pair is not None:
+            key, components[key], state = pair
+            rivals = [key]
         rejected: set[str] = set()
         for key in rivals:
             shifts = passes_time_shift_test(components[key], state, self.folds)
@@ -339,6 +345,70 @@ class Search:
                 self.settings.ambiguous_nats * is_later[key] - sum_evidence(components[key])
             ),
         )
+
+    def _find_pair(
+        self,
+        passing: list[str],
+        components: dict[str, list[Component]],
+        required: dict[str, float],
+        state: State,
+    ) -> tuple[str, list[Component], State] | None:
+        """Find two effects that together explain more than the nuisance alternative.
+
+        An alternative of any form explains more than each of them while the other is not in the
+        model. The evidence of a pair is the lower one of both orders: an effect that is fitted
+        alone to both may have a form that the second one has to undo.
+
+        Returns
+        -------
+        key : str
+            The stronger effect.
+        components : list of Component
+            What it explains with the other in the model.
+        state : State
+            With the other in the model.
+        """
+        alternative = components[passing[0]]
+        keys = [
+            key
+            for key in passing
+            if not key.startswith("~") and components[key][0].statistic is alternative[0].statistic
+        ]
+        beside = {
+            key: self._find_beside(keys, components[key], required[key], state) for key in keys
+        }
+        totals = {
+            (first, second): sum_evidence(components[first]) + sum_evidence(found[second])
+            for first, (_, found) in beside.items()
+            for second in found
+        }
+        pairs = {
+            pair: min(totals[pair], totals[pair[::-1]])
+            for pair in combinations(keys, 2)
+            if pair in totals and pair[::-1] in totals
+        }
+        best = max(pairs, key=lambda pair: pairs[pair], default=None)
+        if best is None or pairs[best] <= sum_evidence(alternative):
+            return None
+        with_other, found = beside[best[1]]
+        return best[0], found[best[0]], with_other
+
+    def _find_beside(
+        self, keys: Sequence[str], components: list[Component], required: float, state: State
+    ) -> tuple[State, dict[str, list[Component]]]:
+        """Return which of some effects pass with these components in the model."""
+        chosen = [self._identify(components, required, (), math.nan)]
+        with_first = condition_on(state, components)
+        sought = [candidate for candidate in self.candidates if candidate.key in keys]
+        found = {}
+        for key, several in group_components(
+            self._evidence(sought, with_first), settings=self.settings
+        ).items():
+            error = form_error(several, chosen, settings=self.settings)
+            physical = is_physical(several, with_first, error=error)
+            if sum_evidence(physical) > self.threshold + error:
+                found[key] = physical
+        return with_first, found
 
     def _without_locked_lines(
         self, passing: list[str], components: dict[str, list[Component]], state: State
