@@ -14,6 +14,7 @@ from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.simulate import simulate
+from tests.support import named
 
 VARIANT = Variant({}, ("size",), np.ones((1, 1, 3)))
 
@@ -91,3 +92,23 @@ def test_two_opposite_jumps_have_evidence_only_together():
         identification.evidence_nats
         > max(one.evidence_nats for one in identification.components) + 5.0
     )
+
+
+@pytest.mark.slow
+def test_a_pair_is_found_where_any_course_explains_more_than_each():
+    heat = {
+        "profile": "ramps", "channel": "temperature", "unit": "degC",
+        "points": [[0, 30], [600, 30], [1500, 50], [2400, 30], [3600, 30]],
+    }  # fmt: skip
+    light = {
+        "profile": "ramps", "channel": "light_power", "unit": "W",
+        "points": [[0, 1e-4], [1200, 1e-4], [2100, 1.8e-4], [3000, 1e-4], [3600, 1e-4]],
+    }  # fmt: skip
+    effects = [
+        {"name": "temperature_noise", "linear": 0.01},
+        {"name": "light_power_noise", "shot": 0.4, "thermal": 0.0},
+    ]
+    blocks = named.record(effects, environment=(heat, light))
+    found = name_effects(blocks, *named.nulls(blocks))
+    assert {one.effect for one in found.identified} == {"temperature_noise", "light_power_noise"}
+    assert not found.unknown
