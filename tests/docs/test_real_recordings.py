@@ -312,7 +312,7 @@ def test_drill_string_without_a_gyro(examine, there, recordings):
     message = SCRIPT.refusal(there("drill-rig-stick-slip"))
     assert re.search(
         r"^drill_rig\.csv\.gz: no gyro column .*bit_speed, top_speed.*"
-        r"--map \"NAME=gyro_x\" --unit",
+        r"--map \"bit_speed=gyro_x\" --unit",
         message,
     )
     table = pd.read_csv(recordings("drill-rig-stick-slip/drill_rig.csv.gz"))

@@ -365,7 +365,7 @@ def _no_gyro(path: Path, headers: Sequence[str]) -> FormatError:
     columns = [column for column in distinct_columns(headers) if column.header]
     free = [c for c in columns if not TIME_PATTERN.match(c.low) and quantity_of(c.low) is None]
     candidates = (c for pattern in GYRO_PATTERNS for c in free if pattern.search(c.name))
-    likely = next(candidates, None)
+    likely = next(candidates, free[0] if free else None)
     low = likely.header.lower() if likely else ""
     unit = (
         "deg/h" if re.search(r"deg_?(per_?|/)?h|dph", low) else "rad/s" if "rad" in low else "deg/s"

@@ -243,12 +243,6 @@ def test_unknown_columns_are_kept_with_a_unit_and_left_out_without(tmp_path: Pat
             FormatError,
             r'no gyro column.*--map "NAME=gyro_x"',
         ),
-        (
-            "well,depth_m\nA-7,2\nA-7,3\n",
-            {},
-            FormatError,
-            r'no gyro column.*Columns: well, depth_m.*--map "NAME=gyro_x"',
-        ),
         (b"", {}, FormatError, r"log.csv: the file is empty"),
         (b"\n\n  \n", {}, FormatError, r"empty"),
         ("# only\n# comments\n", {}, FormatError, r"only 2 blank or comment lines"),
