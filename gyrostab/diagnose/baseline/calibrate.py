@@ -81,12 +81,8 @@ def grid_values(term: str, centre: float, scale: float) -> Array:
 
 
 def _coarse_grid(posterior: Posterior, density: float, span: float) -> tuple[Array, Array, Array]:
-    """Return K and B of the coarse grid, and the log posterior around every point.
-
-    The grid is centred on the root mean square: the median of a posterior with two modes, such as
-    no random walk or a clear one, leaves the higher mode between two points.
-    """
-    centres = np.sqrt(np.mean(posterior.slow, axis=0))
+    """Return K and B of the coarse grid, and the log posterior around every point."""
+    centres = np.sqrt(np.median(posterior.slow, axis=0))
     least = visible_coefficients(density, span)
     K = grid_values("K", float(centres[1]), least[0])
     B = grid_values("B", float(centres[0]), least[1])

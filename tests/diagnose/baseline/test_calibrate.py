@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import _coarse_grid, calibrate_noise
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.expected_statistics import (
     common_variance,
     noise_powers,
@@ -14,7 +14,7 @@ from gyrostab.diagnose.baseline.expected_statistics import (
 )
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.baseline.from_simulation import baseline_from_simulation
-from gyrostab.diagnose.baseline.posterior import Fit, Posterior, fit_squares
+from gyrostab.diagnose.baseline.posterior import Fit, fit_squares
 from gyrostab.diagnose.baseline.quiescent import find_quiescent_blocks
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -182,18 +182,6 @@ def test_the_grid_contains_calibrated_and_much_slower_noise():
     assert K.max() > 5.0 * 0.3
     assert K.min() == 0.0
     assert np.exp(baseline["grid_prior"].values[0]).sum() == pytest.approx(1.0)
-
-
-def test_the_grid_has_a_point_near_either_of_two_modes():
-    weak, clear = 1e-5, 0.0073  # K [deg/h^1.5]; the means just show the second
-    slow = np.zeros((100, 2))
-    slow[:60, 1], slow[60:, 1] = weak**2, clear**2
-    K, B = np.array([weak, clear]), np.full(2, 1e-4)
-    empty = np.empty(0)
-    posterior = Posterior(empty, empty, K, B, np.array([0.6, 0.4]), np.zeros((100, 4)), slow, True)
-    grid, _, log_weight = _coarse_grid(posterior, 2.0 * 0.003**2 * 3600.0, 3600.0)
-    assert np.abs(np.log(grid[grid > 0.0] / clear)).min() < np.log(2.0)
-    assert np.exp(log_weight)[grid > clear / 2.0].sum() == pytest.approx(0.4)
 
 
 def test_baseline_from_a_model_includes_its_effects():
