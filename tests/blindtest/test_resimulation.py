@@ -74,12 +74,14 @@ def nats_of(recording: xr.Dataset, *effects: dict[str, Any]) -> float:
     assert lost[:, ::600].all()
     assert lost.sum() == lost[:, ::600].size
     return likelihood_ratio(
-        measure_statistics(recording), _simulate(json.dumps(effects)), _simulate("[]")
+        measure_statistics(recording),
+        _simulate_effects(json.dumps(effects)),
+        _simulate_effects("[]"),
     )
 
 
 @cache
-def _simulate(effects: str) -> list[dict[str, np.ndarray]]:
+def _simulate_effects(effects: str) -> list[dict[str, np.ndarray]]:
     return simulate_statistics(recording_of(), {"noise": NOISE, "effect": json.loads(effects)})
 
 

@@ -24,9 +24,9 @@ from gyrostab.io.datasets import open_log
 from gyrostab.jobs import checkpoint, engine, schedule
 from gyrostab.jobs.run import run
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool, run_calls
+from tests.support.crashing import WINDOW, WINDOW_OPTIONS
 
 distributed = pytest.importorskip("distributed")
-WINDOW = {"window": "4000samples", "step": "4000samples", "taus": "12"}
 PARTS = 5
 
 
@@ -359,15 +359,6 @@ def test_a_scheduler_that_dies_is_explained_and_resume_goes_on(
 
     This is the last test of the file, because it ends the scheduler of the others.
     """
-    options = [
-        "--window",
-        WINDOW["window"],
-        "--step",
-        WINDOW["step"],
-        "--taus",
-        WINDOW["taus"],
-        "--quiet-progress",
-    ]
     output = tmp_path / "out" / "product.nc"
     output.parent.mkdir()
     address, scheduler = cluster
@@ -382,7 +373,7 @@ def test_a_scheduler_that_dies_is_explained_and_resume_goes_on(
     monkeypatch.setattr(engine, "_MAX_HELD_SECONDS", 0.0)
     monkeypatch.setattr(schedule, "_CONNECT_TIMEOUT_S", 4.0)  # also that of a reconnection
     begun = time.monotonic()
-    assert main(["run", str(log), "-o", str(output), "--scheduler", address, *options]) == 2
+    assert main(["run", str(log), "-o", str(output), "--scheduler", address, *WINDOW_OPTIONS]) == 2
     assert time.monotonic() - begun < 60
     shown = capfd.readouterr().err
     assert "the dask scheduler" in shown
@@ -390,7 +381,7 @@ def test_a_scheduler_that_dies_is_explained_and_resume_goes_on(
     assert "please report" not in shown
     assert "Traceback" not in shown
     monkeypatch.setattr(engine, "write_block", checkpoint.write_block)
-    assert main(["run", str(log), "-o", str(output), "--resume", *options]) == 0
+    assert main(["run", str(log), "-o", str(output), "--resume", *WINDOW_OPTIONS]) == 0
     (tmp_path / "whole.nc").write_bytes(whole)
     expected, made = open_arrays(tmp_path / "whole.nc"), open_arrays(output)
     assert made.keys() == expected.keys()

@@ -22,17 +22,8 @@ from gyrostab.io.datasets import open_log
 from gyrostab.jobs import checkpoint, engine
 from gyrostab.jobs.job import job_folder, lock_job
 from gyrostab.time.grid import time_coordinate
-from tests.support.crashing import WINDOW
+from tests.support.crashing import WINDOW, WINDOW_OPTIONS
 
-OPTIONS = (
-    "--window",
-    WINDOW["window"],
-    "--step",
-    WINDOW["step"],
-    "--taus",
-    WINDOW["taus"],
-    "--quiet-progress",
-)
 PARTS = 5
 
 
@@ -64,7 +55,7 @@ def small(monkeypatch):
 
 
 def call(*arguments: object) -> int:
-    return main(["run", *(str(argument) for argument in (*arguments, *OPTIONS))])
+    return main(["run", *(str(argument) for argument in (*arguments, *WINDOW_OPTIONS))])
 
 
 @pytest.fixture(scope="module")

@@ -21,6 +21,11 @@ from pathlib import Path
 
 CALLS = ("replace", "rename", "fsync", "unlink", "rmdir", "mkdir")
 WINDOW = {"window": "4000samples", "step": "4000samples", "taus": "12"}
+#: The same on the command line, without progress.
+WINDOW_OPTIONS = (
+    *(word for name, value in WINDOW.items() for word in (f"--{name}", value)),
+    "--quiet-progress",
+)
 
 
 def small_parts() -> None:

@@ -198,10 +198,10 @@ def _keep_explained_bands(fit: Fit, settings: Settings) -> Fit:
     Lines and humps would raise the noise of block means, to which they add nothing. A spectrum
     that the terms describe to a factor of two keeps all bands.
     """
-    if not _is_foreign(_misfit(fit), fit.weight, settings).any():
+    if not _is_foreign(_power_ratio(fit), fit.weight, settings).any():
         return fit
     while fit.power.size > MIN_BANDS:
-        off = np.abs(_misfit(fit) - 1.0) * np.sqrt(fit.weight)
+        off = np.abs(_power_ratio(fit) - 1.0) * np.sqrt(fit.weight)
         worst = int(off.argmax())
         if off[worst] <= settings.excess_sigma:
             break
@@ -214,7 +214,7 @@ def _keep_explained_bands(fit: Fit, settings: Settings) -> Fit:
     return fit
 
 
-def _misfit(fit: Fit) -> Array:
+def _power_ratio(fit: Fit) -> Array:
     """Return the powers over those of the noise terms that fit them best."""
     return np.asarray(fit.power / (fit.columns @ fit_squares(fit)[0]))
 
