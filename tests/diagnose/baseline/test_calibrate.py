@@ -369,3 +369,19 @@ def test_a_hump_within_blocks_does_not_raise_the_noise_of_their_means():
     (nulls,) = null_records(blocks, baseline, count=20, rng=rng)
     scatter = 0.5 * nulls["mean"].diff("block").var()
     assert 0.7 < float(scatter) / white < 1.6
+
+
+def test_null_means_have_the_noise_of_means_where_it_is_apart():
+    """Draws of the noise of the powers, four times as strong, do not change the means."""
+    blocks = reduce_log(log({"N": 0.003}))
+    baseline = calibrate_noise(blocks)
+    louder = baseline.assign(posterior=4.0 * baseline["posterior"])
+    ratio = {}
+    for apart in (False, True):
+        attrs = {"white_noise_of_means_apart": list(blocks["axis"].values) if apart else []}
+        given = louder.assign_attrs(attrs)
+        (nulls,) = null_records(blocks, given, count=40, chunk=40, rng=np.random.default_rng(2))
+        steps = nulls["mean"].diff("block").var("block").mean() / 2.0
+        ratio[apart] = float(steps / baseline["mean_variance"].mean())
+    assert ratio[True] == pytest.approx(1.0, abs=0.15)
+    assert ratio[False] > 2.0
