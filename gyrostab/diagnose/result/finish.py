@@ -72,17 +72,16 @@ def finish_diagnosis(task: Task, comparison: Comparison, started: float) -> Diag
     mismatches = _attributed_mismatches(task, comparison, fit, after)
     unexplained = [region["id"] for region in mismatches if not region["explained_by"]]
     held = measure_evidence(blocks, baseline, identifications, first)
+    effects = effect_tables(fit.fitted, blocks, settings=task.settings)
     content = {
         "schema": SCHEMA,
         "recording": recording_table(blocks),
         "baseline": baseline_table(baseline, fit.expected),
-        "verdict": decide_verdict(
-            mismatches, fit.identifications.identified, unexplained, held, settings=task.settings
-        ),
+        "verdict": decide_verdict(mismatches, effects, unexplained, held, settings=task.settings),
         "false_alarm_level": task.level,
         "settings": task.settings.to_dict(),
         "mismatches": mismatches,
-        "effects": effect_tables(fit.fitted, blocks, settings=task.settings),
+        "effects": effects,
         "unexplained": unexplained,
         "not_found": limit_tables(find_upper_limits(fit.identifications)),
         "rejected": rejected_tables(fit.identifications),

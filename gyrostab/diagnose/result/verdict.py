@@ -1,4 +1,4 @@
-"""Decide whether the named effects explain a record, by its mismatches and its held-out data."""
+"""Decide whether the named effects explain a record: by held-out data, and by their probability."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
-__all__ = ["decide_verdict", "failed_checks"]
+__all__ = ["decide_verdict", "failed_checks", "uncertain_names"]
 
 
 def _is_positive(value: Any) -> bool:
@@ -52,9 +52,26 @@ def failed_checks(held: Mapping[str, Any], *, settings: Settings = DEFAULTS) -> 
     return failed
 
 
+def uncertain_names(effects: Iterable[Mapping[str, Any]]) -> list[str]:
+    """List the effects whose names are more probably wrong than right, each once.
+
+    Examples
+    --------
+    >>> uncertain_names([{"name": "warm_up", "probability": 0.475}])
+    ['warm_up']
+    """
+    return list(
+        dict.fromkeys(
+            effect["name"]
+            for effect in effects
+            if effect.get("probability") is not None and effect["probability"] < 0.5
+        )
+    )
+
+
 def decide_verdict(
     mismatches: Sequence[Any],
-    named: Sequence[Any],
+    effects: Sequence[Mapping[str, Any]],
     unexplained: Iterable[int],
     held: Mapping[str, Any],
     *,
@@ -62,23 +79,37 @@ def decide_verdict(
 ) -> str:
     """Choose one of `gyrostab.diagnose.result.content.VERDICTS`.
 
+    Parameters
+    ----------
+    mismatches : sequence
+    effects : sequence of mappings
+        With ``name`` and ``probability``.
+    unexplained : iterable of int
+        Numbers of the mismatches without an effect.
+    held : mapping
+        See `gyrostab.diagnose.result.content.HeldOut`.
+
     Examples
     --------
     >>> good = {"log_likelihood_gain": 9.0, "forecast_gain": 2.0,
     ...         "coverage95_before": 0.7, "coverage95_after": 0.9}
-    >>> decide_verdict([1], ["shupe"], [], good)
+    >>> shupe = {"name": "shupe", "probability": 0.95}
+    >>> decide_verdict([1], [shupe], [], good)
     'explained'
-    >>> decide_verdict([1], ["shupe"], [], good | {"forecast_gain": -1.0})
+    >>> decide_verdict([1], [shupe], [], good | {"forecast_gain": -1.0})
     'partly explained'
-    >>> decide_verdict([1], ["shupe"], [], good | {"log_likelihood_gain": -2.0})
+    >>> decide_verdict([1], [shupe | {"probability": 0.3}], [], good)
+    'partly explained'
+    >>> decide_verdict([1], [shupe], [], good | {"log_likelihood_gain": -2.0})
     'unknown'
     """
-    if not named:
+    if not effects:
         return "unknown" if mismatches else "no mismatch"
     if not _has_gain(held):
         return "unknown"
-    return (
-        "partly explained"
-        if list(unexplained) or failed_checks(held, settings=settings)
-        else "explained"
-    )
+    doubts = [
+        *unexplained,
+        *failed_checks(held, settings=settings),
+        *uncertain_names(effects),
+    ]
+    return "partly explained" if doubts else "explained"

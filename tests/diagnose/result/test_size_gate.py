@@ -31,6 +31,7 @@ from gyrostab.physics.registry import effects
 from tests.diagnose.estimate.test_recalibrate import SHAKE, identify_by_hand, reduce_simulation
 from tests.support.diagnosed import content
 
+SHUPE: dict[str, Any] = content()["effects"][0] | {"name": "shupe", "probability": 0.95}
 GOOD = {
     "blocks": 36, "log_likelihood_gain": 41.2, "stderr": 6.0, "misfit_before": 3.1,
     "misfit_after": 1.0,
@@ -167,11 +168,25 @@ def test_effect_of_possibly_zero_size_becomes_unidentified():
 )
 def test_held_out_data_decide_the_verdict(change: dict[str, Any], verdict: str):
     held = GOOD | change
-    assert decide_verdict([{}], ["shupe"], [], held) == verdict
+    assert decide_verdict([{}], [SHUPE], [], held) == verdict
     assert bool(failed_checks(held)) == (verdict != "explained")
-    assert decide_verdict([{}], ["shupe"], [1], held) != "explained"
+    assert decide_verdict([{}], [SHUPE], [1], held) != "explained"
     assert decide_verdict([{}], [], [1], held) == "unknown"
     assert decide_verdict([], [], [], held) == "no mismatch"
+
+
+@pytest.mark.parametrize(
+    ("probabilities", "verdict"),
+    [([0.95], "explained"), ([0.5], "explained"), ([0.95, 0.49], "partly explained")],
+)
+def test_an_uncertain_name_does_not_explain(probabilities: list[float], verdict: str):
+    effects = [SHUPE | {"probability": one} for one in probabilities]
+    assert decide_verdict([{}], effects, [], GOOD) == verdict
+    text = summary(
+        content() | {"verdict": verdict, "effects": effects, "unexplained": [], "held_out": GOOD}
+    )
+    assert ("does not single out" in text) == (verdict != "explained")
+    assert decide_verdict([{}], [SHUPE | {"probability": None}], [], GOOD) == "explained"
 
 
 NUMBER = st.none() | st.floats(-1e9, 1e9)
@@ -192,7 +207,7 @@ def test_explained_requires_evidence(evidence_nats, forecast, before, after, lef
         "coverage95_before": before,
         "coverage95_after": after,
     }
-    verdict = decide_verdict([{}], ["shupe"], left, held)
+    verdict = decide_verdict([{}], [SHUPE], left, held)
     assert (verdict == "explained") == (not left and not failed_checks(held))
     if verdict == "explained":
         assert evidence_nats > 0.0
