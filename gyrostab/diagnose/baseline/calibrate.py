@@ -6,7 +6,8 @@ B and K. The posterior is kept as draws, so that null records include the calibr
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,9 @@ Array = NDArray[np.float64]
 DRAWS = 512
 #: Values of K and B on the coarse grid, as multiples of the calibrated ones. Design choice.
 _FACTORS = {"K": (0.0, 1.0 / 3.0, 1.0, 3.0, 10.0, 30.0), "B": (0.0, 1.0, 3.0, 10.0)}
+#: Share of the draws that may lie beyond the coarse grid: a tenth of the share of null records that
+#: exceeds the threshold.
+_SHARE_ABOVE = 1e-3
 #: Bands that the noise terms are fitted to, with any spectral shape.
 MIN_BANDS = 6
 _MIN_LOW_SHAPE = 20.0  # of the lowest bands, which define the white noise of a block mean
@@ -73,19 +77,45 @@ def _mean_noise_excess(
     return np.asarray(np.where(deviation > settings.excess_sigma, level, 1.0))
 
 
-def grid_values(term: str, centre: float, scale: float) -> Array:
-    """Return values of K or B, from 0 to far above the calibrated and the just visible ones."""
-    return np.array(
-        [factor * (max(centre, scale) if factor > 1.0 else centre) for factor in _FACTORS[term]]
-    )
+def grid_values(term: str, centre: float, scale: float, *, more: int = 0) -> Array:
+    """Return values of K or B, from 0 to far above the calibrated and the just visible ones.
+
+    `more` values continue them in half decades.
+    """
+    values = [
+        factor * (max(centre, scale) if factor > 1.0 else centre) for factor in _FACTORS[term]
+    ]
+    return np.array([*values, *(values[-1] * 10.0 ** (np.arange(1, more + 1) / 2.0))])
 
 
-def _coarse_grid(posterior: Posterior, density: float, span: float) -> tuple[Array, Array, Array]:
-    """Return K and B of the coarse grid, and the log posterior around every point."""
-    centres = np.sqrt(np.median(posterior.slow, axis=0))
-    least = visible_coefficients(density, span)
-    K = grid_values("K", float(centres[1]), least[0])
-    B = grid_values("B", float(centres[0]), least[1])
+def _coarse_grids(
+    posteriors: Sequence[Posterior], densities: Array, span: float
+) -> list[tuple[Array, Array, Array]]:
+    """Return K and B of the coarse grid of each axis, and the log posterior around every point.
+
+    The largest draws have a value of the grid within a quarter of a decade; with less noise, any
+    slow drift of such a null record would be evidence of an effect. All axes have as many values as
+    the one that needs most.
+    """
+    visible = [visible_coefficients(density, span) for density in densities]
+    values = {}
+    for column, term in enumerate("BK"):
+        slow = [np.sqrt(posterior.slow[:, column]) for posterior in posteriors]
+        places = [
+            (float(np.median(draws)), least[1 - column])
+            for draws, least in zip(slow, visible, strict=True)
+        ]
+        excess = max(
+            np.quantile(draws, 1.0 - _SHARE_ABOVE) / grid_values(term, *place)[-1]
+            for draws, place in zip(slow, places, strict=True)
+        )
+        more = round(2.0 * math.log10(max(excess, 1.0)))
+        values[term] = [grid_values(term, *place, more=more) for place in places]
+    return [_weigh_grid(*axis) for axis in zip(posteriors, values["K"], values["B"], strict=True)]
+
+
+def _weigh_grid(posterior: Posterior, K: Array, B: Array) -> tuple[Array, Array, Array]:
+    """Return the points of a grid of K and B, and the log posterior around each."""
     place = []
     for fine, coarse in ((posterior.K, K), (posterior.B, B)):
         between = np.sqrt(coarse[1:-1] * coarse[2:])
@@ -274,10 +304,8 @@ def assemble_baseline(
         ]
     )
     span = blocks.sizes["block"] * float(blocks.attrs["block_s"])
-    grids = [
-        _coarse_grid(posterior, max(posterior.square[1], least) * HOUR, span)
-        for posterior, least in zip(posteriors, floor, strict=True)
-    ]
+    densities = np.maximum([posterior.square[1] for posterior in posteriors], floor) * HOUR
+    grids = _coarse_grids(posteriors, densities, span)
     common, rest = common_variance(blocks)
     value, error = _mean_coefficients(posteriors)
     value[:, 4], error[:, 4] = 0.0, _ramp_error(blocks, white, value, quiet)

@@ -184,6 +184,15 @@ def test_the_grid_contains_calibrated_and_much_slower_noise():
     assert np.exp(baseline["grid_prior"].values[0]).sum() == pytest.approx(1.0)
 
 
+@pytest.mark.filterwarnings("ignore:the quiet time")
+def test_the_grid_contains_all_noise_that_little_quiescent_time_allows():
+    blocks = reduce_log(log({"N": 0.003}, duration="3h", rate=10.0))
+    baseline = calibrate_noise(blocks, quiet=(0.0, 120.0))
+    draws = np.sqrt(np.quantile(baseline["posterior_slow"].values[0], 0.999, axis=0))
+    for column, term in enumerate("BK"):
+        assert baseline[f"grid_{term}"].values.max() > draws[column] / 10.0**0.25
+
+
 def test_baseline_from_a_model_includes_its_effects():
     effects = [
         {"name": "vibration_noise", "white": 0.001, "axes": ["x"]},
