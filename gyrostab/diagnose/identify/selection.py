@@ -25,7 +25,6 @@ from gyrostab.diagnose.identify.components import (
 )
 from gyrostab.diagnose.identify.identifiability import (
     find_equivalent_effects,
-    find_plainer_effect,
     is_physical,
     without_pulses,
 )
@@ -41,13 +40,11 @@ from gyrostab.diagnose.identify.identification import (
     form_error,
     with_axes_of,
 )
-from gyrostab.diagnose.identify.logger_filters import without_slopes
+from gyrostab.diagnose.identify.naming_order import order_passing, order_rivals
 from gyrostab.diagnose.identify.rejected import find_rejections
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.identify.switching import (
     drop_explained_jumps,
-    identify_switching,
-    put_followers_first,
     renew_component,
 )
 from gyrostab.diagnose.identify.withdrawal import Withdrawal
@@ -251,10 +248,10 @@ class Search:
         for key, several in list(components.items()):
             if not key.startswith("~") and sum_evidence(several) > required[key]:
                 components[key] = is_physical(several, state, error=required[key] - self.threshold)
-        passing = self._order_passing(components, required, state)
+        passing = order_passing(components, required, state, self.folds)
         if not passing:
             return None
-        rivals = self._order_rivals(passing, components, state)
+        rivals = order_rivals(passing, components, state, self.candidates, settings=self.settings)
         pair = None if rivals else self._find_pair(passing, components, required, state)
         if pair is not None:
             key, components[key], state = pair
@@ -283,68 +280,6 @@ class Search:
         return find_unidentified(
             alternative, components[alternative], required[alternative], nearest
         ), set()
-
-    def _order_passing(
-        self, components: dict[str, list[Component]], required: dict[str, float], state: State
-    ) -> list[str]:
-        """Return the keys that pass, in the order in which they are to be named.
-
-        Anomalous samples come first, because they raise powers and means too, and not the other
-        way round. Then motion that another sensor confirms, then a bias that switches within
-        blocks: its spectrum, its tails and its changing noise level would be taken for others.
-        """
-        ranked = sorted(components, key=lambda key: -sum_evidence(components[key]))
-        passing = [key for key in ranked if sum_evidence(components[key]) > required[key]]
-        counts = [
-            key
-            for key in passing
-            if components[key][0].candidate.statistic.is_count and not key.startswith("~")
-        ]
-        confirmed = [
-            key
-            for key in passing
-            if sum_evidence(_confirmed_components(components[key], state)) > required[key]
-        ]
-        switching = identify_switching(passing, components, state)
-        first_count = min(map(passing.index, counts), default=0)
-        if switching and passing.index(switching[0]) < first_count:
-            counts = []
-        first = (
-            counts
-            or confirmed
-            or switching
-            or without_slopes(
-                self._without_locked_lines(passing, components, state),
-                components,
-                state,
-                self.folds,
-            )
-        )
-        return put_followers_first(first, components, state)
-
-    def _order_rivals(
-        self, passing: list[str], components: dict[str, list[Component]], state: State
-    ) -> list[str]:
-        """Return the effects that come close to the best, plainer ones first."""
-        best = sum_evidence(components[passing[0]])
-        least = best - self.settings.ambiguous_nats - self.settings.form_error_share * best
-        rivals = [
-            key
-            for key in passing
-            if not key.startswith("~") and sum_evidence(components[key]) >= least
-        ]
-        effects = {components[key][0].candidate.effect for key in rivals}
-        is_later = {
-            key: self._is_on_single_axis(components[key])
-            or find_plainer_effect(components[key], state) in effects
-            for key in rivals
-        }
-        return sorted(
-            rivals,
-            key=lambda key: (
-                self.settings.ambiguous_nats * is_later[key] - sum_evidence(components[key])
-            ),
-        )
 
     def _find_pair(
         self,
@@ -409,31 +344,6 @@ class Search:
             if sum_evidence(physical) > self.threshold + error:
                 found[key] = physical
         return with_first, found
-
-    def _without_locked_lines(
-        self, passing: list[str], components: dict[str, list[Component]], state: State
-    ) -> list[str]:
-        """Drop lines that a passing phase-locked effect explains."""
-        locked = [key for key in passing if components[key][0].statistic.is_phase_locked]
-        lines = [key for key in passing if components[key][0].candidate.statistic.is_line]
-        if not lines:
-            return passing
-        masks = [
-            mask
-            for key in locked
-            for mask in condition_on(state, components[key]).given.get(("line", "all"), [])
-        ]
-        return [
-            key
-            for key in passing
-            if key not in lines or not any(mask[components[key][0].place] for mask in masks)
-        ]
-
-    def _is_on_single_axis(self, components: Sequence[Component]) -> bool:
-        """Return whether an effect that should be one process on all axes shows on one only."""
-        key = components[0].candidate.key
-        is_common = any(one.key == key and one.statistic.is_pairwise for one in self.candidates)
-        return is_common and len({axis for component in components for axis in component.row}) == 1
 
     def _identify(
         self, components: list[Component], threshold: float, names: Sequence[str], p_value: float
@@ -629,12 +539,3 @@ def _sum_by_key(components: Mapping[str, Sequence[Component]]) -> dict[str, floa
 
 def _positive_evidence(found: CandidateEvidence) -> float:
     return float(np.maximum(found.evidence_nats[0], 0.0).sum())
-
-
-def _confirmed_components(components: Sequence[Component], state: State) -> list[Component]:
-    """Return the components that a channel other than an axis of the gyro sees as well."""
-    return [
-        component
-        for component in components
-        if component.statistic.is_transfer and component.candidate.reference[0] not in state.axes
-    ]
