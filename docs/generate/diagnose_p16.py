@@ -92,7 +92,9 @@ def proof(runs):
             for what in ("misfit", "coverage95")
             for when in ("before", "after")
         ]
-        rows.append([name, *(f"{share:.3g}" for share in shares), f"{held['forecast_gain']:.3g}"])
+        gain = held["forecast_gain"]  # None where no effect acts before and after 70 %
+        forecast = "none" if gain is None else f"{gain:.3g}"
+        rows.append([name, *(f"{share:.3g}" for share in shares), forecast])
     return lines(rows)
 
 

@@ -27,6 +27,8 @@ _FINER = 2
 _LEVEL_LINES = 512  # of a whole segment that define a level, to 6 %; design choice
 _SIDE_LINES = 128  # of a whole segment, on either side; design choice
 _MIN_LEVELS = 4  # intervals of `_LEVEL_LINES` that a spectrum must have
+_NOISE_BANDS = 16  # of equal width, in which periodograms are compared; design choice
+_EQUAL_SIGMA = 2.5  # by which equal levels may differ by chance: one band in 20 with 8 periodograms
 _MIN_SHARE = 0.25  # of a transformed length that must be present; design choice
 #: Expected nats of a sine of known frequency and phase, a sample of its prior.
 _STRENGTHS = 3.0 * 3.0 ** np.arange(12)
@@ -39,6 +41,43 @@ class _Spectrum(NamedTuple):
     taper: Array
     total: Array  # (axis, frequency) [degree2 hour-2 Hz-1]
     used: NDArray[np.int64]  # (axis,), their number
+    band_total: Array  # (axis, band), sum of their levels
+    band_largest: Array  # (axis, band), level of the noisiest one
+
+    def equal_count(self) -> Array:
+        """Return how many equal periodograms have a sum with the upper tail of this one.
+
+        A noisier stretch leaves fewer: with a single one, the sum is an exponential variable.
+
+        Returns
+        -------
+        ndarray, shape (axis, frequency)
+        """
+        lines = self.total.shape[1]
+        widths = np.diff(_band_edges(lines), append=lines)
+        used = np.maximum(self.used, 1)[:, None]
+        mean = np.where(self.band_total > 0.0, self.band_total / used, 1.0)
+        excess = self.band_largest / mean
+        is_equal = excess < 1.0 + _EQUAL_SIGMA * np.sqrt(_FINER / widths)
+        return np.repeat(used / np.where(is_equal, 1.0, excess), widths, axis=1)
+
+
+def _band_edges(lines: int) -> NDArray[np.int64]:
+    """Return the first line of each noise band."""
+    return np.linspace(0, lines, min(_NOISE_BANDS, lines), endpoint=False).astype(np.int64)
+
+
+def _make_spectrum(axes: int, size: int) -> _Spectrum:
+    lines = ordinates(_FINER * size)
+    bands = np.zeros((axes, _band_edges(lines).size))
+    return _Spectrum(
+        size,
+        taper(size),
+        np.zeros((axes, lines)),
+        np.zeros(axes, np.int64),
+        bands,
+        bands.copy(),
+    )
 
 
 class SineSearch:
@@ -51,15 +90,7 @@ class SineSearch:
         self.segment = np.full((axes, blocks * length), np.nan)
         self.filled = 0
         sizes = [blocks // parts * length for parts in _PARTS if blocks >= 2 * parts]
-        self.spectra = [
-            _Spectrum(
-                size,
-                taper(size),
-                np.zeros((axes, ordinates(_FINER * size))),
-                np.zeros(axes, np.int64),
-            )
-            for size in sizes
-        ]
+        self.spectra = [_make_spectrum(axes, size) for size in sizes]
 
     def add(self, values: Array) -> None:
         """Add the samples (axis, sample) that follow; NaN where missing."""
@@ -72,7 +103,9 @@ class SineSearch:
                 self.filled = 0
 
     def _add_periodograms(self) -> None:
-        for size, weights, total, used in self.spectra:
+        for size, weights, total, used, band_total, band_largest in self.spectra:
+            edges = _band_edges(total.shape[1])
+            widths = np.diff(edges, append=total.shape[1])
             for begin in range(0, self.segment.shape[1] - size + 1, size):
                 for axis, values in enumerate(self.segment[:, begin : begin + size]):
                     present = np.isfinite(values)
@@ -80,8 +113,12 @@ class SineSearch:
                         continue
                     centred = np.where(present, values - values[present].mean(), 0.0) * weights
                     power = np.abs(np.fft.rfft(centred, _FINER * size)[1 : total.shape[1] + 1]) ** 2
-                    total[axis] += power / ((weights**2 * present).sum() * self.rate)
+                    power /= (weights**2 * present).sum() * self.rate
+                    total[axis] += power
                     used[axis] += 1
+                    level = np.add.reduceat(power, edges) / widths
+                    band_total[axis] += level
+                    band_largest[axis] = np.maximum(band_largest[axis], level)
 
     def strongest(self, lines: Array) -> dict[str, Any]:
         """Return the strongest sine nearest to each line (frequencies [Hz], evenly spaced).
@@ -127,8 +164,9 @@ class SineSearch:
         usable = (spectrum.used > 0) & spectrum.total.any(axis=1)  # a constant axis has no noise
         if frequency.size < _MIN_LEVELS * width or not usable.any():
             return None
-        count = np.maximum(spectrum.used, 1)[:, None]
-        power = np.where(usable[:, None], spectrum.total[:, inside] / count, 1.0)
+        count = spectrum.equal_count()[:, inside]
+        mean = spectrum.total[:, inside] / np.maximum(spectrum.used, 1)[:, None]
+        power = np.where(usable[:, None], mean, 1.0)
         level = level_around(power, width, side) / (gammaincinv(count, 0.5) / count)
         factor = np.where(usable[:, None], sine_factors(power / level, count), -np.inf)
         place = np.clip(np.rint(frequency / lines[0]).astype(np.int64) - 1, 0, lines.size - 1)
@@ -149,7 +187,7 @@ class SineSearch:
         above = power[:, near] - level[:, near]  # (axis, line, near)
         # Power N and a sine S have the variance N^2 + 2 N S; frequencies within a line are one.
         variance = np.maximum(2.0 * power[:, near] - level[:, near], level[:, near])
-        noise = np.sqrt(_FINER * (level[:, near] * variance).sum(axis=-1) / count)
+        noise = np.sqrt(_FINER * (level[:, near] * variance / count[:, near]).sum(axis=-1))
         weights = np.maximum(above, 0.0).sum(axis=0)
         centre = (weights * frequency[near]).sum(axis=-1) / np.maximum(weights.sum(axis=-1), 1e-300)
         arrays = {
@@ -162,7 +200,7 @@ class SineSearch:
         return place[chosen], total[chosen], arrays
 
 
-def sine_factors(ratio: Array, count: Array | int) -> Array:
+def sine_factors(ratio: Array, count: Array | float) -> Array:
     r"""Return the log Bayes factor of a sine from mean periodograms relative to noise.
 
     With a sine of random phase whose expected gain is E nats, each of n periodograms is 1 + E / n
@@ -173,7 +211,7 @@ def sine_factors(ratio: Array, count: Array | int) -> Array:
     Parameters
     ----------
     ratio : ndarray
-        Mean of `count` periodograms over the density of the noise.
+        Mean of `count` periodograms of equal noise, over its density.
 
     Examples
     --------

@@ -41,7 +41,7 @@ def test_bayes_factor_of_noise_has_mean_one(count):
     assert mean == pytest.approx(1.0, abs=1e-3)
 
 
-@pytest.mark.parametrize("case", ["white", "lost", "walk", "quantized"])
+@pytest.mark.parametrize("case", ["white", "lost", "walk", "quantized", "burst"])
 def test_noise_has_no_sine(case):
     rng = np.random.default_rng([1, len(case)])
     largest = []
@@ -54,6 +54,8 @@ def test_noise_has_no_sine(case):
             noise = 0.1 * noise + np.cumsum(0.03 * rng.standard_normal((3, SIZE)), axis=1)
         elif case == "quantized":
             noise = np.round(noise)
+        elif case == "burst":
+            noise[:, 5000:8000] *= 30.0
         largest.append(search(noise)["sine_nats"].max(axis=1).max())
     # A Bayes factor of e^2 is reached in at most e^-2 of the records; 8 nats name an effect.
     assert np.mean(np.array(largest) > 2.0) <= 0.05
