@@ -33,7 +33,7 @@ from gyrostab.blindtest.scenarios.case import make_case
 from gyrostab.blindtest.scenarios.commitment import commit_case, open_truth, truth_text
 from gyrostab.blindtest.scenarios.drivers import degrade_driver
 from gyrostab.blindtest.scenarios.injection import inject_effect, quantization_step
-from gyrostab.blindtest.scenarios.plan import DEGRADATIONS, plan_case, plan_cases
+from gyrostab.blindtest.scenarios.plan import DEGRADATIONS, plan_case, plan_cases, plan_counterparts
 from gyrostab.blindtest.scoring.baseline_detectors import allan_detector, channel_detector
 from gyrostab.blindtest.scoring.visibility import MAX_SEPARATION
 from gyrostab.errors import FormatError, OptionError
@@ -365,7 +365,7 @@ def test_sub_threshold_cases_are_invisible_in_trace_and_allan_plot():
     assert truth["visibility"]["sample"] < MAX_SEPARATION
     assert truth["visibility"]["second"] < MAX_SEPARATION
     assert all(share < 1 for share in truth["visibility"]["allan"].values())
-    assert not allan_detector(log.rate.values, truth, rng=np.random.default_rng(0), nulls=30)
+    assert allan_detector(log.rate.values, truth, rng=np.random.default_rng(0), nulls=30) < 0.0
 
 
 def test_strong_effect_is_not_sub_threshold():
@@ -508,6 +508,36 @@ def test_a_third_of_the_forms_differ_from_those_fitted():
     assert np.mean(flags) > 1 / 3
 
 
+@pytest.mark.parametrize("name", ["temperature_bias", "informative_gaps", "feedback_reset"])
+def test_counterpart_is_the_record_without_its_effects(name):
+    plan = small(name, strength=8.0)
+    log, truth = make_case(plan)
+    noise, noise_truth = make_case(plan | {"copy": "counterpart"})
+    assert noise_truth["effects"] == []
+    assert noise_truth["plan"]["kind"] == "counterpart"
+    assert set(noise.variables) == set(log.variables)
+    for channel in set(log.variables) - {"rate"}:
+        xr.testing.assert_identical(noise[channel], log[channel])
+    difference = log["rate"].values - noise["rate"].values
+    assert np.array_equal(np.isnan(noise["rate"].values), np.isnan(log["rate"].values))
+    assert noise_truth["missing_share"] == truth["missing_share"]
+    assert np.nanmax(np.abs(difference)) > 0.0
+    if name == "temperature_bias":
+        (effect,) = truth["effects"]
+        axis = effect["axes"][0]
+        means = np.nanmean(difference[AXES.index(axis)].reshape(-1, 100), axis=1)
+        assert means == pytest.approx(np.array(effect["waveform_10s"][axis]), abs=1e-2)
+
+
+def test_one_in_four_cases_with_effects_has_a_counterpart():
+    plans = plan_cases(40, seed=3)
+    copies = plan_counterparts(plans, 4)
+    assert [plan["index"] for plan in copies] == [plan["index"] for plan in plans if plan["names"]][
+        ::4
+    ]
+    assert {plan["copy"] for plan in copies} == {"counterpart"}
+
+
 def test_unknown_effect_and_negative_case_are_refused():
     with pytest.raises(OptionError, match="'gremlin' is not in the catalogue"):
         make_case(small("shupe") | {"names": ["gremlin"]})
@@ -517,12 +547,12 @@ def test_unknown_effect_and_negative_case_are_refused():
 
 def test_baseline_detectors_see_strong_effects_only():
     log, truth = make_case(small("vibration_noise", strength=120.0, seconds=1800))
-    assert allan_detector(log.rate.values, truth, rng=np.random.default_rng(0), nulls=30)
-    assert channel_detector(log)
+    assert allan_detector(log.rate.values, truth, rng=np.random.default_rng(0), nulls=30) > 0.0
+    assert channel_detector(log) > 0.0
     seen = 0
     for i in range(5):
         log, truth = make_case(small(None, index=30 + i, seconds=600))
-        seen += allan_detector(log.rate.values, truth, rng=np.random.default_rng(i), nulls=30)
+        seen += allan_detector(log.rate.values, truth, rng=np.random.default_rng(i), nulls=30) > 0.0
     assert seen <= 2
 
 

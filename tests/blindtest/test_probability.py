@@ -60,6 +60,17 @@ def test_risk_falls_with_the_coverage(drawn):
     assert risk["risk"].iloc[99] < 0.5 * risk["risk"].iloc[-1]
 
 
+def test_coverage_counts_records_with_effects(drawn):
+    rows = rows_of(*drawn)
+    silent = [
+        row | {"index": 1000 + place, "identifications": []} for place, row in enumerate(rows)
+    ]
+    null = [{"index": -1, "kind": "null", "identifications": []}]
+    risk = risk_coverage([*rows, *silent, *null])
+    assert risk["coverage"].iloc[-1] == 0.5
+    assert risk["risk"].equals(risk_coverage(rows)["risk"])
+
+
 def test_names_of_equal_probability_are_one_group():
     stated = np.repeat([0.5, 0.95], [20, 80])
     right = np.concatenate([np.arange(20) < 10, np.arange(80) < 76])
@@ -67,7 +78,7 @@ def test_names_of_equal_probability_are_one_group():
     assert curve[["n", "right"]].to_numpy().tolist() == [[20, 0.5], [80, 0.95]]
     assert expected_calibration_error(stated, right.astype(float)) == pytest.approx(0.0)
     risk = risk_coverage(rows_of(stated, right))
-    assert risk.to_numpy() == pytest.approx(np.array([[0.8, 0.05], [1.0, 0.14]]))
+    assert risk.to_numpy() == pytest.approx(np.array([[0.95, 0.8, 0.05], [0.5, 1.0, 0.14]]))
 
 
 def test_a_diagnosis_without_probabilities_has_no_figures():

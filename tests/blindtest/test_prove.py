@@ -60,6 +60,7 @@ class NothingFound:
 @pytest.fixture
 def small(monkeypatch):
     monkeypatch.setattr("gyrostab.blindtest.scenarios.plan.plan_cases", small_plans)
+    monkeypatch.setitem(core._DEFAULTS, "counterparts", 0)
 
 
 def run_benchmark(folder: Path, **patches) -> tuple[Path, list[str], Proof]:
@@ -71,6 +72,7 @@ def run_benchmark(folder: Path, **patches) -> tuple[Path, list[str], Proof]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gyrostab.blindtest.scenarios.plan.plan_cases", small_plans)
+        patch.setitem(core._DEFAULTS, "counterparts", 0)
         for name, function in patches.items():
             patch.setattr(diagnosing, name, function)
         proof = gyrostab.prove(folder, cases=2, seed=5, nulls=100, workers=0, say=say)
@@ -143,8 +145,8 @@ def test_every_case_is_scored(tmp_path):
     assert check["runs"]
     assert check["nats"] > 0.0
     assert proof.table.set_index("quantity").filter(like="without refit", axis=0)["n"].item() == 1
-    assert {"Allan plot", "correlation with channels"} == set(
-        json.loads(line["baseline_detectors"])
+    assert {"Allan plot", "correlation with channels", "stepwise regression", "random number"} == (
+        set(json.loads(line["baseline_detectors"]))
     )
     assert proof.failed == {}
     text = (folder / "table.md").read_text()
@@ -153,8 +155,8 @@ def test_every_case_is_scored(tmp_path):
     detected = proof.table.set_index("quantity").loc["detected, strength 1.5 or more"]
     assert detected["n"] == 1
     assert detected["value"] == pytest.approx(scores["detected"][1:].mean())
-    for name in ("completeness.png", "reliability.png", "calibration.png"):
-        assert (folder / name).read_bytes()[:4] == b"\x89PNG"
+    for name in ("completeness", "reliability", "calibration", "ranks", "roc"):
+        assert (folder / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_resumed_finished_run_repeats_the_scores(finished, small):
@@ -300,6 +302,50 @@ def test_injections_are_committed_and_scored_separately(small, tmp_path, monkeyp
     assert "| reversing the sign adds a name | 0 |" in page
 
 
+class NamedAlways(NothingFound):
+    verdict = "explained"
+
+    def to_json(self) -> str:
+        gain = {"nats": 12.0, "stderr": 1.0, "threshold": 8.0}
+        effect = {"name": "spectral_line", "alternatives": [], "held_out_gain": gain}
+        return json.dumps(json.loads(super().to_json()) | {"effects": [effect]})
+
+
+def test_counterparts_count_as_noise_and_in_no_other_figure(small, tmp_path, monkeypatch):
+    monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: NamedAlways())
+    proof = gyrostab.prove(
+        tmp_path / "proof", cases=2, seed=8, nulls=100, counterparts=1, workers=0
+    )
+    scores = pd.read_csv(tmp_path / "proof" / "scores.csv", keep_default_na=False, na_values=[""])
+    assert scores["kind"].tolist() == ["null", "single", "counterpart"]
+    assert scores["score"].tolist() == [4.0] * 3
+    noise = scores[scores["kind"] == "counterpart"].iloc[0]
+    assert noise["name"] == case_name(8, 1, "counterpart")
+    assert json.loads(noise["wrong_names"]) == ["spectral_line"]
+    counted = proof.table.set_index("quantity")["n"]
+    assert counted["false alarms: effect named on a null record"] == 1
+    assert counted["false alarms of the Allan plot"] == 1
+    page = (tmp_path / "proof" / "table.md").read_text()
+    assert "| false alarms: effect named on a counterpart | 1 |" in page
+    assert "| detected with its effects, and without them too | 1 |" in page
+    assert "| catalogue | diagnosis | 1 | 2 |" in page
+    assert "--counterparts 1" in page
+    with pytest.raises(ResumeError, match="counterparts 1, not 4"):
+        gyrostab.prove(tmp_path / "proof", counterparts=4, resume=True)
+
+
+def test_run_of_an_earlier_version_is_scored_again(finished, small, tmp_path):
+    before, _, _ = finished
+    folder = shutil.copytree(before, tmp_path / "proof")
+    job = json.loads((folder / "benchmark.json").read_text())
+    del job["counterparts"]
+    (folder / "benchmark.json").write_text(json.dumps(job))
+    for path in (folder / "comparisons").iterdir():
+        path.write_text(json.dumps({"Allan plot": False, "correlation with channels": True}))
+    gyrostab.prove(folder, workers=0, resume=True)
+    assert (folder / "scores.csv").read_bytes() == (before / "scores.csv").read_bytes()
+
+
 def test_run_without_real_recordings_says_so(small, tmp_path, monkeypatch):
     monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: NothingFound())
     messages: list[str] = []
@@ -342,6 +388,7 @@ def test_wrong_names_on_null_records_are_listed():
         "cases": 1,
         "seed": FIRST_PUBLIC_SEED + 1,
         "nulls": 100,
+        "counterparts": 4,
         "code": ["a", "b"],
         "begun": "now",
         "machine": "any",
@@ -363,6 +410,7 @@ def test_invalid_options_leave_nothing_behind(tmp_path):
         ({"cases": 0}, "cases=0"),
         ({"seed": -1}, "seed=-1"),
         ({"nulls": 20}, "nulls=20"),
+        ({"counterparts": -1}, "counterparts=-1"),
     ):
         with pytest.raises(OptionError, match=complaint):
             gyrostab.prove(tmp_path / "proof", **options)

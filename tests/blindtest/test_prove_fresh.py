@@ -51,7 +51,7 @@ def test_each_kind_of_case_is_committed_and_scored(tmp_path, monkeypatch):
     monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: diagnosis())
     proof = gyrostab.prove(tmp_path / "proof", cases=len(KINDS), seed=1, nulls=100, workers=0)
     rows = check_run(tmp_path / "proof", proof, cases=len(KINDS))
-    assert set(rows["kind"]) == set(KINDS)
+    assert set(rows["kind"]) == {*KINDS, "counterpart"}
     assert rows["kind"].value_counts()["pair"] == 2
     assert rows["kind"].value_counts()["triple"] == 3
 
@@ -81,10 +81,9 @@ def check_run(folder: Path, proof: Proof, *, cases: int) -> pd.DataFrame:
         value, path = line.split("  ")
         assert hashlib.sha256((folder / path).read_bytes()).hexdigest() == value
         names.append(path.removeprefix("truth/").removesuffix(".json"))
-    assert len(names) == cases
-
     rows = pd.read_csv(folder / "scores.csv", keep_default_na=False, na_values=[""])
     assert set(rows["name"]) == set(names)
+    assert len(names) == cases + (rows["kind"] == "counterpart").sum()
     assert not rows["failed"].any()
     for name in names:
         found = json.loads((folder / "diagnoses" / f"{name}.json").read_text())
@@ -112,6 +111,6 @@ def check_run(folder: Path, proof: Proof, *, cases: int) -> pd.DataFrame:
     page = (folder / "table.md").read_text()
     assert str(proof.seed) in page
     assert proof.commitment in page
-    for name in ("completeness.png", "reliability.png", "calibration.png"):
-        assert (folder / name).read_bytes()[:4] == b"\x89PNG"
+    for name in ("completeness", "reliability", "calibration", "ranks", "roc"):
+        assert (folder / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
     return rows

@@ -296,7 +296,7 @@ def test_table_of_known_scores():
             else diagnosis()
         )
         rows += score_case(
-            found, truth("shupe", index=i), baseline_hits={"plain Allan plot": i < 5}
+            found, truth("shupe", index=i), baseline_scores={"plain Allan plot": i < 5}
         )
     rows += [
         row

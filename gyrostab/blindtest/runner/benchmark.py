@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Proof", "prove"]
 
-_DEFAULTS = {"cases": 40, "nulls": 400}
+_DEFAULTS = {"cases": 40, "nulls": 400, "counterparts": 4}
 
 _CASES_PER_INJECTION = 40  # each injection makes four more cases
 
@@ -57,6 +57,7 @@ def prove(
     cases: int | None = None,
     seed: int | None = None,
     nulls: int | None = None,
+    counterparts: int | None = None,
     workers: int | None = None,
     real: str | os.PathLike[str] | None = None,
     resume: bool = False,
@@ -80,6 +81,9 @@ def prove(
         Seed of the draws; a random one by default. Seeds below 1 000 000 are for tuning.
     nulls : int
         Null records of each diagnosis, 400 by default.
+    counterparts : int
+        One in so many cases with effects gets a counterpart, the same record without its effects: 4
+        by default, 1 for all cases, 0 for none.
     workers : int
         Number of processes: one per core by default, 0 to work in this process.
     real : path-like
@@ -124,7 +128,7 @@ def prove(
         "seed": FIRST_PUBLIC_SEED + secrets.randbelow(10**9),
         "injected": injected,
     }
-    wanted = {"cases": cases, "seed": seed, "nulls": nulls}
+    wanted = {"cases": cases, "seed": seed, "nulls": nulls, "counterparts": counterparts}
     inspect_folder(folder, wanted, fresh, resume=resume, overwrite=overwrite)
     with lock_job(folder):
         job = begin_run(folder, wanted, fresh, resume=resume, overwrite=overwrite)
@@ -146,24 +150,24 @@ def prove(
 
 
 def _plan_all(job: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Plan all cases, drawn and injected; return name -> plan."""
-    from gyrostab.blindtest.scenarios.plan import plan_cases
+    """Plan all cases, counterparts and injections; return name -> plan."""
+    from gyrostab.blindtest.scenarios.plan import plan_cases, plan_counterparts
     from gyrostab.blindtest.scenarios.real import plan_injections
 
-    drawn = {
-        case_name(job["seed"], plan["index"]): plan
-        for plan in plan_cases(job["cases"], seed=job["seed"])
-    }
-    return drawn | {
-        case_name(job["seed"], plan["index"], plan["copy"]): plan
-        for plan in plan_injections(job["injected"], seed=job["seed"])
+    drawn = plan_cases(job["cases"], seed=job["seed"])
+    copies = plan_counterparts(drawn, job["counterparts"])
+    injections = plan_injections(job["injected"], seed=job["seed"])
+    return {
+        case_name(job["seed"], plan["index"], plan.get("copy", "")): plan
+        for plan in (*drawn, *copies, *injections)
     }
 
 
 def _describe_run(job: dict[str, Any], folder: Path) -> str:
     text = f"{job['cases']} cases of seed {job['seed']}; to repeat: "
     text += f"gyrostab prove --cases {job['cases']} --seed {job['seed']}"
-    text += f" --nulls {job['nulls']}" if job["nulls"] != _DEFAULTS["nulls"] else ""
+    for name in ("nulls", "counterparts"):
+        text += f" --{name} {job[name]}" if job[name] != _DEFAULTS[name] else ""
     if job["injected"]:
         text += f"\nand {job['injected']} injections into real recordings, with three controls each"
     else:
@@ -187,7 +191,7 @@ def _draw_and_commit(
     kept = read_sums(folder)
     if kept is not None:
         return kept
-    if real is None and any("copy" in plan for plan in plans.values()):
+    if real is None and any("recording" in plan for plan in plans.values()):
         raise ResumeError(
             f"{folder}: was begun with real recordings that are not drawn yet; "
             "give their folder again with --real DIR"
@@ -242,7 +246,7 @@ def _score_and_write(
         name: open_truth(folder / "truth" / f"{name}.json", sha256=sums[name]) for name in names
     }
     drawn = [
-        name for name in names if "copy" not in truths[name]["plan"]
+        name for name in names if "recording" not in truths[name]["plan"]
     ]  # the noise level of a real recording is unknown
     jobs = [
         (
@@ -252,7 +256,7 @@ def _score_and_write(
         )
         for name in drawn
     ]
-    baseline_hits = run_in_processes(
+    baseline_scores = run_in_processes(
         compare_case, jobs, workers=workers, report=_count_cases(stage, "comparing", len(drawn))
     )
     found = {
@@ -261,7 +265,7 @@ def _score_and_write(
         if name not in failed
     }
     stage("counting", 0)
-    rows = score_rows(found, truths, dict(zip(drawn, baseline_hits, strict=True)))
+    rows = score_rows(found, truths, dict(zip(drawn, baseline_scores, strict=True)))
     table = score_table(rows)
     files = write_outcome(folder, rows, table, job=job, commitment=commitment, failed=failed)
     return Proof(job["seed"], commitment, table, list_missed(table), failed, files)

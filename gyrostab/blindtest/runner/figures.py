@@ -1,4 +1,4 @@
-"""Figures of a benchmark: completeness, reliability of each name, and its probability."""
+"""Figures of a benchmark: completeness, names, probabilities, ranks, detectors."""
 
 from __future__ import annotations
 
@@ -11,7 +11,13 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
 
-__all__ = ["draw_calibration", "draw_completeness", "draw_reliability"]
+__all__ = [
+    "draw_calibration",
+    "draw_completeness",
+    "draw_ranks",
+    "draw_reliability",
+    "draw_roc",
+]
 
 _COLUMNS = 5
 _POOL_LIMITS = (1.5, 4.0)  # detection is not required below the first
@@ -166,7 +172,71 @@ def draw_calibration(curve: pd.DataFrame, risk: pd.DataFrame) -> Callable[[Path]
     coverage.set(
         xlim=(0, 1),
         ylim=(0, None),
-        xlabel="share of the names, most probable first",
-        ylabel="share of these that are wrong",
+        xlabel="share of the records with effects\nthat have a name, most probable first",
+        ylabel="share of these names\nthat are wrong",
     )
+    return lambda target: save_png(figure, target, colours=64)
+
+
+def draw_ranks(histogram: pd.DataFrame) -> Callable[[Path], None]:
+    """Plot how often the truth has each rank in its estimate, and the range of exact estimates."""
+    from gyrostab.plot import COLOURS, new_figure, save_png
+
+    figure = new_figure(5.0, 3.0)
+    panel: Any = figure.subplots()
+    number = int(histogram["n"].sum())
+    width = 1.0 / len(histogram)
+    centre = [width * (place + 0.5) for place in range(len(histogram))]
+    panel.bar(centre, histogram["n"], width=0.9 * width, color=COLOURS[2])
+    low, high = int(histogram["low"].iloc[0]), int(histogram["high"].iloc[0])
+    panel.axhspan(low, high, color="#dcdcdc", zorder=0)
+    panel.axhline(number * width, color="black", linewidth=0.7, linestyle=":")
+    panel.set(
+        xlim=(0, 1),
+        xlabel="rank of the true parameter in its estimate",
+        ylabel=f"parameters (of {number})",
+    )
+    return lambda target: save_png(figure, target, colours=64)
+
+
+def draw_roc(curves: pd.DataFrame) -> Callable[[Path], None]:
+    """Plot the share of cases detected against the share of false alarms, for each detector.
+
+    The axis of false alarms is logarithmic above one in a hundred, and linear below.
+    """
+    from gyrostab.plot import COLOURS, MARKERS, new_figure, save_png
+
+    figure = new_figure(8.0, 4.2)
+    groups = list(dict.fromkeys(curves["cases"])) or [""]
+    panels: Any = figure.subplots(1, len(groups), sharey=True, squeeze=False)
+    for panel, group in zip(panels.flat, groups, strict=True):
+        part = curves[curves["cases"] == group]
+        for place, name in enumerate(dict.fromkeys(part["detector"])):
+            mine = part[part["detector"] == name]
+            colour, marker = COLOURS[place % len(COLOURS)], MARKERS[place % len(MARKERS)]
+            points, own = mine[~mine["own"]], mine[mine["own"]]
+            panel.step(
+                points["false_alarms"],
+                points["detected"],
+                where="post",
+                color=colour,
+                linewidth=1.2,
+            )
+            panel.plot(
+                own["false_alarms"], own["detected"], marker, color=colour, markersize=6, label=name
+            )
+        panel.set_xscale("symlog", linthresh=0.01, linscale=0.3)
+        panel.set_xticks([0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1])
+        panel.set_xticks([], minor=True)
+        panel.set_xticklabels(["0", "1", "2", "5", "10", "20", "50", "100"])
+        panel.set(xlim=(-0.001, 1.0), ylim=(0, 1.02), xlabel="false alarms [%]")
+        panel.set_title(group, fontsize="small")
+    panels.flat[0].set_ylabel("share of the cases detected")
+    if len(curves):
+        figure.legend(
+            *panels.flat[0].get_legend_handles_labels(),
+            loc="outside upper center",
+            ncols=3,
+            frameon=False,
+        )
     return lambda target: save_png(figure, target, colours=64)

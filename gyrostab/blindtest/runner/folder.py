@@ -49,6 +49,8 @@ _FILES = (
     "completeness.png",
     "reliability.png",
     "calibration.png",
+    "ranks.png",
+    "roc.png",
     "lock",
 )
 
@@ -104,6 +106,7 @@ def read_request(directory: Path) -> dict[str, Any] | None:
             f"{directory / 'benchmark.json'}: is not a benchmark of this version; "
             "begin again in another folder with -o"
         )
+    content.setdefault("counterparts", 0)  # runs of earlier versions had none
     return content
 
 
@@ -160,7 +163,7 @@ def begin_run(
     directory : pathlib.Path
         Folder of the run; its parent must exist.
     wanted : mapping
-        ``cases``, ``seed`` and ``nulls`` as given, None where not given.
+        ``cases``, ``seed``, ``nulls`` and ``counterparts`` as given, None where not given.
     usual : mapping
         Defaults; keys that are not in `wanted` are stored as they are.
 
@@ -221,6 +224,10 @@ def _check_request(chosen: Mapping[str, int]) -> None:
         )
     if chosen["seed"] < 0:
         raise OptionError(f"seed={chosen['seed']}: give a whole number from 0 up")
+    if chosen["counterparts"] < 0:
+        raise OptionError(
+            f"counterparts={chosen['counterparts']}: give 4 for one in four cases, or 0 for none"
+        )
     if chosen["nulls"] < 100:
         raise OptionError(
             f"nulls={chosen['nulls']}: a diagnosis needs at least 100 null records; "

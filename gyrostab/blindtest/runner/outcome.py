@@ -14,7 +14,9 @@ import pandas as pd
 from gyrostab.blindtest.runner.figures import (
     draw_calibration,
     draw_completeness,
+    draw_ranks,
     draw_reliability,
+    draw_roc,
 )
 from gyrostab.blindtest.runner.folder import FIRST_PUBLIC_SEED, write_text
 from gyrostab.blindtest.scoring.curves import (
@@ -22,11 +24,17 @@ from gyrostab.blindtest.scoring.curves import (
     curves,
     fitted_noise_curve,
     names_given,
+    rank_histogram,
     reliability,
+)
+from gyrostab.blindtest.scoring.detection import (
+    counterpart_table,
+    detection_shares,
+    roc_curves,
 )
 from gyrostab.blindtest.scoring.injections import injection_differences, injection_table
 from gyrostab.blindtest.scoring.probability import calibration_curve, risk_coverage
-from gyrostab.blindtest.scoring.score import score_case
+from gyrostab.blindtest.scoring.score import drawn_rows, score_case
 from gyrostab.blindtest.scoring.table import list_missed, markdown
 from gyrostab.store.output import replace_file
 
@@ -44,6 +52,21 @@ _EMPTY_DIAGNOSIS = {
     "seconds": math.nan,
 }
 
+_HEADLINES = (
+    "false alarms: effect named on a null record",
+    "effect named on a counterpart or a null record",
+    "detected, 3 times the limit in fitted noise or more",
+    "named correctly, 3 times the limit in fitted noise or more",
+    "both effects of a pair named correctly, each of that strength",
+    "cases with a wrong name",
+    "out of catalogue: unidentified",
+    "95 % intervals that contain the truth",
+    "probability of a name: expected calibration error",
+    "simulated records nearer to the recording with the effects, without refit",
+    "injections of strength 1.5 or more: named correctly",
+    "injections of 3 times the limit in fitted noise or more: named correctly",
+    "injection adds another name",
+)
 _MAX_LISTED = 40
 _COLUMNS = 118
 
@@ -51,14 +74,14 @@ _COLUMNS = 118
 def score_rows(
     found: Mapping[str, dict[str, Any]],
     truths: Mapping[str, dict[str, Any]],
-    baseline_hits: Mapping[str, Mapping[str, bool]],
+    baseline_scores: Mapping[str, Mapping[str, float]],
 ) -> Rows:
     """Score all cases; a case without a diagnosis counts as "nothing detected"."""
     return [
         {"name": name, "failed": name not in found, **row}
         for name, truth in truths.items()
         for row in score_case(
-            found.get(name, _EMPTY_DIAGNOSIS), truth, baseline_hits=baseline_hits.get(name)
+            found.get(name, _EMPTY_DIAGNOSIS), truth, baseline_scores=baseline_scores.get(name)
         )
     ]
 
@@ -84,6 +107,8 @@ def write_outcome(
         "completeness.png": draw_completeness(curves(rows)),
         "reliability.png": draw_reliability(reliability(rows)),
         "calibration.png": draw_calibration(calibration_curve(rows), risk_coverage(rows)),
+        "ranks.png": draw_ranks(rank_histogram(rows)),
+        "roc.png": draw_roc(roc_curves(rows)),
     }
     targets = [folder / name for name in ("scores.csv", "table.md", *figures)]
     write_text(targets[0], pd.DataFrame(plain).to_csv(index=False))
@@ -105,9 +130,11 @@ def page_text(
     """Format the outcome in Markdown: run, table, missed targets, curves and failed cases."""
     shown = curves(rows)
     every = shown[shown["effect"] == "all"] if len(shown) else shown
-    drawn = [row for row in rows if row["kind"] not in ("injected", "control")]
+    drawn = drawn_rows(rows)
     parts = [
         _describe_run(rows, job, commitment),
+        "### Headline figures",
+        markdown(_select_headlines(rows, table)),
         "### Figures with 95 % intervals and targets",
         "A target is *met* where the whole interval is in the target range, *missed* where the "
         "value is not, and otherwise *not shown*: there are too few cases to decide.",
@@ -134,6 +161,17 @@ def page_text(
         "Identifications in groups of similar probability: the mean probability *stated*, and the "
         "share of names that are *right*: true themselves, not only a member of the ambiguity set.",
         markdown(calibration_curve(rows)),
+        "The share of wrong names, and of the records with effects that have a name, if only names "
+        "of at least this probability count:",
+        markdown(_thin_out(risk_coverage(rows))),
+        "### Ranks of the true parameters",
+        "The rank of a true parameter is the probability below it by estimate and standard error. "
+        "*low* and *high* contain 95 % of the counts of exact normal estimates.",
+        markdown(rank_histogram(rows)),
+        "### Detection at equal rates of false alarms",
+        *_describe_detection(rows),
+        "### Noise-only counterparts",
+        *_describe_counterparts(rows),
         "### Wrong names",
         _format_list(
             [_describe_wrong_name(row) for row in _first_rows(drawn) if row["wrong"]], "none"
@@ -155,6 +193,48 @@ def page_text(
         _format_list([f"{name}: {why}" for name, why in failed.items()], "none"),
     ]
     return "\n\n".join(part if "\n" in part else _wrap_text(part) for part in parts) + "\n"
+
+
+def _thin_out(risk: pd.DataFrame) -> pd.DataFrame:
+    """Keep about ten lines of a risk-coverage curve, the last among them."""
+    every = max(1, math.ceil(len(risk) / 10))
+    return risk[::-1][::every][::-1]
+
+
+def _select_headlines(rows: Sequence[Mapping[str, Any]], table: pd.DataFrame) -> pd.DataFrame:
+    """Select the main lines of all tables."""
+    lines = pd.concat([table, counterpart_table(rows), injection_table(rows)])
+    return lines[lines["quantity"].isin(_HEADLINES)]
+
+
+def _describe_detection(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    shares = detection_shares(rows)
+    if not len(shares):
+        return ["Not computed: the run has no null records, or no effects of strength 1.5 or more."]
+    return [
+        "The threshold of each detector is the score that this share of all records of *noise* "
+        "(null records and counterparts) exceeds, rounded down to whole records. A record counts "
+        "if its strongest effect has strength 1.5 or more. The intervals are those of resampled "
+        "cases and records of noise.",
+        markdown(shares),
+    ]
+
+
+def _describe_counterparts(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    table = counterpart_table(rows)
+    if not len(table):
+        return ["None in this run."]
+    named = [
+        f"{_describe_case(row)}; named {', '.join(row['wrong_names'])}"
+        for row in rows
+        if row["kind"] == "counterpart" and row["wrong_names"]
+    ]
+    return [
+        "A counterpart is the record of a case without its effects: same noise, missing samples, "
+        "channels and quantization.",
+        markdown(table),
+        _format_list(named, "No effect was named on a counterpart."),
+    ]
 
 
 def _describe_injections(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -219,7 +299,8 @@ def _describe_run(
 ) -> str:
     kinds = pd.Series([row["kind"] for row in _first_rows(rows)]).value_counts()
     numbers = ", ".join(f"{number} {kind}" for kind, number in kinds.items())
-    repeat = f"gyrostab prove --cases {job['cases']} --seed {job['seed']} --nulls {job['nulls']}"
+    options = ("cases", "seed", "nulls", "counterparts")
+    repeat = " ".join(["gyrostab prove", *(f"--{name} {job[name]}" for name in options)])
     lines = [
         f"{job['cases']} cases ({numbers}); begun {job['begun']}; {job['machine']}; "
         f"code {' then '.join(job['code'])}.",

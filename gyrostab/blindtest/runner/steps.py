@@ -33,7 +33,7 @@ def draw_case(directory: Path, name: str, plan: dict[str, Any], real: Path | Non
     try:
         log, content = (
             make_injection_case(plan, real)
-            if real is not None and "copy" in plan
+            if real is not None and "recording" in plan
             else make_case(plan)
         )
         sha256 = commit_case(log, content, part, name=name)
@@ -66,21 +66,30 @@ def diagnose_case(recording: Path, target: Path, failed: Path, nulls: int) -> bo
     return True
 
 
-def compare_case(recording: Path, truth: dict[str, Any], target: Path) -> dict[str, bool]:
-    """Apply the baseline detectors: an Allan plot with known noise, and channel correlation."""
+def compare_case(recording: Path, truth: dict[str, Any], target: Path) -> dict[str, float]:
+    """Apply the detectors to compare with; above 0, a score is a detection."""
     import numpy as np
 
-    from gyrostab.blindtest.scoring.baseline_detectors import allan_detector, channel_detector
+    from gyrostab.blindtest.scoring.baseline_detectors import (
+        LEVEL,
+        RANDOM,
+        allan_detector,
+        channel_detector,
+    )
+    from gyrostab.blindtest.scoring.stepwise import stepwise_detector
     from gyrostab.jobs import load_log
 
     if target.exists():
-        kept: dict[str, bool] = json.loads(target.read_text(encoding="utf-8"))
-        return kept
+        kept: dict[str, float] = json.loads(target.read_text(encoding="utf-8"))
+        if RANDOM in kept:  # earlier versions did not keep scores
+            return kept
     log = load_log([recording]).compute()
     rng = np.random.default_rng(int(recording.stem[:7], 16))
-    hits = {
-        "Allan plot": bool(allan_detector(np.asarray(log["rate"].values), truth, rng=rng)),
-        "correlation with channels": bool(channel_detector(log)),
+    scores = {
+        "Allan plot": allan_detector(np.asarray(log["rate"].values), truth, rng=rng),
+        "correlation with channels": channel_detector(log),
+        "stepwise regression": stepwise_detector(log),
+        RANDOM: LEVEL - rng.random(),
     }
-    write_json(target, hits)
-    return hits
+    write_json(target, scores)
+    return scores

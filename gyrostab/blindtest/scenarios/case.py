@@ -116,7 +116,9 @@ def make_case(plan: dict[str, Any]) -> tuple[xr.Dataset, dict[str, Any]]:
     Parameters
     ----------
     plan : dict
-        From `plan_case`; a hand-written one may name any effect of the catalogue.
+        From `plan_case`; a hand-written one may name any effect of the catalogue. With ``copy``
+        of `plan_counterparts`, the effects are left out of the record: noise, missing samples,
+        channels and quantization are those of the case.
 
     Returns
     -------
@@ -168,8 +170,14 @@ def make_case(plan: dict[str, Any]) -> tuple[xr.Dataset, dict[str, Any]]:
         channels = degrade_driver(
             channels, str(driver), how=plan["degradation"], rng=stream(seed, "degradation", attempt)
         )
+    strengths = plan["strengths"]
+    if plan.get("copy") == "counterpart":
+        missing = find_missing(scenario, effects)
+        scenario, effects, strengths = replace(scenario, missing=missing), [], []
+        record = make_record(scenario, effects, seed=seed + attempt)
+        plan = plan | {"kind": "counterpart"}
     log = make_log(record, channels, start=scenario.start, rate=scenario.rate)
-    truth = describe_truth(scenario, effects, strengths=plan["strengths"]) | {
+    truth = describe_truth(scenario, effects, strengths=strengths) | {
         "plan": plan,
         "visibility": visibility,
         "attempts": attempt + 1,

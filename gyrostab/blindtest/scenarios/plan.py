@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,15 @@ from gyrostab.blindtest.generator.catalogue import CATALOGUE, OUT_OF_CATALOGUE
 from gyrostab.blindtest.generator.scenario import stream
 from gyrostab.errors import OptionError
 
-__all__ = ["DEGRADATIONS", "INCOMPATIBLE", "KINDS", "STRENGTHS", "plan_case", "plan_cases"]
+__all__ = [
+    "DEGRADATIONS",
+    "INCOMPATIBLE",
+    "KINDS",
+    "STRENGTHS",
+    "plan_case",
+    "plan_cases",
+    "plan_counterparts",
+]
 
 #: Kind of case -> its number in 20 cases. "single", "sub_threshold", "out_of_catalogue" and
 #: "degraded_driver" hold one effect.
@@ -158,3 +167,17 @@ def plan_cases(number: int, *, seed: int) -> list[dict[str, Any]]:
     5
     """
     return [plan_case(index, seed=seed) for index in range(number)]
+
+
+def plan_counterparts(plans: Sequence[dict[str, Any]], every: int) -> list[dict[str, Any]]:
+    """Plan the noise-only counterpart of one in `every` cases with effects; of none for 0.
+
+    Examples
+    --------
+    >>> plans = plan_cases(20, seed=3)
+    >>> len(plan_counterparts(plans, 4)), len(plan_counterparts(plans, 0))
+    (4, 0)
+    """
+    with_effects = [plan for plan in plans if plan["names"]]
+    chosen = with_effects[::every] if every else []
+    return [plan | {"copy": "counterpart"} for plan in chosen]

@@ -17,7 +17,9 @@ __all__ = [
     "allan_detector",
     "allan_variance",
     "band_excess",
+    "block_series",
     "channel_detector",
+    "channel_means",
     "log_allan",
     "octaves",
 ]
@@ -26,6 +28,9 @@ Array = NDArray[np.float64]
 
 #: Level of both detectors.
 LEVEL = 0.01
+
+#: Name of a detector that draws a random number.
+RANDOM = "random number"
 
 #: A longer record is analysed from block means, and its short times from a part.
 _LONG_RECORD_SAMPLES = 50_000
@@ -223,8 +228,10 @@ def band_excess(values: Array, band: dict[str, Any]) -> float:
 
 def allan_detector(
     record: Array, truth: dict[str, Any], *, rng: np.random.Generator, nulls: int = 60
-) -> bool:
-    """Test whether the Allan deviation of any axis leaves its 99 % band, with the true noise known.
+) -> float:
+    """Compute how far the Allan deviation of any axis is outside its band of noise [sigma].
+
+    The true noise is known. Above 0, the record differs from noise at 1 %.
 
     Parameters
     ----------
@@ -234,6 +241,7 @@ def allan_detector(
         Truth of the case, which holds its noise.
     """
     axes = len(truth["noise"])
+    beyond = []
     for row, noise in zip(record, truth["noise"].values(), strict=True):
         band = allan_band(
             noise=noise,
@@ -243,9 +251,8 @@ def allan_detector(
             nulls=nulls,
             flicker=truth["flicker"],
         )
-        if band_excess(row, band) > _shared_limit(band["limit"], axes):
-            return True
-    return False
+        beyond.append(band_excess(row, band) - _shared_limit(band["limit"], axes))
+    return max(beyond)
 
 
 def _shared_limit(limit: float, axes: int) -> float:
@@ -254,46 +261,59 @@ def _shared_limit(limit: float, axes: int) -> float:
     return float(-special.ndtri(tail / 2))
 
 
-def channel_detector(log: xr.Dataset, *, block: float = 10.0) -> bool:
-    """Test whether block means or variances correlate with any channel, at 1 % over all pairs.
+def block_series(log: xr.Dataset, length: int) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Compute block means and block log-variances (axis, block), and the samples present in each.
 
-    The blocks are assumed to be independent.
+    Parameters
+    ----------
+    length : int
+        Length of the blocks [samples]; an incomplete last one is left out. Blocks that are less
+        than a quarter full count as empty.
+    """
+    record = np.asarray(log["rate"].values)
+    number = record.shape[1] // length
+    cut = record[:, : number * length].reshape(record.shape[0], number, length)
+    count = np.isfinite(cut).sum(axis=2)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.nansum(cut, axis=2) / count
+        power = np.log(np.nansum((cut - mean[:, :, None]) ** 2, axis=2) / (count - 1))
+    return mean, power, np.where(count > max(2, length // 4), count, 0)
+
+
+def channel_means(log: xr.Dataset, length: int, number: int) -> dict[str, Array]:
+    """Average each channel of a log over `number` blocks of `length` samples of the gyro."""
+    out = {}
+    for name, variable in log.data_vars.items():
+        if variable.dims not in (("time",), (f"time_{name}",)):
+            continue
+        values = np.asarray(variable.values, dtype=float)
+        own = values.size / log.sizes["time"]
+        edges = np.minimum((np.arange(number) * length * own).astype(int), values.size - 1)
+        out[str(name)] = np.add.reduceat(values, edges) / np.diff(np.append(edges, values.size))
+    return out
+
+
+def channel_detector(log: xr.Dataset, *, block: float = 10.0) -> float:
+    """Compute how clearly block means or variances correlate with any channel [nats].
+
+    Above 0, the smallest p-value of all pairs is below 1 % over their number. The blocks are
+    assumed to be independent.
 
     Parameters
     ----------
     block : float
         Length of the blocks [s].
     """
-    rate = float(log.attrs["sampling_rate_hz"])
-    record = np.asarray(log["rate"].values)
-    length = round(block * rate)
-    number = record.shape[1] // length
-    cut = record[:, : number * length].reshape(record.shape[0], number, length)
-    enough = np.isfinite(cut).sum(axis=2) > max(2, length // 4)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        count = np.isfinite(cut).sum(axis=2)
-        mean = np.nansum(cut, axis=2) / count
-        spread = np.log(np.nansum((cut - mean[:, :, None]) ** 2, axis=2) / (count - 1))
-    pairs = []
-    for name in _list_channels(log):
-        values = np.asarray(log[name].values, dtype=float)
-        own = values.size / (record.shape[1] / rate)
-        edges = np.minimum((np.arange(number) * block * own).astype(int), values.size - 1)
-        driver = np.add.reduceat(values, edges) / np.diff(np.append(edges, values.size))
-        for i in range(record.shape[0]):
-            pairs += [
-                _correlation_p(series[i][enough[i]], driver[enough[i]]) for series in (mean, spread)
-            ]
-    found = [p for p in pairs if math.isfinite(p)]
-    return bool(found) and min(found) < LEVEL / len(found)
-
-
-def _list_channels(log: xr.Dataset) -> list[str]:
-    return [
-        str(name)
-        for name, variable in log.data_vars.items()
-        if variable.dims in (("time",), (f"time_{name}",))
+    length = round(block * float(log.attrs["sampling_rate_hz"]))
+    means, powers, counts = block_series(log, length)
+    pairs = [
+        _correlation_p(series[present > 0], driver[present > 0])
+        for driver in channel_means(log, length, means.shape[1]).values()
+        for both in (means, powers)
+        for series, present in zip(both, counts, strict=True)
     ]
+    found = [p for p in pairs if math.isfinite(p)]
+    return math.log(LEVEL / len(found) / max(min(found), 1e-300)) if found else -math.inf
 
 
 def _correlation_p(x: Array, y: Array) -> float:

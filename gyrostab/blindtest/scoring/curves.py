@@ -8,17 +8,26 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from gyrostab.blindtest.scoring.proportions import wilson
-from gyrostab.blindtest.scoring.score import first_rows
+from gyrostab.blindtest.scoring.score import drawn_rows, first_rows
 from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH, SURE_STRENGTH
 
-__all__ = ["by_effect", "curves", "fitted_noise_curve", "names_given", "reliability"]
+__all__ = [
+    "by_effect",
+    "curves",
+    "fitted_noise_curve",
+    "names_given",
+    "rank_histogram",
+    "reliability",
+]
 
 Row = Mapping[str, Any]
 
 _CURVES = [f"{key}{end}" for key in ("detected", "named") for end in ("", "_low", "_high")]
+_RANKS = 10  # groups of the rank histogram
 #: Limits between ranges of strength in fitted noise.
 _FITTED_LIMITS = (0.5, 1.0, CLEAR_STRENGTH, 2.0, SURE_STRENGTH, 5.0)
 
@@ -101,7 +110,7 @@ def _column_of(row: Row, key: str) -> str:
 def reliability(rows: Sequence[Row]) -> pd.DataFrame:
     """Compute the share of correct identifications by name, with Wilson's interval."""
     correct: dict[str, list[bool]] = {}
-    for row in first_rows([row for row in rows if row["kind"] not in ("injected", "control")]):
+    for row in first_rows(drawn_rows(rows)):
         for identification in row["identifications"]:
             correct.setdefault(identification["name"], []).append(identification["right"])
     out = []
@@ -117,6 +126,40 @@ def reliability(rows: Sequence[Row]) -> pd.DataFrame:
             }
         )
     return pd.DataFrame(out, columns=["name", "n", "right", "low", "high"])
+
+
+def rank_histogram(rows: Sequence[Row]) -> pd.DataFrame:
+    """Count the ranks of the true parameters in the normal laws of their estimates.
+
+    The rank is the probability below the truth. Exact estimates have all ranks equally often;
+    standard errors that are too small give too many low and high ones.
+
+    Returns
+    -------
+    pandas.DataFrame
+        ``rank`` (range), ``n``, and ``low`` and ``high``, between which 95 % of the counts of exact
+        estimates are.
+    """
+    from scipy.stats import binom, norm
+
+    pulls = [
+        number["pull"]
+        for row in rows
+        if row["kind"] in ("single", "pair", "triple", "sub_threshold")
+        and row["effect"]
+        and row["strength"] >= CLEAR_STRENGTH
+        for number in row["parameter_scores"]
+        if number["pull"] is not None
+    ]
+    edges = np.linspace(0.0, 1.0, _RANKS + 1)
+    counts, _ = np.histogram(norm.sf(np.array(pulls, dtype=float)), edges)
+    low, high = (int(binom.ppf(level, len(pulls), 1 / _RANKS)) for level in (0.025, 0.975))
+    return pd.DataFrame(
+        [
+            {"rank": f"{begin:.1f} to {end:.1f}", "n": int(count), "low": low, "high": high}
+            for (begin, end), count in zip(pairwise(edges), counts, strict=True)
+        ]
+    )
 
 
 def names_given(rows: Sequence[Row]) -> pd.DataFrame:

@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from gyrostab.blindtest.scoring.proportions import NO_TARGET, Line, Target, make_line, wilson
-from gyrostab.blindtest.scoring.score import first_rows
+from gyrostab.blindtest.scoring.score import drawn_rows, first_rows
 
 __all__ = [
     "calibration_curve",
@@ -34,7 +34,7 @@ def _collect_probabilities(rows: Sequence[Row]) -> tuple[Array, Array]:
     """Return the probability of each identification, and 1 where its name is right."""
     pairs = [
         (one["probability"], one["exact"])
-        for row in first_rows([row for row in rows if row["kind"] not in ("injected", "control")])
+        for row in first_rows(drawn_rows(rows))
         for one in row["identifications"]
         if one["probability"] is not None
     ]
@@ -90,20 +90,31 @@ def calibration_curve(rows: Sequence[Row]) -> pd.DataFrame:
 
 
 def risk_coverage(rows: Sequence[Row]) -> pd.DataFrame:
-    """Compute the share of wrong names among the most probable ones.
+    """Compute the share of wrong names against the share of records named.
 
     Returns
     -------
     pandas.DataFrame
-        One line for each probability, the largest first: ``coverage`` (share of the
-        identifications that have at least this probability) and ``risk`` (share of these that is
-        wrong).
+        One line for each probability, the largest first: ``least`` (this probability),
+        ``coverage`` (share of the records with effects that have a name at least as probable) and
+        ``risk`` (share of all such names that is wrong).
     """
     stated, right = _collect_probabilities(rows)
-    above = stated >= np.unique(stated)[::-1, None]
-    number = above.sum(axis=1)
+    least = np.unique(stated)[::-1]
+    above = stated >= least[:, None]
+    records = first_rows([row for row in drawn_rows(rows) if row["kind"] != "null"])
+    surest = np.array(
+        [
+            max((one["probability"] or 0.0 for one in row["identifications"]), default=0.0)
+            for row in records
+        ]
+    )
     return pd.DataFrame(
-        {"coverage": number / max(stated.size, 1), "risk": above @ (1.0 - right) / number}
+        {
+            "least": least,
+            "coverage": [float((surest >= one).mean()) if records else math.nan for one in least],
+            "risk": above @ (1.0 - right) / above.sum(axis=1),
+        }
     )
 
 

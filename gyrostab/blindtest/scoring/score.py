@@ -12,7 +12,13 @@ from gyrostab.blindtest.generator.catalogue import merge_ambiguous
 from gyrostab.blindtest.generator.detection_limits import NATS
 from gyrostab.errors import SchemaError
 
-__all__ = ["first_rows", "intersection_over_union", "score_case"]
+__all__ = [
+    "detection_score",
+    "drawn_rows",
+    "first_rows",
+    "intersection_over_union",
+    "score_case",
+]
 
 Intervals = Sequence[Sequence[str]]
 
@@ -172,6 +178,11 @@ def _check_diagnosis(diagnosis: Mapping[str, Any]) -> None:
         )
 
 
+def drawn_rows(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Keep the rows of drawn cases: no counterparts, injections and controls."""
+    return [row for row in rows if row["kind"] not in ("counterpart", "injected", "control")]
+
+
 def first_rows(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     """Keep one row per case."""
     seen: dict[Any, Mapping[str, Any]] = {}
@@ -180,11 +191,44 @@ def first_rows(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     return list(seen.values())
 
 
+def detection_score(diagnosis: Mapping[str, Any]) -> float:
+    """Compute how far a diagnosis is above its threshold of detection, or below it [nats].
+
+    This is the largest of: the evidence of each named effect, less its threshold; the logarithm of
+    the false-alarm level over the p-value of each mismatch; and what each effect that noise
+    explains lacks, with a negative sign.
+
+    Examples
+    --------
+    >>> weak = {"name": "shupe", "beaten_by": "noise", "nats": 2.5}
+    >>> detection_score({"effects": [], "mismatches": [], "rejected": [weak]})
+    -2.5
+    """
+    level = diagnosis.get("false_alarm_level") or 0.01
+    gains = [effect.get("held_out_gain") or {} for effect in diagnosis["effects"]]
+    margins = [
+        gain["nats"] - gain["threshold"]
+        for gain in gains
+        if gain.get("nats") is not None and gain.get("threshold") is not None
+    ]
+    margins += [
+        math.log(level / max(mismatch["p_value"], 1e-300))
+        for mismatch in diagnosis["mismatches"]
+        if mismatch.get("p_value") is not None
+    ]
+    margins += [
+        -one["nats"]
+        for one in diagnosis.get("rejected", ())
+        if one["beaten_by"] == "noise" and one["nats"] is not None
+    ]
+    return max(margins, default=-math.inf)
+
+
 def score_case(
     diagnosis: Mapping[str, Any],
     truth: Mapping[str, Any],
     *,
-    baseline_hits: Mapping[str, bool] | None = None,
+    baseline_scores: Mapping[str, float] | None = None,
 ) -> list[dict[str, Any]]:
     """Compare a diagnosis with the truth.
 
@@ -194,19 +238,20 @@ def score_case(
         Content of ``diagnosis.json``.
     truth : mapping
         Truth from `make_case` or `open_truth`.
-    baseline_hits : mapping, optional
-        Name of each baseline detector -> whether it detected something.
+    baseline_scores : mapping, optional
+        Name of each baseline detector -> its score, above 0 for a detection.
 
     Returns
     -------
     list of dict
         One row for every true effect, or one row without an effect: ``kind``, ``effect``,
-        ``strength``, ``detected``, ``named`` (ambiguity sets merged), ``named_exactly``,
-        ``in_set``, ``set_size``, ``wrong`` (number of wrong names), ``unidentified``, ``iou``,
-        ``tau_hit``, ``parameter_scores``, ``gain``, ``oracle``, ``learned`` (the oracle's with
-        fitted noise), ``model_check`` (of `check_model`), ``seconds``, ``identifications`` and
-        more. A name counts once, on however many axes it is identified: with its ``probability``,
-        whether its ambiguity set is ``right``, and whether it is a true name itself (``exact``).
+        ``strength``, ``detected``, ``score`` (of `detection_score`), ``named`` (ambiguity
+        sets merged), ``named_exactly``, ``in_set``, ``set_size``, ``wrong`` (number of wrong
+        names), ``unidentified``, ``iou``, ``tau_hit``, ``parameter_scores``, ``gain``, ``oracle``,
+        ``learned`` (the oracle's with fitted noise), ``model_check`` (of `check_model`),
+        ``seconds``, ``identifications`` and more. A name counts once, on however many axes it is
+        identified: with its ``probability``, whether its ambiguity set is ``right``, and whether it
+        is a true name itself (``exact``).
 
     Raises
     ------
@@ -236,6 +281,7 @@ def score_case(
         "missing": truth["missing_share"],
         "verdict": diagnosis["verdict"],
         "detected": detected,
+        "score": detection_score(diagnosis),
         "wrong": len(wrong),
         "wrong_names": wrong,
         "unidentified": bool(
@@ -258,7 +304,7 @@ def score_case(
         "coverage_after": (diagnosis["held_out"] or {}).get("coverage95_after"),
         "model_check": diagnosis.get("model_check"),
         "seconds": float(diagnosis.get("seconds") or 0.0),
-        "baseline_detectors": dict(baseline_hits or {}),
+        "baseline_detectors": dict(baseline_scores or {}),
     }
     if not true:
         return [

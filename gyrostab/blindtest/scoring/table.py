@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from gyrostab.blindtest.scoring.baseline_detectors import RANDOM
 from gyrostab.blindtest.scoring.probability import probability_lines
 from gyrostab.blindtest.scoring.proportions import Line, Target, median, share, spread
-from gyrostab.blindtest.scoring.score import first_rows
+from gyrostab.blindtest.scoring.score import drawn_rows, first_rows
 
 __all__ = ["CLEAR_STRENGTH", "SURE_STRENGTH", "list_missed", "markdown", "score_table"]
 
@@ -31,7 +32,8 @@ def score_table(rows: Sequence[Row]) -> pd.DataFrame:
     Parameters
     ----------
     rows : sequence of dict
-        All rows of `score_case`; injections and their controls are left to `injection_table`.
+        All rows of `score_case`; counterparts are left to `counterpart_table`,
+        injections and their controls to `injection_table`.
 
     Returns
     -------
@@ -40,7 +42,7 @@ def score_table(rows: Sequence[Row]) -> pd.DataFrame:
         the whole interval is in the target range, ``missed`` where the value is not, else ``not
         shown``; empty without a target.
     """
-    rows = [row for row in rows if row["kind"] not in ("injected", "control")]
+    rows = drawn_rows(rows)
     groups = (
         _false_alarm_lines,
         _naming_lines,
@@ -325,11 +327,15 @@ def _baseline_lines(rows: Sequence[Row]) -> list[Line]:
         [row for row in rows if row["kind"] == "null"],
         _catalogue_rows(rows, least=CLEAR_STRENGTH),
     )
-    names = sorted({name for row in rows for name in row["baseline_detectors"]})
+    names = sorted({name for row in rows for name in row["baseline_detectors"]} - {RANDOM})
     lines = [
         share(
             label.format(name),
-            (row["baseline_detectors"][name] for row in part if name in row["baseline_detectors"]),
+            (
+                row["baseline_detectors"][name] > 0.0
+                for row in part
+                if name in row["baseline_detectors"]
+            ),
         )
         for label, part in (
             ("detected by the {}, strength 1.5 or more", clear),

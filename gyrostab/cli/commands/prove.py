@@ -28,6 +28,7 @@ def prove(
     cases: Annotated[int | None, Parameter(metavar="N", validator=Number(gte=1))] = None,
     seed: Annotated[int | None, Parameter(metavar="N", validator=Number(gte=0))] = None,
     nulls: Annotated[int | None, Parameter(metavar="N", validator=Number(gte=100))] = None,
+    counterparts: Annotated[int | None, Parameter(metavar="N", validator=Number(gte=0))] = None,
     real: Annotated[Path | None, Parameter(metavar="DIR", env_var="GYROSTAB_RECORDINGS")] = None,
     resume: Flag = False,
     common: Common = Common(),
@@ -51,6 +52,8 @@ def prove(
         tuning; published figures use others.
     nulls
         Null records of each diagnosis (default: 400; 200 for a quick look).
+    counterparts
+        One in N cases with effects is diagnosed without its effects too (default: 4; 0 for none).
     real
         Folder of real recordings (default: $GYROSTAB_RECORDINGS); one injection is made for every
         40 cases. Without the folder there are no injections.
@@ -80,6 +83,7 @@ def prove(
                 cases=cases,
                 seed=seed,
                 nulls=nulls,
+                counterparts=counterparts,
                 workers=common.workers,
                 real=real,
                 resume=resume,
