@@ -24,7 +24,7 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from gyrostab.blindtest.scoring.probability import expected_calibration_error
-from gyrostab.blindtest.scoring.score import score_case
+from gyrostab.blindtest.scoring.score import drawn_rows, score_case
 from gyrostab.diagnose.settings import DEFAULTS
 
 Array = NDArray[np.float64]
@@ -75,12 +75,10 @@ def collect_names(runs: list[Path]) -> Names:
         for path in sorted((run / "diagnoses").glob("*.json")):
             diagnosis = json.loads(path.read_text(encoding="utf-8"))
             truth = json.loads((run / "truth" / path.name).read_text(encoding="utf-8"))
-            case = score_case(diagnosis, truth)[0]
-            if case["kind"] in ("injected", "control"):  # real recordings have unknown effects
-                continue
-            for one in case["identifications"]:
-                rivals.append(sum_rivals(one["name"], diagnosis))
-                right.append(one["exact"])
+            for case in drawn_rows(score_case(diagnosis, truth))[:1]:
+                for one in case["identifications"]:
+                    rivals.append(sum_rivals(one["name"], diagnosis))
+                    right.append(one["exact"])
     return Names(np.array(rivals), np.array(right))
 
 

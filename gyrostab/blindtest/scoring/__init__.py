@@ -1,1 +1,1 @@
-"""Score diagnoses against the ground truth, and compare them with two baseline detectors."""
+"""Score diagnoses against the ground truth, and compare them with other detectors."""
