@@ -123,10 +123,11 @@ def recalibrate(
     return out
 
 
-#: Variables of a baseline that an axis keeps with its noise.
+#: Variables of a baseline that an axis keeps with its noise. The grid follows from the posterior,
+#: and has as many points on all axes.
 _AXIS_VARIABLES = (
     "coefficient", "stderr", "spectrum", "mean_variance", "square", "square_stderr", "posterior",
-    "posterior_slow", "grid_K", "grid_B", "grid_prior", "grid_calibrated",
+    "posterior_slow",
 )  # fmt: skip
 
 

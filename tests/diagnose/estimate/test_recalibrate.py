@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.baseline.calibrate import (
+    assemble_baseline,
+    calibrate_axes,
+    calibrate_noise,
+)
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.estimate.recalibrate import recalibrate, with_noise
@@ -21,6 +25,7 @@ from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result import finish as conclude
+from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.simulate import simulate
 
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
@@ -150,8 +155,24 @@ def test_noise_that_changes_far_from_its_reference_has_the_level_of_the_record()
 
 def test_axis_without_an_effect_keeps_its_noise(shaken):
     _, baseline, after = shaken
-    for name in ("coefficient", "spectrum", "square", "grid_calibrated", "mean_variance"):
+    for name in ("coefficient", "spectrum", "square", "grid_K", "mean_variance"):
         np.testing.assert_array_equal(after[name].sel(axis="y"), baseline[name].sel(axis="y"))
+    before, now = (np.exp(one["grid_calibrated"].sel(axis="y")) for one in (baseline, after))
+    np.testing.assert_allclose(now, before, atol=1e-9)
+
+
+def test_axes_that_need_larger_grids_before_than_after(shaken):
+    identifications, baseline, _ = shaken
+    blocks = identifications.state.blocks
+    quiet = np.ones((2, blocks.sizes["block"]), np.bool_)
+    quiet[0, 2:] = False
+    wide = assemble_baseline(
+        blocks, calibrate_axes(blocks, quiet, DEFAULTS), quiet=quiet, attrs=baseline.attrs
+    )
+    after = recalibrate(identifications, wide, fit_identifications(identifications, wide))
+    assert after.sizes["grid"] < wide.sizes["grid"]
+    for axis in "xy":
+        assert np.exp(after["grid_calibrated"].sel(axis=axis)).sum() == pytest.approx(1.0)
 
 
 def test_effect_and_new_noise_add_up_to_the_record(shaken):
