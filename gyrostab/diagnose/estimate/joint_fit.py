@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.identify.equivalents import prefer_plainer
 from gyrostab.diagnose.identify.identification import (
     Identification,
     Identifications,
@@ -201,8 +200,6 @@ def _fit_components(
         by_statistic,
         key=lambda name: sum(component.evidence_nats for component in by_statistic[name]),
     )
-    plain = [prefer_plainer(component, state) for component in by_statistic[statistic]]
-    by_statistic[statistic] = [component for component, _ in plain]
     filtered = by_statistic[statistic][0].is_filter
     sizes: Mapping[str, tuple[float, ...]]
     if filtered:
@@ -242,7 +239,7 @@ def _fit_components(
         axes,
         estimates,
         averaged if effect is None else effect,
-        next((note for _, note in plain if note), ""),
+        next((component.note for component in by_statistic[statistic] if component.note), ""),
         averaged,
     )
 

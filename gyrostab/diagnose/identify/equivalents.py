@@ -1,21 +1,116 @@
-"""Reduce effects of several terms to one where the data do not separate the terms."""
+"""Choose one of the equivalent forms of an effect, for its noise, its sizes and its model alike."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+import xarray as xr
 
+from gyrostab.diagnose.identify.identification import (
+    Identification,
+    Identifications,
+    condition_on_selections,
+)
 from gyrostab.diagnose.predict.candidates import Component, Variant
-from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.sizes import component_mixture
+from gyrostab.physics.registry import effects
 
-__all__ = ["prefer_plainer"]
+__all__ = ["prefer_plainer", "settle_forms"]
 
 
-def prefer_plainer(component: Component, state: State) -> tuple[Component, str]:
-    """Return a component with a single term where that explains as much, and a sentence about it.
+def settle_forms(identifications: Identifications, baseline: xr.Dataset) -> Identifications:
+    """Return identifications with the forms that their models will have.
+
+    Each component has a single term where that explains as much, and all components of an effect
+    have the same choice of each parameter that is a text. Noise that is calibrated with another
+    form than the model has does not belong to that model.
+    """
+    start = initial_state(
+        identifications.state.blocks, baseline, settings=identifications.state.settings
+    )
+    chosen = [*identifications.expected, *identifications.identified, *identifications.unknown]
+
+    def settle(identification: Identification) -> Identification:
+        state = replace(
+            condition_on_selections(start, chosen, identification),
+            weight=identifications.state.weight,
+            masked=identifications.state.masked,
+        )
+        alike = _share_choices(identification.components, state)
+        return replace(
+            identification,
+            components=tuple(prefer_plainer(component, state) for component in alike),
+        )
+
+    return replace(
+        identifications,
+        identified=tuple(settle(one) for one in identifications.identified),
+        expected=tuple(settle(one) for one in identifications.expected),
+    )
+
+
+def _share_choices(components: Sequence[Component], state: State) -> list[Component]:
+    """Return components with the same texts, those that explain most together.
+
+    The default is preferred unless another text is clearly better.
+    """
+    choices: list[tuple[float, bool, list[Component]]] = []
+    tried: list[dict[str, str]] = []
+    for component in components:
+        for texts in (variant.texts for variant in component.candidate.variants):
+            if texts not in tried:
+                tried.append(texts)
+    known = {
+        item.name: item.default for item in effects()[components[0].candidate.effect].parameters()
+    }
+    for texts in tried if len(tried) > 1 else ():
+        alike = [_select_texts(component, state, texts) for component in components]
+        if None not in alike:
+            found = [one for one in alike if one is not None]
+            nats = sum(_explained_nats(one, state, one.variant) for one in found if _has_forms(one))
+            choices.append((nats, all(known[name] == texts[name] for name in texts), found))
+    top = max((nats for nats, _, _ in choices), default=0.0)
+    usual = [
+        choice
+        for choice in choices
+        if choice[1] and choice[0] > top - state.settings.ambiguous_nats
+    ]
+    return max(usual or choices, key=lambda choice: choice[0], default=(0.0, True, [*components]))[
+        2
+    ]
+
+
+def _select_texts(component: Component, state: State, texts: Mapping[str, str]) -> Component | None:
+    """Return a component in its best variant with some texts; None if it has none."""
+    if component.variant.texts == texts or not _has_forms(component):
+        return component
+    alike = [
+        one
+        for one in component.candidate.variants
+        if one.columns == component.variant.columns
+        and one.squared == component.variant.squared
+        and one.texts == texts
+    ]
+    if not alike:
+        return None
+    return replace(
+        component, variant=max(alike, key=lambda one: _explained_nats(component, state, one))
+    )
+
+
+def _has_forms(component: Component) -> bool:
+    """Return whether the variants of a component are columns of which the size is fitted."""
+    statistic = component.statistic
+    return bool(component.variant.columns) and (
+        statistic.is_linear_in_means or statistic.is_power or statistic.is_pairwise
+    )
+
+
+def prefer_plainer(component: Component, state: State) -> Component:
+    """Return a component with a single term where that explains as much, and a note about it.
 
     A component of one term gets the first of those that explain as much, but for 3 nats and an
     error of the form. Terms that rise and fall together, as g^2 and g^4 at one level of vibration,
@@ -30,12 +125,11 @@ def prefer_plainer(component: Component, state: State) -> tuple[Component, str]:
 
     Returns
     -------
-    component : Component
-    sentence : str
-        Empty when the component is unchanged.
+    Component
+        Unchanged, or with a sentence about it as its `note`.
     """
     if not (component.statistic.is_linear_in_means or component.statistic.is_power):
-        return component, ""
+        return component
     if len(component.variant.columns) == 1:
         return _prefer_first_term(component, state)
     mean, covariance = component_mixture(component, state).moments()
@@ -44,10 +138,8 @@ def prefer_plainer(component: Component, state: State) -> tuple[Component, str]:
     found = ((name, _single_term_variant(component, name)) for name in component.variant.columns)
     alone = {name: one for name, one in found if one is not None}
     if not alone:
-        return component, ""
-    gains = {
-        name: _single_term_evidence(component, state, variant) for name, variant in alone.items()
-    }
+        return component
+    gains = {name: _explained_nats(component, state, variant) for name, variant in alone.items()}
     needed, share = state.settings.reject_nats, state.settings.form_error_share
     best = max(gains.values())
     # the first that explains as much as the best
@@ -59,12 +151,12 @@ def prefer_plainer(component: Component, state: State) -> tuple[Component, str]:
         correlation < state.settings.term_correlation
         and whole - gains[name] > needed + share * gains[name]
     ):
-        return component, ""
+        return component
     others = [other for other in component.variant.columns if other != name]
-    return replace(component, variant=alone[name]), _describe_unseparated(name, others)
+    return replace(component, variant=alone[name], note=_describe_unseparated(name, others))
 
 
-def _prefer_first_term(component: Component, state: State) -> tuple[Component, str]:
+def _prefer_first_term(component: Component, state: State) -> Component:
     """Return a component of one term with the first of the terms that explain as much.
 
     Rounding or chance may have put another one ahead.
@@ -73,27 +165,27 @@ def _prefer_first_term(component: Component, state: State) -> tuple[Component, s
         one.columns[0] for one in component.candidate.variants if len(one.columns) == 1
     )
     terms = [one for name in names if (one := _single_term_variant(component, name)) is not None]
-    own = _single_term_evidence(component, state, component.variant)
+    own = _explained_nats(component, state, component.variant)
     correlation = [
         one
         for one in terms
         if one.columns == component.variant.columns
-        or _single_term_evidence(component, state, one)
+        or _explained_nats(component, state, one)
         > own - state.settings.ambiguous_nats - state.settings.form_error_share * own
     ]
     if len(correlation) < 2:
-        return component, ""
+        return component
     first, *others = correlation
-    return replace(component, variant=first), _describe_unseparated(
-        first.columns[0], [one.columns[0] for one in others]
-    )
+    note = _describe_unseparated(first.columns[0], [one.columns[0] for one in others])
+    return replace(component, variant=first, note=note)
 
 
-def _single_term_evidence(component: Component, state: State, variant: Variant) -> float:
-    """Return the evidence [nats] of a single term; zero where it would reduce the power."""
+def _explained_nats(component: Component, state: State, variant: Variant) -> float:
+    """Return what the terms of a variant explain [nats]; zero where they would reduce the power."""
     size, spread = component_mixture(component, state, variant).moments()
-    possible = max(float(size[0]), 0.0) if variant.squared else float(size[0])
-    return 0.5 * possible**2 / float(spread[0, 0])
+    if variant.squared and not component.statistic.is_pairwise:
+        size = np.maximum(size, 0.0)
+    return 0.5 * float(size @ np.linalg.solve(spread, size))
 
 
 def _describe_unseparated(name: str, others: Sequence[str]) -> str:

@@ -13,6 +13,7 @@ from gyrostab.diagnose.baseline.quantization_grid import rounded_rates
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence, ExpectedCounts
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
+from gyrostab.diagnose.identify.equivalents import settle_forms
 from gyrostab.diagnose.identify.expected import identify_expected_effects
 from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
@@ -91,7 +92,7 @@ def name_effects(
         settings,
     )
     identified, unidentified, rejected, state = search.run(start)
-    return Identifications(
+    found = Identifications(
         tuple(identified),
         tuple(unidentified),
         search.threshold,
@@ -104,6 +105,7 @@ def name_effects(
         tuple(expected),
         tuple(rejected),
     )
+    return settle_forms(found, baseline)
 
 
 def _score_null_records(

@@ -152,7 +152,7 @@ def _merge_points(points: Sequence[Point]) -> Mixture:
 
 
 def _variant_family(component: Component, candidates: Sequence[Candidate]) -> list[Variant]:
-    """Return the variants of the component with the same columns: the grid."""
+    """Return the variants of the component with the same columns and texts: the grid."""
     candidate = next(
         (
             one
@@ -164,7 +164,9 @@ def _variant_family(component: Component, candidates: Sequence[Candidate]) -> li
     return [
         one
         for one in candidate.variants
-        if one.columns == component.variant.columns and one.squared == component.variant.squared
+        if one.columns == component.variant.columns
+        and one.squared == component.variant.squared
+        and one.texts == component.variant.texts
     ]
 
 

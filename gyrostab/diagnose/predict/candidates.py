@@ -40,6 +40,11 @@ class Variant:
     #: bias switches within blocks.
     inside: Array = field(default_factory=lambda: np.empty(0))
 
+    @property
+    def texts(self) -> dict[str, str]:
+        """Values that are texts."""
+        return {name: value for name, value in self.values.items() if isinstance(value, str)}
+
 
 class Prospect(NamedTuple):
     """An effect with given nuisance values, before a statistic makes variants of it."""
@@ -84,6 +89,7 @@ class Component:
     row: tuple[str, ...]  # axes of the row
     evidence_nats: float  # held-out evidence [nats]
     place: int = -1  # index of the line, or of the set of harmonics; -1 if there is none
+    note: str = ""  # sentence about terms that the record does not separate
 
     @property
     def statistic(self) -> Statistic:

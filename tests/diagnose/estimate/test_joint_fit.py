@@ -14,6 +14,7 @@ from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
+from gyrostab.diagnose.identify.equivalents import settle_forms
 from gyrostab.diagnose.identify.identification import Identification, Identifications
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import Component
@@ -149,7 +150,7 @@ def test_terms_not_separated_by_one_level_become_one(noise_only, levels, both):
     frame = identify_by_hand(
         one, baseline, "vibration_rectification", "mean", ("sensitivity", "quartic")
     )
-    (fitted,) = fit_identifications(frame, baseline)
+    (fitted,) = fit_identifications(settle_forms(frame, baseline), baseline)
     assert set(fitted.parameters) == ({"sensitivity", "quartic"} if both else {"sensitivity"})
     assert ("does not separate" in fitted.say()) is not both
     for name, truth in (("sensitivity", sensitivity), ("quartic", quartic)):
@@ -173,12 +174,31 @@ def test_single_term_is_the_plainest_of_equivalent_ones(noise_only, levels, colu
     shape = xr.DataArray(0.005 * g**2 if column == "sensitivity" else 1e-4 * g**4, dims="block")
     one = blocks.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + shape)
     one["channel_vibration"] = blocks["channel_vibration"].copy(data=g)
-    (fitted,) = fit_identifications(
-        identify_by_hand(one, baseline, "vibration_rectification", "mean", (column,)), baseline
-    )
+    frame = identify_by_hand(one, baseline, "vibration_rectification", "mean", (column,))
+    (fitted,) = fit_identifications(settle_forms(frame, baseline), baseline)
     alike = levels[0] == levels[1]
     assert set(fitted.parameters) == ({"sensitivity"} if alike else {column})
     assert ("does not separate" in fitted.say()) is alike
+
+
+def test_axes_of_one_effect_have_one_choice_of_a_text():
+    """The logger samples all axes alike, also where chance favours another way on one axis."""
+    table = {"name": "aliased_vibration", "low": 17.0, "high": 19.0, "sensitivity": [0.01]}
+    blocks = record([table])
+    baseline = calibrate_noise(blocks)
+    frame = identify_by_hand(blocks, baseline, "aliased_vibration", "power", ("sensitivity",))
+    (identification,) = frame.identified
+    (first,) = identification.components
+    ways = {one.values["sampling"]: one for one in first.candidate.variants}
+    assert set(ways) == {"point", "average"}
+    components = (first, replace(first, row=("y",), variant=ways["average"]))
+    both = replace(identification, axes=("x", "y"), components=components)
+    settled = settle_forms(replace(frame, identified=(both,)), baseline)
+    texts = [one.variant.texts for one in settled.identified[0].components]
+    assert texts == [{"sampling": "point"}] * 2
+    (fitted,) = fit_identifications(settled, baseline)
+    assert fitted.effect is not None
+    assert fitted.effect.sampling == "point"
 
 
 @pytest.fixture(scope="module")

@@ -19,6 +19,7 @@ from gyrostab.diagnose.estimate.recalibrate import recalibrate, with_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
+from gyrostab.diagnose.identify.equivalents import settle_forms
 from gyrostab.diagnose.identify.identification import Identification, Identifications
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
@@ -128,6 +129,29 @@ def test_relative_size_refers_to_the_recalibrated_noise():
     assert first[0].parameters["linear"].high < 0.05
     growth = fit.fitted[0].parameters["linear"].value * noise_coefficient(fit.noise, "N")[0] ** 2
     assert growth == pytest.approx(0.05 * 0.003**2, rel=0.1)
+
+
+def test_noise_is_that_of_the_form_in_the_model():
+    """The evidence may prefer the square of the temperature; the model has the plainer law."""
+    heat = {
+        "profile": "ramps",
+        "channel": "temperature",
+        "unit": "degC",
+        "points": [[0, 50], [900, 60], [1800, 50]],
+    }
+    blocks = reduce_simulation(
+        {"name": "temperature_noise", "linear": 0.03, "axes": ["x"]}, environment=[heat]
+    )
+    baseline = calibrate_noise(blocks)
+    frame = identify_by_hand(blocks, baseline, "temperature_noise", "power", ("quadratic",))
+    identifications = settle_forms(frame, baseline)
+    first = fit_identifications(identifications, baseline)
+    fit = conclude.refit_with_noise(identifications, baseline, first)
+    (size,) = fit.fitted[0].parameters.values()
+    assert set(fit.fitted[0].parameters) == {"linear"}
+    mean = float(blocks["channel_temperature"].mean()) - 25.0
+    level = noise_coefficient(fit.noise, "N")[0] ** 2 * (1.0 + size.value * mean)
+    assert level == pytest.approx(noise_coefficient(baseline, "N")[0] ** 2, rel=0.03)
 
 
 def test_noise_that_changes_far_from_its_reference_has_the_level_of_the_record():
