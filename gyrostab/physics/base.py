@@ -242,6 +242,10 @@ class Effect:
         """List the channels (of `channels`) that *generate* requires with these parameters."""
         return tuple(self.channels)
 
+    def courses(self) -> tuple[str, ...]:
+        """List the channels of which the effect follows the course, not the noise of the sensor."""
+        return ()
+
     def recorded_axes(self) -> tuple[str, ...]:
         """List the axes whose rate *generate* takes from the recording that a log is made like."""
         return ()

@@ -91,6 +91,10 @@ class SupplyBias(Effect):
         """List the channels with a nonzero sensitivity."""
         return ("supply_voltage",) * bool(self.voltage) + ("light_power",) * bool(self.power)
 
+    def courses(self) -> tuple[str, ...]:
+        """List the channels that the effect follows with a lag."""
+        return self.needs() if self.lag else ()
+
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """Make an empty state."""
         return {}

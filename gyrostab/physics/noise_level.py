@@ -206,6 +206,10 @@ class LightPowerNoise(Effect):
             self, thermal=thermal / most, shot=shot / most, nominal=drivers["light_power"]
         )
 
+    def courses(self) -> tuple[str, ...]:
+        """List the light power, because the effect divides by it."""
+        return self.needs()
+
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
         """Compute squared N for every sample."""
         power = chunk.drivers["light_power"]

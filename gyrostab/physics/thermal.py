@@ -182,6 +182,10 @@ class Shupe(Effect):
                 "because one mode has no outer and inner half"
             )
 
+    def courses(self) -> tuple[str, ...]:
+        """List the temperature, because its rate of change would be that of the noise."""
+        return self.needs()
+
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """Start in thermal equilibrium."""
         return None
@@ -314,6 +318,10 @@ class ThermalGradient(Effect):
     )
     lag: float = parameter("s", "lag of that change", default=60.0, low=1e-3, high=1e6)
 
+    def courses(self) -> tuple[str, ...]:
+        """List both temperatures if the effect follows the change of their difference."""
+        return self.needs() if self.change else ()
+
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """Start without a change."""
         return None
@@ -403,6 +411,10 @@ class ThermalHysteresis(Effect):
         "deg/h/degC", "bias per degree in the dead band", typical=3e-4, low=-10.0, high=10.0
     )
     width: float = parameter("degC", "half of the dead band", default=3.0, low=0.0, high=500.0)
+
+    def courses(self) -> tuple[str, ...]:
+        """List the temperature, because its extremes would be those of the noise."""
+        return self.needs()
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """Start without a position; the dead band will be centred on the first temperature."""

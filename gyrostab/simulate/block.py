@@ -24,12 +24,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Step:
-    """One effect with the rows of its axes, and the unit conversion of its channels."""
+    """One effect with the rows of its axes, and the sources and unit conversion of its channels."""
 
     effect: Effect
     setup: Setup
     rows: tuple[int, ...]
     factors: Mapping[str, float] = field(default_factory=dict)
+    sources: Mapping[str, str] = field(default_factory=dict)  # source of each channel it needs
 
 
 @dataclass(frozen=True)
@@ -105,10 +106,9 @@ def next_block(
     def act(number: int, fast: bool = True, **given: Any) -> tuple[Step, Any]:
         step = plan.steps[number]
         size, skip = (index.size, 1) if fast else (count, factor)
-        names = step.effect.channel_names()
         drivers = {
-            role: channels[names[role]][::skip] * step.factors.get(role, 1.0)
-            for role in step.effect.needs()
+            role: channels[name][::skip] * step.factors.get(role, 1.0)
+            for role, name in step.sources.items()
         }
         chunk = Chunk(
             setup=step.setup,

@@ -30,7 +30,7 @@ from gyrostab.schema import (
 )
 from gyrostab.simulate.block import BlockState, Plan, Step, check_effects
 from gyrostab.simulate.channels import combine
-from gyrostab.simulate.drivers import Source, make_source
+from gyrostab.simulate.drivers import Source, make_course, make_source
 from gyrostab.simulate.lazy import lazy_rates
 from gyrostab.simulate.model import PROFILES, Model, read_model
 from gyrostab.simulate.noise import begin_noise, stream
@@ -45,6 +45,7 @@ __all__ = ["simulate"]
 #: Samples of the instrument in one block of the lazy log.
 BLOCK = 2**17
 _RECORDED = "recorded rate of "  # source of an effect, in front of the name of the axis
+_COURSE = "course of "  # source of an effect, in front of the name of a recorded channel
 _RESTART = GAP_CAUSES.index("restart")
 
 
@@ -344,10 +345,16 @@ def _make_plan(
     like: xr.Dataset | None,
 ) -> Plan:
     present = log_channels(environment)
+    measured = [] if like is None else log_channels(like)
     steps = [
-        replace(step, factors=_convert_units(step.effect, environment, present)) for step in steps
+        replace(
+            step,
+            factors=_convert_units(step.effect, environment, present),
+            sources=_choose_sources(step.effect, measured),
+        )
+        for step in steps
     ]
-    needed = {step.effect.channel_names()[role] for step in steps for role in step.effect.needs()}
+    needed = {name for step in steps for name in step.sources.values()}
     turning = (
         str(environment["rotation_rate"].attrs.get("rotation_axis", ""))
         if "rotation_rate" in present
@@ -369,7 +376,12 @@ def _make_plan(
         coefficients=tuple(model.coefficients(axis) for axis in frame.axes),
         steps=tuple(steps),
         sources={
-            **{name: make_source(environment, name) for name in sorted(needed)},
+            **{
+                name: make_course(environment, name.removeprefix(_COURSE))
+                if name.startswith(_COURSE)
+                else make_source(environment, name)
+                for name in sorted(needed)
+            },
             **{f"{_RECORDED}{axis}": source for axis, source in recorded.items()},
         },
         turning=turning,
@@ -377,6 +389,17 @@ def _make_plan(
         recorded={axis: f"{_RECORDED}{axis}" for axis in recorded},
         bias=tuple(model.bias.get(axis, 0.0) for axis in frame.axes),
     )
+
+
+def _choose_sources(effect: Effect, measured: list[str]) -> dict[str, str]:
+    """Return the source of each channel that an effect needs: a measured one without its noise."""
+    names = effect.channel_names()
+    return {
+        role: f"{_COURSE}{names[role]}"
+        if role in effect.courses() and names[role] in measured
+        else names[role]
+        for role in effect.needs()
+    }
 
 
 def _recorded_rates(

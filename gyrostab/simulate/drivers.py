@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,14 +11,21 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import SchemaError
-from gyrostab.time.grid import TimeGridIndex, grid_index
+from gyrostab.kernels.regression.smooth import smooth_curve
+from gyrostab.time.grid import TimeGridIndex, grid_index, grid_times
 from gyrostab.time.stamps import to_nanoseconds
+from gyrostab.units import INNER
 
-__all__ = ["Source", "Stretch", "make_source"]
+__all__ = ["Source", "Stretch", "make_course", "make_source"]
 
 Array = NDArray[np.float64]
 #: Longer channels are read stretch by stretch.
 SHORT = 2**22
+#: Parts over which a recorded channel is averaged: a quarter of a block of the diagnosis [s], and
+#: their least and largest number. Design choices, as for its blocks.
+PART_S, MIN_PARTS, MAX_PARTS = 5.0, 360, 4000
+LONGEST_PARTS = 8.0  # over which a recorded channel is smoothed: two blocks of the diagnosis
+LEAST_POWER_SHARE = 0.01  # of the median, below which a light power is a fault; design choice
 
 
 @dataclass(frozen=True)
@@ -168,3 +176,61 @@ def make_source(log: xr.Dataset, name: str) -> Source:
         _first_number(values, name)
     stamps = to_nanoseconds(log[dim].values)[good]
     return Source(name, units, held, stamps, values[good])
+
+
+def make_course(log: xr.Dataset, name: str) -> Source:
+    """Prepare a recorded channel without the noise of its sensor, as the diagnosis sees it.
+
+    Means over parts of a quarter of a block are smoothed. Steps that hold have no noise, and remain
+    as they are.
+
+    Raises
+    ------
+    SchemaError
+        When it holds no number.
+    """
+    source = make_source(log, name)
+    if source.held or source.size + (0 if source.stamps is None else source.stamps.size) < 2:
+        return source
+    stamps, means = _average_parts(source)
+    present = np.isfinite(means)
+    bridged = np.interp(stamps - stamps[0], stamps[present] - stamps[0], means[present])
+    smooth = smooth_curve(bridged, longest=LONGEST_PARTS)
+    if source.units == INNER["power"]:
+        least = LEAST_POWER_SHARE * float(np.median(smooth))
+        if float(smooth.min()) < least:
+            warnings.warn(
+                f"the channel {name!r} falls to {smooth.min():g} {source.units} without its noise; "
+                f"effects take {least:g} {source.units} at least. Correct the channel, or leave "
+                "its bad values out",
+                stacklevel=2,
+            )
+            smooth = np.maximum(smooth, least)
+    return replace(source, stamps=stamps, values=smooth)
+
+
+def _average_parts(source: Source) -> tuple[NDArray[np.int64], Array]:
+    """Return the middles of parts of a channel [ns since 1970], and its means there."""
+    if source.stamps is None:
+        size, first = source.size, source.start
+        last = int(grid_times(source.start, source.rate, size - 1))
+    else:
+        size, first, last = source.stamps.size, int(source.stamps[0]), int(source.stamps[-1])
+    span = (last - first) * size / (size - 1)
+    count = int(np.clip(span / 1e9 / PART_S, min(MIN_PARTS, size), min(MAX_PARTS, size)))
+    total, number = np.zeros(count), np.zeros(count)
+    for low in range(0, size, SHORT):
+        values = np.asarray(source.values[low : low + SHORT], dtype=np.float64)
+        at = (
+            grid_times(source.start, source.rate, np.arange(low, low + values.size))
+            if source.stamps is None
+            else source.stamps[low : low + SHORT]
+        )
+        good = np.isfinite(values)
+        part = np.minimum((at[good] - first) * (count / span), count - 1).astype(np.int64)
+        total += np.bincount(part, weights=values[good], minlength=count)
+        number += np.bincount(part, minlength=count)
+    with np.errstate(invalid="ignore"):
+        means = total / number
+    middles = first + ((np.arange(count) + 0.5) * (span / count)).astype(np.int64)
+    return middles, np.asarray(means)

@@ -199,6 +199,57 @@ def test_two_effects_of_one_name_add():
     np.testing.assert_allclose(log.rate.values, 0.4, rtol=1e-12)
 
 
+def add_sensor_noise(log, name, size):
+    """Return a recording of which a channel has the noise of its sensor."""
+    noise = size * np.random.default_rng(5).standard_normal(log[name].size)
+    return log.assign({name: log[name].copy(data=log[name].values + noise)})
+
+
+@pytest.mark.parametrize("long", [False, True])
+@pytest.mark.parametrize(
+    ("effect", "noise", "largest"),
+    [
+        ({"name": "shupe", "sensitivity": 0.5, "lag": 100.0, "sensor_lag": 20.0}, 0.05, 0.15),
+        ({"name": "shupe", "sensitivity": 0.5, "lag": 1e-3}, 0.05, 0.2),
+        ({"name": "thermal_hysteresis", "sensitivity": 0.1, "width": 2.0}, 0.5, 0.1),
+    ],
+)
+def test_effects_follow_the_course_of_a_recorded_channel(monkeypatch, effect, noise, largest, long):
+    """The noise of the sensor is neither amplified by a derivative nor taken for extremes."""
+    heat = {
+        "profile": "ramps",
+        "channel": "temperature",
+        "unit": "degC",
+        "points": [[0, 25], [600, 25], [1200, 40], [1800, 40], [2400, 25], [3600, 25]],
+    }
+    tables = {"environment": [heat], "log": {"rate": 1.0, "duration": "1h", "axes": ["x"]}}
+    truth = simulate(tables | {"effect": [effect]}).compute()
+    recorded = add_sensor_noise(truth, "temperature", noise)
+    if long:
+        monkeypatch.setattr(drivers, "SHORT", 1000)
+    follow = {"effect": [effect], "log": {"axes": ["x"]}}
+    found = simulate(follow, like=recorded).rate.values
+    error = found - truth.rate.values
+    assert np.sqrt(np.mean(error**2)) < largest * np.std(truth.rate.values)
+    np.testing.assert_array_equal(simulate(follow, like=recorded, chunk=257).rate.values, found)
+
+
+def test_noise_of_a_light_power_below_zero_is_not_followed():
+    steps = {"profile": "light_power", "power": 1e-5, "points": [[0, 0], [900, 3], [1800, 0]]}
+    tables = {"environment": [steps], "log": {"rate": 1.0, "duration": "1h", "axes": ["x"]}}
+    truth = simulate(tables).compute()
+    recorded = add_sensor_noise(truth, "light_power", 8e-6)
+    assert recorded["light_power"].min() < 0.0
+    noisy = {"name": "light_power_noise", "thermal": 0.5, "nominal": 1e-5}
+    model = {"noise": {"N": 0.01}, "effect": [noisy], "log": {"axes": ["x"]}}
+    found, right = (simulate(model, like=one).rate.values for one in (recorded, truth))
+    assert np.std(found - right) < 0.1 * np.std(right)
+    dark = recorded.assign(light_power=recorded["light_power"] * 0.0)
+    dark["light_power"][:100] = 1e-5
+    with pytest.warns(UserWarning, match="light_power"):
+        simulate(model, like=dark)
+
+
 def test_rotation_is_true_rate_on_its_axis():
     world = [{"profile": "rotation", "points": [[0, 90.0]], "axis": "z"}]
     log = simulate({"environment": world}, duration="5s", rate=10.0)
