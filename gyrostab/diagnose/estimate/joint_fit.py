@@ -23,6 +23,7 @@ from gyrostab.diagnose.reduce.zero_bin import truncated_axes
 from gyrostab.diagnose.statistics import Statistic
 from gyrostab.diagnose.statistics.base import SizeFit
 from gyrostab.diagnose.statistics.rotation_order import fit_amplitude, harmonic_sets, is_reversed
+from gyrostab.diagnose.statistics.sample_sizes import centre_of_range
 from gyrostab.diagnose.statistics.spectral_line import line_quality
 from gyrostab.errors import GyrostabError
 from gyrostab.noise import NORMAL_95
@@ -312,8 +313,7 @@ def _model_settings(
     if identification.effect == "held_samples":
         return {"fill": _fill_of(component, state)}
     if identification.effect == "clipping":
-        own = state.blocks.sel(axis=component.row[0])
-        return {"centre": float(own["mean"].weighted(own["samples"]).mean())}
+        return {"centre": centre_of_range(state.blocks.sel(axis=component.row[0]))}
     if identification.effect == "misalignment":
         return {"motion": "recorded"}
     if (

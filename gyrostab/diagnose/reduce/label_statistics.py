@@ -74,7 +74,11 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
         "repeat_runs": counts[..., 7] + resent[..., 1],
         "resent": resent[..., 0],
         "zero_runs": counts[..., 8],
-        "extremes": _count_at_range_ends(moments, counts[..., 3], counts[..., 4]),
+        "extremes": _count_at_range_ends(moments, counts[..., 3], counts[..., 4]).sum(axis=-1),
+        "range_end": np.concatenate(_record_range(moments), axis=1),
+        "range_end_samples": _count_at_range_ends(moments, counts[..., 3], counts[..., 4]).sum(
+            axis=1
+        ),
         "zeros": counts[..., 1],
         "stuck": _count_stuck(moments, counts, filled),
         "filled": filled,
@@ -169,17 +173,18 @@ def _record_range(moments: Array) -> tuple[Array, Array]:
 def _count_at_range_ends(
     moments: Array, low: NDArray[np.int64], high: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Count samples at the record's smallest and largest value in each block."""
+    """Count samples at the record's smallest and largest value in each block, (axis, block, 2)."""
     lowest, highest = _record_range(moments)
-    return np.asarray(
-        np.where(moments[..., 3] == lowest, low, 0)
-        + np.where((moments[..., 4] == highest) & (lowest < highest), high, 0)
+    at_top = (moments[..., 4] == highest) & (lowest < highest)
+    return np.stack(
+        [np.where(moments[..., 3] == lowest, low, 0), np.where(at_top, high, 0)], axis=-1
     )
 
 
 def _count_repeats(moments: Array, counts: NDArray[np.int64]) -> NDArray[np.int64]:
     """Count held samples; those at zero or at an end of the range have another cause."""
-    return counts[..., 2] - _count_at_range_ends(moments, counts[..., 5], counts[..., 6])
+    ends = _count_at_range_ends(moments, counts[..., 5], counts[..., 6])
+    return np.asarray(counts[..., 2] - ends.sum(axis=-1))
 
 
 def _count_stuck(

@@ -67,6 +67,8 @@ BLOCK_STATISTICS: dict[str, Variable] = {
     "resent": Variable(_BLOCK, "1", "samples of frames sent twice"),
     "zero_runs": Variable(_BLOCK, "1", "runs of samples that are exactly 0"),
     "extremes": Variable(_BLOCK, "1", "samples equal to the smallest or largest of the record"),
+    "range_end": Variable(("axis", "range"), _RATE, "smallest and largest value of the record"),
+    "range_end_samples": Variable(("axis", "range"), "1", "samples of the record that equal it"),
     "zeros": Variable(_BLOCK, "1", "samples that are exactly 0"),
     "stuck": Variable(_BLOCK, "1", "zeros of one axis, within its range"),
     "filled": Variable(

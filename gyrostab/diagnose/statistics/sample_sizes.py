@@ -15,12 +15,13 @@ from gyrostab.diagnose.settings import INTERVAL_TAILS, Settings
 from gyrostab.noise import NORMAL_95
 from gyrostab.units import HOUR
 
-__all__ = ["estimate_from_counts"]
+__all__ = ["centre_of_range", "estimate_from_counts"]
 
 #: Standard deviation of the difference of white noise and the median of its eight neighbours, in
 #: standard deviations of the noise.
 MEDIAN_DEPARTURE_SIGMA = 1.08
 VARIANCE_TOLERANCE_SHARE = 0.2  # by which chance may raise the variance of a single block
+_MIN_LIMITED = 2  # samples at an end of the range that is a limit
 MIN_CLEAN_BLOCKS = 5  # without an outlier, that determine the noise level
 
 
@@ -70,10 +71,7 @@ def estimate_from_counts(
     low, high = (end - usual for end in _poisson_interval(count + usual))
     share, least, most = (min(max(one, 0.0) / samples, 0.999) for one in (count, low, high))
     if effect == "clipping":
-        least = max(least, INTERVAL_TAILS[0] / samples)  # nothing bounds a limit without a count
-        limit, far, near = (spread * -float(ndtri(one / 2.0)) for one in (share, least, most))
-        slope = spread / (2.0 * float(_normal_density(limit / spread)))
-        return {"limit": (limit, slope * error / samples, near, far)}
+        return {"limit": _size_range(blocks.sel(axis=axis), spread, samples)}
     if effect == "dead_zone":
         width, narrow, wide = (
             spread * float(ndtri(0.5 + one / 2.0)) for one in (share, least, most)
@@ -81,6 +79,32 @@ def estimate_from_counts(
         slope = spread / (2.0 * float(_normal_density(width / spread)))
         return {"width": (width, slope * error / samples, narrow, wide)}
     return {}
+
+
+def centre_of_range(blocks: xr.Dataset) -> float:
+    """Return the middle of the range of an axis, or the end that one sample alone reaches.
+
+    Such an end is no limit: the other one is that far from it, and the range goes on beyond it.
+    """
+    ends, counts = blocks["range_end"].values, blocks["range_end_samples"].values
+    return float(ends[counts.argmin()] if counts.min() < _MIN_LIMITED else ends.mean())
+
+
+def _size_range(blocks: xr.Dataset, spread: float, samples: float) -> tuple[float, ...]:
+    """Return the distance of a limit from the centre of the range, exact with both limits.
+
+    With one, the other may be just beyond the end of the record, by an exponential law as for the
+    largest of so many samples.
+    """
+    lowest, highest = blocks["range_end"].values.tolist()
+    half = 0.5 * (highest - lowest)
+    limit = highest - centre_of_range(blocks)
+    limit = max(limit, centre_of_range(blocks) - lowest)
+    if limit == half:
+        return limit, 0.0, limit, limit
+    beyond = spread / -float(ndtri(1.0 / (samples + 1.0)))
+    high = limit - beyond * math.log(INTERVAL_TAILS[0])
+    return limit, (high - half) / (2.0 * NORMAL_95), half, high
 
 
 def _size_spikes(

@@ -19,7 +19,7 @@ from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result import finish as conclude
 from gyrostab.diagnose.settings import Settings
-from gyrostab.diagnose.statistics.sample_sizes import estimate_from_counts
+from gyrostab.diagnose.statistics.sample_sizes import centre_of_range, estimate_from_counts
 from gyrostab.ingest.make_log import make_log
 from gyrostab.physics.registry import make_effect
 from tests.support.effect_bench import run
@@ -235,6 +235,29 @@ def test_intervals_of_outliers_exclude_zero_and_contain_the_truth(number: int, k
     assert np.mean(held["per_hour"]) > (0.9 if kind == "normal" else 0.7)
 
 
+@pytest.mark.parametrize("both", [False, True])
+def test_limits_of_a_rate_that_moves_are_the_ends_of_the_record(both):
+    """The range is that of the record, not that of the noise about a moving mean."""
+    motion = 5.0 * np.sin(2.0 * np.pi * np.arange(15_000) / 7_000.0)
+    noise = SCATTER * np.random.default_rng(9).standard_normal(15_000)
+    least = -5.5 if both else -np.inf
+    rate = np.clip(motion + noise, least, 5.5)
+    blocks = reduce_log(make_log(rate[None], rate=10.0, unit="deg/h", axis=["x"]))
+    estimated = estimate_from_counts(
+        "clipping", "extremes", "x", blocks, CountEvidence({}), Settings()
+    )
+    limit, error, low, high = estimated["limit"]
+    centre = centre_of_range(blocks.sel(axis="x"))
+    assert centre + limit == pytest.approx(5.5)
+    assert centre - limit == pytest.approx(-5.5) if both else centre - limit < rate.min() - 10.0
+    assert (error == 0.0) is both
+    assert low <= limit <= high
+    assert blocks["range_end_samples"].values[0].tolist() == [
+        int((rate == rate.min()).sum()),
+        int((rate == 5.5).sum()),
+    ]
+
+
 @pytest.mark.parametrize(
     ("effect", "mark", "name", "size"),
     [
@@ -259,8 +282,8 @@ def test_intervals_of_a_few_stuck_samples_contain_the_truth(
             continue
         estimated = estimate_from_counts(effect, mark, axis, blocks, CountEvidence({}), Settings())
         _, _, low, high = estimated[name]
-        assert 0.0 < low < high < math.inf
-        held.append(low < size < high)
+        assert 0.0 < low <= high < math.inf
+        held.append(low <= size <= high)
     assert len(held) > 20
     assert np.mean(held) > 0.87
 
