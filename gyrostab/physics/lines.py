@@ -23,6 +23,10 @@ from gyrostab.units import INNER
 
 __all__ = ["RotationLine", "SpectralLine"]
 
+#: Slower rotation is rest: a turn takes more than 100 s, and the channel may have noise. Design
+#: choice, a tenth of the slowest stick-slip.
+_LEAST_TURNING_DEG_S = 3.6
+
 
 @dataclass(frozen=True, kw_only=True)
 class SpectralLine(Effect):
@@ -148,14 +152,14 @@ class RotationLine(Effect):
     """Lines phase-locked to the rotation of the tool, or of another driver such as a pump.
 
     ``rate(t) = sum_k A k^-p cos(k (m theta(t) + phi))`` over k = 1 to `harmonics`, theta the turns
-    of the channel since the start of the log, m the `order` in lines per turn. The phase is the
-    integral of the channel, continued from sample to sample, and each sample is the mean over its
-    interval, so a line is aliased where its frequency exceeds half of the sampling rate.
+    of the channel since the start of the log, m the `order` in lines per turn; zero at rest,
+    because the motion causes the lines. The phase is the integral of the channel, continued from
+    sample to sample, and each sample is the mean over its interval, so a line is aliased where its
+    frequency exceeds half of the sampling rate.
 
     *DAVAR*: the bump of a sinusoid at 0.371 / (m f), smeared where f varies inside a window; it
-    moves to shorter times as the tool speeds up. *Window mean*: zero during rotation; ``A
-    cos(phi)`` at rest. *Spectrum*: a comb that follows the rotation. *Axes*: phase-locked, with
-    amplitude and phase of each axis.
+    moves to shorter times as the tool speeds up. *Window mean*: zero. *Spectrum*: a comb that
+    follows the rotation. *Axes*: phase-locked, with amplitude and phase of each axis.
 
     Confused with earth_rate (15 deg/h at most, quadrature between the cross axes), g_sensitivity
     and magnetic (proportional to their channels), and spectral_line (constant frequency): check
@@ -210,12 +214,11 @@ class RotationLine(Effect):
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Compute the rate contribution [degree hour-1] of every sample."""
-        middle, inside, state = turns_of_samples(
-            self.order * chunk.drivers["rotation_rate"], chunk.rate, state
-        )
-        return self._sum_lines(
-            middle, inside, chunk.setup.axes, self.each("amplitude", chunk.setup.axes)
-        ), state
+        rotation = chunk.drivers["rotation_rate"]
+        middle, inside, state = turns_of_samples(self.order * rotation, chunk.rate, state)
+        amplitude = self.each("amplitude", chunk.setup.axes)
+        lines = self._sum_lines(middle, inside, chunk.setup.axes, amplitude)
+        return lines * (np.abs(rotation) >= _LEAST_TURNING_DEG_S), state
 
     def _sum_lines(
         self, middle: Array, inside: Array, axes: tuple[str, ...], amplitude: Array
@@ -235,7 +238,8 @@ class RotationLine(Effect):
         """Predict window means at slow rotation, the comb, and the frequencies of the lines."""
         rotation = self.order * windows.drivers["rotation_rate"]
         middle, inside = turns_of_windows(windows, rotation)
-        mean = self._sum_lines(middle, inside, windows.axes, np.ones(len(windows.axes)))
+        turning = np.abs(windows.drivers["rotation_rate"]) >= _LEAST_TURNING_DEG_S
+        mean = self._sum_lines(middle, inside, windows.axes, np.ones(len(windows.axes))) * turning
         k = np.arange(1.0, int(self.harmonics) + 1)[:, None]
         cycles = k * np.abs(rotation) / TURN
         place = fold(cycles, windows.rate)

@@ -117,6 +117,17 @@ def test_lines_lock_to_a_changing_rotation():
         np.testing.assert_allclose(rates[row], wave.reshape(-1, factor).mean(axis=1), atol=3e-4)
 
 
+def test_lines_need_rotation():
+    """The channel has noise at rest, about a turn in half an hour."""
+    rest = 0.2 * np.random.default_rng(2).standard_normal(1000)
+    speed = np.concatenate([rest, np.full(1000, 90.0), rest])
+    effect = make_effect({"name": "rotation_line", "amplitude": [0.5], "axes": ["x"]})
+    (rates,) = run(effect, size=3000, rate=50.0, drivers={"rotation_rate": speed})
+    assert not rates[:1000].any()
+    assert not rates[2000:].any()
+    assert np.std(rates[1000:2000]) == pytest.approx(0.5 / np.sqrt(2.0), rel=0.01)
+
+
 def test_fractional_number_of_lines_is_refused():
     with pytest.raises(OptionError, match=r"'harmonics': 2\.5 is not a whole number of lines"):
         make_effect({"name": "rotation_line", "amplitude": 1, "harmonics": 2.5})

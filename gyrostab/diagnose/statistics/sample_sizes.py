@@ -84,7 +84,7 @@ def estimate_from_counts(
 def centre_of_range(blocks: xr.Dataset) -> float:
     """Return the middle of the range of an axis, or the end that one sample alone reaches.
 
-    Such an end is no limit: the other one is that far from it, and the range goes on beyond it.
+    Noise reached such an end: the limit at the other one is that far from it.
     """
     ends, counts = blocks["range_end"].values, blocks["range_end_samples"].values
     return float(ends[counts.argmin()] if counts.min() < _MIN_LIMITED else ends.mean())
