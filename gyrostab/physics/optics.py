@@ -314,14 +314,11 @@ class FeedbackReset(Effect):
     def _predict_profiles(self, windows: Windows) -> dict[str, Array]:
         """Predict the error by phase of the ramp at the end of the sample, averaged over the bins.
 
-        The rate and thus the turns of the ramp in a sample are taken as constant.
+        The turns of the ramp in a sample are taken as constant.
         """
-        if not windows.phase.size:
+        if not (windows.phase.size and np.isfinite(windows.turns).any()):
             return {}
-        own = np.stack([windows.own[axis] for axis in windows.axes])
-        if not np.isfinite(own).any():
-            return {}
-        moved = np.nanmedian(own) / (self.turn * _NRAD_PER_S * windows.rate)
+        moved = np.sign(self.full) * np.nanmean(windows.turns) / windows.rate
         step, direction = max(abs(moved), 1e-9), 1.0 if moved >= 0.0 else -1.0
         place = (np.arange(windows.phase.size * _PARTS_OF_BIN) + 0.5) / (
             windows.phase.size * _PARTS_OF_BIN

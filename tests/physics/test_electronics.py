@@ -218,8 +218,12 @@ def test_resets_of_a_real_gyro_match_the_model(recordings):
 @pytest.mark.parametrize("full", [7.0, -7.0])
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 @pytest.mark.parametrize("decay", [0.0005, 0.01, 0.3])
-def test_profile_over_the_ramp_is_the_generated_one(decay, direction, full):
-    """Decays much shorter than a sample, of one, and of many: each bin is averaged exactly."""
+@pytest.mark.parametrize("other", [1.0, -3.0])
+def test_profile_over_the_ramp_is_the_generated_one(decay, direction, full, other):
+    """Decays much shorter than a sample, of one, and of many: each bin is averaged exactly.
+
+    The ramp may be that of another axis.
+    """
     bins, turns = 16, direction * 0.0137 * np.arange(1, 60_001)
     phase = turns % 1.0 if full > 0.0 else 1.0 - turns % 1.0
     for part in ("kick", "tail", "sawtooth"):
@@ -235,7 +239,7 @@ def test_profile_over_the_ramp_is_the_generated_one(decay, direction, full):
             1000,
             100.0,
             10.0,
-            own={"x": np.array([rate])},
+            own={"x": np.array([other * rate])},
             phase=(np.arange(bins) + 0.5) / bins,
             turns=np.array([math.copysign(1.37, rate * full)]),
         )
