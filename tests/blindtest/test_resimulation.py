@@ -196,3 +196,18 @@ def test_rare_large_values_do_not_widen_the_law_of_all():
     several = [[{"means": one} for one in draws[rare][1:]] for rare in (True, False)]
     assert likelihood_ratio({"means": draws[True][0]}, *several) > 10.0
     assert abs(likelihood_ratio({"means": draws[False][0]}, *several)) < 5.0
+
+
+def test_outliers_are_counted_that_noise_hardly_has():
+    """Flipped bits of six standard deviations, on noise that wanders by many."""
+    rng = np.random.default_rng(8)
+    recording = recording_of()
+    noise = rng.standard_normal(SIZE) + 0.05 * np.cumsum(rng.standard_normal(SIZE))
+    flipped = noise.copy()
+    flipped[rng.choice(SIZE, 20, replace=False)] += 6.0
+    few, many = (
+        float(record_statistics(rates[None], recording)["count outliers/0"][0] ** 2)
+        for rates in (noise, flipped)
+    )
+    assert few < 5.0
+    assert 15.0 <= many - few <= 22.0

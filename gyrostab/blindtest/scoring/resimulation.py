@@ -17,7 +17,9 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from gyrostab.errors import GyrostabError
 
@@ -39,7 +41,7 @@ _MIN_TURNS = 2.0  # in a segment, of which an amplitude at multiples of the rota
 _MIN_CHANNEL_SHARE = 0.9  # values per sample of a channel that is compared sample by sample
 _TAIL_FREEDOM = 5.0  # of Student's law, which bounds what a single statistic decides
 _ROUNDS = 50  # of the iteration for the scale
-_OUTLIER_SIGMA = 6.0
+_NEIGHBOURS = 4  # samples on either side, from the median of which an outlier departs
 #: Least scatter of roots of counts: that of a Poisson count is 1/2.
 _MIN_SCATTER = {"count": 0.5, "ramp": 1e-6, "levels": 0.02}
 
@@ -219,20 +221,29 @@ def _sample_counts(values: Array) -> dict[str, Array]:
     """
     steps = np.diff(values, append=np.nan)
     good = values[np.isfinite(values)]
-    scatter = 1.4826 * np.nanmedian(np.abs(values - np.nanmedian(values))) + 1e-300
     counts = {
         "zeros": (values == 0.0).sum(),
         "repeats": ((steps == 0.0) & (values != 0.0)).sum(),
         "ends": ((good == good.min()) | (good == good.max())).sum(),
-        "outliers": (
-            np.abs(steps) > _OUTLIER_SIGMA * np.nanmedian(np.abs(steps)) + _OUTLIER_SIGMA * scatter
-        ).sum(),
+        "outliers": _count_outliers(values),
         "copies": good.size - np.unique(good).size,
     }
     return {
         **{f"count {name}": np.sqrt([count + 0.375]) for name, count in counts.items()},
         "levels": np.array([np.log(np.unique(good[:20_000]).size)]),
     }
+
+
+def _count_outliers(values: Array) -> int:
+    """Count samples that depart from the median of their neighbours by more than chance allows.
+
+    Normal noise has one such sample in a record.
+    """
+    several = sliding_window_view(values, 2 * _NEIGHBOURS + 1)
+    neighbours = np.delete(several, _NEIGHBOURS, axis=1)
+    departure = np.abs(several[:, _NEIGHBOURS] - np.median(neighbours, axis=1))
+    limit = -1.4826 * np.nanmedian(departure) * float(ndtri(0.5 / departure.size))
+    return int((departure > limit).sum())
 
 
 def _channel_couplings(
