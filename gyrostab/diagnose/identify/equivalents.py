@@ -11,6 +11,7 @@ import xarray as xr
 from gyrostab.diagnose.identify.identification import (
     Identification,
     Identifications,
+    Selection,
     condition_on_selections,
 )
 from gyrostab.diagnose.predict.candidates import Component, Variant
@@ -31,7 +32,11 @@ def settle_forms(identifications: Identifications, baseline: xr.Dataset) -> Iden
     start = initial_state(
         identifications.state.blocks, baseline, settings=identifications.state.settings
     )
-    chosen = [*identifications.expected, *identifications.identified, *identifications.unknown]
+    chosen: list[Selection] = [
+        *identifications.expected,
+        *identifications.identified,
+        *identifications.unknown,
+    ]
 
     def settle(identification: Identification) -> Identification:
         state = replace(
