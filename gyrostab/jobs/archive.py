@@ -29,6 +29,7 @@ from gyrostab.store.remote import (
     full_name,
     is_folder,
     list_urls,
+    read_object,
     remove_copies,
     walk_address,
 )
@@ -117,8 +118,7 @@ def find_archive(paths: Sequence[str | Path]) -> Archive:
     ----------
     paths : sequence of path
         Folders, which are searched with all folders below, files, Zarr stores and patterns, or
-        addresses of them. Hidden items and fleets that gyrostab wrote are left out, at addresses
-        also diagnoses.
+        addresses of them. Hidden items and fleets that gyrostab wrote are left out.
 
     Returns
     -------
@@ -144,15 +144,17 @@ def find_archive(paths: Sequence[str | Path]) -> Archive:
         else:
             matching = list_urls(url) if url else sorted(glob.iglob(item, recursive=True))
         for path in map(Path, matching):
+            inside: Iterable[tuple[str, Path]] = ()
             if url:
-                found.update(dict.fromkeys(map(Path, _list_address(find_url(path) or url))))
+                inside = _walk_address(find_url(path) or url)
             elif not path.exists():
                 raise FormatError(f"{path}: there is no such file or folder")
             elif path.is_dir() and not (is_store(path) or is_fleet(path)):
-                for kind, inside in _walk_folder(path, visited):
-                    (diagnoses if kind == DIAGNOSIS else found)[inside] = None
+                inside = _walk_folder(path, visited)
             elif not (is_pattern and _is_inside_output(path)):
-                found[path] = None
+                inside = [("file", path)]
+            for kind, item_inside in inside:
+                (diagnoses if kind == DIAGNOSIS else found)[item_inside] = None
         bases.append(_find_base(item, is_pattern=is_pattern, alone=len(paths) == 1))
     if not found:
         raise FormatError(f"{', '.join(map(str, paths))}: there are no files")
@@ -174,20 +176,25 @@ def _find_base(item: str, *, is_pattern: bool, alone: bool) -> Path:
     return path if alone and is_archive else path.parent
 
 
-def _list_address(url: str) -> Iterator[str]:
-    """Yield the files and Zarr stores at an address and below, without fleets and diagnoses."""
+def _walk_address(url: str) -> Iterator[tuple[str, Path]]:
+    """Yield the files, Zarr stores and diagnoses at an address and below, without fleets."""
     if not is_folder(url):
-        yield url
+        yield "file", Path(url)
         return
     for place, folders, names, is_zarr in walk_address(url):
-        is_output = FLEET_MARK in names or "diagnosis.json" in names
+        is_fleet_folder, is_diagnosis = FLEET_MARK in names, "diagnosis.json" in names
+        is_output = is_fleet_folder or is_diagnosis
+        if is_diagnosis and not is_fleet_folder and _is_diagnosis(Path(place)):
+            yield DIAGNOSIS, Path(place)
         if is_zarr and not is_output:
-            yield place
+            yield "file", Path(place)
         for name in list(folders):
             if is_zarr or is_output or name.startswith("."):
                 del folders[name]
         if not (is_zarr or is_output):
-            yield from (f"{place}/{name}" for name in names if not name.startswith("."))
+            yield from (
+                ("file", Path(f"{place}/{name}")) for name in names if not name.startswith(".")
+            )
 
 
 def _walk_folder(folder: Path, visited: set[str]) -> Iterator[tuple[str, Path]]:
@@ -213,8 +220,12 @@ def _walk_folder(folder: Path, visited: set[str]) -> Iterator[tuple[str, Path]]:
 
 def _is_diagnosis(folder: Path) -> bool:
     """Whether gyrostab wrote the diagnosis in a folder, also if it is damaged further on."""
+    path = folder / "diagnosis.json"
+    url = find_url(path)
     try:
-        with (folder / "diagnosis.json").open("rb") as file:
+        if url:
+            return SCHEMA.encode() in read_object(url, _SCHEMA_BYTES)
+        with path.open("rb") as file:
             return SCHEMA.encode() in file.read(_SCHEMA_BYTES)
     except OSError:
         return False
@@ -448,6 +459,6 @@ def _find_diagnosis(
     names, folder = {path.name for path in files}, files[0].parent
     for place, diagnosed, verdict in diagnoses:
         is_of_files = diagnosed is None or diagnosed & names
-        if is_of_files and folder in Path(os.path.abspath(place)).parents:
+        if is_of_files and folder in Path(full_name(place)).parents:
             return place, verdict
     return None, ""

@@ -15,6 +15,7 @@ import os
 import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -22,7 +23,7 @@ from typing import Any
 
 import pandas as pd
 
-from gyrostab.errors import FormatError, GyrostabError, OptionError, WorkerError
+from gyrostab.errors import FormatError, GyrostabError, OptionError, OutputError, WorkerError
 from gyrostab.jobs.archive import (
     DIAGNOSIS,
     FLEET_MARK,
@@ -61,13 +62,22 @@ from gyrostab.store.output import (
     resolve_link,
 )
 from gyrostab.store.read import open_stored
-from gyrostab.store.remote import find_url, full_name, remove_copies
+from gyrostab.store.remote import (
+    find_url,
+    full_name,
+    has_content,
+    has_file,
+    remove_address,
+    remove_copies,
+    upload_file,
+)
 
 __all__ = ["process_run", "run_fleet", "write_file_table"]
 
 #: Time after which the table of runs is written again [s]; a killed call loses rows of this time,
 #: which are made again from the products.
 _SAVE_SECONDS = 30.0
+_REQUESTS = 16  # to an object store at a time
 _MAX_NAMES = 3  # runs that an error message names
 PLOTLY_FILE = "plotly.js"  # in the folder of the reports, which share it
 
@@ -89,8 +99,8 @@ def write_file_table(
     paths : sequence of path
         Folders, files, Zarr stores and patterns, or addresses of them.
     output : path
-        Parquet file. An earlier table is brought up to date: files that have not changed are not
-        opened again.
+        Parquet file, or address of one. An earlier table is brought up to date: files that have not
+        changed are not opened again.
     reading : mapping
         Options of `gyrostab.jobs.run.load_log`.
     overwrite : bool
@@ -104,11 +114,14 @@ def write_file_table(
         The table of `gyrostab.jobs.archive.index_files`.
     """
     scheduler = check_scheduler(scheduler)
-    _check_local(output)
     known = read_table(Path(output), content=FILES)
-    check_output(output, suffixes=[".parquet"], overwrite=overwrite or known is not None)
+    if url := find_url(output):
+        _check_address(url, ".parquet", is_own=known is not None)
+    else:
+        check_output(output, suffixes=[".parquet"], overwrite=overwrite or known is not None)
     archive = find_archive(paths)
-    with _open_workers(scheduler, workers, archive.files[:1]) as pool:
+    files = [path for path in archive.files[:1] if not find_url(path)]
+    with _open_workers(scheduler, workers, files) as pool:
         table = index_files(
             archive,
             reading=reading or {},
@@ -147,7 +160,8 @@ def run_fleet(
         Folders, files, Zarr stores and patterns, or addresses of them; or one table of
         `write_file_table`.
     output : path
-        Folder to write, or to bring up to date; a Zarr store if its name ends in ``.zarr``.
+        Folder to write, or to bring up to date; a Zarr store if its name ends in ``.zarr``, which
+        may be at an address.
     per : {"folder", "file"}
         Whether the logs of a folder together, or each log, are a run.
     tool : str, optional
@@ -183,21 +197,23 @@ def run_fleet(
         When the output or an option is wrong.
     """
     scheduler = check_scheduler(scheduler)
-    _check_local(output)
     options = {
         "reading": dict(reading or {}),
         "windows": dict(windows or {}),
         "fitting": dict(fitting or {}),
     }
     check_windows(**options["windows"])
-    check_output(output, overwrite=True, find_foreign=_find_foreign)
+    if url := find_url(output):
+        _check_address(url, ".zarr", is_own=is_fleet(Path(output)))
+    else:
+        check_output(output, overwrite=True, find_foreign=_find_foreign)
     target = resolve_link(output)
     check_job_folder(job_folder(target))
     with protect_inputs(paths), lock_job(job_folder(target)):
         try:
             _begin_output(target, reports=reports)
             archive, known = _open_archive(paths, target)
-            files = [target, *archive.files[:1]]
+            files = [path for path in (target, *archive.files[:1]) if not find_url(path)]
             with _open_workers(scheduler, workers, files) as pool:
                 table = index_files(
                     archive, reading=options["reading"], known=known, pool=pool, stage=stage
@@ -220,19 +236,23 @@ def run_fleet(
         warnings.warn(f"{row['run']}: {row['error']}", stacklevel=2)
     if len(failed):
         names = ", ".join(failed["run"][:_MAX_NAMES])
+        page = Path(output) / "index.html"
         more = f" and {len(failed) - _MAX_NAMES} more" if len(failed) > _MAX_NAMES else ""
         raise FormatError(
             f"{len(failed)} of {len(rows)} runs failed: {names}{more}; "
-            f"{Path(output) / 'index.html'} lists the reasons"
+            f"{find_url(page) or page} lists the reasons"
         )
     return rows
 
 
-def _check_local(output: str | Path) -> None:
-    if url := find_url(output):
-        raise OptionError(
-            f"{url}: the output of a fleet is a local folder; give one, and copy it with a tool "
-            "such as aws s3 sync"
+def _check_address(url: str, suffix: str, *, is_own: bool) -> None:
+    """Check the address of an output: what another program wrote is never replaced."""
+    if not url.lower().endswith(suffix):
+        raise OptionError(f"output {url!r} must end in {suffix}; give another name with -o")
+    if not is_own and has_content(url):
+        raise OutputError(
+            f"output {url!r} exists already, and gyrostab fleet or index did not make it; remove "
+            "it first, or give another name with -o"
         )
 
 
@@ -252,14 +272,21 @@ def _find_foreign(folder: Path) -> str | None:
 def _begin_output(target: Path, *, reports: bool) -> None:
     from gyrostab.report.charts import plotly_script
 
-    target.mkdir(exist_ok=True)
+    if not find_url(target):
+        target.mkdir(exist_ok=True)
     _write_json(target / FLEET_MARK, {"schema": FLEET_SCHEMA})
     if is_zarr(target):
         _write_json(target / ".zgroup", {"zarr_format": 2})
     if reports:
-        (target / "reports").mkdir(exist_ok=True)
+        _make_folder(target / "reports")
         with replace_file(target / "reports" / PLOTLY_FILE) as temporary:
             temporary.write_text(plotly_script(), encoding="utf-8")
+
+
+def _make_folder(folder: Path) -> None:
+    """Make a folder, with those above it; an address needs none."""
+    if not find_url(folder):
+        folder.mkdir(parents=True, exist_ok=True)
 
 
 def _write_json(path: Path, content: Any) -> None:
@@ -294,20 +321,23 @@ def _compute_runs(
 ) -> pd.DataFrame:
     """Compute the runs that are new or changed, and write the table and the page of all runs."""
     before = read_rows(target)
-    waiting = [
-        item
-        for item in runs
-        if overwrite or not _is_current(before.get(item.name), target, item, options, reports)
-    ]
+    with ThreadPoolExecutor(_REQUESTS if find_url(target) else 1) as threads:
+        is_current = threads.map(
+            lambda item: (
+                not overwrite and _is_current(before.get(item.name), target, item, options, reports)
+            ),
+            runs,
+        )
+        waiting = [item for item, is_done in zip(runs, is_current, strict=True) if not is_done]
     waiting.sort(key=lambda item: -item.bytes)  # a long run at the end would leave workers idle
     stale = {item.name for item in waiting}
     rows = {
         name: row
         for name, row in before.items()
-        if name not in stale and product_path(target, name).exists()
+        if name not in stale and _has_product(target, name)
     }
     work = partial(
-        process_run, str(target.absolute()), json.dumps(options, default=str), reports, overwrite
+        process_run, full_name(target), json.dumps(options, default=str), reports, overwrite
     )
     done, saved = 0, time.monotonic()
     stage("computing", len(waiting), 0, "runs")
@@ -351,10 +381,15 @@ def _is_current(
     reports: bool,
 ) -> bool:
     """Whether row, product and report of a run are those of its files and options."""
-    if row is None or row["error"] or (reports and not (target / str(row["report"])).is_file()):
+    if row is None or row["error"] or (reports and not has_file(target / str(row["report"]))):
         return False
     made_by = read_job_name(product_path(target, item.name))
     return bool(row.get("job") == made_by == find_job_name(item.files, **options))
+
+
+def _has_product(target: Path, name: str) -> bool:
+    path = product_path(target, name)
+    return read_job_name(path) is not None if find_url(path) else path.exists()
 
 
 def _pack_run(item: LogRun) -> dict[str, Any]:
@@ -398,6 +433,8 @@ def process_run(
     try:
         _make_folders(Path(target), product.parent)
         row["job"] = find_job_name(item["files"], **given)
+        if (url := find_url(product)) and (overwrite or read_job_name(product) != row["job"]):
+            remove_address(url)  # a run replaces nothing at an address
         with dask.config.set(scheduler="synchronous"), remove_copies():
             run(
                 item["files"],
@@ -419,11 +456,11 @@ def process_run(
 
 def _make_folders(target: Path, folder: Path) -> None:
     """Make the folders between the output and a run, in a Zarr store as groups."""
-    folder.mkdir(parents=True, exist_ok=True)
+    _make_folder(folder)
     for group in [folder, *folder.parents] if is_zarr(target) else ():
         if group == target:
             break
-        if not (group / ".zgroup").exists():
+        if not has_file(group / ".zgroup"):
             _write_json(group / ".zgroup", {"zarr_format": 2})
 
 
@@ -434,8 +471,9 @@ def _finish_run(path: Path, report: Path | None, plotly: str) -> dict[str, Any]:
     product = from_disk(open_stored(path, lazy=False), str(path))
     product.close()
     if report is not None:
-        report.parent.mkdir(parents=True, exist_ok=True)
-        write_report(product, report, overwrite=True, plotly=plotly)
+        _make_folder(report.parent)
+        with upload_file(report) as place:
+            write_report(product, place, overwrite=True, plotly=plotly)
     return summarise_run(product)
 
 
@@ -454,8 +492,9 @@ def _consolidate_metadata(target: Path, names: Sequence[str]) -> None:
     metadata: dict[str, Any] = {
         ".zgroup": {"zarr_format": 2},
     }
-    for name in names:
-        content = read_json(target / name / ".zmetadata")
+    with ThreadPoolExecutor(_REQUESTS if find_url(target) else 1) as threads:
+        found = list(threads.map(lambda name: read_json(target / name / ".zmetadata"), names))
+    for name, content in zip(names, found, strict=True):
         if content is None:
             continue
         parts = name.split("/")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from gyrostab.schema import texts
 from gyrostab.store.cf import from_disk
 from gyrostab.store.output import new_output
 from gyrostab.store.read import open_stored
+from gyrostab.store.remote import find_url, full_name, read_object, upload_file
 from gyrostab.units import DAY, INNER
 
 __all__ = [
@@ -63,7 +63,7 @@ def write_table(table: pd.DataFrame, path: Path, *, content: str, overwrite: boo
 
     made = pa.Table.from_pandas(table, preserve_index=False)
     made = made.replace_schema_metadata({**(made.schema.metadata or {}), _METADATA: content})
-    with new_output(path, overwrite=overwrite) as temporary:
+    with upload_file(path) as place, new_output(place, overwrite=overwrite) as temporary:
         pq.write_table(made, temporary)
 
 
@@ -72,8 +72,9 @@ def read_table(path: Path, *, content: str) -> pd.DataFrame | None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    url = find_url(path)
     try:
-        table = pq.read_table(path)
+        table = pq.read_table(pa.BufferReader(read_object(url)) if url else path)
     except (OSError, pa.ArrowException):
         return None
     is_own = (table.schema.metadata or {}).get(_METADATA) == content.encode()
@@ -103,7 +104,7 @@ def open_fleet(folder: Path) -> xr.Dataset | None:
     xarray.Dataset or None
         None if `folder` is neither a fleet nor a folder of runs in one.
     """
-    folder = folder.absolute()
+    folder = Path(full_name(folder))
     root = next((path for path in (folder, *folder.parents) if is_fleet(path)), None)
     rows = {} if root is None else read_rows(root)
     paths = [product_path(root, name) for name, row in rows.items() if root and not row["error"]]
@@ -112,7 +113,7 @@ def open_fleet(folder: Path) -> xr.Dataset | None:
         if folder in path.parents:
             with from_disk(open_stored(path, lazy=False), str(path)) as product:
                 names = [name for name, item in product.data_vars.items() if "time" in item.dims]
-                products.append(product[names].isel(tau=slice(-1, None)))
+                products.append(product[names].isel(tau=slice(-1, None)).load())
     if not products:
         return None
     whole = xr.concat(
@@ -202,9 +203,7 @@ def read_rows(target: Path) -> dict[str, dict[str, Any]]:
 def make_table(rows: Mapping[str, Mapping[str, Any]], runs: Sequence[LogRun]) -> pd.DataFrame:
     """Make the table of runs, with the verdicts of their diagnoses."""
     diagnosed = {
-        item.name: (item.verdict, os.path.abspath(item.diagnosis))
-        for item in runs
-        if item.diagnosis
+        item.name: (item.verdict, full_name(item.diagnosis)) for item in runs if item.diagnosis
     }
     first = ("run", "tool", "error", "files", "start", "end", "span [s]", "rate [Hz]", "windows")
     return pd.DataFrame(

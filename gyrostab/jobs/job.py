@@ -56,9 +56,15 @@ _MAX_DIFFERENCES = 4  # differences that a message lists
 
 
 def job_folder(output: Path) -> Path:
-    """Return the job folder of an output; that of an output at an address is in this directory."""
-    if find_url(output):
-        return Path(f".{output.name}.job")
+    """Return the job folder of an output; that of an output at an address is in this directory.
+
+    Examples
+    --------
+    >>> job_folder(Path("s3://bucket/run7.zarr")) == job_folder(Path("s3://other/run7.zarr"))
+    False
+    """
+    if url := find_url(output):
+        return Path(f".{output.name}-{hashlib.sha256(url.encode()).hexdigest()[:8]}.job")
     return output.with_name(f".{output.name}.job")
 
 

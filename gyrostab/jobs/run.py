@@ -53,6 +53,7 @@ from gyrostab.store.output import (
     resolve_link,
 )
 from gyrostab.store.private import library_lock
+from gyrostab.store.remote import find_url
 
 __all__ = ["count_samples", "find_job_name", "load_log", "read_job_name", "run"]
 
@@ -209,8 +210,9 @@ def run(
     check_windows(**options["windows"])
     with protect_inputs(paths), protect_inputs(options["reading"].get("channel", ())):
         zarr = zarr or Path(output).suffix.lower() == ".zarr"
-        check_output(output, overwrite=True, **_FORMS[zarr])
         job = _describe_job(paths, resolve_link(output), options, zarr=zarr)
+        if not (resume and _is_complete(job)):
+            check_output(output, overwrite=True, **_FORMS[zarr])
         check_job_folder(job.folder)
         pool = partial(open_pool, scheduler, workers=workers, files=job.files)
         _run_job(job, paths, pool, resume=resume, overwrite=overwrite, stage=stage)
@@ -304,7 +306,7 @@ def _describe_job(
 def _inspect_job(job: _Job, *, resume: bool, overwrite: bool) -> _Progress:
     """Find the state of a job, and refuse to destroy an output or to mix two jobs."""
     before, kept = read_job(job.folder), has_finished_work(job.folder)
-    if resume and read_job_name(job.target) == job.name:
+    if resume and _is_complete(job):
         return _Progress(complete=True, fresh=False, overwrite=False)
     if before and kept and not (resume or overwrite):
         raise ResumeError(
@@ -329,9 +331,13 @@ def _inspect_job(job: _Job, *, resume: bool, overwrite: bool) -> _Progress:
     return _Progress(complete=False, fresh=not again, overwrite=overwrite)
 
 
+def _is_complete(job: _Job) -> bool:
+    return read_job_name(job.target) == job.name
+
+
 def read_job_name(path: Path) -> str | None:
     """Read the hash of the job that made a product; None for anything else."""
-    if path.is_dir():
+    if find_url(path) or path.is_dir():
         attributes = read_json(path / ".zattrs")
         return attributes.get("gyrostab_job") if isinstance(attributes, dict) else None
     if not path.is_file():

@@ -30,6 +30,7 @@ from gyrostab.plot.style import (
 )
 from gyrostab.report.page import page_text
 from gyrostab.store.output import new_output
+from gyrostab.store.remote import find_url, upload_file
 from gyrostab.units import HOUR
 
 __all__ = ["combine_effects", "write_overview"]
@@ -68,7 +69,8 @@ def write_overview(
     """
     done, failed = table[table["error"] == ""], table[table["error"] != ""]
     axes = _find_axes(table)
-    with new_output(path, overwrite=overwrite) as temporary:
+    path = Path(path)
+    with upload_file(path) as place, new_output(place, overwrite=overwrite) as temporary:
         text = page_text(
             "fleet.html.jinja",
             title="Gyro stability of a fleet",
@@ -80,11 +82,11 @@ def write_overview(
             effects=[] if effects is None else combine_effects(effects, done),
             trend_count=0 if trends is None else len(trends),
             trends=[] if trends is None else _describe_trends(trends),
-            runs=[_describe_run(row, axes, Path(path).parent) for row in done.to_dict("records")],
+            runs=[_describe_run(row, axes, path.parent) for row in done.to_dict("records")],
             figures=[_make_figure(done, axes)] if len(done) and axes else [],
         )
         temporary.write_text(text, encoding="utf-8")
-    return Path(path)
+    return path
 
 
 def _find_axes(table: pd.DataFrame) -> list[str]:
@@ -188,10 +190,17 @@ def _describe_run(row: Mapping[Any, Any], axes: list[str], folder: Path) -> dict
         else "–",
         "ratio": ratio,
         "verdict": row["verdict"] or "–",
-        "diagnosis": quote(os.path.relpath(Path(diagnosis, "report.html"), folder.absolute()))
-        if diagnosis
-        else "",
+        "diagnosis": _link_diagnosis(Path(diagnosis, "report.html"), folder) if diagnosis else "",
     }
+
+
+def _link_diagnosis(page: Path, folder: Path) -> str:
+    """Link to the report of a diagnosis: relative if it and the overview are in folders."""
+    if url := find_url(page):
+        return quote(url, safe="/:")
+    if find_url(folder):
+        return page.absolute().as_uri()
+    return quote(os.path.relpath(page, folder.absolute()))
 
 
 def _describe_term(row: Mapping[Any, Any], term: str, axes: list[str]) -> dict[str, Any]:

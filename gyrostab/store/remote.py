@@ -21,8 +21,9 @@ from typing import Any
 from gyrostab.errors import FormatError, GyrostabError, OptionError, OutputError
 
 __all__ = [
-    "describe_address", "fetch_file", "find_store", "find_url", "full_name", "is_folder",
-    "is_taken", "list_urls", "reaching", "remove_copies", "upload", "walk_address",
+    "describe_address", "fetch_file", "find_store", "find_url", "full_name", "has_content",
+    "has_file", "is_folder", "is_taken", "list_urls", "reaching", "read_object", "remove_address",
+    "remove_copies", "upload", "upload_file", "walk_address",
 ]  # fmt: skip
 
 _URL = re.compile(r"([a-z][a-z0-9+.-]+):/+(.+)")  # a single letter is a drive of Windows
@@ -114,6 +115,34 @@ def is_taken(url: str) -> bool:
         if filesystem.isfile(path):
             return True
         return any(filesystem.exists(f"{path}/{name}") for name in _ROOT_METADATA)
+
+
+def has_content(url: str) -> bool:
+    """Whether there is an object at an address or below it."""
+    with reaching(url, error=OutputError):
+        filesystem, path = _open_filesystem(url)
+        filesystem.invalidate_cache()
+        return bool(filesystem.exists(path))
+
+
+def has_file(path: Path) -> bool:
+    """Whether there is a file under a name or address."""
+    url = find_url(path)
+    if url is None:
+        return path.is_file()
+    with reaching(url):
+        filesystem, place = _open_filesystem(url)
+        return bool(filesystem.isfile(place))
+
+
+def read_object(url: str, count: int | None = None) -> bytes:
+    """Read an object, or its first `count` bytes; `FileNotFoundError` when there is none."""
+    with reaching(url):
+        filesystem, path = _open_filesystem(url)
+        with contextlib.suppress(FileNotFoundError):
+            content = filesystem.cat_file(path, end=count)
+            return bytes(content)
+    raise FileNotFoundError(url)
 
 
 def find_store(url: str) -> str | None:
@@ -236,6 +265,34 @@ def remove_copies() -> Iterator[None]:
             _download_file.cache_clear()
         while len(copies) > before:
             copies.pop().cleanup()
+
+
+def remove_address(url: str) -> None:
+    """Remove all that is at an address, if there is something."""
+    with reaching(url, error=OutputError):
+        filesystem, path = _open_filesystem(url)
+        filesystem.invalidate_cache()
+        with contextlib.suppress(FileNotFoundError):
+            filesystem.rm(path, recursive=True)
+        filesystem.invalidate_cache()
+
+
+@contextlib.contextmanager
+def upload_file(path: Path) -> Iterator[Path]:
+    """Provide the name to write a file to: a local one, which is uploaded if `path` is an address.
+
+    An object at the address is replaced at once.
+    """
+    url = find_url(path)
+    if url is None:
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="gyrostab-") as folder:
+        local = Path(folder, path.name)
+        yield local
+        with reaching(url, error=OutputError):
+            filesystem, place = _open_filesystem(url)
+            filesystem.put_file(str(local), place)
 
 
 @contextlib.contextmanager

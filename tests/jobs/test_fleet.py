@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import subprocess
+import sys
 import tempfile
 import time
 import warnings
@@ -364,14 +367,98 @@ def test_a_fleet_is_read_from_a_web_server(archive, done, tmp_path, serve_folder
 
 
 def test_what_a_fleet_does_not_do_at_addresses_is_said(archive, tmp_path, memory):
-    for call in (run_fleet, write_file_table):
-        with pytest.raises(OptionError, match=r"s3://rig/.*: the output of a fleet is a local"):
-            call([archive], "s3://rig/fleet.zarr")
+    for call, name in ((run_fleet, "fleet"), (write_file_table, "files.csv")):
+        with pytest.raises(
+            OptionError, match=r"output 'memory://rig/.*' must end in \.(zarr|parq)"
+        ):
+            call([archive], f"memory://rig/{name}")
+    foreign = {"fleet.zarr": run_fleet, "files.parquet": write_file_table}
+    for name, call in foreign.items():
+        memory.pipe(f"/mine/{name}", b"mine")
+        with pytest.raises(
+            OutputError, match="exists already, and gyrostab fleet or index did not"
+        ):
+            call([archive], f"memory://mine/{name}")
+        assert memory.cat(f"/mine/{name}") == b"mine"
     with pytest.raises(OptionError, match="either at addresses or in folders"):
         find_archive(["memory://rig", archive])
     with pytest.raises(FormatError, match=r"memory://none: there is no such object"):
         find_archive(["memory://none"])
     assert not list(tmp_path.iterdir())
+
+
+def test_a_fleet_is_written_to_an_object_store(archive, done, memory, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    output = "memory://results/fleet.zarr"
+    run_fleet([archive / "tool 1"], output, **{**OPTIONS, "reports": True})
+    tree = xr.open_datatree(output, engine="zarr")
+    assert set(tree.children) == {"run a", "run <b>"}
+    with open_product(done / "tool 1" / "run a.nc") as expected:
+        xr.testing.assert_equal(open_product(f"{output}/run a").load(), expected.load())
+        np.testing.assert_array_equal(tree["run a"]["N"].values, expected["N"].values)
+    found = {name.removeprefix("/results/fleet.zarr/") for name in memory.find("/results")}
+    tables = {"effects.parquet", "files.parquet", "index.parquet", "trends.parquet"}
+    pages = {"index.html", "reports/plotly.js", "reports/run a.html", "reports/run <b>.html"}
+    assert found > tables | pages | {"fleet.json"}
+    page = memory.cat("/results/fleet.zarr/index.html").decode()
+    assert 'href="reports/run%20a.html"' in page
+    terms = tmp_path / "tool.csv"
+    assert main(["export", output, "--format", "iscwsa", "-o", str(terms)]) == 0
+    assert "from 2 runs of fleet.zarr, " in terms.read_text()
+    assert [path.name for path in tmp_path.iterdir()] == ["tool.csv"]
+
+
+def test_a_fleet_at_an_address_is_brought_up_to_date(memory, tmp_path, computed, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    own, output, table = tmp_path / "in", "memory://results/fleet.zarr", "memory://rig/all.parquet"
+    for name in ("a", "b", "c"):
+        write_log(own / name / "log.nc", 5)
+    put, calls = type(memory).put, []
+
+    def fail_once(self, *arguments, **options):
+        calls.append(arguments)
+        if len(calls) == 4:  # the metadata of the second product
+            raise OSError("the network is down")
+        return put(self, *arguments, **options)
+
+    monkeypatch.setattr(type(memory), "put", fail_once)
+    write_file_table([own], table, scheduler="threads")
+    with pytest.raises(FormatError, match="1 of 3 runs failed: "), pytest.warns(match="is down"):
+        run_fleet([table], output, **OPTIONS)
+    assert computed == ["a", "b", "c"]
+    run_fleet([own], output, **OPTIONS)
+    assert computed[3:] == ["b"]
+    write_log(own / "d" / "log.nc", 6)
+    (own / "c" / "log.nc").unlink()
+    write_log(own / "c" / "log.nc", 7, minutes=6.0)
+    memory.rm("/results/fleet.zarr/a", recursive=True)
+    write_file_table([own], table, scheduler="threads")
+    rows = run_fleet([table], output, **OPTIONS)
+    assert sorted(computed[4:]) == ["a", "c", "d"]
+    assert list(rows["span [s]"]) == [300.0, 300.0, 360.0, 300.0]
+    tree = xr.open_datatree(output, engine="zarr")
+    assert {name: node.sizes["time"] for name, node in tree.children.items()} == {
+        "a": 9, "b": 9, "c": 11, "d": 9,
+    }  # fmt: skip
+    del computed[:]
+    run_fleet([own], output, **OPTIONS)
+    assert computed == []
+
+
+def test_diagnoses_at_addresses_are_those_of_their_runs(memory, archive, tmp_path):
+    from tests.jobs.test_fleet_table import write_diagnosis
+
+    write_diagnosis(tmp_path / "found", 4.0)
+    made = json.loads((tmp_path / "found" / "diagnosis.json").read_text())
+    made["recording"]["files"] = ["log.zarr"]
+    memory.pipe("/rig/tool 1/run b/found/diagnosis.json", json.dumps(made).encode())
+    table = run_fleet(["memory://rig"], tmp_path / "fleet", **OPTIONS).set_index("run")
+    assert table["verdict"].to_dict() == {"tool 1/run a": "", "tool 1/run b": "explained"}
+    effects = pd.read_parquet(tmp_path / "fleet" / "effects.parquet")
+    assert list(effects["effect"]) == ["vibration_noise"]
+    page = (tmp_path / "fleet" / "index.html").read_text(encoding="utf-8")
+    assert 'href="memory://rig/tool%201/run%20b/found/report.html"' in page
+    assert "1 of 1 diagnosed runs" in page
 
 
 def test_the_command_line_tells_the_failures(archive, tmp_path, capfd):
@@ -416,3 +503,47 @@ def test_a_killed_fleet_goes_on_where_it_was(tmp_path, computed):
     assert len(after) == 4
     assert {name: after[name] for name in before} == before
     assert not [path for path in output.rglob("*") if path.name.endswith((".job", ".part"))]
+
+
+_KILLED_CALL = """
+import os, signal, sys
+import s3fs
+from gyrostab.cli import main
+
+put, calls = s3fs.S3FileSystem.put, []
+
+def kill_fourth(*arguments, **options):
+    calls.append(arguments)
+    if len(calls) == 4:  # the metadata of the second product
+        os.kill(os.getpid(), signal.SIGKILL)
+    return put(*arguments, **options)
+
+s3fs.S3FileSystem.put = kill_fourth
+main(sys.argv[1:])
+"""
+
+
+@pytest.mark.slow  # 570 requests of a server in Python
+def test_a_fleet_killed_while_it_writes_to_a_bucket_goes_on(s3_bucket, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for number in range(2):
+        write_log(tmp_path / "archive" / f"run{number}" / "log.nc", number)
+    output = f"{s3_bucket}/fleet.zarr"
+    command = ["fleet", "archive", "-o", output, "--window", "60s", "--step", "30s"]
+    command += ["--taus", "12", "--no-reports", "--scheduler", "threads", "--quiet-progress"]
+    killed = subprocess.run([sys.executable, "-c", _KILLED_CALL, *command])
+    assert killed.returncode == -signal.SIGKILL
+    store = pytest.importorskip("fsspec").filesystem("s3")
+    complete = store.glob(f"{output}/*/.zmetadata")
+    assert len(complete) == 1
+    before = store.info(complete[0])["ETag"]
+    assert main(command) == 0
+    store.invalidate_cache()
+    assert store.info(complete[0])["ETag"] == before  # with the time at which it was made
+    tree = xr.open_datatree(output, engine="zarr")
+    for name, node in tree.children.items():
+        run([tmp_path / "archive" / name / "log.nc"], tmp_path / "product.nc", windows=WINDOWS,
+            overwrite=True)  # fmt: skip
+        with open_product(tmp_path / "product.nc") as single:
+            np.testing.assert_array_equal(node["N"].values, single["N"].values)
+    assert not list(tmp_path.glob(".*"))  # the job folders are removed

@@ -1,4 +1,4 @@
-"""Logs and products at addresses: in memory, and on a local server that speaks S3."""
+"""Logs and products at addresses: in memory, and on local servers that speak S3 and GCS."""
 
 from __future__ import annotations
 
@@ -58,24 +58,6 @@ def assert_same_values(left, right) -> None:
             np.testing.assert_array_equal(a[name].values, b[name].values, err_msg=str(name))
 
 
-@pytest.fixture(scope="module")
-def bucket():
-    """A bucket on a local server."""
-    moto = pytest.importorskip("moto.server")
-    server = moto.ThreadedMotoServer(port=0)
-    server.start()
-    host, port = server.get_host_and_port()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
-        patch.setenv("AWS_ACCESS_KEY_ID", "test")
-        patch.setenv("AWS_SECRET_ACCESS_KEY", "test")
-        patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
-        s3 = fsspec.filesystem("s3")
-        s3.mkdir("archive")
-        yield "s3://archive"
-    server.stop()
-
-
 @pytest.mark.parametrize("stamps", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_logs_and_products_in_memory_have_the_bits_of_local_ones(stamps, log, local):
     to_zarr(log, "memory://archive/log.zarr", stamps=stamps)
@@ -84,11 +66,20 @@ def test_logs_and_products_in_memory_have_the_bits_of_local_ones(stamps, log, lo
     np.testing.assert_array_equal(opened["rate"].values, log["rate"].values)
     run(["memory://archive/*.zarr"], "memory://results/product.zarr", windows=WINDOWS)
     assert_same_values("memory://results/product.zarr", local)
+    with pytest.warns(UserWarning, match="is complete already"):
+        run(
+            ["memory://archive/*.zarr"],
+            "memory://results/product.zarr",
+            windows=WINDOWS,
+            resume=True,
+        )
     assert not list(Path().iterdir())  # the job folder is removed
 
 
 @pytest.mark.slow
-def test_commands_read_and_write_a_bucket(bucket, log, local, capsys):
+@pytest.mark.parametrize("bucket", ["s3_bucket", "gs_bucket"])
+def test_commands_read_and_write_a_bucket(bucket, request, log, local, capsys):
+    bucket = request.getfixturevalue(bucket)
     to_zarr(log, f"{bucket}/log.zarr")
     options = [part for name, value in WINDOWS.items() for part in (f"--{name}", value)]
     product = f"{bucket}/product.zarr"
@@ -100,7 +91,9 @@ def test_commands_read_and_write_a_bucket(bucket, log, local, capsys):
     assert "nothing at an address is replaced" in capsys.readouterr().err
     assert main(["run", f"{bucket}/none.zarr", "-o", "a.nc"]) == 2
     assert "none.zarr: there is no such object; check the bucket" in capsys.readouterr().err
-    assert main(["run", "s3://no-such-bucket/log.zarr", "-o", "a.nc"]) == 2
+    assert (
+        main(["run", bucket.replace("archive", "no-such-bucket") + "/log.zarr", "-o", "a.nc"]) == 2
+    )
     assert "there is no such object; check the bucket" in capsys.readouterr().err
     assert not list(Path().iterdir())
 
@@ -150,6 +143,8 @@ def test_what_cannot_be_done_is_said(log, monkeypatch):
     fsspec.filesystem("memory").pipe("/archive/other.zarr/.zgroup", b'{"zarr_format": 2}')
     with pytest.raises(FormatError, match="is a Zarr store of another program"):
         load_log(["memory://archive/other.zarr"])
+    loaded = sys.modules["fsspec.registry"]._registry
+    monkeypatch.delitem(loaded, "gs", raising=False)  # loaded by another test
     monkeypatch.setitem(sys.modules, "gcsfs", None)
     with pytest.raises(OptionError, match=r"pip install 'gyrostab\[gcs\]'"):
         load_log(["gs://archive/log.zarr"])

@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from gyrostab.cli.frame import Output, app, show_stages
 from gyrostab.cli.options import Common, Fitting, Reading, Windows
+from gyrostab.store.remote import find_url
 from gyrostab.wording import list_some
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ def index(
     archive
         Folders, which are searched with all folders below, files, or quoted patterns.
     output
-        Parquet file to write.
+        Parquet file to write, also at an address (s3://bucket/files.parquet).
     scheduler
         Where to open the files: processes, or the address of a dask scheduler.
     """
@@ -60,7 +61,7 @@ def index(
             stage=stage,
         )
     _print_left_out(table, output)
-    print(output)
+    print(find_url(output) or output)
 
 
 @app.command(sort_key=5, help_epilogue="")
@@ -92,7 +93,7 @@ def fleet(
         written by gyrostab index.
     output
         Folder to write: products, index.parquet, index.html and reports. FLEET.zarr makes the
-        products groups of a Zarr store.
+        products groups of a Zarr store, also at an address (s3://bucket/fleet.zarr).
     per
         What a run is: all logs of a folder, or each file.
     tool
@@ -127,7 +128,8 @@ def fleet(
         _print_left_out(files, output / "files.parquet")
     tools = table["tool"].nunique()
     print(f"{len(table)} run{'s'[: len(table) != 1]} of {tools} tool{'s'[: tools != 1]}")
-    print(output / "index.html", output, sep="\n")
+    for path in (output / "index.html", output):
+        print(find_url(path) or path)
 
 
 def _print_left_out(table: pd.DataFrame, path: Path) -> None:
@@ -137,7 +139,7 @@ def _print_left_out(table: pd.DataFrame, path: Path) -> None:
     if len(others):
         names = list_some([Path(name).name for name in others["file"]])
         print(
-            f"note: not logs, or not without options: {names}; {path} lists them with the reasons, "
-            "and gyrostab scan FILE prints the options that a file needs",
+            f"note: not logs, or not without options: {names}; {find_url(path) or path} lists "
+            "them with the reasons, and gyrostab scan FILE prints the options that a file needs",
             file=sys.stderr,
         )

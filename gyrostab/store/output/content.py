@@ -9,6 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from gyrostab.store.remote import find_url, read_object
+
 __all__ = ["FindForeign", "find_foreign_item", "is_store", "read_json"]
 
 #: Function that returns the name of an item of a folder that must not be removed, or None.
@@ -21,9 +23,10 @@ _CHUNK = re.compile(r"(c|(c\.)?\d+(\.\d+)*)(\.[0-9a-f]{32}\.partial)?")
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file; None when it cannot be read."""
+    """Read a JSON file, also at an address; None when it cannot be read."""
+    url = find_url(path)
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(read_object(url) if url else path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
 

@@ -18,7 +18,7 @@ from gyrostab.errors import GyrostabError, OutputError
 from gyrostab.store.output.check import check_folder, check_target
 from gyrostab.store.output.content import FindForeign
 from gyrostab.store.output.inputs import check_unchanged
-from gyrostab.store.remote import find_url, upload
+from gyrostab.store.remote import find_url, upload, upload_file
 from gyrostab.store.system import exchange_paths, rename_new, sync_path
 
 __all__ = ["is_leftover", "new_folder", "new_output", "remove_leftovers", "replace_file"]
@@ -112,6 +112,10 @@ def new_output(
 @contextlib.contextmanager
 def replace_file(path: Path) -> Iterator[Path]:
     """Write a file inside a folder of gyrostab like `new_output`, and replace an existing one."""
+    if find_url(path):
+        with upload_file(path) as temporary:
+            yield temporary
+        return
     with _temporary_output(
         path, path.with_name(_hide_name(path.name)), make_folder=False
     ) as temporary:
