@@ -51,7 +51,7 @@ def measure(calls: dict[str, tuple[Callable[[Path], Any], bool]], paths: list[Pa
             with ExitStack() as stack:
                 for module in () if is_direct else ("store.read", "ingest.formats.netcdf"):
                     target = f"gyrostab.{module}.open_netcdf_log"
-                    stack.enter_context(patch(target, lambda path: None))
+                    stack.enter_context(patch(target, lambda path, **_: None))
                 begun = time.thread_time()
                 for path in paths:
                     call(path)

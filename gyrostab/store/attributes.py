@@ -21,7 +21,7 @@ from gyrostab.store.safe_names import is_storable, make_name_storable
 from gyrostab.time.clock import time_of_day
 from gyrostab.units import ON_DISK, on_disk
 
-__all__ = ["decode_attributes", "encode_attributes", "make_global_attributes"]
+__all__ = ["JSON_NAMES", "decode_attributes", "encode_attributes", "make_global_attributes"]
 
 _CONVENTIONS = "CF-1.11, ACDD-1.3"
 _TITLES = {
@@ -31,7 +31,7 @@ _TITLES = {
     "log": "Gyro log on a uniform time axis",
     "dataset": "Gyro stability data",
 }
-_JSON_NAMES = "json_attributes"
+JSON_NAMES = "json_attributes"
 
 # Names that UDUNITS reads as intended. An integer power may follow; UDUNITS misreads a fractional
 # one without an error, so none passes.
@@ -67,7 +67,7 @@ def encode_attributes(attrs: dict[str, Any]) -> dict[str, Any]:
             attrs[name] = json.dumps(value, default=str)
             coded.append(name)
     if coded:
-        attrs[_JSON_NAMES] = " ".join(coded)
+        attrs[JSON_NAMES] = " ".join(coded)
     return attrs
 
 
@@ -113,7 +113,7 @@ def make_global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[st
 
 def decode_attributes(attrs: dict[str, Any]) -> dict[str, Any]:
     """Convert attributes of a file back; those that concern only the file are dropped."""
-    for name in set(str(attrs.pop(_JSON_NAMES, "")).split()) & set(attrs):
+    for name in set(str(attrs.pop(JSON_NAMES, "")).split()) & set(attrs):
         attrs[name] = json.loads(attrs[name])
     for name, value in attrs.items():
         attrs[name] = value.item() if isinstance(value, np.generic) else value

@@ -22,9 +22,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
+from gyrostab.store.attributes import JSON_NAMES
 from gyrostab.store.hdf5_heaps import check_global_heaps
 from gyrostab.store.layout import has_known_filters
 from gyrostab.store.private import library_lock
+from gyrostab.store.safe_names import ORIGINAL_NAME
 from gyrostab.store.times import GRID, follows_rule, parse_time_grids
 
 __all__ = ["StoredLog", "open_netcdf_log", "read_content"]
@@ -40,6 +42,14 @@ _UNREAD = {b"CLASS", b"DIMENSION_LIST", b"REFERENCE_LIST", b"_NCProperties"}
 _NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
 #: Attributes that change what values or coordinates mean; gyrostab writes none of them in a log.
 _FOREIGN = {"_Unsigned", "add_offset", "coordinates", "dtype", "missing_value"}
+#: Attributes that a summary needs, or that are checked.
+_BRIEF = {
+    name.encode()
+    for name in (
+        *_ENCODED, *_FOREIGN, _FIRST_DIMENSION, _DIMENSIONS, _NAME, GRID, JSON_NAMES,
+        ORIGINAL_NAME, "calendar", "gyrostab_content", "notes", "source_units", "units",
+    )
+}  # fmt: skip
 _MAX_READ_VALUES = 2**17
 
 
@@ -57,8 +67,13 @@ class StoredLog:
         """Do nothing, as the file is closed."""
 
 
-def open_netcdf_log(path: Path) -> StoredLog | None:
+def open_netcdf_log(path: Path, *, brief: bool = False) -> StoredLog | None:
     """Open a NetCDF log as it is on disk, with neither decoded times nor indexes.
+
+    Parameters
+    ----------
+    brief : bool
+        Read only the attributes that a summary of the log needs.
 
     Returns
     -------
@@ -79,8 +94,8 @@ def open_netcdf_log(path: Path) -> StoredLog | None:
                 return None
             values = _open_values(file)
             check_global_heaps(path, skip=_find_data(values.values()))
-            attrs = _read_attributes(file)
-            variables = _open_variables(values)
+            attrs = _read_attributes(file, brief=brief)
+            variables = _open_variables(values, brief=brief)
             for name, rule in parse_time_grids(variables, path).items():
                 if variables[name].ndim:
                     start = _reduce_stamps(variables.pop(name), rule, values[name])
@@ -148,14 +163,16 @@ def _open_values(file: Any) -> dict[str, Any]:
     return {name.decode(): h5d.open(file, name) for name in names}
 
 
-def _read_attributes(place: Any) -> dict[str, Any]:
+def _read_attributes(place: Any, *, brief: bool) -> dict[str, Any]:
     """Read the attributes of a file or variable, in the order in which they were made."""
     from h5py import h5, h5a
 
     names: list[bytes] = []
     h5a.iterate(place, names.append, index_type=h5.INDEX_CRT_ORDER)
     return {
-        name.decode(): _read_value(h5a.open(place, name)) for name in names if name not in _UNREAD
+        name.decode(): _read_value(h5a.open(place, name))
+        for name in names
+        if name not in _UNREAD and (not brief or name in _BRIEF)
     }
 
 
@@ -195,9 +212,9 @@ def _find_data(values: Iterable[Any]) -> list[tuple[int, int]]:
     return sorted(found)
 
 
-def _open_variables(values: dict[str, Any]) -> dict[Any, xr.Variable]:
+def _open_variables(values: dict[str, Any], *, brief: bool) -> dict[Any, xr.Variable]:
     """Open the variables; `ValueError` when one must be decoded, or is laid out otherwise."""
-    attributes = {name: _read_attributes(item) for name, item in values.items()}
+    attributes = {name: _read_attributes(item, brief=brief) for name, item in values.items()}
     names = {attrs[_FIRST_DIMENSION]: name for name, attrs in attributes.items() if _NAME in attrs}
     variables = {}
     for name, attrs in attributes.items():

@@ -10,7 +10,9 @@ from typing import Any
 
 import xarray as xr
 
-__all__ = ["is_storable", "make_name_storable", "make_names_storable", "restore_names"]
+__all__ = [
+    "ORIGINAL_NAME", "is_storable", "make_name_storable", "make_names_storable", "restore_names",
+]  # fmt: skip
 
 # NetCDF User's Guide, "Permitted characters in netCDF names"; Zarr adds that a name is part of a
 # path, and reserves two underscores.
@@ -19,7 +21,7 @@ _STORABLE = re.compile(
 )
 # NetCDF allows 256, a file name 255, and a suffix for the time axis is added
 _MAX_NAME_BYTES = 200
-_ORIGINAL_NAME = "original_name"
+ORIGINAL_NAME = "original_name"
 
 
 def is_storable(name: str) -> bool:
@@ -83,7 +85,7 @@ def make_names_storable(dataset: xr.Dataset) -> xr.Dataset:
         renamed[other].attrs = {
             "long_name": shown,
             **renamed[other].attrs,
-            _ORIGINAL_NAME: json.dumps(name),
+            ORIGINAL_NAME: json.dumps(name),
         }
     renamings = ", ".join(f"{name!a} as {other!r}" for name, other in safe.items())
     warnings.warn(
@@ -98,8 +100,8 @@ def restore_names(dataset: xr.Dataset) -> xr.Dataset:
     """Restore the names that `make_names_storable` replaced."""
     originals: dict[Any, str] = {}
     for name, variable in dataset.variables.items():
-        if _ORIGINAL_NAME in variable.attrs:
-            originals[name] = json.loads(variable.attrs.pop(_ORIGINAL_NAME))
+        if ORIGINAL_NAME in variable.attrs:
+            originals[name] = json.loads(variable.attrs.pop(ORIGINAL_NAME))
     if not originals:
         return dataset
     return dataset.rename(

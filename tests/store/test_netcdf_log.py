@@ -31,7 +31,7 @@ def test_a_log_is_that_which_xarray_opens(tmp_path, monkeypatch, stamps):
     _write_log(path, stamps=stamps)
     assert open_netcdf_log(path) is not None
     direct = open_log(path)
-    monkeypatch.setattr(read, "open_netcdf_log", lambda path: None)
+    monkeypatch.setattr(read, "open_netcdf_log", lambda path, **_: None)
     slow = open_log(path)
     xr.testing.assert_identical(direct, slow)
     assert list(direct.variables) == list(slow.variables)
@@ -39,14 +39,29 @@ def test_a_log_is_that_which_xarray_opens(tmp_path, monkeypatch, stamps):
     assert direct["rate"].dtype == slow["rate"].dtype
 
 
-@pytest.mark.parametrize("stamps", [True, False])
-def test_a_log_has_the_summary_of_its_samples(tmp_path, monkeypatch, stamps):
+@pytest.mark.filterwarnings("ignore:a file cannot hold a channel of this name")
+@pytest.mark.parametrize(("stamps", "named"), [(True, False), (False, False), (True, True)])
+def test_a_log_has_the_summary_of_its_samples(tmp_path, monkeypatch, stamps, named):
     path = tmp_path / "log.nc"
     _write_log(path, stamps=stamps)
+    with open_log(path) as log:
+        log = log.load().assign_attrs(notes=["the tool was struck", "twice"])
+    log["accel_x"] = ("time", np.full(5000, 1.0), {"units": "g"})
+    slow = np.datetime64("2026-01-01", "ns") + np.arange(50) * np.timedelta64(1, "s")
+    log = log.assign_coords(time_depth=slow)
+    log["depth"] = ("time_depth", np.arange(50.0), {"units": "m"})
+    if named:
+        log = log.rename(depth="a/b", time_depth="time_a/b")
+    to_netcdf(log, path, overwrite=True, stamps=stamps)
     direct = scan_file(path)
-    monkeypatch.setattr(netcdf, "open_netcdf_log", lambda path: None)
+    assert {column.unit for column in direct.columns} == {
+        "degree hour-1", "degree_Celsius", "g", "m",
+    }  # fmt: skip
+    assert len(direct.notes) == 2
+    monkeypatch.setattr(netcdf, "open_netcdf_log", lambda path, **_: None)
     assert direct == scan_file(path)
-    assert (direct.n_rows, direct.channels) == (5000, ("temperature",))
+    channels = ("temperature", "accel_x", "a/b" if named else "depth")
+    assert (direct.n_rows, direct.channels) == (5000, channels)
 
 
 def test_changed_stamps_are_left_to_xarray(tmp_path):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import sys
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,12 +35,15 @@ from gyrostab.ingest.limits import check_declared, check_stored
 from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
 from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name
+from gyrostab.store.attributes import decode_attributes
 from gyrostab.store.blosc_chunks import check_blosc_chunks
 from gyrostab.store.cf import from_disk
 from gyrostab.store.hdf5_heaps import check_global_heaps
-from gyrostab.store.netcdf_log import open_netcdf_log, read_content
-from gyrostab.store.read import Stored, open_stored
+from gyrostab.store.netcdf_log import StoredLog, open_netcdf_log, read_content
+from gyrostab.store.read import open_stored
 from gyrostab.store.remote import find_url
+from gyrostab.store.safe_names import ORIGINAL_NAME
+from gyrostab.store.times import index_dim, parse_time_grids
 from gyrostab.time.grid import grid_times, time_coordinate
 from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import ON_DISK
@@ -68,7 +71,13 @@ def matches(path: Path) -> bool:
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Summarise variables, sizes, and first and last stamps."""
-    log = _open_remote(path) if find_url(path) else _open_log(path, options, values=False)
+    if path.is_file():
+        read_classic_header(path)
+        stored = open_netcdf_log(path, brief=True)
+        summary = None if stored is None else _summarise_stored(path, stored, options)
+        if summary is not None:
+            return summary
+    log = _open_remote(path) if find_url(path) else _open_log(path, options)
     if log is not None:
         with log:
             return _summarise_log(path, log)
@@ -100,17 +109,13 @@ def _open_remote(path: Path) -> xr.Dataset:
     return log
 
 
-def _open_log(path: Path, options: ReadOptions, *, values: bool = True) -> xr.Dataset | None:
-    """Open a regular log, of gyrostab or with a stamp for each sample; None for other files.
-
-    The samples of a log of gyrostab may be NaN without `values`.
-    """
+def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
+    """Open a regular log, of gyrostab or with a stamp for each sample; None for other files."""
     if path.is_file():
         read_classic_header(path)  # before the library allocates what a damaged header asks for
-    stored = None if values or path.is_dir() else open_netcdf_log(path)
-    content = _content_kind(path) if stored is None else "log"
+    content = _content_kind(path)
     if content == "log":
-        return _open_own(path, options, stored)
+        return _open_own(path, options)
     if path.is_file():
         check_global_heaps(path)
     if content in _OTHER_CONTENT and not options.channels_only:
@@ -223,13 +228,10 @@ def _content_kind(path: Path) -> str:
         return ""
 
 
-def _open_own(path: Path, options: ReadOptions, stored: Stored | None) -> xr.Dataset:
-    """Open a log that gyrostab wrote, or take it as it is on disk if it is open."""
+def _open_own(path: Path, options: ReadOptions) -> xr.Dataset:
+    """Open a log that gyrostab wrote."""
     check = partial(check_declared, given=options.limits)
-    if stored is None:
-        stored = open_stored(path, strict=options.strict, check=check)
-    else:
-        check(path, stored.variables)
+    stored = open_stored(path, strict=options.strict, check=check)
     log = from_disk(stored, path.name)
     try:
         log = as_uniform(log)
@@ -265,28 +267,80 @@ def _with_uniform_time(log: xr.Dataset) -> xr.Dataset:
     return as_uniform(log)
 
 
+def _summarise_stored(path: Path, stored: StoredLog, options: ReadOptions) -> FileSummary | None:
+    """Summarise a log as it is on disk; None where decoding finds more, or what is wrong."""
+    check_declared(path, stored.variables, given=options.limits)
+    rules = {rule["dim"]: rule for rule in parse_time_grids(stored.variables, path.name).values()}
+    signals = [name for name in SIGNAL_UNITS if name in stored.data_vars]
+    variables, labels = stored.variables, stored.variables.get("axis")
+    if "time" not in rules or len(signals) != 1 or labels is None or labels.ndim != 1:
+        return None
+    rule, (signal,) = rules["time"], signals
+    time = next((dim for dim in ("time", index_dim("time")) if dim in stored.sizes), "")
+    is_plain = (
+        variables[signal].dims == ("axis", time)
+        and stored.sizes[time] == rule["size"] > 0
+        and variables[signal].attrs.get("units") == ON_DISK.get(*2 * (SIGNAL_UNITS[signal],))
+        and len(set(labels.values.tolist())) == labels.size > 0
+        and not any(ORIGINAL_NAME in item.attrs for item in variables.values())
+    )
+    if not is_plain:
+        return None
+    ends = rule["first"] + rule["stride"] * np.array([0, rule["size"] - 1])
+    own = {dim: {time} | {f"time_{dim}", index_dim(f"time_{dim}")} for dim in stored.data_vars}
+    channels = {
+        name: str(decode_attributes(dict(variables[name].attrs)).get("units", ""))
+        for name in stored.data_vars
+        if variables[name].ndim == 1 and variables[name].dims[0] in own[name]
+    }
+    return _make_summary(
+        path,
+        signal,
+        labels.values.tolist(),
+        channels,
+        grid_times(rule["start_ns"], rule["rate_hz"], ends),
+        rule["size"],
+        decode_attributes(dict(stored.attrs)).get("notes", ()),
+    )
+
+
 def _summarise_log(path: Path, log: xr.Dataset) -> FileSummary:
-    channels = log_channels(log)
-    signal = signal_name(log)
-    first, last = (np.datetime64(stamp, "ns") for stamp in log_span(log))
+    return _make_summary(
+        path,
+        signal_name(log),
+        log["axis"].values.tolist(),
+        {name: str(log[name].attrs.get("units", "")) for name in log_channels(log)},
+        log_span(log),
+        log.sizes["time"],
+        log.attrs.get("notes", ()),
+    )
+
+
+def _make_summary(
+    path: Path,
+    signal: str,
+    labels: Sequence[Any],
+    channels: Mapping[str, str],
+    span: Iterable[int],
+    size: int,
+    notes: Iterable[str],
+) -> FileSummary:
     axes = [
         ColumnSummary(str(axis), f"gyro_{axis}", "gyro", signal, SIGNAL_UNITS[signal])
-        for axis in log["axis"].values
+        for axis in labels
     ]
-    others = [
-        ColumnSummary(name, name, "channel", None, str(log[name].attrs.get("units", "")))
-        for name in channels
-    ]
+    others = [ColumnSummary(name, name, "channel", None, units) for name, units in channels.items()]
+    first, last = (np.datetime64(int(stamp), "ns") for stamp in span)
     return FileSummary(
         path=path,
         format="gyrostab log",
         columns=(*axes, *others),
-        axes=tuple(str(axis) for axis in log["axis"].values),
+        axes=tuple(map(str, labels)),
         channels=tuple(channels),
         first=first,
         last=last,
-        n_rows=log.sizes["time"],
-        notes=tuple(log.attrs.get("notes", ())),
+        n_rows=size,
+        notes=tuple(notes),
     )
 
 
