@@ -204,7 +204,8 @@ def _connect_cluster(address: str, files: Sequence[Path]) -> Iterator[Pool]:
                 partial(reach, client.submit, _identity, pure=False),
             )
         finally:
-            executor.shutdown(wait=False)
+            with contextlib.suppress(Exception):  # of a lost scheduler, which has been explained
+                executor.shutdown(wait=False)
 
 
 def _reach_scheduler(

@@ -57,6 +57,8 @@ _OPTIONS = "gyrostab_watch"
 _MAX_WORK_SHARE = 0.1
 #: Share of the bytes that the next window is estimated to need from which on files are read.
 _DUE_SHARE = 0.9
+_M_MMAP_THRESHOLD = -3  # of malloc.h of glibc
+_LARGE_BYTES = 2**17  # its first value, which it raises up to 32 MiB unless it is set
 #: Notes whose counts matter are repeated when the counts change.
 _COUNTED_NOTES = ("out of order", "dropped")
 
@@ -145,6 +147,7 @@ def watch(
         "fitting": dict(fitting or {}),
     }
     check_windows(**options["windows"])
+    _return_large_arrays()
     wait = duration_seconds(lateness, "--lateness") if lateness else 0.0
     quiet = duration_seconds(idle, "--idle") if idle else np.inf
     path = Path(output)
@@ -389,6 +392,12 @@ class _View:
             for event in (event for alarm in self.alarms for event in alarm.update(window)):
                 if not is_known:
                     self.listener.show_alarm(event)
+
+
+def _return_large_arrays() -> None:
+    """Let glibc return each large array to the system when it is freed, not only at first."""
+    with contextlib.suppress(TypeError, AttributeError):  # on Windows and without glibc
+        ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)
 
 
 def _release_memory() -> None:

@@ -21,7 +21,9 @@ from gyrostab.allan.davar import davar_parts
 from gyrostab.cli import main
 from gyrostab.errors import OptionError, WorkerError
 from gyrostab.io.datasets import open_log
-from gyrostab.jobs import checkpoint, engine, schedule
+from gyrostab.jobs import checkpoint, engine, fleet, schedule
+from gyrostab.jobs.fleet import process_run
+from gyrostab.jobs.fleet_table import read_table
 from gyrostab.jobs.run import run
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool, run_calls
 from tests.support.crashing import WINDOW, WINDOW_OPTIONS
@@ -32,11 +34,17 @@ PARTS = 5
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
-    """Start a scheduler and two workers of one thread each as separate programs, as a user does.
+    """Start a scheduler and two workers; see `start_cluster`."""
+    with start_cluster(tmp_path_factory.mktemp("cluster"), workers=2) as found:
+        yield found
+
+
+@contextmanager
+def start_cluster(folder: Path, *, workers: int) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """Start a scheduler and workers of one thread each as separate programs, as a user does.
 
     Yields the address of the scheduler, and its process.
     """
-    folder = tmp_path_factory.mktemp("cluster")
     where = folder / "scheduler.json"
     environment = {
         **os.environ,
@@ -49,7 +57,7 @@ def cluster(tmp_path_factory):
         "--host",
         "127.0.0.1",
         "--nworkers",
-        "2",
+        str(workers),
         "--nthreads",
         "1",
         "--memory-limit",
@@ -71,7 +79,7 @@ def cluster(tmp_path_factory):
         )
         _wait_for(where)
         with distributed.Client(scheduler_file=str(where)) as client:
-            client.wait_for_workers(2, timeout=60)
+            client.wait_for_workers(workers, timeout=60)
             found = client.scheduler.address
         yield found, process
 
@@ -357,7 +365,7 @@ def test_a_scheduler_that_dies_is_explained_and_resume_goes_on(
 ):
     """Finished parts survive the death of the scheduler, and threads compute the rest.
 
-    This is the last test of the file, because it ends the scheduler of the others.
+    This is the last test that uses the scheduler of the others, because it ends it.
     """
     output = tmp_path / "out" / "product.nc"
     output.parent.mkdir()
@@ -388,3 +396,41 @@ def test_a_scheduler_that_dies_is_explained_and_resume_goes_on(
     for name, values in made.items():
         np.testing.assert_array_equal(values, expected[name], err_msg=name)
     assert [path.name for path in output.parent.iterdir()] == [output.name]
+
+
+def test_a_fleet_whose_scheduler_dies_goes_on(tmp_path, monkeypatch, capfd):
+    """The message says how many runs are done, and the same command computes the others."""
+    for number in range(6):
+        folder = tmp_path / "archive" / f"run{number}"
+        folder.mkdir(parents=True)
+        to_netcdf(_log().isel(time=slice(0, 20_000 + number)), folder / "log.nc")
+    command = ["fleet", str(tmp_path / "archive"), "-o", str(tmp_path / "fleet"), "--no-reports"]
+    command += [*WINDOW_OPTIONS]
+    monkeypatch.setattr(schedule, "_CONNECT_TIMEOUT_S", 4.0)  # also that of a reconnection
+    real = fleet.run_calls
+    with start_cluster(tmp_path, workers=1) as (address, scheduler):
+
+        def kill_after_two(pool, calls):
+            for number, answer in enumerate(real(pool, calls)):
+                yield answer
+                if number == 1:
+                    os.killpg(scheduler.pid, signal.SIGKILL)
+                    scheduler.wait()
+
+        monkeypatch.setattr(fleet, "run_calls", kill_after_two)
+        assert main([*command, "--scheduler", address]) == 2
+        shown = capfd.readouterr().err
+        assert "the dask scheduler" in shown
+        assert "2 of 6 runs are done, and the same command continues" in shown
+        assert "Traceback" not in shown
+    monkeypatch.setattr(fleet, "run_calls", real)
+    computed = []
+    monkeypatch.setattr(
+        fleet, "process_run", lambda *given: computed.append(given) or process_run(*given)
+    )
+    assert main([*command, "--scheduler", "threads"]) == 0
+    assert len(computed) <= 4
+    assert read_table(tmp_path / "fleet" / "index.parquet", content="runs")["error"].tolist() == (
+        6 * [""]
+    )
+    assert not [path for path in (tmp_path / "fleet").rglob(".*")]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import platform
 import signal
 import subprocess
 import sys
@@ -324,3 +325,39 @@ def test_a_command_that_is_stopped_or_killed_is_continued(number, tmp_path):
     assert main([*command[3:], "--idle", "0.3s"]) == 0
     run([source], tmp_path / "run.nc", windows=WINDOWS)
     assert_same_product(output, tmp_path / "run.nc")
+
+
+_READING = """
+import ctypes, gc, sys, warnings
+from pathlib import Path
+from gyrostab.jobs.follow import FileMemory, list_files
+from gyrostab.jobs.run import load_log
+from gyrostab.jobs.watch import _release_memory, _return_large_arrays
+
+warnings.simplefilter("ignore")
+_return_large_arrays()
+memory, files = FileMemory(), list_files(sys.argv[1])
+memory.ended = True
+for count in range(2, len(files) + 1, 4):
+    memory.update(dict(list(files.items())[:count]))
+    load_log(list(memory.files), read=memory.read)
+    gc.collect()
+    _release_memory()
+    print(int(Path("/proc/self/statm").read_text().split()[1]) * 4 // 1024)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="is about the allocator of glibc")
+def test_memory_does_not_grow_with_the_files_that_were_read(tmp_path):
+    rows = 40_000
+    cells = np.random.default_rng(1).standard_normal((rows, 2)).round(4).tolist()
+    for number in range(18):
+        text = "".join(f"{number * rows + i}0,{x},{y}\n" for i, (x, y) in enumerate(cells))
+        (tmp_path / f"{number:02}.csv").write_text(
+            f"time [ms],gyro_x [deg/h],gyro_y [deg/h]\n{text}"
+        )
+    done = subprocess.run(
+        [sys.executable, "-c", _READING, str(tmp_path)], capture_output=True, text=True, check=True
+    )
+    sizes = [int(line) for line in done.stdout.splitlines()]  # MiB
+    assert sizes[-1] - sizes[1] < 15
