@@ -145,8 +145,11 @@ def test_scan_shows_how_to_read_messages(
     path = Path("log.bin")
     path.write_bytes(b"".join(kvh_message(n, RATES[:, n] * 1e-3, 40) for n in range(ROWS)))
     hint = '--unit "gyro=1000 rad/s" for angles at 1000 Hz'
-    call("scan", path)
-    assert hint in capsys.readouterr().err
+    assert call("scan", path) == 0
+    shown = capsys.readouterr().out
+    assert "check: --rate 100 is an assumption" in shown
+    assert shown.splitlines()[-1].startswith("# next: gyrostab run log.bin -o product.nc")
+    assert shown.splitlines()[-1].endswith(" --rate 100")
     for options in ([], ["--unit", "gyro=rad/s"]):
         assert call("scan", path, "--rate", "1000", *options) in (0, 2)
         shown = capsys.readouterr().out

@@ -44,17 +44,17 @@ def has_layout(path: Path) -> bool:
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Summarise fields, number of records, and first and last stamps; searches all messages."""
-    table, notes = _make_table(path, options)
+    table, notes = _make_table(path, options, needs_rate=False)
     return scan_tables(path, "binary", [table], options, notes)
 
 
 def read(path: Path, options: ReadOptions) -> xr.Dataset:
     """Return the raw log of a binary file; see `gyrostab.ingest.read_log`."""
-    table, notes = _make_table(path, options)
+    table, notes = _make_table(path, options, needs_rate=True)
     return read_tables(path, [table], options, notes=notes)
 
 
-def _make_table(path: Path, options: ReadOptions) -> tuple[Table, list[str]]:
+def _make_table(path: Path, options: ReadOptions, *, needs_rate: bool) -> tuple[Table, list[str]]:
     layout = find_layout(path)
     rows, rest = divmod(path.stat().st_size - layout.header, layout.size)
     starts = None
@@ -69,7 +69,7 @@ def _make_table(path: Path, options: ReadOptions) -> tuple[Table, list[str]]:
             "record); copy it again, or correct the layout"
         )
     fetch = partial(_read_field, path, layout, starts)
-    stamps, notes = _count_time(path, layout, fetch, rows, options)
+    stamps, notes = _count_time(path, layout, fetch, rows, options, needs_rate=needs_rate)
     if layout.sync:
         notes.insert(0, f"read as messages of {layout.place}{layout.note and ': '}{layout.note}")
     if rest:
@@ -83,11 +83,19 @@ def _make_table(path: Path, options: ReadOptions) -> tuple[Table, list[str]]:
 
 
 def _count_time(
-    path: Path, layout: Layout, fetch: Any, rows: int, options: ReadOptions
+    path: Path,
+    layout: Layout,
+    fetch: Any,
+    rows: int,
+    options: ReadOptions,
+    *,
+    needs_rate: bool,
 ) -> tuple[Any, list[str]]:
     """Return the stamps by the counter of the layout [ns], and a note on lost messages."""
     counter = layout.counter
     if counter is None:
+        return None, []
+    if options.rate is None and not needs_rate:
         return None, []
     if options.rate is None:
         raise OptionError(
