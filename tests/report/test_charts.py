@@ -13,12 +13,16 @@ import subprocess
 import numpy as np
 import pytest
 
+from gyrostab.jobs.archive import LogRun
+from gyrostab.jobs.fleet_table import list_effects, make_table, summarise_run
 from gyrostab.noise import model_avar
 from gyrostab.plot.style import COLOURS
 from gyrostab.report import write_diagnosis_report, write_report
 from gyrostab.report.diagnosis_charts import diagnosis_charts
+from gyrostab.report.fleet import write_overview
 from gyrostab.report.product_charts import product_charts, window_data
 from tests.diagnose.result.test_diagnosis import content, diagnosis, surfaces
+from tests.jobs.test_fleet_table import write_diagnosis
 from tests.support import synthetic
 
 _BROWSER = next(filter(None, map(shutil.which, ("chromium", "google-chrome", "chrome"))), None)
@@ -203,6 +207,21 @@ const probe = {
         .map(({ text }) => text);
     });
   },
+  runs() {
+    const heads = document.querySelectorAll("#runs th");
+    if (!heads.length) return {};
+    const names = () => Array.from(document.querySelectorAll("#runs tbody tr"))
+      .filter((row) => row.checkVisibility()).map((row) => row.cells[0].textContent);
+    Array.from(heads).find((head) => head.textContent.startsWith("N ")).click();
+    const ordered = names();
+    const filter = document.getElementById("filter");
+    const show = (words) => {
+      filter.value = words;
+      filter.dispatchEvent(new Event("input"));
+      return names();
+    };
+    return { ordered, filtered: show("RUN 2"), all: show("") };
+  },
   tables() {
     return Array.from(document.querySelectorAll("table"))
       .filter((table) => table.checkVisibility()).map((table) => {
@@ -216,7 +235,7 @@ window.addEventListener("load", () => setTimeout(() => {
   const linked = probe.linked();
   const closed = Array.from(document.querySelectorAll("details:not([open])"));
   for (const details of closed) details.open = true;
-  parent.postMessage(JSON.stringify({ ...linked,
+  parent.postMessage(JSON.stringify({ ...linked, runs: probe.runs(),
     drawn: document.querySelectorAll(".chart .main-svg").length,
     wide: root.scrollWidth, seen: root.clientWidth, body: document.body.scrollWidth,
     controls: probe.controls(), texts: probe.texts(), tables: probe.tables(),
@@ -326,3 +345,36 @@ def test_a_browser_draws_the_page_of_a_diagnosis(tmp_path, width):
     _check_access(state, width)
     assert state["drawn"] >= 4
     assert "summary" in {row["tag"] for row in state["controls"]}
+
+
+@pytest.mark.slow
+@_needs_browser
+@pytest.mark.parametrize("width", [1280, 400])
+def test_a_browser_sorts_and_filters_the_overview_of_a_fleet(tmp_path, width):
+    """Run 0 is the noisiest, run 4 the quietest; two are diagnosed, and one failed."""
+    rows, runs = {}, []
+    for number in range(5):
+        name = f"tool 1/run {number}"
+        product = synthetic.product()
+        row = summarise_run(product.assign(N=product["N"] * (6 - number)))
+        rows[name] = {"run": name, "tool": "tool 1", "error": "", "files": 1, **row}
+        rows[name]["report"] = f"reports/{name}.html"
+        folder = tmp_path / f"diagnosis {number}"
+        write_diagnosis(folder, 4.0 if number else None)
+        is_diagnosed = number < 2
+        runs.append(
+            LogRun(name, "tool 1", (), 0, folder, "explained")
+            if is_diagnosed
+            else LogRun(name, "tool 1", (), 0, None, "")
+        )
+    rows["tool 2/run 5"] = {"run": "tool 2/run 5", "tool": "tool 2", "error": "it is <damaged>"}
+    table = make_table(rows, runs)
+    effects = list_effects(table)
+    path = write_overview(table, tmp_path / "index.html", effects=effects)
+    assert "1 of 2 diagnosed runs" in path.read_text(encoding="utf-8")
+    state = _browse(path, width)
+    _check_access(state, width)
+    names = [f"tool 1/run {number}" for number in range(5)]
+    assert state["runs"] == {"ordered": names[::-1], "filtered": [names[2]], "all": names[::-1]}
+    assert set(names) <= {row["name"] for row in state["controls"] if row["tag"] == "a"}
+    assert "Missing [%]" in {row["name"] for row in state["controls"] if row["tag"] == "button"}
