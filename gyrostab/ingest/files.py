@@ -97,9 +97,9 @@ def _find_reader(path: Path) -> Reader:
     first = "binary" if has_layout(path) else None
     if first is None:
         refuse_unread(path)
-    order = ("binary", "text")
-    names = sorted(set(_entry_points()) - {*order}) + list(order)
-    for name in sorted(names, key=lambda name: name != first):
+    order = {"netcdf": -1, "binary": 1, "text": 2}  # archives of many files are NetCDF
+    names = sorted(_entry_points(), key=lambda name: (name != first, order.get(name, 0), name))
+    for name in names:
         reader = cast(Reader, _entry_points()[name].load())
         if reader.matches(path):
             return reader
