@@ -41,7 +41,7 @@ def call(command: str | list[str], folder: Path, bin_folder: Path | None = None)
     return done.stdout
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The files of this checkout that git knows, in another folder."""
     folder = tmp_path_factory.mktemp("checkout") / "gyrostab"
