@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gyrostab.diagnose.result.families import group_families
-from gyrostab.diagnose.result.verdict import failed_checks, uncertain_names
+from gyrostab.diagnose.result.verdict import doubtful_names, failed_checks
 from gyrostab.diagnose.settings import stored_settings
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.diagnose.statistics.wording import axes_text, subject
@@ -346,9 +346,9 @@ def summary(content: Mapping[str, Any]) -> str:
         content["held_out"], settings=stored_settings(content.get("settings", {}))
     )
     doubt = f" The effects do not describe the record well: {'; '.join(failed)}." if failed else ""
-    if uncertain := uncertain_names(content["effects"]):
+    if doubtful := doubtful_names(content["effects"]):
         doubt += (
-            f" The evidence does not single out {join_words(list(map(plain_name, uncertain)))}."
+            f" An alternative is more probable than {join_words([*map(plain_name, doubtful)])}."
         )
     if content["verdict"] == "unknown":
         return f"{differs}. The effects that were found do not explain {them}: {names}.{doubt}"

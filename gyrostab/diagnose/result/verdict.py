@@ -8,7 +8,7 @@ from typing import Any
 
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
-__all__ = ["decide_verdict", "failed_checks", "uncertain_names"]
+__all__ = ["decide_verdict", "doubtful_names", "failed_checks"]
 
 
 def _is_positive(value: Any) -> bool:
@@ -52,19 +52,26 @@ def failed_checks(held: Mapping[str, Any], *, settings: Settings = DEFAULTS) -> 
     return failed
 
 
-def uncertain_names(effects: Iterable[Mapping[str, Any]]) -> list[str]:
-    """List the effects whose names are more probably wrong than right, each once.
+def doubtful_names(effects: Iterable[Mapping[str, Any]]) -> list[str]:
+    """List the effects that an alternative is more probable than, each once.
+
+    Such a name has less than half of its share if all were equally probable. An effect without
+    alternatives is doubtful below 50 %.
 
     Examples
     --------
-    >>> uncertain_names([{"name": "warm_up", "probability": 0.475}])
+    >>> warm_up = {"name": "warm_up", "alternatives": ["temperature_bias"]}
+    >>> doubtful_names([warm_up | {"probability": 0.475}])
+    []
+    >>> doubtful_names([warm_up | {"probability": 0.2}])
     ['warm_up']
     """
     return list(
         dict.fromkeys(
             effect["name"]
             for effect in effects
-            if effect.get("probability") is not None and effect["probability"] < 0.5
+            if effect.get("probability") is not None
+            and effect["probability"] * (1 + len(effect["alternatives"])) < 0.5
         )
     )
 
@@ -83,7 +90,7 @@ def decide_verdict(
     ----------
     mismatches : sequence
     effects : sequence of mappings
-        With ``name`` and ``probability``.
+        With ``name``, ``probability`` and ``alternatives``.
     unexplained : iterable of int
         Numbers of the mismatches without an effect.
     held : mapping
@@ -93,7 +100,7 @@ def decide_verdict(
     --------
     >>> good = {"log_likelihood_gain": 9.0, "forecast_gain": 2.0,
     ...         "coverage95_before": 0.7, "coverage95_after": 0.9}
-    >>> shupe = {"name": "shupe", "probability": 0.95}
+    >>> shupe = {"name": "shupe", "probability": 0.95, "alternatives": []}
     >>> decide_verdict([1], [shupe], [], good)
     'explained'
     >>> decide_verdict([1], [shupe], [], good | {"forecast_gain": -1.0})
@@ -110,6 +117,6 @@ def decide_verdict(
     doubts = [
         *unexplained,
         *failed_checks(held, settings=settings),
-        *uncertain_names(effects),
+        *doubtful_names(effects),
     ]
     return "partly explained" if doubts else "explained"

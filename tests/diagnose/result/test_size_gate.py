@@ -31,7 +31,11 @@ from gyrostab.physics.registry import effects
 from tests.diagnose.estimate.test_recalibrate import SHAKE, identify_by_hand, reduce_simulation
 from tests.support.diagnosed import content
 
-SHUPE: dict[str, Any] = content()["effects"][0] | {"name": "shupe", "probability": 0.95}
+SHUPE: dict[str, Any] = content()["effects"][0] | {
+    "name": "shupe",
+    "probability": 0.95,
+    "alternatives": [],
+}
 GOOD = {
     "blocks": 36, "log_likelihood_gain": 41.2, "stderr": 6.0, "misfit_before": 3.1,
     "misfit_after": 1.0,
@@ -176,17 +180,29 @@ def test_held_out_data_decide_the_verdict(change: dict[str, Any], verdict: str):
 
 
 @pytest.mark.parametrize(
-    ("probabilities", "verdict"),
-    [([0.95], "explained"), ([0.5], "explained"), ([0.95, 0.49], "partly explained")],
+    ("probability", "alternatives", "verdict"),
+    [
+        (0.95, 0, "explained"),
+        (0.475, 1, "explained"),
+        (0.24, 1, "partly explained"),
+        (0.2, 3, "explained"),
+        (0.49, 0, "partly explained"),
+        (None, 1, "explained"),
+    ],
 )
-def test_an_uncertain_name_does_not_explain(probabilities: list[float], verdict: str):
-    effects = [SHUPE | {"probability": one} for one in probabilities]
-    assert decide_verdict([{}], effects, [], GOOD) == verdict
+def test_a_name_with_a_better_alternative_does_not_explain(
+    probability: float | None, alternatives: int, verdict: str
+):
+    one = SHUPE | {
+        "probability": probability,
+        "alternatives": ["warm_up", "bias_jump", "telegraph"],
+    }
+    one["alternatives"] = one["alternatives"][:alternatives]
+    assert decide_verdict([{}], [SHUPE, one], [], GOOD) == verdict
     text = summary(
-        content() | {"verdict": verdict, "effects": effects, "unexplained": [], "held_out": GOOD}
+        content() | {"verdict": verdict, "effects": [one], "unexplained": [], "held_out": GOOD}
     )
-    assert ("does not single out" in text) == (verdict != "explained")
-    assert decide_verdict([{}], [SHUPE | {"probability": None}], [], GOOD) == "explained"
+    assert ("An alternative is more probable than" in text) == (verdict != "explained")
 
 
 NUMBER = st.none() | st.floats(-1e9, 1e9)
