@@ -288,8 +288,8 @@ def _has_stamps_of(rule: dict[str, Any], stamps: xr.Variable, folder: Path) -> b
 
 
 def follows_rule(ends: NDArray[Any], attrs: dict[Any, Any], rule: dict[str, Any]) -> bool:
-    """Whether the first and last stamps, with their attributes, follow the rule of a time axis."""
-    samples = rule["first"] + rule["stride"] * np.array([0, rule["size"] - 1])[: ends.size]
+    """Whether the first and last stamps, or the last, follow the rule of a time axis."""
+    samples = rule["first"] + rule["stride"] * np.array([0, rule["size"] - 1])[-ends.size :]
     step = _STEPS.get(str(attrs.get("units")))
     found = (
         ends * step

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import h5py
 import netCDF4
 import numpy as np
 import pytest
@@ -70,7 +71,18 @@ def test_changed_stamps_are_left_to_xarray(tmp_path):
     with netCDF4.Dataset(path, "a") as file:
         file["time"][:] += 3_600_000_000
     assert open_netcdf_log(path) is None
+    assert open_netcdf_log(path, brief=True) is None
     assert str(open_log(path).time.values[0]).startswith("2026-01-01T01:00:00")
+
+
+def test_summaries_read_no_text_from_a_heap(tmp_path):
+    path = tmp_path / "log.nc"
+    _write_log(path)
+    assert open_netcdf_log(path, brief=True) is not None
+    with h5py.File(path, "r+") as file:
+        file["rate"].attrs["units"] = "degree hour-1"  # of variable length
+    assert open_netcdf_log(path) is not None
+    assert open_netcdf_log(path, brief=True) is None
 
 
 def test_files_of_other_programs_are_left_to_xarray(tmp_path):
