@@ -41,6 +41,7 @@ from gyrostab.jobs.job import (
     remove_job,
     write_store_checksum,
 )
+from gyrostab.jobs.memory import return_large_arrays
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool
 from gyrostab.kernels.workspace import Workspaces
 from gyrostab.progress import Stage, no_stage
@@ -397,6 +398,8 @@ def _compute_missing(
         clear_job(job.folder)
     remove_damage(job.folder)
     remove_leftovers(job.target)
+    if any(map(find_url, paths)):
+        return_large_arrays()  # chunks arrive in new arrays, which no thread reuses
     stage("reading", 0)
     on_file = partial(_show_file, stage)
     log = load_log([store]) if store.exists() else load_log(paths, **reading, on_file=on_file)

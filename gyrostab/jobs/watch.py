@@ -9,7 +9,6 @@ which late rows fell.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import hashlib
 import json
 import re
@@ -40,6 +39,7 @@ from gyrostab.jobs.job import (
     make_fingerprint,
     remove_job,
 )
+from gyrostab.jobs.memory import release_memory, return_large_arrays
 from gyrostab.jobs.run import load_log
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.schema import log_channels, signal_name
@@ -57,8 +57,6 @@ _OPTIONS = "gyrostab_watch"
 _MAX_WORK_SHARE = 0.1
 #: Share of the bytes that the next window is estimated to need from which on files are read.
 _DUE_SHARE = 0.9
-_M_MMAP_THRESHOLD = -3  # of malloc.h of glibc
-_LARGE_BYTES = 2**17  # its first value, which it raises up to 32 MiB unless it is set
 #: Notes whose counts matter are repeated when the counts change.
 _COUNTED_NOTES = ("out of order", "dropped")
 
@@ -147,7 +145,7 @@ def watch(
         "fitting": dict(fitting or {}),
     }
     check_windows(**options["windows"])
-    _return_large_arrays()
+    return_large_arrays()
     wait = duration_seconds(lateness, "--lateness") if lateness else 0.0
     quiet = duration_seconds(idle, "--idle") if idle else np.inf
     path = Path(output)
@@ -280,7 +278,7 @@ class _View:
             if final and not self.state.exists:
                 raise
             self._show_note(f"waiting: {error}")
-        _release_memory()
+        release_memory()
         self.is_new_data = False
         spent = time.monotonic() - begun
         self.next_update = time.monotonic() + spent * (1.0 / _MAX_WORK_SHARE - 1.0)
@@ -392,18 +390,6 @@ class _View:
             for event in (event for alarm in self.alarms for event in alarm.update(window)):
                 if not is_known:
                     self.listener.show_alarm(event)
-
-
-def _return_large_arrays() -> None:
-    """Let glibc return each large array to the system when it is freed, not only at first."""
-    with contextlib.suppress(TypeError, AttributeError):  # on Windows and without glibc
-        ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)
-
-
-def _release_memory() -> None:
-    """Return memory that is free in the C library to the system; glibc alone keeps it."""
-    with contextlib.suppress(TypeError, AttributeError):  # on Windows and without glibc
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 def hash_samples(log: xr.Dataset, span: tuple[int, int], common: str) -> bytes:

@@ -332,17 +332,17 @@ import ctypes, gc, sys, warnings
 from pathlib import Path
 from gyrostab.jobs.follow import FileMemory, list_files
 from gyrostab.jobs.run import load_log
-from gyrostab.jobs.watch import _release_memory, _return_large_arrays
+from gyrostab.jobs.memory import release_memory, return_large_arrays
 
 warnings.simplefilter("ignore")
-_return_large_arrays()
+return_large_arrays()
 memory, files = FileMemory(), list_files(sys.argv[1])
 memory.ended = True
 for count in range(2, len(files) + 1, 4):
     memory.update(dict(list(files.items())[:count]))
     load_log(list(memory.files), read=memory.read)
     gc.collect()
-    _release_memory()
+    release_memory()
     print(int(Path("/proc/self/statm").read_text().split()[1]) * 4 // 1024)
 """
 
