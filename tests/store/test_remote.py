@@ -177,3 +177,16 @@ def test_a_failed_block_uploads_nothing():
 )
 def test_addresses_are_found_in_paths(path, url):
     assert find_url(path) == url
+
+
+def test_a_run_over_an_address_returns_large_arrays(tmp_path, monkeypatch):
+    """Chunks arrive in new arrays, which glibc would keep."""
+    called = []
+    monkeypatch.setattr("gyrostab.jobs.run.return_large_arrays", lambda: called.append(True))
+    log = make_log(np.zeros((1, 600)), rate=10.0, unit="deg/h", start="2026-01-01")
+    to_zarr(log, tmp_path / "log.zarr")
+    to_zarr(log, "memory://archive/returned.zarr")
+    run([tmp_path / "log.zarr"], tmp_path / "local.nc", windows={"window": "20s"})
+    assert not called
+    run(["memory://archive/returned.zarr"], tmp_path / "remote.nc", windows={"window": "20s"})
+    assert called

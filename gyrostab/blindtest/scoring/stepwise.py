@@ -48,7 +48,7 @@ def _lag_values(values: Array, blocks: float) -> Array:
     return np.asarray(lfilter([1.0 - keep], [1.0, -keep], values, zi=[keep * values[0]])[0])
 
 
-def _whiten(columns: Array, variance: Array, walk: Array) -> tuple[Array, float]:
+def _whiten_differences(columns: Array, variance: Array, walk: Array) -> tuple[Array, float]:
     """Whiten differences of blocks (block, column) in white noise and random walk.
 
     `variance` (block) is that of the white noise, `walk` (difference) that of the steps between.
@@ -85,7 +85,7 @@ def _gain_of_terms(
     columns = columns / np.maximum(np.ptp(columns, axis=0), 1e-300)
     best = np.full(_MAX_TERMS + 1, -math.inf)
     for ratio in walk_ratios:
-        white, half_determinant = _whiten(columns, variance, ratio * np.diff(at))
+        white, half_determinant = _whiten_differences(columns, variance, ratio * np.diff(at))
         best = np.maximum(best, _select_terms(white, costs) - half_determinant)
     each = 0.5 * math.log(at.size)
     return float((best[1:] - best[0] - each * np.arange(1, _MAX_TERMS + 1)).max())
