@@ -207,3 +207,11 @@ def test_injected_spike_exceeds_outliers_of_the_recording():
         np.random.default_rng(9),
     )["injected"]
     assert truth["effects"][0]["parameters"]["spike"]["value"] > 9.0
+
+
+@pytest.mark.parametrize("effect", ["spikes", "clipping", "spectral_line"])
+def test_an_injection_stays_on_the_grid_of_the_recording(effect: str) -> None:
+    step = 0.003
+    log = make_log(step * np.rint(white(4) / step), {}, start=0, rate=RATE)
+    values = inject_effect(log, effect, 8.0, np.random.default_rng(2))["injected"][0]["rate"].values
+    assert np.abs(values / step - np.rint(values / step)).max() < 1e-6

@@ -132,21 +132,19 @@ def quantization_step(values: Array) -> float:
     return step if np.abs(gaps / step - np.rint(gaps / step)).max() < _MAX_STEP_ERROR else 0.0
 
 
-def _quantize_like(record: Array, added: Array, rng: np.random.Generator) -> Array:
-    """Add an effect to a record (axis, time), with stochastic rounding to the record's steps.
+def _quantize_like(record: Array, values: Array, dither: Array) -> Array:
+    """Round values (axis, time) down to the steps of a record, after adding a dither in steps.
 
     Steps are counted from the value nearest to zero, so that zeros remain exact.
     """
-    total = record + added
-    for row, values in enumerate(record):
-        step = quantization_step(values)
+    rounded = values.copy()
+    for row, recorded in enumerate(record):
+        step = quantization_step(recorded)
         if step > 0.0:
-            good = values[np.isfinite(values)]
+            good = recorded[np.isfinite(recorded)]
             level = float(good[np.abs(good).argmin()])
-            total[row] = level + step * np.floor(
-                (total[row] - level) / step + rng.random(values.size)
-            )
-    return total
+            rounded[row] = level + step * np.floor((values[row] - level) / step + dither[row])
+    return rounded
 
 
 def inject_effect(
@@ -192,10 +190,13 @@ def inject_effect(
     record = np.asarray(log["rate"].values[:3], dtype=float)
     axes = [str(name) for name in log["axis"].values[:3]]
     scenario, made = _draw_effect(log, record, effect, strength, rng)
-    injected = _quantize_like(record, _compute_addition(scenario, made, rng)[: len(axes)], rng)
+    total = record + _compute_addition(scenario, made, rng)[: len(axes)]
+    injected = _quantize_like(record, total, rng.random(record.shape))
     if made.after is not None:
         padded = np.concatenate([injected, np.zeros((3 - len(axes), scenario.size))])
-        injected = made.after(padded)[: len(axes)]
+        changed = made.after(padded)[: len(axes)]
+        to_nearest = _quantize_like(record, changed, np.full(record.shape, 0.5))
+        injected = np.where(changed == injected, injected, to_nearest)
         injected[np.isnan(record)] = np.nan
     channels = {
         name: channel

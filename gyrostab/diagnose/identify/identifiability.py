@@ -21,7 +21,7 @@ from gyrostab.diagnose.identify.identification import (
 from gyrostab.diagnose.identify.jumps import event_nats, gradual_nats, scatter_nats
 from gyrostab.diagnose.identify.logger_filters import separate_axes_nats
 from gyrostab.diagnose.identify.steady import intermittent_nats
-from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.diagnose.reduce.zero_bin import possibly_truncated_axes
@@ -35,6 +35,7 @@ __all__ = [
     "find_better_form",
     "find_equivalent_effects",
     "find_plainer_effect",
+    "find_spectral_alternatives",
     "is_physical",
     "without_pulses",
 ]
@@ -45,6 +46,12 @@ _JUMP_CHANGES = 2  # from block to block, in the column of a jump within a block
 OBSERVATIONALLY_EQUIVALENT: dict[str, tuple[str, ...]] = {
     "gauss_markov": ("telegraph",),
     "spectral_line": ("real_motion", "supply_bias"),
+}
+#: Effect -> effects that follow the same channel with another spectrum, which may be any that a
+#: mount, a filter or aliasing gives them.
+DIFFERENT_SPECTRUM: dict[str, tuple[str, ...]] = {
+    "aliased_vibration": ("vibration_noise",),
+    "vibration_noise": ("aliased_vibration",),
 }
 #: Effect -> effect that it becomes at the end of the range of a parameter: without a dead band,
 #: hysteresis is proportional to temperature.
@@ -357,3 +364,47 @@ def find_equivalent_effects(
         ):
             out.append("g_sensitivity")
     return out
+
+
+def find_spectral_alternatives(
+    effect: str,
+    components: Sequence[Component],
+    state: State,
+    gains: Callable[[Sequence[Candidate], State], list[CandidateEvidence]],
+) -> list[str]:
+    """Return effects of the same channel, if a spectrum of another form explains clearly more.
+
+    The forms that were tried then do not tell the effects apart: vibration through the resonance of
+    a mount has a hump like an aliased band.
+
+    Parameters
+    ----------
+    components : sequence of Component
+        Components of the effect.
+    state : State
+        With all other effects in the model.
+    gains : callable
+        Computes the evidence of candidates in a state.
+    """
+    powers = [component for component in components if component.statistic.is_power]
+    if effect not in DIFFERENT_SPECTRUM or not powers:
+        return []
+    own = sum(component.evidence_nats for component in powers)
+    free = 0.0
+    for component in powers:
+        found = gains([_any_spectrum(component, state)], state)[0]
+        free += float(found.evidence_nats[0, found.rows.index(component.row)])
+    allowed = state.settings.ambiguous_nats + state.settings.form_error_share * own
+    return list(DIFFERENT_SPECTRUM[effect]) if free - own > allowed else []
+
+
+def _any_spectrum(component: Component, state: State) -> Candidate:
+    """Return a power of any spectrum with the course of a component over time."""
+    design = component.variant.design
+    row = state.axes.index(component.row[0]) if design.shape[1] > 1 else 0
+    course = design[0, row].mean(axis=-1)
+    bands = np.eye(design.shape[-1])
+    variant = Variant(
+        {}, tuple(map(str, range(len(bands)))), course[None, None, :, None] * bands[:, None, None]
+    )
+    return Candidate("~S(f)", component.statistic, component.candidate.driver, (variant,))

@@ -25,6 +25,7 @@ from gyrostab.diagnose.identify.components import (
 )
 from gyrostab.diagnose.identify.identifiability import (
     find_equivalent_effects,
+    find_spectral_alternatives,
     is_physical,
     without_pulses,
 )
@@ -453,6 +454,13 @@ class Search:
         rivals += find_equivalent_effects(
             identification.effect, identification.components, state, lines=len(lines)
         )
+        of_any_spectrum = find_spectral_alternatives(
+            identification.effect,
+            [component for layer in again for component in layer],
+            weighted,
+            self._evidence,
+        )
+        rivals += of_any_spectrum
         alternatives = dict.fromkeys([*identification.alternatives, *rivals])
         alternatives.pop(identification.effect, None)
         components = tuple(
@@ -465,7 +473,8 @@ class Search:
             evidence_nats=evidence_nats,
             alternatives=tuple(alternatives),
             components=components,
-            instead=_sum_by_key(on_axes),
+            # as probable as this effect, whatever their own form explains
+            instead=_sum_by_key(on_axes) | dict.fromkeys(of_any_spectrum, evidence_nats),
         )
 
     def _find_instead(

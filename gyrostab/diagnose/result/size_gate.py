@@ -77,8 +77,17 @@ def keep_supported(
         if sum_evidence(kept) > identification.threshold:
             axes = tuple(axis for axis in identification.axes if axis in good)
             evidence_nats = min(identification.evidence_nats, sum_evidence(kept))
+            # its alternatives are compared with it, and lose the same axes
+            left = evidence_nats - identification.evidence_nats
+            instead = {key: nats + left for key, nats in identification.instead.items()}
             identified.append(
-                replace(identification, components=kept, axes=axes, evidence_nats=evidence_nats)
+                replace(
+                    identification,
+                    components=kept,
+                    axes=axes,
+                    evidence_nats=evidence_nats,
+                    instead=instead,
+                )
             )
         else:
             lost = identification.components

@@ -110,13 +110,18 @@ def test_effect_keeps_axes_with_a_size():
         ],
         [Fitted(other, ("z",), {"sensitivity": estimate(0.4, 0.1)}, None)],
     ]
+    rival = identification.evidence_nats - 2.0
+    identification = replace(identification, instead={"shupe": rival})
     before = make_identifications(identification, other)
     identifications = keep_supported(before, numbers)
     assert [(one.effect, one.axes) for one in identifications.identified] == [
         ("temperature_bias", ("x",)),
         ("shupe", ("z",)),
     ]
-    assert identifications.identified[0].components == identification.components[:1]
+    kept = identifications.identified[0]
+    assert kept.components == identification.components[:1]
+    assert kept.evidence_nats < identification.evidence_nats
+    assert kept.instead == {"shupe": kept.evidence_nats - 2.0}  # on the same axes
     assert [(one.axes, one.generic) for one in identifications.unknown] == [(("y",), "~bias(t)")]
     assert keep_supported(before, [numbers[0][:1], numbers[1]]).identified[0].axes == ("x",)
     assert keep_supported(identifications, [numbers[0][:1], numbers[1]]) is identifications

@@ -1,0 +1,49 @@
+"""Effects that differ in the spectrum only are separated where their forms fit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.signal import butter, sosfilt
+
+from gyrostab.diagnose.identify.forward_search import name_effects
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.result.probability import name_probability
+from gyrostab.diagnose.settings import DEFAULTS
+from gyrostab.ingest.make_log import make_log
+from tests.support.named import nulls
+
+RATE, SECONDS = 20.0, 1200
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def shaken_record(kind: str, *, seed: int = 5) -> xr.Dataset:
+    """Make white noise on one axis, with more noise of some kind while the tool vibrates."""
+    rng = np.random.default_rng(seed)
+    size = round(RATE * SECONDS)
+    shaken = (np.arange(size) // round(RATE * 100)) % 3 == 1
+    added = rng.standard_normal(size)
+    if kind == "rising":  # N and Q
+        added = 0.5 * added + np.diff(rng.standard_normal(size + 1))
+    else:
+        hump = sosfilt(butter(2, [2.0, 4.0], "bandpass", fs=RATE, output="sos"), added)
+        added = hump / hump.std()
+    rates = rng.standard_normal(size) + shaken * added
+    log = make_log(
+        rates[None], rate=RATE, unit="deg/h", channels={"vibration": (5.0 * shaken, "g")}
+    )
+    return reduce_log(log, block="20s")
+
+
+@pytest.mark.parametrize(("kind", "is_separated"), [("rising", True), ("hump", False)])
+def test_vibration_noise_is_alone_only_if_its_spectrum_fits(kind: str, is_separated: bool) -> None:
+    blocks = shaken_record(kind)
+    baseline, records = nulls(blocks, 30)
+    found = name_effects(blocks, baseline, records).identified
+    (one,) = found
+    names = {"vibration_noise", "aliased_vibration"}
+    assert one.effect in names
+    assert set(one.alternatives) == (set() if is_separated else names - {one.effect})
+    share = 1.0 if is_separated else 0.5
+    assert name_probability(one) == pytest.approx(share * DEFAULTS.set_probability)
