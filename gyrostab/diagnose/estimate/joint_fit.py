@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from scipy.special import ndtr, ndtri
 
 from gyrostab.diagnose.identify.identification import (
     Identification,
@@ -34,6 +35,7 @@ from gyrostab.physics.rotation import EarthRate
 __all__ = ["Estimate", "Fitted", "fit_identifications"]
 
 _ANGLE = "deg"
+_TAIL = float(ndtr(-NORMAL_95))  # beyond either end of an interval
 _PLACE = "frequency"  # of a line: where it is does not depend on what makes it
 
 
@@ -373,11 +375,16 @@ def _make_estimate(
 ) -> Estimate:
     """Return an estimate with the error of the form.
 
-    `ends` are those of an asymmetric 95 % interval without it.
+    `ends` are those of an asymmetric 95 % interval without it. What cannot be negative has a normal
+    law cut off at zero, if the interval reaches it.
     """
     if sd <= 0.0:  # a count is exact
         return Estimate(mean, 0.0, mean, mean, unit)
     low, high = ends or (mean - NORMAL_95 * sd, mean + NORMAL_95 * sd)
     low = mean - math.hypot(mean - low, NORMAL_95 * form)
     high = mean + math.hypot(high - mean, NORMAL_95 * form)
-    return Estimate(mean, math.hypot(sd, form), max(low, 0.0) if positive else low, high, unit)
+    sd = math.hypot(sd, form)
+    if positive and low < 0.0:
+        low, high = 0.0, max(high, mean - sd * float(ndtri(_TAIL * ndtr(mean / sd))))
+        mean = max(mean, 0.0)
+    return Estimate(mean, sd, low, high, unit)

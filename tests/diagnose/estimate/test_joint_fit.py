@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
-from gyrostab.diagnose.estimate.joint_fit import fit_identifications
+from gyrostab.diagnose.estimate.joint_fit import _make_estimate, fit_identifications
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
@@ -376,3 +378,16 @@ def test_axes_missing_in_the_strongest_statistic_get_sizes_from_the_next():
     for axis, size in truth.items():
         one = fitted.parameters[f"sensitivity.{axis}"]
         assert one.low - one.stderr < size < one.high + one.stderr
+
+
+@given(st.floats(-5.0, 5.0), st.floats(0.01, 10.0))
+def test_an_interval_of_a_positive_size_contains_it(mean: float, sd: float) -> None:
+    one = _make_estimate(mean, sd, "1", positive=True, form=0.0)
+    assert 0.0 <= one.low <= one.value < one.high
+
+
+def test_an_interval_cut_off_at_zero_holds_its_share() -> None:
+    draws = np.random.default_rng(3).normal(-1.5, 1.0, 4_000_000)
+    positive = draws[draws > 0.0]
+    high = _make_estimate(-1.5, 1.0, "1", positive=True, form=0.0).high
+    assert abs((positive > high).mean() - 0.025) < 0.001
