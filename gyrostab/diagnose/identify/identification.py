@@ -305,10 +305,11 @@ def form_error(
     Only effects in the same statistics and axes count. A steady line leaves nothing at other
     frequencies, because what it leaks into is taken out with it. The record shows the course in
     time of a driven noise well, but its spectrum is that of a simple law, without mounts and
-    decimators. A filter would explain what this leaves over frequency.
+    decimators. A filter, or another noise of the same channel, would explain what this leaves over
+    frequency.
     """
     statistics = [
-        (component.statistic, set(component.row), component.candidate.effect)
+        (component.statistic, set(component.row), component.candidate)
         for component in components
         if not component.statistic.is_line
     ]
@@ -316,8 +317,8 @@ def form_error(
     for one in chosen:
         for component in one.components:
             beside = [
-                effect
-                for statistic, axes, effect in statistics
+                candidate
+                for statistic, axes, candidate in statistics
                 if statistic.error_shows_in[0] in component.statistic.error_shows_in
                 and axes & set(component.row)
             ]
@@ -325,7 +326,7 @@ def form_error(
                 component.statistic.is_power
                 and isinstance(one, Identification)
                 and bool(one.driver)
-                and _FILTER in beside
+                and any(other.effect == _FILTER or other.driver == one.driver for other in beside)
             )
             share = settings.spectrum_error_share if of_spectrum else settings.form_error_share
             error += share * component.evidence_nats if beside else 0.0

@@ -231,7 +231,7 @@ def test_a_steady_line_has_no_model_error() -> None:
     assert form_error([component("warm_up", "mean", 20.0)], chosen) == pytest.approx(4.0)
 
 
-def test_driven_noise_may_leave_a_filter_but_no_other_noise() -> None:
+def test_driven_noise_may_leave_a_filter_or_noise_of_its_channel_but_no_other_noise() -> None:
     driven = replace(
         identification(component("vibration_noise", "power", 200.0)), driver=("vibration",)
     )
@@ -242,6 +242,9 @@ def test_driven_noise_may_leave_a_filter_but_no_other_noise() -> None:
         (steady, "logger_filter", 2.0),
     ):
         assert form_error([component(effect, "power", 17.0)], [chosen]) == pytest.approx(error)
+    left = component("aliased_vibration", "power", 17.0)
+    left = replace(left, candidate=replace(left.candidate, driver=driven.driver))
+    assert form_error([left], [driven]) == pytest.approx(20.0)
 
 
 @pytest.mark.parametrize("weight", [0.1, 0.25, 0.5])
