@@ -184,6 +184,16 @@ def test_fitted_noise_absorbs_random_walk_and_not_a_fast_random_bias():
     assert 0.0 < slow < 0.1 < fast < 1.0
 
 
+def test_the_turn_that_a_misaligned_axis_sees_is_no_evidence_in_fitted_noise():
+    scenario = white_scenario()
+    effect = CATALOGUE["misalignment"].make(scenario, stream(1, "turn"), strength=8.0)
+    assert effect.mean is not None
+    assert effect.learned_nats is not None
+    leak = effect.mean * (np.arange(3) != 2)[:, None]
+    assert effect.learned_nats == pytest.approx(learned_nats(scenario, leak))
+    assert effect.learned_nats < 0.5 * effect.nats < learned_nats(scenario, effect.mean)
+
+
 @pytest.mark.parametrize(
     ("quantization", "least", "most"), [(0.0, 0.98, 1.0), (0.02, 0.3, 0.9), (0.2, 0.0, 0.01)]
 )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from gyrostab.blindtest.generator import tool, vibration
-from gyrostab.blindtest.generator.detection_limits import band_density
+from gyrostab.blindtest.generator.detection_limits import band_density, learned_nats
 from gyrostab.blindtest.generator.measured_noise import BANDS
 from gyrostab.blindtest.generator.noise_floor import white_level
 from gyrostab.blindtest.generator.scenario import (
@@ -316,5 +316,9 @@ def misalignment(scenario: Scenario, rng: np.random.Generator, *, strength: floa
         "z": {"values": {AXES[int(np.argmax(shares))]: 1e3 * angle}, "unit": "mrad"}
     }
     return replace(
-        leak, mean=mean, parameters=parameters, also_accepted=("real_motion", "scale_factor")
+        leak,
+        mean=mean,
+        parameters=parameters,
+        learned_nats=learned_nats(scenario, leak.mean),  # without the turn of z itself
+        also_accepted=("real_motion", "scale_factor"),
     )
