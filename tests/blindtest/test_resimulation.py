@@ -113,17 +113,26 @@ def test_record_with_the_effect_is_nearer_only_if_the_recording_has_it(
 
 def test_model_is_compared_with_records_of_its_own(noise_alone: xr.Dataset):
     for recording in (noise_alone, recording_and_nats(EFFECTS[0])[0]):
-        found = check_model(recording, {"noise": NOISE, "effect": EFFECTS[:1]})
+        found = check_model(recording, {"noise": NOISE, "effect": EFFECTS[:1]}, NOISE)
         assert found == {"runs": True, "nats": nats_of(recording, EFFECTS[0])}
 
 
+def test_an_effect_that_replaces_noise_is_not_nearer_than_the_calibrated_noise(
+    noise_alone: xr.Dataset,
+):
+    low = {axis: terms | {"N": 0.0015} for axis, terms in NOISE.items()}
+    model = {"noise": low, "effect": [{"name": "temperature_noise", "linear": 0.1}]}
+    assert check_model(noise_alone, model, low)["nats"] > 100.0
+    assert check_model(noise_alone, model, NOISE)["nats"] < 0.0
+
+
 def test_equal_models_are_equally_near(noise_alone: xr.Dataset):
-    assert check_model(noise_alone, {"noise": NOISE, "effect": []})["nats"] == 0.0
+    assert check_model(noise_alone, {"noise": NOISE, "effect": []}, NOISE)["nats"] == 0.0
 
 
 def test_model_that_cannot_be_simulated_is_reported(noise_alone: xr.Dataset):
     model = {"noise": NOISE, "effect": [{"name": "light_power_noise", "thermal": 0.2}]}
-    found = check_model(noise_alone, model)
+    found = check_model(noise_alone, model, NOISE)
     assert not found["runs"]
     assert "light_power" in found["reason"]
 

@@ -56,7 +56,12 @@ def diagnose_case(recording: Path, target: Path, failed: Path, nulls: int) -> bo
     try:
         log = load_log([recording])
         found = diagnose(log, nulls=nulls, seed=int(recording.stem[:7], 16))
-        checked = check_model(log.compute(), found.model) if found.model.get("effect") else None
+        calibrated = {
+            axis: {term: one["value"] for term, one in terms.items()}
+            for axis, terms in found.content["baseline"]["noise"].items()
+        }
+        has_effect = bool(found.model.get("effect"))
+        checked = check_model(log.compute(), found.model, calibrated) if has_effect else None
         write_json(target, json.loads(found.to_json()) | {"model_check": checked})
     except Exception as error:  # a case that breaks the diagnosis is reported as a result
         lines = traceback.format_exc() if not isinstance(error, GyrostabError) else ""
