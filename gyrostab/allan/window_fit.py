@@ -240,7 +240,8 @@ def _bound_estimates(
     """Find standard errors of coefficients, and 95 % upper limits of their squares.
 
     Interval and limit follow from `estimate_bounds`. 1.96 standard errors are half of the 95 %
-    interval; where it begins at zero, they reach its upper end at least.
+    interval; where it begins at zero, they reach its upper end at least. Those of a ramp also reach
+    the upper end, from a value below the trend.
     """
     names = ("free", "variance_null", "variance_linear", "variance_square")
     scores = np.array([NORMAL_95, -NORMAL_95, -_LIMIT_SIGMA])
@@ -251,7 +252,7 @@ def _bound_estimates(
     trend = np.sqrt(field["free"][:, 4])
     limit[:, 4] = (trend + _LIMIT_SIGMA * _trend_error(field, _LIMIT_SIGMA)) ** 2
     stderr = half / NORMAL_95
-    stderr[:, 4] = _trend_error(field, NORMAL_95)
+    stderr[:, 4] = _trend_error(field, NORMAL_95) + (trend - value[:, 4]) / NORMAL_95
     return stderr, limit
 
 

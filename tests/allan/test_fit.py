@@ -305,6 +305,17 @@ def test_bounds_of_an_estimate_alone_are_those_of_chi_square(freedom):
     )
 
 
+def test_interval_of_a_marginal_ramp_on_a_strong_random_walk_holds():
+    """The value is shrunk where the ramp is not observed; the binomial sd of the share is 1.1 %."""
+    rng = np.random.default_rng(12)
+    x = random_walk(rng, 400, 3000, K=400.0, rate=RATE)
+    spread = np.sqrt(window_fit.fit_tables((1, 2), (0, 0), RATE, 3000).trend_variance[3]) * 400.0
+    x += white(rng, 400, 3000, N=0.01, rate=RATE) + 2.5 * spread * np.arange(3000) / RATE / 3600
+    product = fit_noise(windows_of(x, taus=21), observed_only=False)
+    held = abs(product.R - 2.5 * spread) <= NORMAL_95 * product.R_stderr
+    assert 0.92 <= float(held.mean()) <= 0.99
+
+
 def test_bounds_of_an_estimate_have_their_scores():
     """Put the bounds into the definition of the score, with the integral done by quadrature."""
     for estimate, a, b, c in ((0.0, 1.0, 0.0, 0.1), (-0.7, 1.0, 0.5, 1.4), (3.0, 0.2, 1.5, 0.3)):
