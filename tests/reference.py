@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from gyrostab.noise import NORMAL_95
+
 
 def direct_surface(
     x: NDArray[np.float64],
@@ -220,7 +222,7 @@ def average_plainly(plain: dict[str, Any]) -> dict[str, NDArray[np.float64]]:
     feasible = [fit for fit in fits if (fit[1][fit[0]] > 0).all()]
     weights = weigh(feasible)
     average = np.average([fit[1] for fit in feasible], axis=0, weights=weights)
-    out = np.full((4, 6), np.nan)
+    out = np.full((4, 10), np.nan)
     for a in range(4):
         able = [fit for fit in fits if a in fit[0] and all(fit[1][b] > 0 for b in fit[0] if b != a)]
         having = [fit for fit in fits if a in fit[0]]
@@ -231,23 +233,43 @@ def average_plainly(plain: dict[str, Any]) -> dict[str, NDArray[np.float64]]:
             for there in (True, False)
         ]
 
-        def variance(squares: NDArray[np.float64], a: int = a, able: Any = able) -> Any:
-            covariance = plain["products"](squares)
-            rows = [fit[2][fit[0].index(a)] for fit in able]
-            return np.average([row @ covariance @ row for row in rows], weights=weigh(able))
+        def scatter(
+            some: list[Any], weights: Any, noise: NDArray[np.float64], a: int = a
+        ) -> tuple[float, float, float]:
+            rows = [fit[2][fit[0].index(a)] for fit in some]
+
+            def variance(squares: NDArray[np.float64]) -> Any:
+                covariance = plain["products"](squares)
+                return np.average([row @ covariance @ row for row in rows], weights=weights)
+
+            noise = np.where(np.arange(5) == a, 0.0, noise)
+            unit = np.eye(5)[a] * spread[a]
+            null, both, own = variance(noise), variance(noise + unit), variance(unit)
+            return null, (both - null - own) / spread[a], own / spread[a] ** 2
 
         noise = np.append(average, plain["square"][4])
-        noise[a] = 0.0
-        unit = np.eye(5)[a] * spread[a]
-        null, both, own = variance(noise), variance(noise + unit), variance(unit)
+        null, linear, own = scatter(able, weigh(able), noise)
+        covariance = plain["products"](noise)
+        shared = np.zeros((len(having), 4))
+        for fit, line in zip(having, shared, strict=True):
+            line[fit[0]] = fit[2] @ covariance @ fit[2][fit[0].index(a)]
+        others = np.average(shared, axis=0, weights=penalised)
+        inside = np.array([any(fit is other for other in able) for fit in having])
+        wide = weigh(able) * shared[inside, a] ** 2
+        low, error = np.average([free[inside], shared[inside, a]], axis=1, weights=wide)
+        fall = min(max(low, 0.0), NORMAL_95 * np.sqrt(error))
+        rise = np.maximum(-others / others[a], 0.0) * fall
         out[a] = (
             average[a],
             mean,
             2 * (best[0] - best[1]),
             null + np.average((free - mean) ** 2, weights=penalised),
-            (both - null - own) / spread[a],
-            own / spread[a] ** 2,
+            linear,
+            own,
+            low,
+            *scatter(able, wide, noise + np.append(rise, 0.0)),
         )
+        out[a, 7] += np.average((free[inside] - low) ** 2, weights=wide)
     return dict(
         zip(
             (
@@ -257,6 +279,10 @@ def average_plainly(plain: dict[str, Any]) -> dict[str, NDArray[np.float64]]:
                 "variance_null",
                 "variance_linear",
                 "variance_square",
+                "low",
+                "low_null",
+                "low_linear",
+                "low_square",
             ),
             out.T,
             strict=True,

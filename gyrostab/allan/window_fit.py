@@ -24,6 +24,8 @@ __all__ = ["FitTables", "fit_block", "fit_tables", "is_described", "quantile_cur
 #: One-sided normal quantiles: 95 % for limits, 99 % for an observed term; two-sided 99 %, for the
 #: sign of a ramp is unknown.
 _LIMIT_SIGMA, _OBSERVED_SIGMA, _RAMP_SIGMA = 1.6449, 2.3263, 2.5758
+#: Parts of the variance of an estimate, by the power of the square: `estimate_bounds`.
+_POWERS = ("null", "linear", "square")
 #: Probability of a misfit by chance below which the model does not fit a window.
 _MISFIT_PROBABILITY = 1e-3
 #: Ratio of the averaging times, from the longest down, that bound the terms (except Q) of a window
@@ -142,7 +144,8 @@ def fit_block(
     """
     result, misfit, dof = run_kernel(flat, trend, response, exact, tables, allowed)
     field = {name: result[:, i] for i, name in enumerate(FIT_FIELDS)}
-    field["variance_square"][:, TERMS.index("N")] += (2.0 * white_error) ** 2
+    for name in ("variance_square", "low_square"):
+        field[name][:, TERMS.index("N")] += (2.0 * white_error) ** 2
     fails = _widen_misfits(field, misfit)
     square = field["square"]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -229,8 +232,9 @@ def _widen_misfits(
     chi2, dof = misfit.T
     fails = ~is_described(chi2, dof)
     wider = np.where(fails, chi2 / np.maximum(dof, 1.0), 1.0)[:, None]
-    for name in ("variance_null", "variance_linear", "variance_square"):
-        field[name] *= wider
+    for law in ("variance", "low"):
+        for power in _POWERS:
+            field[f"{law}_{power}"] *= wider
     return np.asarray(fails)
 
 
@@ -239,14 +243,13 @@ def _bound_estimates(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Find standard errors of coefficients, and 95 % upper limits of their squares.
 
-    Interval and limit follow from `estimate_bounds`. 1.96 standard errors are half of the 95 %
-    interval; where it begins at zero, they reach its upper end at least. Those of a ramp also reach
-    the upper end, from a value below the trend.
+    Interval and limit follow from `estimate_bounds`; the lower end of an interval has its own law,
+    see `gyrostab.kernels.fit.submodels`. 1.96 standard errors are half of the 95 % interval; where
+    it begins at zero, they reach its upper end at least. Those of a ramp also reach the upper end,
+    from a value below the trend.
     """
-    names = ("free", "variance_null", "variance_linear", "variance_square")
-    scores = np.array([NORMAL_95, -NORMAL_95, -_LIMIT_SIGMA])
-    bounds = estimate_bounds(*(np.ravel(field[name]) for name in names), scores)
-    low, high, limit = bounds.reshape(3, *value.shape)
+    high, limit = _solve_bounds(field, "free", "variance", -NORMAL_95, -_LIMIT_SIGMA)
+    (low,) = _solve_bounds(field, "low", "low", NORMAL_95)
     half = 0.5 * (np.sqrt(high) - np.sqrt(low))
     half = np.where(low > 0, half, np.maximum(half, np.sqrt(high) - value))
     trend = np.sqrt(field["free"][:, 4])
@@ -254,6 +257,15 @@ def _bound_estimates(
     stderr = half / NORMAL_95
     stderr[:, 4] = _trend_error(field, NORMAL_95) + (trend - value[:, 4]) / NORMAL_95
     return stderr, limit
+
+
+def _solve_bounds(
+    field: dict[str, NDArray[np.float64]], estimate: str, law: str, *scores: float
+) -> NDArray[np.float64]:
+    """Run `estimate_bounds` on one of the estimates and its law, for (score, window, term)."""
+    parts = [field[name] for name in (estimate, *(f"{law}_{n}" for n in _POWERS))]
+    bounds = estimate_bounds(*(np.ravel(part) for part in parts), np.array(scores))
+    return np.asarray(bounds.reshape(len(scores), *parts[0].shape))
 
 
 def _limit_of_curve(

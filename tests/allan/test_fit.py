@@ -136,7 +136,10 @@ def test_covariance_between_averaging_times_is_that_of_simulated_noise():
 
 @pytest.mark.parametrize(("share", "block"), [(0.0, 1), (0.2, 50), (0.2, 5)])
 def test_standard_errors_are_right(share, block):
-    """z-scores of repeated simulations have a standard deviation of 0.82 to 1.1, also with gaps."""
+    """z-scores of repeated simulations have a standard deviation of 0.78 to 1.1, also with gaps.
+
+    The least is that of N, whose error allows for a marginal B.
+    """
     rng = np.random.default_rng([4, block])
     truth = {"Q": 0.3, "N": 0.01, "K": 400.0}
     x = white(rng, 1000, 3000, N=truth["N"], rate=RATE) + quantization(
@@ -147,7 +150,7 @@ def test_standard_errors_are_right(share, block):
     product = fit_noise(surface)
     for term, value in truth.items():
         z = (product[term] - value) / product[f"{term}_stderr"]
-        assert 0.82 <= float(z.std()) <= 1.1, term
+        assert 0.78 <= float(z.std()) <= 1.1, term
     assert 0.7 < float((product.fit_chi2 / product.fit_dof).mean()) < 1.2
     # B cannot be negative and takes a little from its neighbours; without it they are unbiased
     for term, value in truth.items():
@@ -314,6 +317,20 @@ def test_interval_of_a_marginal_ramp_on_a_strong_random_walk_holds():
     product = fit_noise(windows_of(x, taus=21), observed_only=False)
     held = abs(product.R - 2.5 * spread) <= NORMAL_95 * product.R_stderr
     assert 0.92 <= float(held.mean()) <= 0.99
+
+
+@pytest.mark.slow
+def test_intervals_of_n_and_b_hold_where_four_terms_compete():
+    """N and B are too high where another term is dropped; the binomial sd of a share is 0.6 %."""
+    rng = np.random.default_rng(14)
+    truth = {"Q": 0.25, "N": 0.01, "B": 0.9, "K": 60.0}
+    x = white(rng, 1500, 4000, N=truth["N"], rate=RATE) + flicker(rng, 1500, 4000, B=truth["B"])
+    x += quantization(rng, 1500, 4000, Q=truth["Q"], rate=RATE)
+    x += random_walk(rng, 1500, 4000, K=truth["K"], rate=RATE)
+    product = fit_noise(windows_of(lose(rng, x, 0.3, 50), taus=24), observed_only=False)
+    for term in "NB":
+        held = abs(product[term] - truth[term]) <= NORMAL_95 * product[f"{term}_stderr"]
+        assert 0.935 <= float(held.mean()) <= 0.98, term
 
 
 def test_bounds_of_an_estimate_have_their_scores():

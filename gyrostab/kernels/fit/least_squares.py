@@ -461,7 +461,7 @@ def fit_windows(  # type: ignore[no-untyped-def]
 
     Returns
     -------
-    result : float64 (n_windows, 7, 5)
+    result : float64 (n_windows, 11, 5)
         Rows as `FIT_FIELDS`, see `average_submodels`.
     misfit : float64 (n_windows, 2)
         Chi-square and degrees of freedom.

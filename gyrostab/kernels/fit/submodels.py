@@ -8,6 +8,12 @@ estimates is not positive. For the estimate of one term, its own sign is free, a
 estimate of another, z standard errors below zero, only costs a factor exp(-z^2): others that are
 never too low would bias it. To the variance between sets comes the mean of those whose other
 estimates are positive.
+
+The lower end of an interval has another law. If a term that a set lacks is there, the others get
+its part and are too high, never too low; the low tail of the mixture is that of its widest sets.
+For the lower end, estimate and variance are averaged over the sets whose other estimates are
+positive, with the square of the variance as a further factor of the weight, and the other terms
+are as high as they would be with this one at its lower end.
 """
 
 from __future__ import annotations
@@ -32,12 +38,18 @@ FIT_FIELDS = (
     "variance_null",
     "variance_linear",
     "variance_square",
+    "low",
+    "low_null",
+    "low_linear",
+    "low_square",
     "separation",
 )
 #: Sets of four terms.
 _SETS = 16
 #: Passes in which the covariance of a submodel is updated to that of its estimates.
 _PASSES = 3
+#: Standard errors from an estimate to the lower end of its 95 % interval.
+_LOW_SIGMA = 1.959964
 
 
 class Submodels(NamedTuple):
@@ -53,7 +65,7 @@ class Submodels(NamedTuple):
     design: NDArray[np.float64]
     inner: NDArray[np.float64]
     #: Estimates, what negative ones cost, their weights on the data, log-likelihood, and mean and
-    #: variance of the trend's variance, of each set; its weights in a mean and a variance.
+    #: variance of the trend's variance, of each set; its weights in a mean and a law of scatter.
     estimates: NDArray[np.float64]
     penalties: NDArray[np.float64]
     rows: NDArray[np.float64]
@@ -61,6 +73,9 @@ class Submodels(NamedTuple):
     slope: NDArray[np.float64]
     weights: NDArray[np.float64]
     squares: NDArray[np.float64]
+    #: Product of the covariance with a row on the data, and covariance of a term with the others.
+    image: NDArray[np.float64]
+    shared: NDArray[np.float64]
 
 
 @njit(**INNER)
@@ -83,6 +98,8 @@ def make_submodels():  # type: ignore[no-untyped-def]
         np.zeros((_SETS, 2)),
         np.zeros((_SETS, 2)),
         np.zeros(5),
+        np.zeros(4),
+        np.zeros(4),
     )
 
 
@@ -296,43 +313,43 @@ def _best_likelihood(a, wanted, room):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _average_term(a, room, form):  # type: ignore[no-untyped-def]
-    """Average a term over the sets that have it: mean, and variance between the sets.
+def _average_estimates(a, column, room):  # type: ignore[no-untyped-def]
+    """Average the estimates of a term with one of the weights: mean, and variance between sets."""
+    total = mean = square = 0.0
+    for index in range(1, _SETS):
+        weight, estimate = room.weights[index, column], room.estimates[index, a]
+        if weight > 0.0:
+            total += weight
+            mean += weight * estimate
+            square += weight * estimate * estimate
+    mean /= total
+    return mean, max(square / total - mean * mean, 0.0)
 
-    To `form` goes the quadratic form that turns a covariance of the data into the mean variance of
-    the estimate.
-    """
-    total = mean = square = whole = 0.0
+
+@njit(**INNER)
+def _average_forms(a, room, form):  # type: ignore[no-untyped-def]
+    """Average the quadratic form that turns a covariance of the data into a variance of a term."""
+    total = 0.0
     for entry in range(10):
         form[entry] = 0.0
     for index in range(1, _SETS):
-        estimate, row = room.estimates[index, a], room.rows[index, a]
-        if room.weights[index, 0] > 0.0:
-            total += room.weights[index, 0]
-            mean += room.weights[index, 0] * estimate
-            square += room.weights[index, 0] * estimate * estimate
-        weight = room.weights[index, 1]
+        weight, row = room.weights[index, 1], room.rows[index, a]
         if not weight > 0.0:
             continue
-        whole += weight
+        total += weight
         entry = 0
         for c in range(4):
             for d in range(c, 4):
                 form[entry] += weight * row[c] * row[d] * (1.0 if c == d else 2.0)
                 entry += 1
     for entry in range(10):
-        form[entry] /= whole
-    mean /= total
-    return mean, max(square / total - mean * mean, 0.0)
+        form[entry] /= total
 
 
 @njit(**INNER)
-def _judge_term(a, base, room, form, result):  # type: ignore[no-untyped-def]
-    """Write estimate, likelihood ratio and variance of a term under the squares `base` (5,)."""
-    if not _weigh_sets(a, room):
-        return
-    mean, null = _average_term(a, room, form)
-    linear = quadratic = 0.0
+def _expand_variance(a, base, room, form):  # type: ignore[no-untyped-def]
+    """Expand the variance of a term as a polynomial in its square, others as in `base`."""
+    null = linear = quadratic = 0.0
     table = np.int64(0)
     for b in range(4):
         for c in range(b, 5):
@@ -344,13 +361,93 @@ def _judge_term(a, base, room, form, result):  # type: ignore[no-untyped-def]
             else:
                 null += value * base[b] * base[c]
             table += 1
+    return null, linear, quadratic
+
+
+@njit(**INNER)
+def _multiply_covariance(row, room):  # type: ignore[no-untyped-def]
+    """Multiply ``room.covariance`` by a row on the data."""
+    for c in range(4):
+        room.image[c] = 0.0
+    entry = 0
+    for c in range(4):
+        for d in range(c, 4):
+            value = room.covariance[entry]
+            room.image[c] += value * row[d]
+            if d != c:
+                room.image[d] += value * row[c]
+            entry += 1
+
+
+@njit(**INNER)
+def _multiply_rows(row, other):  # type: ignore[no-untyped-def]
+    return row[0] * other[0] + row[1] * other[1] + row[2] * other[2] + row[3] * other[3]
+
+
+@njit(**INNER)
+def _weigh_low_end(a, base, room):  # type: ignore[no-untyped-def]
+    """Turn the weights in the variance of a term into those at its lower end; whether any has one.
+
+    To ``room.squares`` go the squares with the term at its lower end: those of `base`, more where
+    another term would replace a part of it.
+    """
+    total = mean = own = variance = 0.0
+    for b in range(4):
+        room.shared[b] = 0.0
+    for index in range(1, _SETS):
+        if not room.weights[index, 0] > 0.0:
+            continue
+        _multiply_covariance(room.rows[index, a], room)
+        for b in range(4):
+            if index >> b & 1:
+                shared = _multiply_rows(room.rows[index, b], room.image)
+                room.shared[b] += room.weights[index, 0] * shared
+                variance = shared if b == a else variance
+        room.weights[index, 1] *= variance * variance
+        total += room.weights[index, 1]
+        mean += room.weights[index, 1] * room.estimates[index, a]
+        own += room.weights[index, 1] * variance
+    if not total > 0.0:
+        return False
+    fall = min(max(mean / total, 0.0), _LOW_SIGMA * math.sqrt(own / total))
+    for b in range(4):
+        room.squares[b] = base[b] + max(-room.shared[b] / room.shared[a], 0.0) * fall
+    room.squares[4] = base[4]
+    return True
+
+
+@njit(**INNER)
+def _repeat_law(a, result):  # type: ignore[no-untyped-def]
+    """Take estimate and variance of a term for the lower end of its interval too."""
+    result[6, a], result[7, a] = result[1, a], result[3, a]
+    result[8, a], result[9, a] = result[4, a], result[5, a]
+
+
+@njit(**INNER)
+def _judge_term(a, base, room, form, result):  # type: ignore[no-untyped-def]
+    """Write estimate, likelihood ratio and variances of a term under the squares `base` (5,)."""
+    if not _weigh_sets(a, room):
+        return
+    mean, between = _average_estimates(a, np.int64(0), room)
+    _average_forms(a, room, form)
+    null, linear, quadratic = _expand_variance(a, base, room, form)
     present = _best_likelihood(a, 1, room)
     scale = room.scale[a]
     result[1, a] = mean / scale
     result[2, a] = 2.0 * (present - _best_likelihood(a, 0, room)) if present > -np.inf else 0.0
-    result[3, a] = null / scale**2
+    result[3, a] = (null + between) / scale**2
     result[4, a] = linear / scale
     result[5, a] = quadratic
+    if not _weigh_low_end(a, base, room):
+        _repeat_law(a, result)
+        return
+    mean, between = _average_estimates(a, np.int64(1), room)
+    _average_forms(a, room, form)
+    null, linear, quadratic = _expand_variance(a, room.squares, room, form)
+    result[6, a] = mean / scale
+    result[7, a] = (null + between) / scale**2
+    result[8, a] = linear / scale
+    result[9, a] = quadratic
 
 
 @njit(**INNER)
@@ -394,7 +491,7 @@ def _find_separations(allowed, members, room, result):  # type: ignore[no-untype
     solvable = _invert_factor(inner, size) < np.inf
     for p in range(size):
         share = _inverse_entry(inner, p, p, size)
-        result[6, members[p]] = 1.0 / max(share, 1.0) if solvable else 0.0
+        result[10, members[p]] = 1.0 / max(share, 1.0) if solvable else 0.0
 
 
 @njit(**INNER)
@@ -441,13 +538,14 @@ def average_submodels(allowed, start, trend_square, room, form, result):  # type
         With ``data``, ``normal``, ``products`` and ``trend`` of the window, which are scaled here.
     form : float64 (10,)
         Scratch.
-    result : float64 (7, 5)
+    result : float64 (11, 5)
         Rows as `FIT_FIELDS`: squared coefficient, averaged over all submodels; its average over
         those with the term, where it may be negative; twice the log of the likelihood ratio of the
         best submodels with and without the term; variance of the second number without the term,
-        its growth per unit of the square, per unit of its square; share of the column that the
-        other terms cannot reproduce. For a ramp, rows 3 and 4 are the variance of the trend under
-        the other terms and the variance of that.
+        its growth per unit of the square, per unit of its square; the second number and its
+        variance again, for the lower end of an interval; share of the column that the other terms
+        cannot reproduce. For a ramp, rows 3 and 4 are the variance of the trend under the other
+        terms and the variance of that.
     """
     allowed = _scale_window(allowed, room)
     base, members = np.zeros(5), np.empty(4, np.int64)
@@ -461,6 +559,7 @@ def average_submodels(allowed, start, trend_square, room, form, result):  # type
         if not index & ~allowed:
             _fit_set(members, index, start, base[4], room)
     _average_sets(room, base, result)
+    _mix_products(room.products, base, room.covariance)
     for a in range(4):
         if allowed >> a & 1:
             result[0, a] = base[a] / room.scale[a]
@@ -470,4 +569,5 @@ def average_submodels(allowed, start, trend_square, room, form, result):  # type
         result[0, 4] = max(trend_square - result[3, 4], 0.0)
         result[1, 4] = trend_square
         result[2, 4] = result[5, 4] = 0.0
-        result[6, 4] = 1.0
+        _repeat_law(np.int64(4), result)
+        result[10, 4] = 1.0
