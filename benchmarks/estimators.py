@@ -48,6 +48,8 @@ class Records(NamedTuple):
     #: quarter of it: averaging factors, and Allan variance (n_records, n_factors).
     dense: tuple[NDArray[np.int64], Array]
     octaves: tuple[NDArray[np.int64], Array]
+    #: At a quarter of it: averaging factors (1,), and Allan variance (n_records, 1).
+    quarter: tuple[NDArray[np.int64], Array]
 
 
 class Estimates(NamedTuple):
@@ -81,8 +83,8 @@ def make_records(values: Array, rate: float) -> Records:
     n = values.shape[1]
     dense = np.unique(np.round(np.geomspace(1, n // 10, 100)).astype(np.int64))
     octaves = 2 ** np.arange(int(np.log2(n)) - 1)
-    first, second = ((ks, measure_avar(values, rate, ks)) for ks in (dense, octaves))
-    return Records(values, rate, first, second)
+    factors = (dense, octaves, np.array([n // 4]))
+    return Records(values, rate, *((ks, measure_avar(values, rate, ks)) for ks in factors))
 
 
 def fit_gyrostab(records: Records) -> Estimates:
@@ -235,9 +237,10 @@ def fit_logarithms(records: Records) -> Estimates:
 
 
 def read_slopes(records: Records) -> Estimates:
-    """Read B at the minimum, the other terms where the local slope is closest to theirs.
+    """Read B at the minimum, Q and R at the ends, N and K where the local slope is closest.
 
-    As in MATLAB's example; Q and N only before the minimum, K and R only behind it.
+    N before and K behind the minimum, as in MATLAB's example; Q at the shortest averaging time, R
+    at a quarter of the record.
     """
     ks, avar = records.dense
     columns = avar_columns(ks / records.rate)
@@ -245,11 +248,17 @@ def read_slopes(records: Records) -> Estimates:
     value = np.empty((len(avar), 5))
     for row, (data, slopes) in enumerate(zip(avar, local, strict=True)):
         low = min(max(int(data.argmin()), 1), slopes.size - 1)
-        for a, law in enumerate(LAWS.values()):
-            first, last = (0, low) if law.power < 0 else (low, slopes.size)
-            place = first + int(np.abs(slopes[first:last] - law.power).argmin())
-            place = low if law.power == 0 else place
+        places = {
+            "Q": 0,
+            "N": int(np.abs(slopes[:low] - LAWS["N"].power).argmin()),
+            "B": low,
+            "K": low + int(np.abs(slopes[low:] - LAWS["K"].power).argmin()),
+        }
+        for term, place in places.items():
+            a = TERMS.index(term)
             value[row, a] = np.sqrt(data[place] / columns[place, a])
+    ks, avar = records.quarter
+    value[:, 4] = np.sqrt(avar[:, 0] / avar_columns(ks / records.rate)[0, 4])
     return without_intervals(value)
 
 
