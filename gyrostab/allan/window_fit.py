@@ -243,13 +243,15 @@ def _bound_estimates(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Find standard errors of coefficients, and 95 % upper limits of their squares.
 
-    Interval and limit follow from `estimate_bounds`; the lower end of an interval has its own law,
-    see `gyrostab.kernels.fit.submodels`. 1.96 standard errors are half of the 95 % interval; where
-    it begins at zero, they reach its upper end at least. Those of a ramp also reach the upper end,
-    from a value below the trend.
+    Interval and limit follow from `estimate_bounds`; the lower end of an interval has another law
+    unless that is above the estimate, see `gyrostab.kernels.fit.submodels`. 1.96 standard errors
+    are half of the 95 % interval; where it begins at zero, they reach its upper end at least. Those
+    of a ramp also reach the upper end, from a value below the trend.
     """
-    high, limit = _solve_bounds(field, "free", "variance", -NORMAL_95, -_LIMIT_SIGMA)
-    (low,) = _solve_bounds(field, "low", "low", NORMAL_95)
+    scores = (NORMAL_95, -NORMAL_95, -_LIMIT_SIGMA)
+    low, high, limit = _solve_bounds(field, "free", "variance", *scores)
+    (own,) = _solve_bounds(field, "low", "low", NORMAL_95)
+    low = np.where(own < field["free"], own, low)
     half = 0.5 * (np.sqrt(high) - np.sqrt(low))
     half = np.where(low > 0, half, np.maximum(half, np.sqrt(high) - value))
     trend = np.sqrt(field["free"][:, 4])

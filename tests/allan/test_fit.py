@@ -333,6 +333,19 @@ def test_intervals_of_n_and_b_hold_where_four_terms_compete():
         assert 0.935 <= float(held.mean()) <= 0.98, term
 
 
+def test_a_lower_end_above_the_estimate_is_not_used():
+    field = {name: np.zeros((1, 5)) for name in FIT_FIELDS}
+    field["free"] += 1.0
+    field["variance_null"] += 0.04
+    errors = []
+    for low, null in ((1.0, 0.04), (4.0, 0.01), (1.0, 0.16)):  # the same, above, and wider
+        law = {**field, "low": 0.0 * field["free"] + low, "low_null": 0.0 * field["free"] + null}
+        errors.append(window_fit._bound_estimates(law, np.ones((1, 5)))[0][0, 0])
+    same, above, wider = errors
+    assert same == above > 0
+    assert wider > 1.2 * same
+
+
 def test_bounds_of_an_estimate_have_their_scores():
     """Put the bounds into the definition of the score, with the integral done by quadrature."""
     for estimate, a, b, c in ((0.0, 1.0, 0.0, 0.1), (-0.7, 1.0, 0.5, 1.4), (3.0, 0.2, 1.5, 0.3)):
