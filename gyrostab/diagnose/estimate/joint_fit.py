@@ -375,12 +375,15 @@ def _make_estimate(
 ) -> Estimate:
     """Return an estimate with the error of the form.
 
-    `ends` are those of an asymmetric 95 % interval without it. What cannot be negative has a normal
-    law cut off at zero, if the interval reaches it.
+    `ends` are those of an asymmetric 95 % interval without it, half of which is 1.96 standard
+    errors at most: a point of the grid that hardly determines the size has a large variance, and
+    little weight. What cannot be negative has a normal law cut off at zero, if the interval reaches
+    it.
     """
     if sd <= 0.0:  # a count is exact
         return Estimate(mean, 0.0, mean, mean, unit)
     low, high = ends or (mean - NORMAL_95 * sd, mean + NORMAL_95 * sd)
+    sd = min(sd, 0.5 * (high - low) / NORMAL_95)
     low = mean - math.hypot(mean - low, NORMAL_95 * form)
     high = mean + math.hypot(high - mean, NORMAL_95 * form)
     sd = math.hypot(sd, form)

@@ -391,3 +391,9 @@ def test_an_interval_cut_off_at_zero_holds_its_share() -> None:
     positive = draws[draws > 0.0]
     high = _make_estimate(-1.5, 1.0, "1", positive=True, form=0.0).high
     assert abs((positive > high).mean() - 0.025) < 0.001
+
+
+def test_a_standard_error_is_no_wider_than_its_interval() -> None:
+    one = _make_estimate(-0.5, 49.0, "1", positive=False, form=0.0, ends=(-0.93, -0.09))
+    assert one.stderr == pytest.approx(0.5 * 0.84 / 1.96, rel=1e-3)
+    assert (one.low, one.high) == pytest.approx((-0.93, -0.09))
