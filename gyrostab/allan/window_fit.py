@@ -194,6 +194,7 @@ def run_kernel(
         tables.diagonal,
         tables.weight,
         noise,
+        NORMAL_95,
     )
     result[..., [not allowed >> a & 1 for a in range(len(TERMS))]] = np.nan
     return result, misfit, dof

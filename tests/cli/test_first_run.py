@@ -39,7 +39,7 @@ avar = rng.gamma(8.0, truth / 8.0, (windows, n))
 trend, diagonal = np.zeros((windows, 5)), np.full((n, 14), 0.05)
 found = fit_windows(
     avar, whole, whole, whole, whole, trend, columns, np.ones(5), pairs, ramps, diagonal,
-    np.full(n, 20.0), 31,
+    np.full(n, 20.0), 31, 1.96,
 )
 assert np.isfinite(found[0]).any()
 print(hashlib.sha256(b"".join(part.tobytes() for part in found)).hexdigest())

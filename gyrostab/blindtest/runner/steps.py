@@ -7,10 +7,13 @@ import os
 import shutil
 import traceback
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gyrostab.blindtest.runner.folder import write_json, write_text
 from gyrostab.errors import GyrostabError
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 __all__ = ["compare_case", "diagnose_case", "draw_case"]
 
@@ -50,18 +53,12 @@ def diagnose_case(recording: Path, target: Path, failed: Path, nulls: int) -> bo
     The diagnosis is written with the check of its model, if that has an effect.
     """
     from gyrostab import diagnose
-    from gyrostab.blindtest.scoring.resimulation import check_model
     from gyrostab.jobs import load_log
 
     try:
         log = load_log([recording])
         found = diagnose(log, nulls=nulls, seed=int(recording.stem[:7], 16))
-        calibrated = {
-            axis: {term: one["value"] for term, one in terms.items()}
-            for axis, terms in found.content["baseline"]["noise"].items()
-        }
-        has_effect = bool(found.model.get("effect"))
-        checked = check_model(log.compute(), found.model, calibrated) if has_effect else None
+        checked = _check_model(log, found) if found.model.get("effect") else None
         write_json(target, json.loads(found.to_json()) | {"model_check": checked})
     except Exception as error:  # a case that breaks the diagnosis is reported as a result
         lines = traceback.format_exc() if not isinstance(error, GyrostabError) else ""
@@ -69,6 +66,17 @@ def diagnose_case(recording: Path, target: Path, failed: Path, nulls: int) -> bo
         return False
     failed.unlink(missing_ok=True)
     return True
+
+
+def _check_model(log: xr.Dataset, found: Any) -> dict[str, Any]:
+    """Compare a recording with its model and with the noise that was calibrated first."""
+    from gyrostab.blindtest.scoring.resimulation import check_model
+
+    calibrated = {
+        axis: {term: one["value"] for term, one in terms.items()}
+        for axis, terms in found.content["baseline"]["noise"].items()
+    }
+    return check_model(log.compute(), found.model, calibrated)
 
 
 def compare_case(recording: Path, truth: dict[str, Any], target: Path) -> dict[str, float]:

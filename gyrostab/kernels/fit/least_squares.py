@@ -406,7 +406,7 @@ def _reduce_windows(cells, room, tables):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _average_window(allowed, place, fit, cells, room, submodels, start, form, result):  # type: ignore[no-untyped-def]
+def _average_window(allowed, place, low_sigma, fit, cells, room, submodels, start, form, result):  # type: ignore[no-untyped-def]
     """Average the window in one place over its submodels."""
     for a in range(4):
         start[a] = fit.squares[a, place]
@@ -417,7 +417,7 @@ def _average_window(allowed, place, fit, cells, room, submodels, start, form, re
     for table in range(PRODUCTS):
         for entry in range(10):
             submodels.products[table, entry] = room.products[10 * table + entry, place]
-    average_submodels(allowed, start, cells.trend[4, place], submodels, form, result)
+    average_submodels(allowed, start, cells.trend[4, place], low_sigma, submodels, form, result)
 
 
 @njit(**KERNEL)
@@ -435,6 +435,7 @@ def fit_windows(  # type: ignore[no-untyped-def]
     diagonal,
     weight,
     allowed,
+    low_sigma,
 ):
     """Fit every window.
 
@@ -458,6 +459,8 @@ def fit_windows(  # type: ignore[no-untyped-def]
         Degrees of freedom for white noise, the weights of the first pass.
     allowed : int
         Bit set of the terms to fit.
+    low_sigma : float
+        Standard errors from an estimate to the lower end of its interval.
 
     Returns
     -------
@@ -510,7 +513,9 @@ def fit_windows(  # type: ignore[no-untyped-def]
             misfit[w, 0], misfit[w, 1] = chi2[0, place], valid[place]
             for a in range(4):
                 misfit[w, 1] -= 1.0 if fit.terms[a, place] > 0.5 else 0.0
-            _average_window(allowed, place, fit, cells, room, submodels, start, form, result[w])
+            _average_window(
+                allowed, place, low_sigma, fit, cells, room, submodels, start, form, result[w]
+            )
             for a in range(5):
                 squares[a] = result[w, 0, a] if result[w, 0, a] > 0.0 else 0.0
             degrees_of_freedom(

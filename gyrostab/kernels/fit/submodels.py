@@ -48,8 +48,6 @@ FIT_FIELDS = (
 _SETS = 16
 #: Passes in which the covariance of a submodel is updated to that of its estimates.
 _PASSES = 3
-#: Standard errors from an estimate to the lower end of its 95 % interval.
-_LOW_SIGMA = 1.959964
 
 
 class Submodels(NamedTuple):
@@ -385,7 +383,7 @@ def _multiply_rows(row, other):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _weigh_low_end(a, base, room):  # type: ignore[no-untyped-def]
+def _weigh_low_end(a, base, low_sigma, room):  # type: ignore[no-untyped-def]
     """Turn the weights in the variance of a term into those at its lower end; whether any has one.
 
     To ``room.squares`` go the squares with the term at its lower end: those of `base`, more where
@@ -409,7 +407,7 @@ def _weigh_low_end(a, base, room):  # type: ignore[no-untyped-def]
         own += room.weights[index, 1] * variance
     if not total > 0.0:
         return False
-    fall = min(max(mean / total, 0.0), _LOW_SIGMA * math.sqrt(own / total))
+    fall = min(max(mean / total, 0.0), low_sigma * math.sqrt(own / total))
     for b in range(4):
         room.squares[b] = base[b] + max(-room.shared[b] / room.shared[a], 0.0) * fall
     room.squares[4] = base[4]
@@ -424,7 +422,7 @@ def _repeat_law(a, result):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _judge_term(a, base, room, form, result):  # type: ignore[no-untyped-def]
+def _judge_term(a, base, low_sigma, room, form, result):  # type: ignore[no-untyped-def]
     """Write estimate, likelihood ratio and variances of a term under the squares `base` (5,)."""
     if not _weigh_sets(a, room):
         return
@@ -438,7 +436,7 @@ def _judge_term(a, base, room, form, result):  # type: ignore[no-untyped-def]
     result[3, a] = (null + between) / scale**2
     result[4, a] = linear / scale
     result[5, a] = quadratic
-    if not _weigh_low_end(a, base, room):
+    if not _weigh_low_end(a, base, low_sigma, room):
         _repeat_law(a, result)
         return
     mean, between = _average_estimates(a, np.int64(1), room)
@@ -523,7 +521,7 @@ def _scale_window(allowed, room):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def average_submodels(allowed, start, trend_square, room, form, result):  # type: ignore[no-untyped-def]
+def average_submodels(allowed, start, trend_square, low_sigma, room, form, result):  # type: ignore[no-untyped-def]
     """Average one window over the submodels.
 
     Parameters
@@ -534,6 +532,8 @@ def average_submodels(allowed, start, trend_square, room, form, result):  # type
         Squared coefficients of the non-negative fit, where the iterations begin; overwritten.
     trend_square : float64
         Squared trend of the window.
+    low_sigma : float
+        Standard errors from an estimate to the lower end of its interval.
     room : Submodels
         With ``data``, ``normal``, ``products`` and ``trend`` of the window, which are scaled here.
     form : float64 (10,)
@@ -563,7 +563,7 @@ def average_submodels(allowed, start, trend_square, room, form, result):  # type
     for a in range(4):
         if allowed >> a & 1:
             result[0, a] = base[a] / room.scale[a]
-            _judge_term(a, base, room, form, result)
+            _judge_term(a, base, low_sigma, room, form, result)
     _find_separations(allowed, members, room, result)
     if allowed >> 4 & 1:
         result[0, 4] = max(trend_square - result[3, 4], 0.0)

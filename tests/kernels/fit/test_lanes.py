@@ -21,7 +21,7 @@ import numpy as np
 from gyrostab.kernels.fit import lanes
 from gyrostab.kernels.fit.least_squares import fit_windows
 given = np.load(sys.argv[1])
-found = fit_windows(*[given[f"arr_{i}"] for i in range(12)], 31)
+found = fit_windows(*[given[f"arr_{i}"] for i in range(12)], 31, 1.96)
 np.savez(sys.argv[2], *found, places=lanes.PLACES)
 """
 
@@ -51,7 +51,7 @@ def test_plain_numba_gives_the_fit_of_the_vectors(tmp_path):
     )
     plain = np.load(tmp_path / "found.npz")
     assert (lanes.PLACES, int(plain["places"])) == (8, 1)
-    for number, expected in enumerate(fit_windows(*given, 31)):
+    for number, expected in enumerate(fit_windows(*given, 31, 1.96)):
         assert np.isfinite(expected).any()
         largest = np.nanmax(abs(expected), axis=0)
         np.testing.assert_allclose(
