@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Protocol
 
-__all__ = ["Stage", "no_stage", "show_progress"]
+__all__ = ["Stage", "no_stage", "show_progress", "watch_compiler"]
 
 _COMPILING = "compiling, once after installation"
 #: Events of numba: it compiles, or `gyrostab.kernels.compile_ahead` waits for another process.
@@ -58,7 +58,7 @@ def show_progress(*, quiet: bool = False) -> Iterator[Stage]:
 
 
 @contextmanager
-def _watch_compiler(show: Callable[[bool], None]) -> Iterator[Callable[[], None]]:
+def watch_compiler(show: Callable[[bool], None]) -> Iterator[Callable[[], None]]:
     """Call `show` when numba starts to compile, here or in another process, and when it ends.
 
     Yields
@@ -134,7 +134,7 @@ def _show_lines() -> Iterator[Stage]:
         if unit == "samples":
             amount = total - first  # without what an earlier run has done
 
-    with _watch_compiler(announce) as watch:
+    with watch_compiler(announce) as watch:
         yield stage
     stage("", 0)
     print(f"done in {time.perf_counter() - begun:.1f} s{worked}", file=sys.stderr)
@@ -214,6 +214,6 @@ def _show_bar() -> Iterator[Stage]:
                 share = min(now["ended"] / now["tasks"], 1.0)
                 show(share, share * now["total"], "samples")
 
-        with Callback(start_state=start, posttask=after), _watch_compiler(announce) as watch:
+        with Callback(start_state=start, posttask=after), watch_compiler(announce) as watch:
             yield stage
         finish()

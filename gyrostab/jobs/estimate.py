@@ -6,7 +6,8 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,9 @@ from gyrostab.allan.plan import make_plan
 from gyrostab.io.datasets import to_netcdf
 from gyrostab.jobs.engine import compute_part
 from gyrostab.jobs.run import load_log
+from gyrostab.progress import watch_compiler
 
 __all__ = ["estimate_run"]
-
-#: Longest time of loading compiled kernels [s]. What takes longer is compiling, which the run that
-#: follows does not repeat.
-_MAX_LOADING_S = 2.0
 
 
 def estimate_run(
@@ -46,27 +44,26 @@ def estimate_run(
     workers : int, optional
         Number of cores; all by default.
     """
-    log = load_log(paths, **reading)
-    opened = time.process_time()  # of the process, with its start
-    plan, parts = make_plan(log, **windows), davar_parts(log, **windows)
-    rate = float(log.attrs["sampling_rate_hz"])
-    total, first, tau = parts[-1].stop, parts[0], plan.unit.ks / rate
-    yield "\n".join(
-        [
-            f"record     {log.sizes['time'] / rate:.6g} s at {rate:.6g} Hz, axes "
-            f"{', '.join(plan.signal['axis'].values)}",
-            f"windows    {total} of {plan.unit.window / rate:g} s, one every "
-            f"{plan.unit.step / rate:g} s, in {len(parts)} part{'s' * (len(parts) > 1)}",
-            f"averaging  {tau.size} times from {tau[0]:.4g} to {tau[-1]:.4g} s",
-        ]
-    )
-    base = _measure_part(log, slice(0, 1), windows, fitting)  # compiles or loads the kernels
-    opened += min(time.process_time() - opened, _MAX_LOADING_S)
-    begun = time.process_time()
-    size = _measure_part(log, first, windows, fitting)
-    share = total / first.stop
+    with _measure_work() as work_s:
+        log = load_log(paths, **reading)
+        plan, parts = make_plan(log, **windows), davar_parts(log, **windows)
+        rate = float(log.attrs["sampling_rate_hz"])
+        total, first, tau = parts[-1].stop, parts[0], plan.unit.ks / rate
+        yield "\n".join(
+            [
+                f"record     {log.sizes['time'] / rate:.6g} s at {rate:.6g} Hz, axes "
+                f"{', '.join(plan.signal['axis'].values)}",
+                f"windows    {total} of {plan.unit.window / rate:g} s, one every "
+                f"{plan.unit.step / rate:g} s, in {len(parts)} part{'s' * (len(parts) > 1)}",
+                f"averaging  {tau.size} times from {tau[0]:.4g} to {tau[-1]:.4g} s",
+            ]
+        )
+        base = _measure_part(log, slice(0, 1), windows, fitting)  # compiles or loads the kernels
+        opened = work_s()
+        size = _measure_part(log, first, windows, fitting)
+        share = total / first.stop
+        worked = (work_s() - opened) * share
     cores = workers or os.cpu_count() or 1
-    worked = (time.process_time() - begun) * share
     seconds = opened + worked / min(cores, len(parts))
     yield "\n".join(
         [
@@ -76,6 +73,23 @@ def estimate_run(
             f"output     about {(base + (size - base) * share) / 1e6:.2g} MB",
         ]
     )
+
+
+@contextmanager
+def _measure_work() -> Iterator[Callable[[], float]]:
+    """Measure the processor time of this process [s], without what it spends on compiling.
+
+    The run that follows does not compile again.
+    """
+    compiling_s = 0.0
+
+    def follow_compiler(begins: bool) -> None:
+        nonlocal compiling_s
+        compiling_s += -time.process_time() if begins else time.process_time()
+
+    with watch_compiler(follow_compiler) as watch:
+        watch()
+        yield lambda: time.process_time() - compiling_s
 
 
 def _measure_part(log: Any, part: slice, windows: Any, fitting: Any) -> int:
