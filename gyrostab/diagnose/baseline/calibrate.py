@@ -63,9 +63,9 @@ def _mean_noise_excess(
     Bands that the noise does not explain in quiescent blocks tell nothing of the noise of a mean.
     Inputs (block, band).
     """
-    known = np.where(np.isfinite(power) & np.isfinite(shape) & quiet[:, None], shape, 0.0)
-    total = known.sum(axis=0)
-    ratio = (known * np.nan_to_num(power / spectrum)).sum(axis=0) / np.maximum(total, 1e-300)
+    usable_shape = np.where(np.isfinite(power) & np.isfinite(shape) & quiet[:, None], shape, 0.0)
+    total = usable_shape.sum(axis=0)
+    ratio = (usable_shape * np.nan_to_num(power / spectrum)).sum(axis=0) / np.maximum(total, 1e-300)
     explained = ~_is_foreign(ratio, total, settings)
     if explained.sum() >= MIN_BANDS:
         power, shape, spectrum = power[:, explained], shape[:, explained], spectrum[:, explained]
@@ -102,8 +102,8 @@ def _coarse_grids(
     for column, term in enumerate("BK"):
         slow = [np.sqrt(posterior.slow[:, column]) for posterior in posteriors]
         places = [
-            (float(np.median(draws)), least[1 - column])
-            for draws, least in zip(slow, visible, strict=True)
+            (float(np.median(draws)), limits[1 - column])
+            for draws, limits in zip(slow, visible, strict=True)
         ]
         excess = max(
             np.quantile(draws, 1.0 - _SHARE_ABOVE) / grid_values(term, *place)[-1]
@@ -177,7 +177,7 @@ def calibrate_axes(
 ) -> list[Posterior]:
     """Compute the noise of every axis from the chosen blocks (axis, block)."""
     columns = noise_powers(blocks)
-    common, rest = common_variance(blocks)
+    common, shape_alone = common_variance(blocks)
     power, shape = blocks["power"].values, blocks["shape"].values
     mean = blocks["mean"].values
     step = float(blocks.attrs["block_s"])
@@ -191,7 +191,7 @@ def calibrate_axes(
                 "too few to calibrate on; "
                 "name other quiet time, or diagnose a part of the record with fewer gaps"
             )
-        fit = _reduce_weights(fit, shape[row][use], rest[row][use], common[row][use])
+        fit = _reduce_weights(fit, shape[row][use], shape_alone[row][use], common[row][use])
         explained = _keep_explained_bands(fit, settings)
         square = np.maximum(fit_squares(explained)[0], [0.0, floor_square(explained), 0.0, 0.0])
         variance = white_variance(blocks, np.tile(square, (len(mean), 1)))[row]
@@ -249,11 +249,13 @@ def _power_ratio(fit: Fit) -> Array:
     return np.asarray(fit.power / (fit.columns @ fit_squares(fit)[0]))
 
 
-def _reduce_weights(fit: Fit, shape: Array, rest: Array, common: Array) -> Fit:
+def _reduce_weights(fit: Fit, shape: Array, shape_alone: Array, common: Array) -> Fit:
     """Reduce the weights of a fit by the common variance of the bands."""
-    block_weight = np.nansum(rest, axis=1)
-    known = (block_weight / (1.0 + common * block_weight)).sum()
-    return fit._replace(weight=fit.weight * min(1.0, float(known / max(np.nansum(shape), 1e-300))))
+    block_weight = np.nansum(shape_alone, axis=1)
+    effective_shape = (block_weight / (1.0 + common * block_weight)).sum()
+    return fit._replace(
+        weight=fit.weight * min(1.0, float(effective_shape / max(np.nansum(shape), 1e-300)))
+    )
 
 
 def assemble_baseline(
@@ -293,20 +295,20 @@ def assemble_baseline(
     of_means[:, 1] = np.maximum(of_means[:, 1], floor)
     white = white_variance(blocks, of_means)
     white = white * np.maximum(expected[..., 0] / noise[..., 0], 0.1)
-    known = expected.copy()
+    spectrum_of_means = expected.copy()
     for row, posterior in enumerate(posteriors):
         if posterior.of_means is not None:
-            known[row] *= columns[row] @ posterior.of_means / noise[row]
+            spectrum_of_means[row] *= columns[row] @ posterior.of_means / noise[row]
     variance = white * np.stack(
         [
             _mean_noise_excess(*arrays, settings)
-            for arrays in zip(power, shape, known, quiet, strict=True)
+            for arrays in zip(power, shape, spectrum_of_means, quiet, strict=True)
         ]
     )
     span = blocks.sizes["block"] * float(blocks.attrs["block_s"])
     densities = np.maximum([posterior.square[1] for posterior in posteriors], floor) * HOUR
     grids = _coarse_grids(posteriors, densities, span)
-    common, rest = common_variance(blocks)
+    common, shape_alone = common_variance(blocks)
     value, error = _mean_coefficients(posteriors)
     value[:, 4], error[:, 4] = 0.0, _ramp_error(blocks, white, value, quiet)
     variables = {
@@ -317,7 +319,7 @@ def assemble_baseline(
         "known_mean": np.zeros(quiet.shape) if known_mean is None else known_mean,
         "mean_variance": variance,
         "common": common,
-        "shape_alone": rest,
+        "shape_alone": shape_alone,
         "columns": columns,
         "square": square,
         "square_stderr": np.stack([posterior.error for posterior in posteriors]),
@@ -370,8 +372,8 @@ def _ramp_error(blocks: xr.Dataset, white: Array, value: Array, quiet: NDArray[n
     for row in range(len(white)):
         K, B = value[row, 3:4], value[row, 2:3]
         step = float(blocks.attrs["block_s"])
-        seen = mean_products(
+        information = mean_products(
             hours[:, :0], hours, variance=white[row], step=step, K=K, B=B, present=present[row]
         ).gram[0, 0, 0]
-        error[row] = 1.0 / np.sqrt(seen) if seen > 0.0 else np.inf
+        error[row] = 1.0 / np.sqrt(information) if information > 0.0 else np.inf
     return error

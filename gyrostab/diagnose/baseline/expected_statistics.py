@@ -50,9 +50,9 @@ def band_columns(blocks: xr.Dataset) -> Array:
     ndarray, shape (band, term)
         [degree2 hour-2 Hz-1 per squared unit of the noise table].
     """
-    each = line_columns(blocks)
+    columns = line_columns(blocks)
     edges = band_edges(int(blocks.attrs["block_samples"])) - 1
-    return np.stack([each[low:high].mean(axis=0) for low, high in pairwise(edges)])
+    return np.stack([columns[low:high].mean(axis=0) for low, high in pairwise(edges)])
 
 
 def noise_powers(blocks: xr.Dataset, response: Array | None = None) -> Array:
@@ -68,8 +68,8 @@ def noise_powers(blocks: xr.Dataset, response: Array | None = None) -> Array:
     ndarray, shape (axis, block, band, term)
         [degree2 hour-2 Hz-1 per squared unit of the noise table].
     """
-    whole = band_columns(blocks).T * (1.0 if response is None else response)
-    return np.stack([spread_by_gaps(one[None, None], blocks) for one in whole], axis=-1)
+    term_powers = band_columns(blocks).T * (1.0 if response is None else response)
+    return np.stack([spread_by_gaps(power[None, None], blocks) for power in term_powers], axis=-1)
 
 
 def common_variance(blocks: xr.Dataset) -> tuple[Array, Array]:
@@ -84,9 +84,9 @@ def common_variance(blocks: xr.Dataset) -> tuple[Array, Array]:
         Of the gamma distribution of each power, given the common factor.
     """
     shape = blocks["shape"].values
-    near = blocks["neighbours"].values
+    neighbours = blocks["neighbours"].values
     samples = np.maximum(blocks["samples"].values, 1)
-    scattered = np.clip(1.0 - np.where(np.isfinite(near), near, 1.0), 0.0, 1.0)
+    scattered = np.clip(1.0 - np.where(np.isfinite(neighbours), neighbours, 1.0), 0.0, 1.0)
     weights = taper(int(blocks.attrs["block_samples"]))
     scattered = np.maximum(
         scattered - (1.0 - float((weights[1:] * weights[:-1]).sum() / (weights**2).sum())), 0.0
@@ -104,9 +104,11 @@ def white_variance(blocks: xr.Dataset, square: Array) -> Array:
     The squares have the shape (axis, 4).
     """
     samples = blocks["samples"].values.astype(np.float64)
-    near = blocks["neighbours"].values
+    neighbours = blocks["neighbours"].values
     rate, count = float(blocks.attrs["sampling_rate_hz"]), np.maximum(samples, 1.0)
-    apart = 1.0 - np.where(np.isfinite(near), near, samples / float(blocks.attrs["block_samples"]))
+    apart = 1.0 - np.where(
+        np.isfinite(neighbours), neighbours, samples / float(blocks.attrs["block_samples"])
+    )
     # Each run of samples leaves a rounding of the angle at either end.
     runs = np.maximum(apart, 0.0) * count + 1.0
     return np.asarray(

@@ -76,15 +76,15 @@ def baseline_from_model(
         )
     chosen = np.ones((len(axes), blocks.sizes["block"]), np.bool_)
     attrs: dict[str, Any] = {"source": "model", "calibrated_on": [], "model": parsed.source}
-    given = given_quiescent_blocks(blocks, quiet, settings=settings)
-    if given is not None:
-        chosen, attrs["quiet_by"] = given, GIVEN
+    given_blocks = given_quiescent_blocks(blocks, quiet, settings=settings)
+    if given_blocks is not None:
+        chosen, attrs["quiet_by"] = given_blocks, GIVEN
         attrs["calibrated_on"] = find_quiescent_spans(blocks, chosen)
         posteriors = _scale_to_quiescent(blocks, parsed, posteriors, chosen)
-    known = expect_known_effects(
+    effects = expect_known_effects(
         blocks, parsed, np.stack([posterior.square for posterior in posteriors])
     )
-    attrs["left_out"] = known.left_out
+    attrs["left_out"] = effects.left_out
     hours = (blocks["begin"].values + blocks["end"].values) / (2.0 * HOUR)
     ramp = np.array([parsed.coefficients(axis)["R"] for axis in axes])
     out = assemble_baseline(
@@ -92,18 +92,20 @@ def baseline_from_model(
         posteriors,
         quiet=chosen,
         attrs=attrs,
-        known_mean=known.mean + ramp[:, None] * hours,
-        spectrum=known.spectrum,
+        known_mean=effects.mean + ramp[:, None] * hours,
+        spectrum=effects.spectrum,
         settings=settings,
     )
-    out = with_wandering(out, known.wandering, known.spectrum)
-    extra = known.lines if known.cross is None else {"cross": known.cross, **known.lines}
+    out = with_wandering(out, effects.wandering, effects.spectrum)
+    extra = effects.lines if effects.cross is None else {"cross": effects.cross, **effects.lines}
     out = out.assign(label_variables(extra, BASELINE))
-    if known.lines:
+    if effects.lines:
         noise = np.stack([line_columns(blocks) @ posterior.square for posterior in posteriors])
-        out["shape_alone"] *= independent_line_share(noise + known.lines["peaks"], blocks)[:, None]
+        out["shape_alone"] *= independent_line_share(noise + effects.lines["peaks"], blocks)[
+            :, None
+        ]
     out["coefficient"].loc[{"term": "R"}] = ramp
-    out["stderr"].loc[{"term": list(TERMS) if given is None else ["R"]}] = 0.0
+    out["stderr"].loc[{"term": list(TERMS) if given_blocks is None else ["R"]}] = 0.0
     return out
 
 
@@ -112,7 +114,7 @@ def _scale_to_quiescent(
 ) -> list[Posterior]:
     """Scale the noise of a model to the quiescent blocks (axis, block), given its effects."""
     square = np.stack([posterior.square for posterior in posteriors])
-    whole, added = (
+    spectrum, added = (
         expect_known_effects(blocks, model, values).spectrum for values in (square, 0.0 * square)
     )
-    return scale_axes(blocks, posteriors, *quiescent_level(blocks, whole - added, added, quiet))
+    return scale_axes(blocks, posteriors, *quiescent_level(blocks, spectrum - added, added, quiet))

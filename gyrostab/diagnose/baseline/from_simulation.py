@@ -55,7 +55,7 @@ def baseline_from_simulation(
     SchemaError
         If the two differ in axes, sampling rate or length.
     """
-    for name, wanted, got in (
+    for name, in_recording, in_simulation in (
         (
             "sampling rate [Hz]",
             blocks.attrs["sampling_rate_hz"],
@@ -68,9 +68,9 @@ def baseline_from_simulation(
         ),
         ("axes", list(blocks["axis"].values), list(simulated["axis"].values)),
     ):
-        if wanted != got:
+        if in_recording != in_simulation:
             raise SchemaError(
-                f"simulation: {name} {got}, but {wanted} in the recording; "
+                f"simulation: {name} {in_simulation}, but {in_recording} in the recording; "
                 "simulate with --like RECORDING"
             )
     chosen, reason = find_quiescent_blocks(simulated, settings=settings)
@@ -95,9 +95,9 @@ def baseline_from_simulation(
         "quiet_by": reason,
     }
     spectrum = noise * level[..., None] * shown.form[:, None]
-    given = given_quiescent_blocks(blocks, quiet, settings=settings)
-    if given is not None:
-        chosen, attrs["quiet_by"] = given, GIVEN
+    given_blocks = given_quiescent_blocks(blocks, quiet, settings=settings)
+    if given_blocks is not None:
+        chosen, attrs["quiet_by"] = given_blocks, GIVEN
         attrs["calibrated_on"] = find_quiescent_spans(blocks, chosen)
         factor, error = quiescent_level(blocks, spectrum, 0.0 * spectrum, chosen)
         posteriors = scale_axes(blocks, posteriors, factor, error)

@@ -44,18 +44,18 @@ def expect_lines(
         [np.interp(np.log(frequency), np.log(bands), axis_response) for axis_response in response]
     )
     steady, largest, broad = (np.zeros(passed.shape) for _ in range(3))
-    near, band_power = unspread_share(blocks)[..., None], np.zeros((len(axes), bands.size))
+    unspread, band_power = unspread_share(blocks)[..., None], np.zeros((len(axes), bands.size))
     leak = _line_leakage(int(blocks.attrs["block_samples"]))
     for effect, rows, density in narrow:
         chosen = tuple(axes[row] for row in rows)
         prediction = predict_effect(effect, blocks, chosen, frequency)
-        band_power += (near * density).mean(axis=1) * response
+        band_power += (unspread * density).mean(axis=1) * response
         for name, values in prediction.spectrum.items():
             size = np.abs(complex_factors(effect, name, chosen)[:, None]) ** 2 * values.mean(
                 axis=-2
             )
             places = 0 if prediction.line is None else prediction.line.size // blocks.sizes["block"]
-            alone = np.count_nonzero(values, axis=-1).max() <= places
+            is_line = np.count_nonzero(values, axis=-1).max() <= places
             peak = resonance_density(effect, name, blocks, chosen)
             if peak is not None:
                 broad[rows] += (
@@ -66,7 +66,7 @@ def expect_lines(
                 continue
             own_leak = leak[1]
             if (
-                alone
+                is_line
                 and places == 1
                 and prediction.line is not None
                 and np.ptp(prediction.line) == 0.0
@@ -79,10 +79,10 @@ def expect_lines(
                     int(blocks.attrs["block_samples"]), apart * float(blocks.attrs["block_s"])
                 )[0]
             for row, power in zip(rows, size * passed[rows], strict=True):
-                (steady if alone else broad)[row] += np.convolve(
-                    power, own_leak if alone else leak[0], "same"
+                (steady if is_line else broad)[row] += np.convolve(
+                    power, own_leak if is_line else leak[0], "same"
                 )
-                largest[row] += np.convolve(power, leak[2], "same") if alone else 0.0
+                largest[row] += np.convolve(power, leak[2], "same") if is_line else 0.0
     return {"lines": steady, "lines_most": largest, "peaks": broad, "line_spectrum": band_power}
 
 
@@ -128,8 +128,8 @@ def resonance_density(
 def _sum_near(lines: Array) -> Array:
     """Sum over each line (axis, line) and those that it leaks into."""
     padded = np.pad(lines, ((0, 0), (LEAK_LINES, LEAK_LINES)))
-    near = np.lib.stride_tricks.sliding_window_view(padded, 2 * LEAK_LINES + 1, axis=-1)
-    return np.asarray(near.sum(axis=-1))
+    neighbourhoods = np.lib.stride_tricks.sliding_window_view(padded, 2 * LEAK_LINES + 1, axis=-1)
+    return np.asarray(neighbourhoods.sum(axis=-1))
 
 
 def average_in_bands(density: Array, blocks: xr.Dataset) -> Array:
@@ -179,27 +179,34 @@ def remove_known_lines(
         return blocks
     power, weight = blocks["line_power"], blocks["line_weight"]
     noise = expected_lines(baseline, blocks["line_frequency"].values)[:, None]
-    known, largest = (baseline[name].values[:, None] for name in ("lines", "lines_most"))
+    known_power, largest_power = (
+        baseline[name].values[:, None] for name in ("lines", "lines_most")
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
-        scatter = np.sqrt((noise**2 + 2.0 * noise * largest) / weight.values[..., None])
-    above = power.values - noise - known
+        scatter = np.sqrt((noise**2 + 2.0 * noise * largest_power) / weight.values[..., None])
+    above = power.values - noise - known_power
     error = settings.spectrum_error_share
-    exceeds = power.values - noise - largest > error * largest + settings.known_line_sigma * scatter
+    exceeds = (
+        power.values - noise - largest_power
+        > error * largest_power + settings.known_line_sigma * scatter
+    )
     padded_lines = np.pad(exceeds, ((0, 0), (0, 0), (LEAK_LINES, LEAK_LINES)))
     # With the lines that it leaks into.
     exceeds = np.lib.stride_tricks.sliding_window_view(
         padded_lines, 2 * LEAK_LINES + 1, axis=-1
     ).any(axis=-1)
-    freed = noise + np.where(exceeds | (largest < error * noise), above, 0.0)
-    freed = np.where(known > 0.0, np.maximum(freed, 0.0), power.values)
+    freed = noise + np.where(exceeds | (largest_power < error * noise), above, 0.0)
+    freed = np.where(known_power > 0.0, np.maximum(freed, 0.0), power.values)
     out = {"line_power": power.copy(data=np.where(np.isfinite(power.values), freed, np.nan))}
     if "sine_nats" in blocks:
         square, stderr = (blocks[f"sine_square{end}"].values for end in ("", "_stderr"))
         step = float(blocks["line_frequency"][0])
-        average, most = (4.0 * step * _sum_near(lines[:, 0]) for lines in (known, largest))
-        exceeds = square - most > error * most + settings.clear_sigma * stderr
+        known_square, largest_square = (
+            4.0 * step * _sum_near(lines[:, 0]) for lines in (known_power, largest_power)
+        )
+        exceeds = square - largest_square > error * largest_square + settings.clear_sigma * stderr
         in_peak = _sum_near(baseline["peaks"].values) > error * noise[:, 0]
-        new = (exceeds | (most == 0.0)) & ~in_peak
+        new = (exceeds | (largest_square == 0.0)) & ~in_peak
         out["sine_nats"] = blocks["sine_nats"].where(new, -np.inf)
-        out["sine_square"] = blocks["sine_square"] - average
+        out["sine_square"] = blocks["sine_square"] - known_square
     return blocks.assign(out)

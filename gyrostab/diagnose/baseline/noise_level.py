@@ -47,7 +47,7 @@ def quiescent_level(
         If an axis has no spectrum in its quiescent blocks.
     """
     power, shape = (blocks[name].values for name in ("power", "shape"))
-    common, alone = common_variance(blocks)
+    common, shape_alone = common_variance(blocks)
     factors = []
     for row, axis in enumerate(blocks["axis"].values):
         good = np.isfinite(power[row]) & np.isfinite(shape[row]) & quiet[row][:, None]
@@ -57,13 +57,13 @@ def quiescent_level(
                 f"axis {axis}: the quiet blocks hold no spectrum to calibrate the simulation on; "
                 "name other quiet time, or leave --quiet out to take the simulation as it is"
             )
-        separate_shape = np.where(good, alone[row], 0.0).sum(axis=1)
+        separate_shape = np.where(good, shape_alone[row], 0.0).sum(axis=1)
         reduction = 1.0 / (
             1.0 + np.where(quiet[row], common[row], 0.0) * separate_shape
         )  # see `common_variance`
         weight = (shape[row] * np.broadcast_to(reduction[:, None], good.shape))[good]
         factors.append(_fit_factor(power[row][good], noise[row][good], added[row][good], weight))
-    return np.array([one for one, _ in factors]), np.array([error for _, error in factors])
+    return np.array([factor for factor, _ in factors]), np.array([error for _, error in factors])
 
 
 def _fit_factor(power: Array, noise: Array, added: Array, weight: Array) -> tuple[float, float]:

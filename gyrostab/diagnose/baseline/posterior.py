@@ -122,7 +122,7 @@ def _fit_likelihood(fit: Fit) -> tuple[Array, Array, Array]:
     )
     free_columns, precision = fit.free()
     # Otherwise the likelihood is not that of these powers alone.
-    alone = not free_columns.shape[1] and fit.known is None and fit.start is None
+    has_powers_only = not free_columns.shape[1] and fit.known is None and fit.start is None
     for _ in range(50):
         weight = fit.weight / spectrum**2
         normal, right, to_noise, to_right = _eliminate_free_sizes(
@@ -130,33 +130,33 @@ def _fit_likelihood(fit: Fit) -> tuple[Array, Array, Array]:
         )
         solution = np.empty(width)
         solve_nonnegative(normal, right, (1 << width) - 1, solution, 0)
-        after = np.asarray(fit.columns @ np.maximum(solution, 0.0), dtype=np.float64)
+        next_spectrum = np.asarray(fit.columns @ np.maximum(solution, 0.0), dtype=np.float64)
         if free_columns.shape[1] or fit.known is not None:
-            after = (
-                after
+            next_spectrum = (
+                next_spectrum
                 + (fit.power - fit.rest())
                 + free_columns @ (to_right - to_noise @ np.maximum(solution, 0.0))
             )
-            after = np.asarray(np.maximum(after, _MIN_POWER_RATIO * spectrum))
-        if not (after > 0.0).all():
+            next_spectrum = np.asarray(np.maximum(next_spectrum, _MIN_POWER_RATIO * spectrum))
+        if not (next_spectrum > 0.0).all():
             break
-        fraction = _choose_step(fit, spectrum, after) if alone else 1.0
+        fraction = _choose_step(fit, spectrum, next_spectrum) if has_powers_only else 1.0
         square = square + fraction * (np.maximum(solution, 0.0) - square)
-        after = spectrum + fraction * (after - spectrum)
-        change = np.abs(after / spectrum - 1.0).max()
-        spectrum = after
+        next_spectrum = spectrum + fraction * (next_spectrum - spectrum)
+        change = np.abs(next_spectrum / spectrum - 1.0).max()
+        spectrum = next_spectrum
         if change < 1e-9:
             break
     return square, np.asarray(normal, dtype=np.float64), spectrum
 
 
-def _choose_step(fit: Fit, spectrum: Array, after: Array) -> float:
+def _choose_step(fit: Fit, spectrum: Array, next_spectrum: Array) -> float:
     """Return the step towards the next spectrum, halved until the likelihood does not fall."""
-    least = _log_likelihood(fit, spectrum)
+    log_likelihood = _log_likelihood(fit, spectrum)
     fraction = 1.0
     while fraction > _MIN_STEP and _log_likelihood(
-        fit, spectrum + fraction * (after - spectrum)
-    ) < least - _ROUNDING_SHARE * abs(least):
+        fit, spectrum + fraction * (next_spectrum - spectrum)
+    ) < log_likelihood - _ROUNDING_SHARE * abs(log_likelihood):
         fraction *= 0.5
     return fraction
 
@@ -217,7 +217,7 @@ def _likelihood_of_powers(
     free_columns, precision = fit.free()
     weight = fit.weight / spectrum**2
     fast_columns = np.concatenate([fit.columns[:, :2], free_columns], axis=1)
-    known = fit.power - fit.rest()
+    known_power = fit.power - fit.rest()
     normal = _normal_matrix(fast_columns, weight, precision)
     without = _normal_matrix(fast_columns[:, 1:], weight, precision)
     chunks = [
@@ -226,7 +226,7 @@ def _likelihood_of_powers(
             np.outer(b**2, fit.columns[:, 2]) + np.outer(k**2, fit.columns[:, 3]),
             fast_columns,
             (normal, without),
-            (weight, known, spectrum),
+            (weight, known_power, spectrum),
         )
         for b, k in zip(
             np.array_split(B, -(-B.size // _POINTS_AT_ONCE)),
@@ -236,8 +236,8 @@ def _likelihood_of_powers(
     ]
     inverse = np.linalg.inv(normal)[:2, :2] if free_columns.shape[1] else None
     return (
-        np.concatenate([one[0] for one in chunks]),
-        np.concatenate([one[1] for one in chunks]),
+        np.concatenate([chunk[0] for chunk in chunks]),
+        np.concatenate([chunk[1] for chunk in chunks]),
         normal if inverse is None else np.linalg.inv(inverse),
     )
 
@@ -259,16 +259,16 @@ def _likelihood_of_points(
     setup: tuple[Array, Array, Array],
 ) -> tuple[Array, Array]:
     """Compute some points of the grid; `slow` (point, cell) is the power of B and K."""
-    weight, known, spectrum = setup
+    weight, known_power, spectrum = setup
     right = (weight * (fit.rest() - slow)) @ fast_columns
     best = np.linalg.solve(normals[0], right.T).T
-    alone = np.linalg.solve(normals[1], right[:, 1:].T).T
-    alone[:, 0] = np.maximum(alone[:, 0], 1e-12 * float(spectrum.max()) / HOUR)
+    best_without_q = np.linalg.solve(normals[1], right[:, 1:].T).T
+    best_without_q[:, 0] = np.maximum(best_without_q[:, 0], 1e-12 * float(spectrum.max()) / HOUR)
     inside = np.asarray((best[:, :2] > 0.0).all(axis=1))
     used = np.where(
-        inside[:, None], best, np.concatenate([np.zeros((len(best), 1)), alone], axis=1)
+        inside[:, None], best, np.concatenate([np.zeros((len(best), 1)), best_without_q], axis=1)
     )
-    expected = used @ fast_columns.T + slow + known
+    expected = used @ fast_columns.T + slow + known_power
     if fast_columns.shape[1] > 2 or fit.known is not None:
         expected = np.maximum(expected, _MIN_POWER_RATIO * spectrum)
     return np.asarray(
@@ -282,9 +282,13 @@ def _draw_near(mean: Array, covariance: Array, rng: np.random.Generator) -> Arra
     low = np.minimum(-mean[:, 0] / sd, 30.0)
     Q = np.maximum(mean[:, 0] - sd * ndtri(rng.random(len(mean)) * ndtr(-low)), 0.0)
     slope = float(covariance[0, 1] / covariance[0, 0])
-    rest = float(np.sqrt(covariance[1, 1] - slope * covariance[0, 1]))
+    conditional_sd = float(np.sqrt(covariance[1, 1] - slope * covariance[0, 1]))
     return np.stack(
-        [Q, mean[:, 1] + slope * (Q - mean[:, 0]) + rest * rng.standard_normal(len(mean))], axis=1
+        [
+            Q,
+            mean[:, 1] + slope * (Q - mean[:, 0]) + conditional_sd * rng.standard_normal(len(mean)),
+        ],
+        axis=1,
     )
 
 

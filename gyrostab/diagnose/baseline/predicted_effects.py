@@ -43,20 +43,20 @@ def predict_effect(
 
 def sizes_by_axis(effect: Effect, name: str, axes: tuple[str, ...]) -> Array:
     """Return a parameter for each axis."""
-    known = {parameter.name: parameter for parameter in effect.parameters()}
+    parameters = {parameter.name: parameter for parameter in effect.parameters()}
     return (
         effect.each(name, axes)
-        if known[name].many
+        if parameters[name].many
         else np.full(len(axes), float(getattr(effect, name)))
     )
 
 
 def complex_factors(effect: Effect, name: str, axes: tuple[str, ...]) -> NDArray[np.complex128]:
     """Return the complex factor of a spectrum for each axis: size, direction, phase."""
-    known = {parameter.name: parameter for parameter in effect.parameters()}
+    parameters = {parameter.name: parameter for parameter in effect.parameters()}
     factor = sizes_by_axis(effect, name, axes).astype(np.complex128)
-    if "direction" in known:
+    if "direction" in parameters:
         factor *= sizes_by_axis(effect, "direction", axes)
-    if "phase" in known and known["phase"].many:
+    if "phase" in parameters and parameters["phase"].many:
         factor *= np.exp(1j * np.radians(sizes_by_axis(effect, "phase", axes)))
     return factor

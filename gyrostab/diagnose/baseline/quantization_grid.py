@@ -76,18 +76,18 @@ def _rounded_by_spectrum(
     ratio = _fit_q_square(blocks, baseline) / angle_square
     error = baseline["square_stderr"].sel(noise="Q").values / angle_square
     with np.errstate(divide="ignore", invalid="ignore"):
-        known = step**2 / 12.0 > settings.form_error_share * white
-        known &= np.isfinite(ratio) & (error > 0.0)
+        is_testable = step**2 / 12.0 > settings.form_error_share * white
+        is_testable &= np.isfinite(ratio) & (error > 0.0)
         shortfall = (1.0 - ratio) / error
-    if not known.any():
-        return known
-    weight = error[known] ** -2.0  # one logger writes all axes in one way
-    mean_ratio = float(weight @ ratio[known] / weight.sum())
+    if not is_testable.any():
+        return is_testable
+    weight = error[is_testable] ** -2.0  # one logger writes all axes in one way
+    mean_ratio = float(weight @ ratio[is_testable] / weight.sum())
     falls_short = (1.0 - mean_ratio) * np.sqrt(weight.sum()) >= settings.excess_sigma
     if not falls_short or abs(mean_ratio) > settings.majority_share:
         return np.zeros(step.shape, np.bool_)
     return np.asarray(
-        known & (ratio < settings.majority_share) & (shortfall > settings.visible_sigma)
+        is_testable & (ratio < settings.majority_share) & (shortfall > settings.visible_sigma)
     )
 
 

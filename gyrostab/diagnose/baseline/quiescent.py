@@ -153,13 +153,14 @@ def _drop_noisy_blocks(
             _, deviation = noise_level_excess(
                 power[row] / typical - 1.0, shape[row], settings=settings
             )
-            kept = start & (deviation < settings.noisy_sigma)
+            still_quiescent = start & (deviation < settings.noisy_sigma)
             if (
-                kept.sum() < max(settings.min_quiescent_blocks, settings.steady_share * start.sum())
-                or (kept == quiescent[row]).all()
+                still_quiescent.sum()
+                < max(settings.min_quiescent_blocks, settings.steady_share * start.sum())
+                or (still_quiescent == quiescent[row]).all()
             ):
                 break
-            quiescent[row] = kept
+            quiescent[row] = still_quiescent
     return quiescent
 
 
@@ -180,18 +181,18 @@ def find_quiescent_blocks(
         Description of the criterion.
     """
     n = blocks.sizes["block"]
-    given = given_quiescent_blocks(blocks, quiet, settings=settings)
-    if given is not None:
-        return given, GIVEN
+    given_blocks = given_quiescent_blocks(blocks, quiet, settings=settings)
+    if given_blocks is not None:
+        return given_blocks, GIVEN
     distances = _distance_from_rest(blocks, settings)
     worst = np.max([*distances.values(), np.zeros(n)], axis=0)
     start = worst <= 1.0
     names = [name.removeprefix("channel_") for name in distances]
     criterion = ", ".join(names)
     reason = f"quiescent {criterion}" if names else "the level of each block (no channel)"
-    least = max(settings.min_quiescent_blocks, int(settings.quiescent_share * n))
-    if start.sum() < least:
-        start = worst <= np.sort(worst)[min(least, n) - 1]
+    min_blocks = max(settings.min_quiescent_blocks, int(settings.quiescent_share * n))
+    if start.sum() < min_blocks:
+        start = worst <= np.sort(worst)[min(min_blocks, n) - 1]
         reason = f"no quiescent block by {criterion}: the quietest blocks"
     return _drop_noisy_blocks(blocks, start, settings), reason
 

@@ -58,8 +58,8 @@ def worst_band(simulated: xr.Dataset, expected: Array, *, min_sigma: float) -> N
     -------
     ndarray of bool, shape (axis, band)
     """
-    form, known = _spectral_form(simulated, expected)
-    off = np.abs(form - 1.0) * np.sqrt(known)
+    form, shape = _spectral_form(simulated, expected)
+    off = np.abs(form - 1.0) * np.sqrt(shape)
     return np.asarray((off > min_sigma) & (off == off.max(axis=1, keepdims=True)))
 
 
@@ -79,10 +79,10 @@ def measure_extra_statistics(
     unexplained : ndarray of bool, shape (axis, band)
         Bands that the noise terms do not explain.
     """
-    form, known = _spectral_form(simulated, expected)
+    form, shape = _spectral_form(simulated, expected)
     # An unexplained band reaches into others.
     measured = unexplained.any(axis=1, keepdims=True)
-    form, form_shape = np.where(measured, form, 1.0), np.where(measured, known, np.inf)
+    form, form_shape = np.where(measured, form, 1.0), np.where(measured, shape, np.inf)
     coherency, error = _measure_coherency(
         simulated, expected * form[:, None], settings.coherency_probability
     )
@@ -119,20 +119,22 @@ def _measure_coherency(
         return np.zeros((0, expected.shape[2]), np.complex128), np.zeros((0, expected.shape[2]))
     axes = [str(axis) for axis in simulated["axis"].values]
     cross, shape = (simulated[name].values for name in ("cross", "cross_shape"))
-    pairs = [(axes.index(one), axes.index(other)) for one, other in pair_rows(simulated)]
+    pairs = [
+        (axes.index(axis), axes.index(other_axis)) for axis, other_axis in pair_rows(simulated)
+    ]
     geometric_mean = (
-        np.stack([np.sqrt(expected[one] * expected[other]) for one, other in pairs])
+        np.stack([np.sqrt(expected[row] * expected[other_row]) for row, other_row in pairs])
         if pairs
         else np.empty(cross.shape)
     )
-    found, known = _weighted_mean(cross / geometric_mean, shape)
-    total = 2.0 * (np.abs(found) ** 2 * known).sum(axis=1, keepdims=True)
-    significant = (known > 0.0) & (
-        chdtrc(2.0 * (known > 0.0).sum(axis=1, keepdims=True), total) < p_value
+    coherency, coherency_shape = _weighted_mean(cross / geometric_mean, shape)
+    total = 2.0 * (np.abs(coherency) ** 2 * coherency_shape).sum(axis=1, keepdims=True)
+    significant = (coherency_shape > 0.0) & (
+        chdtrc(2.0 * (coherency_shape > 0.0).sum(axis=1, keepdims=True), total) < p_value
     )
     with np.errstate(divide="ignore"):
-        return np.where(significant, found, 0.0), np.where(
-            significant, 1.0 / np.sqrt(2.0 * known), 0.0
+        return np.where(significant, coherency, 0.0), np.where(
+            significant, 1.0 / np.sqrt(2.0 * coherency_shape), 0.0
         )
 
 
@@ -150,39 +152,39 @@ def _measure_lines(
         frequency,
     )
     evidence_nats = line_evidence(power[None], weight, slope)[0]
-    lines, most, peaks = (np.zeros(evidence_nats.shape) for _ in range(3))
-    inside, near = _lines_in_bands(simulated), unexplained.copy()
-    near[:, 1:] |= unexplained[:, :-1]
-    near[:, :-1] |= unexplained[:, 1:]
+    lines, largest, peaks = (np.zeros(evidence_nats.shape) for _ in range(3))
+    inside, near_unexplained = _lines_in_bands(simulated), unexplained.copy()
+    near_unexplained[:, 1:] |= unexplained[:, :-1]
+    near_unexplained[:, :-1] |= unexplained[:, 1:]
     for row, axis in enumerate(simulated["axis"].values):
-        known = np.zeros(evidence_nats.shape[1], np.bool_)
+        in_skirt = np.zeros(evidence_nats.shape[1], np.bool_)
         for _ in range(_MAX_LINES):
-            place = int(np.argmax(np.where(known, -np.inf, evidence_nats[row])))
-            if known[place] or not evidence_nats[row, place] > settings.line_nats:
+            place = int(np.argmax(np.where(in_skirt, -np.inf, evidence_nats[row])))
+            if in_skirt[place] or not evidence_nats[row, place] > settings.line_nats:
                 break
-            known |= line_skirt(simulated, str(axis), place, settings)
+            in_skirt |= line_skirt(simulated, str(axis), place, settings)
         good = (weight[row] > 0.0) & np.isfinite(power[row]).all(axis=1)
         if not good.any():
             continue
         mean = np.average(power[row][good], axis=0, weights=weight[row][good])
-        level = np.where(known, local_level(mean[None])[0], mean)
+        level = np.where(in_skirt, local_level(mean[None])[0], mean)
         lines[row] = np.maximum(mean - level, 0.0)
         if "sine_nats" in simulated:
-            weak = (simulated["sine_nats"].values[row] > settings.line_nats) & ~known
+            weak = (simulated["sine_nats"].values[row] > settings.line_nats) & ~in_skirt
             square, stderr = (
                 simulated[f"sine_square{end}"].values[row] / (4.0 * frequency[0])
                 for end in ("", "_stderr")
             )
             lines[row] = np.where(weak, square, lines[row])
-            most[row] = np.where(weak, square + settings.clear_sigma * stderr, 0.0)
-        most[row] = np.maximum(most[row], lines[row])
+            largest[row] = np.where(weak, square + settings.clear_sigma * stderr, 0.0)
+        largest[row] = np.maximum(largest[row], lines[row])
         smooth = np.convolve(
             np.pad(level, _SMOOTHING_LINES // 2, mode="edge"),
             np.full(_SMOOTHING_LINES, 1.0 / _SMOOTHING_LINES),
             "valid",
         )
-        peaks[row] = np.where(inside[near[row]].any(axis=0), smooth - slope[row], 0.0)
-    return lines, most, peaks
+        peaks[row] = np.where(inside[near_unexplained[row]].any(axis=0), smooth - slope[row], 0.0)
+    return lines, largest, peaks
 
 
 def _lines_in_bands(blocks: xr.Dataset) -> NDArray[np.bool_]:
@@ -210,8 +212,8 @@ def add_extra_statistics(
         spectrum = baseline["spectrum"].values
         geometric_mean = np.stack(
             [
-                np.sqrt(spectrum[axes.index(one)] * spectrum[axes.index(other)])
-                for one, other in pair_rows(blocks)
+                np.sqrt(spectrum[axes.index(axis)] * spectrum[axes.index(other_axis)])
+                for axis, other_axis in pair_rows(blocks)
             ]
         )
         arrays["cross"] = extra.coherency[:, None] * geometric_mean

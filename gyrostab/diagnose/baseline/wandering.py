@@ -31,7 +31,7 @@ def is_described_by_variance(seen: Prediction) -> bool:
 
     It does for a constant correlation time without steps.
     """
-    return not seen.levels and all(_is_steady(*one) for one in seen.wander.values())
+    return not seen.levels and all(_is_steady(*process) for process in seen.wander.values())
 
 
 def _is_steady(time: float, variance: Array) -> bool:
@@ -56,18 +56,18 @@ def add_up_wandering(
     """
     square, time = [], []
     walk, power = np.zeros((axes, block_count)), np.zeros((axes, block_count))
-    for sizes, seen in effects:
-        for name, (memory, variance) in seen.wander.items():
-            if seen.levels or not _is_steady(memory, variance):
+    for sizes, prediction in effects:
+        for name, (memory, variance) in prediction.wander.items():
+            if prediction.levels or not _is_steady(memory, variance):
                 continue
             if np.isinf(memory):
                 walk += sizes[name][:, None] * variance
             else:
                 square.append(sizes[name] * variance[0])
                 time.append(memory)
-            if name in seen.spectrum:
-                lowest = np.asarray(seen.spectrum[name]).reshape(
-                    -1, block_count, bands, seen.spectrum[name].shape[-1] // bands
+            if name in prediction.spectrum:
+                lowest = np.asarray(prediction.spectrum[name]).reshape(
+                    -1, block_count, bands, prediction.spectrum[name].shape[-1] // bands
                 )[0, :, 0]
                 power += sizes[name][:, None] * lowest.mean(axis=-1)
     return Wandering(np.array(square).reshape(-1, axes).T, np.array(time), walk, power)

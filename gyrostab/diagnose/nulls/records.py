@@ -124,12 +124,12 @@ def repeatable_null_records(
     # with lines and cross-spectra, a null record takes about three times as much as its powers
     if count * power_bytes * 3 > MAX_KEPT_NULL_BYTES:
         return draw
-    kept: list[xr.Dataset] = []
+    records: list[xr.Dataset] = []
 
     def recall() -> Iterable[xr.Dataset]:
-        if not kept:
-            kept.extend(draw())
-        return kept
+        if not records:
+            records.extend(draw())
+        return records
 
     return recall
 
@@ -159,7 +159,7 @@ def _prepare_nulls(
         np.column_stack([lines * square, peak])
         for square, peak in zip(baseline["square"].values, peaks, strict=True)
     ]
-    tails = np.array([_kurtosis_excess(blocks, one, rng) for one in density])
+    tails = np.array([_kurtosis_excess(blocks, axis_density, rng) for axis_density in density])
     shape = blocks["shape"].values
     ties = _common_shapes(baseline["shape_alone"].values, int(blocks.attrs["block_samples"]))
     return _NullSetup(
@@ -194,13 +194,13 @@ def _common_shapes(shape: Array, size: int) -> list[Array]:
     for low, high, tie in _pairs_of_bands(total, ties):
         low += tie
         high += tie
-    least = np.divide(
+    factor = np.divide(
         _MAX_COMMON_SHARE * safe,
         total,
         out=np.ones_like(safe),
         where=total > _MAX_COMMON_SHARE * safe,
     )
-    return [tie * np.minimum(low, high) for low, high, tie in _pairs_of_bands(least, ties)]
+    return [tie * np.minimum(low, high) for low, high, tie in _pairs_of_bands(factor, ties)]
 
 
 def _pairs_of_bands(values: Array, ties: list[Array]) -> Iterator[tuple[Array, Array, Array]]:
@@ -312,11 +312,11 @@ def _draw_correlated_gamma(
 ) -> Array:
     """Draw gamma variables with common parts, whose shapes add up at equal scale."""
     safe = np.where(np.isfinite(shape) & (shape > 0.0), shape, 1.0)
-    alone = safe.copy()
-    for low, high, tie in _pairs_of_bands(alone, ties):
+    shape_alone = safe.copy()
+    for low, high, tie in _pairs_of_bands(shape_alone, ties):
         low -= tie
         high -= tie
-    drawn = rng.standard_gamma(np.broadcast_to(alone, mean.shape))
+    drawn = rng.standard_gamma(np.broadcast_to(shape_alone, mean.shape))
     for low, high, tie in _pairs_of_bands(drawn, ties):
         common_part = rng.standard_gamma(np.broadcast_to(tie, (len(mean), *tie.shape)))
         low += common_part
@@ -328,12 +328,12 @@ def _draw_means(setup: _NullSetup, squares: Array, slow: Array, rng: np.random.G
     """Draw block means: white noise, random walk, flicker and known random processes."""
     blocks, baseline = setup.blocks, setup.baseline
     n, step = blocks.sizes["block"], float(blocks.attrs["block_s"])
-    each = np.stack(
+    unit_variance = np.stack(
         [white_variance(blocks, np.tile(unit, (len(slow[0]), 1))) for unit in np.eye(4)[:2]],
         axis=-1,
     )
-    usual = np.einsum("abn,an->ab", each, baseline["square"].values[:, :2])
-    drawn = np.einsum("abn,ran->rab", each, squares[..., :2])
+    usual = np.einsum("abn,an->ab", unit_variance, baseline["square"].values[:, :2])
+    drawn = np.einsum("abn,ran->rab", unit_variance, squares[..., :2])
     # An axis may have neither.
     level = np.divide(
         drawn, usual, out=np.ones_like(drawn), where=np.broadcast_to(usual > 0.0, drawn.shape)
@@ -356,11 +356,11 @@ def _draw_means(setup: _NullSetup, squares: Array, slow: Array, rng: np.random.G
             1.0 / step,
             rng.standard_normal(times.size),
         )
-        known = expected_processes(baseline, place[1])
-        steps = rng.standard_normal((2, n)) * np.sqrt((K2 / HOUR + known.walk) * step)
+        processes = expected_processes(baseline, place[1])
+        steps = rng.standard_normal((2, n)) * np.sqrt((K2 / HOUR + processes.walk) * step)
         walk, _ = brownian_means(steps[0], steps[1], 0.0)
         total[place] += np.sqrt(B2) * flicker + walk
-        for square, memory in zip(known.square, known.time, strict=True):
+        for square, memory in zip(processes.square, processes.time, strict=True):
             wander, _ = ornstein_uhlenbeck_means(
                 rng.standard_normal((n, 2)), memory / step, float(rng.standard_normal())
             )
@@ -376,16 +376,16 @@ def _draw_lines(setup: _NullSetup, squares: Array, rng: np.random.Generator) -> 
     part_count, n = weight.shape[1], blocks.sizes["block"]
     columns = line_columns(blocks)
     part_of = np.arange(n) * part_count // n
-    near = blocks["neighbours"].values
+    neighbours = blocks["neighbours"].values
     frequency, bands = np.log(blocks["line_frequency"].values), np.log(blocks["frequency"].values)
     plain = squares @ columns.T
     flat = plain.mean(axis=-1, keepdims=True)
     out = np.full((*plain.shape[:2], part_count, plain.shape[2]), np.nan)
     for axis, part in np.ndindex(*weight.shape):
-        chosen = (part_of == part) & np.isfinite(near[axis])
+        chosen = (part_of == part) & np.isfinite(neighbours[axis])
         if not (chosen.any() and weight[axis, part] > 0.0):
             continue
-        share = near[axis, chosen].mean()
+        share = neighbours[axis, chosen].mean()
         over = setup.effects[axis, chosen].mean(axis=0)
         if "line_spectrum" in setup.baseline:
             noise = (setup.columns[axis, chosen] @ setup.baseline["square"].values[axis]).mean(
@@ -422,10 +422,10 @@ def _draw_independent_cross(
 ) -> NDArray[np.complex128]:
     """Draw cross-spectra of axes without anything in common."""
     names = [str(axis) for axis in setup.blocks["axis"].values]
-    one = [names.index(str(name)) for name in setup.blocks["first"].values]
-    other = [names.index(str(name)) for name in setup.blocks["second"].values]
-    size = np.sqrt(power[:, one] * power[:, other])
-    shape = np.minimum(setup.shape[one], setup.shape[other])
+    first = [names.index(str(name)) for name in setup.blocks["first"].values]
+    second = [names.index(str(name)) for name in setup.blocks["second"].values]
+    size = np.sqrt(power[:, first] * power[:, second])
+    shape = np.minimum(setup.shape[first], setup.shape[second])
     if "cross_shape" in setup.blocks:
         shape = setup.blocks["cross_shape"].values
     cross = size * draw_coherency(shape, size.shape, rng)
@@ -438,8 +438,8 @@ def _scale_shared_cross(
 ) -> NDArray[np.complex128]:
     """Return cross-spectra of axes with common noise, from those over the levels of both."""
     assert setup.shared is not None
-    one, other = ([pair[side] for pair in setup.shared.pairs] for side in (0, 1))
-    cross = between * np.sqrt(level[:, one] * level[:, other])
+    first, second = ([pair[side] for pair in setup.shared.pairs] for side in (0, 1))
+    cross = between * np.sqrt(level[:, first] * level[:, second])
     cross[..., np.isnan(setup.blocks["cross"].values)] = np.nan
     return np.asarray(cross)
 

@@ -72,8 +72,8 @@ class NullScores:
 
     def p_value(self, statistic: str, z: Array | float) -> Array:
         """Return the probability that a null record is as extreme in any statistic as `z` here."""
-        own = self.statistics[statistic].tail.surprise(np.square(z) / 2.0)
-        return np.asarray(np.clip(np.exp(-self.family.surprise(own)), _MIN_P_VALUE, 1.0))
+        surprise = self.statistics[statistic].tail.surprise(np.square(z) / 2.0)
+        return np.asarray(np.clip(np.exp(-self.family.surprise(surprise)), _MIN_P_VALUE, 1.0))
 
     def critical(self, statistic: str, level: float) -> float:
         """Return the standardised score of a statistic at which the p-value is `level`."""
@@ -153,10 +153,10 @@ class _ScoreSums:
     def add(self, scores: xr.Dataset) -> None:
         """Add the scores of some null records."""
         z = scores["z"].values.reshape(scores.sizes["record"], -1)
-        known = np.isfinite(z)
-        filled = np.where(known, z, 0.0)
+        present = np.isfinite(z)
+        filled = np.where(present, z, 0.0)
         self.sums += np.stack(
-            [known.sum(axis=0), filled.sum(axis=0), np.square(filled).sum(axis=0)]
+            [present.sum(axis=0), filled.sum(axis=0), np.square(filled).sum(axis=0)]
         )
         self.waiting.append(z)
         if self.records + sum(len(part) for part in self.waiting) >= _FIRST_RECORDS:
@@ -183,10 +183,10 @@ class _ScoreSums:
         pooled_variance = np.empty(self.shape)
         for length in np.unique(self.length):
             same_length = self.length == length
-            known = count[:, same_length] > 1
-            total = np.where(known, variance[:, same_length], 0.0).sum(axis=1, keepdims=True)
+            is_measured = count[:, same_length] > 1
+            total = np.where(is_measured, variance[:, same_length], 0.0).sum(axis=1, keepdims=True)
             pooled_variance[:, same_length] = total / np.maximum(
-                known.sum(axis=1, keepdims=True), 1
+                is_measured.sum(axis=1, keepdims=True), 1
             )
         return pooled_variance.ravel()
 
@@ -196,8 +196,10 @@ class _ScoreSums:
         pooled_variance = self._pool_variance()
         mean, spread = self._pooled_moments(self.sums, pooled_variance, self.floor)
         record, cell, z = (np.concatenate(part) for part in zip(*self.extremes, strict=True))
-        others = self.sums[:, cell] - np.stack([np.ones(z.size), z, z**2])
-        own_mean, own_spread = self._pooled_moments(others, pooled_variance[cell], self.floor[cell])
+        other_sums = self.sums[:, cell] - np.stack([np.ones(z.size), z, z**2])
+        own_mean, own_spread = self._pooled_moments(
+            other_sums, pooled_variance[cell], self.floor[cell]
+        )
         deviation = (z - own_mean) / own_spread
         largest = np.full(self.records, self.kept)
         np.maximum.at(
@@ -215,7 +217,7 @@ class _ScoreSums:
             variance = (
                 np.maximum(second - count * mean**2, 0.0) + self.pooled_records * pooled_variance
             ) / (count + self.pooled_records)
-        known = count > 1
-        return np.where(known, mean, np.nan), np.where(
-            known, np.maximum(np.sqrt(variance), floor), np.nan
+        is_measured = count > 1
+        return np.where(is_measured, mean, np.nan), np.where(
+            is_measured, np.maximum(np.sqrt(variance), floor), np.nan
         )

@@ -91,9 +91,9 @@ def draw_shared_spectra(
         mixed = np.einsum("bfij,jkbf->ikbf", shared.root, _bartlett_factor(axis_shape, rng))
         power[record] = (mixed.real**2 + mixed.imag**2).sum(axis=1)
         for number, (a, b) in enumerate(shared.pairs):
-            alone = rng.standard_normal((2, *axis_shape.shape[1:])) * unpaired[number]
+            scatter = rng.standard_normal((2, *axis_shape.shape[1:])) * unpaired[number]
             cross[record, number] = (
-                (mixed[a] * mixed[b].conj()).sum(axis=0) + alone[0] + 1j * alone[1]
+                (mixed[a] * mixed[b].conj()).sum(axis=0) + scatter[0] + 1j * scatter[1]
             )
     return power, cross
 
