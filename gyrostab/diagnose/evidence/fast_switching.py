@@ -120,10 +120,12 @@ def switching_evidence(
     n = present.size
     flat = np.where(present, values.ravel(), 0.0)[:, None]
     variance = np.where(present, variance.ravel(), 1.0)
-    own = np.empty((n, 0)) if given is None else _merge_columns(given, merged).reshape(n, -1)
+    effect_columns = (
+        np.empty((n, 0)) if given is None else _merge_columns(given, merged).reshape(n, -1)
+    )
     best: SwitchingEvidence | None = None
     for count in (0, 8):
-        columns_given = np.concatenate([drift_waves(n, count), own], axis=1)
+        columns_given = np.concatenate([drift_waves(n, count), effect_columns], axis=1)
         courses = telegraph_courses(
             flat,
             variance,
@@ -134,7 +136,7 @@ def switching_evidence(
             parts=_PARTS_PER_SUB_BLOCK,
         )
         evidence_nats, beyond = _course_gains(
-            courses, flat, variance, present, own, step, baseline.sel(axis=axis)
+            courses, flat, variance, present, effect_columns, step, baseline.sel(axis=axis)
         )
         evidence_nats -= np.log(2.0)
         share = np.repeat(courses.share[0].reshape(shape), merged, axis=1)
@@ -188,19 +190,21 @@ def _is_like_two_levels(
     )
 
 
-def _count_equal_neighbours(share: Array, least: float) -> Array:
+def _count_equal_neighbours(share: Array, min_share: float) -> Array:
     """Count neighbouring sub-blocks (record,) with equal shares, between the levels."""
-    between = (share > least) & (share < 1.0 - least)
+    between = (share > min_share) & (share < 1.0 - min_share)
     return np.asarray(
-        (between[:, 1:] & between[:, :-1] & (np.abs(np.diff(share, axis=1)) < least)).sum(axis=1)
+        (between[:, 1:] & between[:, :-1] & (np.abs(np.diff(share, axis=1)) < min_share)).sum(
+            axis=1
+        )
     )
 
 
 def _sub_block_means(data: xr.Dataset, baseline: xr.Dataset, axis: str) -> tuple[Array, Array, int]:
     """Return means over sub-blocks, their white variance, and how many are merged in each."""
-    result, known = data.sel(axis=axis), baseline.sel(axis=axis)
-    samples = result["sub_block_samples"].values.astype(np.float64)
-    mean = result["sub_block_mean"].values
+    axis_data, axis_baseline = data.sel(axis=axis), baseline.sel(axis=axis)
+    samples = axis_data["sub_block_samples"].values.astype(np.float64)
+    mean = axis_data["sub_block_mean"].values
     merged = 1
     while samples.size // merged > _MAX_MEANS and merged < samples.shape[1]:
         merged *= 2
@@ -211,19 +215,23 @@ def _sub_block_means(data: xr.Dataset, baseline: xr.Dataset, axis: str) -> tuple
         .sum(axis=2)
     )
     enough = (count >= _MIN_SAMPLE_SHARE * max(np.median(count), 1.0)) & np.isfinite(
-        result["mean"].values
+        axis_data["mean"].values
     )[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
-        values = np.where(enough, total / count, np.nan) - known["known_mean"].values[:, None]
-        variance = (known["mean_variance"].values * result["samples"].values)[:, None] / count
+        values = (
+            np.where(enough, total / count, np.nan) - axis_baseline["known_mean"].values[:, None]
+        )
+        variance = (axis_baseline["mean_variance"].values * axis_data["samples"].values)[
+            :, None
+        ] / count
     return values, np.where(enough, variance, np.nan), merged
 
 
 def _merge_columns(given: Array, merged: int) -> Array:
     """Average columns (block, sub-block, column) over merged sub-blocks; scale to at most one."""
     out = np.nan_to_num(given).reshape(given.shape[0], -1, merged, given.shape[2]).mean(axis=2)
-    most = np.abs(out).max(axis=(0, 1))
-    return np.asarray(out / np.where(most > 0.0, most, 1.0))
+    largest = np.abs(out).max(axis=(0, 1))
+    return np.asarray(out / np.where(largest > 0.0, largest, 1.0))
 
 
 def _course_gains(
@@ -283,12 +291,16 @@ def _normal_log_likelihood(
         )
         usable = present & np.all([np.roll(present, lag) for lag in range(order + 1)], axis=0)
         usable[:order] = False
-        used, others = int(usable.sum()), present & ~usable
+        used, unpredicted = int(usable.sum()), present & ~usable
         if used < n / 2:
             continue
         factor, *_ = np.linalg.lstsq(lags[usable], y[usable], rcond=None)
         log = -0.5 * used * (1.0 + np.log(np.mean((y[usable] - lags[usable] @ factor) ** 2)))
-        log -= 0.5 * others.sum() * (1.0 + np.log(np.mean(y[others] ** 2))) if others.any() else 0.0
+        log -= (
+            0.5 * unpredicted.sum() * (1.0 + np.log(np.mean(y[unpredicted] ** 2)))
+            if unpredicted.any()
+            else 0.0
+        )
         best = max(best, float(log) - 0.5 * order * np.log(n))
     return float(best + constant)
 
@@ -300,8 +312,8 @@ def _slow_noise_grid(baseline: xr.Dataset) -> tuple[Array, Array, Array]:
     switching.
     """
     K, B, free = (baseline[f"grid_{name}"].values for name in ("K", "B", "prior"))
-    least = np.min(B, where=B > 0.0, initial=np.inf)
-    chosen = (B == 0.0) | ((K == 0.0) & (least == B))
+    min_flicker = np.min(B, where=B > 0.0, initial=np.inf)
+    chosen = (B == 0.0) | ((K == 0.0) & (min_flicker == B))
     return K[chosen], B[chosen], free[chosen] - np.logaddexp.reduce(free[chosen])
 
 
@@ -309,10 +321,10 @@ def _white_levels(
     courses: TelegraphCourses, values: Array, variance: Array, present: NDArray[np.bool_]
 ) -> Array:
     """Return white levels to try, over the expected one; some from differences of neighbours."""
-    both = present[1:] & present[:-1]
+    pair_present = present[1:] & present[:-1]
     ratios = [1.0, 2.0, 4.0]
-    for left in (values, values - courses.step[0] * courses.share[0]):
-        square = np.diff(left)[both] ** 2 / (variance[1:] + variance[:-1])[both]
+    for residual in (values, values - courses.step[0] * courses.share[0]):
+        square = np.diff(residual)[pair_present] ** 2 / (variance[1:] + variance[:-1])[pair_present]
         ratios += [
             float(np.mean(square)),
             *(
@@ -379,11 +391,15 @@ def _course_by_sample(share: Array, chosen_blocks: slice, size: int) -> Array:
     pieces = share.shape[1]
     flat = np.clip(share.ravel(), 0.0, 1.0)
     ends = np.concatenate([flat[:1], (flat[1:] + flat[:-1]) / 2.0, flat[-1:]]) > 0.5
-    before, after = (result.reshape(share.shape)[chosen_blocks] for result in (ends[:-1], ends[1:]))
+    starts_upper, ends_upper = (
+        result.reshape(share.shape)[chosen_blocks] for result in (ends[:-1], ends[1:])
+    )
     upper_share = flat.reshape(share.shape)[chosen_blocks]
-    outer = before & after
+    outer = starts_upper & ends_upper
     long = np.where(outer, 1.0 - upper_share, upper_share)
-    begin = np.where(before == after, 0.5 - long / 2.0, np.where(before, 0.0, 1.0 - long))
+    begin = np.where(
+        starts_upper == ends_upper, 0.5 - long / 2.0, np.where(starts_upper, 0.0, 1.0 - long)
+    )
     place = np.arange(size + 1) / size * pieces
     which = np.minimum(place[:-1].astype(np.int64), pieces - 1)
     low, high = place[:-1] - which, place[1:] - which

@@ -142,15 +142,15 @@ def mean_factors(
     white = mean_products(
         values[:, :0], columns, **setup, K=np.zeros(1), B=np.zeros(1), present=present
     )
-    before = (np.where(present[:, None], columns, 0.0) ** 2 / setup["variance"][:, None])[
+    raw_square = (np.where(present[:, None], columns, 0.0) ** 2 / setup["variance"][:, None])[
         present
     ].sum(axis=0)
-    widest_limits = factor_errors(before, np.diagonal(white.gram[0]))[design_width:]
+    widest_limits = factor_errors(raw_square, np.diagonal(white.gram[0]))[design_width:]
     precision = np.diag(
         1.0 / np.square(np.where(widest_limits > 0.0, widest_limits, 1.0) * WIDTHS[-1])
     )
     limits = factor_errors(
-        before[:design_width],
+        raw_square[:design_width],
         np.diagonal(marginalise(white, columns_given.shape[1], precision).gram[0]),
     )
     grid: dict[str, Any] = {
@@ -229,9 +229,9 @@ def with_independent_cells(
     weight = np.where(
         np.isfinite(model.weight) & np.isfinite(model.values).all(axis=2), model.weight, 0.0
     )
-    seen = weight[..., None] > 0.0
+    present = weight[..., None] > 0.0
     values, given, *designs = (
-        remove_common_part(np.where(seen & np.isfinite(array), array, 0.0), weight, common, unit)
+        remove_common_part(np.where(present & np.isfinite(array), array, 0.0), weight, common, unit)
         for array in (model.values, model.given, *model.designs)
     )
     return LinearModel(values, weight, designs, given, model.precision)
@@ -271,10 +271,11 @@ def linear_model_factors(model: LinearModel, folds: xr.DataArray) -> Array:
         )
     total = _sum_products(products)
     design_width = columns.shape[2] - count
-    before = np.asarray(np.diagonal(total.gram[0]))
-    precision = _fill_free_precision(model.precision, before[design_width:])
+    raw_square = np.asarray(np.diagonal(total.gram[0]))
+    precision = _fill_free_precision(model.precision, raw_square[design_width:])
     limits = factor_errors(
-        before[:design_width], np.asarray(np.diagonal(marginalise(total, count, precision).gram[0]))
+        raw_square[:design_width],
+        np.asarray(np.diagonal(marginalise(total, count, precision).gram[0])),
     )
     subset_products = [total]
     for length in range(classes.shape[1]):
@@ -329,6 +330,6 @@ def _add_arrays(arrays: Sequence[Array]) -> Array:
 
 def _fill_free_precision(precision: Array, square: Array) -> Array:
     """Return precisions of given columns, negative ones replaced by the widest prior."""
-    known = np.diagonal(precision)
+    diagonal = np.diagonal(precision)
     free = np.where(square > 0.0, square, 1.0) / WIDTHS[-1] ** 2
-    return np.diag(np.where(known < 0.0, free, known))
+    return np.diag(np.where(diagonal < 0.0, free, diagonal))

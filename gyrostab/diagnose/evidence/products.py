@@ -85,8 +85,8 @@ def factor_errors(before: Array, after: Array) -> Array:
     `before` and `after` are the squares of the columns, without and with the constant and the given
     columns projected out.
     """
-    seen = after > _MIN_SQUARE_SHARE * np.maximum(before, np.finfo(float).tiny)
-    return np.where(seen, 1.0 / np.sqrt(np.where(seen, after, 1.0)), 0.0)
+    is_visible = after > _MIN_SQUARE_SHARE * np.maximum(before, np.finfo(float).tiny)
+    return np.where(is_visible, 1.0 / np.sqrt(np.where(is_visible, after, 1.0)), 0.0)
 
 
 def mean_products(
@@ -157,11 +157,11 @@ def column_pairs(
 
     Each column meets itself, the columns of its design, and the last `given` columns.
     """
-    wanted = np.eye(width, dtype=np.bool_)
-    wanted[:, width - given :] = True
+    is_pair = np.eye(width, dtype=np.bool_)
+    is_pair[:, width - given :] = True
     for chosen in designs:
-        wanted[np.ix_(chosen, chosen)] = True
-    first, second = np.nonzero(np.triu(wanted))
+        is_pair[np.ix_(chosen, chosen)] = True
+    first, second = np.nonzero(np.triu(is_pair))
     return first, second
 
 
@@ -214,13 +214,13 @@ def remove_common_part(
     >>> float((values[0].T @ np.linalg.inv([[0.75, 0.5], [0.5, 1.5]]) @ values[0])[0, 0].round(9))
     6.0
     """
-    one = np.ones_like(weight) if unit is None else unit
-    total = (weight * one**2).sum(axis=1)
-    taken = np.where(total > 0.0, 1.0 - 1.0 / np.sqrt(1.0 + common * total), 0.0) / np.where(
+    cell_unit = np.ones_like(weight) if unit is None else unit
+    total = (weight * cell_unit**2).sum(axis=1)
+    factor = np.where(total > 0.0, 1.0 - 1.0 / np.sqrt(1.0 + common * total), 0.0) / np.where(
         total > 0.0, total, 1.0
     )
-    common_part = np.einsum("bc,bck->bk", weight * one, values) * taken[:, None]
-    return np.asarray(values - one[..., None] * common_part[:, None])
+    common_part = np.einsum("bc,bck->bk", weight * cell_unit, values) * factor[:, None]
+    return np.asarray(values - cell_unit[..., None] * common_part[:, None])
 
 
 def log_evidence(
@@ -316,8 +316,8 @@ def held_out_evidence(
     [8.]
     """
     owner = np.asarray(owner)
-    given = np.ones(owner.size) if weight is None else np.asarray(weight, dtype=np.float64)
-    chance = np.log(given.reshape(owner.size, -1))
+    prior_weight = np.ones(owner.size) if weight is None else np.asarray(weight, dtype=np.float64)
+    chance = np.log(prior_weight.reshape(owner.size, -1))
     out = []
     for candidate in range(int(owner.max()) + 1 if owner.size else 0):
         chosen = owner == candidate

@@ -86,9 +86,9 @@ def hidden_by_grid(blocks: xr.Dataset, name: str) -> NDArray[np.bool_]:
     if name not in _PREDICTED_COUNTS or not coarse.any():
         return coarse & (name in GRID_COUNTS)
     by_axis = np.moveaxis(blocks["kurtosis"].values, -2, 0).reshape(coarse.size, -1)
-    known = np.where(np.isfinite(by_axis).any(axis=1, keepdims=True), by_axis, np.inf)
+    kurtosis = np.where(np.isfinite(by_axis).any(axis=1, keepdims=True), by_axis, np.inf)
     scatter = np.sqrt(24.0 / np.maximum(np.median(blocks["samples"].values, axis=-1), 1.0))
-    is_normal = np.nanquantile(known, _NORMAL_SHARE, axis=1) < _MAX_NORMAL_KURTOSIS * scatter
+    is_normal = np.nanquantile(kurtosis, _NORMAL_SHARE, axis=1) < _MAX_NORMAL_KURTOSIS * scatter
     step = blocks["quantization_step"].values
     return np.asarray(
         coarse & ~(is_normal & (step < _MAX_PREDICTED_SCATTERS * quiescent_scatter(blocks)))
@@ -197,7 +197,7 @@ class CountEvidence:
     @classmethod
     def gathered(cls, expected: ExpectedCounts, rounded: NDArray[np.bool_]) -> CountEvidence:
         """Compute the expected counts from all null records."""
-        found = {}
+        moments = {}
         for name, counts in expected.sums.items():
             if not counts:
                 continue
@@ -205,10 +205,10 @@ class CountEvidence:
             if name == "kurtosis":
                 good = np.isfinite(values)
                 clean = np.where(good, values, np.nan)
-                found[name] = (np.nanmean(clean, axis=(0, 2)), np.nanstd(clean, axis=(0, 2)))
+                moments[name] = (np.nanmean(clean, axis=(0, 2)), np.nanstd(clean, axis=(0, 2)))
             else:
-                found[name] = expected_counts(values)
-        return cls(found, rounded)
+                moments[name] = expected_counts(values)
+        return cls(moments, rounded)
 
 
 def _log_ratio(count: Array, mean: Array) -> Array:

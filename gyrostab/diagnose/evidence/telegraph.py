@@ -130,7 +130,9 @@ def telegraph_courses(
     level = np.quantile((y - plain @ columns_given.T)[:, present], np.unique(starts), axis=1)
     attempts = []
     for start in starts:
-        first, last = (level[int(np.searchsorted(np.unique(starts), one))] for one in start)
+        first, last = (
+            level[int(np.searchsorted(np.unique(starts), quantile))] for quantile in start
+        )
         size = np.concatenate([plain, (last - first)[:, None]], axis=1)
         size[:, 0] += first
         fit = _Fit(size, np.full((len(y), 2), _START_TIME_BLOCKS), np.ones(len(y)))
@@ -170,31 +172,33 @@ class _Fit:
     parts: int = PARTS_PER_BLOCK
 
 
-def _select_by_record(several: Sequence[Array], chosen: NDArray[np.int64]) -> Array:
+def _select_by_record(arrays: Sequence[Array], chosen: NDArray[np.int64]) -> Array:
     """Select for each record one of several arrays over records."""
-    return np.asarray(np.stack(several)[chosen, np.arange(chosen.size)])
+    return np.asarray(np.stack(arrays)[chosen, np.arange(chosen.size)])
 
 
 def _smooth_courses(
     fit: _Fit, y: Array, weight: Array, columns_given: Array
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return log likelihood, share and its square, steps up, and sum of weighted squares."""
-    left = y - fit.size[:, :-1] @ columns_given.T
+    residual = y - fit.size[:, :-1] @ columns_given.T
     step = fit.size[:, -1]
     levels = step[:, None, None] * np.arange(fit.parts + 1) / fit.parts
-    log = -0.5 * (weight / fit.scale[:, None])[..., None] * (left[..., None] - levels) ** 2
-    most = log.max(axis=2)
+    log = -0.5 * (weight / fit.scale[:, None])[..., None] * (residual[..., None] - levels) ** 2
+    largest_log = log.max(axis=2)
     chance, rises = level_tables(fit.times[:, 0], fit.times[:, 1], fit.parts)
     start = fit.times / fit.times.sum(axis=1, keepdims=True)
-    found, share, square, up = levels_smooth(np.exp(log - most[..., None]), chance, rises, start)
-    seen = weight > 0.0
-    found = (
-        found
-        + most.sum(axis=1)
-        + 0.5 * (np.log(weight[seen] / (2.0 * np.pi)).sum() - seen.sum() * np.log(fit.scale))
+    log_likelihood, share, square, up = levels_smooth(
+        np.exp(log - largest_log[..., None]), chance, rises, start
     )
-    away = (left - step[:, None] * share) ** 2 + step[:, None] ** 2 * (square - share**2)
-    return found, share, square, up, away @ weight
+    present = weight > 0.0
+    log_likelihood = (
+        log_likelihood
+        + largest_log.sum(axis=1)
+        + 0.5 * (np.log(weight[present] / (2.0 * np.pi)).sum() - present.sum() * np.log(fit.scale))
+    )
+    away = (residual - step[:, None] * share) ** 2 + step[:, None] ** 2 * (square - share**2)
+    return log_likelihood, share, square, up, away @ weight
 
 
 def _maximise(
@@ -236,12 +240,12 @@ def _maximise(
 def _make_courses(fit: _Fit, y: Array, weight: Array, columns_given: Array) -> TelegraphCourses:
     """Return the courses of a fit, with the upper level above the lower one."""
     log, share, square, up, total = _smooth_courses(fit, y, weight, columns_given)
-    seen = weight > 0.0
+    present = weight > 0.0
     spread = np.maximum(square - share**2, 0.0)
     expected = -0.5 * (
         total / fit.scale
-        - np.log(weight[seen] / (2.0 * np.pi)).sum()
-        + seen.sum() * np.log(fit.scale)
+        - np.log(weight[present] / (2.0 * np.pi)).sum()
+        + present.sum() * np.log(fit.scale)
     )
     switch_count = 2.0 * up + share[:, 0] - share[:, -1]
     turned = fit.size[:, -1] < 0.0
@@ -354,8 +358,8 @@ def telegraph_evidence(
     present = np.asarray(np.isfinite(values).all(axis=1)) & np.isfinite(variance)
     n = present.size
     scaled_given = np.empty((n, 0)) if given is None else np.where(np.isfinite(given), given, 0.0)
-    most = np.abs(scaled_given).max(axis=0)
-    scaled_given = scaled_given / np.where(most > 0.0, most, 1.0)
+    largest = np.abs(scaled_given).max(axis=0)
+    scaled_given = scaled_given / np.where(largest > 0.0, largest, 1.0)
     setup: dict[str, Any] = {
         "variance": variance,
         "step": float(data["end"][0] - data["begin"][0]),
@@ -369,18 +373,18 @@ def telegraph_evidence(
     safe = np.where(present[:, None], values, 0.0)
     attempts = []
     for count in _DRIFT_WAVES:
-        found = telegraph_courses(
+        courses = telegraph_courses(
             safe, variance, present, np.concatenate([drift_waves(n, count), scaled_given], axis=1)
         )
         worth = _course_evidence_by_record(
-            found, safe, scaled_given, setup, grid, log_weight
+            courses, safe, scaled_given, setup, grid, log_weight
         ) - np.log(len(_DRIFT_WAVES))
-        has_switches = found.switch_count >= settings.min_switches
-        attempts.append((np.where(has_switches, worth, -np.inf), found))
+        has_switches = courses.switch_count >= settings.min_switches
+        attempts.append((np.where(has_switches, worth, -np.inf), courses))
     chosen = np.argmax([evidence_nats for evidence_nats, _ in attempts], axis=0)
     best = TelegraphCourses(
         *(
-            _select_by_record([getattr(one, item.name) for _, one in attempts], chosen)
+            _select_by_record([getattr(courses, item.name) for _, courses in attempts], chosen)
             for item in fields(TelegraphCourses)
         )
     )
@@ -393,7 +397,7 @@ def drift_waves(n: int, count: int) -> Array:
 
 
 def _course_evidence_by_record(
-    found: TelegraphCourses,
+    courses: TelegraphCourses,
     values: Array,
     given: Array,
     setup: dict[str, Any],
@@ -402,9 +406,9 @@ def _course_evidence_by_record(
 ) -> Array:
     """Return the evidence of the courses minus their cost; their scatter counts as a datum."""
     records, columns_given = values.shape[1], given.shape[1]
-    columns = np.concatenate([found.share.T, given], axis=1)
+    columns = np.concatenate([courses.share.T, given], axis=1)
     present, variance = setup["present"], setup["variance"]
-    scatter = found.spread @ np.where(present, 1.0 / np.where(present, variance, 1.0), 0.0)
+    scatter = courses.spread @ np.where(present, 1.0 / np.where(present, variance, 1.0), 0.0)
     white = mean_products(values[:, :0], columns, **setup, K=np.zeros(1), B=np.zeros(1))
     square = np.diagonal(white.gram[0])
     wide = np.where(square[records:] > 0.0, square[records:], 1.0) / WIDTHS[-1] ** 2
@@ -418,7 +422,7 @@ def _course_evidence_by_record(
     for r in range(records):
         none, two = course_evidence(products, r, scatter[r], weight, unit=usual[r])
         out[r] = two - none
-    return out - found.cost
+    return out - courses.cost
 
 
 def course_evidence(

@@ -91,17 +91,19 @@ def compare_visits(
     present = np.isfinite(y)
     parts = share.reshape(y.size, -1)
     levels = [
-        visit_columns(one.ravel()).reshape(-1, *parts.shape).mean(axis=2)
-        for one in (parts, 1.0 - parts)
+        visit_columns(level_share.ravel()).reshape(-1, *parts.shape).mean(axis=2)
+        for level_share in (parts, 1.0 - parts)
     ]
-    switch_count = max(sum(len(one) for one in levels) - 1, 0)
+    switch_count = max(sum(len(visits) for visits in levels) - 1, 0)
     course = parts.mean(axis=1)
     if switch_count > y.size:
         return Visits(-np.inf, switch_count, course[None])
-    known = np.empty((y.size, 0)) if given is None else np.where(np.isfinite(given), given, 0.0)
-    size = np.abs(known).max(axis=0, initial=0.0)
+    effect_columns = (
+        np.empty((y.size, 0)) if given is None else np.where(np.isfinite(given), given, 0.0)
+    )
+    size = np.abs(effect_columns).max(axis=0, initial=0.0)
     columns = np.column_stack(
-        [course, known / np.where(size > 0.0, size, 1.0), *(one.T for one in levels)]
+        [course, effect_columns / np.where(size > 0.0, size, 1.0), *(visits.T for visits in levels)]
     )
     grid: dict[str, Any] = {
         name: baseline[f"grid_{name}"].sel(axis=axis).values for name in ("K", "B")
@@ -115,14 +117,17 @@ def compare_visits(
         wander=expected_processes(baseline, axis),
         **grid,
     )
-    own, log_weight = 1 + known.shape[1], baseline["grid_prior"].sel(axis=axis).values
-    same, step = _log_evidence(products, np.arange(own), own, 0.0, log_weight)
-    first = own + np.cumsum([0, *(len(one) for one in levels)])
+    base_count, log_weight = (
+        1 + effect_columns.shape[1],
+        baseline["grid_prior"].sel(axis=axis).values,
+    )
+    same, step = _log_evidence(products, np.arange(base_count), base_count, 0.0, log_weight)
+    first = base_count + np.cumsum([0, *(len(visits) for visits in levels)])
     free = [
         _log_evidence(
             products,
-            np.concatenate([np.arange(own), np.arange(begin, end)]),
-            own,
+            np.concatenate([np.arange(base_count), np.arange(begin, end)]),
+            base_count,
             (_SCATTER * step) ** 2,
             log_weight,
         )[0]
@@ -133,7 +138,11 @@ def compare_visits(
 
 
 def _log_evidence(
-    products: Products, chosen: NDArray[np.int64], own: int, variance: float, log_weight: Array
+    products: Products,
+    chosen: NDArray[np.int64],
+    base_count: int,
+    variance: float,
+    log_weight: Array,
 ) -> tuple[float, float]:
     """Return the log evidence of columns, those after `own` with a prior variance; and the step."""
     part = Products(
@@ -142,10 +151,10 @@ def _log_evidence(
         products.gram[:, chosen[:, None], chosen],
         products.log_determinant,
     )
-    width = chosen.size - own
+    width = chosen.size - base_count
     if width:
         part = marginalise(part, width, np.eye(width) / variance)
-    ridge = 1e-9 * (1.0 + np.trace(part.gram, axis1=1, axis2=2))[:, None, None] * np.eye(own)
+    ridge = 1e-9 * (1.0 + np.trace(part.gram, axis1=1, axis2=2))[:, None, None] * np.eye(base_count)
     gram = part.gram + ridge
     mean = np.linalg.solve(gram, part.cross)[:, :, 0]
     log = log_weight - 0.5 * (

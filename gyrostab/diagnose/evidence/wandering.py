@@ -43,13 +43,13 @@ def expected_processes(baseline: xr.Dataset, axis: str | int) -> RandomProcesses
     """
     if "wander_square" not in baseline:
         return RandomProcesses(np.empty(0), np.empty(0), np.zeros(baseline.sizes["block"]))
-    own = baseline[["wander_square", "wander_time", "wander_walk"]]
-    own = own.isel(axis=axis) if isinstance(axis, int) else own.sel(axis=axis)
-    active = own["wander_square"].values > 0.0
+    processes = baseline[["wander_square", "wander_time", "wander_walk"]]
+    processes = processes.isel(axis=axis) if isinstance(axis, int) else processes.sel(axis=axis)
+    active = processes["wander_square"].values > 0.0
     return RandomProcesses(
-        own["wander_square"].values[active],
-        own["wander_time"].values[active],
-        own["wander_walk"].values,
+        processes["wander_square"].values[active],
+        processes["wander_time"].values[active],
+        processes["wander_walk"].values,
     )
 
 

@@ -98,8 +98,8 @@ def locate_mismatches(
     for statistic in STATISTICS:
         if statistic.name in null.statistics:
             find = _locate_mean_regions if statistic.is_linear_in_means else _locate_regions
-            seen = statistic.prepare(blocks, baseline, regions)
-            regions += find(statistic, seen, baseline, null, level, settings)
+            prepared = statistic.prepare(blocks, baseline, regions)
+            regions += find(statistic, prepared, baseline, null, level, settings)
     merged = merge_regions(regions, settings=settings)
     return _make_table(merged[:MAX_MISMATCHES], blocks, null, level)
 
@@ -117,16 +117,16 @@ def _locate_regions(
     if scores is None:
         return []
     z, critical = standardise(scores, null.statistics[name]), null.critical(name, level)
-    found = []
+    regions = []
     for row in range(z.shape[0]):
-        left = z[row].copy()
+        remaining = z[row].copy()
         for _ in range(MAX_PER_ROW):
-            region = _take_region(statistic, scores, row, left, z[row], critical, settings)
+            region = _take_region(statistic, scores, row, remaining, z[row], critical, settings)
             if region is None:
                 break
             region["p_value"] = float(null.p_value(name, region["z"]))
-            found.append(region)
-    return found
+            regions.append(region)
+    return regions
 
 
 def _locate_mean_regions(
@@ -142,11 +142,11 @@ def _locate_mean_regions(
     A step at one place shifts the mean of the whole record.
     """
     name = statistic.name
-    critical, found = null.critical(name, level), []
-    known = baseline["known_mean"].copy(deep=True)
+    critical, regions = null.critical(name, level), []
+    known_mean = baseline["known_mean"].copy(deep=True)
     open_rows = set(range(blocks.sizes["axis"]))
     for _ in range(MAX_PER_ROW):
-        now = baseline.assign(known_mean=known)
+        now = baseline.assign(known_mean=known_mean)
         scores = statistic.score(blocks, now)
         if scores is None:
             break
@@ -164,29 +164,29 @@ def _locate_mean_regions(
                 "estimate": region_mean(blocks, now, row, inside),
                 "tau_max_s": max(region["end"] - region["begin"], region["tau_min_s"]),
             }
-            known.values[row] += np.where(inside, region["estimate"], 0.0)
-            found.append(region)
+            known_mean.values[row] += np.where(inside, region["estimate"], 0.0)
+            regions.append(region)
         if not open_rows:
             break
-    return merge_wandering_regions(found, settings=settings)
+    return merge_wandering_regions(regions, settings=settings)
 
 
 def _take_region(
     statistic: Statistic,
     scores: xr.Dataset,
     row: int,
-    left: Array,
+    remaining: Array,
     z: Array,
     critical: float,
     settings: Settings,
 ) -> dict[str, Any] | None:
     """Return the region around the largest score left, or None; remove it from `left`."""
-    if not np.isfinite(left).any() or np.nanmax(np.abs(left)) < critical:
+    if not np.isfinite(remaining).any() or np.nanmax(np.abs(remaining)) < critical:
         return None
-    window, column = np.unravel_index(np.nanargmax(np.abs(left)), left.shape)
-    sign = 1.0 if left[window, column] > 0 else -1.0
+    window, column = np.unravel_index(np.nanargmax(np.abs(remaining)), remaining.shape)
+    sign = 1.0 if remaining[window, column] > 0 else -1.0
     free = np.where(
-        np.isfinite(left[:, column]) | np.isnan(z[:, column]), z[:, column], 0.0
+        np.isfinite(remaining[:, column]) | np.isnan(z[:, column]), z[:, column], 0.0
     )  # explained windows do not count
     begin, end, fine = _find_span(scores, free * sign, int(window), settings)
     combined, ratio = _combine_windows(scores, row, z * sign, fine, int(window))
@@ -205,7 +205,7 @@ def _take_region(
         "z": float(
             sign
             * max(
-                abs(left[window, column]),
+                abs(remaining[window, column]),
                 combined[column] if np.isfinite(combined[column]) else 0.0,
             )
         ),
@@ -216,7 +216,7 @@ def _take_region(
     }
     overlap = (scores["begin"].values < end - 1e-9) & (scores["end"].values > begin + 1e-9)
     overlap[window] = True
-    left[np.ix_(overlap, reach)] = np.nan
+    remaining[np.ix_(overlap, reach)] = np.nan
     return region
 
 
@@ -231,8 +231,8 @@ def _find_span(
     first, stop = scores["first"].values, scores["stop"].values
     begin, end = scores["begin"].values, scores["end"].values
     fine = _disjoint_windows(first, stop, np.flatnonzero(np.isfinite(z)))
-    near = 3 * (stop[window] - first[window])
-    fine = fine[(stop[fine] > first[window] - near) & (first[fine] < stop[window] + near)]
+    reach = 3 * (stop[window] - first[window])
+    fine = fine[(stop[fine] > first[window] - reach) & (first[fine] < stop[window] + reach)]
     total = np.concatenate([[0.0], np.cumsum(z[fine])])
     best, low, high = -np.inf, 0, fine.size
     for count in range(1, fine.size + 1):
@@ -285,11 +285,11 @@ def _combine_windows(
     A column without short windows has those of the window itself.
     """
     ratio = scores["ratio"].values[row]
-    known = np.isfinite(z[fine])
-    count = known.sum(axis=0)
+    present = np.isfinite(z[fine])
+    count = present.sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        combined = np.where(known, z[fine], 0.0).sum(axis=0) / np.sqrt(count)
-        mean = np.where(known, ratio[fine], 0.0).sum(axis=0) / count
+        combined = np.where(present, z[fine], 0.0).sum(axis=0) / np.sqrt(count)
+        mean = np.where(present, ratio[fine], 0.0).sum(axis=0) / count
     coarse = 2 * count < fine.size
     return np.where(coarse, z[window], combined), np.where(coarse, ratio[window], mean)
 
@@ -303,23 +303,23 @@ def _find_columns(
     settings: Settings,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the columns of a region, and those that it explains."""
-    what, low, high = (scores[name].values for name in ("what", "tau_min_s", "tau_max_s"))
+    kinds, low, high = (scores[name].values for name in ("what", "tau_min_s", "tau_max_s"))
     above = np.nan_to_num(combined) > settings.clear_sigma
-    if what[column] == "level":  # of all averaging times: the region has those above the noise
-        seen = np.flatnonzero(above & (what == "avar"))
-        return (seen if seen.size else np.array([column])), np.arange(what.size)
+    if kinds[column] == "level":  # of all averaging times: the region has those above the noise
+        avar_columns = np.flatnonzero(above & (kinds == "avar"))
+        return (avar_columns if avar_columns.size else np.array([column])), np.arange(kinds.size)
     lower = upper = column
-    while lower > 0 and above[lower - 1] and what[lower - 1] == what[column]:
+    while lower > 0 and above[lower - 1] and kinds[lower - 1] == kinds[column]:
         lower -= 1
-    while upper + 1 < what.size and above[upper + 1] and what[upper + 1] == what[column]:
+    while upper + 1 < kinds.size and above[upper + 1] and kinds[upper + 1] == kinds[column]:
         upper += 1
     grown = np.arange(lower, upper + 1)
     excess = np.abs(ratio - 1.0) if statistic.is_ratio else np.abs(combined)
     region = grown[excess[grown] >= settings.region_excess_share * excess[column]]
-    beside = LEAK_LINES if what[column] == "line" else 0
-    if what[column] == "line":
+    margin = LEAK_LINES if kinds[column] == "line" else 0
+    if kinds[column] == "line":
         return np.array([column]), np.arange(
-            max(lower - beside, 0), min(upper + beside + 1, what.size)
+            max(lower - margin, 0), min(upper + margin + 1, kinds.size)
         )
     overlap = (low <= high[grown].max() * 1.01) & (high >= low[grown].min() * 0.99)
     return region, np.flatnonzero(overlap)

@@ -36,9 +36,9 @@ def merge_regions(regions: Sequence[Region], *, settings: Settings = DEFAULTS) -
     >>> [(merged["axes"], merged["end"]) for merged in merge_regions([region, on_y, later])]
     [('x y', 90.0)]
     """
-    kept: list[Region] = []
-    for region in sorted(regions, key=lambda one: (one["p_value"], -abs(one["z"]))):
-        for other in kept:
+    merged: list[Region] = []
+    for region in sorted(regions, key=lambda region: (region["p_value"], -abs(region["z"]))):
+        for other in merged:
             if not _are_alike(region, other, settings):
                 continue
             if _common_share(region, other) > settings.majority_share or _are_adjacent(
@@ -47,26 +47,26 @@ def merge_regions(regions: Sequence[Region], *, settings: Settings = DEFAULTS) -
                 _extend_region(other, region, settings)
                 break
         else:
-            kept.append(dict(region))
-    return kept
+            merged.append(dict(region))
+    return merged
 
 
-def _are_alike(one: Region, other: Region, settings: Settings) -> bool:
+def _are_alike(region: Region, other: Region, settings: Settings) -> bool:
     """Return whether statistic, direction, and averaging times or line are the same."""
-    if one["view"] != other["view"] or (
-        one["sign"] != other["sign"] and one["view"] != "cross_axis"
+    if region["view"] != other["view"] or (
+        region["sign"] != other["sign"] and region["view"] != "cross_axis"
     ):
         return False
-    if one["what"] == "line" or other["what"] == "line":
+    if region["what"] == "line" or other["what"] == "line":
         return bool(
-            one["what"] == other["what"]
-            and abs(one["frequency"] / other["frequency"] - 1.0) < settings.line_width_share
+            region["what"] == other["what"]
+            and abs(region["frequency"] / other["frequency"] - 1.0) < settings.line_width_share
         )
-    if _kind_of(one) != _kind_of(other):
+    if _kind_of(region) != _kind_of(other):
         return False
     return bool(
-        min(one["tau_max_s"], other["tau_max_s"])
-        >= TAU_TOLERANCE * max(one["tau_min_s"], other["tau_min_s"])
+        min(region["tau_max_s"], other["tau_max_s"])
+        >= TAU_TOLERANCE * max(region["tau_min_s"], other["tau_min_s"])
     )
 
 
@@ -80,22 +80,22 @@ def _kind_of(region: Region) -> str:
     return kind if kind in _SEPARATE_KINDS else ""
 
 
-def _common_share(one: Region, other: Region) -> float:
+def _common_share(region: Region, other: Region) -> float:
     """Return the time in common as a share of the time that both span."""
-    common = min(one["end"], other["end"]) - max(one["begin"], other["begin"])
-    return float(common / (max(one["end"], other["end"]) - min(one["begin"], other["begin"])))
+    common = min(region["end"], other["end"]) - max(region["begin"], other["begin"])
+    return float(common / (max(region["end"], other["end"]) - min(region["begin"], other["begin"])))
 
 
-def _are_adjacent(one: Region, other: Region, settings: Settings) -> bool:
+def _are_adjacent(region: Region, other: Region, settings: Settings) -> bool:
     """Return whether two regions of the same axes are adjacent."""
     if (
-        not set(one["axes"].split()) <= set(other["axes"].split())
-        or not find_statistic(one["statistic"]).grows_in_time
+        not set(region["axes"].split()) <= set(other["axes"].split())
+        or not find_statistic(region["statistic"]).grows_in_time
     ):
         return False
-    shorter, longer = sorted([one["end"] - one["begin"], other["end"] - other["begin"]])
+    shorter, longer = sorted([region["end"] - region["begin"], other["end"] - other["begin"]])
     return bool(
-        max(one["begin"], other["begin"]) - min(one["end"], other["end"])
+        max(region["begin"], other["begin"]) - min(region["end"], other["end"])
         <= min(settings.gap_time_share * longer, shorter) + 1e-6
     )
 
@@ -129,7 +129,7 @@ def merge_wandering_regions(
     regions : sequence of dict
         Regions of the mean, one axis each.
     """
-    found = []
+    merged = []
     for axes in dict.fromkeys(region["axes"] for region in regions):
         mine = [region for region in regions if region["axes"] == axes]
         if len(mine) > settings.max_mean_regions:
@@ -137,5 +137,5 @@ def merge_wandering_regions(
             begin = min(region["begin"] for region in mine)
             end = max(region["end"] for region in mine)
             mine = [largest | {"sign": 0, "begin": begin, "end": end, "tau_max_s": end - begin}]
-        found += mine
-    return found
+        merged += mine
+    return merged
