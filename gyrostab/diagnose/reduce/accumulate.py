@@ -78,12 +78,12 @@ class Accumulator:
         rows = self.rows = self.axes + len(self.channels)
         self.edges = kernel.band_edges(length)
         self.weights = kernel.taper(length)
-        whole = np.ones((1, length), bool)
-        self.full, mask, squared = kernel.gap_spectra(whole, self.weights)
+        all_present = np.ones((1, length), bool)
+        self.full, mask, squared = kernel.gap_spectra(all_present, self.weights)
         self.full_shape = kernel.shape_of_bands(
             mask, squared, self.full, np.array([length]), self.edges, length
         )[0]
-        self.full_neighbours = _neighbour_share(whole, self.weights)[0]
+        self.full_neighbours = _neighbour_share(all_present, self.weights)[0]
         bands = self.edges.size - 1
         self.moments = np.full((rows, block_count, 5), np.nan)
         self.counts = np.zeros((rows, block_count, 9), np.int64)
@@ -150,14 +150,14 @@ class Accumulator:
                 self.counts[row, block_range],
             )
             if row < self.axes:
-                found = find_peaks(batch.values[row], self.histogram[row, block_range])
+                peaks = find_peaks(batch.values[row], self.histogram[row, block_range])
                 is_sent = present[row] & (batch.values[row] != 0.0)
                 kernel.resent_samples(
                     np.where(is_sent, batch.values[row].view(np.int64), 0),
                     _MIN_RESENT,
                     self.resent[row, block_range],
                 )
-                self.peaks[row].append(found._replace(block=found.block + batch.first))
+                self.peaks[row].append(peaks._replace(block=peaks.block + batch.first))
         self._add_spectra(block_range, centred, present)
         self.sines.add(batch.values[: self.axes].reshape(self.axes, -1))
         self.common_zeros[:, block_range] = simultaneous_zeros(batch.values[: self.axes])
@@ -213,10 +213,10 @@ class Accumulator:
         low, high = self.ramp_range
         moved = np.diff(phase, axis=1) / (high - low)
         moved -= np.round(moved)
-        known = np.isfinite(moved)
-        total = np.where(known, moved, 0.0).sum(axis=1)
+        finite = np.isfinite(moved)
+        total = np.where(finite, moved, 0.0).sum(axis=1)
         self.ramp_turns[block_range] = (
-            np.where(known.any(axis=1), total / np.maximum(known.sum(axis=1), 1), np.nan)
+            np.where(finite.any(axis=1), total / np.maximum(finite.sum(axis=1), 1), np.nan)
             * self.rate
         )
 
@@ -251,15 +251,15 @@ class Accumulator:
             if row < self.axes:
                 self._add_line_spectra(row, block_range, spectra[row], table, place, used[row])
         for number, (a, b) in enumerate(self.pairs):
-            both = np.count_nonzero(present[a] & present[b], axis=-1)
+            joint_count = np.count_nonzero(present[a] & present[b], axis=-1)
             cross = kernel.band_powers(
                 spectra[a], spectra[b], tables[a], places[a], self.edges, self.rate
             )
-            differ = (both != counts[a]) | (both != counts[b])
+            differ = (joint_count != counts[a]) | (joint_count != counts[b])
             differ &= used[a] & used[b]
             self.cross_shape[number, block_range] = self.shape[a, block_range]
             self.cross_neighbours[number, block_range] = self.neighbours[a, block_range]
-            self.cross_samples[number, block_range] = both
+            self.cross_samples[number, block_range] = joint_count
             if differ.any():
                 joint = (present[a] & present[b])[differ]
                 cross[differ], self.cross_shape[number, block_range][differ] = self._joint_spectra(
@@ -269,7 +269,7 @@ class Accumulator:
                     joint, self.weights
                 )
             cross[~(used[a] & used[b])] = np.nan
-            cross[both < max(_MIN_SPECTRUM_SHARE * self.length, 2)] = np.nan
+            cross[joint_count < max(_MIN_SPECTRUM_SHARE * self.length, 2)] = np.nan
             self.cross[number, block_range] = cross
 
     def _tabulate_masks(
@@ -334,17 +334,21 @@ class Accumulator:
         if enough.any():
             present, centred = present[enough], centred[:, enough]
             centred = _subtract_mean(centred, present)
-            one, other = np.fft.rfft(centred * self.weights, axis=-1)[
+            spectrum, other_spectrum = np.fft.rfft(centred * self.weights, axis=-1)[
                 ..., 1 : kernel.ordinates(self.length) + 1
             ]
             expected, mask, squared = kernel.gap_spectra(present, self.weights)
-            cross, *own = (
+            cross, *powers = (
                 kernel.band_powers(
                     *pair, expected, np.arange(present.shape[0]), self.edges, self.rate
                 )
-                for pair in ((one, other), (one, one), (other, other))
+                for pair in (
+                    (spectrum, other_spectrum),
+                    (spectrum, spectrum),
+                    (other_spectrum, other_spectrum),
+                )
             )
-            joint = own[0].real * own[1].real
+            joint = powers[0].real * powers[1].real
             scale = np.divide(
                 power[:, enough].prod(axis=0), joint, out=np.zeros_like(joint), where=joint > 0.0
             )
@@ -385,14 +389,16 @@ class Accumulator:
         counts = self.counts[: self.axes, block_range, 0]
         enough = turned & (counts >= max(_MIN_SPECTRUM_SHARE * self.length, 2))
         wheels = [np.exp(-2j * math.pi * harmonic * turns) for harmonic in HARMONICS]
-        present, left = centred != 0.0, centred  # missing samples count as zero
+        present, residual = centred != 0.0, centred  # missing samples count as zero
         with np.errstate(invalid="ignore", divide="ignore"):
             for number, wheel in enumerate(wheels):
                 value = 2.0 * np.einsum("abi,bi->ab", centred, wheel) / counts
                 self.order[:, block_range, number] = np.where(enough, value, np.nan)
-                left = left - np.where(present, (value[..., None] * np.conj(wheel)).real, 0.0)
+                residual = residual - np.where(
+                    present, (value[..., None] * np.conj(wheel)).real, 0.0
+                )
             for number, wheel in enumerate(wheels):
-                level = _power_near_order(left * wheel, often, HARMONICS[number]) / (
+                level = _power_near_order(residual * wheel, often, HARMONICS[number]) / (
                     counts * self.rate
                 )
                 self.order_level[:, block_range, number] = np.where(enough, level, np.nan)
@@ -413,8 +419,8 @@ def _power_near_order(turned: NDArray[np.complex128], often: Array, harmonic: in
     neighbours = np.concatenate([-np.arange(*_NEIGHBOUR_TURNS)[::-1], np.arange(*_NEIGHBOUR_TURNS)])
     power = np.abs(np.fft.fft(turned, axis=-1)[..., neighbours]) ** 2
     place = np.abs(harmonic * often[:, None] + neighbours)
-    taken = np.abs(often)[:, None, None] * np.array([0, *HARMONICS])
-    free = (np.abs(place[..., None] - taken) >= _MIN_TURNS_APART).all(axis=-1)
+    removed = np.abs(often)[:, None, None] * np.array([0, *HARMONICS])
+    free = (np.abs(place[..., None] - removed) >= _MIN_TURNS_APART).all(axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray((power * free).sum(axis=-1) / free.sum(axis=-1))
 
@@ -443,14 +449,14 @@ def _find_rotation_source(log: xr.Dataset) -> tuple[Source | None, float]:
         or not np.isfinite(_finite_range(log[name].data)).all()
     ):
         return None, 1.0
-    wanted = parse_unit(INNER[name])
+    inner_unit = parse_unit(INNER[name])
     try:
-        found = parse_unit(str(log[name].attrs.get("units")))
+        log_unit = parse_unit(str(log[name].attrs.get("units")))
     except UnitError:
         return None, 1.0
     return (
-        (make_source(log, name), found.factor / wanted.factor)
-        if found.quantity == wanted.quantity
+        (make_source(log, name), log_unit.factor / inner_unit.factor)
+        if log_unit.quantity == inner_unit.quantity
         else (None, 1.0)
     )
 

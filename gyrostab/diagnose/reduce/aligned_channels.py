@@ -308,13 +308,15 @@ def _take_nearest(
     instants: Stamps, stamps: Stamps, values: Array, reach: float, period: float
 ) -> Array:
     """Return the nearest value of each instant, NaN beyond reach."""
-    after = (
+    following = (
         np.clip(np.searchsorted(stamps, instants), 1, stamps.size - 1)
         if stamps.size > 1
         else np.zeros(instants.size, np.int64)
     )
-    before = np.maximum(after - 1, 0)
-    place = np.where(instants - stamps[before] <= stamps[after] - instants, before, after)
+    preceding = np.maximum(following - 1, 0)
+    place = np.where(
+        instants - stamps[preceding] <= stamps[following] - instants, preceding, following
+    )
     return np.where(np.abs(instants - stamps[place]) <= reach, values[place], np.nan)
 
 
@@ -328,16 +330,16 @@ def _interpolate_linearly(
     hold_previous: bool,
 ) -> Array:
     """Interpolate linearly, or hold the previous value; NaN across gaps longer than reach."""
-    after = np.searchsorted(stamps, instants, side="left")
-    inside = (after < stamps.size) & (
-        (after > 0) | (stamps[np.minimum(after, stamps.size - 1)] == instants)
+    following = np.searchsorted(stamps, instants, side="left")
+    inside = (following < stamps.size) & (
+        (following > 0) | (stamps[np.minimum(following, stamps.size - 1)] == instants)
     )
-    high = np.clip(after, 0, stamps.size - 1)
+    high = np.clip(following, 0, stamps.size - 1)
     low = np.where(stamps[high] == instants, high, np.maximum(high - 1, 0))
-    near = inside & (stamps[high] - stamps[low] <= reach)
+    within_reach = inside & (stamps[high] - stamps[low] <= reach)
     share = (instants - stamps[low]) / np.maximum(stamps[high] - stamps[low], 1)
     line = values[low] + (0.0 if hold_previous else share) * (values[high] - values[low])
-    return np.where(near, line, np.nan)
+    return np.where(within_reach, line, np.nan)
 
 
 def _average_around(

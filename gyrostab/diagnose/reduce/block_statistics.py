@@ -48,10 +48,10 @@ def block_samples(size: int, rate: float, block: Any = None) -> int:
     (2000, 800, 100)
     """
     if block is None:
-        wanted = max(
+        default_length = max(
             min(_BLOCK_S * rate, size / _MIN_DEFAULT_BLOCKS), size / _MAX_BLOCKS, _MIN_BLOCK_SAMPLES
         )
-        length = _round_to_small_primes(int(wanted))
+        length = _round_to_small_primes(int(default_length))
     else:
         length = samples(block, rate, "block")
         if length < 16:
@@ -60,11 +60,11 @@ def block_samples(size: int, rate: float, block: Any = None) -> int:
                 f"a block needs 16 ({16 / rate:g} s) at least"
             )
     if size < MIN_BLOCKS * length:
-        what = f"{MIN_BLOCKS} blocks of {length / rate:g} s"
+        minimum = f"{MIN_BLOCKS} blocks of {length / rate:g} s"
         raise OptionError(
             f"the record of {size / rate:.4g} s ({size} samples at {rate:g} Hz) "
             "is too short to diagnose: "
-            f"it must hold {what}, {MIN_BLOCKS * length / rate:g} s at least"
+            f"it must hold {minimum}, {MIN_BLOCKS * length / rate:g} s at least"
             + ("; give a shorter block" if block is not None else "")
         )
     return length
@@ -73,11 +73,11 @@ def block_samples(size: int, rate: float, block: Any = None) -> int:
 def _round_to_small_primes(length: int) -> int:
     """Return the largest even product of 2, 3 and 5 up to `length`."""
     while True:
-        rest = length
+        cofactor = length
         for prime in (2, 3, 5):
-            while rest % prime == 0:
-                rest //= prime
-        if rest == 1 and length % 2 == 0:
+            while cofactor % prime == 0:
+                cofactor //= prime
+        if cofactor == 1 and length % 2 == 0:
             return length
         length -= 1
 

@@ -113,9 +113,9 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
     )
 
 
-def _kept_values(work: Accumulator, row: int, most: int | None = None) -> Array:
-    """Return the kept samples of an axis, up to `most` of each block."""
-    return np.concatenate([kept[row][:most] for kept in work.kept_samples])
+def _kept_values(work: Accumulator, row: int, max_per_block: int | None = None) -> Array:
+    """Return the kept samples of an axis, up to `max_per_block` of each block."""
+    return np.concatenate([samples[row][:max_per_block] for samples in work.kept_samples])
 
 
 def _sub_block_means(work: Accumulator) -> dict[str, Any]:
@@ -139,14 +139,15 @@ def _equal_block_share(
     """
     good = np.isfinite(power) & np.isfinite(shape) & (shape > 0.0)
     ordinates = np.where(good, shape, 0.0)
-    known = np.where(good, power, 0.0)
-    usual = (ordinates * known).sum(axis=1, keepdims=True) / np.maximum(
+    usable_power = np.where(good, power, 0.0)
+    usual = (ordinates * usable_power).sum(axis=1, keepdims=True) / np.maximum(
         ordinates.sum(axis=1, keepdims=True), 1e-300
     )
     total = np.maximum(ordinates.sum(axis=2), 1e-300)
-    level = (ordinates * np.divide(known, usual, out=np.zeros_like(known), where=usual > 0.0)).sum(
-        axis=2
-    ) / total
+    level = (
+        ordinates
+        * np.divide(usable_power, usual, out=np.zeros_like(usable_power), where=usual > 0.0)
+    ).sum(axis=2) / total
     out = np.ones((len(power), part_count))
     for part in range(part_count):
         in_part = np.arange(power.shape[1]) * part_count // power.shape[1] == part
@@ -198,13 +199,13 @@ def _count_stuck(
 def _cross_spectra(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
     """Return cross-spectra of the axes, and of each axis with the channels on the log's time."""
     axes = work.axes
-    own = [number for number, (_, other) in enumerate(work.pairs) if other < axes]
+    axis_pairs = [number for number, (_, other) in enumerate(work.pairs) if other < axes]
     variables = label_variables(
         {
-            "cross": work.cross[own],
-            "cross_shape": work.cross_shape[own],
-            "cross_neighbours": work.cross_neighbours[own],
-            "cross_samples": work.cross_samples[own],
+            "cross": work.cross[axis_pairs],
+            "cross_shape": work.cross_shape[axis_pairs],
+            "cross_neighbours": work.cross_neighbours[axis_pairs],
+            "cross_samples": work.cross_samples[axis_pairs],
         }
     )
     if work.channels:
@@ -240,12 +241,14 @@ def _phase_locked_statistics(work: Accumulator) -> dict[str, Any]:
 def _channel_means(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
     """Return block means of the channels; the rms of vibration."""
     variables: dict[str, Any] = {}
-    inside, own = numeric_channels(log)
+    on_log_time, on_own_time = numeric_channels(log)
     edges = grid_times(work.start, work.rate, np.arange(work.block_count + 1) * work.length)
-    for name in (*inside, *own):
+    for name in (*on_log_time, *on_own_time):
         rms = name.startswith("vibration")
-        if name in inside:
-            mean, spread = np.moveaxis(work.moments[work.axes + inside.index(name), :, :2], -1, 0)
+        if name in on_log_time:
+            mean, spread = np.moveaxis(
+                work.moments[work.axes + on_log_time.index(name), :, :2], -1, 0
+            )
             values = np.sqrt(mean**2 + spread) if rms else mean
         else:
             values = channel_means(log, name, edges, rms=rms)
@@ -297,8 +300,8 @@ def _gap_table(work: Accumulator, log: xr.Dataset, restart: float) -> dict[str, 
     gaps = np.array(work.gaps, dtype=np.float64).reshape(-1, 2) / work.rate
     starts = gaps[gaps[:, 1] - gaps[:, 0] >= restart].tolist()
     if "gap_cause" in log.variables:
-        known = log["gap_cause"].values == GAP_CAUSES.index("restart")
-        ends = [to_nanoseconds(log[name].values[known]) for name in ("gap_start", "gap_end")]
+        is_restart = log["gap_cause"].values == GAP_CAUSES.index("restart")
+        ends = [to_nanoseconds(log[name].values[is_restart]) for name in ("gap_start", "gap_end")]
         known_restarts = grid_index(work.start, work.rate, np.stack(ends, axis=-1)) / work.rate
         starts += [
             span

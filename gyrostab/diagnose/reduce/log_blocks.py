@@ -70,9 +70,9 @@ def read_batches(log: xr.Dataset, size: int) -> Iterator[BlockBatch]:
     """
     rows = count_rows(log)
     blocks_per_batch = max(1, _SAMPLES_PER_BATCH // (rows * size))
-    rest, number = np.empty((rows, 0)), 0
+    remainder, number = np.empty((rows, 0)), 0
     for values in _read_rates(log):
-        values = np.concatenate([rest, values], axis=1) if rest.shape[1] else values
+        values = np.concatenate([remainder, values], axis=1) if remainder.shape[1] else values
         block_count = values.shape[1] // size
         for low in range(0, block_count, blocks_per_batch):
             high = min(low + blocks_per_batch, block_count)
@@ -80,7 +80,7 @@ def read_batches(log: xr.Dataset, size: int) -> Iterator[BlockBatch]:
                 number + low, values[:, low * size : high * size].reshape(rows, high - low, size)
             )
         number += block_count
-        rest = values[:, block_count * size :].copy()  # a copy, to free the other values
+        remainder = values[:, block_count * size :].copy()  # a copy, to free the other values
 
 
 def _read_rates(log: xr.Dataset) -> Iterator[Array]:
@@ -93,10 +93,12 @@ def _read_rates(log: xr.Dataset) -> Iterator[Array]:
     for low, high in _split_at_chunks(signal, axes + len(channels)):
         values = _load_rows(signal, channels, low, high)
         if name == "angle":
-            whole = values if last_angle is None else np.concatenate([last_angle, values], axis=1)
-            last_angle = whole[:, -1:].copy()
-            values = whole[:, :-1].copy()
-            values[:axes] = np.diff(whole[:axes], axis=1) * (
+            extended = (
+                values if last_angle is None else np.concatenate([last_angle, values], axis=1)
+            )
+            last_angle = extended[:, -1:].copy()
+            values = extended[:, :-1].copy()
+            values[:axes] = np.diff(extended[:axes], axis=1) * (
                 float(log.attrs["sampling_rate_hz"]) * HOUR
             )
         yield values
@@ -196,15 +198,16 @@ def _interpolate_empty(
 ) -> Array:
     """Interpolate empty intervals between values at most `longest` [ns] apart."""
     middle = edges[:-1] + np.diff(edges) // 2
-    known = source.stamps
-    assert known is not None
-    after = np.searchsorted(known, middle)
-    inside = (after > 0) & (after < known.size)
-    near = inside & (
-        known[np.clip(after, 1, known.size - 1)] - known[np.clip(after - 1, 0, known.size - 2)]
+    stamps = source.stamps
+    assert stamps is not None
+    following = np.searchsorted(stamps, middle)
+    inside = (following > 0) & (following < stamps.size)
+    within_reach = inside & (
+        stamps[np.clip(following, 1, stamps.size - 1)]
+        - stamps[np.clip(following - 1, 0, stamps.size - 2)]
         <= longest
     )
-    fill = np.isnan(means) & near
+    fill = np.isnan(means) & within_reach
     if fill.any():
         means = means.copy()
         means[fill] = source.at(middle[fill], None, None)[0]

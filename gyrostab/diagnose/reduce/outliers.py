@@ -139,20 +139,22 @@ def count_outliers(
         sums[:, np.minimum(block_count + _NEIGHBOUR_BLOCKS + 1, block_count.size)]
         - sums[:, np.maximum(block_count - _NEIGHBOUR_BLOCKS, 0)]
     )
-    own, wide = _deviation_from_median(np.diff(sums, axis=1)), _deviation_from_median(nearby)
-    adjacent = np.pad(own, ((0, 0), (1, 1)))
+    narrow, wide = _deviation_from_median(np.diff(sums, axis=1)), _deviation_from_median(nearby)
+    adjacent = np.pad(narrow, ((0, 0), (1, 1)))
     adjacent = np.maximum(adjacent[:, :-2], adjacent[:, 2:])
-    usual = np.maximum(np.maximum(own, wide), 0.1 * _deviation_from_median(sums[:, -1:]))
+    usual = np.maximum(np.maximum(narrow, wide), 0.1 * _deviation_from_median(sums[:, -1:]))
     scale = np.where(adjacent > _NOISIER_NEIGHBOUR_RATIO * usual, adjacent, usual)
     number, outliers = np.zeros((2, *scale.shape), np.int64)
     for axis, batches in enumerate(found):
         limit = _fluctuating_level_limit(histogram[axis], scale[axis])
-        for one in batches:
-            departure = one.size / np.maximum(scale[axis, one.block], one.level)
-            np.add.at(number[axis], one.block, departure > limit)
+        for batch_peaks in batches:
+            departure = batch_peaks.size / np.maximum(
+                scale[axis, batch_peaks.block], batch_peaks.level
+            )
+            np.add.at(number[axis], batch_peaks.block, departure > limit)
             np.add.at(
                 outliers[axis],
-                one.block,
+                batch_peaks.block,
                 np.where(departure > 2.0 * limit, 3, 1) * (departure > limit),
             )
     return number, outliers
@@ -187,9 +189,12 @@ def _count_between(histogram: NDArray[np.uint32], scale: Array, low: float, high
     )
     tail = ndtr(-edges)
     inside = ndtr(-np.clip(edges, low, high))
-    whole = tail[:, :-1] - tail[:, 1:]
+    bin_probability = tail[:, :-1] - tail[:, 1:]
     share = np.divide(
-        inside[:, :-1] - inside[:, 1:], whole, out=np.zeros_like(whole), where=whole > 0.0
+        inside[:, :-1] - inside[:, 1:],
+        bin_probability,
+        out=np.zeros_like(bin_probability),
+        where=bin_probability > 0.0,
     )
     return float((histogram * share).sum())
 
@@ -197,11 +202,11 @@ def _count_between(histogram: NDArray[np.uint32], scale: Array, low: float, high
 def _deviation_from_median(histogram: NDArray[np.int64]) -> Array:
     """Return the standard deviation from the median, without zeros, which held samples cause."""
     total = np.cumsum(histogram[..., 1:], axis=-1)
-    wanted = total[..., -1] / 2.0
-    number = np.argmax(total >= np.maximum(wanted, 1)[..., None], axis=-1)
+    half = total[..., -1] / 2.0
+    number = np.argmax(total >= np.maximum(half, 1)[..., None], axis=-1)
     inside = np.take_along_axis(histogram, number[..., None] + 1, axis=-1)[..., 0]
-    before = np.take_along_axis(total, number[..., None], axis=-1)[..., 0] - inside
-    share = np.divide(wanted - before, inside, out=np.ones(wanted.shape), where=inside > 0)
+    below = np.take_along_axis(total, number[..., None], axis=-1)[..., 0] - inside
+    share = np.divide(half - below, inside, out=np.ones(half.shape), where=inside > 0)
     return np.asarray(
         np.where(total[..., -1] > 0, histogram_edge(number + 1 + share) / _NORMAL_MEDIAN_ABS, 0.0)
     )
@@ -234,13 +239,13 @@ def simultaneous_zeros(values: Array) -> NDArray[np.int64]:
         return np.zeros(zero.shape[:2], np.int64)
     if len(zero) == 1:
         pair = zero[..., 1:] & zero[..., :-1]
-        found = zero & (
+        is_lost = zero & (
             np.pad(pair, ((0, 0), (0, 0), (1, 0))) | np.pad(pair, ((0, 0), (0, 0), (0, 1)))
         )
     else:
         gone = np.isnan(values)
-        found = zero & (zero | gone).all(axis=0) & (zero.sum(axis=0) > 1)
-    return np.asarray(found.sum(axis=-1))
+        is_lost = zero & (zero | gone).all(axis=0) & (zero.sum(axis=0) > 1)
+    return np.asarray(is_lost.sum(axis=-1))
 
 
 def simultaneous_samples(present: NDArray[np.bool_]) -> dict[tuple[bool, ...], NDArray[np.int64]]:
@@ -271,15 +276,15 @@ def simultaneous_samples(present: NDArray[np.bool_]) -> dict[tuple[bool, ...], N
         return {(True,) * axes: np.asarray(np.count_nonzero(present[0], axis=-1), np.int64)}
     code = (present * (1 << np.arange(axes, dtype=np.int64))[:, None, None]).sum(axis=0)
     kinds, place = np.unique(code, return_inverse=True)
-    each = np.arange(block_count)[:, None] * kinds.size + place.reshape(code.shape)
-    number = np.bincount(each.ravel(), minlength=block_count * kinds.size).reshape(
+    cell = np.arange(block_count)[:, None] * kinds.size + place.reshape(code.shape)
+    number = np.bincount(cell.ravel(), minlength=block_count * kinds.size).reshape(
         block_count, kinds.size
     )
-    found = {
+    number_by_kind = {
         tuple(bool(kind >> axis & 1) for axis in range(axes)): number[:, k]
         for k, kind in enumerate(kinds.tolist())
     }
-    return {kind: found[kind] for kind in sorted(found) if sum(kind) > 1}
+    return {kind: number_by_kind[kind] for kind in sorted(number_by_kind) if sum(kind) > 1}
 
 
 def zeros_beyond_chance(
@@ -329,7 +334,10 @@ def probability_all_zero(share: Array, subset: NDArray[np.bool_]) -> Array:
     The shares of zeros are (..., axis, block).
     """
     return np.asarray(
-        np.stack([np.prod(share[..., np.flatnonzero(one), :], axis=-2) for one in subset], axis=-2)
+        np.stack(
+            [np.prod(share[..., np.flatnonzero(members), :], axis=-2) for members in subset],
+            axis=-2,
+        )
     )
 
 
@@ -355,17 +363,23 @@ def quantization_step(values: Array) -> float:
         return 0.0
     levels, times = np.unique(finite, return_counts=True)
     size = float(np.abs(levels).max())
-    kept = [_frequent_levels(levels, times, rare) for rare in (_MAX_OFF_GRID_SHARE, _SPIKE_SHARE)]
-    for kept_levels in (one for one in kept if one.size) if kept[0].size else (levels,):
+    level_sets = [
+        _frequent_levels(levels, times, rare) for rare in (_MAX_OFF_GRID_SHARE, _SPIKE_SHARE)
+    ]
+    for kept_levels in (
+        (level_set for level_set in level_sets if level_set.size)
+        if level_sets[0].size
+        else (levels,)
+    ):
         # as written in single and in double precision; numbers of the former repeat on any grid
         # that is coarser than their last digit, and those of the latter are that precise
-        for resolution, least in ((2.0**-23, 0.0), (2.0**-52, 2.0**-20)):
+        for resolution, min_step_share in ((2.0**-23, 0.0), (2.0**-52, 2.0**-20)):
             fine = 8.0 * resolution * size
             distances = np.diff(kept_levels)
             distances = distances[distances > fine]
-            if distances.size and (least or distances.size <= 0.8 * finite.size):
+            if distances.size and (min_step_share or distances.size <= 0.8 * finite.size):
                 step = _common_divisor(distances, fine)
-                if step > least * size and (
+                if step > min_step_share * size and (
                     kept_levels is levels
                     or _off_grid_share(levels, times, step, fine) <= _MAX_OFF_GRID_SHARE
                 ):
@@ -383,8 +397,8 @@ def _frequent_levels(levels: Array, times: NDArray[np.int64], rare: float) -> Ar
 def _off_grid_share(levels: Array, times: NDArray[np.int64], step: float, fine: float) -> float:
     """Return the share of values off the grid of this step through the most common value."""
     departure = np.abs(levels - levels[times.argmax()]) / step
-    whole = np.round(departure)
-    off = np.abs(departure - whole) * step > 2.0 * fine * (1.0 + whole)
+    step_count = np.round(departure)
+    off = np.abs(departure - step_count) * step > 2.0 * fine * (1.0 + step_count)
     return float(times[off].sum() / times.sum())
 
 
@@ -392,14 +406,14 @@ def _common_divisor(distances: Array, fine: float) -> float:
     """Return the largest common divisor of distances with `fine` errors; 0 if there is none."""
     step = float(distances.min())
     while step > _MIN_STEP_ERRORS * fine:
-        whole = np.round(distances / step)
+        step_count = np.round(distances / step)
         # Farther distances may be off by their number times the error of the step.
-        nearby = whole < step / (16.0 * fine)
-        rest = np.abs(distances - whole * step)
-        wrong = nearby & (rest > 2.0 * fine * (1.0 + whole))
+        nearby = step_count < step / (16.0 * fine)
+        remainder = np.abs(distances - step_count * step)
+        wrong = nearby & (remainder > 2.0 * fine * (1.0 + step_count))
         if not nearby.any():
             return 0.0
         if not wrong.any():
-            return float(distances[nearby].sum() / whole[nearby].sum())
-        step = float(rest[wrong].min())
+            return float(distances[nearby].sum() / step_count[nearby].sum())
+        step = float(remainder[wrong].min())
     return 0.0

@@ -95,9 +95,9 @@ class SineSearch:
     def add(self, values: Array) -> None:
         """Add the samples (axis, sample) that follow; NaN where missing."""
         while values.shape[1]:
-            taken = min(values.shape[1], self.segment.shape[1] - self.filled)
-            self.segment[:, self.filled : self.filled + taken] = values[:, :taken]
-            self.filled, values = self.filled + taken, values[:, taken:]
+            count = min(values.shape[1], self.segment.shape[1] - self.filled)
+            self.segment[:, self.filled : self.filled + count] = values[:, :count]
+            self.filled, values = self.filled + count, values[:, count:]
             if self.filled == self.segment.shape[1]:
                 self._add_periodograms()
                 self.filled = 0
@@ -140,10 +140,10 @@ class SineSearch:
         }
         best = np.full(lines.size, -np.inf)
         for spectrum in self.spectra:
-            found = self._search_spectrum(spectrum, lines)
-            if found is None:
+            result = self._search_spectrum(spectrum, lines)
+            if result is None:
                 continue
-            place, total, arrays = found
+            place, total, arrays = result
             better = total > best[place]
             best[place[better]] = total[better]
             for name, values in arrays.items():
@@ -179,17 +179,23 @@ class SineSearch:
         chosen = order[last]
         gains = factor[:, chosen] - math.log(2.0)
         sharing = np.maximum((gains > 0.0).sum(axis=0), 1)
-        near = np.clip(
+        neighbours = np.clip(
             chosen[:, None] + np.arange(-_FINER * LEAK_LINES, _FINER * LEAK_LINES + 1),
             0,
             frequency.size - 1,
         )
-        above = power[:, near] - level[:, near]  # (axis, line, near)
+        above = power[:, neighbours] - level[:, neighbours]  # (axis, line, neighbour)
         # Power N and a sine S have the variance N^2 + 2 N S; frequencies within a line are one.
-        variance = np.maximum(2.0 * power[:, near] - level[:, near], level[:, near])
-        noise = np.sqrt(_FINER * (level[:, near] * variance / count[:, near]).sum(axis=-1))
+        variance = np.maximum(
+            2.0 * power[:, neighbours] - level[:, neighbours], level[:, neighbours]
+        )
+        noise = np.sqrt(
+            _FINER * (level[:, neighbours] * variance / count[:, neighbours]).sum(axis=-1)
+        )
         weights = np.maximum(above, 0.0).sum(axis=0)
-        centre = (weights * frequency[near]).sum(axis=-1) / np.maximum(weights.sum(axis=-1), 1e-300)
+        centre = (weights * frequency[neighbours]).sum(axis=-1) / np.maximum(
+            weights.sum(axis=-1), 1e-300
+        )
         arrays = {
             "sine_nats": gains - cost / sharing,
             "sine_frequency": centre,
@@ -218,8 +224,8 @@ def sine_factors(ratio: Array, count: Array | float) -> Array:
     >>> sine_factors(np.array([1.0, 40.0]), 1).round(1).tolist()  # noise, and a sine of 39 nats
     [-2.6, 33.8]
     """
-    each = [
+    log_factors = [
         count * (ratio * strength / (count + strength) - np.log1p(strength / count))
         for strength in _STRENGTHS
     ]
-    return np.asarray(logsumexp(each, axis=0) - math.log(len(_STRENGTHS)))
+    return np.asarray(logsumexp(log_factors, axis=0) - math.log(len(_STRENGTHS)))

@@ -81,14 +81,15 @@ def bin_widths(values: Array, step: float) -> tuple[Array, Array]:
         (count[reach - 1] + count[reach + 1], np.array([-1.5, 1.5])),
     ]
     width, error = np.empty(2), np.empty(2)
-    for bin_index, (seen, at) in enumerate(counted):
+    for bin_index, (bin_count, at) in enumerate(counted):
         columns = _parabola_columns(at, float(reach))
         density = np.exp(columns @ size)
         slope = density @ columns / density.sum()
         usual = float(density.mean() if bin_index == 0 else density.sum())
-        width[bin_index] = seen / usual
+        width[bin_index] = bin_count / usual
         error[bin_index] = np.hypot(
-            np.sqrt(max(seen, 1)) / usual, width[bin_index] * np.sqrt(slope @ covariance @ slope)
+            np.sqrt(max(bin_count, 1)) / usual,
+            width[bin_index] * np.sqrt(slope @ covariance @ slope),
         )
     return width, error
 
@@ -130,9 +131,9 @@ def truncated_axes(blocks: xr.Dataset) -> NDArray[np.bool_]:
     ndarray of bool, shape (axis,)
     """
     quantized = np.asarray(blocks["quantization_step"].values > 0.0)
-    width, error, known = _read_widths(blocks)
-    like_truncation = known & _is_like_truncation(width, error)
-    narrower = known & (
+    width, error, is_measured = _read_widths(blocks)
+    like_truncation = is_measured & _is_like_truncation(width, error)
+    narrower = is_measured & (
         width[:, 0]
         < _TRUNCATED_WIDTHS_STEPS[0]
         - _MAX_MISFIT_STDERRS
@@ -151,9 +152,10 @@ def truncated_axes(blocks: xr.Dataset) -> NDArray[np.bool_]:
 
 def possibly_truncated_axes(blocks: xr.Dataset) -> NDArray[np.bool_]:
     """Find the quantized axes whose bins do not rule out truncation; see `truncated_axes`."""
-    width, error, known = _read_widths(blocks)
+    width, error, is_measured = _read_widths(blocks)
     return np.asarray(
-        (blocks["quantization_step"].values > 0.0) & (~known | _is_like_truncation(width, error))
+        (blocks["quantization_step"].values > 0.0)
+        & (~is_measured | _is_like_truncation(width, error))
     )
 
 
