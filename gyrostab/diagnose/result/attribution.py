@@ -38,11 +38,11 @@ def active_blocks(
     These are all blocks when neither depends on time.
     """
     block_count = blocks.sizes["block"]
-    there = np.zeros(block_count, bool)
+    is_active = np.zeros(block_count, bool)
     for component in identification.components:
         design = component.variant.design
         if component.statistic.is_rotation:
-            there |= _rotating_blocks(blocks, settings)
+            is_active |= _rotating_blocks(blocks, settings)
             continue
         if not component.statistic.has_course or design.size == 0:
             return np.ones(block_count, bool)
@@ -54,9 +54,9 @@ def active_blocks(
             size = size - _rest_level(size, settings)
         size = np.abs(size)
         largest = np.nanmax(size, axis=0, initial=0.0)
-        least = settings.active_share * np.where(largest > 0, largest, np.inf)
-        there |= (size > least).any(axis=1)
-    return there if there.any() else np.ones(block_count, bool)
+        min_size = settings.active_share * np.where(largest > 0, largest, np.inf)
+        is_active |= (size > min_size).any(axis=1)
+    return is_active if is_active.any() else np.ones(block_count, bool)
 
 
 def _rest_level(size: Array, settings: Settings) -> Array:
@@ -141,22 +141,24 @@ def attribute_mismatches(
     ]
     score_with = partial(statistic_scores, still=still, settings=settings)
     scores = score_with(blocks, after, null, regions, identified)
-    known: dict[tuple[int, ...], Scores] = {(): scores}
+    scores_without: dict[tuple[int, ...], Scores] = {(): scores}
 
-    def left(region: Mapping[str, Any], out: Sequence[Identification]) -> tuple[float, float]:
+    def score_without(
+        region: Mapping[str, Any], out: Sequence[Identification]
+    ) -> tuple[float, float]:
         chosen = tuple(
             number
             for number, identification in enumerate(identified)
-            if any(identification is one for one in out)
+            if any(identification is left_out for left_out in out)
         )
-        if chosen not in known and without is not None:
-            rest = [
+        if chosen not in scores_without and without is not None:
+            remaining = [
                 identification
                 for number, identification in enumerate(identified)
                 if number not in chosen
             ]
-            known[chosen] = score_with(blocks, without(out), null, regions, rest)
-        return score_left(region, known[chosen], null, level, settings.score_error_share)
+            scores_without[chosen] = score_with(blocks, without(out), null, regions, remaining)
+        return score_left(region, scores_without[chosen], null, level, settings.score_error_share)
 
     when = [_explained_spans(identification, blocks, settings) for identification in identified]
     moves = [
@@ -195,18 +197,18 @@ def attribute_mismatches(
                 or (
                     without is not None
                     and _is_caused_elsewhere(
-                        region, components, partial(left, region, (identification,))
+                        region, components, partial(score_without, region, (identification,))
                     )
                 )
             ):
                 shown.append((identification, components))
-        several = without is not None and score < limit
-        kept = (
-            needed_effects(region, shown, partial(left, region), settings=settings)
-            if several
+        is_gone = without is not None and score < limit
+        needed = (
+            needed_effects(region, shown, partial(score_without, region), settings=settings)
+            if is_gone
             else [identification for identification, _ in shown]
         )
-        explained.append(list(dict.fromkeys(identification.effect for identification in kept)))
+        explained.append(list(dict.fromkeys(identification.effect for identification in needed)))
     return explained
 
 
@@ -231,20 +233,22 @@ def drop_expected(
         The recording, and the baseline with these effects.
     """
     anomalous = [
-        one
-        for one in expected
+        identification
+        for identification in expected
         if any(
             component.statistic.is_count
             and find_anomalous_blocks(component, blocks, settings).any()
-            for component in one.components
+            for component in identification.components
         )
     ]
-    others = [one for one in expected if one not in anomalous]
+    not_anomalous = [
+        identification for identification in expected if identification not in anomalous
+    ]
     by_count, by_all = (
         attribute_mismatches(
             found, identified, blocks, before, null, level=level, settings=settings
         )
-        for identified in (anomalous, others)
+        for identified in (anomalous, not_anomalous)
     )
     is_expected = [
         bool(named) or (bool(counted) and statistic == "distribution")
@@ -256,7 +260,7 @@ def drop_expected(
 def _is_caused_elsewhere(
     region: Mapping[str, Any],
     components: Sequence[Component],
-    left: Callable[[], tuple[float, float]],
+    score_without: Callable[[], tuple[float, float]],
 ) -> bool:
     """Return whether a mismatch of the mean is due to what an effect does at other times.
 
@@ -267,7 +271,7 @@ def _is_caused_elsewhere(
         component.statistic.is_in_means for component in components
     ):
         return False
-    score, limit = left()
+    score, limit = score_without()
     return score >= limit
 
 
@@ -309,7 +313,7 @@ def _moving_spans(
     """Return the blocks [s] in which an effect moves the rate of an axis within the block."""
     axes = [str(axis) for axis in blocks["axis"].values]
     moving = expect_known_motion(blocks, after, settings=settings)
-    there = np.zeros(blocks.sizes["block"], np.bool_)
+    is_moving = np.zeros(blocks.sizes["block"], np.bool_)
     for component in (
         component
         for component in identification.components
@@ -318,9 +322,9 @@ def _moving_spans(
         row = axes.index(component.row[0])
         for column in mean_columns(component.variant, row):
             step = np.abs(np.diff(np.nan_to_num(column)))
-            far = step > settings.active_share * step.max(initial=0.0)
-            there |= moving[row] & (np.append(far, False) | np.append(False, far))
+            is_step = step > settings.active_share * step.max(initial=0.0)
+            is_moving |= moving[row] & (np.append(is_step, False) | np.append(False, is_step))
     return [
         (float(blocks["begin"].values[block]), float(blocks["end"].values[block]))
-        for block in np.flatnonzero(there)
+        for block in np.flatnonzero(is_moving)
     ]

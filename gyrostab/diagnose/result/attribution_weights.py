@@ -44,15 +44,15 @@ def statistic_scores(
     out = []
     blocks = remove_known_motion(blocks, after, settings=settings)
     after = _with_shared_lines(blocks, after, identified := list(identified))
-    seen = mask_anomalous_blocks(blocks, components_of(identified), settings)
+    masked = mask_anomalous_blocks(blocks, components_of(identified), settings)
     turns_left_out = drop_changed_tails(blocks, after["spectrum"].values, settings)
-    lines = seen
+    lines = masked
     if still is not None:
-        lines = seen.assign({name: still[name] for name in ("line_power", "line_weight")})
+        lines = masked.assign({name: still[name] for name in ("line_power", "line_weight")})
     for statistic in STATISTICS:
         if statistic.name not in null.statistics:
             continue
-        judged = seen
+        judged = masked
         if statistic.is_count:
             judged = turns_left_out
         elif statistic.uses_line_spectra:
@@ -80,29 +80,29 @@ def _with_shared_lines(
     ]
     if "cross" not in blocks or len(lines) < 2:
         return after
-    seen, shape = (blocks[name].values for name in ("cross", "cross_shape"))
-    known = after["cross"].values if "cross" in after else np.zeros_like(seen)
-    weight = np.where(np.isfinite(seen) & np.isfinite(shape), shape, 0.0)
+    observed, shape = (blocks[name].values for name in ("cross", "cross_shape"))
+    expected = after["cross"].values if "cross" in after else np.zeros_like(observed)
+    weight = np.where(np.isfinite(observed) & np.isfinite(shape), shape, 0.0)
     total = weight.sum(axis=1)
     mean = np.divide(
-        (np.nan_to_num(seen - known) * weight).sum(axis=1),
+        (np.nan_to_num(observed - expected) * weight).sum(axis=1),
         total,
         out=np.zeros(total.shape, complex),
         where=total > 0.0,
     )
     reach = 1.0 / float(blocks.attrs["block_s"])
-    cross = known.copy()
+    cross = expected.copy()
     for place in {place for place, _ in lines}:
         frequency = float(blocks["line_frequency"].values[place])
         bands = np.flatnonzero(
             (blocks["band_low"].values <= frequency + reach)
             & (frequency - reach < blocks["band_high"].values)
         )
-        axes = {axis for other, axis in lines if other == place}
+        axes = {axis for line_place, axis in lines if line_place == place}
         for number, pair in enumerate(pair_rows(blocks)):
             if set(pair) <= axes:
                 mine = bands[bands > 0]
-                cross[number][:, mine] = known[number][:, mine] + mean[number][mine]
+                cross[number][:, mine] = expected[number][:, mine] + mean[number][mine]
     return after.assign(cross=(("pair", "block", "band"), cross))
 
 
@@ -113,7 +113,7 @@ def score_left(
 
     An error of the form of an effect may leave `error_share` of the score of the mismatch.
     """
-    left, limit = 0.0, np.inf
+    largest_score, limit = 0.0, np.inf
     for name, statistic, z in scores:
         if (
             statistic.attrs["view"] != region["view"]
@@ -134,10 +134,10 @@ def score_left(
         columns &= statistic["tau_min_s"].values <= 1.01 * region["tau_max_s"]
         cells = np.abs(z[np.ix_(rows, inside, columns)])
         if np.isfinite(cells).any():
-            left = max(left, float(np.nanmax(cells)))
+            largest_score = max(largest_score, float(np.nanmax(cells)))
             allowed = error_share * abs(float(region["z"]))
             limit = min(limit, max(null.critical(name, level), allowed))
-    return left, limit
+    return largest_score, limit
 
 
 def needed_effects(
@@ -167,25 +167,27 @@ def needed_effects(
         Takes effects to leave out; returns the score that is left, and the score of a mismatch.
     """
     weighed = [
-        one
-        for one, components in shown
+        identification
+        for identification, components in shown
         if all(_is_weighed(component, region) for component in components)
     ]
     if not weighed or len(shown) < 2:
-        return [one for one, _ in shown]
-    whole = left(())[0]
-    brought = left(weighed)[0] - whole
-    without = [left((one,)) for one in weighed]
+        return [identification for identification, _ in shown]
+    score_with_all = left(())[0]
+    brought = left(weighed)[0] - score_with_all
+    without = [left((identification,)) for identification in weighed]
     fair = settings.needed_share * brought / len(shown)
-    kept = [
+    needed = [
         number
         for number, (score, limit) in enumerate(without)
-        if score >= limit or 0.0 < fair <= score - whole
+        if score >= limit or 0.0 < fair <= score - score_with_all
     ]
-    if not kept and len(weighed) == len(shown):
-        kept = [int(np.argmax([score for score, _ in without]))]
-    dropped = [id(one) for number, one in enumerate(weighed) if number not in kept]
-    return [one for one, _ in shown if id(one) not in dropped]
+    if not needed and len(weighed) == len(shown):
+        needed = [int(np.argmax([score for score, _ in without]))]
+    dropped = [
+        id(identification) for number, identification in enumerate(weighed) if number not in needed
+    ]
+    return [identification for identification, _ in shown if id(identification) not in dropped]
 
 
 def _is_weighed(component: Component, region: Region) -> bool:

@@ -148,10 +148,10 @@ def effect_table(effect: Effect) -> dict[str, Any]:
         table["driver"] = list(effect.driver)
     required = set(kind.required())
     defaults = {name: item.default for name, item in kind.__dataclass_fields__.items()}
-    for known in kind.parameters():
-        value = getattr(effect, known.name)
-        if known.name in required or value != defaults[known.name]:
-            table[known.name] = list(value) if isinstance(value, tuple) else value
+    for parameter in kind.parameters():
+        value = getattr(effect, parameter.name)
+        if parameter.name in required or value != defaults[parameter.name]:
+            table[parameter.name] = list(value) if isinstance(value, tuple) else value
     return table
 
 

@@ -49,15 +49,15 @@ def find_families(
     """
     lines, places = np.unique(np.asarray(frequencies, dtype=np.float64), return_inverse=True)
     labels: dict[int, str] = {}
-    rest = np.arange(lines.size)
-    while rest.size > 1:
+    remaining = np.arange(lines.size)
+    while remaining.size > 1:
         chance, label, members = min(
-            _try_families(lines[rest], resolution, bandwidth), key=lambda one: one[0]
+            _try_families(lines[remaining], resolution, bandwidth), key=lambda family: family[0]
         )
         if chance > MAX_CHANCE:
             break
-        labels |= dict.fromkeys(rest[members].tolist(), label)
-        rest = np.delete(rest, members)
+        labels |= dict.fromkeys(remaining[members].tolist(), label)
+        remaining = np.delete(remaining, members)
     return [labels.get(int(place)) for place in places]
 
 
@@ -73,9 +73,11 @@ def _try_families(
                     lines - centre, abs(line - centre) / order, highest, resolution
                 )
                 share = 2.0 * resolution * min(1.0 / spacing, 2.0 * highest / bandwidth)
-                own = 2 if centre else 1  # lines that define the family
-                tried = math.comb(lines.size, own) * order**2
-                chance = bdtrc(len(members) - own - 1, lines.size - own, min(share, 1.0))
+                defining_count = 2 if centre else 1  # lines that define the family
+                tried = math.comb(lines.size, defining_count) * order**2
+                chance = bdtrc(
+                    len(members) - defining_count - 1, lines.size - defining_count, min(share, 1.0)
+                )
                 label = (
                     f"side bands of {centre:.4g} Hz, {spacing:.4g} Hz apart"
                     if centre

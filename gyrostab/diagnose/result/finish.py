@@ -89,11 +89,11 @@ def finish_diagnosis(task: Task, comparison: Comparison, started: float) -> Diag
         "held_out": {name: held[name] for name in HELD_OUT},
         "seconds": round(time.perf_counter() - started, 3),
     }
-    own = task.simulation if isinstance(task.simulation, Model) else None
+    given_model = task.simulation if isinstance(task.simulation, Model) else None
     diagnosis = Diagnosis(
         plain(content),
         _make_surfaces_with_outliers(blocks, fit, before, after),
-        model_tables(fit.noise, fit.fitted, own, blocks, _turning_axis(task)),
+        model_tables(fit.noise, fit.fitted, given_model, blocks, _turning_axis(task)),
     )
     check_diagnosis(diagnosis.content)
     return diagnosis
@@ -135,10 +135,10 @@ def fit_supported(
             [fitted for fitted in fit.fitted if fitted.identification is identification]
             for identification in fit.identifications.identified
         ]
-        kept = keep_supported(identifications, numbers)
-        if kept is identifications:
+        supported = keep_supported(identifications, numbers)
+        if supported is identifications:
             return identifications, first, fit
-        identifications = kept
+        identifications = supported
 
 
 def refit_with_noise(
@@ -237,7 +237,7 @@ def _attributed_mismatches(
 ) -> list[dict[str, Any]]:
     """Return the mismatches that were located or identified, each with what explains it."""
     blocks = comparison.blocks
-    found = comparison.mismatches
+    mismatches = comparison.mismatches
     identified = fit.identifications.identified
 
     def without(left_out: Sequence[Identification]) -> xr.Dataset:
@@ -245,11 +245,11 @@ def _attributed_mismatches(
 
     lines = (
         lines_without_motion(task, blocks, after)
-        if identified and (found["view"] == "spectrum").any()
+        if identified and (mismatches["view"] == "spectrum").any()
         else None
     )
     explained = attribute_mismatches(
-        found,
+        mismatches,
         identified,
         blocks,
         after,
@@ -259,7 +259,9 @@ def _attributed_mismatches(
         still=lines,
         settings=task.settings,
     )
-    return mismatch_tables(found, explained, fit.identifications, blocks, settings=task.settings)
+    return mismatch_tables(
+        mismatches, explained, fit.identifications, blocks, settings=task.settings
+    )
 
 
 def _make_surfaces_with_outliers(

@@ -137,16 +137,16 @@ def _gains_on_longer_stretches(
     blocks: xr.Dataset, before: Trained, after: Trained, more_gain: float
 ) -> list[Gain]:
     """Return the gains on longer stretches, one for each length."""
-    found = []
+    gains = []
     for fold in fold_blocks(blocks).values[1:]:
-        whole = Gain(more_gain, 2.0 * abs(more_gain))
+        gain = Gain(more_gain, 2.0 * abs(more_gain))
         for number in range(FOLDS):
             held = fold == number
-            whole = whole.plus(
+            gain = gain.plus(
                 _compare_models(blocks, _fit_model(before, ~held), _fit_model(after, ~held), held)
             )
-        found.append(whole)
-    return found
+        gains.append(gain)
+    return gains
 
 
 def cut_stretches(blocks: xr.Dataset) -> Windows:
@@ -216,9 +216,11 @@ def _gain_variance(
     twice the gain.
     """
     power, shape = (blocks[name].values for name in ("power", "shape"))
-    one, other = (baseline["spectrum"].values for baseline in (after, before))
+    spectrum_after, spectrum_before = (baseline["spectrum"].values for baseline in (after, before))
     with np.errstate(divide="ignore", invalid="ignore"):
-        terms = np.square(shape * (1.0 / one - 1.0 / other) * (power - one))[:, held]
+        terms = np.square(
+            shape * (1.0 / spectrum_after - 1.0 / spectrum_before) * (power - spectrum_after)
+        )[:, held]
     by_power = float((_power_terms(blocks, after) - _power_terms(blocks, before))[held].sum())
     return float(terms[np.isfinite(terms)].sum()) + 2.0 * abs(evidence_nats - by_power)
 
@@ -248,24 +250,24 @@ def _cross_terms(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:
     power, shape = (np.moveaxis(blocks[name].values, 0, -1) for name in ("power", "shape"))
     spectrum = np.moveaxis(baseline["spectrum"].values, 0, -1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        both = np.sqrt(spectrum[..., left] * spectrum[..., right])
-        seen = np.moveaxis(blocks["cross"].values, 0, -1) / both
-        model = np.moveaxis(baseline["cross"].values, 0, -1) / both
+        geometric_mean = np.sqrt(spectrum[..., left] * spectrum[..., right])
+        coherency = np.moveaxis(blocks["cross"].values, 0, -1) / geometric_mean
+        model = np.moveaxis(baseline["cross"].values, 0, -1) / geometric_mean
         flat = power / spectrum
     has_data = (
-        np.isfinite(seen).all(axis=-1)
+        np.isfinite(coherency).all(axis=-1)
         & np.isfinite(model).all(axis=-1)
         & np.isfinite(flat).all(axis=-1)
     )
     size = len(axes)
     expected = np.zeros((*has_data.shape, size, size), dtype=np.complex128)
-    found = expected.copy()
+    observed = expected.copy()
     expected[..., range(size), range(size)] = 1.0
-    found[..., range(size), range(size)] = np.where(has_data[..., None], flat, 1.0)
-    for matrix, values in ((expected, model), (found, seen)):
+    observed[..., range(size), range(size)] = np.where(has_data[..., None], flat, 1.0)
+    for matrix, values in ((expected, model), (observed, coherency)):
         values = np.where(has_data[..., None], values, 0.0)
         matrix[..., left, right], matrix[..., right, left] = values, values.conj()
-    trace = np.einsum("...ij,...ji->...", np.linalg.inv(expected) - np.eye(size), found).real
+    trace = np.einsum("...ij,...ji->...", np.linalg.inv(expected) - np.eye(size), observed).real
     weight = np.where(has_data, np.nan_to_num(shape.min(axis=-1)), 0.0)
     return np.asarray((-weight * (np.linalg.slogdet(expected)[1] + trace)).sum(axis=-1))
 
@@ -290,7 +292,7 @@ def _mean_evidence(
             for term in ("K", "B")
         )
         weight = np.zeros(1)
-    found = mean_products(
+    products = mean_products(
         np.where(present, residual, 0.0)[:, None],
         np.empty((residual.size, 0)),
         variance=np.where(present, variance, 1.0),
@@ -300,7 +302,11 @@ def _mean_evidence(
         present=present,
         wander=expected_processes(baseline, axis),
     )
-    log = weight - np.logaddexp.reduce(weight) - 0.5 * (found.square[:, 0] + found.log_determinant)
+    log = (
+        weight
+        - np.logaddexp.reduce(weight)
+        - 0.5 * (products.square[:, 0] + products.log_determinant)
+    )
     return float(np.logaddexp.reduce(log))
 
 
@@ -331,15 +337,17 @@ def _mean_scores(blocks: xr.Dataset, baseline: xr.Dataset, held: Windows) -> Arr
 
 
 def _summarise_scores(squares: dict[str, list[Array]]) -> dict[str, float]:
-    found: dict[str, float] = {}
+    summary: dict[str, float] = {}
     joined = {name: np.concatenate(components) for name, components in squares.items()}
     for name in ("before", "after"):
         cells = joined[name]
-        found[f"misfit_{name}"] = float(cells.mean()) if cells.size else np.nan
-        found[f"coverage95_{name}"] = float((cells < NORMAL_95**2).mean()) if cells.size else np.nan
+        summary[f"misfit_{name}"] = float(cells.mean()) if cells.size else np.nan
+        summary[f"coverage95_{name}"] = (
+            float((cells < NORMAL_95**2).mean()) if cells.size else np.nan
+        )
         means = joined[f"mean_{name}"]
-        found[f"mean_misfit_{name}"] = float(means.mean()) if means.size else np.nan
-    return found
+        summary[f"mean_misfit_{name}"] = float(means.mean()) if means.size else np.nan
+    return summary
 
 
 def select_forecast_start(blocks: xr.Dataset) -> NDArray[np.bool_]:

@@ -24,15 +24,16 @@ def name_probability(identification: Identification, *, settings: Settings = DEF
     >>> name_probability(alone) == DEFAULTS.set_probability
     True
     """
-    own = identification.evidence_nats
-    others = [_evidence_instead(identification, name) for name in identification.alternatives]
-    share = np.exp(own - np.logaddexp.reduce([own, *others]))  # E_k - E may be any number of nats
+    evidence_nats = identification.evidence_nats
+    other_nats = [_evidence_instead(identification, name) for name in identification.alternatives]
+    # E_k - E may be any number of nats.
+    share = np.exp(evidence_nats - np.logaddexp.reduce([evidence_nats, *other_nats]))
     return float(settings.set_probability * share)
 
 
 def _evidence_instead(identification: Identification, effect: str) -> float:
     """Return the evidence of an alternative in the place of an effect [nats]."""
-    found = [
+    nats_instead = [
         nats for key, nats in identification.instead.items() if key.partition("(")[0] == effect
     ]
-    return max(found, default=identification.evidence_nats)
+    return max(nats_instead, default=identification.evidence_nats)

@@ -39,13 +39,19 @@ def supported_axes(fitted: Fitted) -> tuple[str, ...]:
         All axes when no size is measured, as for motion with another form in every band.
     """
     sizes = effects()[fitted.identification.effect].size_parameters
-    measured = {name: one for name, one in fitted.parameters.items() if name.split(".")[0] in sizes}
-    found = []
+    measured = {
+        name: estimate
+        for name, estimate in fitted.parameters.items()
+        if name.split(".")[0] in sizes
+    }
+    axes = []
     for axis in fitted.axes:
-        own = [one for name, one in measured.items() if name.partition(".")[2] in ("", axis)]
-        if not own or not all(has_zero(one) for one in own):
-            found.append(axis)
-    return tuple(found)
+        axis_sizes = [
+            estimate for name, estimate in measured.items() if name.partition(".")[2] in ("", axis)
+        ]
+        if not axis_sizes or not all(has_zero(estimate) for estimate in axis_sizes):
+            axes.append(axis)
+    return tuple(axes)
 
 
 def keep_supported(
@@ -66,24 +72,26 @@ def keep_supported(
     rejected: list[Rejection] = []
     changed = False
     for identification, numbers in zip(identifications.identified, fitted, strict=True):
-        good = {axis for one in numbers for axis in supported_axes(one)}
-        kept = tuple(
+        good = {axis for fitted_effect in numbers for axis in supported_axes(fitted_effect)}
+        supported = tuple(
             component for component in identification.components if set(component.row) <= good
         )
         if set(identification.axes) <= good or not numbers:
             identified.append(identification)
             continue
-        lost = tuple(component for component in identification.components if component not in kept)
-        if sum_evidence(kept) > identification.threshold:
+        lost = tuple(
+            component for component in identification.components if component not in supported
+        )
+        if sum_evidence(supported) > identification.threshold:
             axes = tuple(axis for axis in identification.axes if axis in good)
-            evidence_nats = min(identification.evidence_nats, sum_evidence(kept))
+            evidence_nats = min(identification.evidence_nats, sum_evidence(supported))
             # its alternatives are compared with it, and lose the same axes
-            left = evidence_nats - identification.evidence_nats
-            instead = {key: nats + left for key, nats in identification.instead.items()}
+            change_nats = evidence_nats - identification.evidence_nats
+            instead = {key: nats + change_nats for key, nats in identification.instead.items()}
             identified.append(
                 replace(
                     identification,
-                    components=kept,
+                    components=supported,
                     axes=axes,
                     evidence_nats=evidence_nats,
                     instead=instead,

@@ -50,11 +50,15 @@ def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> 
     for baseline in (before, after):
         noise = allan_surface(blocks, baseline, windows)
         shape = noise["shape"][..., keep]
-        known = _known_avar(blocks, baseline, windows)[..., keep]
+        known_avar = _known_avar(blocks, baseline, windows)[..., keep]
         with np.errstate(invalid="ignore"):
-            avar.append(noise["expected"][..., keep] + known)
-            low.append(noise["expected"][..., keep] * gammaincinv(shape, 0.025) / shape + known)
-            high.append(noise["expected"][..., keep] * gammaincinv(shape, 0.975) / shape + known)
+            avar.append(noise["expected"][..., keep] + known_avar)
+            low.append(
+                noise["expected"][..., keep] * gammaincinv(shape, 0.025) / shape + known_avar
+            )
+            high.append(
+                noise["expected"][..., keep] * gammaincinv(shape, 0.975) / shape + known_avar
+            )
             information = window_means(blocks, baseline, windows)[1]
             error.append(1.0 / np.sqrt(information))
         mean.append(_predicted_means(blocks, baseline, windows))
@@ -73,11 +77,15 @@ def _make_windows(block_count: int) -> Windows:
 def _known_avar(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> Array:
     """Return the Allan variance of the known mean, which that of the noise does not include."""
     means = np.where(np.isfinite(blocks["mean"].values), baseline["known_mean"].values, np.nan)
-    alone = blocks.assign(mean=(("axis", "block"), means))
-    found = allan_surface(alone, baseline.assign(known_mean=baseline["known_mean"] * 0.0), windows)
+    known_only = blocks.assign(mean=(("axis", "block"), means))
+    surface = allan_surface(
+        known_only, baseline.assign(known_mean=baseline["known_mean"] * 0.0), windows
+    )
     return np.asarray(
         np.where(
-            found["columns"]["tau_min_s"] >= float(blocks.attrs["block_s"]), found["observed"], 0.0
+            surface["columns"]["tau_min_s"] >= float(blocks.attrs["block_s"]),
+            surface["observed"],
+            0.0,
         )
     )
 
@@ -95,14 +103,14 @@ def _average_windows(blocks: xr.Dataset, values: Array, windows: Windows) -> Arr
 
 def _predicted_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> Array:
     """Return the window means of the effects plus the constant that fits the recording."""
-    known, mean = baseline["known_mean"].values, blocks["mean"].values
+    known_mean, mean = baseline["known_mean"].values, blocks["mean"].values
     weight = np.where(np.isfinite(mean), 1.0 / baseline["mean_variance"].values, 0.0)
     weight = np.where(np.isfinite(weight), weight, 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        level = (weight * np.nan_to_num(mean - known)).sum(axis=-1, keepdims=True) / weight.sum(
+        level = (weight * np.nan_to_num(mean - known_mean)).sum(
             axis=-1, keepdims=True
-        )
-    return _average_windows(blocks, known + level, windows)
+        ) / weight.sum(axis=-1, keepdims=True)
+    return _average_windows(blocks, known_mean + level, windows)
 
 
 def _attach_labels(

@@ -103,20 +103,21 @@ def baseline_table(baseline: xr.Dataset, expected: Sequence[Fitted]) -> dict[str
                 "unit": LAWS[str(term)].label,
             }
     spans = baseline.attrs.get("calibrated_on", [])
-    known = [
+    expected_effects = [
         {
-            "name": one.identification.effect,
-            "axes": list(one.axes),
-            "statement": one.say() or unsized_statement(one.identification.effect, one.axes),
+            "name": fitted_effect.identification.effect,
+            "axes": list(fitted_effect.axes),
+            "statement": fitted_effect.say()
+            or unsized_statement(fitted_effect.identification.effect, fitted_effect.axes),
         }
-        for one in expected
+        for fitted_effect in expected
     ]
     table = {
         "source": baseline.attrs["source"],
         "noise": noise,
         "calibrated_on": [list(span) for span in spans],
     }
-    return {**table, "expected": known} if known else table
+    return {**table, "expected": expected_effects} if expected_effects else table
 
 
 def _mismatch(
@@ -163,16 +164,16 @@ def mismatch_tables(
 
 
 def _located_mismatches(
-    found: xr.Dataset, blocks: xr.Dataset, explained: Sequence[Sequence[str]]
+    mismatches: xr.Dataset, blocks: xr.Dataset, explained: Sequence[Sequence[str]]
 ) -> list[dict[str, Any]]:
     """Return the located mismatches."""
-    whole = float(blocks["end"].values[-1])
+    record_s = float(blocks["end"].values[-1])
     out = []
     for number, names in enumerate(explained):
         region = {
-            str(name): found[name].values[number].item()
-            for name in found.data_vars
-            if found[name].dtype.kind != "M"
+            str(name): mismatches[name].values[number].item()
+            for name in mismatches.data_vars
+            if mismatches[name].dtype.kind != "M"
         }
         region["axes"] = str(region["axes"]).split()
         out.append(
@@ -183,7 +184,7 @@ def _located_mismatches(
                 (region["begin"], region["end"]),
                 (region["tau_min_s"], region["tau_max_s"]),
                 region["p_value"],
-                mismatch_statement(region, whole),
+                mismatch_statement(region, record_s),
                 ratio=region["ratio"],
                 explained_by=names,
             )
@@ -205,23 +206,39 @@ def identified_mismatches(
     """
     out: list[dict[str, Any]] = []
     begin, end = blocks["begin"].values, blocks["end"].values
-    for one in identifications.identified:
+    for identification in identifications.identified:
         if any(
-            one.effect in region["explained_by"] and set(region["axes"]) & set(one.axes)
+            identification.effect in region["explained_by"]
+            and set(region["axes"]) & set(identification.axes)
             for region in known
         ):
             continue
-        strongest = max(one.components, key=lambda component: component.evidence_nats)
+        strongest = max(identification.components, key=lambda component: component.evidence_nats)
         view = strongest.statistic.view
         taus = strongest.statistic.averaging_times(strongest, blocks)
-        p_value = tail_probability(identifications.null_best, one.evidence_nats, settings=settings)
-        for span in join_blocks(active_blocks(one, blocks, settings=settings), begin, end):
+        p_value = tail_probability(
+            identifications.null_best, identification.evidence_nats, settings=settings
+        )
+        for span in join_blocks(
+            active_blocks(identification, blocks, settings=settings), begin, end
+        ):
             text = named_statement(
-                view, one.effect, one.axes, span_text(*span, float(end[-1])), p_value
+                view,
+                identification.effect,
+                identification.axes,
+                span_text(*span, float(end[-1])),
+                p_value,
             )
             out.append(
                 _mismatch(
-                    blocks, view, one.axes, span, taus, p_value, text, explained_by=[one.effect]
+                    blocks,
+                    view,
+                    identification.axes,
+                    span,
+                    taus,
+                    p_value,
+                    text,
+                    explained_by=[identification.effect],
                 )
             )
     return out
@@ -234,43 +251,45 @@ def unidentified_mismatches(
     out: list[dict[str, Any]] = []
     rate, block = float(blocks.attrs["sampling_rate_hz"]), float(blocks.attrs["block_s"])
     longest = float(blocks["end"].values[-1]) / 2.0
-    for one in identifications.unknown:
-        view = _NUISANCE_VIEWS.get(one.generic, "davar")
+    for unidentified in identifications.unknown:
+        view = _NUISANCE_VIEWS.get(unidentified.generic, "davar")
         if any(
             region["view"] == view
-            and set(region["axes"]) & set(one.axes)
+            and set(region["axes"]) & set(unidentified.axes)
             and not region["explained_by"]
             for region in known
         ):
             continue
         p_value = tail_probability(
-            identifications.null_best, one.evidence_nats, settings=identifications.state.settings
+            identifications.null_best,
+            unidentified.evidence_nats,
+            settings=identifications.state.settings,
         )
-        candidates = ", ".join(plain_name(name) for name in one.candidates)
+        candidates = ", ".join(plain_name(name) for name in unidentified.candidates)
         nearest = f"; the closest candidates are {candidates}" if candidates else ""
-        what = NUISANCE_ALTERNATIVES.get(one.generic, "something differs")
-        begin, end, when = _find_event(one, blocks)
+        description = NUISANCE_ALTERNATIVES.get(unidentified.generic, "something differs")
+        begin, end, when = _find_event(unidentified, blocks)
         text = (
-            f"On {axes_text(one.axes)} {what}{when}; no known effect explains it{nearest} "
-            f"({chance(p_value)})."
+            f"On {axes_text(unidentified.axes)} {description}{when}; no known effect "
+            f"explains it{nearest} ({chance(p_value)})."
         )
         taus = (block, longest) if view == "mean" else (1.0 / rate, block)
-        out.append(_mismatch(blocks, view, one.axes, (begin, end), taus, p_value, text))
+        out.append(_mismatch(blocks, view, unidentified.axes, (begin, end), taus, p_value, text))
     return out
 
 
-def _find_event(one: Unidentified, blocks: xr.Dataset) -> tuple[float, float, str]:
+def _find_event(unidentified: Unidentified, blocks: xr.Dataset) -> tuple[float, float, str]:
     """Return begin and end [s] of an unidentified event with their text, or the whole record."""
-    whole = float(blocks["end"].values[-1])
-    found = [
+    record_s = float(blocks["end"].values[-1])
+    spans = [
         (component.variant.values["begin"], component.variant.values["end"])
-        for component in one.components
+        for component in unidentified.components
         if "begin" in component.variant.values
     ]
-    if not found:
-        return float(blocks["begin"].values[0]), whole, ""
-    begin, end = min(first for first, _ in found), max(last for _, last in found)
-    return begin, end, f", {span_text(begin, end, whole)}"
+    if not spans:
+        return float(blocks["begin"].values[0]), record_s, ""
+    begin, end = min(first for first, _ in spans), max(last for _, last in spans)
+    return begin, end, f", {span_text(begin, end, record_s)}"
 
 
 def motion_mismatches(
@@ -331,18 +350,20 @@ def effect_tables(
     """
     begin, end = blocks["begin"].values, blocks["end"].values
     out = []
-    for one, family in zip(fitted, _families_of(fitted, blocks), strict=True):
-        identification = one.identification
+    for fitted_effect, family in zip(fitted, _families_of(fitted, blocks), strict=True):
+        identification = fitted_effect.identification
         acting = active_blocks(identification, blocks, settings=settings)
         when = join_blocks(acting, begin, end)
-        whole = float(end[-1])
+        record_s = float(end[-1])
         out.append(
             {
                 "name": identification.effect,
-                "axes": list(one.axes),
+                "axes": list(fitted_effect.axes),
                 "driver": ",".join(filter(None, identification.driver)) or None,
                 "intervals": [[iso(blocks, low), iso(blocks, high)] for low, high in when],
-                "parameters": {name: asdict(estimate) for name, estimate in one.parameters.items()},
+                "parameters": {
+                    name: asdict(estimate) for name, estimate in fitted_effect.parameters.items()
+                },
                 "held_out_gain": {
                     "nats": identification.evidence_nats,
                     "stderr": math.sqrt(2.0 * max(identification.evidence_nats, 0.0)),
@@ -352,11 +373,12 @@ def effect_tables(
                 "probability": round(name_probability(identification, settings=settings), 3),
                 "family": family,
                 "statement": effect_statement(
-                    one.say() or unsized_statement(identification.effect, one.axes),
+                    fitted_effect.say()
+                    or unsized_statement(identification.effect, fitted_effect.axes),
                     alternatives=identification.alternatives,
                     intervals=[]
-                    if when == [(float(begin[0]), whole)]
-                    else [span_text(*span, whole) for span in when],
+                    if when == [(float(begin[0]), record_s)]
+                    else [span_text(*span, record_s) for span in when],
                 ),
             }
         )
@@ -367,18 +389,19 @@ def _families_of(fitted: Sequence[Fitted], blocks: xr.Dataset) -> list[str | Non
     """Return the family of each effect that is a line at a frequency; None for others."""
     lines = [
         number
-        for number, one in enumerate(fitted)
-        if are_lines(one.identification.components) and "frequency" in one.parameters
+        for number, fitted_effect in enumerate(fitted)
+        if are_lines(fitted_effect.identification.components)
+        and "frequency" in fitted_effect.parameters
     ]
     families: list[str | None] = [None] * len(fitted)
     if len(lines) > 1:
         frequencies = [fitted[number].parameters["frequency"].value for number in lines]
-        found = find_families(
+        labels = find_families(
             frequencies,
             resolution=float(np.diff(blocks["line_frequency"].values[:2])[0]),
             bandwidth=0.5 * float(blocks.attrs["sampling_rate_hz"]),
         )
-        for number, family in zip(lines, group_unrelated(found), strict=True):
+        for number, family in zip(lines, group_unrelated(labels), strict=True):
             families[number] = family
     return families
 
@@ -386,18 +409,25 @@ def _families_of(fitted: Sequence[Fitted], blocks: xr.Dataset) -> list[str | Non
 def limit_tables(found: Mapping[str, UpperLimit]) -> dict[str, Any]:
     """Return the upper limit of each effect that was not found, and why it was not."""
     return {
-        name: {"upper_limit": one.upper_limit, "unit": one.unit, "reason": one.reason}
-        for name, one in found.items()
+        name: {"upper_limit": limit.upper_limit, "unit": limit.unit, "reason": limit.reason}
+        for name, limit in found.items()
     }
 
 
 def rejected_tables(identifications: Identifications) -> list[dict[str, Any]]:
     """Return what beats each effect that was examined and not named, the closest first."""
-    named = {one.effect for one in identifications.identified}
+    named = {identification.effect for identification in identifications.identified}
     return [
-        {"name": one.effect, "axes": list(one.axes), "beaten_by": one.beaten_by, "nats": one.nats}
-        for one in sorted(identifications.rejected, key=lambda one: (one.nats, one.effect))
-        if one.effect not in named
+        {
+            "name": rejection.effect,
+            "axes": list(rejection.axes),
+            "beaten_by": rejection.beaten_by,
+            "nats": rejection.nats,
+        }
+        for rejection in sorted(
+            identifications.rejected, key=lambda rejection: (rejection.nats, rejection.effect)
+        )
+        if rejection.effect not in named
     ]
 
 
@@ -424,26 +454,28 @@ def model_tables(
         }
         for axis in baseline["axis"].values
     }
-    before = list(own.effects) if own is not None else []
-    found = [one.effect for one in fitted if one.effect is not None]
+    given_effects = list(own.effects) if own is not None else []
+    added_effects = [
+        fitted_effect.effect for fitted_effect in fitted if fitted_effect.effect is not None
+    ]
     if baseline.attrs.get("source") == "calibrated":
         rate = float(blocks.attrs["sampling_rate_hz"])
-        for axis, variance in noise_lost_by_truncation(blocks, found).items():
+        for axis, variance in noise_lost_by_truncation(blocks, added_effects).items():
             square = max(noise[axis]["N"] ** 2 + variance / (HOUR * rate), 0.0)
             noise[axis]["N"] = float(f"{math.sqrt(square):.6g}")
     instrument = max(
         [
             int(own.log.get("oversampling", 1)) if own is not None else 1,
-            *map(_instrument_samples, found),
+            *map(_instrument_samples, added_effects),
         ]
     )
     log = {"log": {"oversampling": instrument}} if instrument > 1 else {}
-    rates = constant_rates(blocks, [*before, *found], turning)
+    rates = constant_rates(blocks, [*given_effects, *added_effects], turning)
     return {
         **log,
         "noise": noise,
         "bias": {axis: float(f"{rate:.6g}") for axis, rate in rates.items()},
-        "effect": [effect_table(effect) for effect in [*before, *found]],
+        "effect": [effect_table(effect) for effect in [*given_effects, *added_effects]],
     }
 
 
@@ -466,7 +498,7 @@ def surfaces_with_blocks(
     with np.errstate(invalid="ignore"):
         cases = [blocks["power"], before["spectrum"], after["spectrum"]]
         has_data = np.isfinite(blocks["power"].values)
-        density = np.stack([_average_where(one.values, has_data) for one in cases])
+        density = np.stack([_average_where(case.values, has_data) for case in cases])
         lines = blocks["line_power"].weighted(blocks["line_weight"].fillna(0.0)).mean("part")
     step = max(1, lines.sizes["line"] // MAX_LINES)
     lines = lines.coarsen(line=step, boundary="trim").max() if step > 1 else lines

@@ -276,7 +276,7 @@ def family_text(strongest: Mapping[str, Any], others: Sequence[Mapping[str, Any]
     >>> family_text({"family": "harmonics of 12.5 Hz"}, lines)
     'It is the strongest of the harmonics of 12.5 Hz; the others are at 25 and 37.5 Hz.'
     """
-    at = sorted({f"{one['parameters']['frequency']['value']:.4g}" for one in others}, key=float)
+    at = sorted({f"{line['parameters']['frequency']['value']:.4g}" for line in others}, key=float)
     are = "other is" if len(at) == 1 else "others are"
     return f"It is the strongest of the {strongest['family']}; the {are} at {join_words(at)} Hz."
 
@@ -296,10 +296,10 @@ def rejection_text(beaten_by: str, nats: float | None) -> str:
         return "" if nats is None else f"{nats:.1f} {short}"
     if nats is None:
         return f"it would need {beaten_by}"
-    other = plain_name(beaten_by) if beaten_by in effects() else beaten_by
+    winner = plain_name(beaten_by) if beaten_by in effects() else beaten_by
     if nats < 0.0:
-        return f"{other} comes first, although it explains {-nats:.1f} nats less"
-    return f"{other} explains {nats:.1f} nats more"
+        return f"{winner} comes first, although it explains {-nats:.1f} nats less"
+    return f"{winner} explains {nats:.1f} nats more"
 
 
 def next_measurement(name: str, alternatives: Sequence[str]) -> str:
@@ -312,12 +312,14 @@ def next_measurement(name: str, alternatives: Sequence[str]) -> str:
      rectification does not.'
     """
     names = (name, *alternatives)
-    known = {other: effects()[other].next_measurement for other in names if other in effects()}
-    steps = list(dict.fromkeys(filter(None, map(known.get, names[:3]))))
+    measurements = {
+        effect: effects()[effect].next_measurement for effect in names if effect in effects()
+    }
+    steps = list(dict.fromkeys(filter(None, map(measurements.get, names[:3]))))
     if not steps:
         return ""
     if {"vibration_rectification", "g_sensitivity"} <= set(names):
-        steps = [known[name]]  # either measurement separates the two
+        steps = [measurements[name]]  # either measurement separates the two
     if alternatives:
         return f"To tell them apart, {'; or '.join(steps[:2])}."
     return f"To confirm it, {steps[0]}."
@@ -352,11 +354,11 @@ def summary(content: Mapping[str, Any]) -> str:
         )
     if content["verdict"] == "unknown":
         return f"{differs}. The effects that were found do not explain {them}: {names}.{doubt}"
-    left = len(content["unexplained"])
-    if not left:
+    unexplained_count = len(content["unexplained"])
+    if not unexplained_count:
         return f"{differs}. Explanation: {names}.{doubt}"
-    rest = "1 place is" if left == 1 else f"{left} places are"
-    return f"{differs}. Partial explanation: {names}. {rest} not explained.{doubt}"
+    remainder = "1 place is" if unexplained_count == 1 else f"{unexplained_count} places are"
+    return f"{differs}. Partial explanation: {names}. {remainder} not explained.{doubt}"
 
 
 def _list_effects(named: Sequence[Mapping[str, Any]]) -> str:
@@ -367,13 +369,13 @@ def _list_effects(named: Sequence[Mapping[str, Any]]) -> str:
     >>> _list_effects([{"name": "warm_up", "axes": [axis], "family": None} for axis in "xy"])
     'warm-up after power-on, on axes x and y'
     """
-    found: dict[tuple[str, str], list[Sequence[str]]] = {}
+    axes_by_name: dict[tuple[str, str], list[Sequence[str]]] = {}
     for effect, *others in group_families(named):
         lines = f" ({effect['family']}, {len(others) + 1} lines)" if others else ""
-        found.setdefault((plain_name(effect["name"]), lines), []).append(effect["axes"])
+        axes_by_name.setdefault((plain_name(effect["name"]), lines), []).append(effect["axes"])
     texts = []
-    for (name, lines), axes in found.items():
-        together = [axis for several in axes for axis in several]
+    for (name, lines), axes in axes_by_name.items():
+        together = [axis for effect_axes in axes for axis in effect_axes]
         if len(set(together)) == len(together):
             texts.append(f"{name}, on {axes_text(sorted(together))}{lines}")
             continue
