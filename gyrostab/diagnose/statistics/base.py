@@ -219,7 +219,7 @@ class Statistic:
             if not is_given and trial.rng is not None:
                 model = simulate_noise(model, trial.rng, trial.data.sizes["record"])
             factors.append(linear_model_factors(model, trial.folds)[:, 1:])
-            spread = factors[-1].shape[1] // sum(len(one.variants) for one in group)
+            spread = factors[-1].shape[1] // sum(len(candidate.variants) for candidate in group)
         return collect_evidence(group, rows, factors, spread)
 
     # ---------------------------------------------------------------------- in the model
@@ -251,8 +251,8 @@ class Statistic:
         free, means : list of ndarray
             Powers and means of free size.
         """
-        given = self.condition(state, component).given
-        return 0.0, given.get(("power", axis), []), given.get(("mean", axis), [])
+        columns = self.condition(state, component).given
+        return 0.0, columns.get(("power", axis), []), columns.get(("mean", axis), [])
 
     def has_power_of_effect(self, component: Component, state: State) -> bool:
         """Return whether only the effect itself, and no column, gives the power of a component."""
@@ -298,7 +298,7 @@ class Statistic:
                 out[key], fit.likeliest[key] = size, likeliest
             out |= nuisance
             points.append(dict(variant.values))
-        if all(one == points[0] for one in points):
+        if all(point == points[0] for point in points):
             fit.likeliest.update(points[0] if points else {})
         else:  # axes that differ in a common parameter
             fit.likeliest.clear()
@@ -338,5 +338,5 @@ def _square_root(square: float, sd: float) -> tuple[float, float]:
 
 def column_choices(columns: Sequence[str]) -> list[tuple[str, ...]]:
     """Return each parameter alone, and all together."""
-    alone: list[tuple[str, ...]] = [(name,) for name in columns]
-    return alone if len(alone) < 2 else [*alone, tuple(columns)]
+    single_columns: list[tuple[str, ...]] = [(name,) for name in columns]
+    return single_columns if len(single_columns) < 2 else [*single_columns, tuple(columns)]

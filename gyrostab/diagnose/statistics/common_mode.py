@@ -129,10 +129,10 @@ def _whiten_means(
         variance = np.where(present, white[axis] + b**2 * faster, 1.0)
         series = residual[..., axis, :].reshape(-1, residual.shape[-1])
         columns = np.ascontiguousarray(np.where(present, series, 0.0).T)
-        known = expected_processes(baseline, axis)
-        states = np.append(b**2 * share, known.square), np.append(times, known.time)
+        processes = expected_processes(baseline, axis)
+        states = np.append(b**2 * share, processes.square), np.append(times, processes.time)
         whitened, _ = whiten(
-            columns, variance, end - begin, present, k**2 / HOUR + known.walk, *states
+            columns, variance, end - begin, present, k**2 / HOUR + processes.walk, *states
         )
         increments[..., axis, :] = whitened.T.reshape(increments[..., axis, :].shape)
     return increments
@@ -220,8 +220,10 @@ def _score_all_axes(r: Array, count: Array, pairs: list[tuple[int, int]], axes: 
     matrix = np.broadcast_to(np.eye(axes), (*r.shape[:-3], *r.shape[-2:], axes, axes)).copy()
     for place, (a, b) in enumerate(pairs):
         matrix[..., a, b] = matrix[..., b, a] = r[..., place, :, :]
-    known = np.asarray(np.isfinite(matrix).all(axis=(-2, -1)))
-    sign, logarithm = np.linalg.slogdet(np.where(known[..., None, None], matrix, np.eye(axes)))
+    is_complete = np.asarray(np.isfinite(matrix).all(axis=(-2, -1)))
+    sign, logarithm = np.linalg.slogdet(
+        np.where(is_complete[..., None, None], matrix, np.eye(axes))
+    )
     samples = np.maximum(count.min(axis=-3) - (2.0 * axes + 5.0) / 6.0, 1.0)
     freedom = len(pairs)
     value = (
@@ -229,4 +231,6 @@ def _score_all_axes(r: Array, count: Array, pairs: list[tuple[int, int]], axes: 
         * np.where(sign > 0, np.maximum(logarithm, _MIN_LOG_DETERMINANT), _MIN_LOG_DETERMINANT)
         / freedom
     )
-    return np.where(known, cube_root_score(value, np.full(value.shape, freedom / 2.0)), np.nan)
+    return np.where(
+        is_complete, cube_root_score(value, np.full(value.shape, freedom / 2.0)), np.nan
+    )

@@ -141,26 +141,30 @@ class CrossSpectrum(Statistic):
         """Build the model of the cross-spectrum of a pair of axes."""
         pair = pair_rows(state.blocks)[row]
         i, j = (state.axes.index(axis) for axis in pair)
-        known = expected_cross(state.baseline)
-        shared = known[row] if known is not None else np.zeros(1)
+        expected = expected_cross(state.baseline)
+        shared = expected[row] if expected is not None else np.zeros(1)
         values = records_last(data["cross"].values, 3)[row] - shared[..., None]
         shape = state.blocks["cross_shape"].values[row]
         # The scatter is larger in phase with shared noise, and smaller in quadrature.
-        alone, apart = state.weight[i] * state.weight[j], (shared**2).real
+        noise_product, shared_product = state.weight[i] * state.weight[j], (shared**2).real
         weight = np.concatenate(
             [
-                2.0 * shape / (alone + apart),
-                2.0 * shape / np.maximum(alone - apart, _MIN_QUADRATURE_SHARE * alone),
+                2.0 * shape / (noise_product + shared_product),
+                2.0
+                * shape
+                / np.maximum(noise_product - shared_product, _MIN_QUADRATURE_SHARE * noise_product),
             ],
             axis=1,
         )
         weight = np.where((state.masked[i] | state.masked[j])[:, None], 0.0, weight)
         given, precision = given_columns(state, "cross", pair, weight.shape)
-        near, width = unspread_share(state.blocks, "pair")[row], band_widths(state.blocks)
+        unspread, width = unspread_share(state.blocks, "pair")[row], band_widths(state.blocks)
         designs = stack_designs(
             candidates,
             weight.shape,
-            lambda one: real_and_imaginary(mix_with_mean(select_row(one, row) + 0j, near, width)),
+            lambda density: real_and_imaginary(
+                mix_with_mean(select_row(density, row) + 0j, unspread, width)
+            ),
         )
         return LinearModel(real_and_imaginary(values, axis=1), weight, designs, given, precision)
 
@@ -168,8 +172,8 @@ class CrossSpectrum(Statistic):
         """Condition on a component in the cross-spectra."""
         row = pair_rows(state.blocks).index(component.row)
         columns = []
-        for one in component.variant.design:
-            chosen = cross_column(one, row, state.blocks)
+        for density in component.variant.design:
+            chosen = cross_column(density, row, state.blocks)
             columns.append(np.concatenate([chosen.real, chosen.imag], axis=-1))
         state = state.with_columns("cross", ",".join(component.row), columns)
         if not component.variant.squared:
@@ -177,15 +181,21 @@ class CrossSpectrum(Statistic):
         calibrated = state.baseline.attrs.get("source", "calibrated") == "calibrated"
         # White noise was calibrated with it.
         added = [
-            one.real for one in component.variant.design if not (calibrated and _is_white(one))
+            density.real
+            for density in component.variant.design
+            if not (calibrated and _is_white(density))
         ]
         for axis in component.row if added else ():
-            powers = [power_column(one, state.axes.index(axis), state) for one in added]
-            known = state.given.get(("power", axis), [])
+            powers = [power_column(density, state.axes.index(axis), state) for density in added]
+            known_powers = state.given.get(("power", axis), [])
             state = state.with_columns(
                 "power",
                 axis,
-                [one for one in powers if not any(np.array_equal(one, other) for other in known)],
+                [
+                    power
+                    for power in powers
+                    if not any(np.array_equal(power, known_power) for known_power in known_powers)
+                ],
             )
         return state
 
@@ -242,11 +252,13 @@ def _pair_coherency(
         sums = sum_over_windows(np.where(present, values, 0.0) * weight, windows)
         return np.concatenate([sums, sums.sum(axis=-1, keepdims=True)], axis=-1)
 
-    one, other = flat[..., left, :, :], flat[..., right, :, :]
-    product = summed(one).real * summed(other).real
+    left_power, right_power = flat[..., left, :, :], flat[..., right, :, :]
+    product = summed(left_power).real * summed(right_power).real
     with np.errstate(divide="ignore", invalid="ignore"):
         sums = summed(cross) / np.sqrt(product)
-        count = np.fmin(summed(np.ones_like(one)).real, product / summed(one * other).real)
+        count = np.fmin(
+            summed(np.ones_like(left_power)).real, product / summed(left_power * right_power).real
+        )
     return np.where(count >= _MIN_FREQUENCIES, sums, complex(np.nan, np.nan)), count
 
 
@@ -273,8 +285,8 @@ def draw_coherency(
     shape: Array, size: tuple[int, ...], rng: np.random.Generator
 ) -> NDArray[np.complex128]:
     """Draw the sample coherency of independent signals, from `shape` complex frequencies."""
-    rest = np.maximum(np.where(np.isfinite(shape), shape, 1.0) - 1.0, 0.0)
+    freedom = np.maximum(np.where(np.isfinite(shape), shape, 1.0) - 1.0, 0.0)
     with np.errstate(divide="ignore", over="ignore"):
         # Beta(1, n - 1)
-        squared = np.where(rest > 0.0, 1.0 - rng.random(size) ** (1.0 / rest), 1.0)
+        squared = np.where(freedom > 0.0, 1.0 - rng.random(size) ** (1.0 / freedom), 1.0)
     return np.asarray(np.sqrt(squared) * np.exp(2j * np.pi * rng.random(size)))

@@ -227,17 +227,23 @@ def window_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> 
 def _matched_filter(residual: Array, noise: MeanNoise, windows: Windows) -> tuple[Array, Array]:
     """Return filter output and information of each window, both independent of a constant."""
     weighted = apply_precision(residual, noise)
-    one = apply_precision(np.ones(residual.shape[-1]), noise)
-    total = one.sum()
-    weighted = weighted - one * (weighted.sum(axis=-1, keepdims=True) / total)
-    own = np.empty(windows.first.size)
+    weighted_ones = apply_precision(np.ones(residual.shape[-1]), noise)
+    total = weighted_ones.sum()
+    weighted = weighted - weighted_ones * (weighted.sum(axis=-1, keepdims=True) / total)
+    boxcar = np.empty(windows.first.size)
     boxcar_information(
-        windows.first, windows.stop, noise.innovation, noise.gain, noise.decay, noise.remaining, own
+        windows.first,
+        windows.stop,
+        noise.innovation,
+        noise.gain,
+        noise.decay,
+        noise.remaining,
+        boxcar,
     )
-    across = sum_over_windows(one[:, None], windows)[:, 0]
+    across = sum_over_windows(weighted_ones[:, None], windows)[:, 0]
     count = sum_over_windows(noise.present[:, None], windows)[:, 0]
-    information = own - across**2 / total
-    enough = (count >= 0.25 * windows.length) & (information > 1e-3 * own)
+    information = boxcar - across**2 / total
+    enough = (count >= 0.25 * windows.length) & (information > 1e-3 * boxcar)
     return sum_over_windows(weighted[..., None], windows)[..., 0], np.where(
         enough, information, np.nan
     )
@@ -257,9 +263,9 @@ def mean_noise(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, present: Arr
     step = np.diff((begin + end) / 2.0, append=end[-1])
     block, span = float(blocks.attrs["block_s"]), float(end[-1] - begin[0])
     share, times, white = flicker_states(block, span)
-    known = expected_processes(baseline, axis)
-    slow = np.append(b**2 * share, known.square * block_mean_variance(block, known.time))
-    times = np.append(times, known.time)
+    processes = expected_processes(baseline, axis)
+    slow = np.append(b**2 * share, processes.square * block_mean_variance(block, processes.time))
+    times = np.append(times, processes.time)
     decay = np.exp(-step[:, None] / times)
     variance = baseline["mean_variance"].values[axis] + b**2 * white
     present = present & np.isfinite(variance) & (variance > 0)
@@ -267,7 +273,7 @@ def mean_noise(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, present: Arr
     innovation, gain = np.empty(n), np.empty((n, times.size + 1))
     remaining = np.empty((n + 1, times.size + 1, times.size + 1))
     filter_gains(
-        variance, present, (k**2 / HOUR + known.walk) * step, slow, decay, innovation, gain
+        variance, present, (k**2 / HOUR + processes.walk) * step, slow, decay, innovation, gain
     )
     remaining_information(innovation, gain, decay, remaining)
     return MeanNoise(present.astype(float), innovation, gain, decay, remaining)

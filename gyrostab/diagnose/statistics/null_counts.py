@@ -71,12 +71,12 @@ def null_counts(
         for axis, step in enumerate(blocks["quantization_step"].values)
     ]
     has_zeros = blocks["zeros"].values.any(axis=1, keepdims=True)
-    zero, again, repeat = (np.stack(part) for part in zip(*chances, strict=True))
+    zero, zero_again, repeat = (np.stack(part) for part in zip(*chances, strict=True))
     size = (count, *samples.shape)
     # an error of the probabilities is common to all blocks of an axis
     error = 1.0 + _CHANCE_ERROR_SHARE * rng.standard_normal((count, len(samples), 1))
     zeros = rng.binomial(samples, np.clip(np.where(has_zeros, zero, 0.0) * error, 0.0, 1.0))
-    filled = _filled_zeros(blocks, zeros, samples, again, rng)
+    filled = _filled_zeros(blocks, zeros, samples, zero_again, rng)
     return {
         "outliers": rng.poisson(
             np.broadcast_to(
@@ -138,19 +138,19 @@ def _filled_zeros(
     blocks: xr.Dataset,
     zeros: NDArray[np.int64],
     samples: NDArray[np.int64],
-    again: Array,
+    zero_again: Array,
     rng: np.random.Generator,
 ) -> NDArray[np.int64]:
     """Return the zeros (record, axis, block) that look filled because they coincide by chance.
 
-    On a single axis these are zeros next to another one, whose probability is `again`.
+    On a single axis these are zeros next to another one, whose probability is `zero_again`.
     """
     subset = blocks["axes_at_once"].values.astype(bool)
     number = blocks["at_once"].values.astype(np.int64)
     share = zeros / np.maximum(samples, 1)
     if len(samples) == 1:
         # rare ones come in pairs, and rare zeros alone exclude each other: variance 2 z p (1 - p)^2
-        chance = 1.0 - (1.0 - again) ** 2
+        chance = 1.0 - (1.0 - zero_again) ** 2
         scatter = np.sqrt(2.0 * zeros * chance) * (1.0 - chance)
         drawn = np.rint(zeros * chance + scatter * rng.standard_normal(zeros.shape))
         coinciding = np.clip(drawn, 0, zeros).astype(np.int64)
@@ -190,7 +190,7 @@ def _grid_chance(
     centre = _before_truncation(mean, step, inner) if truncated else mean
     half_zero = step if truncated else 0.5 * step
     zero, both_zero = _chance_in_bin(-centre, half_zero, inner, rho)
-    again = np.divide(both_zero, zero, out=np.zeros_like(zero), where=zero > 0.0)
+    zero_again = np.divide(both_zero, zero, out=np.zeros_like(zero), where=zero > 0.0)
     difference = inner * np.sqrt(2.0 - 2.0 * rho)
     ratio = step / difference
     if (ratio < _FINE_STEP).all():
@@ -203,9 +203,9 @@ def _grid_chance(
         repeat = np.zeros(mean.size)
         for level in range(-reach, reach + 1):
             place = nearest + level
-            both = _chance_in_bin(place * step - centre, 0.5 * step, inner, rho)[1]
-            repeat += np.where(np.abs(place * step) < half_zero, 0.0, both)
-    return _GridChance(zero, again, np.clip(repeat, 0.0, 1.0))
+            pair_chance = _chance_in_bin(place * step - centre, 0.5 * step, inner, rho)[1]
+            repeat += np.where(np.abs(place * step) < half_zero, 0.0, pair_chance)
+    return _GridChance(zero, zero_again, np.clip(repeat, 0.0, 1.0))
 
 
 def _chance_in_bin(
@@ -224,11 +224,13 @@ def _chance_in_bin(
     value = middle[:, None] + half * nodes
     density = np.exp(-0.5 * (value / scatter[:, None]) ** 2) / np.sqrt(2.0 * np.pi)
     density *= half * weights / scatter[:, None]
-    rest = (scatter * np.sqrt(1.0 - correlation**2))[:, None]
+    conditional_scatter = (scatter * np.sqrt(1.0 - correlation**2))[:, None]
     shift = middle[:, None] - correlation[:, None] * value
-    both = density * (ndtr((shift + half) / rest) - ndtr((shift - half) / rest))
-    one = ndtr((middle + half) / scatter) - ndtr((middle - half) / scatter)
-    return np.asarray(one), np.asarray(both.sum(axis=1))
+    pair_density = density * (
+        ndtr((shift + half) / conditional_scatter) - ndtr((shift - half) / conditional_scatter)
+    )
+    chance = ndtr((middle + half) / scatter) - ndtr((middle - half) / scatter)
+    return np.asarray(chance), np.asarray(pair_density.sum(axis=1))
 
 
 def _before_truncation(mean: Array, step: float, scatter: Array) -> Array:

@@ -152,14 +152,17 @@ class Power(Statistic):
                 if _changes_over_time(density) or not case.seen.coherent
             }
         for columns, squared in ((level, False), (spectrum, True)):
-            kept = {
+            densities = {
                 name: density
                 for name, density in columns.items()
                 if np.abs(density).max(initial=0.0) > 0 and not _is_white_and_constant(density)
             }
-            for chosen in column_choices(list(kept)):
+            for chosen in column_choices(list(densities)):
                 yield Variant(
-                    case.values, chosen, np.stack([kept[name] for name in chosen]), squared=squared
+                    case.values,
+                    chosen,
+                    np.stack([densities[name] for name in chosen]),
+                    squared=squared,
                 )
         if case.seen.response is not None:
             yield Variant(
@@ -178,16 +181,18 @@ class Power(Statistic):
         weight = state.baseline["shape_alone"].sel(axis=axis).values / state.weight[row] ** 2
         weight = np.where(state.masked[row][:, None], 0.0, weight)
         level, precision = noise_columns(state.baseline, axis=axis)
-        known = [level[..., number] * expected for number in range(level.shape[2])]
-        given, whole = given_columns(
-            state, "power", (axis,), weight.shape, known, np.diagonal(precision)
+        level_columns = [level[..., number] * expected for number in range(level.shape[2])]
+        given, given_precision = given_columns(
+            state, "power", (axis,), weight.shape, level_columns, np.diagonal(precision)
         )
-        near, width = unspread_share(state.blocks)[row], band_widths(state.blocks)
+        unspread, width = unspread_share(state.blocks)[row], band_widths(state.blocks)
         designs = stack_designs(
-            candidates, weight.shape, lambda one: mix_with_mean(select_row(one, row), near, width)
+            candidates,
+            weight.shape,
+            lambda density: mix_with_mean(select_row(density, row), unspread, width),
         )
         return with_independent_cells(
-            LinearModel(values, weight, designs, given, whole),
+            LinearModel(values, weight, designs, given, given_precision),
             state.baseline["common"].sel(axis=axis).values,
             state.weight[row],
         )
@@ -211,7 +216,9 @@ class Power(Statistic):
         ):
             return state  # the noise of the baseline is filtered already
         return state.with_columns(
-            "power", axis, [power_column(one, row, state) for one in component.variant.design]
+            "power",
+            axis,
+            [power_column(density, row, state) for density in component.variant.design],
         )
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
@@ -361,8 +368,8 @@ def _pair_variance(white: Array, k: int) -> Array:
 
 def _pad_end(values: Array, size: int) -> Array:
     """Append NaN up to the size of the record."""
-    rest = np.full((*values.shape[:-1], size - values.shape[-1]), np.nan)
-    return np.concatenate([values, rest], axis=-1)
+    padding = np.full((*values.shape[:-1], size - values.shape[-1]), np.nan)
+    return np.concatenate([values, padding], axis=-1)
 
 
 def _slow_allan_variance(blocks: xr.Dataset, baseline: xr.Dataset, tau: float) -> Array:
@@ -391,7 +398,7 @@ def _filter_change(
     """Return the change of the baseline spectrum by a response."""
     total = np.zeros((coefficient.sizes["axis"], 1, frequency.size))
     size, terms = coefficient.values, list(coefficient["term"].values)
-    for symbol in (one for one in "QNBK" if one in terms):
+    for symbol in (symbol for symbol in "QNBK" if symbol in terms):
         total += size[:, terms.index(symbol), None, None] ** 2 * sampled_psd(
             symbol, frequency, rate
         )

@@ -63,11 +63,11 @@ class RampPhase(Statistic):
         windows = window_set(blocks.sizes["block"], LENGTHS)
         rate, block = float(blocks.attrs["sampling_rate_hz"]), float(blocks.attrs["block_s"])
         scored: list[tuple[Array, ...]] = []
-        what: list[str] = []
+        kinds: list[str] = []
         tau_min, tau_max = [], []
         if "order" in blocks:
             scored.append(score_orders(blocks, baseline, windows))
-            what += [f"order {h}" for h in range(1, blocks.sizes["harmonic"] + 1)]
+            kinds += [f"order {h}" for h in range(1, blocks.sizes["harmonic"] + 1)]
             turning = turns_per_second(blocks)
             turning_blocks = turning[turning > 0]
             low, high = (
@@ -81,7 +81,7 @@ class RampPhase(Statistic):
             tau_max += [SINE_TAU_CYCLES / (h * low) for h in range(1, blocks.sizes["harmonic"] + 1)]
         if "profile" in blocks:
             scored.append(_score_profile(blocks, baseline, windows))
-            what.append("ramp phase")
+            kinds.append("ramp phase")
             tau_min.append(1.0 / rate)
             tau_max.append(block)
         if not scored:
@@ -93,7 +93,7 @@ class RampPhase(Statistic):
             "spectrum",
             blocks,
             windows=windows,
-            columns={"what": what, "tau_min_s": tau_min, "tau_max_s": tau_max},
+            columns={"what": kinds, "tau_min_s": tau_min, "tau_max_s": tau_max},
             z=z,
             ratio=ratio,
             estimate=estimate,
@@ -105,13 +105,13 @@ class RampPhase(Statistic):
         """Yield profiles that change over the phase."""
         if "profile" not in case.blocks:
             return
-        kept = {
+        profiles = {
             name: design
             for name, design in case.seen.phase_locked.items()
             if np.isfinite(design).all() and np.ptp(design) > 0
         }
-        for chosen in column_choices(list(kept)):
-            yield Variant(case.values, chosen, np.stack([kept[name] for name in chosen]))
+        for chosen in column_choices(list(profiles)):
+            yield Variant(case.values, chosen, np.stack([profiles[name] for name in chosen]))
 
     def model(
         self, candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
@@ -148,14 +148,14 @@ class RampPhase(Statistic):
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
         """Describe what is locked to the rotation or to the ramp."""
-        what = str(region["what"])
+        kind = str(region["what"])
         component = (
             f"The rate of {axes_text(region['axes'])} has a component of "
             f"{region['estimate']:.3g} deg/h"
         )
-        if what == "ramp phase":
+        if kind == "ramp phase":
             return f"{component} rms that is locked to the phase of the feedback ramp {when}"
-        order = what.removeprefix("order ")
+        order = kind.removeprefix("order ")
         multiple = "" if order == "1" else f"{order} times "
         return f"{component} at {multiple}the rotation rate of the tool {when}"
 
@@ -187,12 +187,12 @@ def _ramp_lines(state: State) -> NDArray[np.bool_]:
     if not turns.size:
         return np.zeros(lines.size, np.bool_)
     number = np.arange(1, max(2, int(rate / max(turns.mean(), lines[0]))))
-    low, high = (fold(number * one, rate) for one in (turns.min(), turns.max()))
+    low, high = (fold(number * turn_rate, rate) for turn_rate in (turns.min(), turns.max()))
     reach = LEAK_LINES * lines[0]
-    near = (lines[:, None] >= np.minimum(low, high) - reach) & (
+    near_ramp = (lines[:, None] >= np.minimum(low, high) - reach) & (
         lines[:, None] <= np.maximum(low, high) + reach
     )
-    return np.asarray(near.any(axis=1))
+    return np.asarray(near_ramp.any(axis=1))
 
 
 def _profile_power(component: Component, state: State) -> Array:

@@ -52,11 +52,11 @@ class Restart(Statistic):
                 z[..., axis, :] = amount / np.sqrt(information)
                 estimate[..., axis, :] = amount / information
         # Each window has only one column.
-        what = [f"transient of {k} blocks" for k in _DECAY_BLOCKS] + ["jump"]
+        kinds = [f"transient of {k} blocks" for k in _DECAY_BLOCKS] + ["jump"]
         column = np.concatenate(
             [np.arange(len(_DECAY_BLOCKS)), np.full(restarts.size, len(_DECAY_BLOCKS))]
         )
-        scores = np.full((*z.shape, len(what)), np.nan)
+        scores = np.full((*z.shape, len(kinds)), np.nan)
         size = scores.copy()
         scores[..., np.arange(column.size), column], size[..., np.arange(column.size), column] = (
             z,
@@ -67,7 +67,7 @@ class Restart(Statistic):
             "restart",
             blocks,
             windows=windows,
-            columns={"what": what, "tau_min_s": block, "tau_max_s": tau},
+            columns={"what": kinds, "tau_min_s": block, "tau_max_s": tau},
             z=scores,
             ratio=np.abs(scores),
             estimate=size,
@@ -111,7 +111,7 @@ def _restart_designs(restarts: np.ndarray, block_count: int) -> tuple[Array, Win
 def _matched_filter(residual: Array, designs: Array, noise: MeanNoise) -> tuple[Array, Array]:
     """Return filter output and information of each design, both independent of a constant."""
     weighted = apply_precision(designs, noise)
-    one = apply_precision(np.ones((1, designs.shape[-1])), noise)[0]
-    weighted = weighted - np.outer(weighted.sum(axis=-1) / one.sum(), one)
+    weighted_ones = apply_precision(np.ones((1, designs.shape[-1])), noise)[0]
+    weighted = weighted - np.outer(weighted.sum(axis=-1) / weighted_ones.sum(), weighted_ones)
     information = (weighted * designs).sum(axis=-1)
     return np.nan_to_num(residual) @ weighted.T, np.where(information > 0, information, np.nan)

@@ -96,43 +96,47 @@ class RotationOrder(Statistic):
         weight = order_weight(state)
         count = weight.shape[-1]
         if candidates[0].each:
-            both = np.concatenate([weight[row], weight[row]], axis=1)
+            cell_weight = np.concatenate([weight[row], weight[row]], axis=1)
             designs = [
-                stack_columns(order_columns(np.ones(count, complex), chosen), both.shape)
+                stack_columns(order_columns(np.ones(count, complex), chosen), cell_weight.shape)
                 for chosen in harmonic_sets(count)
             ]
-            given, precision = given_columns(state, "order", (state.axes[row],), both.shape)
+            given, precision = given_columns(state, "order", (state.axes[row],), cell_weight.shape)
             return LinearModel(
                 real_and_imaginary(values[row], axis=1),
-                both,
+                cell_weight,
                 designs * len(candidates),
                 given,
                 precision,
             )
         # The cells of all axes side by side.
-        both = np.concatenate([np.concatenate([one, one], axis=1) for one in weight], axis=1)
-        stacked = np.concatenate([real_and_imaginary(one, axis=1) for one in values], axis=1)
+        cell_weight = np.concatenate(
+            [np.concatenate([axis_weight, axis_weight], axis=1) for axis_weight in weight], axis=1
+        )
+        stacked = np.concatenate(
+            [real_and_imaginary(axis_values, axis=1) for axis_values in values], axis=1
+        )
         designs = []
         for candidate in candidates:
             for variant in candidate.variants:
                 for pattern in (variant.design[0], np.conj(variant.design[0])):
-                    by_axis = [order_columns(one, (0,)) for one in pattern]
+                    by_axis = [order_columns(factor, (0,)) for factor in pattern]
                     designs.append(
                         stack_columns(
                             [np.concatenate(columns) for columns in zip(*by_axis, strict=True)],
-                            both.shape,
+                            cell_weight.shape,
                         )
                     )
         named_columns = [state.given.get(("order", axis), []) for axis in state.axes]
-        given, precision = np.empty((*both.shape, 0)), np.empty((0, 0))
+        given, precision = np.empty((*cell_weight.shape, 0)), np.empty((0, 0))
         for number, columns in enumerate(named_columns):
-            for one in columns:
-                wide = np.zeros((*both.shape, 1))
-                wide[:, number * 2 * count : (number + 1) * 2 * count, 0] = one
+            for column in columns:
+                wide = np.zeros((*cell_weight.shape, 1))
+                wide[:, number * 2 * count : (number + 1) * 2 * count, 0] = column
                 given = np.concatenate([given, wide], axis=2)
         if given.shape[2]:
             precision = -np.eye(given.shape[2])
-        return LinearModel(stacked, both, designs, given, precision)
+        return LinearModel(stacked, cell_weight, designs, given, precision)
 
     def condition(self, state: State, component: Component) -> State:
         """Condition on a component in the rotation orders."""
@@ -159,12 +163,12 @@ class RotationOrder(Statistic):
                     state = state.with_columns("power", axis, [column])
                     state = free_covariance(state, (axis,), column)
         lines = state.blocks["line_frequency"].values
-        taken = np.zeros(lines.size, np.bool_)
+        near_order = np.zeros(lines.size, np.bool_)
         for k in chosen:
-            taken |= (lines >= np.nanmin(turn) * (k + 1) - 2 * lines[0]) & (
+            near_order |= (lines >= np.nanmin(turn) * (k + 1) - 2 * lines[0]) & (
                 lines <= np.nanmax(turn) * (k + 1) + 2 * lines[0]
             )
-        return state.with_columns("line", "all", [taken])
+        return state.with_columns("line", "all", [near_order])
 
     def estimate(self, fit: SizeFit) -> Sizes:
         """Return amplitude and phase of components locked to the rotation.
@@ -237,9 +241,9 @@ def order_columns(pattern: Array, chosen: tuple[int, ...]) -> list[Array]:
     """
     columns = []
     for k in chosen:
-        one = np.zeros_like(pattern)
-        one[..., k] = pattern[..., k]
-        columns += [real_and_imaginary(one), real_and_imaginary(1j * one)]
+        harmonic = np.zeros_like(pattern)
+        harmonic[..., k] = pattern[..., k]
+        columns += [real_and_imaginary(harmonic), real_and_imaginary(1j * harmonic)]
     return columns
 
 

@@ -178,7 +178,7 @@ class SampleCounts(Statistic):
         for variable in ("mean", "power"):
             blocks[variable] = blocks[variable].where(keep | ~is_axis)
         if "cross" in blocks:
-            rows = np.array([one == axis for one in state.axes])
+            rows = np.array([name == axis for name in state.axes])
             blocks["cross"] = cross_without(blocks, anomalous & rows[:, None])
         return replace(state, blocks=blocks)
 
@@ -286,14 +286,16 @@ def find_anomalous_blocks(
     None either if fewer than the least quiescent share of the blocks would be left.
     """
     samples = blocks["samples"].sel(axis=component.row[0]).values
-    kept = samples > MIN_MEAN_SHARE * samples.max(initial=0)
-    if _is_everywhere(component) or not kept.any():
-        return np.zeros(kept.size, np.bool_)
+    has_samples = samples > MIN_MEAN_SHARE * samples.max(initial=0)
+    if _is_everywhere(component) or not has_samples.any():
+        return np.zeros(has_samples.size, np.bool_)
     count = blocks[component.variant.columns[0]].sel(axis=component.row[0]).values
     # The noise has a negligible number of outliers.
-    usual = 0.0 if component.variant.columns[0] == "outliers" else float(np.median(count[kept]))
+    usual = (
+        0.0 if component.variant.columns[0] == "outliers" else float(np.median(count[has_samples]))
+    )
     anomalous = count > usual + settings.clear_sigma * np.sqrt(max(usual, 0.0))
-    return np.asarray(anomalous & (anomalous[kept].mean() <= 1.0 - settings.quiescent_share))
+    return np.asarray(anomalous & (anomalous[has_samples].mean() <= 1.0 - settings.quiescent_share))
 
 
 def mask_anomalous_blocks(
@@ -308,6 +310,6 @@ def mask_anomalous_blocks(
         )
     if not anomalous.any():
         return blocks
-    kept = xr.DataArray(~anomalous, dims=("axis", "block"))
-    left = blocks.assign(mean=blocks["mean"].where(kept), power=blocks["power"].where(kept))
-    return left.assign(cross=cross_without(blocks, anomalous)) if "cross" in blocks else left
+    usable = xr.DataArray(~anomalous, dims=("axis", "block"))
+    masked = blocks.assign(mean=blocks["mean"].where(usable), power=blocks["power"].where(usable))
+    return masked.assign(cross=cross_without(blocks, anomalous)) if "cross" in blocks else masked

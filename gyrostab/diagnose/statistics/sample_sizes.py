@@ -39,7 +39,7 @@ def estimate_from_counts(
     hours = samples / rate / HOUR
     if mark == "lattice":
         return {"step": (float(blocks["quantization_step"].sel(axis=axis)), 0.0)}
-    row = [str(one) for one in blocks["axis"].values].index(axis)
+    row = [str(name) for name in blocks["axis"].values].index(axis)
     usual = float(count_evidence.of[mark][0][row].sum()) if mark in count_evidence.of else 0.0
     count = max(float(blocks[mark].sel(axis=axis).sum()) - usual, 1.0)
     spread = _sample_deviation(blocks, axis)
@@ -69,12 +69,15 @@ def estimate_from_counts(
             ),
         }
     low, high = (end - usual for end in _poisson_interval(count + usual))
-    share, least, most = (min(max(one, 0.0) / samples, 0.999) for one in (count, low, high))
+    share, low_share, high_share = (
+        min(max(number, 0.0) / samples, 0.999) for number in (count, low, high)
+    )
     if effect == "clipping":
         return {"limit": _size_range(blocks.sel(axis=axis), spread, samples)}
     if effect == "dead_zone":
         width, narrow, wide = (
-            spread * float(ndtri(0.5 + one / 2.0)) for one in (share, least, most)
+            spread * float(ndtri(0.5 + fraction / 2.0))
+            for fraction in (share, low_share, high_share)
         )
         slope = spread / (2.0 * float(_normal_density(width / spread)))
         return {"width": (width, slope * error / samples, narrow, wide)}
@@ -120,9 +123,9 @@ def _size_spikes(
     relative = 1.0 / math.sqrt(count)
     if outliers is None:  # no block was steady enough to have a kurtosis
         return {"per_hour": (count / hours, relative * count / hours, low / hours, high / hours)}
-    seen, size, many = outliers
-    law = max(settings.outlier_law_error, -0.5 * math.log(seen))
-    often, doubt = count / seen / hours, math.hypot(1.0 / math.sqrt(2.0 * many), law)
+    seen_share, size, many = outliers
+    law = max(settings.outlier_law_error, -0.5 * math.log(seen_share))
+    often, doubt = count / seen_share / hours, math.hypot(1.0 / math.sqrt(2.0 * many), law)
     return {
         "per_hour": (
             often,
@@ -146,19 +149,19 @@ def _normal_density(x: Any) -> Any:
 
 def _poisson_interval(count: float) -> tuple[float, float]:
     """Return the exact 95 % interval of the mean of a Poisson law (Garwood, 1936)."""
-    tail, other = INTERVAL_TAILS
-    return float(gammaincinv(count, tail)), float(gammaincinv(count + 1.0, other))
+    lower_tail, upper_tail = INTERVAL_TAILS
+    return float(gammaincinv(count, lower_tail)), float(gammaincinv(count + 1.0, upper_tail))
 
 
 def _held_runs(blocks: xr.Dataset, axis: str, mark: str, usual: float) -> float:
     """Return how often samples were held: runs of repeats, less those of the quantization grid."""
-    own = {
+    totals = {
         name: float(blocks[name].sel(axis=axis).sum())
         for name in ("adjacent", "repeats", "repeat_runs", "zeros", "zero_runs", "filled")
     }
     if mark == "filled":
-        return max(own["zero_runs"] * own["filled"] / max(own["zeros"], 1.0), 1.0)
-    return max(own["repeat_runs"] - usual * (1.0 - usual / max(own["adjacent"], 1.0)), 1.0)
+        return max(totals["zero_runs"] * totals["filled"] / max(totals["zeros"], 1.0), 1.0)
+    return max(totals["repeat_runs"] - usual * (1.0 - usual / max(totals["adjacent"], 1.0)), 1.0)
 
 
 def _estimate_outliers(blocks: xr.Dataset, axis: str) -> tuple[float, float, float] | None:
@@ -175,17 +178,17 @@ def _estimate_outliers(blocks: xr.Dataset, axis: str) -> tuple[float, float, flo
         for name in ("peaks", "kurtosis", "samples")
     )
     good = (count > 0.0) & np.isfinite(excess) & (excess > 0.0)
-    alone = good & (count == 1.0)  # several in a block differ in size
-    good = alone if alone.any() else good
+    single = good & (count == 1.0)  # several in a block differ in size
+    good = single if single.any() else good
     if not good.any():
         return None
     many = count[good]
-    most = (
+    max_excess = (
         samples[good] / (many * (1.0 - many / samples[good])) - 3.0
     )  # without noise, after removal of the block mean
-    tails = np.minimum(excess[good] + 3.0, (1.0 - 1e-4) * most)
-    half, far = tails - 3.0, most - tails
-    share = (half + np.sqrt(half**2 + far * half)) / far
+    tails = np.minimum(excess[good] + 3.0, (1.0 - 1e-4) * max_excess)
+    half, margin = tails - 3.0, max_excess - tails
+    share = (half + np.sqrt(half**2 + margin * half)) / margin
     variance = blocks["variance"].sel(axis=axis).values
     clean = (count == 0.0) & (
         variance > 0.0

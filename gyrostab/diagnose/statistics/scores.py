@@ -56,20 +56,21 @@ def window_set(block_count: int, lengths: Sequence[int], *, whole: bool = True) 
     [1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 5, 5, 5, 5, 5, 5, 10]
     """
     first, length = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
-    for wanted in lengths:
-        if wanted > max(block_count // 2, 1):
+    for window_length in lengths:
+        if window_length > max(block_count // 2, 1):
             continue
         step = max(
             1,
             round(
-                wanted * (_WINDOW_STEP if block_count <= _MAX_DENSE_BLOCKS else _LONG_WINDOW_STEP)
+                window_length
+                * (_WINDOW_STEP if block_count <= _MAX_DENSE_BLOCKS else _LONG_WINDOW_STEP)
             ),
         )
-        start = np.arange(0, block_count - wanted + 1, step)
-        if start[-1] != block_count - wanted:
-            start = np.append(start, block_count - wanted)
+        start = np.arange(0, block_count - window_length + 1, step)
+        if start[-1] != block_count - window_length:
+            start = np.append(start, block_count - window_length)
         first.append(start)
-        length.append(np.full(start.size, wanted))
+        length.append(np.full(start.size, window_length))
     if whole:
         first.append(np.zeros(1, np.int64))
         length.append(np.full(1, block_count))

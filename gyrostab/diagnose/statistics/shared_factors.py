@@ -48,38 +48,42 @@ def estimate_shared_factors(
     name = components[0].variant.columns[0]
     rows = [row for row in pair_rows(state.blocks) if set(row) <= set(axes)]
     rng = np.random.default_rng(0)
-    seen = _weight_bandwidths(components[0], rows, axes, state)
-    chosen = rng.choice(seen.share.size, size=DRAWS, p=seen.share)
-    product = seen.product[chosen] + seen.error[chosen] * rng.standard_normal((DRAWS, len(rows)))
-    limit = seen.limit[chosen]
+    bandwidths = _weight_bandwidths(components[0], rows, axes, state)
+    chosen = rng.choice(bandwidths.share.size, size=DRAWS, p=bandwidths.share)
+    product = bandwidths.product[chosen] + bandwidths.error[chosen] * rng.standard_normal(
+        (DRAWS, len(rows))
+    )
+    limit = bandwidths.limit[chosen]
     factor = (
         _draw_pair_factors(product[:, 0], limit, rng)
         if len(axes) == 2
         else _solve_factors(product, rows, axes, limit)
     )
-    white = np.isinf(seen.width)
+    white = np.isinf(bandwidths.width)
     factor *= np.exp(np.where(white[chosen], 0.0, ORDER_ERROR) * rng.standard_normal(DRAWS))[
         :, None
     ]
-    plain = bool(seen.share[white].sum() >= 0.5)
-    alike = white[chosen] == plain
+    plain = bool(bandwidths.share[white].sum() >= 0.5)
+    is_likelier = white[chosen] == plain
     sizes: dict[str, tuple[float, ...]] = {
-        name if len(axes) == 1 else f"{name}.{axis}": _summarise_draws(factor[:, k], alike)
+        name if len(axes) == 1 else f"{name}.{axis}": _summarise_draws(factor[:, k], is_likelier)
         for k, axis in enumerate(axes)
     }
     if "bandwidth" in components[0].variant.values:
-        width = seen.width[chosen][alike]
+        width = bandwidths.width[chosen][is_likelier]
         sizes["bandwidth"] = (
             (math.inf, 0.0) if plain else _summarise_draws(width, np.ones(width.size, np.bool_))
         )
     return sizes
 
 
-def _summarise_draws(draws: Array, alike: NDArray[np.bool_]) -> tuple[float, float, float, float]:
+def _summarise_draws(
+    draws: Array, is_likelier: NDArray[np.bool_]
+) -> tuple[float, float, float, float]:
     """Return the median of the likelier draws, and spread and ends of the 95 % interval of all."""
     low, high = np.quantile(draws, INTERVAL_TAILS)
     return (
-        float(np.median(draws[alike])),
+        float(np.median(draws[is_likelier])),
         float((high - low) / (2.0 * NORMAL_95)),
         float(low),
         float(high),
@@ -143,16 +147,19 @@ def _score_bandwidth(
     """Return log likelihood, products of the pairs, their errors, and limits for one bandwidth."""
     variant = component.variant
     if "bandwidth" in variant.values:
-        other = replace(variant, values={**variant.values, "bandwidth": width})
+        changed_variant = replace(variant, values={**variant.values, "bandwidth": width})
         variant = (
-            rebuild_variant(component.candidate, other, state.blocks, state.baseline["coefficient"])
+            rebuild_variant(
+                component.candidate, changed_variant, state.blocks, state.baseline["coefficient"]
+            )
             or variant
         )
     moments = [
         component_mixture(replace(component, row=row), state, variant).moments() for row in rows
     ]
     product, square = (
-        np.array([float(one.flat[0]) for one in several]) for several in zip(*moments, strict=True)
+        np.array([float(moment.flat[0]) for moment in pair_moments])
+        for pair_moments in zip(*moments, strict=True)
     )
     limit = [_max_factor(axis, variant, state) for axis in axes]
     return np.concatenate(
@@ -192,8 +199,8 @@ def _solve_factors(
     """
     place = {row: number for number, row in enumerate(rows)}
     matrix = np.zeros((product.shape[0], len(axes), len(axes)))
-    for (i, one), (j, other) in combinations(enumerate(axes), 2):
-        number = place[one, other] if (one, other) in place else place[other, one]
+    for (i, axis), (j, other_axis) in combinations(enumerate(axes), 2):
+        number = place[axis, other_axis] if (axis, other_axis) in place else place[other_axis, axis]
         matrix[:, i, j] = matrix[:, j, i] = product[:, number]
     diagonal = np.arange(len(axes))
     for _ in range(FACTOR_ROUNDS):

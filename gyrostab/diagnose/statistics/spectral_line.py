@@ -79,9 +79,9 @@ class SpectralLine(Statistic):
         used_weight = np.where(present, weight[..., None], 0.0)
         flat = np.where(present, flat, 0.0) * used_weight
         with np.errstate(divide="ignore", invalid="ignore"):
-            whole = flat.sum(axis=-2, keepdims=True)
+            record_sum = flat.sum(axis=-2, keepdims=True)
             count = np.concatenate([used_weight, used_weight.sum(axis=-2, keepdims=True)], axis=-2)
-            flat = np.concatenate([flat, whole], axis=-2) / count
+            flat = np.concatenate([flat, record_sum], axis=-2) / count
             count = count * _equal_block_share(blocks, windows)
             around = _mean_around(flat)
             ratio = flat / around
@@ -123,8 +123,8 @@ class SpectralLine(Statistic):
         evidence_nats = line_evidence(power, trial.state.blocks["line_weight"].values, expected)
         if "record" not in trial.data["line_power"].dims and "sine_nats" in trial.data:
             evidence_nats = np.logaddexp(evidence_nats, trial.data["sine_nats"].values) - np.log(2)
-        taken = trial.state.given.get(("line", "all"), [])
-        for mask in taken:
+        masks = trial.state.given.get(("line", "all"), [])
+        for mask in masks:
             evidence_nats = np.where(mask, -np.inf, evidence_nats)
         # (record,), one line for all axes
         place = np.maximum(evidence_nats, 0.0).sum(axis=1).argmax(axis=-1)
@@ -144,11 +144,11 @@ class SpectralLine(Statistic):
         frequency = float(state.blocks["line_frequency"].values[component.place])
         axis = component.row[0]
         density = bands_at(state, np.asarray(frequency)).astype(float)
-        known = state.given.get(("power", axis), [])
+        power_columns = state.given.get(("power", axis), [])
         for band in np.flatnonzero(density.any(axis=0)):
             column = np.zeros_like(density)
             column[:, band] = 1.0
-            if any(np.array_equal(column, other) for other in known):
+            if any(np.array_equal(column, other) for other in power_columns):
                 continue  # another line in the same band is already given
             state = state.with_columns("power", axis, [column])
             state = free_covariance(state, (axis,), column)
@@ -160,11 +160,12 @@ class SpectralLine(Statistic):
 
         In the lowest bands, the slow noise is fitted to its power.
         """
-        here, place = blocks.sel(axis=component.row[0]), component.place
+        axis_blocks, place = blocks.sel(axis=component.row[0]), component.place
         return (
             place >= 0
-            and _has_constant_phase(here, place)
-            and float(here["sine_frequency"][place]) < _SLOW_CYCLES / float(blocks.attrs["block_s"])
+            and _has_constant_phase(axis_blocks, place)
+            and float(axis_blocks["sine_frequency"][place])
+            < _SLOW_CYCLES / float(blocks.attrs["block_s"])
         )
 
     def estimate(self, fit: SizeFit) -> Sizes:
@@ -299,12 +300,12 @@ def estimate_line(
     The amplitude follows from the power about the line that exceeds the local level, in the whole
     record if a sine of constant phase has more evidence than a line, and else in blocks.
     """
-    here = blocks.sel(axis=axis)
+    axis_blocks = blocks.sel(axis=axis)
     lines, power, weight = (
-        here[name].values for name in ("line_frequency", "line_power", "line_weight")
+        axis_blocks[name].values for name in ("line_frequency", "line_power", "line_weight")
     )
-    if _has_constant_phase(here, place):
-        sine = here.isel(line=place)
+    if _has_constant_phase(axis_blocks, place):
+        sine = axis_blocks.isel(line=place)
         return _root_of_square(float(sine["sine_square"]), float(sine["sine_square_stderr"])), (
             float(sine["sine_frequency"]),
             0.5 * float(sine["sine_resolution"]),
@@ -312,14 +313,14 @@ def estimate_line(
     good = (weight > 0) & np.isfinite(power).all(axis=1)
     total = (power[good] * weight[good, None]).sum(axis=0) / weight[good].sum()
     level = local_level(total[None, None])[0, 0]
-    near = line_skirt(blocks, axis, place, settings)
+    skirt = line_skirt(blocks, axis, place, settings)
     step = float(np.diff(lines[:2])[0])
-    above = total[near] - level[near]
+    above = total[skirt] - level[skirt]
     # Power N and a line S have the variance N^2 + 2 N S.
-    variance = level[near] * np.maximum(2.0 * total[near] - level[near], level[near])
+    variance = level[skirt] * np.maximum(2.0 * total[skirt] - level[skirt], level[skirt])
     noise = 4.0 * step * float(np.sqrt(variance.sum() / weight[good].sum()))
     positive = np.maximum(above, 0.0)
-    frequency = float((positive * lines[near]).sum() / max(positive.sum(), 1e-300))
+    frequency = float((positive * lines[skirt]).sum() / max(positive.sum(), 1e-300))
     return _root_of_square(4.0 * float(above.sum()) * step, noise), (frequency, 0.5 * step)
 
 

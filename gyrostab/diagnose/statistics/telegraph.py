@@ -66,16 +66,16 @@ class Telegraph(BlockMeanStatistic):
         evidence_nats = np.full((records, len(rows)), -np.inf)
         courses: list[tuple[TelegraphCourses, SwitchingEvidence | None]] = []
         for row, axis in enumerate(trial.state.axes):
-            found, course = telegraph_evidence(
+            axis_nats, course = telegraph_evidence(
                 searched,
                 trial.state.baseline,
                 axis=axis,
                 given=trial.state.given_to("mean", axis),
                 settings=trial.state.settings,
             )
-            evidence_nats[: found.size, row] = found
+            evidence_nats[: axis_nats.size, row] = axis_nats
             within, refuted = _search_fast_switching(
-                searched, trial.state, axis, course, float(found[0])
+                searched, trial.state, axis, course, float(axis_nats[0])
             )
             if refuted:
                 evidence_nats[0, row] = -np.inf
@@ -95,8 +95,8 @@ class Telegraph(BlockMeanStatistic):
             for candidate in group
         ]
         return [
-            _with_free_levels(one, trial) if one.candidate.effect == _LEVELS else one
-            for one in by_candidate
+            _with_free_levels(evidence, trial) if evidence.candidate.effect == _LEVELS else evidence
+            for evidence in by_candidate
         ]
 
     def condition(self, state: State, component: Component) -> State:
@@ -120,8 +120,8 @@ class Telegraph(BlockMeanStatistic):
             state.blocks["axis"] == axis
         )
         blank = {
-            name: state.blocks[name].where(~moves, other)
-            for name, other in (("kurtosis", np.nan), ("outliers", 0))
+            name: state.blocks[name].where(~moves, replacement)
+            for name, replacement in (("kurtosis", np.nan), ("outliers", 0))
         }
         return replace(state, blocks=state.blocks.assign(blank))
 
@@ -137,9 +137,11 @@ class Telegraph(BlockMeanStatistic):
         out: dict[str, tuple[float, float]] = {}
         for component in ranked:
             mean, covariance = component_mixture(component, fit.state).moments()
-            own = component.variant.design[0, 0]
+            component_course = component.variant.design[0, 0]
             sign = (
-                1.0 if component is ranked[0] or float(np.cov(own, course)[0, 1]) >= 0.0 else -1.0
+                1.0
+                if component is ranked[0] or float(np.cov(component_course, course)[0, 1]) >= 0.0
+                else -1.0
             )
             label = name if len(fit.axes) == 1 else f"{name}.{component.row[0]}"
             out[label] = (sign * float(mean[0]), float(math.sqrt(covariance[0, 0])))
@@ -162,34 +164,36 @@ def _search_fast_switching(
     data: xr.Dataset, state: State, axis: str, course: TelegraphCourses, evidence_nats: float
 ) -> tuple[SwitchingEvidence | None, bool]:
     """Find switching within blocks, if better than in block means; and whether it refutes it."""
-    found, block = _search_sub_blocks(data, state, axis), float(state.blocks.attrs["block_s"])
-    if found is None:
+    switching, block = _search_sub_blocks(data, state, axis), float(state.blocks.attrs["block_s"])
+    if switching is None:
         return None, False
-    if not _is_resolved(found, block):
-        return None, found.refuted and float(course.times[0].min()) < state.settings.refuted_blocks
+    if not _is_resolved(switching, block):
+        return None, switching.refuted and float(
+            course.times[0].min()
+        ) < state.settings.refuted_blocks
     deviation = float(np.sqrt(np.nanmedian(state.baseline["mean_variance"].sel(axis=axis).values)))
     # in block means the share of a block on a level is known to half of one of its parts
     error = float(course.step[0]) / (2.0 * PARTS_PER_BLOCK)
     coarse = np.isfinite(evidence_nats) and error < state.settings.visible_sigma * deviation
-    is_slow = found.times.min() > state.settings.fast_blocks * block
-    return (None if coarse and is_slow else found), False
+    is_slow = switching.times.min() > state.settings.fast_blocks * block
+    return (None if coarse and is_slow else switching), False
 
 
 def fast_switching_evidence(data: xr.Dataset, state: State, axis: str) -> SwitchingEvidence | None:
     """Compute the evidence of a bias that switches within blocks; None if there is none."""
-    found = _search_sub_blocks(data, state, axis)
+    switching = _search_sub_blocks(data, state, axis)
     return (
-        found
-        if found is not None and _is_resolved(found, float(state.blocks.attrs["block_s"]))
+        switching
+        if switching is not None and _is_resolved(switching, float(state.blocks.attrs["block_s"]))
         else None
     )
 
 
-def _is_resolved(found: SwitchingEvidence, block: float) -> bool:
+def _is_resolved(switching: SwitchingEvidence, block: float) -> bool:
     """Return whether sub-blocks resolve two levels; anything shorter is a spike."""
     return (
-        bool(np.isfinite(found.evidence_nats))
-        and float(found.times.min()) >= block / found.share.shape[1]
+        bool(np.isfinite(switching.evidence_nats))
+        and float(switching.times.min()) >= block / switching.share.shape[1]
     )
 
 
@@ -206,15 +210,15 @@ def _search_sub_blocks(data: xr.Dataset, state: State, axis: str) -> SwitchingEv
     )
 
 
-def _with_free_levels(found: CandidateEvidence, trial: Trial) -> CandidateEvidence:
+def _with_free_levels(evidence: CandidateEvidence, trial: Trial) -> CandidateEvidence:
     """Return the evidence of an arbitrary course of levels instead of two [nats].
 
     Each visit to a level has its own height. In null records it is that of two levels.
     """
     if "record" in trial.data.dims:
-        return found
-    evidence_nats, best = found.evidence_nats.copy(), list(found.best)
-    for row, (axis,) in enumerate(found.rows):
+        return evidence
+    evidence_nats, best = evidence.evidence_nats.copy(), list(evidence.best)
+    for row, (axis,) in enumerate(evidence.rows):
         if not np.isfinite(evidence_nats[0, row]):
             continue
         inside = best[row].inside
@@ -233,11 +237,11 @@ def _with_free_levels(found: CandidateEvidence, trial: Trial) -> CandidateEviden
             # the sum of all visits is the course itself
             design=np.concatenate([best[row].design, visits.columns[:-1, None]]),
         )
-    return replace(found, evidence_nats=evidence_nats, best=tuple(best))
+    return replace(evidence, evidence_nats=evidence_nats, best=tuple(best))
 
 
 def _variant_with_course(
-    variant: Variant, found: TelegraphCourses, within: SwitchingEvidence | None, state: State
+    variant: Variant, course: TelegraphCourses, within: SwitchingEvidence | None, state: State
 ) -> Variant:
     """Return the variant with the course of the first record, and its mean times [s]."""
     if within is not None:
@@ -250,6 +254,6 @@ def _variant_with_course(
             inside=within.share,
         )
     block = float(state.blocks.attrs["block_s"])
-    low, high = found.times[0] * block
-    values = {"low": float(low), "high": float(high), "switches": float(found.switch_count[0])}
-    return replace(variant, values=values, design=found.share[0][None, None])
+    low, high = course.times[0] * block
+    values = {"low": float(low), "high": float(high), "switches": float(course.switch_count[0])}
+    return replace(variant, values=values, design=course.share[0][None, None])

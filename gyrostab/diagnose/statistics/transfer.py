@@ -65,8 +65,8 @@ class Transfer(Statistic):
     ) -> list[Candidate]:
         """Return candidates of rates that follow another channel or axis at every frequency."""
         return [
-            replace(one, driver=driver)
-            for one in self._candidates_by_channel(kind.name, predictions, windows, blocks)
+            replace(candidate, driver=driver)
+            for candidate in self._candidates_by_channel(kind.name, predictions, windows, blocks)
         ]
 
     def _candidates_by_channel(
@@ -78,27 +78,29 @@ class Transfer(Statistic):
     ) -> list[Candidate]:
         """Build candidates of rates that follow another channel or axis at every frequency."""
         reference_channels = (
-            {str(one) for one in blocks["reference"].values}
+            {str(channel) for channel in blocks["reference"].values}
             if "reference" in blocks.dims
             else set()
         )
         axes = set(windows.axes) if "cross" in blocks else set()
-        found: dict[str, list[Variant]] = {}
+        by_channel: dict[str, list[Variant]] = {}
         for values, prediction in predictions:
             for (parameter, channel), transfer in prediction.transfer.items():
                 if channel in reference_channels or channel in axes:
-                    found.setdefault(channel, []).append(
+                    by_channel.setdefault(channel, []).append(
                         Variant(values, (parameter,), np.asarray(transfer)[None])
                     )
-        if found and effects()[name].stage == "motion":
+        if by_channel and effects()[name].stage == "motion":
             unknown_channels = [
                 channel for channel in sorted(reference_channels) if not _is_known_channel(channel)
             ]
-            for channel in [*found, *unknown_channels]:
-                found[channel] = found.get(channel, []) + _any_transfer(windows.frequency.size)
+            for channel in [*by_channel, *unknown_channels]:
+                by_channel[channel] = by_channel.get(channel, []) + _any_transfer(
+                    windows.frequency.size
+                )
         return [
             Candidate(name, self, (), distinct_variants(variants), reference=(channel,))
-            for channel, variants in found.items()
+            for channel, variants in by_channel.items()
         ]
 
     def candidates_without_channel(self, kind: type[Effect], blocks: xr.Dataset) -> list[Candidate]:
@@ -107,7 +109,9 @@ class Transfer(Statistic):
             return []
         variants = distinct_variants(_any_transfer(blocks.sizes["band"]))
         unknown_channels = sorted(
-            str(one) for one in blocks["reference"].values if not _is_known_channel(str(one))
+            str(channel)
+            for channel in blocks["reference"].values
+            if not _is_known_channel(str(channel))
         )
         return [
             Candidate(kind.name, self, (), variants, reference=(channel,))
@@ -132,7 +136,7 @@ class Transfer(Statistic):
             values = real_and_imaginary(cross / root[..., None], axis=1)
         given, precision = given_columns(state, "transfer", (state.axes[row],), weight.shape)
         designs = stack_designs(
-            candidates, weight.shape, lambda one: real_and_imaginary(one * root * share)
+            candidates, weight.shape, lambda density: real_and_imaginary(density * root * share)
         )
         return LinearModel(values, weight, designs, given, precision)
 
@@ -171,12 +175,12 @@ def reference_channel_of(
 
     Shapes (block, band, record) and (block, band). Expected cross-spectra are subtracted.
     """
-    axes = [str(one) for one in blocks["axis"].values]
+    axes = [str(axis) for axis in blocks["axis"].values]
     if name in axes:
         cross = records_last(measured(data, "cross").values, 3)
         has_power = np.isfinite(blocks["power"].values[row])[..., None]
-        known = expected_cross(baseline)
-        cross = cross if known is None else cross - known[..., None]
+        expected = expected_cross(baseline)
+        cross = cross if expected is None else cross - expected[..., None]
         cross_power = np.full(cross.shape[1:], np.nan + 0j)
         for number, pair in enumerate(pair_rows(blocks)):
             if set(pair) == {name, axes[row]} and name != axes[row]:
@@ -184,7 +188,7 @@ def reference_channel_of(
                     has_power, np.conj(cross[number]) if pair[0] == name else cross[number], np.nan
                 )
         return cross_power, reference_channel_power(name, blocks)
-    place = [str(one) for one in blocks["reference"].values].index(name)
+    place = [str(channel) for channel in blocks["reference"].values].index(name)
     cross = records_last(data["reference_cross"].values, 4)
     return cross[row, place], reference_channel_power(name, blocks)
 
@@ -221,9 +225,12 @@ def _is_known_channel(channel: str) -> bool:
 
 def _any_transfer(bands: int) -> list[Variant]:
     """Return any factor in each band, and in all bands: a mounting may resonate."""
-    alone = np.eye(bands, dtype=np.complex128)
-    one = [Variant({}, ("any",) * 2, np.stack([row, 1j * row])) for row in alone]
-    return [*one, Variant({}, ("any",) * (2 * bands), np.concatenate([alone, 1j * alone]))]
+    single_bands = np.eye(bands, dtype=np.complex128)
+    variants = [Variant({}, ("any",) * 2, np.stack([row, 1j * row])) for row in single_bands]
+    return [
+        *variants,
+        Variant({}, ("any",) * (2 * bands), np.concatenate([single_bands, 1j * single_bands])),
+    ]
 
 
 def _transferred_power(component: Component, state: State) -> Array:

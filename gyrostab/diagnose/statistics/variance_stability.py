@@ -87,10 +87,11 @@ class VarianceStability(Statistic):
             _score_scatter(level, weight, windows, span, single=int(used.sum())) for span in spans
         ]
         z, ratio, variation = (
-            np.concatenate([one[place] for one in scatter], axis=-1) for place in range(3)
+            np.concatenate([span_scores[place] for span_scores in scatter], axis=-1)
+            for place in range(3)
         )
-        f_low = np.append([low[used][one].min() for one in members], low[used][0])
-        f_high = np.append([high[used][one].max() for one in members], high[used][-1])
+        f_low = np.append([low[used][group].min() for group in members], low[used][0])
+        f_high = np.append([high[used][group].max() for group in members], high[used][-1])
         return statistic_dataset(
             "davar",
             blocks,
@@ -145,7 +146,7 @@ def scale_to_expected(
     """
     if not spans:
         return blocks
-    power, spectrum = (one.values for one in (blocks["power"], baseline["spectrum"]))
+    power, spectrum = (variable.values for variable in (blocks["power"], baseline["spectrum"]))
     shape, power = blocks["shape"].values, power.copy()
     for axes, begin, end in spans:
         inside = np.flatnonzero(
@@ -217,9 +218,12 @@ def _relative_levels(
         present = np.isfinite(ratio) & (shape > 0)
         used_shape = np.where(present, shape, 0.0)
         ratio = ratio * _limit_noisy_blocks(np.where(present, ratio, 0.0), used_shape)
-        weight = np.stack([used_shape[..., one].sum(axis=-1) for one in members], axis=-1)
+        weight = np.stack([used_shape[..., group].sum(axis=-1) for group in members], axis=-1)
         total = np.stack(
-            [np.where(present, ratio * used_shape, 0.0)[..., one].sum(axis=-1) for one in members],
+            [
+                np.where(present, ratio * used_shape, 0.0)[..., group].sum(axis=-1)
+                for group in members
+            ],
             axis=-1,
         )
         level = total / weight
@@ -264,19 +268,19 @@ def _coherence_factor(
     if "cross" not in blocks:
         return np.ones(1)
     axes = [str(axis) for axis in blocks["axis"].values]
-    one, other = (
+    first, second = (
         [axes.index(str(axis)) for axis in blocks[name].values] for name in ("first", "second")
     )
     power = np.nan_to_num(blocks["power"].values[..., used])
     cross = np.nan_to_num(blocks["cross"].values[..., used])
     with np.errstate(divide="ignore", invalid="ignore"):
         squared = np.abs(cross.sum(axis=-2)) ** 2 / (
-            power[..., one, :, :].sum(axis=-2) * power[..., other, :, :].sum(axis=-2)
+            power[..., first, :, :].sum(axis=-2) * power[..., second, :, :].sum(axis=-2)
         )
     squared = np.minimum(np.nan_to_num(squared), 1.0)
     mean = np.stack([squared[..., values].mean(axis=-1) for values in members], axis=-1)
     share = weight.sum(axis=-2)
-    pairs = 2.0 * (np.sqrt(share[..., one, :] * share[..., other, :]) * mean).sum(axis=-2)
+    pairs = 2.0 * (np.sqrt(share[..., first, :] * share[..., second, :]) * mean).sum(axis=-2)
     return np.asarray(1.0 + np.nan_to_num(pairs / share.sum(axis=-2)))[..., None, None, :]
 
 
