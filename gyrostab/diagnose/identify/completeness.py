@@ -36,11 +36,15 @@ def with_neighbouring_variants(
         if not (component.statistic.is_linear_in_means and component.row == (axis,)):
             continue
         family = [
-            one for one in component.candidate.variants if one.columns == component.variant.columns
+            variant
+            for variant in component.candidate.variants
+            if variant.columns == component.variant.columns
         ]
-        place = next(number for number, one in enumerate(family) if one is component.variant)
-        for other in family[max(place - 1, 0) : place] + family[place + 1 : place + 2]:
-            state = state.with_columns("mean", axis, mean_columns(other, row))
+        place = next(
+            number for number, variant in enumerate(family) if variant is component.variant
+        )
+        for neighbour in family[max(place - 1, 0) : place] + family[place + 1 : place + 2]:
+            state = state.with_columns("mean", axis, mean_columns(neighbour, row))
     return state
 
 
@@ -50,8 +54,8 @@ def excess_low_frequency_noise(state: State, axis: str, folds: xr.DataArray) -> 
     All identified effects are in the model. It is zero where the free noise is the weaker: a
     calibration on blocks with an effect takes the effect for noise.
     """
-    given = state.given_to("mean", axis)
-    columns = [np.linspace(-1.0, 1.0, state.blocks.sizes["block"])] if given is None else []
+    given_columns = state.given_to("mean", axis)
+    columns = [np.linspace(-1.0, 1.0, state.blocks.sizes["block"])] if given_columns is None else []
     evidence, strength = [], []
     span = state.blocks.sizes["block"] * float(state.blocks.attrs["block_s"])
     slow = (
@@ -61,7 +65,13 @@ def excess_low_frequency_noise(state: State, axis: str, folds: xr.DataArray) -> 
     for tier in ("free", "calibrated"):
         evidence.append(
             mean_factors(
-                state.blocks, state.baseline, [], axis=axis, tier=tier, given=given, folds=folds
+                state.blocks,
+                state.baseline,
+                [],
+                axis=axis,
+                tier=tier,
+                given=given_columns,
+                folds=folds,
             )[0, 0, 0]
         )
         strength.append(float(mean_mixture(state, axis, columns, tier=tier).weights() @ slow))
@@ -82,16 +92,20 @@ def variance_fluctuation(state: State, axis: str) -> float:
         return 0.0
     step = float(state.blocks.attrs["block_s"])
     usual = float(np.median(variance[present]))
-    least = visible_coefficients(usual * step, present.sum() * step)
+    smallest_coefficients = visible_coefficients(usual * step, present.sum() * step)
     K, B = (
         component.ravel()
         for component in np.meshgrid(
-            *([0.0, *(one * np.array(_NOISE_STEPS))] for one in least), indexing="ij"
+            *(
+                [0.0, *(coefficient * np.array(_NOISE_STEPS))]
+                for coefficient in smallest_coefficients
+            ),
+            indexing="ij",
         )
     )
     safe = np.where(present, variance, usual)
-    most = state.settings.max_level_sigma * np.sqrt(safe)
-    values = np.clip(np.where(present, level, 0.0), -most, most)[:, None]
+    limit = state.settings.max_level_sigma * np.sqrt(safe)
+    values = np.clip(np.where(present, level, 0.0), -limit, limit)[:, None]
     products = mean_products(values, columns, variance=safe, step=step, K=K, B=B, present=present)
     gram = products.gram + 1e-9 * np.eye(columns.shape[1]) * (
         1.0 + np.trace(products.gram, axis1=1, axis2=2)[:, None, None]
@@ -115,8 +129,8 @@ def _power_levels(state: State, row: int, axis: str) -> tuple[Array, Array, Arra
         level = (use * np.nan_to_num(ratio)).sum(axis=1) / total
         variance = 1.0 / total + state.baseline["common"].sel(axis=axis).values
         named = [
-            (use * one / state.weight[row]).sum(axis=1) / total
-            for one in state.given.get(("power", axis), [])
+            (use * column / state.weight[row]).sum(axis=1) / total
+            for column in state.given.get(("power", axis), [])
         ]
     columns = np.nan_to_num(np.stack(named, axis=-1)) if named else np.empty((total.size, 0))
     moves = (

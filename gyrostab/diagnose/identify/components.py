@@ -55,11 +55,17 @@ def group_components(
 ) -> dict[str, list[Component]]:
     """Return the components of each effect with enough evidence, the strongest first."""
     out: dict[str, list[Component]] = {}
-    for one in found:
-        out.setdefault(one.candidate.key, []).extend(find_components(one, settings=settings))
+    for evidence in found:
+        out.setdefault(evidence.candidate.key, []).extend(
+            find_components(evidence, settings=settings)
+        )
     for key, components in out.items():
         good = _drop_repeated_power(
-            [one for one in components if one.evidence_nats > settings.component_nats]
+            [
+                component
+                for component in components
+                if component.evidence_nats > settings.component_nats
+            ]
         )
         out[key] = sorted(good or components, key=lambda component: -component.evidence_nats)
     return out
@@ -89,15 +95,15 @@ def merge_lines(components: dict[str, list[Component]]) -> dict[str, list[Compon
     cause. These effects are among its alternatives. Their other components count as before.
     """
     out = {}
-    for key, several in components.items():
-        plain = several[0].candidate.effect == PLAIN_LINE
-        kept = (
-            several
+    for key, effect_components in components.items():
+        plain = effect_components[0].candidate.effect == PLAIN_LINE
+        remaining = (
+            effect_components
             if plain
-            else [component for component in several if not component.statistic.is_line]
+            else [component for component in effect_components if not component.statistic.is_line]
         )
-        if kept:
-            out[key] = kept
+        if remaining:
+            out[key] = remaining
     return out
 
 
@@ -117,12 +123,13 @@ def sum_evidence(components: Sequence[Component]) -> float:
 
 def evidence_of(components: Sequence[Component], like: Component) -> float:
     """Return the evidence of the component with the same statistic, row and reference channel."""
-    wanted = like.candidate.statistic, like.row, like.candidate.reference
+    place = like.candidate.statistic, like.row, like.candidate.reference
     return next(
         (
-            one.evidence_nats
-            for one in components
-            if (one.candidate.statistic, one.row, one.candidate.reference) == wanted
+            component.evidence_nats
+            for component in components
+            if (component.candidate.statistic, component.row, component.candidate.reference)
+            == place
         ),
         like.evidence_nats,
     )
@@ -130,12 +137,12 @@ def evidence_of(components: Sequence[Component], like: Component) -> float:
 
 def candidates_of(components: Sequence[Component]) -> list[Candidate]:
     """Return the candidates that the components come from, each once."""
-    seen: dict[tuple[object, ...], Candidate] = {}
+    distinct_candidates: dict[tuple[object, ...], Candidate] = {}
     for component in components:
-        seen[component.candidate.key, component.statistic, component.candidate.reference] = (
-            component.candidate
-        )
-    return list(seen.values())
+        distinct_candidates[
+            component.candidate.key, component.statistic, component.candidate.reference
+        ] = component.candidate
+    return list(distinct_candidates.values())
 
 
 def axes_of(components: Sequence[Component], order: Sequence[str]) -> tuple[str, ...]:
@@ -147,13 +154,13 @@ def axes_of(components: Sequence[Component], order: Sequence[str]) -> tuple[str,
 def split_layers(components: Sequence[Component]) -> list[list[Component]]:
     """Split components by how often their statistic, row and reference channel occurred before."""
     out: list[list[Component]] = []
-    seen: Counter[tuple[object, ...]] = Counter()
+    occurrences: Counter[tuple[object, ...]] = Counter()
     for component in components:
         place = component.statistic, component.row, component.candidate.reference
-        if seen[place] == len(out):
+        if occurrences[place] == len(out):
             out.append([])
-        out[seen[place]].append(component)
-        seen[place] += 1
+        out[occurrences[place]].append(component)
+        occurrences[place] += 1
     return out
 
 
@@ -182,10 +189,10 @@ def find_layers_again(
     out = [list(first)]
     weight, key = state.weight, components[0].candidate.key
     axes = {axis for component in components for axis in component.row}
-    for before, layer in pairwise(split_layers(components)):
-        state = replace(condition_on(state, before), weight=weight)
-        again = group_components(gains(candidates_of(layer), state), settings=state.settings).get(
-            key, []
-        )
-        out.append([component for component in again if set(component.row) & axes])
+    for previous_layer, layer in pairwise(split_layers(components)):
+        state = replace(condition_on(state, previous_layer), weight=weight)
+        layer_components = group_components(
+            gains(candidates_of(layer), state), settings=state.settings
+        ).get(key, [])
+        out.append([component for component in layer_components if set(component.row) & axes])
     return out

@@ -62,14 +62,14 @@ def effect_candidates(
     >>> blocks = reduce_log(make_log(noise, rate=100.0, unit="deg/h"))
     >>> coordinates = {"axis": ["axis_0"], "term": ["N", "B"]}
     >>> level = xr.DataArray([[0.003, 0.0]], coordinates, ("axis", "term"))
-    >>> found, reasons = effect_candidates(blocks, level)
+    >>> candidates, reasons = effect_candidates(blocks, level)
     >>> reasons["shupe"]
     'not identifiable: the recording has no channel temperature'
-    >>> sorted({one.effect for one in found if one.statistic.is_count})
+    >>> sorted({candidate.effect for candidate in candidates if candidate.statistic.is_count})
     ['clipping', 'dead_zone', 'held_samples', 'rate_quantization', 'spikes']
     """
     units = channel_units(blocks)
-    found: list[Candidate] = []
+    candidates: list[Candidate] = []
     reasons: dict[str, str] = {}
     for name, kind in effects().items():
         if name in _SAME_DESIGN:
@@ -80,14 +80,16 @@ def effect_candidates(
             reasons[name] = "not identifiable: the quantization grid is too coarse"
             continue
         for drivers in _driver_assignments(kind, blocks, units):
-            added, why = _candidates_of_effect(kind, blocks, drivers, coefficient, settings)
+            added, obstacle = _candidates_of_effect(kind, blocks, drivers, coefficient, settings)
             built += added
-            reason = reason or why
-        found += built
+            reason = reason or obstacle
+        candidates += built
         if not built:
-            why = reason or "it leaves no trace in means, spectra and distribution of this record"
-            reasons[name] = f"not identifiable: {why}"
-    return found, reasons
+            obstacle = (
+                reason or "it leaves no trace in means, spectra and distribution of this record"
+            )
+            reasons[name] = f"not identifiable: {obstacle}"
+    return candidates, reasons
 
 
 def _is_hidden_by_grid(kind: type[Effect], blocks: xr.Dataset) -> bool:
@@ -125,7 +127,7 @@ def _matching_channels(
     channel: str, unit: str, channels: tuple[str, ...], blocks: xr.Dataset, units: Mapping[str, str]
 ) -> list[str]:
     """Return channels of the log for one of the effect's: vectors by name, others by prefix."""
-    if sum(other[:-1] == channel[:-1] for other in channels) > 1 and channel[-1] in "xyz":
+    if sum(name[:-1] == channel[:-1] for name in channels) > 1 and channel[-1] in "xyz":
         names = [channel]
     else:
         base = channel.rstrip("0123456789").rstrip("_")
@@ -154,15 +156,15 @@ def _candidates_of_effect(
 ) -> tuple[list[Candidate], str]:
     """Build the candidates of an effect with its channels, by statistic; or say why not."""
     if kind.channels and not drivers:
-        without = [
+        candidates = [
             candidate
             for statistic in STATISTICS
             for candidate in statistic.candidates_without_channel(kind, blocks)
         ]
-        return without, missing_channel_reason(tuple(kind.channels), blocks)
+        return candidates, missing_channel_reason(tuple(kind.channels), blocks)
     windows = make_windows(blocks, drivers)
     predictions: list[tuple[dict[str, Any], Prediction]] = []
-    why = ""
+    obstacle = ""
     for values in _nuisance_grid(kind, windows):
         try:
             effect = kind.example(**values)
@@ -175,9 +177,9 @@ def _candidates_of_effect(
                 )
             )
         except KeyError as error:
-            why = missing_channel_reason((str(error.args[0]),), blocks)
+            obstacle = missing_channel_reason((str(error.args[0]),), blocks)
         except OptionError as error:
-            why = str(error)
+            obstacle = str(error)
     driver = tuple(drivers.get(channel, "") for channel in kind.channels) if drivers else ()
     constant_channels = [
         name
@@ -186,7 +188,7 @@ def _candidates_of_effect(
     ]
     if constant_channels:
         verb = "does" if len(constant_channels) == 1 else "do"
-        why = f"{' and '.join(constant_channels)} {verb} not change"
+        obstacle = f"{' and '.join(constant_channels)} {verb} not change"
     built = [
         candidate
         for statistic in STATISTICS
@@ -194,7 +196,7 @@ def _candidates_of_effect(
             kind, driver, predictions, windows, blocks, coefficient
         )
     ]
-    return built, why
+    return built, obstacle
 
 
 def _effect_channel(drivers: Mapping[str, str], name: str) -> str:
@@ -214,22 +216,22 @@ def _nuisance_grid(kind: type[Effect], windows: Windows) -> Iterator[dict[str, A
     except KeyError:
         grid = {}
     grid |= {item.name: item.choices for item in kind.parameters() if item.choices}
-    known = kind.example().points(windows)
-    if known:
-        yield from (dict(point) for point in known)
+    known_points = kind.example().points(windows)
+    if known_points:
+        yield from (dict(point) for point in known_points)
         return
     points = list(product(*grid.values()))
-    most = max(_MAX_VARIANTS, len(grid.get(TIME_PARAMETER, ())))
-    for point in points[:: max(1, -(-len(points) // most))]:
+    max_points = max(_MAX_VARIANTS, len(grid.get(TIME_PARAMETER, ())))
+    for point in points[:: max(1, -(-len(points) // max_points))]:
         yield {
             name: value if isinstance(value, str) else float(value)
             for name, value in zip(grid, point, strict=True)
         }
 
 
-def _thin_out(values: Array, most: int) -> list[Any]:
-    """Select at most `most` values at equal steps."""
-    every = max(1, -(-len(values) // most))
+def _thin_out(values: Array, max_count: int) -> list[Any]:
+    """Select at most `max_count` values at equal steps."""
+    every = max(1, -(-len(values) // max_count))
     return list(values[every // 2 :: every])
 
 

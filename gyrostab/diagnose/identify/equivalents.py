@@ -44,16 +44,16 @@ def settle_forms(identifications: Identifications, baseline: xr.Dataset) -> Iden
             weight=identifications.state.weight,
             masked=identifications.state.masked,
         )
-        alike = _share_choices(identification.components, state)
+        components = _share_choices(identification.components, state)
         return replace(
             identification,
-            components=tuple(prefer_plainer(component, state) for component in alike),
+            components=tuple(prefer_plainer(component, state) for component in components),
         )
 
     return replace(
         identifications,
-        identified=tuple(settle(one) for one in identifications.identified),
-        expected=tuple(settle(one) for one in identifications.expected),
+        identified=tuple(settle(identification) for identification in identifications.identified),
+        expected=tuple(settle(identification) for identification in identifications.expected),
     )
 
 
@@ -68,15 +68,21 @@ def _share_choices(components: Sequence[Component], state: State) -> list[Compon
         for texts in (variant.texts for variant in component.candidate.variants):
             if texts not in tried:
                 tried.append(texts)
-    known = {
+    defaults = {
         item.name: item.default for item in effects()[components[0].candidate.effect].parameters()
     }
     for texts in tried if len(tried) > 1 else ():
-        alike = [_select_texts(component, state, texts) for component in components]
-        if None not in alike:
-            found = [one for one in alike if one is not None]
-            nats = sum(_explained_nats(one, state, one.variant) for one in found if _has_forms(one))
-            choices.append((nats, all(known[name] == texts[name] for name in texts), found))
+        matches = [_select_texts(component, state, texts) for component in components]
+        if None not in matches:
+            matching_components = [component for component in matches if component is not None]
+            nats = sum(
+                _explained_nats(component, state, component.variant)
+                for component in matching_components
+                if _has_forms(component)
+            )
+            choices.append(
+                (nats, all(defaults[name] == texts[name] for name in texts), matching_components)
+            )
     top = max((nats for nats, _, _ in choices), default=0.0)
     usual = [
         choice
@@ -92,17 +98,18 @@ def _select_texts(component: Component, state: State, texts: Mapping[str, str]) 
     """Return a component in its best variant with some texts; None if it has none."""
     if component.variant.texts == texts or not _has_forms(component):
         return component
-    alike = [
-        one
-        for one in component.candidate.variants
-        if one.columns == component.variant.columns
-        and one.squared == component.variant.squared
-        and one.texts == texts
+    variants = [
+        variant
+        for variant in component.candidate.variants
+        if variant.columns == component.variant.columns
+        and variant.squared == component.variant.squared
+        and variant.texts == texts
     ]
-    if not alike:
+    if not variants:
         return None
     return replace(
-        component, variant=max(alike, key=lambda one: _explained_nats(component, state, one))
+        component,
+        variant=max(variants, key=lambda variant: _explained_nats(component, state, variant)),
     )
 
 
@@ -140,25 +147,27 @@ def prefer_plainer(component: Component, state: State) -> Component:
     mean, covariance = component_mixture(component, state).moments()
     error = np.sqrt(np.diagonal(covariance))
     correlation = float(np.abs(np.tril(covariance / np.outer(error, error), -1)).max())
-    found = ((name, _single_term_variant(component, name)) for name in component.variant.columns)
-    alone = {name: one for name, one in found if one is not None}
-    if not alone:
+    named_terms = (
+        (name, _single_term_variant(component, name)) for name in component.variant.columns
+    )
+    terms = {name: variant for name, variant in named_terms if variant is not None}
+    if not terms:
         return component
-    gains = {name: _explained_nats(component, state, variant) for name, variant in alone.items()}
+    gains = {name: _explained_nats(component, state, variant) for name, variant in terms.items()}
     needed, share = state.settings.reject_nats, state.settings.form_error_share
     best = max(gains.values())
     # the first that explains as much as the best
     name = next(
         name for name in component.variant.columns if gains.get(name, -np.inf) > best - needed
     )
-    whole = 0.5 * float(mean @ np.linalg.solve(covariance, mean))
+    total_nats = 0.5 * float(mean @ np.linalg.solve(covariance, mean))
     if (
         correlation < state.settings.term_correlation
-        and whole - gains[name] > needed + share * gains[name]
+        and total_nats - gains[name] > needed + share * gains[name]
     ):
         return component
-    others = [other for other in component.variant.columns if other != name]
-    return replace(component, variant=alone[name], note=_describe_unseparated(name, others))
+    other_names = [other for other in component.variant.columns if other != name]
+    return replace(component, variant=terms[name], note=_describe_unseparated(name, other_names))
 
 
 def _prefer_first_term(component: Component, state: State) -> Component:
@@ -167,21 +176,23 @@ def _prefer_first_term(component: Component, state: State) -> Component:
     Rounding or chance may have put another one ahead.
     """
     names = dict.fromkeys(
-        one.columns[0] for one in component.candidate.variants if len(one.columns) == 1
+        variant.columns[0] for variant in component.candidate.variants if len(variant.columns) == 1
     )
-    terms = [one for name in names if (one := _single_term_variant(component, name)) is not None]
-    own = _explained_nats(component, state, component.variant)
+    terms = [
+        variant for name in names if (variant := _single_term_variant(component, name)) is not None
+    ]
+    own_nats = _explained_nats(component, state, component.variant)
     correlation = [
-        one
-        for one in terms
-        if one.columns == component.variant.columns
-        or _explained_nats(component, state, one)
-        > own - state.settings.ambiguous_nats - state.settings.form_error_share * own
+        variant
+        for variant in terms
+        if variant.columns == component.variant.columns
+        or _explained_nats(component, state, variant)
+        > own_nats - state.settings.ambiguous_nats - state.settings.form_error_share * own_nats
     ]
     if len(correlation) < 2:
         return component
-    first, *others = correlation
-    note = _describe_unseparated(first.columns[0], [one.columns[0] for one in others])
+    first, *other_terms = correlation
+    note = _describe_unseparated(first.columns[0], [variant.columns[0] for variant in other_terms])
     return replace(component, variant=first, note=note)
 
 
@@ -193,21 +204,21 @@ def _explained_nats(component: Component, state: State, variant: Variant) -> flo
     return 0.5 * float(size @ np.linalg.solve(spread, size))
 
 
-def _describe_unseparated(name: str, others: Sequence[str]) -> str:
-    taken = "is" if len(others) == 1 else "are"
+def _describe_unseparated(name: str, other_names: Sequence[str]) -> str:
+    verb = "is" if len(other_names) == 1 else "are"
     return (
-        f"The record does not separate its {name} from its {' and '.join(others)}, which {taken} "
-        "taken as 0."
+        f"The record does not separate its {name} from its {' and '.join(other_names)}, which "
+        f"{verb} taken as 0."
     )
 
 
 def _single_term_variant(component: Component, name: str) -> Variant | None:
     """Return the variant of the same values with this term alone."""
-    for one in component.candidate.variants:
+    for variant in component.candidate.variants:
         if (
-            one.columns == (name,)
-            and one.squared == component.variant.squared
-            and one.values == component.variant.values
+            variant.columns == (name,)
+            and variant.squared == component.variant.squared
+            and variant.values == component.variant.values
         ):
-            return one
+            return variant
     return None

@@ -51,22 +51,25 @@ def identify_expected_effects(
         With these in the model.
     """
     identified: list[Identification] = []
-    state, left = start, list(known)
+    state, remaining = start, list(known)
     needed = start.settings.component_nats
-    rounds = MAX_ROUNDS_PER_EFFECT * len(left)
-    while left and rounds > 0:
+    rounds = MAX_ROUNDS_PER_EFFECT * len(remaining)
+    while remaining and rounds > 0:
         rounds -= 1
-        found = [(_best_components(effect, candidates, state, gains), effect) for effect in left]
-        left = [effect for components, effect in found if sum_evidence(components) > needed]
+        choices = [
+            (_best_components(effect, candidates, state, gains), effect) for effect in remaining
+        ]
+        remaining = [effect for components, effect in choices if sum_evidence(components) > needed]
         components, effect = max(
-            found, key=lambda one: (_are_anomalous_samples(one[0], needed), sum_evidence(one[0]))
+            choices,
+            key=lambda choice: (_are_anomalous_samples(choice[0], needed), sum_evidence(choice[0])),
         )
         if sum_evidence(components) <= needed:
             break
         identified.append(_make_identification(components, state))
         state = condition_on(state, components)
         if _are_anomalous_samples(components, needed):  # their counts cannot be taken out
-            left = [one for one in left if one is not effect]
+            remaining = [other for other in remaining if other is not effect]
     return identified, state
 
 
@@ -91,19 +94,21 @@ def _best_components(
     gains: Callable[[Sequence[Candidate], State], list[CandidateEvidence]],
 ) -> list[Component]:
     """Return the components of an effect with the most evidence on its axes."""
-    by = group_components(
-        gains([one for one in candidates if _is_candidate_of(one, effect)], state),
+    components_by_key = group_components(
+        gains(
+            [candidate for candidate in candidates if _is_candidate_of(candidate, effect)], state
+        ),
         settings=state.settings,
     )
-    own = [
+    components_on_axes = [
         [
             component
             for component in components
             if not effect.axes or set(component.row) <= set(effect.axes)
         ]
-        for components in by.values()
+        for components in components_by_key.values()
     ]
-    return max(own, key=sum_evidence, default=[])
+    return max(components_on_axes, key=sum_evidence, default=[])
 
 
 def _make_identification(components: Sequence[Component], state: State) -> Identification:

@@ -79,8 +79,8 @@ def name_effects(
         known,
         effects,
         start,
-        lambda some, state: compute_evidence(
-            some, state.blocks, state, folds, count_evidence=count_evidence
+        lambda group, state: compute_evidence(
+            group, state.blocks, state, folds, count_evidence=count_evidence
         ),
     )
     search = Search(
@@ -92,7 +92,7 @@ def name_effects(
         settings,
     )
     identified, unidentified, rejected, state = search.run(start)
-    found = Identifications(
+    identifications = Identifications(
         tuple(identified),
         tuple(unidentified),
         search.threshold,
@@ -105,7 +105,7 @@ def name_effects(
         tuple(expected),
         tuple(rejected),
     )
-    return settle_forms(found, baseline)
+    return settle_forms(identifications, baseline)
 
 
 def _score_null_records(
@@ -125,18 +125,18 @@ def _score_null_records(
     linear = [candidate for candidate in candidates if not candidate.statistic.is_count]
     counts = [candidate for candidate in candidates if candidate.statistic.is_count]
     sums: list[dict[str, Array]] = []
-    kept: list[xr.Dataset] = []
+    count_chunks: list[xr.Dataset] = []
     records = 0
     for chunk in nulls:
         expected.add(chunk)
         sums.append(evidence_by_effect(compute_evidence(linear, chunk, state, folds, rng=rng)))
-        kept.append(chunk[[name for name in expected.sums if name in chunk]])
+        count_chunks.append(chunk[[name for name in expected.sums if name in chunk]])
         records += chunk.sizes["record"]
         progress("naming", 0, records)
     rounded = rounded_rates(state.blocks, state.baseline, settings=state.settings)
     count_evidence = CountEvidence.gathered(expected, rounded)
     best = []
-    for linear_sums, chunk in zip(sums, kept, strict=True):
+    for linear_sums, chunk in zip(sums, count_chunks, strict=True):
         count_sums = evidence_by_effect(
             compute_evidence(counts, chunk, state, folds, count_evidence=count_evidence)
         )

@@ -72,20 +72,26 @@ def without_pulses(
         weight = settings.min_comb_lines if has_profile else int(component.statistic.is_line)
         lines.update(dict.fromkeys(component.row, weight))
     out: list[Selection] = []
-    for one in chosen:
-        if isinstance(one, Identification) and one.effect == "spikes":
-            kept = tuple(
+    for selection in chosen:
+        if isinstance(selection, Identification) and selection.effect == "spikes":
+            remaining = tuple(
                 component
-                for component in one.components
+                for component in selection.components
                 if lines[component.row[0]] < settings.min_comb_lines
             )
             out += (
-                [replace(one, components=kept, axes=tuple(component.row[0] for component in kept))]
-                if kept
+                [
+                    replace(
+                        selection,
+                        components=remaining,
+                        axes=tuple(component.row[0] for component in remaining),
+                    )
+                ]
+                if remaining
                 else []
             )
         else:
-            out.append(one)
+            out.append(selection)
     return out
 
 
@@ -116,9 +122,11 @@ def find_better_form(
     state, error : State, float
         As for `is_physical`.
     """
-    other = _find_other_course(components, state, error)
-    forms = [_find_other_form(component, state) for component in components] if not other else []
-    return other or (forms[0] if forms and all(forms) else None)
+    other_course = _find_other_course(components, state, error)
+    forms = (
+        [_find_other_form(component, state) for component in components] if not other_course else []
+    )
+    return other_course or (forms[0] if forms and all(forms) else None)
 
 
 def _find_other_course(
@@ -222,10 +230,10 @@ def _is_in_range(component: Component, state: State) -> bool:
         for item in effects()[component.candidate.effect].parameters()
     }
     sizes, covariance = component_mixture(component, state).moments()
-    least = np.abs(sizes) - state.settings.clear_sigma * np.sqrt(np.diagonal(covariance))
+    smallest_sizes = np.abs(sizes) - state.settings.clear_sigma * np.sqrt(np.diagonal(covariance))
     return all(
         size <= largest.get(name, np.inf)
-        for name, size in zip(component.variant.columns, least, strict=True)
+        for name, size in zip(component.variant.columns, smallest_sizes, strict=True)
     )
 
 
@@ -238,13 +246,13 @@ def _is_above_least(component: Component, state: State) -> bool:
 
     if component.variant.squared or len(component.variant.columns) != 1:
         return True
-    least = {
+    lower_bound = {
         item.name: item.low for item in effects()[component.candidate.effect].parameters()
     }.get(component.variant.columns[0])
-    if least is None or not np.isfinite(least):
+    if lower_bound is None or not np.isfinite(lower_bound):
         return True
     size, error = component_size(component, state)
-    return size >= least - state.settings.clear_sigma * error
+    return size >= lower_bound - state.settings.clear_sigma * error
 
 
 def _further_level_nats(component: Component, state: State) -> float:
@@ -257,14 +265,16 @@ def _further_level_nats(component: Component, state: State) -> float:
     axis, settings = component.row[0], state.settings
     allowed = settings.ambiguous_nats + settings.form_error_share * component.evidence_nats
     if component.variant.inside.size:
-        within = fast_switching_evidence(state.blocks, add_fast_switching(state, component), axis)
-        nats = within.evidence_nats if within is not None else 0.0
+        switching = fast_switching_evidence(
+            state.blocks, add_fast_switching(state, component), axis
+        )
+        nats = switching.evidence_nats if switching is not None else 0.0
         return nats if nats > allowed else 0.0
-    given = np.stack(
+    given_columns = np.stack(
         [*state.given.get(("mean", axis), []), component.variant.design[0, 0]], axis=-1
     )
     evidence_nats, _ = telegraph_evidence(
-        state.blocks, state.baseline, axis=axis, given=given, settings=settings
+        state.blocks, state.baseline, axis=axis, given=given_columns, settings=settings
     )
     return float(evidence_nats[0]) if evidence_nats[0] > allowed else 0.0
 
@@ -290,34 +300,36 @@ def _unequal_nats(component: Component, state: State) -> float:
     Jumps that were named first may be switches. The switches are therefore also found without them.
     """
     variant, axis = component.variant, component.row[0]
-    given = state.given.get(("mean", axis), [])
+    given_columns = state.given.get(("mean", axis), [])
     share = variant.inside if variant.inside.size else variant.design[0, 0]
-    courses = [(share, given)]
-    others = [column for column in given if np.count_nonzero(np.diff(column)) > _JUMP_CHANGES]
-    if len(others) < len(given) and not variant.inside.size:
-        _, found = telegraph_evidence(
+    courses = [(share, given_columns)]
+    without_jumps = [
+        column for column in given_columns if np.count_nonzero(np.diff(column)) > _JUMP_CHANGES
+    ]
+    if len(without_jumps) < len(given_columns) and not variant.inside.size:
+        _, telegraph = telegraph_evidence(
             state.blocks,
             state.baseline,
             axis=axis,
-            given=np.stack(others, axis=-1) if others else None,
+            given=np.stack(without_jumps, axis=-1) if without_jumps else None,
             settings=state.settings,
         )
-        courses.append((found.share[0], others))
-    return min(_compare_course(one, axis, columns, state) for one, columns in courses)
+        courses.append((telegraph.share[0], without_jumps))
+    return min(_compare_course(share, axis, columns, state) for share, columns in courses)
 
 
-def _compare_course(share: Array, axis: str, given: Sequence[Array], state: State) -> float:
+def _compare_course(share: Array, axis: str, given_columns: Sequence[Array], state: State) -> float:
     """Return the evidence of a course for levels that differ, at least 0 with few switches."""
-    found = compare_visits(
+    visits = compare_visits(
         state.blocks["mean"].sel(axis=axis).values,
         state.baseline,
         share,
         axis=axis,
         block_s=float(state.blocks.attrs["block_s"]),
-        given=np.stack(given, axis=-1) if given else None,
+        given=np.stack(given_columns, axis=-1) if given_columns else None,
     )
-    is_known = found.switch_count >= state.settings.min_switches
-    return found.unequal_nats if is_known else max(found.unequal_nats, 0.0)
+    is_known = visits.switch_count >= state.settings.min_switches
+    return visits.unequal_nats if is_known else max(visits.unequal_nats, 0.0)
 
 
 def _is_moving(axis: str, state: State) -> bool:
@@ -389,13 +401,13 @@ def find_spectral_alternatives(
     powers = [component for component in components if component.statistic.is_power]
     if effect not in DIFFERENT_SPECTRUM or not powers:
         return []
-    own = sum(component.evidence_nats for component in powers)
+    own_nats = sum(component.evidence_nats for component in powers)
     free = 0.0
     for component in powers:
-        found = gains([_any_spectrum(component, state)], state)[0]
-        free += float(found.evidence_nats[0, found.rows.index(component.row)])
-    allowed = state.settings.ambiguous_nats + state.settings.form_error_share * own
-    return list(DIFFERENT_SPECTRUM[effect]) if free - own > allowed else []
+        evidence = gains([_any_spectrum(component, state)], state)[0]
+        free += float(evidence.evidence_nats[0, evidence.rows.index(component.row)])
+    allowed = state.settings.ambiguous_nats + state.settings.form_error_share * own_nats
+    return list(DIFFERENT_SPECTRUM[effect]) if free - own_nats > allowed else []
 
 
 def _any_spectrum(component: Component, state: State) -> Candidate:

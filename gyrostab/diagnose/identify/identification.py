@@ -176,14 +176,17 @@ class Identifications:
 
 def components_of(chosen: Iterable[Selection]) -> list[Component]:
     """Return the components of several selections, in order."""
-    return [component for one in chosen for component in one.components]
+    return [component for selection in chosen for component in selection.components]
 
 
 def condition_on_selections(
     start: State, chosen: Sequence[Selection], without: Selection | None = None
 ) -> State:
     """Return the state with all selections but one in the model."""
-    return [start, *conditioned_states(start, [one for one in chosen if one is not without])][-1]
+    return [
+        start,
+        *conditioned_states(start, [selection for selection in chosen if selection is not without]),
+    ][-1]
 
 
 def conditioned_states(start: State, chosen: Sequence[Selection]) -> Iterator[State]:
@@ -209,16 +212,26 @@ def remove_phase_locked(
     small part of its evidence, and lose in every band that it leaves. Therefore its own statistic
     alone counts, and the powers of both models are without it.
     """
-    kept, evidence_nats = [], 0.0
-    for one in identifications.identified:
-        locked = [part.statistic.is_only_in_phase(part, blocks) for part in one.components]
-        rest = tuple(part for part, out in zip(one.components, locked, strict=True) if not out)
+    identified, evidence_nats = [], 0.0
+    for identification in identifications.identified:
+        locked = [
+            part.statistic.is_only_in_phase(part, blocks) for part in identification.components
+        ]
+        rest = tuple(
+            part for part, out in zip(identification.components, locked, strict=True) if not out
+        )
         evidence_nats += sum(
-            part.evidence_nats for part, out in zip(one.components, locked, strict=True) if out
+            part.evidence_nats
+            for part, out in zip(identification.components, locked, strict=True)
+            if out
         )
         if rest:
-            kept.append(replace(one, components=rest) if len(rest) < len(one.components) else one)
-    return replace(identifications, identified=tuple(kept)), evidence_nats
+            identified.append(
+                replace(identification, components=rest)
+                if len(rest) < len(identification.components)
+                else identification
+            )
+    return replace(identifications, identified=tuple(identified)), evidence_nats
 
 
 def add_identification(chosen: Sequence[Selection], one: Selection) -> list[Selection]:
@@ -233,15 +246,15 @@ def add_identification(chosen: Sequence[Selection], one: Selection) -> list[Sele
             and _is_same_effect(one, other)
         ):
             axes = tuple(sorted({*other.axes, *one.axes}))
-            alike = tuple(dict.fromkeys([*other.alternatives, *one.alternatives]))
-            both = replace(
+            alternatives = tuple(dict.fromkeys([*other.alternatives, *one.alternatives]))
+            merged = replace(
                 other,
                 axes=axes,
                 components=(*other.components, *one.components),
                 evidence_nats=other.evidence_nats + one.evidence_nats,
-                alternatives=alike,
+                alternatives=alternatives,
             )
-            return [*chosen[:place], both, *chosen[place + 1 :]]
+            return [*chosen[:place], merged, *chosen[place + 1 :]]
     return [*chosen, one]
 
 
@@ -255,29 +268,33 @@ def with_axes_of(
 
     `again` has the components that were found with all others in the model.
     """
-    seen = {
+    shown_axes = {
         axis
         for component in again.get(identification.components[0].candidate.key, [])
         if component.evidence_nats > settings.component_nats
         for axis in component.row
     }
-    kept = tuple(component for component in identification.components if set(component.row) <= seen)
+    components = tuple(
+        component for component in identification.components if set(component.row) <= shown_axes
+    )
     return (
         replace(
             identification,
-            components=kept,
-            axes=tuple(axis for axis in identification.axes if axis in seen),
+            components=components,
+            axes=tuple(axis for axis in identification.axes if axis in shown_axes),
         )
-        if kept
+        if components
         else identification
     )
 
 
-def _is_same_effect(one: Identification, other: Identification) -> bool:
+def _is_same_effect(first: Identification, other: Identification) -> bool:
     lines = {
-        component.place for component in components_of((one, other)) if component.statistic.is_line
+        component.place
+        for component in components_of((first, other))
+        if component.statistic.is_line
     }
-    return (one.effect, one.driver) == (other.effect, other.driver) and len(lines) < 2
+    return (first.effect, first.driver) == (other.effect, other.driver) and len(lines) < 2
 
 
 def find_unidentified(
@@ -314,9 +331,9 @@ def form_error(
         if not component.statistic.is_line
     ]
     error = 0.0
-    for one in chosen:
-        for component in one.components:
-            beside = [
+    for selection in chosen:
+        for component in selection.components:
+            affected_candidates = [
                 candidate
                 for statistic, axes, candidate in statistics
                 if statistic.error_shows_in[0] in component.statistic.error_shows_in
@@ -324,10 +341,13 @@ def form_error(
             ]
             of_spectrum = (
                 component.statistic.is_power
-                and isinstance(one, Identification)
-                and bool(one.driver)
-                and any(other.effect == _FILTER or other.driver == one.driver for other in beside)
+                and isinstance(selection, Identification)
+                and bool(selection.driver)
+                and any(
+                    candidate.effect == _FILTER or candidate.driver == selection.driver
+                    for candidate in affected_candidates
+                )
             )
             share = settings.spectrum_error_share if of_spectrum else settings.form_error_share
-            error += share * component.evidence_nats if beside else 0.0
+            error += share * component.evidence_nats if affected_candidates else 0.0
     return error

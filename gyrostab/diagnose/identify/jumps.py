@@ -117,11 +117,11 @@ def _allowed_nats(jumps: Sequence[Component], state: State) -> float:
 def _evidence_in_scatter(component: Component, state: State) -> float:
     """Return the log Bayes factor of a jump in means that may be noisy for a while [nats]."""
     variances = _possible_variances(component, state)
-    jump = [component_mixture(component, state, variance=one) for one in variances]
-    none = [mean_mixture(state, component.row[0], [], variance=one) for one in variances]
+    jump = [component_mixture(component, state, variance=variance) for variance in variances]
+    none = [mean_mixture(state, component.row[0], [], variance=variance) for variance in variances]
     with_jump, without = (
-        np.array([np.logaddexp.reduce(one.log_weight) for one in several])
-        for several in (jump, none)
+        np.array([np.logaddexp.reduce(mixture.log_weight) for mixture in mixtures])
+        for mixtures in (jump, none)
     )
     likely = jump[int(with_jump.argmax())]
     size, covariance = likely.moments()
@@ -145,15 +145,19 @@ def _possible_variances(component: Component, state: State) -> list[Array]:
     at = round(float(component.variant.values[_INSTANT]) / float(state.blocks.attrs["block_s"]))
     lengths = [2**power for power in range(1, max(block_count, 2).bit_length())]
     spans = {
-        (max(at - one, 0), min(at + two, block_count))
+        (max(at - blocks_before, 0), min(at + blocks_after, block_count))
         for length in lengths
-        for one, two in ((length, length), (0, length), (length, 0))
+        for blocks_before, blocks_after in ((length, length), (0, length), (length, 0))
     }
     usual = state.baseline["mean_variance"].sel(axis=axis).values
     inside = [(block >= first) & (block < stop) for first, stop in sorted(spans)]
     return [
         usual,
-        *(np.where(here, factor * usual, usual) for here in inside for factor in _VARIANCE_FACTORS),
+        *(
+            np.where(is_inside, factor * usual, usual)
+            for is_inside in inside
+            for factor in _VARIANCE_FACTORS
+        ),
     ]
 
 
@@ -168,10 +172,10 @@ def _event_spans(component: Component, state: State) -> list[tuple[int, int]]:
             EVENT_LENGTHS,
         ).astype(int)
     ).tolist()
-    both = [span for length in lengths for span in ((at, at + length), (at - length, at))]
+    spans = [span for length in lengths for span in ((at, at + length), (at - length, at))]
     return [
         (first, stop)
-        for first, stop in both
+        for first, stop in spans
         if first >= MIN_LEVEL_BLOCKS and stop <= block_count - MIN_LEVEL_BLOCKS
     ]
 
@@ -184,10 +188,13 @@ def _fit_event(
     shape = component.variant.design.shape
     during = np.broadcast_to(((block >= span[0]) & (block < span[1])).astype(np.float64), shape)
     behind = np.broadcast_to((block >= span[1]).astype(np.float64), shape)
-    alone, both = (
-        replace(component.variant, design=one) for one in (during, np.concatenate([during, behind]))
+    event, event_with_level = (
+        replace(component.variant, design=design)
+        for design in (during, np.concatenate([during, behind]))
     )
-    return component_mixture(component, state, alone), component_mixture(component, state, both)
+    return component_mixture(component, state, event), component_mixture(
+        component, state, event_with_level
+    )
 
 
 def _is_other_level(component: Component, state: State, span: tuple[int, int]) -> bool:

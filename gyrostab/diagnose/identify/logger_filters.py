@@ -44,14 +44,19 @@ def without_slopes(
     if not lines or not filters:
         return passing
     trial = condition_on(state, list(components[filters[0]]))
-    again = compute_evidence(_candidates_of(components, lines), trial.blocks, trial, folds)
-    left = {one.candidate.key: float(np.maximum(one.evidence_nats[0], 0.0).sum()) for one in again}
-    before = {
+    line_evidence = compute_evidence(_candidates_of(components, lines), trial.blocks, trial, folds)
+    nats_after = {
+        evidence.candidate.key: float(np.maximum(evidence.evidence_nats[0], 0.0).sum())
+        for evidence in line_evidence
+    }
+    nats_before = {
         key: sum(max(component.evidence_nats, 0.0) for component in components[key])
         for key in lines
     }
     real = {
-        key for key in lines if left.get(key, 0.0) > state.settings.majority_share * before[key]
+        key
+        for key in lines
+        if nats_after.get(key, 0.0) > state.settings.majority_share * nats_before[key]
     }
     return [
         key for key in passing if (key in real if key in lines else key not in filters or not real)
@@ -74,8 +79,8 @@ def separate_axes_nats(components: Sequence[Component], state: State) -> float:
     ).T
     evidence = sum(max(component.evidence_nats, 0.0) for component in shown)
     nats = disagreement_nats(share, error**-2.0)
-    most = state.settings.reject_nats + state.settings.spectrum_error_share * evidence
-    return nats if nats > most else 0.0
+    allowed = state.settings.reject_nats + state.settings.spectrum_error_share * evidence
+    return nats if nats > allowed else 0.0
 
 
 def _candidates_of(
@@ -94,7 +99,7 @@ def fit_filter_sizes(
     sizes : dict of str to (float, float) or (float, float, float, float)
         The parameter that is measured with its standard error, and with the ends of its 95 %
         interval where several places of the grid fit.
-    others : dict of str to float
+    other_values : dict of str to float
         Order, and how the samples are made.
     """
     kind = effects()[components[0].candidate.effect]
@@ -105,31 +110,41 @@ def fit_filter_sizes(
             band_columns(state.blocks)
             * band_response(kind.example(**values), state.blocks)[:, None]
         )
-        return sum(_max_log_likelihood(fit._replace(columns=seen @ filtered)) for fit, seen in fits)
+        return sum(
+            _max_log_likelihood(fit._replace(columns=mixing @ filtered)) for fit, mixing in fits
+        )
 
     family = [
-        one.values
-        for one in components[0].candidate.variants
-        if components[0].statistic.is_filter(one)
+        variant.values
+        for variant in components[0].candidate.variants
+        if components[0].statistic.is_filter(variant)
     ]
-    log = [likelihood(one) for one in family]
+    log = [likelihood(values) for values in family]
     best = family[int(np.argmax(log))]
     name = "cutoff" if best["cutoff"] else "length"
-    others = {key: float(value) for key, value in best.items() if key != name}
+    other_values = {key: float(value) for key, value in best.items() if key != name}
     if name == "length" and best["instrument"] == 1.0:
-        return {name: (float(best[name]), 0.0)}, others  # a count of samples
-    alike = sorted(
-        {float(one[name]) for one in family if all(one[key] == best[key] for key in others)}
+        return {name: (float(best[name]), 0.0)}, other_values  # a count of samples
+    grid = sorted(
+        {
+            float(values[name])
+            for values in family
+            if all(values[key] == best[key] for key in other_values)
+        }
     )
     refined = _refine_on_grid(
-        alike, float(best[name]), lambda value: likelihood({**best, name: value})
+        grid, float(best[name]), lambda value: likelihood({**best, name: value})
     )
     return {
         name: _widen_interval(
             refined,
-            [(float(one[name]), each) for one, each in zip(family, log, strict=True) if one[name]],
+            [
+                (float(values[name]), log_likelihood)
+                for values, log_likelihood in zip(family, log, strict=True)
+                if values[name]
+            ],
         )
-    }, others
+    }, other_values
 
 
 def _refine_on_grid(
@@ -166,11 +181,11 @@ def _widen_interval(
         Values of all filters of the family, evenly spread in their logarithm, and their log
         likelihoods.
     """
-    value, log = (np.array(one) for one in zip(*sorted(tried), strict=True))
+    value, log = (np.array(column) for column in zip(*sorted(tried), strict=True))
     share = np.exp(log - np.logaddexp.reduce(log))
     mean, sd = refined
-    near = np.abs(np.log(value / mean)) <= max(GRID_REACH, 2.0 * sd / mean)
-    if share[~near].sum() < MIN_ELSEWHERE_SHARE:
+    is_near = np.abs(np.log(value / mean)) <= max(GRID_REACH, 2.0 * sd / mean)
+    if share[~is_near].sum() < MIN_ELSEWHERE_SHARE:
         return refined
     below, above = share.cumsum(), share[::-1].cumsum()[::-1]
     low = min(float(value[below >= INTERVAL_TAILS[0]].min()), mean - NORMAL_95 * sd)
@@ -190,31 +205,34 @@ def _average_powers(axis: str, state: State) -> tuple[Fit, Array]:
         np.isfinite(power) & np.isfinite(shape) & ~state.masked[row][:, None], shape, 0.0
     )
     total = np.maximum(use.sum(axis=0), 1e-300)
-    common, alone = (one[row] for one in common_variance(blocks))
-    each = np.nansum(alone, axis=1)
-    share = min(1.0, float((each / (1.0 + common * each)).sum() / max(np.nansum(shape), 1e-300)))
+    common, shape_alone = (values[row] for values in common_variance(blocks))
+    block_shape = np.nansum(shape_alone, axis=1)
+    share = min(
+        1.0,
+        float((block_shape / (1.0 + common * block_shape)).sum() / max(np.nansum(shape), 1e-300)),
+    )
 
     def mean(values: Array) -> Array:
         return np.asarray(
             (use * np.nan_to_num(np.broadcast_to(values, use.shape))).sum(axis=0) / total
         )
 
-    whole = mean(unspread_share(blocks)[row, :, None])
+    unspread = mean(unspread_share(blocks)[row, :, None])
     width = (blocks["band_high"] - blocks["band_low"]).values
-    seen = np.diag(whole) + np.outer(1.0 - whole, width / width.sum())
-    beside = [mean(one) for one in state.given.get(("power", axis), [])]
+    mixing = np.diag(unspread) + np.outer(1.0 - unspread, width / width.sum())
+    effect_columns = [mean(column) for column in state.given.get(("power", axis), [])]
     free = (
-        np.stack([one / max(np.abs(one).max(), 1e-300) for one in beside], axis=1)
-        if beside
+        np.stack([column / max(np.abs(column).max(), 1e-300) for column in effect_columns], axis=1)
+        if effect_columns
         else None
     )
     return Fit(
         mean(power),
-        seen @ band_columns(blocks),
+        mixing @ band_columns(blocks),
         total * share,
         free_columns=free,
         start=mean(state.weight[row]),
-    ), seen
+    ), mixing
 
 
 def _max_log_likelihood(fit: Fit) -> float:

@@ -53,30 +53,33 @@ def _moving_blocks_of_axis(mean: Array, settings: Settings) -> NDArray[np.bool_]
     """Find the moving blocks of one axis."""
     good = np.isfinite(mean)
     nothing = np.zeros(mean.size, np.bool_)
-    least = max(settings.min_rest_blocks, (1.0 - settings.max_moving_share) * good.sum())
-    if good.sum() < least:
+    min_blocks = max(settings.min_rest_blocks, (1.0 - settings.max_moving_share) * good.sum())
+    if good.sum() < min_blocks:
         return nothing
     centre, scale = _find_rest_level(mean[good])
     away = np.abs(mean - centre)
-    rest = good & (away <= settings.rest_sigma * scale)
+    is_at_rest = good & (away <= settings.rest_sigma * scale)
     for _ in range(REST_ROUNDS):
-        if rest.sum() < least:
+        if is_at_rest.sum() < min_blocks:
             return nothing
-        away = np.abs(mean - np.median(mean[rest]))
-        scale = MAD_TO_SIGMA * float(np.median(away[rest]))
-        rest = good & (away <= settings.rest_sigma * scale)
+        away = np.abs(mean - np.median(mean[is_at_rest]))
+        scale = MAD_TO_SIGMA * float(np.median(away[is_at_rest]))
+        is_at_rest = good & (away <= settings.rest_sigma * scale)
     if not scale > 0.0 or not np.nanmax(away) > settings.motion_sigma * scale:
         return nothing
-    is_moving = good & ~rest
+    is_moving = good & ~is_at_rest
     if is_moving.sum() < 2:  # a motion lasts; a single block is an outlier
         return nothing
     place = np.flatnonzero(good)
-    near = (
+    is_near_motion = (
         np.convolve(is_moving[place], np.ones(2 * settings.motion_margin_blocks + 1), "same") > 0.5
     )  # neighbours among the blocks that are there
     out = nothing.copy()
-    out[place] = near
-    has_rest = rest.sum() >= least and np.count_nonzero(~near) >= settings.min_rest_blocks
+    out[place] = is_near_motion
+    has_rest = (
+        is_at_rest.sum() >= min_blocks
+        and np.count_nonzero(~is_near_motion) >= settings.min_rest_blocks
+    )
     return out if has_rest else nothing
 
 
@@ -112,12 +115,16 @@ def unexplained_motion(
     }
     moving = moving_blocks(blocks, settings=settings)
     for row, axis in enumerate(map(str, blocks["axis"].values)):
-        own = [
+        axis_components = [
             component
             for component in components
             if component.statistic.is_in_means and component.row == (axis,)
         ]
-        columns = [column for one in own for column in mean_columns(one.variant, row)]
+        columns = [
+            column
+            for component in axis_components
+            for column in mean_columns(component.variant, row)
+        ]
         if axis in explained_axes or (
             columns
             and _is_explained(
@@ -125,7 +132,7 @@ def unexplained_motion(
                 moving[row],
                 np.stack(columns, axis=1),
                 settings,
-                has_form=not any(one.statistic.is_switching for one in own),
+                has_form=not any(component.statistic.is_switching for component in axis_components),
             )
         ):
             moving[row] = False
@@ -150,12 +157,12 @@ def _is_explained(
     design = np.column_stack([np.ones(mean.size), np.nan_to_num(columns)])[good]
     design /= np.maximum(np.abs(design).max(axis=0), 1e-300)
     size, *_ = np.linalg.lstsq(design, mean[good], rcond=None)
-    left = mean[good] - design @ size
-    if not has_form and _moving_blocks_of_axis(left, settings).any():
+    residual = mean[good] - design @ size
+    if not has_form and _moving_blocks_of_axis(residual, settings).any():
         return False
     away = mean[good] - np.median(mean[good & ~moving])
     is_moving = moving[good]
-    return float((left[is_moving] ** 2).sum()) <= settings.spectrum_error_share * float(
+    return float((residual[is_moving] ** 2).sum()) <= settings.spectrum_error_share * float(
         (away[is_moving] ** 2).sum()
     )
 
@@ -182,9 +189,11 @@ def without_motion(
     """
     same = f"{blocks.attrs['block_samples']}samples"
     out = reduce_log(log, block=same, restart_gap=restart_gap, left_out=moving, progress=progress)
-    out = out.assign({f"measured_{one}": blocks[one] for one in _KEPT_STATISTICS if one in blocks})
+    out = out.assign(
+        {f"measured_{name}": blocks[name] for name in _KEPT_STATISTICS if name in blocks}
+    )
     out = out.drop_dims([dim for dim in ("gap", "restart") if dim in out.dims]).assign(
-        {one: blocks[one] for one in ("gap_begin", "gap_end", "restart_begin", "restart_end")}
+        {name: blocks[name] for name in ("gap_begin", "gap_end", "restart_begin", "restart_end")}
     )
     out["moving"] = (
         ("axis", "block"),

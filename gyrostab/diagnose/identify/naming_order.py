@@ -70,9 +70,11 @@ def order_rivals(
 ) -> list[str]:
     """Return the effects that come close to the best, plainer ones first."""
     best = sum_evidence(components[passing[0]])
-    least = best - settings.ambiguous_nats - settings.form_error_share * best
+    min_nats = best - settings.ambiguous_nats - settings.form_error_share * best
     rivals = [
-        key for key in passing if not key.startswith("~") and sum_evidence(components[key]) >= least
+        key
+        for key in passing
+        if not key.startswith("~") and sum_evidence(components[key]) >= min_nats
     ]
     effects = {components[key][0].candidate.effect for key in rivals}
     is_later = {
@@ -109,7 +111,9 @@ def _without_locked_lines(
 def _is_on_single_axis(components: Sequence[Component], candidates: Sequence[Candidate]) -> bool:
     """Return whether an effect that should be one process on all axes shows on one only."""
     key = components[0].candidate.key
-    is_common = any(one.key == key and one.statistic.is_pairwise for one in candidates)
+    is_common = any(
+        candidate.key == key and candidate.statistic.is_pairwise for candidate in candidates
+    )
     return is_common and len({axis for component in components for axis in component.row}) == 1
 
 

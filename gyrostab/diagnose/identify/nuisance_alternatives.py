@@ -46,12 +46,15 @@ def burst_intervals(block_count: int, most: int = _MAX_INTERVALS) -> NDArray[np.
     """
     lengths = [2**power for power in range(max(1, block_count // 2).bit_length())]
     first = [np.arange(0, block_count - length + 1, max(1, length // 2)) for length in lengths]
-    while sum(one.size for one in first) > most:
+    while sum(starts.size for starts in first) > most:
         # The shortest intervals are the most numerous.
-        longest = next(number for number, one in enumerate(first) if one.size > 2)
+        longest = next(number for number, starts in enumerate(first) if starts.size > 2)
         first[longest] = np.array([0, block_count - lengths[longest]])
     return np.concatenate(
-        [np.stack([one, one + length], axis=1) for one, length in zip(first, lengths, strict=True)]
+        [
+            np.stack([starts, starts + length], axis=1)
+            for starts, length in zip(first, lengths, strict=True)
+        ]
     )
 
 
@@ -130,18 +133,19 @@ def _numbered_columns(count: int) -> tuple[str, ...]:
 def _single_designs(designs: Array) -> tuple[Variant, ...]:
     """Return a variant for each design alone."""
     return tuple(
-        Variant({"band": float(number)}, ("0",), one[None]) for number, one in enumerate(designs)
+        Variant({"band": float(number)}, ("0",), design[None])
+        for number, design in enumerate(designs)
     )
 
 
 def _covariance_variants(bands: int) -> tuple[Variant, ...]:
     """Return covariances in each band, or in four groups of bands, with any phase."""
-    alone = [np.eye(bands)[number] for number in range(bands)]
+    single_bands = [np.eye(bands)[number] for number in range(bands)]
     groups = [
         np.isin(np.arange(bands), group).astype(float)
         for group in np.array_split(np.arange(bands), min(4, bands))
     ]
-    variants = [_any_phase([one]) for one in alone]
+    variants = [_any_phase([band]) for band in single_bands]
     return (*variants, _any_phase(groups))
 
 

@@ -57,26 +57,31 @@ def find_rejections(
     folds : xarray.DataArray
         Blocks that are held out together.
     """
-    given = [*expected, *chosen]
-    named = {one.effect for one in given if isinstance(one, Identification)}
+    selections = [*expected, *chosen]
+    named = {selection.effect for selection in selections if isinstance(selection, Identification)}
     out: dict[str, tuple[float, Rejection]] = {}
-    for key, several in components.items():
-        effect = several[0].candidate.effect
+    for key, effect_components in components.items():
+        effect = effect_components[0].candidate.effect
         if key.startswith("~") or effect in named:
             continue
-        beside = sum_evidence(several)
-        error = form_error(several, given, settings=state.settings)
-        winner = max(chosen, key=lambda one: one.instead.get(key, -math.inf), default=None)
+        added_nats = sum_evidence(effect_components)
+        error = form_error(effect_components, selections, settings=state.settings)
+        winner = max(
+            chosen, key=lambda selection: selection.instead.get(key, -math.inf), default=None
+        )
         instead = winner.instead.get(key, -math.inf) if winner else -math.inf
-        if beside > threshold + error:
-            name, nats = _find_veto(several, chosen, state, folds, error)
+        if added_nats > threshold + error:
+            name, nats = _find_veto(effect_components, chosen, state, folds, error)
         elif winner and instead > threshold:
             name, nats = _name_of(winner), winner.evidence_nats - instead
         else:
-            name, nats = _NOISE, threshold + error - beside
-        best = max(beside, instead)
+            name, nats = _NOISE, threshold + error - added_nats
+        best = max(added_nats, instead)
         if effect not in out or best > out[effect][0]:
-            out[effect] = best, Rejection(effect, axes_of(several, state.axes), name, nats)
+            out[effect] = (
+                best,
+                Rejection(effect, axes_of(effect_components, state.axes), name, nats),
+            )
     return [rejection for _, rejection in out.values()]
 
 
@@ -89,20 +94,26 @@ def _find_veto(
 ) -> tuple[str, float]:
     """Return what beats an effect with enough evidence, and by how much."""
     effect = components[0].candidate.effect
-    for one in chosen:  # withdrawn: with the effect in the model, the noise still changes
-        if isinstance(one, Unidentified) and not one.instead and effect in one.candidates:
-            return NUISANCE_ALTERNATIVES[one.generic], one.evidence_nats
-    other = find_better_form(components, state, error=error)
-    if other:
-        return other
+    for selection in chosen:  # withdrawn: with the effect in the model, the noise still changes
+        if (
+            isinstance(selection, Unidentified)
+            and not selection.instead
+            and effect in selection.candidates
+        ):
+            return NUISANCE_ALTERNATIVES[selection.generic], selection.evidence_nats
+    better_form = find_better_form(components, state, error=error)
+    if better_form:
+        return better_form
     shifts = passes_time_shift_test(components, state, folds)
     if not shifts.passed:
         return "a time-shifted channel", shifts.nats
     statistics = {component.statistic for component in components}
     rivals = [
-        one for one in chosen if statistics & {component.statistic for component in one.components}
+        selection
+        for selection in chosen
+        if statistics & {component.statistic for component in selection.components}
     ]
-    strongest = max(rivals, key=lambda one: one.evidence_nats, default=None)
+    strongest = max(rivals, key=lambda selection: selection.evidence_nats, default=None)
     if strongest is None:
         return _NOISE, math.nan
     return _name_of(strongest), strongest.evidence_nats - sum_evidence(components)

@@ -110,28 +110,28 @@ class Search:
         state : State
             With all of these in the model.
         """
-        selected, found = self._select_all(start)
+        selected, all_evidence = self._select_all(start)
         chosen = drop_explained_jumps(
             selected,
-            lambda some: condition_on_selections(start, some),
+            lambda selections: condition_on_selections(start, selections),
             self._evidence,
             self.threshold,
         )
         chosen = self._prune(start, without_pulses(chosen, settings=self.settings))
         chosen, identified = self._settle(start, chosen)
-        unidentified = [one for one in chosen if isinstance(one, Unidentified)]
+        unidentified = [selection for selection in chosen if isinstance(selection, Unidentified)]
         state = condition_on_selections(start, [*identified, *unidentified])
         withdrawal = Withdrawal(start, self.candidates, self.folds, self.threshold, self.settings)
-        kept, withdrawn = withdrawal.run(state, identified, unidentified)
+        remaining, withdrawn = withdrawal.run(state, identified, unidentified)
         unidentified += withdrawn
-        if len(kept) < len(identified) or withdrawn:
-            state = condition_on_selections(start, [*kept, *unidentified])
-        kept = sorted(kept, key=lambda one: -one.evidence_nats)
-        is_unchanged = _variants_by_row(selected) == _variants_by_row([*kept, *unidentified])
+        if len(remaining) < len(identified) or withdrawn:
+            state = condition_on_selections(start, [*remaining, *unidentified])
+        remaining = sorted(remaining, key=lambda identification: -identification.evidence_nats)
+        is_unchanged = _variants_by_row(selected) == _variants_by_row([*remaining, *unidentified])
         rejected = self._reject_others(
-            start, kept, unidentified, state, found if is_unchanged else ()
+            start, remaining, unidentified, state, all_evidence if is_unchanged else ()
         )
-        return kept, unidentified, rejected, state
+        return remaining, unidentified, rejected, state
 
     def _select_all(self, start: State) -> tuple[list[Selection], list[CandidateEvidence]]:
         """Select the best candidate, put it into the model, and repeat while one passes.
@@ -139,20 +139,23 @@ class Search:
         The second result is the evidence of the others, with all of these in the model.
         """
         chosen: list[Selection] = []
-        state = before = start
+        state = previous = start
         barred = {
             key
-            for one in self.expected
-            for key in (one.components[0].candidate.key, *self._explained_count_keys(one))
+            for identification in self.expected
+            for key in (
+                identification.components[0].candidate.key,
+                *self._explained_count_keys(identification),
+            )
         }
         effects_left, lines_left = MAX_EFFECTS, MAX_LINES
-        found: list[CandidateEvidence] = []
+        all_evidence: list[CandidateEvidence] = []
         while effects_left:
-            known = reusable_evidence(found, before, state)
-            found, before = self._score_candidates(state, barred, known), state
-            selected = self._select_next(found, state, chosen)
+            known_evidence = reusable_evidence(all_evidence, previous, state)
+            all_evidence, previous = self._score_candidates(state, barred, known_evidence), state
+            selected = self._select_next(all_evidence, state, chosen)
             if selected is None:
-                return chosen, found
+                return chosen, all_evidence
             selection, rejected = selected
             barred |= rejected
             if selection is not None and are_lines(selection.components):
@@ -193,27 +196,33 @@ class Search:
         )
 
     def _score_candidates(
-        self, state: State, barred: set[str], known: Sequence[CandidateEvidence] = ()
+        self, state: State, barred: set[str], known_evidence: Sequence[CandidateEvidence] = ()
     ) -> list[CandidateEvidence]:
-        """Compute the evidence of all candidates that are not barred; `known` ones are reused.
+        """Compute the evidence of all candidates that are not barred; `known_evidence` is reused.
 
         Powers are weighted with the strongest effect in the powers, because its noise is in every
         statistic.
         """
-        is_known = {id(one.candidate) for one in known}
+        is_known = {id(evidence.candidate) for evidence in known_evidence}
         sought = [
             candidate
             for candidate in self.candidates
             if candidate.key not in barred and id(candidate) not in is_known
         ]
-        found = [
-            *(one for one in known if one.candidate.key not in barred),
+        all_evidence = [
+            *(evidence for evidence in known_evidence if evidence.candidate.key not in barred),
             *self._evidence(sought, state),
         ]
-        weighted = [one.candidate for one in found if one.candidate.statistic.is_power_weighted]
+        weighted = [
+            evidence.candidate
+            for evidence in all_evidence
+            if evidence.candidate.statistic.is_power_weighted
+        ]
         is_new = any(candidate.statistic.is_power_weighted for candidate in sought)
         for _ in range(2 if is_new else 0):
-            powers = [one for one in found if one.candidate.statistic.is_power]
+            powers = [
+                evidence for evidence in all_evidence if evidence.candidate.statistic.is_power
+            ]
             strongest = max(powers, key=_positive_evidence, default=None)
             if (
                 strongest is None
@@ -222,14 +231,18 @@ class Search:
             ):
                 break
             trial = condition_on(state, find_components(strongest, settings=self.settings))
-            again = compute_evidence(
+            weighted_evidence = compute_evidence(
                 weighted, state.blocks, replace(state, weight=trial.weight), self.folds
             )
-            found = [one for one in found if not one.candidate.statistic.is_power_weighted] + again
-        return found
+            all_evidence = [
+                evidence
+                for evidence in all_evidence
+                if not evidence.candidate.statistic.is_power_weighted
+            ] + weighted_evidence
+        return all_evidence
 
     def _select_next(
-        self, found: list[CandidateEvidence], state: State, chosen: Sequence[Selection]
+        self, all_evidence: list[CandidateEvidence], state: State, chosen: Sequence[Selection]
     ) -> tuple[Selection | None, set[str]] | None:
         """Select the next effect, or the nuisance alternative that explains more.
 
@@ -240,15 +253,17 @@ class Search:
         rejected : set of str
             Keys that fail it. Instead of both, None when nothing passes.
         """
-        components = merge_lines(group_components(found, settings=self.settings))
+        components = merge_lines(group_components(all_evidence, settings=self.settings))
         required = {
             key: self.threshold
-            + form_error(several, [*self.expected, *chosen], settings=self.settings)
-            for key, several in components.items()
+            + form_error(effect_components, [*self.expected, *chosen], settings=self.settings)
+            for key, effect_components in components.items()
         }
-        for key, several in list(components.items()):
-            if not key.startswith("~") and sum_evidence(several) > required[key]:
-                components[key] = is_physical(several, state, error=required[key] - self.threshold)
+        for key, effect_components in list(components.items()):
+            if not key.startswith("~") and sum_evidence(effect_components) > required[key]:
+                components[key] = is_physical(
+                    effect_components, state, error=required[key] - self.threshold
+                )
         passing = order_passing(components, required, state, self.folds)
         if not passing:
             return None
@@ -261,13 +276,13 @@ class Search:
         for key in rivals:
             shifts = passes_time_shift_test(components[key], state, self.folds)
             if shifts.passed:
-                least = sum_evidence(components[key]) - self.settings.ambiguous_nats
+                min_nats = sum_evidence(components[key]) - self.settings.ambiguous_nats
                 close = [
                     components[other][0].candidate.effect
                     for other in rivals
                     if other != key
                     and other not in rejected
-                    and sum_evidence(components[other]) >= least
+                    and sum_evidence(components[other]) >= min_nats
                 ]
                 return self._identify(
                     components[key], required[key], close, shifts.p_value
@@ -310,13 +325,14 @@ class Search:
             for key in passing
             if not key.startswith("~") and components[key][0].statistic is alternative[0].statistic
         ]
-        beside = {
+        companions = {
             key: self._find_beside(keys, components[key], required[key], state) for key in keys
         }
         totals = {
-            (first, second): sum_evidence(components[first]) + sum_evidence(found[second])
-            for first, (_, found) in beside.items()
-            for second in found
+            (first, second): sum_evidence(components[first])
+            + sum_evidence(components_beside[second])
+            for first, (_, components_beside) in companions.items()
+            for second in components_beside
         }
         pairs = {
             pair: min(totals[pair], totals[pair[::-1]])
@@ -326,8 +342,8 @@ class Search:
         best = max(pairs, key=lambda pair: pairs[pair], default=None)
         if best is None or pairs[best] <= sum_evidence(alternative):
             return None
-        with_other, found = beside[best[1]]
-        return best[0], found[best[0]], with_other
+        with_other, components_beside = companions[best[1]]
+        return best[0], components_beside[best[0]], with_other
 
     def _find_beside(
         self, keys: Sequence[str], components: list[Component], required: float, state: State
@@ -336,15 +352,15 @@ class Search:
         chosen = [self._identify(components, required, (), math.nan)]
         with_first = condition_on(state, components)
         sought = [candidate for candidate in self.candidates if candidate.key in keys]
-        found = {}
-        for key, several in group_components(
+        components_beside = {}
+        for key, effect_components in group_components(
             self._evidence(sought, with_first), settings=self.settings
         ).items():
-            error = form_error(several, chosen, settings=self.settings)
-            physical = is_physical(several, with_first, error=error)
+            error = form_error(effect_components, chosen, settings=self.settings)
+            physical = is_physical(effect_components, with_first, error=error)
             if sum_evidence(physical) > self.threshold + error:
-                found[key] = physical
-        return with_first, found
+                components_beside[key] = physical
+        return with_first, components_beside
 
     def _identify(
         self, components: list[Component], threshold: float, names: Sequence[str], p_value: float
@@ -370,12 +386,13 @@ class Search:
         whatever their evidence.
         """
         for selection in sorted(
-            chosen, key=lambda one: (isinstance(one, Identification), one.evidence_nats)
+            chosen,
+            key=lambda selection: (isinstance(selection, Identification), selection.evidence_nats),
         ):
             if len(chosen) < 2:
                 break
             state = condition_on_selections(start, chosen, selection)
-            again = group_components(
+            components_by_key = group_components(
                 self._evidence(candidates_of(selection.components), state), settings=self.settings
             )
             is_leading = (
@@ -383,11 +400,13 @@ class Search:
                 and isinstance(selection, Identification)
                 and not selection.components[0].statistic.is_count
             )
-            best = max((sum_evidence(components) for components in again.values()), default=0.0)
+            best = max(
+                (sum_evidence(components) for components in components_by_key.values()), default=0.0
+            )
             if not is_leading and best < self.threshold:
                 chosen = [other for other in chosen if other is not selection]
             elif isinstance(selection, Identification):
-                reduced = with_axes_of(selection, again, settings=self.settings)
+                reduced = with_axes_of(selection, components_by_key, settings=self.settings)
                 chosen = [reduced if other is selection else other for other in chosen]
         return chosen
 
@@ -397,13 +416,14 @@ class Search:
         """Finish the identifications, and drop the weakest until all reach their threshold."""
         while True:
             identified = {
-                place: self._finish(start, one, chosen)
-                for place, one in enumerate(chosen)
-                if isinstance(one, Identification)
+                place: self._finish(start, selection, chosen)
+                for place, selection in enumerate(chosen)
+                if isinstance(selection, Identification)
             }
             margin = {
-                place: one.evidence_nats - self._required_nats(one, identified)
-                for place, one in identified.items()
+                place: identification.evidence_nats
+                - self._required_nats(identification, identified)
+                for place, identification in identified.items()
             }
             weakest = min(margin, key=lambda place: margin[place], default=None)
             if weakest is None or margin[weakest] >= 0.0:
@@ -414,13 +434,14 @@ class Search:
         self, identification: Identification, identified: dict[int, Identification]
     ) -> float:
         """Return the evidence that an identification needs, whatever was named first."""
-        others = [
+        other_identifications = [
             *self.expected,
-            *(one for one in identified.values() if one is not identification),
+            *(other for other in identified.values() if other is not identification),
         ]
         return max(
             identification.threshold,
-            self.threshold + form_error(identification.components, others, settings=self.settings),
+            self.threshold
+            + form_error(identification.components, other_identifications, settings=self.settings),
         )
 
     def _finish(
@@ -430,21 +451,21 @@ class Search:
         state = condition_on_selections(start, chosen, identification)
         key = identification.components[0].candidate.key
         on_axes, weighted = self._find_instead(identification, state)
-        again = find_layers_again(
+        layers = find_layers_again(
             identification.components, on_axes.get(key, []), weighted, self._evidence
         )
         evidence_nats = (
-            sum(max(sum_evidence(layer), 0.0) for layer in again) or identification.evidence_nats
+            sum(max(sum_evidence(layer), 0.0) for layer in layers) or identification.evidence_nats
         )
-        least = evidence_nats - self.settings.ambiguous_nats
+        min_nats = evidence_nats - self.settings.ambiguous_nats
         rivals = [
             components[0].candidate.effect
             for other, components in on_axes.items()
             if components
             and other != key
             and not other.startswith("~")
-            and sum_evidence(components) >= least
-            and sum_evidence(is_physical(components, state)) >= least
+            and sum_evidence(components) >= min_nats
+            and sum_evidence(is_physical(components, state)) >= min_nats
         ]
         lines = {
             component.place
@@ -456,7 +477,7 @@ class Search:
         )
         of_any_spectrum = find_spectral_alternatives(
             identification.effect,
-            [component for layer in again for component in layer],
+            [component for layer in layers for component in layer],
             weighted,
             self._evidence,
         )
@@ -464,8 +485,10 @@ class Search:
         alternatives = dict.fromkeys([*identification.alternatives, *rivals])
         alternatives.pop(identification.effect, None)
         components = tuple(
-            renew_component(found, component)
-            for layer, found in zip(split_layers(identification.components), again, strict=True)
+            renew_component(layer_components, component)
+            for layer, layer_components in zip(
+                split_layers(identification.components), layers, strict=True
+            )
             for component in layer
         )
         return replace(
@@ -487,12 +510,16 @@ class Search:
         """
         weighted = replace(state, weight=condition_on(state, list(selection.components)).weight)
         statistics = {component.statistic for component in selection.components}
-        near = [one for one in self.candidates if one.statistic in statistics]
+        candidates = [
+            candidate for candidate in self.candidates if candidate.statistic in statistics
+        ]
         axes = set(selection.axes)
-        found = group_components(self._evidence(near, weighted), settings=self.settings)
+        components_by_key = group_components(
+            self._evidence(candidates, weighted), settings=self.settings
+        )
         return {
             key: [component for component in components if set(component.row) & axes]
-            for key, components in found.items()
+            for key, components in components_by_key.items()
         }, weighted
 
     def _reject_others(
@@ -501,31 +528,32 @@ class Search:
         identified: Sequence[Identification],
         unidentified: Sequence[Unidentified],
         state: State,
-        known: Sequence[CandidateEvidence],
+        known_evidence: Sequence[CandidateEvidence],
     ) -> list[Rejection]:
         """Return what beats each effect that is not among the identified.
 
-        `state` has all of them in the model, and `known` is evidence in it.
+        `state` has all of them in the model, and `known_evidence` is valid in it.
         """
         chosen: list[Selection] = [
             *identified,
             *(
                 replace(
-                    one,
+                    selection,
                     instead=_sum_by_key(
                         self._find_instead(
-                            one, condition_on_selections(start, [*identified, *unidentified], one)
+                            selection,
+                            condition_on_selections(start, [*identified, *unidentified], selection),
                         )[0]
                     ),
                 )
-                if one.components
-                else one
-                for one in unidentified
+                if selection.components
+                else selection
+                for selection in unidentified
             ),
         ]
-        found = self._score_candidates(state, set(), known)
+        all_evidence = self._score_candidates(state, set(), known_evidence)
         return find_rejections(
-            merge_lines(group_components(found, settings=self.settings)),
+            merge_lines(group_components(all_evidence, settings=self.settings)),
             chosen,
             self.expected,
             self.threshold,
@@ -543,8 +571,12 @@ def _variants_by_row(chosen: Sequence[Selection]) -> set[tuple[str, tuple[str, .
 
 
 def _sum_by_key(components: Mapping[str, Sequence[Component]]) -> dict[str, float]:
-    return {key: sum_evidence(several) for key, several in components.items() if several}
+    return {
+        key: sum_evidence(effect_components)
+        for key, effect_components in components.items()
+        if effect_components
+    }
 
 
-def _positive_evidence(found: CandidateEvidence) -> float:
-    return float(np.maximum(found.evidence_nats[0], 0.0).sum())
+def _positive_evidence(evidence: CandidateEvidence) -> float:
+    return float(np.maximum(evidence.evidence_nats[0], 0.0).sum())

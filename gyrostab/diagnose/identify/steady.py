@@ -42,10 +42,10 @@ def intermittent_nats(component: Component, state: State) -> float:
     weight = np.where(np.isfinite(size) & np.isfinite(error) & (error > 0.0), error, np.inf) ** -2.0
     size = np.where(weight > 0.0, size, 0.0)
     nats = disagreement_nats(size, weight)
-    most = state.settings.disagreement_nats + state.settings.spectrum_error_share * max(
+    allowed = state.settings.disagreement_nats + state.settings.spectrum_error_share * max(
         component.evidence_nats, 0.0
     )
-    return nats if nats > most else 0.0
+    return nats if nats > allowed else 0.0
 
 
 def _fit_part(component: Component, state: State, inside: NDArray[np.int64]) -> tuple[float, float]:

@@ -61,8 +61,10 @@ def passes_time_shift_test(
     state : State
         What is in the model without it.
     """
-    own = [component for component in components if _follows_channel(component, state)]
-    if not own:
+    following_components = [
+        component for component in components if _follows_channel(component, state)
+    ]
+    if not following_components:
         return TimeShifts(True)
     block_count = state.blocks.sizes["block"]
     shifts = np.unique(
@@ -73,7 +75,7 @@ def passes_time_shift_test(
     real, shifted = 0.0, np.zeros(shifts.size)
     valid = np.ones(shifts.size, np.bool_)
     limit = state.settings.surrogate_correlation
-    for component in own:
+    for component in following_components:
         surrogates = _make_surrogates(component, state, shifts)
         row = state.axes.index(component.row[0])
         for number, surrogate in enumerate(surrogates):
@@ -82,17 +84,17 @@ def passes_time_shift_test(
         chosen = [
             surrogate if surrogate is not None else component.variant for surrogate in surrogates
         ]
-        several = [
-            replace(component.candidate, effect=f"shifted {number}", variants=(one,))
-            for number, one in enumerate(chosen)
+        shifted_candidates = [
+            replace(component.candidate, effect=f"shifted {number}", variants=(variant,))
+            for number, variant in enumerate(chosen)
         ]
-        found = compute_evidence(
-            [replace(component.candidate, variants=(component.variant,)), *several],
+        all_evidence = compute_evidence(
+            [replace(component.candidate, variants=(component.variant,)), *shifted_candidates],
             state.blocks,
             state,
             folds,
         )
-        values = np.array([one.evidence_nats[0, row] for one in found])
+        values = np.array([evidence.evidence_nats[0, row] for evidence in all_evidence])
         real += float(values[0])
         shifted += values[1:]
     if valid.sum() < state.settings.min_surrogates:
@@ -132,8 +134,8 @@ def _make_surrogates(
         )
         if candidate.effect not in _FOLLOWING_AXES:
             return shifted
-        own = (fill_linearly(rotate(mean)) for mean in means)
-        return replace(shifted, own=dict(zip(windows.axes, own, strict=True)))
+        rotated_means = (fill_linearly(rotate(mean)) for mean in means)
+        return replace(shifted, own=dict(zip(windows.axes, rotated_means, strict=True)))
 
     coefficient = state.baseline["coefficient"]
     return [

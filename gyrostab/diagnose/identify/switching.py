@@ -55,11 +55,13 @@ def put_followers_first(
 
 
 def _has_possible_cause(component: Component, led: Sequence[Component], state: State) -> bool:
-    beside = [one for one in led if component.statistic.is_switching and one.row == component.row]
+    others_on_axis = [
+        other for other in led if component.statistic.is_switching and other.row == component.row
+    ]
     return any(
-        one.evidence_nats >= component.evidence_nats
-        or _explained_share(component, one, state) > state.settings.majority_share
-        for one in beside
+        other.evidence_nats >= component.evidence_nats
+        or _explained_share(component, other, state) > state.settings.majority_share
+        for other in others_on_axis
     )
 
 
@@ -67,16 +69,21 @@ def _explained_share(component: Component, other: Component, state: State) -> fl
     """Return the share of the variance of a course that another component explains."""
     row = state.axes.index(component.row[0])
     course = mean_columns(component.variant, row)[0]
-    beside = np.stack(mean_columns(other.variant, row), axis=1)
+    other_columns = np.stack(mean_columns(other.variant, row), axis=1)
     good = (
         np.isfinite(state.blocks["mean"].values[row])
-        & np.isfinite(beside).all(axis=1)
+        & np.isfinite(other_columns).all(axis=1)
         & np.isfinite(course)
     )
-    course, beside = course[good] - course[good].mean(), beside[good] - beside[good].mean(axis=0)
-    size, *_ = np.linalg.lstsq(beside, course, rcond=None)
+    course, other_columns = (
+        course[good] - course[good].mean(),
+        other_columns[good] - other_columns[good].mean(axis=0),
+    )
+    size, *_ = np.linalg.lstsq(other_columns, course, rcond=None)
     return float(
-        1.0 - np.square(course - beside @ size).sum() / max(float(np.square(course).sum()), 1e-300)
+        1.0
+        - np.square(course - other_columns @ size).sum()
+        / max(float(np.square(course).sum()), 1e-300)
     )
 
 
@@ -122,25 +129,27 @@ def drop_explained_jumps(
         Evidence that jumps must add to the telegraph bias [nats].
     """
     out = list(chosen)
-    for component in [one for one in components_of(chosen) if one.statistic.is_switching]:
+    for component in [
+        component for component in components_of(chosen) if component.statistic.is_switching
+    ]:
         jumps = _jumps_on_axis(component, out, state_with([]))
-        for some in [jumps, *([one] for one in jumps if len(jumps) > 1)]:
-            if not some or not _contains_all(out, some):
+        for dropped_jumps in [jumps, *([jump] for jump in jumps if len(jumps) > 1)]:
+            if not dropped_jumps or not _contains_all(out, dropped_jumps):
                 continue
-            beside, alone = (
+            with_jumps, without_jumps = (
                 state_with(_drop_components(out, left_out))
-                for left_out in ([component], [component, *some])
+                for left_out in ([component], [component, *dropped_jumps])
             )
-            own = _block_evidence(component, beside)
+            own_nats = _block_evidence(component, with_jumps)
             if (
-                np.isfinite(own)
-                and own + sum(jump.evidence_nats for jump in some)
-                < _block_evidence(component, alone) + threshold
+                np.isfinite(own_nats)
+                and own_nats + sum(jump.evidence_nats for jump in dropped_jumps)
+                < _block_evidence(component, without_jumps) + threshold
             ):
-                instead = _component_found(component, gains([component.candidate], alone))
+                instead = _component_found(component, gains([component.candidate], without_jumps))
                 out = [
-                    _replace_component(one, component, instead)
-                    for one in _drop_components(out, some)
+                    _replace_component(selection, component, instead)
+                    for selection in _drop_components(out, dropped_jumps)
                 ]
                 component = instead
     return out
@@ -162,8 +171,8 @@ def _block_evidence(component: Component, state: State) -> float:
 
 
 def _contains_all(chosen: Sequence[Selection], components: Sequence[Component]) -> bool:
-    known = components_of(chosen)
-    return all(any(component is own for own in known) for component in components)
+    chosen_components = components_of(chosen)
+    return all(any(component is other for other in chosen_components) for component in components)
 
 
 def _replace_component(
@@ -171,7 +180,9 @@ def _replace_component(
 ) -> Selection:
     return replace(
         identification,
-        components=tuple(instead if own is component else own for own in identification.components),
+        components=tuple(
+            instead if other is component else other for other in identification.components
+        ),
     )
 
 
@@ -179,44 +190,46 @@ def _jumps_on_axis(
     component: Component, chosen: Sequence[Selection], state: State
 ) -> list[Component]:
     return [
-        one
-        for one in components_of(chosen)
-        if one.row == component.row and is_free_jump(one, state)
+        other
+        for other in components_of(chosen)
+        if other.row == component.row and is_free_jump(other, state)
     ]
 
 
 def _drop_components(chosen: Sequence[Selection], left_out: Sequence[Component]) -> list[Selection]:
     """Drop some components from the selections, and selections that lose all."""
     out = []
-    for one in chosen:
-        kept = tuple(
+    for selection in chosen:
+        remaining = tuple(
             component
-            for component in one.components
+            for component in selection.components
             if not any(component is other for other in left_out)
         )
-        if len(kept) < len(one.components):
+        if len(remaining) < len(selection.components):
             evidence_nats = (
-                one.evidence_nats
-                - sum(component.evidence_nats for component in one.components)
-                + sum(component.evidence_nats for component in kept)
+                selection.evidence_nats
+                - sum(component.evidence_nats for component in selection.components)
+                + sum(component.evidence_nats for component in remaining)
             )
-            one = replace(
-                one,
-                components=kept,
-                axes=axes_of(kept, list(one.axes)),
+            selection = replace(
+                selection,
+                components=remaining,
+                axes=axes_of(remaining, list(selection.axes)),
                 evidence_nats=evidence_nats,
             )
-            if not kept:
+            if not remaining:
                 continue
-        out.append(one)
+        out.append(selection)
     return out
 
 
-def _component_found(component: Component, found: Sequence[CandidateEvidence]) -> Component:
+def _component_found(component: Component, all_evidence: Sequence[CandidateEvidence]) -> Component:
     """Return the component as found again."""
-    (one,) = found
-    row = one.rows.index(component.row)
-    return replace(component, variant=one.best[row], evidence_nats=float(one.evidence_nats[0, row]))
+    (evidence,) = all_evidence
+    row = evidence.rows.index(component.row)
+    return replace(
+        component, variant=evidence.best[row], evidence_nats=float(evidence.evidence_nats[0, row])
+    )
 
 
 def renew_component(components: Sequence[Component], component: Component) -> Component:
@@ -229,9 +242,9 @@ def renew_component(components: Sequence[Component], component: Component) -> Co
         return fresh
     return next(
         (
-            replace(fresh, variant=one.variant)
-            for one in components
-            if one.statistic.is_switching and one.row == component.row
+            replace(fresh, variant=other.variant)
+            for other in components
+            if other.statistic.is_switching and other.row == component.row
         ),
         fresh,
     )
@@ -242,16 +255,16 @@ def remove_telegraph_bias(identifications: Identifications) -> tuple[Identificat
 
     No held-out data show the course of one.
     """
-    those = [
+    switching = [
         identification
         for identification in identifications.identified
         if any(component.statistic.is_switching for component in identification.components)
     ]
-    kept = tuple(
+    identified = tuple(
         identification
         for identification in identifications.identified
-        if identification not in those
+        if identification not in switching
     )
-    return replace(identifications, identified=kept), sum(
-        identification.evidence_nats for identification in those
+    return replace(identifications, identified=identified), sum(
+        identification.evidence_nats for identification in switching
     )

@@ -58,77 +58,88 @@ class Withdrawal:
         unidentified: Sequence[Unidentified],
     ) -> tuple[list[Identification], list[Unidentified]]:
         """Withdraw effects that leave structure in time, in the means or in the powers."""
-        kept, withdrawn = list(identified), []
+        remaining, withdrawn = list(identified), []
         for axis in state.axes:
-            kept, unexplained = self._withdraw_in_means(state, kept, unidentified, axis)
+            remaining, unexplained = self._withdraw_in_means(state, remaining, unidentified, axis)
             withdrawn += unexplained
         for axis in state.axes:
-            on_axis = _identified_on(kept, axis, in_means=False)
+            on_axis = _identified_on(remaining, axis, in_means=False)
             if not on_axis:
                 continue
             weak, _ = self._find_weak(
-                on_axis, variance_fluctuation(condition_on_selections(self.start, kept), axis)
+                on_axis, variance_fluctuation(condition_on_selections(self.start, remaining), axis)
             )
             if weak:
-                kept = [one for one in kept if one not in weak]
-                rest = condition_on_selections(self.start, [*kept, *unidentified])
-                withdrawn += self._find_fluctuation(rest, axis, weak)
-        return kept, withdrawn
+                remaining = [
+                    identification for identification in remaining if identification not in weak
+                ]
+                reduced_state = condition_on_selections(self.start, [*remaining, *unidentified])
+                withdrawn += self._find_fluctuation(reduced_state, axis, weak)
+        return remaining, withdrawn
 
     def _withdraw_in_means(
         self,
         state: State,
-        kept: list[Identification],
+        remaining: list[Identification],
         unidentified: Sequence[Unidentified],
         axis: str,
     ) -> tuple[list[Identification], list[Unidentified]]:
         """Withdraw effects on the means of an axis that leave more slow noise than calibrated."""
-        on_axis = _identified_on(kept, axis, in_means=True)
+        on_axis = _identified_on(remaining, axis, in_means=True)
         part_of_drift = _find_part_of_drift(on_axis, unidentified, axis)
-        kept = [one for one in kept if one not in part_of_drift]
+        remaining = [
+            identification for identification in remaining if identification not in part_of_drift
+        ]
         has_alternative = any(
-            one.generic in (*_DRIFTS, "~S(f)", "~cov") and axis in one.axes for one in unidentified
+            selection.generic in (*_DRIFTS, "~S(f)", "~cov") and axis in selection.axes
+            for selection in unidentified
         )
         has_shape = any(
             component.candidate.effect in _SPECTRAL_SHAPES and axis in component.row
-            for component in components_of(kept)
+            for component in components_of(remaining)
         )
         if has_alternative or has_shape:
-            return kept, []
-        left = excess_low_frequency_noise(
+            return remaining, []
+        excess_nats = excess_low_frequency_noise(
             with_neighbouring_variants(state, on_axis, axis), axis, self.folds
         )
-        weak, strength = self._find_weak(on_axis, left)
-        if not weak and left <= self.threshold + self.settings.form_error_share * strength:
-            return kept, []
-        names = tuple(one.effect for one in weak)
-        unexplained = Unidentified("~red", (axis,), left, self.threshold, names)
-        return [one for one in kept if one not in weak], [unexplained]
+        weak, strength = self._find_weak(on_axis, excess_nats)
+        if not weak and excess_nats <= self.threshold + self.settings.form_error_share * strength:
+            return remaining, []
+        names = tuple(identification.effect for identification in weak)
+        unexplained = Unidentified("~red", (axis,), excess_nats, self.threshold, names)
+        return [identification for identification in remaining if identification not in weak], [
+            unexplained
+        ]
 
     def _find_weak(
-        self, identified: Sequence[Identification], left: float
+        self, identified: Sequence[Identification], excess_nats: float
     ) -> tuple[list[Identification], float]:
         """Return the effects that explain too little for what they leave [nats], and their sum."""
         settings = self.settings
-        strength = sum(one.evidence_nats for one in identified)
-        most = settings.component_nats + settings.form_error_share * strength
+        strength = sum(identification.evidence_nats for identification in identified)
+        allowed = settings.component_nats + settings.form_error_share * strength
         share = settings.spectrum_error_share
-        return [one for one in identified if left > max(most, share * one.evidence_nats)], strength
+        return [
+            identification
+            for identification in identified
+            if excess_nats > max(allowed, share * identification.evidence_nats)
+        ], strength
 
     def _find_fluctuation(
         self, state: State, axis: str, weak: Sequence[Identification]
     ) -> list[Unidentified]:
         """Return what a free noise level explains on an axis, instead of withdrawn effects."""
-        free = [one for one in self.candidates if one.effect == "~N(t)"]
-        found = group_components(
+        free = [candidate for candidate in self.candidates if candidate.effect == "~N(t)"]
+        components_by_key = group_components(
             compute_evidence(free, state.blocks, state, self.folds), settings=self.settings
         )
         components = [
             component
-            for component in found.get("~N(t)", [])
+            for component in components_by_key.get("~N(t)", [])
             if component.row == (axis,) and component.evidence_nats > self.threshold
         ]
-        names = [one.effect for one in weak]
+        names = [identification.effect for identification in weak]
         return [find_unidentified("~N(t)", components, self.threshold, names)] if components else []
 
 
@@ -137,12 +148,12 @@ def _identified_on(
 ) -> list[Identification]:
     """Return the identifications with a component in the means of an axis, or in its powers."""
     return [
-        one
-        for one in identified
+        identification
+        for identification in identified
         if any(
             (component.statistic.is_linear_in_means if in_means else component.statistic.is_power)
             and component.row == (axis,)
-            for component in one.components
+            for component in identification.components
         )
     ]
 
@@ -155,6 +166,12 @@ def _find_part_of_drift(
     They may be a piece of that drift.
     """
     drift = sum(
-        one.evidence_nats for one in unidentified if one.generic in _DRIFTS and axis in one.axes
+        selection.evidence_nats
+        for selection in unidentified
+        if selection.generic in _DRIFTS and axis in selection.axes
     )
-    return [one for one in on_axis if not any(one.driver) and one.evidence_nats < drift]
+    return [
+        identification
+        for identification in on_axis
+        if not any(identification.driver) and identification.evidence_nats < drift
+    ]
