@@ -93,9 +93,12 @@ def average_sizes(
     share = np.exp(weighed - np.logaddexp.reduce(weighed))
     nuisance: dict[str, tuple[float, ...]] = {}
     for name in {
-        key for one in family for key, value in one.values.items() if not isinstance(value, str)
+        key
+        for variant in family
+        for key, value in variant.values.items()
+        if not isinstance(value, str)
     }:
-        tried = np.array([float(one.values[name]) for one in family])
+        tried = np.array([float(variant.values[name]) for variant in family])
         if not np.isfinite(tried).all():
             continue
         if np.ptp(tried) == 0.0:
@@ -134,7 +137,7 @@ def _size_interval(mean: Array, covariance: Array, supported: Sequence[Mixture])
         extreme.reduce(bounds)
         for extreme, bounds in zip(
             (np.fmin, np.fmax),
-            np.stack([one.quantiles(SUPPORT_TAIL) for one in supported], axis=1),
+            np.stack([mixture.quantiles(SUPPORT_TAIL) for mixture in supported], axis=1),
             strict=True,
         )
     )
@@ -142,10 +145,10 @@ def _size_interval(mean: Array, covariance: Array, supported: Sequence[Mixture])
 
 
 def _merge_points(points: Sequence[Point]) -> Mixture:
-    several = [point.weighed() for point in points]
+    mixtures = [point.weighed() for point in points]
     return Mixture(
         *(
-            np.concatenate([getattr(one, name) for one in several])
+            np.concatenate([getattr(mixture, name) for mixture in mixtures])
             for name in ("log_weight", "mean", "covariance")
         )
     )
@@ -155,18 +158,19 @@ def _variant_family(component: Component, candidates: Sequence[Candidate]) -> li
     """Return the variants of the component with the same columns and texts: the grid."""
     candidate = next(
         (
-            one
-            for one in candidates
-            if one.key == component.candidate.key and one.statistic is component.statistic
+            candidate
+            for candidate in candidates
+            if candidate.key == component.candidate.key
+            and candidate.statistic is component.statistic
         ),
         component.candidate,
     )
     return [
-        one
-        for one in candidate.variants
-        if one.columns == component.variant.columns
-        and one.squared == component.variant.squared
-        and one.texts == component.variant.texts
+        variant
+        for variant in candidate.variants
+        if variant.columns == component.variant.columns
+        and variant.squared == component.variant.squared
+        and variant.texts == component.variant.texts
     ]
 
 
@@ -175,16 +179,17 @@ def plain_places(effect: str, family: Sequence[Variant]) -> list[int]:
 
     Their sizes have the same unit.
     """
-    known = {item.name: item.default for item in effects()[effect].parameters()}
+    defaults = {item.name: item.default for item in effects()[effect].parameters()}
     tried = {
         name
-        for name in known
-        if not _is_lag(name) and any(one.values.get(name) == known[name] for one in family)
+        for name in defaults
+        if not _is_lag(name)
+        and any(variant.values.get(name) == defaults[name] for variant in family)
     }
     return [
         place
-        for place, one in enumerate(family)
-        if all(one.values.get(name, known[name]) == known[name] for name in tried)
+        for place, variant in enumerate(family)
+        if all(variant.values.get(name, defaults[name]) == defaults[name] for name in tried)
     ]
 
 
@@ -202,9 +207,13 @@ def _usual_places(
 
 def _places_without_lag(family: Sequence[Variant]) -> list[int]:
     """Return the places of the variants without a lag; empty where the effect has no lags."""
-    lags = [_lag_values(one.values) for one in family]
+    lags = [_lag_values(variant.values) for variant in family]
     return (
-        [place for place, mine in enumerate(lags) if mine and max(mine.values()) <= MAX_ZERO_LAG_S]
+        [
+            place
+            for place, variant_lags in enumerate(lags)
+            if variant_lags and max(variant_lags.values()) <= MAX_ZERO_LAG_S
+        ]
         if any(lags)
         else []
     )
@@ -225,13 +234,13 @@ def _interval_ends(tried: Array, share: Array, middle: float) -> tuple[float, fl
     last. Lags, time constants and dead bands are known to a factor, so that the interval extends
     further up than down.
     """
-    known, place = np.unique(tried, return_inverse=True)
+    values, place = np.unique(tried, return_inverse=True)
     between = np.where(
-        known[:-1] > known[1:] / 100.0,
-        np.sqrt(known[:-1] * known[1:]),
-        0.5 * (known[:-1] + known[1:]),
+        values[:-1] > values[1:] / 100.0,
+        np.sqrt(values[:-1] * values[1:]),
+        0.5 * (values[:-1] + values[1:]),
     )
-    first, last = known[0] - (between[0] - known[0]), known[-1] + (known[-1] - between[-1])
+    first, last = values[0] - (between[0] - values[0]), values[-1] + (values[-1] - between[-1])
     edge = np.concatenate([[max(first, 0.0)], between, [last]])
     below = np.append(0.0, np.cumsum(np.bincount(place, weights=share)))
     low, high = np.interp(INTERVAL_TAILS, below / below[-1], edge)
@@ -240,6 +249,6 @@ def _interval_ends(tried: Array, share: Array, middle: float) -> tuple[float, fl
 
 def _grid_spacing(grid: Array, place: float) -> float:
     """Return the distance of the grid's values about a place."""
-    known = np.unique(grid)
-    nearest = int(np.abs(known - place).argmin())
-    return float(np.diff(known[max(nearest - 1, 0) : nearest + 2]).mean())
+    values = np.unique(grid)
+    nearest = int(np.abs(values - place).argmin())
+    return float(np.diff(values[max(nearest - 1, 0) : nearest + 2]).mean())

@@ -45,15 +45,15 @@ def unused_channels(blocks: xr.Dataset, used: Iterable[str]) -> list[dict[str, s
     list of dict
         ``name`` and ``reason``.
     """
-    found = dict(blocks.attrs.get("unused_channels", {}))
-    known = set(used)
+    reasons = dict(blocks.attrs.get("unused_channels", {}))
+    used_channels = set(used)
     for name in channel_units(blocks):
-        if name in known:
+        if name in used_channels:
             continue
         problem = _describe_problem(name, blocks)
         if problem or not name.startswith(CALIBRATION_CHANNELS):
-            found[name] = problem or _describe_unused(name, blocks)
-    return [{"name": name, "reason": reason} for name, reason in found.items()]
+            reasons[name] = problem or _describe_unused(name, blocks)
+    return [{"name": name, "reason": reason} for name, reason in reasons.items()]
 
 
 def _describe_problem(name: str, blocks: xr.Dataset) -> str:
@@ -68,10 +68,10 @@ def _describe_problem(name: str, blocks: xr.Dataset) -> str:
             f"it has values in {100 * share:.0f} % of the blocks, and "
             f"{100 * MIN_BLOCK_SHARE:.0f} % are needed"
         )
-    unit, wanted = str(blocks[variable].attrs.get("units", "")), _wanted_units(name)
-    if wanted and unit not in wanted:
+    unit, usable_units = str(blocks[variable].attrs.get("units", "")), _wanted_units(name)
+    if usable_units and unit not in usable_units:
         return (
-            f"its unit is {unit!r}, and effects need {' or '.join(map(repr, wanted))}; "
+            f"its unit is {unit!r}, and effects need {' or '.join(map(repr, usable_units))}; "
             f"give it with --unit {name}=UNIT"
         )
     if np.nanmax(values) == np.nanmin(values) and not _is_compared(name, blocks):
@@ -81,13 +81,13 @@ def _describe_problem(name: str, blocks: xr.Dataset) -> str:
 
 def _wanted_units(name: str) -> list[str]:
     """Return the units in which effects use a channel with this name or prefix."""
-    found: dict[str, None] = {}
+    units: dict[str, None] = {}
     for kind in effects().values():
         for channel, unit in kind.channels.items():
             base = channel.rstrip("0123456789").rstrip("_")
             if name in (channel, base):
-                found[unit] = None
-    return list(found)
+                units[unit] = None
+    return list(units)
 
 
 def _is_compared(name: str, blocks: xr.Dataset) -> bool:

@@ -46,7 +46,9 @@ def condition_on_components(state: State, components: Iterable[Component]) -> St
 
 def mean_columns(variant: Variant, row: int) -> list[Array]:
     """Return the columns of the mean on an axis, (block,) each."""
-    return [np.asarray(one[row] if one.shape[0] > 1 else one[0]) for one in variant.design]
+    return [
+        np.asarray(design[row] if design.shape[0] > 1 else design[0]) for design in variant.design
+    ]
 
 
 def free_covariance(state: State, axes: tuple[str, ...], density: Array) -> State:
@@ -74,7 +76,7 @@ def free_shape(state: State, axis: str) -> State:
     """Add any spectrum of constant shape to the powers of an axis."""
     bands = state.weight.shape[2]
     return state.with_columns(
-        "power", axis, [np.broadcast_to(one, state.weight.shape[1:]) for one in np.eye(bands)]
+        "power", axis, [np.broadcast_to(band, state.weight.shape[1:]) for band in np.eye(bands)]
     )
 
 
@@ -88,7 +90,7 @@ def refit_weights(state: State) -> State:
                 state,
                 row,
                 axis,
-                np.stack([np.broadcast_to(one, weight.shape[1:]) for one in named], axis=-1),
+                np.stack([np.broadcast_to(column, weight.shape[1:]) for column in named], axis=-1),
             )[0]
     return replace(
         state, weight=weight, blocks=drop_changed_tails(state.blocks, weight, state.settings)
@@ -98,11 +100,11 @@ def refit_weights(state: State) -> State:
 def power_shares(state: State, axis: str) -> Array:
     """Return the fitted contribution of each power column of an axis, (column, block, band)."""
     row, shape = state.axes.index(axis), state.weight.shape[1:]
-    named = [np.broadcast_to(one, shape) for one in state.given.get(("power", axis), [])]
+    named = [np.broadcast_to(column, shape) for column in state.given.get(("power", axis), [])]
     if not named:
         return np.empty((0, *shape))
     sizes = _fit_powers(state, row, axis, np.stack(named, axis=-1))[1]
-    return np.stack([size * one for size, one in zip(sizes, named, strict=True)])
+    return np.stack([size * column for size, column in zip(sizes, named, strict=True)])
 
 
 def drop_changed_tails(
@@ -127,8 +129,8 @@ def drop_changed_tails(
     left_out = {"kurtosis": (unusual, np.nan), "outliers": (turns, 0)}
     return blocks.assign(
         {
-            name: blocks[name].where(xr.DataArray(~where, dims=("axis", "block")), other)
-            for name, (where, other) in left_out.items()
+            name: blocks[name].where(xr.DataArray(~where, dims=("axis", "block")), replacement)
+            for name, (where, replacement) in left_out.items()
             if name in blocks
         }
     )

@@ -91,7 +91,7 @@ def undo_filter(
         return blocks, stopped
     is_axis = blocks["axis"] == axis
     factor = xr.DataArray(np.maximum(response, _MIN_RESPONSE * response.max()), dims="line")
-    before = blocks["line_power"]
-    return blocks.assign(line_power=before.where(~is_axis, before / factor)).assign_attrs(
+    line_power = blocks["line_power"]
+    return blocks.assign(line_power=line_power.where(~is_axis, line_power / factor)).assign_attrs(
         straightened=" ".join([*done, axis])
     ), stopped

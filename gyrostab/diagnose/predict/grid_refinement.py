@@ -72,25 +72,30 @@ def refine_grid(component: Component, state: State, points: Sequence[Point]) -> 
     name = _find_scale(component, points)
     if name is None:
         return list(points)
-    found = [
-        PlacedPoint(_make_point(one.variant, one.sizes), *place)
-        for one, place in zip(points, _place_points(points, name), strict=True)
+    placed_points = [
+        PlacedPoint(_make_point(point.variant, point.sizes), *place)
+        for point, place in zip(points, _place_points(points, name), strict=True)
     ]
-    for line in sorted({one.line for one in found}):
-        members = sorted((one for one in found if one.line == line), key=lambda one: one.place)
+    for line in sorted({placed.line for placed in placed_points}):
+        members = sorted(
+            (placed for placed in placed_points if placed.line == line),
+            key=lambda placed: placed.place,
+        )
         for down in (True, False) if len(members) > 1 else ():
-            found += _extend_line(component, state, name, members, found, down)
+            placed_points += _extend_line(component, state, name, members, placed_points, down)
     for _ in range(MAX_ROUNDS):
-        steps = _steps_to_halve(found)[: max(MAX_ADDED_POINTS - len(found) + len(points), 0)]
+        steps = _steps_to_halve(placed_points)[
+            : max(MAX_ADDED_POINTS - len(placed_points) + len(points), 0)
+        ]
         new = [
             made
-            for one, other in steps
-            if (made := _halve_step(component, state, name, one, other)) is not None
+            for left, right in steps
+            if (made := _halve_step(component, state, name, left, right)) is not None
         ]
         if not new:
             break
-        found += new
-    return _share_steps(found)
+        placed_points += new
+    return _share_steps(placed_points)
 
 
 @dataclass(frozen=True)
@@ -142,39 +147,41 @@ def _value_at(point: Point, name: str) -> float:
     return float(point.variant.values[name])
 
 
-def _neighbour_pairs(found: Sequence[PlacedPoint]) -> list[tuple[PlacedPoint, PlacedPoint]]:
-    ordered = sorted(found, key=lambda one: (one.line, one.place))
-    return [(one, other) for one, other in pairwise(ordered) if one.line == other.line]
+def _neighbour_pairs(placed_points: Sequence[PlacedPoint]) -> list[tuple[PlacedPoint, PlacedPoint]]:
+    ordered = sorted(placed_points, key=lambda placed: (placed.line, placed.place))
+    return [(left, right) for left, right in pairwise(ordered) if left.line == right.line]
 
 
-def _steps_to_halve(found: Sequence[PlacedPoint]) -> list[tuple[PlacedPoint, PlacedPoint]]:
+def _steps_to_halve(placed_points: Sequence[PlacedPoint]) -> list[tuple[PlacedPoint, PlacedPoint]]:
     """Return the steps to be halved, the likeliest first."""
-    best = max(found, key=lambda one: one.point.evidence)
-    top, first = best.point.evidence, not any(one.place % 1.0 for one in found)
+    best = max(placed_points, key=lambda placed: placed.point.evidence)
+    top, first = best.point.evidence, not any(placed.place % 1.0 for placed in placed_points)
     out = []
-    for one, other in _neighbour_pairs(found):
-        likely = max(one.point.evidence, other.point.evidence) > top - LIKELY_NATS
-        if (first and (best is one or best is other)) or (
-            likely and _are_different(one.point, other.point)
+    for left, right in _neighbour_pairs(placed_points):
+        likely = max(left.point.evidence, right.point.evidence) > top - LIKELY_NATS
+        if (first and (best is left or best is right)) or (
+            likely and _are_different(left.point, right.point)
         ):
-            out.append((one, other))
-    return sorted(out, key=lambda pair: -max(one.point.evidence for one in pair))
+            out.append((left, right))
+    return sorted(out, key=lambda pair: -max(placed.point.evidence for placed in pair))
 
 
-def _are_different(one: Point, other: Point) -> bool:
-    if abs(one.evidence - other.evidence) > STEEP_NATS:
+def _are_different(left: Point, right: Point) -> bool:
+    if abs(left.evidence - right.evidence) > STEEP_NATS:
         return True
-    (mean, covariance), (after, _) = one.sizes.moments(), other.sizes.moments()
-    return bool((np.abs(mean - after) > MAX_STEP_SIGMA * np.sqrt(np.diagonal(covariance))).any())
+    (mean, covariance), (other_mean, _) = left.sizes.moments(), right.sizes.moments()
+    return bool(
+        (np.abs(mean - other_mean) > MAX_STEP_SIGMA * np.sqrt(np.diagonal(covariance))).any()
+    )
 
 
 def _halve_step(
-    component: Component, state: State, name: str, one: PlacedPoint, other: PlacedPoint
+    component: Component, state: State, name: str, left: PlacedPoint, right: PlacedPoint
 ) -> PlacedPoint | None:
     """Return the point in the middle of a step, in the logarithm unless one end is near zero."""
-    low, high = sorted((_value_at(one.point, name), _value_at(other.point, name)))
+    low, high = sorted((_value_at(left.point, name), _value_at(right.point, name)))
     value = math.sqrt(low * high) if low > high / MAX_RATIO else 0.5 * (low + high)
-    return _place_point(component, state, name, one, value, 0.5 * (one.place + other.place))
+    return _place_point(component, state, name, left, value, 0.5 * (left.place + right.place))
 
 
 def _extend_line(
@@ -182,7 +189,7 @@ def _extend_line(
     state: State,
     name: str,
     line: Sequence[PlacedPoint],
-    found: Sequence[PlacedPoint],
+    placed_points: Sequence[PlacedPoint],
     down: bool,
 ) -> list[PlacedPoint]:
     """Return points beyond an end of a line, in steps like the last one.
@@ -190,29 +197,32 @@ def _extend_line(
     They continue while the likelihood rises and is within `LIKELY_NATS` of the largest. A lag
     longer than the record is only another slope.
     """
-    before, last = (line[1], line[0]) if down else (line[-2], line[-1])
-    ratio = _value_at(last.point, name) / max(_value_at(before.point, name), 1e-300)
-    top, out = max(one.point.evidence for one in found) - LIKELY_NATS, list[PlacedPoint]()
+    previous, last = (line[1], line[0]) if down else (line[-2], line[-1])
+    ratio = _value_at(last.point, name) / max(_value_at(previous.point, name), 1e-300)
+    top, out = (
+        max(placed.point.evidence for placed in placed_points) - LIKELY_NATS,
+        list[PlacedPoint](),
+    )
     longest = float(state.blocks["end"].values[-1]) / _SECONDS.get(
         _unit_of(component, name), math.nan
     )
     while (
         len(out) < MAX_ROUNDS
         and 1.0 / MAX_RATIO < ratio < MAX_RATIO
-        and last.point.evidence > max(before.point.evidence + STEEP_NATS, top)
+        and last.point.evidence > max(previous.point.evidence + STEEP_NATS, top)
     ):
         value = ratio * _value_at(last.point, name)
-        after = (
+        added = (
             None
             if value > longest
             else _place_point(
                 component, state, name, last, value, last.place + (-1.0 if down else 1.0)
             )
         )
-        if after is None:
+        if added is None:
             break
-        out.append(after)
-        before, last = last, after
+        out.append(added)
+        previous, last = last, added
     return out
 
 
@@ -220,10 +230,10 @@ def _place_point(
     component: Component, state: State, name: str, like: PlacedPoint, value: float, place: float
 ) -> PlacedPoint | None:
     """Return a point of another value on the same line, or None where the effect cannot have it."""
-    wanted = replace(like.point.variant, values={**like.point.variant.values, name: value})
+    target_variant = replace(like.point.variant, values={**like.point.variant.values, name: value})
     try:
         variant = rebuild_variant(
-            component.candidate, wanted, state.blocks, state.baseline["coefficient"]
+            component.candidate, target_variant, state.blocks, state.baseline["coefficient"]
         )
     except OptionError:
         return None
@@ -234,15 +244,18 @@ def _place_point(
     )
 
 
-def _share_steps(found: Sequence[PlacedPoint]) -> list[Point]:
+def _share_steps(placed_points: Sequence[PlacedPoint]) -> list[Point]:
     """Return the points with their shares: half of both steps next to them, or half a step."""
     out = []
-    for line in sorted({one.line for one in found}):
-        ordered = sorted((one for one in found if one.line == line), key=lambda one: one.place)
-        place = np.array([one.place for one in ordered])
+    for line in sorted({placed.line for placed in placed_points}):
+        ordered = sorted(
+            (placed for placed in placed_points if placed.line == line),
+            key=lambda placed: placed.place,
+        )
+        place = np.array([placed.place for placed in ordered])
         edge = np.concatenate([[place[0] - 0.5], 0.5 * (place[1:] + place[:-1]), [place[-1] + 0.5]])
         out += [
-            replace(one.point, share=float(share))
-            for one, share in zip(ordered, np.diff(edge), strict=True)
+            replace(placed.point, share=float(share))
+            for placed, share in zip(ordered, np.diff(edge), strict=True)
         ]
     return out

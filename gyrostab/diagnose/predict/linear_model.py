@@ -75,7 +75,7 @@ class State:
     @property
     def axes(self) -> list[str]:
         """Names of the axes."""
-        return [str(one) for one in self.blocks["axis"].values]
+        return [str(axis) for axis in self.blocks["axis"].values]
 
 
 def initial_state(
@@ -100,10 +100,12 @@ def unspread_share(blocks: xr.Dataset, row: str = "axis") -> Array:
     Shape (axis or pair, block). Random gaps spread the rest over all frequencies. The missing
     neighbours at the tapered ends of a block spread nothing.
     """
-    near = blocks["neighbours" if row == "axis" else "cross_neighbours"].values
+    neighbours = blocks["neighbours" if row == "axis" else "cross_neighbours"].values
     weights = taper(int(blocks.attrs["block_samples"]))
-    whole = float((weights[1:] * weights[:-1]).sum() / (weights**2).sum())
-    return np.minimum(np.where(np.isfinite(near), near, whole) / whole, 1.0)
+    without_gaps = float((weights[1:] * weights[:-1]).sum() / (weights**2).sum())
+    return np.minimum(
+        np.where(np.isfinite(neighbours), neighbours, without_gaps) / without_gaps, 1.0
+    )
 
 
 def spread_by_gaps(density: Array, blocks: xr.Dataset, row: str = "axis") -> Array:
@@ -183,14 +185,14 @@ def given_columns(
 ) -> Any:
     """Return given columns (block, cell, column), known ones and named effects, and precision."""
     named_columns = state.given.get((statistic, ",".join(row)), [])
-    columns = [np.broadcast_to(one, shape) for one in [*known, *named_columns]]
+    columns = [np.broadcast_to(column, shape) for column in [*known, *named_columns]]
     given = np.stack(columns, axis=-1) if columns else np.empty((*shape, 0))
     return given, np.diag([*precision, *[-1.0] * len(named_columns)])
 
 
 def stack_columns(columns: Sequence[Array], shape: tuple[int, ...]) -> Array:
     """Stack columns as (block, cell, column)."""
-    return np.stack([np.broadcast_to(one, shape) for one in columns], axis=-1)
+    return np.stack([np.broadcast_to(column, shape) for column in columns], axis=-1)
 
 
 def stack_designs(
@@ -198,7 +200,7 @@ def stack_designs(
 ) -> list[Array]:
     """Return the designs (block, cell, column) of all variants, in order."""
     return [
-        stack_columns([make_column(one) for one in variant.design], shape)
+        stack_columns([make_column(design) for design in variant.design], shape)
         for candidate in candidates
         for variant in candidate.variants
     ]
@@ -206,10 +208,10 @@ def stack_designs(
 
 def power_column(density: Array, row: int, state: State) -> Array:
     """Return an added density (axis or 1, block or 1, band) of an axis with gaps, (block, band)."""
-    seen = mix_with_mean(
+    mixed = mix_with_mean(
         select_row(density, row), unspread_share(state.blocks)[row], band_widths(state.blocks)
     )
-    return np.broadcast_to(seen, state.weight.shape[1:])
+    return np.broadcast_to(mixed, state.weight.shape[1:])
 
 
 def cross_column(density: Array, row: int, blocks: xr.Dataset) -> Array:

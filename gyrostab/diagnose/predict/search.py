@@ -86,7 +86,7 @@ def reusable_evidence(
         and np.array_equal(before.masked, now.masked)
     )
     if is_same_model and before.blocks.equals(now.blocks):
-        return [one for one in found if not one.candidate.statistic.is_line]
+        return [evidence for evidence in found if not evidence.candidate.statistic.is_line]
     left, right = (
         state.blocks.drop_vars(_TAIL_VARIABLES, errors="ignore") for state in (before, now)
     )
@@ -155,15 +155,15 @@ def collect_evidence(
     )
     out = []
     for number, candidate in enumerate(group):
-        own = first[owner == number]
-        best = tuple(variants[number][int(place)] for place in own.argmax(axis=0))
+        log_weight = first[owner == number]
+        best = tuple(variants[number][int(place)] for place in log_weight.argmax(axis=0))
         out.append(
             CandidateEvidence(
                 candidate,
                 rows,
                 evidence_nats[number],
                 best,
-                own.argmax(axis=0)[None] if spread > 1 else np.empty((0, 0), np.int64),
+                log_weight.argmax(axis=0)[None] if spread > 1 else np.empty((0, 0), np.int64),
             )
         )
     return out
@@ -181,11 +181,16 @@ def _share_variants(
     starts = np.flatnonzero(np.diff(owner, prepend=-1))
     joint = [row[0] + np.log(weight)[:, None] for row in factors]
     total = [np.logaddexp.reduceat(row, starts, axis=0)[owner] for row in joint]
-    known = np.exp(np.log(weight)[:, None] - np.log(np.add.reduceat(weight, starts))[owner, None])
+    variant_prior = np.exp(
+        np.log(weight)[:, None] - np.log(np.add.reduceat(weight, starts))[owner, None]
+    )
     best = np.argmax(total, axis=0)
-    left = np.take_along_axis(
-        np.stack([np.exp(row - whole) for row, whole in zip(joint, total, strict=True)]),
+    posterior = np.take_along_axis(
+        np.stack([np.exp(row - row_total) for row, row_total in zip(joint, total, strict=True)]),
         best[None],
         axis=0,
     )[0]
-    return [np.where(best == row, known, 0.5 * (known + left)) for row in range(len(factors))]
+    return [
+        np.where(best == row, variant_prior, 0.5 * (variant_prior + posterior))
+        for row in range(len(factors))
+    ]

@@ -46,8 +46,8 @@ class Mixture:
 
         Examples
         --------
-        >>> one = Mixture(np.zeros(2), np.array([[10.0], [40.0]]), np.ones((2, 1, 1)))
-        >>> one.quantiles(0.025).round(1).tolist()
+        >>> mixture = Mixture(np.zeros(2), np.array([[10.0], [40.0]]), np.ones((2, 1, 1)))
+        >>> mixture.quantiles(0.025).round(1).tolist()
         [[8.4], [41.6]]
         """
         from scipy.special import ndtr
@@ -171,9 +171,9 @@ def linear_mixture(component: Component, state: State, variant: Variant) -> Mixt
     size = np.sqrt(np.maximum((weight[:, None] * columns**2).sum(axis=0), 1e-300))
     columns = columns / size
     own_count = design.shape[2]
-    known = np.diagonal(model.precision)
+    precision = np.diagonal(model.precision)
     prior = np.concatenate(
-        [np.zeros(own_count), np.where(known < 0.0, 0.0, known) / size[own_count:] ** 2]
+        [np.zeros(own_count), np.where(precision < 0.0, 0.0, precision) / size[own_count:] ** 2]
     )
     normal = (columns * weight[:, None]).T @ columns + np.diag(prior + 1e-9)
     projected = columns.T @ (weight * values)

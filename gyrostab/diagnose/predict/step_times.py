@@ -46,14 +46,14 @@ def select_step_times(values: Array, windows: Windows) -> list[float]:
         return [float(instant) for instant in values]
     every = -(-len(values) // (_MAX_TIMES - 3 * _MAX_STEPS))
     steps = _largest_steps(windows)
-    near = values[
+    near_steps = values[
         np.abs(values[:, None] - steps).min(axis=1, initial=np.inf)
         <= 0.5 * (windows.end[0] - windows.begin[0])
     ]
     return [
         float(instant)
         for instant in np.unique(
-            np.concatenate([values[every // 2 :: every], power_on_times(windows), near])
+            np.concatenate([values[every // 2 :: every], power_on_times(windows), near_steps])
         )
     ]
 

@@ -53,7 +53,7 @@ def make_windows(blocks: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
         Channels of the log by channel of the effect.
     """
     axes = tuple(str(axis) for axis in blocks["axis"].values)
-    own = dict(zip(axes, map(fill_linearly, measured(blocks, "mean").values), strict=True))
+    means = dict(zip(axes, map(fill_linearly, measured(blocks, "mean").values), strict=True))
 
     def spans(name: str) -> Array:
         if f"{name}_begin" not in blocks:
@@ -77,7 +77,7 @@ def make_windows(blocks: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
             for inner, name in drivers.items()
             if f"fine_{name}" in blocks
         },
-        own=own,
+        own=means,
         gaps=spans("gap"),
         restarts=spans("restart"),
         phase=(np.arange(blocks.sizes["phase"]) + 0.5) / blocks.sizes["phase"]
@@ -160,31 +160,35 @@ def rebuild_variant(
         Prospect(dict(variant.values), prediction, blocks, coefficient)
     )
     return next(
-        (one for one in built if one.columns == variant.columns and one.squared == variant.squared),
+        (
+            rebuilt
+            for rebuilt in built
+            if rebuilt.columns == variant.columns and rebuilt.squared == variant.squared
+        ),
         None,
     )
 
 
 def distinct_variants(variants: list[Variant]) -> tuple[Variant, ...]:
     """Drop variants with empty designs, or designs equal to others."""
-    kept: list[Variant] = []
+    distinct: list[Variant] = []
     known_designs: set[tuple[Any, ...]] = set()
-    for one in variants:
-        if one.design.size:
-            size = np.abs(one.design).max(initial=0.0)
+    for variant in variants:
+        if variant.design.size:
+            size = np.abs(variant.design).max(initial=0.0)
             if not (np.isfinite(size) and size > 0.0):
                 continue
             mark: tuple[Any, ...] = (
-                one.columns,
-                one.time,
-                np.round(one.design / size / _MAX_DESIGN_DIFFERENCE).tobytes(),
+                variant.columns,
+                variant.time,
+                np.round(variant.design / size / _MAX_DESIGN_DIFFERENCE).tobytes(),
             )
         else:
-            mark = (one.columns,)
+            mark = (variant.columns,)
         if mark not in known_designs:
             known_designs.add(mark)
-            kept.append(one)
-    return tuple(kept)
+            distinct.append(variant)
+    return tuple(distinct)
 
 
 def weigh_by_time(variants: tuple[Variant, ...], windows: Windows) -> tuple[Variant, ...]:
@@ -193,17 +197,20 @@ def weigh_by_time(variants: tuple[Variant, ...], windows: Windows) -> tuple[Vari
     Times at which power came back have the same total probability as all others, which have that of
     the interval they represent.
     """
-    if not variants or not all(TIME_PARAMETER in one.values for one in variants):
+    if not variants or not all(TIME_PARAMETER in variant.values for variant in variants):
         return variants
-    at = np.array([one.values[TIME_PARAMETER] for one in variants])
-    known = np.array([bool(np.isclose(power_on_times(windows), instant).any()) for instant in at])
-    others, place = np.unique(at[~known], return_inverse=True)
-    if others.size < 2:
+    at = np.array([variant.values[TIME_PARAMETER] for variant in variants])
+    is_power_on = np.array(
+        [bool(np.isclose(power_on_times(windows), instant).any()) for instant in at]
+    )
+    other_times, place = np.unique(at[~is_power_on], return_inverse=True)
+    if other_times.size < 2:
         return variants
     weight = np.ones(at.size)
-    span = np.gradient(others)[place]
-    weight[~known] = span / span.mean()
-    weight[known] = weight[~known].sum() / max(int(known.sum()), 1)
+    span = np.gradient(other_times)[place]
+    weight[~is_power_on] = span / span.mean()
+    weight[is_power_on] = weight[~is_power_on].sum() / max(int(is_power_on.sum()), 1)
     return tuple(
-        replace(one, weight=float(share)) for one, share in zip(variants, weight, strict=True)
+        replace(variant, weight=float(share))
+        for variant, share in zip(variants, weight, strict=True)
     )
