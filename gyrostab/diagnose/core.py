@@ -187,34 +187,44 @@ def _compare_blocks(task: Task, blocks: xr.Dataset, baseline: xr.Dataset) -> Com
     Identified effects and located mismatches have half of the false-alarm level each.
     """
     level = task.level / 2.0
-    seen = remove_known_lines(blocks, baseline, settings=task.settings)
-    records = repeatable_null_records(seen, baseline, task.nulls, task.seed)
+    blocks_without_lines = remove_known_lines(blocks, baseline, settings=task.settings)
+    records = repeatable_null_records(blocks_without_lines, baseline, task.nulls, task.seed)
     task.progress("comparing", 0)
     null = null_scores(baseline, records(), settings=task.settings)
     task.progress("naming", 0)
-    known = task.simulation.effects if isinstance(task.simulation, Model) else ()
+    known_effects = task.simulation.effects if isinstance(task.simulation, Model) else ()
     identifications = name_effects(
-        seen,
+        blocks_without_lines,
         baseline,
         records(),
         level=level,
         seed=task.seed,
-        known=[one for one in known if one.name in baseline.attrs["left_out"]],
+        known=[effect for effect in known_effects if effect.name in baseline.attrs["left_out"]],
         progress=task.progress,
         settings=task.settings,
     )
     expected = identifications.expected
-    before = expected_baseline(identifications, baseline)
-    at_rest = lines_without_motion(task, seen, before) if expected else seen
+    conditioned_baseline = expected_baseline(identifications, baseline)
+    at_rest = (
+        lines_without_motion(task, blocks_without_lines, conditioned_baseline)
+        if expected
+        else blocks_without_lines
+    )
     mismatches = locate_mismatches(
         without_expected(at_rest, baseline, expected),
-        before,
+        conditioned_baseline,
         null,
         level=level,
         settings=task.settings,
     )
     mismatches = drop_expected(
-        mismatches, expected, seen, before, null, level=level, settings=task.settings
+        mismatches,
+        expected,
+        blocks_without_lines,
+        conditioned_baseline,
+        null,
+        level=level,
+        settings=task.settings,
     )
     return Comparison(blocks, baseline, mismatches, identifications, null)
 

@@ -507,5 +507,5 @@ def stored_settings(values: Mapping[str, Any]) -> Settings:
 
     Names that this version does not know are left out; those that it lacks have their defaults.
     """
-    known = {field.name for field in fields(Settings)}
-    return Settings(**{name: value for name, value in values.items() if name in known})
+    names = {field.name for field in fields(Settings)}
+    return Settings(**{name: value for name, value in values.items() if name in names})

@@ -58,11 +58,11 @@ def predict_baseline(
     keep = (
         np.ones(blocks.sizes["block"], np.bool_) if known is None else np.asarray(known, np.bool_)
     )
-    seen = blocks.copy()
+    usable_blocks = blocks.copy()
     for name in ("mean", "power", "cross"):
-        if name in seen:
-            seen[name] = seen[name].where(xr.DataArray(keep, dims="block"))
-    state = initial_state(seen, baseline, settings=identifications.state.settings)
+        if name in usable_blocks:
+            usable_blocks[name] = usable_blocks[name].where(xr.DataArray(keep, dims="block"))
+    state = initial_state(usable_blocks, baseline, settings=identifications.state.settings)
     # for each column in the model, whether it belongs to an effect that is left out
     is_left_out: dict[tuple[str, str], list[bool]] = {}
     identified = (*identifications.expected, *identifications.identified)
@@ -70,39 +70,39 @@ def predict_baseline(
     for identification, state in zip(identified, states, strict=True):
         for place, columns in state.given.items():
             known_of = is_left_out.setdefault(place, [])
-            known_of += [any(identification is one for one in left_out)] * (
+            known_of += [any(identification is other for other in left_out)] * (
                 len(columns) - len(known_of)
             )
     weight = _powers_without(state, baseline, is_left_out)
-    state = replace(state, blocks=seen, masked=identifications.state.masked)
+    state = replace(state, blocks=usable_blocks, masked=identifications.state.masked)
     mean = baseline["known_mean"].values.copy()
     for row, axis in enumerate(state.axes):
         columns = state.given.get(("mean", axis), [])
-        kept = ~np.array(is_left_out.get(("mean", axis), []), np.bool_)
-        if kept.any():
-            alone = replace(
+        is_kept = ~np.array(is_left_out.get(("mean", axis), []), np.bool_)
+        if is_kept.any():
+            state_without_means = replace(
                 state,
                 given={key: value for key, value in state.given.items() if key != ("mean", axis)},
             )
-            size, _ = mean_mixture(alone, axis, columns).moments()
-            mean[row] += np.tensordot(size[kept], np.stack(columns)[kept], axes=1)
-    after = baseline.assign(
+            size, _ = mean_mixture(state_without_means, axis, columns).moments()
+            mean[row] += np.tensordot(size[is_kept], np.stack(columns)[is_kept], axes=1)
+    predicted = baseline.assign(
         spectrum=baseline["spectrum"].copy(data=weight),
         known_mean=baseline["known_mean"].copy(data=mean),
     )
     remaining = [
         identification
         for identification in identified
-        if not any(identification is one for one in left_out)
+        if not any(identification is other for other in left_out)
     ]
     shared = [
         component for component in components_of(remaining) if component.statistic.is_pairwise
     ]
     if not shared:
-        return after
+        return predicted
     expected = expected_cross(baseline)
     cross = _cross_spectra(shared, state, identifications)
-    return after.assign(
+    return predicted.assign(
         cross=(("pair", "block", "band"), cross if expected is None else cross + expected)
     )
 
@@ -112,12 +112,12 @@ def _powers_without(
 ) -> NDArray[np.float64]:
     """Return the expected powers without some of the columns in the model."""
     weight = state.weight.copy()
-    least = MIN_POWER_RATIO * baseline["spectrum"].values
+    min_power = MIN_POWER_RATIO * baseline["spectrum"].values
     for row, axis in enumerate(state.axes):
         chosen = np.array(is_left_out.get(("power", axis), []), np.bool_)
         if chosen.any():
             weight[row] = np.maximum(
-                weight[row] - power_shares(state, axis)[chosen].sum(axis=0), least[row]
+                weight[row] - power_shares(state, axis)[chosen].sum(axis=0), min_power[row]
             )
     return weight
 
@@ -131,10 +131,10 @@ def _cross_spectra(
     total = np.zeros((len(pairs), *shape), np.complex128)
     for component in components:
         row = pairs.index(component.row)
-        alone = replace(
+        state_without_cross = replace(
             state, given={key: value for key, value in state.given.items() if key[0] != "cross"}
         )
-        mean, _ = component_mixture(component, alone).moments()
+        mean, _ = component_mixture(component, state_without_cross).moments()
         for size, design in zip(mean, component.variant.design, strict=True):
             total[row] += size * cross_column(design, row, state.blocks)
     return total

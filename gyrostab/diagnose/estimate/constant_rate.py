@@ -43,10 +43,10 @@ def constant_rates(
     axes = tuple(str(axis) for axis in blocks["axis"].values)
     rate = blocks["mean"].values.copy()
     for effect in effects:
-        own = tuple(axis for axis in axes if not effect.axes or axis in effect.axes)
-        rows = [axes.index(axis) for axis in own]
-        for name, design in predict_effect(effect, blocks, own).mean.items():
-            rate[rows] -= sizes_by_axis(effect, name, own)[:, None] * np.atleast_2d(design)
+        effect_axes = tuple(axis for axis in axes if not effect.axes or axis in effect.axes)
+        rows = [axes.index(axis) for axis in effect_axes]
+        for name, design in predict_effect(effect, blocks, effect_axes).mean.items():
+            rate[rows] -= sizes_by_axis(effect, name, effect_axes)[:, None] * np.atleast_2d(design)
     if turning in axes and "channel_rotation_rate" in blocks:
         rate[axes.index(turning)] -= HOUR * blocks["channel_rotation_rate"].values
     means = _average_blocks(blocks, rate)
@@ -66,8 +66,8 @@ def noise_lost_by_truncation(blocks: xr.Dataset, effects: Sequence[Effect]) -> d
     out = {}
     for row, step in _truncated_rows(axes, effects):
         mean, variance = _moments_of_axis(blocks, row)
-        before = _undo_truncation(mean, variance, step)[1]
-        out[axes[row]] = before - (variance - step**2 / 12.0)
+        variance_before = _undo_truncation(mean, variance, step)[1]
+        out[axes[row]] = variance_before - (variance - step**2 / 12.0)
     return out
 
 
@@ -102,7 +102,8 @@ def _undo_truncation(mean: float, variance: float, step: float) -> tuple[float, 
     --------
     >>> x = np.random.default_rng(1).normal(0.7, 1.5, 1_000_000)
     >>> mean, variance = np.trunc(x).mean(), np.trunc(x).var()
-    >>> [round(float(one), 2) for one in (mean, variance, *_undo_truncation(mean, variance, 1.0))]
+    >>> moments = (mean, variance, *_undo_truncation(mean, variance, 1.0))
+    >>> [round(float(moment), 2) for moment in moments]
     [0.52, 1.43, 0.7, 2.24]
     """
     from scipy.special import ndtr
@@ -117,8 +118,8 @@ def _undo_truncation(mean: float, variance: float, step: float) -> tuple[float, 
     for _ in range(_ROUNDS):
         sigma = np.sqrt(square)
         share = ndtr((high - centre) / sigma) - ndtr((low - centre) / sigma)
-        first = float(share @ level)
-        second = float(share @ (level - first) ** 2)
-        centre += target - first
-        square = max(square + spread - second, 1e-3)
+        level_mean = float(share @ level)
+        level_variance = float(share @ (level - level_mean) ** 2)
+        centre += target - level_mean
+        square = max(square + spread - level_variance, 1e-3)
     return centre * step, square * step**2

@@ -69,7 +69,7 @@ class Fitted:
         if self.effect is None or not self.parameters:
             return ""
         text = (self.shown or self.effect).say(
-            {name: one.stderr for name, one in self.parameters.items()}
+            {name: estimate.stderr for name, estimate in self.parameters.items()}
         )
         return f"{text} {self.note}" if self.note else text
 
@@ -86,20 +86,20 @@ def fit_identifications(identifications: Identifications, baseline: xr.Dataset) 
     start = initial_state(
         identifications.state.blocks, baseline, settings=identifications.state.settings
     )
-    found: list[Fitted] = []
+    fitted: list[Fitted] = []
     for identification in identifications.identified:
-        everything: list[Selection] = [
+        selections: list[Selection] = [
             *identifications.expected,
             *identifications.identified,
             *identifications.unknown,
         ]
         state = replace(
-            condition_on_selections(start, everything, identification),
+            condition_on_selections(start, selections, identification),
             weight=identifications.state.weight,
             masked=identifications.state.masked,
         )
-        found += _fit_identification(identification, state, identifications)
-    return found
+        fitted += _fit_identification(identification, state, identifications)
+    return fitted
 
 
 def _fit_identification(
@@ -161,27 +161,27 @@ def _split_harmonics(identification: Identification, state: State) -> list[list[
         if component.statistic.is_rotation and component.candidate.each
     ]
     sets = harmonic_sets(state.blocks.sizes["harmonic"]) if turning else []
-    there = sorted({k for component in turning for k in sets[component.place]})
-    alone = [
+    harmonics = sorted({k for component in turning for k in sets[component.place]})
+    by_harmonic = [
         [replace(component, place=k) for component in turning if k in sets[component.place]]
-        for k in there
+        for k in harmonics
     ]
-    if len(alone) < 2:
+    if len(by_harmonic) < 2:
         return [list(identification.components)]
     clear = [
         max(
             size / error
             for size, error, _ in (fit_amplitude(component, state) for component in components)
         )
-        for components in alone
+        for components in by_harmonic
     ]
-    kept = [
+    visible_harmonics = [
         components
-        for components, times in zip(alone, clear, strict=True)
+        for components, times in zip(by_harmonic, clear, strict=True)
         if times > state.settings.visible_sigma or times == max(clear)
     ]
     rest = [component for component in identification.components if component not in turning]
-    return [[*kept[0], *rest], *kept[1:]]
+    return [[*visible_harmonics[0], *rest], *visible_harmonics[1:]]
 
 
 def _fit_components(
@@ -208,12 +208,14 @@ def _fit_components(
     if filtered:
         sizes, values = fit_filter_sizes(by_statistic[statistic], state)
     else:
-        own, together = _estimate_sizes(by_statistic[statistic], axes, state, identifications)
-        for name, value in together.items():
+        own_sizes, likeliest_values = _estimate_sizes(
+            by_statistic[statistic], axes, state, identifications
+        )
+        for name, value in likeliest_values.items():
             _store_value(likeliest, name, value, axes)
         sizes = {
             **_sizes_on_other_axes(by_statistic, statistic, axes, state, identifications),
-            **own,
+            **own_sizes,
         }
     for name, (mean, sd, *ends) in sizes.items():
         unit = units.get(name.split(".")[0], "1")
@@ -255,20 +257,22 @@ def _sizes_on_other_axes(
     identifications: Identifications,
 ) -> dict[str, tuple[float, ...]]:
     """Return sizes on axes that the strongest statistic does not cover, from the next that does."""
-    seen = {axis for component in by_statistic[statistic] for axis in component.row}
-    found: dict[str, tuple[float, ...]] = {}
-    for other in sorted(
+    covered_axes = {axis for component in by_statistic[statistic] for axis in component.row}
+    added_sizes: dict[str, tuple[float, ...]] = {}
+    for other_statistic in sorted(
         set(by_statistic) - {statistic},
         key=lambda name: -sum(component.evidence_nats for component in by_statistic[name]),
     ):
-        lacking = {axis for component in by_statistic[other] for axis in component.row} - seen
+        lacking = {
+            axis for component in by_statistic[other_statistic] for axis in component.row
+        } - covered_axes
         if lacking:
-            sizes, _ = _estimate_sizes(by_statistic[other], axes, state, identifications)
-            found |= {
+            sizes, _ = _estimate_sizes(by_statistic[other_statistic], axes, state, identifications)
+            added_sizes |= {
                 name: size for name, size in sizes.items() if name.partition(".")[2] in lacking
             }
-            seen |= lacking
-    return found
+            covered_axes |= lacking
+    return added_sizes
 
 
 def _estimate_sizes(
@@ -296,8 +300,8 @@ def _store_value(values: dict[str, Any], name: str, value: Any, axes: tuple[str,
     if not axis:
         values[base] = value
         return
-    known = values.setdefault(base, [0.0] * len(axes))
-    known[axes.index(axis)] = value
+    axis_values = values.setdefault(base, [0.0] * len(axes))
+    axis_values[axes.index(axis)] = value
 
 
 def _model_settings(
@@ -341,18 +345,22 @@ def _fill_of(component: Component, state: State) -> str:
     """Return what lost samples are replaced by."""
     if component.variant.columns[0] == "filled":
         return "zero"
-    own = state.blocks.sel(axis=component.row[0])
-    return "frame" if 2.0 * float(own["resent"].sum()) > float(own["repeats"].sum()) else "repeat"
+    axis_blocks = state.blocks.sel(axis=component.row[0])
+    return (
+        "frame"
+        if 2.0 * float(axis_blocks["resent"].sum()) > float(axis_blocks["repeats"].sum())
+        else "repeat"
+    )
 
 
 def _make_effect(
     kind: type[Effect], values: Mapping[str, Any], axes: tuple[str, ...], driver: tuple[str, ...]
 ) -> Effect | None:
-    known = {item.name: item for item in kind.parameters()}
+    parameters = {item.name: item for item in kind.parameters()}
     clean = {}
     for name, value in values.items():
-        if name in known:
-            item = known[name]
+        if name in parameters:
+            item = parameters[name]
             clean[name] = (
                 value if isinstance(value, str) else _clip_to_range(value, item.low, item.high)
             )
@@ -366,7 +374,7 @@ def _make_effect(
 
 def _clip_to_range(value: Any, low: float, high: float) -> Any:
     if isinstance(value, list | tuple):
-        return [min(max(float(one), low), high) for one in value]
+        return [min(max(float(element), low), high) for element in value]
     return min(max(float(value), low), high)
 
 

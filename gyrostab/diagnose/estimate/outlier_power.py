@@ -36,21 +36,23 @@ def add_outlier_power(
     frequency, rate = blocks["frequency"].values, float(blocks.attrs["sampling_rate_hz"])
     spectrum = baseline["spectrum"]
     added = np.zeros(spectrum.shape)
-    for one in fitted:
-        if one.effect is None or not any(
-            component.statistic.is_count for component in one.identification.components
+    for effect_fit in fitted:
+        if effect_fit.effect is None or not any(
+            component.statistic.is_count for component in effect_fit.identification.components
         ):
             continue
-        rows = [axes.index(axis) for axis in one.axes]
-        seen = one.effect.explain(replace(make_windows(blocks, {}), axes=tuple(one.axes)))
-        if _EVERYWHERE in seen.marks:
+        rows = [axes.index(axis) for axis in effect_fit.axes]
+        prediction = effect_fit.effect.explain(
+            replace(make_windows(blocks, {}), axes=tuple(effect_fit.axes))
+        )
+        if _EVERYWHERE in prediction.marks:
             continue
-        for name, density in seen.spectrum.items():
-            added[rows] += getattr(one.effect, name) ** 2 * density
-        for (term, name), share in seen.level.items():
-            square = baseline["coefficient"].sel(term=term, axis=list(one.axes)).values ** 2
-            own = square[:, None] * getattr(one.effect, name) * share
-            added[rows] += own[..., None] * sampled_psd(term, frequency, rate)
+        for name, density in prediction.spectrum.items():
+            added[rows] += getattr(effect_fit.effect, name) ** 2 * density
+        for (term, name), share in prediction.level.items():
+            square = baseline["coefficient"].sel(term=term, axis=list(effect_fit.axes)).values ** 2
+            added_square = square[:, None] * getattr(effect_fit.effect, name) * share
+            added[rows] += added_square[..., None] * sampled_psd(term, frequency, rate)
     return (
         baseline.assign(spectrum=spectrum.copy(data=spectrum.values + added))
         if added.any()

@@ -88,28 +88,28 @@ def recalibrate(
     use = np.ones(blocks.sizes["block"], np.bool_) if known is None else np.asarray(known, np.bool_)
     state = initial_state(blocks, baseline, settings=identifications.state.settings)
     state = condition_on_selections(state, identifications.identified)
-    found: list[Posterior] = []
+    posteriors: list[Posterior] = []
     power = baseline["spectrum"].values.copy()
     columns = noise_powers(blocks)
     changed, quiet = [], baseline["quiet"].values.copy()
     for row, axis in enumerate(state.axes):
-        seen = _collect_effects(identifications, baseline, fitted, axis)
+        axis_effects = _collect_effects(identifications, baseline, fitted, axis)
         posterior = None
-        if seen is not None:
-            has_unidentified = any(axis in one.axes for one in identifications.unknown)
+        if axis_effects is not None:
+            has_unidentified = any(axis in selection.axes for selection in identifications.unknown)
             chosen = use & ~state.masked[row] & (quiet[row] if has_unidentified else True)
-            posterior = _fit_noise(state, row, seen, chosen)
+            posterior = _fit_noise(state, row, axis_effects, chosen)
             if posterior is not None:
                 changed.append(axis)
                 quiet[row] = chosen
-                columns[row] = noise_powers(blocks, seen.response)[row]
-                power[row] = columns[row] @ posterior.square + seen.known
-        found.append(_kept_posterior(baseline, row) if posterior is None else posterior)
+                columns[row] = noise_powers(blocks, axis_effects.response)[row]
+                power[row] = columns[row] @ posterior.square + axis_effects.known
+        posteriors.append(_kept_posterior(baseline, row) if posterior is None else posterior)
     if not changed:
         return baseline
     out = assemble_baseline(
         blocks,
-        found,
+        posteriors,
         quiet=quiet,
         attrs={**baseline.attrs, "recalibrated": changed},
         spectrum=power,
@@ -143,14 +143,14 @@ def remove_fast_switching(identifications: Identifications, baseline: xr.Dataset
         calibrated on the recording and such a bias is identified.
     """
     switching = tuple(
-        one
-        for one in identifications.identified
-        if any(component.variant.inside.size for component in one.components)
+        identification
+        for identification in identifications.identified
+        if any(component.variant.inside.size for component in identification.components)
     )
     if not switching:
         return baseline
-    alone = replace(identifications, identified=switching, unknown=())
-    noise = recalibrate(alone, baseline, fit_identifications(alone, baseline))
+    switching_only = replace(identifications, identified=switching, unknown=())
+    noise = recalibrate(switching_only, baseline, fit_identifications(switching_only, baseline))
     return noise if noise is baseline else noise.assign_attrs(recalibrated=[])
 
 
@@ -167,32 +167,32 @@ def refer_to_kept_noise(
     recalibrated = noise.attrs.get("recalibrated", ())
     quiet = dict(zip(noise["axis"].values.tolist(), noise["quiet"].values, strict=True))
     out = []
-    for one in fitted:
-        kept = [axis for axis in one.axes if axis not in recalibrated]
-        if one.effect is None or one.effect.stage != "noise" or not kept:
-            out.append(one)
+    for effect_fit in fitted:
+        kept_axes = [axis for axis in effect_fit.axes if axis not in recalibrated]
+        if effect_fit.effect is None or effect_fit.effect.stage != "noise" or not kept_axes:
+            out.append(effect_fit)
             continue
-        at_rest = quiet[kept[0]]
+        at_rest = quiet[kept_axes[0]]
         means = {
             role: float(np.nanmean(blocks[f"channel_{name}"].values[at_rest]))
-            for role, name in find_drivers(one.effect).items()
+            for role, name in find_drivers(effect_fit.effect).items()
         }
-        effect = one.effect.refer_noise_to(means)
-        shown = None if one.shown is None else one.shown.refer_noise_to(means)
-        out.append(replace(one, effect=effect, shown=shown))
+        effect = effect_fit.effect.refer_noise_to(means)
+        shown = None if effect_fit.shown is None else effect_fit.shown.refer_noise_to(means)
+        out.append(replace(effect_fit, effect=effect, shown=shown))
     return out
 
 
 def _kept_posterior(baseline: xr.Dataset, row: int) -> Posterior:
     """Return the posterior of an axis whose noise is kept."""
-    one = baseline.isel(axis=row)
-    K, B = one["grid_K"].values, one["grid_B"].values
-    weight = np.exp(one["grid_calibrated"].values)
-    draws = one["posterior"].values
-    slow = one["posterior_slow"].values
+    axis_baseline = baseline.isel(axis=row)
+    K, B = axis_baseline["grid_K"].values, axis_baseline["grid_B"].values
+    weight = np.exp(axis_baseline["grid_calibrated"].values)
+    draws = axis_baseline["posterior"].values
+    slow = axis_baseline["posterior_slow"].values
     return Posterior(
-        one["square"].values,
-        one["square_stderr"].values,
+        axis_baseline["square"].values,
+        axis_baseline["square_stderr"].values,
         K,
         B,
         weight / weight.sum(),
@@ -218,7 +218,11 @@ def _collect_effects(
         for component in components:
             _add_component(out, component, identifications, baseline, axis)
         numbers = next(
-            (one for one in fitted if one.identification is identification and axis in one.axes),
+            (
+                effect_fit
+                for effect_fit in fitted
+                if effect_fit.identification is identification and axis in effect_fit.axes
+            ),
             None,
         )
         effect = None if numbers is None else numbers.effect
@@ -239,9 +243,9 @@ def _collect_effects(
                 [
                     out.doubt,
                     *(
-                        2.0 * one.stderr / abs(one.value)
-                        for one in numbers.parameters.values()
-                        if one.value
+                        2.0 * estimate.stderr / abs(estimate.value)
+                        for estimate in numbers.parameters.values()
+                        if estimate.value
                     ),
                 ]
             )
@@ -263,11 +267,11 @@ def _add_component(
     state = initial_state(
         identifications.state.blocks, baseline, settings=identifications.state.settings
     )
-    known, free, means = component.statistic.noise_shares(
+    known_power, free, means = component.statistic.noise_shares(
         component, axis, state, identifications.state.weight
     )
-    out.known += known
-    out.free += [np.broadcast_to(one, out.known.shape) for one in free]
+    out.known += known_power
+    out.free += [np.broadcast_to(column, out.known.shape) for column in free]
     out.means += means
 
 
@@ -286,7 +290,7 @@ def _effect_power(effect: Effect, blocks: xr.Dataset, axis: str) -> Array:
 
 
 def _fit_noise(
-    state: State, row: int, seen: AxisEffects, chosen: NDArray[np.bool_]
+    state: State, row: int, axis_effects: AxisEffects, chosen: NDArray[np.bool_]
 ) -> Posterior | None:
     """Fit the noise of an axis with the effects; None where too little is left to determine it."""
     blocks = state.blocks
@@ -294,10 +298,15 @@ def _fit_noise(
     chosen = chosen & (np.isfinite(power) & np.isfinite(shape)).any(axis=1)
     if chosen.sum() < MIN_BLOCKS:
         return None
-    columns = noise_powers(blocks, seen.response)[row]
-    common, alone = (one[row] for one in common_variance(blocks))
+    columns = noise_powers(blocks, axis_effects.response)[row]
+    common, shape_alone = (values[row] for values in common_variance(blocks))
     fit = _average_groups(
-        power, _reduced_shapes(shape, alone, common), columns, state.weight[row], seen, chosen
+        power,
+        _reduced_shapes(shape, shape_alone, common),
+        columns,
+        state.weight[row],
+        axis_effects,
+        chosen,
     )
     square, information = fit_squares(fit)
     plain = float(
@@ -313,7 +322,7 @@ def _fit_noise(
     variance = white_variance(blocks, np.tile(square, (count, 1)))[row]
     variance = variance * np.maximum(state.weight[row, :, 0] / (columns[:, 0] @ square), 0.1)
     mean = blocks["mean"].values[row]
-    effect_means = np.stack(seen.means, axis=1) if seen.means else None
+    effect_means = np.stack(axis_effects.means, axis=1) if axis_effects.means else None
     return noise_posterior(
         fit,
         mean,
@@ -327,10 +336,12 @@ def _fit_noise(
     )
 
 
-def _reduced_shapes(shape: Array, alone: Array, common: Array) -> Array:
+def _reduced_shapes(shape: Array, shape_alone: Array, common: Array) -> Array:
     """Return the shapes of the powers, reduced by the scatter that the bands of a block share."""
-    each = np.nansum(alone, axis=1)
-    share = each / (1.0 + common * each) / np.maximum(np.nansum(shape, axis=1), 1e-300)
+    block_shape = np.nansum(shape_alone, axis=1)
+    share = (
+        block_shape / (1.0 + common * block_shape) / np.maximum(np.nansum(shape, axis=1), 1e-300)
+    )
     return np.asarray(shape * np.minimum(share, 1.0)[:, None])
 
 
@@ -339,7 +350,7 @@ def _average_groups(
     shape: Array,
     columns: Array,
     expected: Array,
-    seen: AxisEffects,
+    axis_effects: AxisEffects,
     chosen: NDArray[np.bool_],
 ) -> Fit:
     """Average the powers over blocks of similar level."""
@@ -347,13 +358,13 @@ def _average_groups(
     groups = np.array_split(
         np.argsort(level, kind="stable")[: int(chosen.sum())], min(LEVEL_GROUPS, int(chosen.sum()))
     )
-    size = [max(float(np.abs(one).max()), 1e-300) for one in seen.free]
+    size = [max(float(np.abs(column).max()), 1e-300) for column in axis_effects.free]
     components = [
         power,
         columns,
-        seen.known,
+        axis_effects.known,
         expected,
-        *[one / top for one, top in zip(seen.free, size, strict=True)],
+        *[column / top for column, top in zip(axis_effects.free, size, strict=True)],
     ]
     means: list[list[Array]] = [[] for _ in components]
     weights = []
@@ -366,23 +377,23 @@ def _average_groups(
         total = use.sum(axis=0)
         safe = np.where(total > 0.0, total, 1.0)
         weights.append(total)
-        for place, one in enumerate(components):
-            wide = use[..., None] if one.ndim == 3 else use
-            by = safe[:, None] if one.ndim == 3 else safe
-            means[place].append((wide * np.nan_to_num(one[block_count])).sum(axis=0) / by)
+        for place, component in enumerate(components):
+            wide = use[..., None] if component.ndim == 3 else use
+            by = safe[:, None] if component.ndim == 3 else safe
+            means[place].append((wide * np.nan_to_num(component[block_count])).sum(axis=0) / by)
     weight = np.concatenate(weights)
-    some = weight > 0.0
-    flat = [np.concatenate(one)[some] for one in means]
-    free = np.stack(flat[4:], axis=1) if len(flat) > 4 else np.empty((int(some.sum()), 0))
-    known = flat[2][:, None]
+    has_weight = weight > 0.0
+    flat = [np.concatenate(group_means)[has_weight] for group_means in means]
+    free = np.stack(flat[4:], axis=1) if len(flat) > 4 else np.empty((int(has_weight.sum()), 0))
+    known_power = flat[2][:, None]
     precision = np.zeros(free.shape[1])
-    if np.any(known > 0.0):  # the predicted power has an error too
-        free = np.concatenate([free, known], axis=1)
-        precision = np.append(precision, 1.0 / seen.doubt**2)
+    if np.any(known_power > 0.0):  # the predicted power has an error too
+        free = np.concatenate([free, known_power], axis=1)
+        precision = np.append(precision, 1.0 / axis_effects.doubt**2)
     return Fit(
         flat[0],
         flat[1],
-        weight[some],
+        weight[has_weight],
         known=flat[2],
         free_columns=free,
         precision=precision,
@@ -398,19 +409,21 @@ def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identi
     blocks = identifications.state.blocks
     swapped = {}
     for component in components_of(identifications.identified):
-        one = component.candidate
-        if one.statistic.is_power and id(one) not in swapped:
+        candidate = component.candidate
+        if candidate.statistic.is_power and id(candidate) not in swapped:
             made = [
-                rebuild_variant(one, variant, blocks, baseline["coefficient"]) or variant
-                for variant in one.variants
+                rebuild_variant(candidate, variant, blocks, baseline["coefficient"]) or variant
+                for variant in candidate.variants
             ]
-            swapped[id(one)] = (one, replace(one, variants=tuple(made)))
+            swapped[id(candidate)] = (candidate, replace(candidate, variants=tuple(made)))
 
     def part_of(component: Component) -> Component:
         if id(component.candidate) not in swapped:
             return component
         old, new = swapped[id(component.candidate)]
-        place = next(number for number, one in enumerate(old.variants) if one is component.variant)
+        place = next(
+            number for number, variant in enumerate(old.variants) if variant is component.variant
+        )
         return replace(component, candidate=new, variant=new.variants[place])
 
     identified = tuple(
@@ -421,6 +434,7 @@ def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identi
         for identification in identifications.identified
     )
     candidates = tuple(
-        swapped[id(one)][1] if id(one) in swapped else one for one in identifications.candidates
+        swapped[id(candidate)][1] if id(candidate) in swapped else candidate
+        for candidate in identifications.candidates
     )
     return replace(identifications, identified=identified, candidates=candidates)

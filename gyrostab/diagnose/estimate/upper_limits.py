@@ -57,20 +57,22 @@ def find_upper_limits(identifications: Identifications) -> dict[str, UpperLimit]
         if name in identifications.reasons:
             out[name] = UpperLimit(math.nan, unit, identifications.reasons[name])
             continue
-        found = [
-            _limit_candidate(one, identifications.state)
-            for one in identifications.candidates
-            if one.effect == name and one.statistic.has_course and one.statistic.has_size
+        limits = [
+            _limit_candidate(candidate, identifications.state)
+            for candidate in identifications.candidates
+            if candidate.effect == name
+            and candidate.statistic.has_course
+            and candidate.statistic.has_size
         ]
-        known = [(value, column) for value, column in found if math.isfinite(value)]
-        if not known:
+        finite_limits = [(value, column) for value, column in limits if math.isfinite(value)]
+        if not finite_limits:
             out[name] = UpperLimit(
                 math.nan,
                 unit,
-                "not identifiable: free noise does as much" if found else "below limit",
+                "not identifiable: free noise does as much" if limits else "below limit",
             )
             continue
-        value, column = max(known)
+        value, column = max(finite_limits)
         unit = next((item.unit for item in kind.parameters() if item.name == column), unit)
         out[name] = UpperLimit(value, unit, "below limit")
     return out
@@ -85,12 +87,18 @@ def _limit_candidate(candidate: Candidate, state: State) -> tuple[float, str]:
         return math.nan, ""
     family = _select_variants(
         candidate,
-        [one for one in candidate.variants if one.columns == candidate.variants[0].columns],
+        [
+            variant
+            for variant in candidate.variants
+            if variant.columns == candidate.variants[0].columns
+        ],
     )
     rows = candidate.statistic.rows(candidate, state)
-    found = [_limit_row(Component(candidate, family[0], row, 0.0), family, state) for row in rows]
-    known = [bound for bound in found if math.isfinite(bound)]
-    worst = max(known) if known else math.nan
+    row_limits = [
+        _limit_row(Component(candidate, family[0], row, 0.0), family, state) for row in rows
+    ]
+    finite_limits = [bound for bound in row_limits if math.isfinite(bound)]
+    worst = max(finite_limits) if finite_limits else math.nan
     return (math.sqrt(worst) if family[0].squared else worst), family[0].columns[0]
 
 
@@ -112,15 +120,15 @@ def _select_variants(candidate: Candidate, family: Sequence[Variant]) -> Sequenc
 def _limit_row(component: Component, family: Sequence[Variant], state: State) -> float:
     """Return the 95 % limit of a size (or its square) on an axis or pair; NaN without one."""
     moving = [
-        one
-        for one in family
+        variant
+        for variant in family
         if not component.statistic.is_linear_in_means
-        or np.ptp(mean_columns(one, state.axes.index(component.row[0]))[0]) > 0.0
+        or np.ptp(mean_columns(variant, state.axes.index(component.row[0]))[0]) > 0.0
     ]
-    sizes = [component_mixture(component, state, one) for one in moving]
+    sizes = [component_mixture(component, state, variant) for variant in moving]
     moments = [
         (float(mean[0]), math.sqrt(max(float(square[0, 0]), 0.0)))
-        for mean, square in (one.moments() for one in sizes)
+        for mean, square in (mixture.moments() for mixture in sizes)
     ]
     usable = [
         place
