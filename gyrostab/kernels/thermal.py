@@ -77,17 +77,17 @@ def _relax_mode(
 ) -> tuple[Array, Array]:
     size, count = change.size, decay.size
     total = np.empty((weight.shape[0], size))
-    here = carry.copy()
+    position = carry.copy()
     for i in range(size):
         for k in range(count):
-            value = decay[k] * here[k] + gain[k] * change[i]
-            here[k] = 0.0 if abs(value) < TINY else value
+            value = decay[k] * position[k] + gain[k] * change[i]
+            position[k] = 0.0 if abs(value) < TINY else value
         for row in range(weight.shape[0]):
             value = 0.0
             for k in range(count):
-                value += weight[row, k] * here[k]
+                value += weight[row, k] * position[k]
             total[row, i] = value
-    return total, here
+    return total, position
 
 
 def relax(
@@ -131,18 +131,18 @@ def _follow_values(at: Array, values: Array, time: float) -> Array:
         step = at[i] - at[i - 1]
         if step > 0.0:
             slope = (values[i] - values[i - 1]) / step
-            kept = math.exp(-step / time)
-            behind = behind * kept + slope * time * (1.0 - kept)
+            decay = math.exp(-step / time)
+            behind = behind * decay + slope * time * (1.0 - decay)
         out[i] = values[i] - behind
     return out
 
 
-def mean_changes(known: Array, values: Array, begin: Array, end: Array, time: float) -> Array:
+def mean_changes(value_times: Array, values: Array, begin: Array, end: Array, time: float) -> Array:
     """Average one mode of `relax` over intervals, with T straight between few values.
 
     Parameters
     ----------
-    known : ndarray, shape (n,)
+    value_times : ndarray, shape (n,)
         Times of the values, rising [s].
     values : ndarray, shape (n,)
         T; extrapolated linearly beyond the ends.
@@ -162,19 +162,21 @@ def mean_changes(known: Array, values: Array, begin: Array, end: Array, time: fl
     >>> mean_changes(t, T, np.array([0.0, 10.0]), np.array([10.0, 20.0]), 0.01)
     array([0.1998, 0.2   ])
     """
-    at, line = _polygon_corners(known, values, begin, end)
+    at, line = _polygon_corners(value_times, values, begin, end)
     followed = _follow_values(at, line, time)
     return np.asarray(
         (followed[np.searchsorted(at, end)] - followed[np.searchsorted(at, begin)]) / (end - begin)
     )
 
 
-def mean_followed(known: Array, values: Array, begin: Array, end: Array, time: float) -> Array:
+def mean_followed(
+    value_times: Array, values: Array, begin: Array, end: Array, time: float
+) -> Array:
     """Average over intervals what follows T with one relaxation time, ``y' = (T - y) / t``.
 
     Parameters
     ----------
-    known, values, begin, end, time : ndarray, float
+    value_times, values, begin, end, time : ndarray, float
         As for `mean_changes`.
 
     Returns
@@ -188,21 +190,23 @@ def mean_followed(known: Array, values: Array, begin: Array, end: Array, time: f
     >>> mean_followed(t, T, np.array([0.0, 10.0]), np.array([10.0, 20.0]), 0.5).round(4)
     array([0.905, 2.9  ])
     """
-    at, line = _polygon_corners(known, values, begin, end)
+    at, line = _polygon_corners(value_times, values, begin, end)
     followed = _follow_values(at, line, time)
     total = np.concatenate([[0.0], np.cumsum((line[1:] + line[:-1]) / 2.0 * np.diff(at))])
-    whole = total - time * followed  # the integral of y is that of T less t times the growth of y
+    integral = (
+        total - time * followed
+    )  # the integral of y is that of T less t times the growth of y
     return np.asarray(
-        (whole[np.searchsorted(at, end)] - whole[np.searchsorted(at, begin)]) / (end - begin)
+        (integral[np.searchsorted(at, end)] - integral[np.searchsorted(at, begin)]) / (end - begin)
     )
 
 
-def mean_rates(known: Array, values: Array, begin: Array, end: Array) -> Array:
+def mean_rates(value_times: Array, values: Array, begin: Array, end: Array) -> Array:
     """Average the rate of change over intervals, with T straight between few values.
 
     Parameters
     ----------
-    known, values, begin, end : ndarray
+    value_times, values, begin, end : ndarray
         As for `mean_changes`.
 
     Returns
@@ -216,20 +220,22 @@ def mean_rates(known: Array, values: Array, begin: Array, end: Array) -> Array:
     >>> mean_rates(t, T, np.array([0.0, 10.0]), np.array([10.0, 20.0]))
     array([0.2, 0.2])
     """
-    at, line = _polygon_corners(known, values, begin, end)
+    at, line = _polygon_corners(value_times, values, begin, end)
     return np.asarray(
         (line[np.searchsorted(at, end)] - line[np.searchsorted(at, begin)]) / (end - begin)
     )
 
 
-def _polygon_corners(known: Array, values: Array, begin: Array, end: Array) -> tuple[Array, Array]:
+def _polygon_corners(
+    value_times: Array, values: Array, begin: Array, end: Array
+) -> tuple[Array, Array]:
     """Find the corners of the polygon through the known values, and at the edges of intervals."""
-    at = np.unique(np.concatenate([known, begin, end]))
-    line = np.interp(at, known, values)
-    if known.size > 1:
-        for edge, one, other in ((at < known[0], 0, 1), (at > known[-1], -1, -2)):
-            slope = (values[one] - values[other]) / (known[one] - known[other])
-            line[edge] = values[one] + slope * (at[edge] - known[one])
+    at = np.unique(np.concatenate([value_times, begin, end]))
+    line = np.interp(at, value_times, values)
+    if value_times.size > 1:
+        for edge, outer, inner in ((at < value_times[0], 0, 1), (at > value_times[-1], -1, -2)):
+            slope = (values[outer] - values[inner]) / (value_times[outer] - value_times[inner])
+            line[edge] = values[outer] + slope * (at[edge] - value_times[outer])
     return at, line
 
 
@@ -256,21 +262,21 @@ def apply_dead_band(values: Array, width: float, start: float) -> tuple[Array, f
     (array([ 0.,  3.,  3.,  2., -3.]), -3.0)
     """
     out = np.empty(values.size)
-    here = start
+    position = start
     for i in range(values.size):
-        here = max(values[i] - width, min(values[i] + width, here))
-        out[i] = here
-    return out, here
+        position = max(values[i] - width, min(values[i] + width, position))
+        out[i] = position
+    return out, position
 
 
 def mean_dead_band_distance(
-    known: Array, values: Array, begin: Array, end: Array, width: float
+    value_times: Array, values: Array, begin: Array, end: Array, width: float
 ) -> Array:
     """Average the distance of T from the output of `apply_dead_band`, with T straight.
 
     Parameters
     ----------
-    known, values, begin, end : ndarray
+    value_times, values, begin, end : ndarray
         As for `mean_changes`; the output begins at T at the first time.
     width : float
         Half-width of the dead band.
@@ -286,7 +292,7 @@ def mean_dead_band_distance(
     >>> mean_dead_band_distance(t, T, begin, end, 2.5).round(2)
     array([ 2.19, -1.25])
     """
-    at, line = _polygon_corners(known, values, begin, end)
+    at, line = _polygon_corners(value_times, values, begin, end)
     corner = (
         np.arange(8 * (at.size - 1) + 1) / 8.0
     )  # the slider starts and stops between the corners of the polygon

@@ -72,7 +72,7 @@ def _limit_terms(  # type: ignore[no-untyped-def]
     ks,
     shifts,
     head_lengths,
-    whole,
+    whole_blocks,
     splits,
     sizes,
 ):
@@ -83,8 +83,8 @@ def _limit_terms(  # type: ignore[no-untyped-def]
     largest = 0
     for q in range(count):
         split = a + head_lengths[i + q]
-        last = n_windows + whole[i + q] - 1
-        end = split if block == last or whole[i + q] == 0 else a + step
+        last = n_windows + whole_blocks[i + q] - 1
+        end = split if block == last or whole_blocks[i + q] == 0 else a + step
         end = ((min(end, high, stop - 2 * ks[i + q]) + up) >> shift) - first
         sizes[q] = end if end > 0 and block <= last else 0
         splits[q] = min(sizes[q], max(0, ((split + up) >> shift) - first))
@@ -95,12 +95,13 @@ def _limit_terms(  # type: ignore[no-untyped-def]
 @njit(**INNER)
 def _add_stretch(  # type: ignore[no-untyped-def]
     flat, places, base, starts, stops, step, begin, end, tile, ks, shifts, lags, groups,
-    head_lengths, whole, n_windows,
-    near, splits, sizes, out,
+    head_lengths, whole_blocks, n_windows,
+    first_runs, splits, sizes, out,
 ):  # fmt: skip
     """Add the terms of the blocks from `begin` to `end`, from sample `tile` of each block on.
 
-    At most `_STRETCH_POINTS` samples of each block are used; `near` holds the first runs in reach.
+    At most `_STRETCH_POINTS` samples of each block are used; `first_runs` holds the first runs in
+    reach.
     """
     heads, tails = out[0].reshape(-1), out[1].reshape(-1)
     # No slice of an array and no new array in these loops: each costs as much as a hundred terms.
@@ -111,9 +112,9 @@ def _add_stretch(  # type: ignore[no-untyped-def]
         for block in range(begin, end):
             low = block * step + tile
             high = min(low + _STRETCH_POINTS, (block + 1) * step)
-            while near[g] < stops.size and stops[near[g]] - 2 * ks[i] <= low:
-                near[g] += 1
-            for r in range(near[g], stops.size):
+            while first_runs[g] < stops.size and stops[first_runs[g]] - 2 * ks[i] <= low:
+                first_runs[g] += 1
+            for r in range(first_runs[g], stops.size):
                 if starts[r] >= high:
                     break
                 first = (max(low, starts[r]) + (1 << shift) - 1) >> shift
@@ -129,7 +130,7 @@ def _add_stretch(  # type: ignore[no-untyped-def]
                     ks,
                     shifts,
                     head_lengths,
-                    whole,
+                    whole_blocks,
                     splits,
                     sizes,
                 ):
@@ -167,15 +168,15 @@ def _move_to_front(flat, capacity, levels, by, held):  # type: ignore[no-untyped
 
 def held_points(n_points: int, step: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> int:
     """Find how many points of the angle `grouped_blocks` keeps: twice the reach of its terms."""
-    whole = 1 << int(shifts.max(initial=0))
-    wanted = 4 * int(ks[-1]) + 2 * max(step, _STRETCH_POINTS) + TILE + whole
-    return -(-min(wanted, n_points) // whole) * whole
+    unit = 1 << int(shifts.max(initial=0))
+    needed_points = 4 * int(ks[-1]) + 2 * max(step, _STRETCH_POINTS) + TILE + unit
+    return -(-min(needed_points, n_points) // unit) * unit
 
 
 @njit(**KERNEL)
 def grouped_blocks(  # type: ignore[no-untyped-def]
     x, offset, flat, capacity, places, starts, stops, step, ks, shifts, groups, head_lengths,
-    whole, n_windows, out
+    whole_blocks, n_windows, out
 ):  # fmt: skip
     """Sum heads and tails of every block and averaging factor, and count their terms.
 
@@ -193,10 +194,10 @@ def grouped_blocks(  # type: ignore[no-untyped-def]
         `pyramid_places`); start of the level of each averaging factor.
     starts, stops : int64 (n_runs,)
         Runs of present points of the angle, one more each than of present rates.
-    step, ks, shifts, groups, head_lengths, whole, n_windows
+    step, ks, shifts, groups, head_lengths, whole_blocks, n_windows
         Samples of a block; averaging factors, their thinning (`flat` holds the angle thinned by
         ``2**shifts[i]``) and groups; terms of a head; blocks of a window, not rising; windows:
-        there are ``n_windows + whole[0]`` blocks.
+        there are ``n_windows + whole_blocks[0]`` blocks.
     out : float64 (2 or 4, n_blocks, n_tau)
         Overwritten.
 
@@ -206,7 +207,7 @@ def grouped_blocks(  # type: ignore[no-untyped-def]
         Largest magnitude of the angle that was integrated.
     """
     n_blocks = out.shape[1]
-    near, ends = np.zeros(groups.size, np.int64), stops - 1
+    first_runs, ends = np.zeros(groups.size, np.int64), stops - 1
     lags = ks >> shifts
     splits, sizes = np.empty(CONSECUTIVE_LAGS, np.int64), np.empty(CONSECUTIVE_LAGS, np.int64)
     levels, together = shifts[-1], max(1, _STRETCH_POINTS // step)
@@ -235,8 +236,8 @@ def grouped_blocks(  # type: ignore[no-untyped-def]
                 done = b
             _add_stretch(
                 flat, places, base, starts, stops, step, begin, end, tile, ks, shifts, lags,
-                groups, head_lengths, whole, n_windows,
-                near, splits, sizes, out,
+                groups, head_lengths, whole_blocks, n_windows,
+                first_runs, splits, sizes, out,
             )  # fmt: skip
     return largest
 
@@ -250,9 +251,9 @@ def _sum_windows(heads, tails, length, first, stop, out):  # type: ignore[no-unt
     for begin in range(0, n, length):
         for b in range(length - 1, -1, -1):
             row, head, tail = suffix[b], heads[begin + b, first:stop], tails[begin + b, first:stop]
-            before = suffix[min(b + 1, length - 1)]
+            next_row = suffix[min(b + 1, length - 1)]
             for i in range(row.size):
-                row[i] = head[i] + tail[i] if b == length - 1 else before[i] + (head[i] + tail[i])
+                row[i] = head[i] + tail[i] if b == length - 1 else next_row[i] + (head[i] + tail[i])
         prefix[:] = 0.0
         for j in range(begin, min(begin + length, n)):
             row, head, result = suffix[j - begin], heads[j + length, first:stop], out[j, first:stop]
@@ -264,15 +265,15 @@ def _sum_windows(heads, tails, length, first, stop, out):  # type: ignore[no-unt
 
 
 @njit(**KERNEL)
-def windows_from_blocks(heads, tails, whole, out):  # type: ignore[no-untyped-def]
-    """Add the blocks ``j .. j + whole[i] - 1`` and the head of the next, by additions only."""
+def windows_from_blocks(heads, tails, whole_blocks, out):  # type: ignore[no-untyped-def]
+    """Add blocks ``j .. j + whole_blocks[i] - 1`` and the head of the next, by additions only."""
     first = np.int64(0)
-    while first < whole.size:
+    while first < whole_blocks.size:
         stop = first + 1
-        while stop < whole.size and whole[stop] == whole[first]:
+        while stop < whole_blocks.size and whole_blocks[stop] == whole_blocks[first]:
             stop += 1
-        if whole[first] > 0:
-            _sum_windows(heads, tails, whole[first], first, stop, out)
+        if whole_blocks[first] > 0:
+            _sum_windows(heads, tails, whole_blocks[first], first, stop, out)
         else:
             for j in range(out.shape[0]):
                 for i in range(first, stop):

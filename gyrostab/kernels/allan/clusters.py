@@ -82,17 +82,17 @@ def pack_mask(starts, stops, n):  # type: ignore[no-untyped-def]
         sum of the numbers (0 to n - 1) of the samples present before this row.
     """
     mask = np.zeros((n // 64 + 1, 5), np.int64)
-    one = np.int64(1)
+    bit = np.int64(1)
     for r in range(starts.size):
         first, last = starts[r] >> 6, (stops[r] - 1) >> 6
         for row in range(first, last + 1):
             word = np.int64(-1)
             if row == first:
-                word &= -(one << (starts[r] & 63))
+                word &= -(bit << (starts[r] & 63))
             if row == last and stops[r] & 63:
-                word &= (one << (stops[r] & 63)) - one
+                word &= (bit << (stops[r] & 63)) - bit
             mask[row, 0] |= word
-        mask[first, 1] |= one << (starts[r] & 63)
+        mask[first, 1] |= bit << (starts[r] & 63)
     for row in range(1, mask.shape[0]):
         mask[row, 2] = mask[row - 1, 2] + _count_ones(mask[row - 1, 0])
         mask[row, 3] = mask[row - 1, 3] + _count_ones(mask[row - 1, 1])
@@ -125,15 +125,15 @@ def integrate_places(starts, stops, n):  # type: ignore[no-untyped-def]
 @njit(**INNER)
 def _add_pairs(theta, places, mask, a, b, k, stride, row):  # type: ignore[no-untyped-def]
     """Add the pairs of clusters in ``a <= m < b``: weight d^2, weight, responses, number, trend."""
-    one = np.int64(1)
+    bit = np.int64(1)
     squares = weights = white = quantization = ramp = slope = 0.0
     count = 0
     for m in range((a + stride - 1) // stride * stride, b, stride):
         row0, row1, row2 = np.uint64(m >> 6), np.uint64((m + k) >> 6), np.uint64((m + 2 * k) >> 6)
         low0, low1, low2 = (
-            (one << (m & 63)) - one,
-            (one << ((m + k) & 63)) - one,
-            (one << ((m + 2 * k) & 63)) - one,
+            (bit << (m & 63)) - bit,
+            (bit << ((m + k) & 63)) - bit,
+            (bit << ((m + 2 * k) & 63)) - bit,
         )
         middle = mask[row1, 2] + _count_ones(mask[row1, 0] & low1)
         n1 = middle - mask[row0, 2] - _count_ones(mask[row0, 0] & low0)
@@ -157,8 +157,8 @@ def _add_pairs(theta, places, mask, a, b, k, stride, row):  # type: ignore[no-un
         # a run that a cluster cuts counts in both
         runs = mask[row1, 3] + _count_ones(mask[row1, 1] & low1)
         cut0, cut1 = (
-            mask[row0, 0] & ~mask[row0, 1] & (low0 + one) != 0,
-            mask[row1, 0] & ~mask[row1, 1] & (low1 + one) != 0,
+            mask[row0, 0] & ~mask[row0, 1] & (low0 + bit) != 0,
+            mask[row1, 0] & ~mask[row1, 1] & (low1 + bit) != 0,
         )
         r1 = runs - mask[row0, 3] - _count_ones(mask[row0, 1] & low0) + cut0
         r2 = mask[row2, 3] + _count_ones(mask[row2, 1] & low2) - runs + cut1
@@ -206,21 +206,21 @@ def cluster_cells(theta, places, mask, window, step, k, stride, poor):  # type: 
         response to a ramp; slope of the rate per sample that fits the pairs best.
     """
     length = window - 2 * k + 1
-    whole = length // step
-    head = length - whole * step
+    whole_blocks = length // step
+    head = length - whole_blocks * step
     n_windows = poor.size
-    heads, tails = np.zeros((n_windows + whole, 7)), np.zeros((n_windows + whole, 7))
+    heads, tails = np.zeros((n_windows + whole_blocks, 7)), np.zeros((n_windows + whole_blocks, 7))
     last = -1
     for j in range(n_windows):
         if poor[j]:
-            for block in range(max(last + 1, j), j + whole + 1):
+            for block in range(max(last + 1, j), j + whole_blocks + 1):
                 a = block * step
                 _add_pairs(theta, places, mask, a, a + head, k, stride, heads[block])
-                if block < n_windows + whole - 1:
+                if block < n_windows + whole_blocks - 1:
                     _add_pairs(theta, places, mask, a + head, a + step, k, stride, tails[block])
-            last = j + whole
+            last = j + whole_blocks
     sums = np.empty((n_windows, 7))
-    windows_from_blocks(heads, tails, np.full(7, whole), sums)
+    windows_from_blocks(heads, tails, np.full(7, whole_blocks), sums)
     out = np.zeros((n_windows, 7))
     for j in range(n_windows):
         if poor[j] and sums[j, 4] > 0.0:
@@ -301,11 +301,12 @@ def _add_section(places, lags, close, many, sums):  # type: ignore[no-untyped-de
         sums[3] += 1.0 + 2.0 * lags[stop - i - 1]
         if places[5, i] == 0.0:
             continue
-        own = places[3, i] + places[4, i]
-        near = min(i + close, stop)
-        sums[0] += own
-        sums[1] += own * own + 2.0 * places[5, i] * (
-            _sum_overlapping(places, i, i + 1, near) + _sum_touching(places, i, near, stop)
+        weight = places[3, i] + places[4, i]
+        overlap_stop = min(i + close, stop)
+        sums[0] += weight
+        sums[1] += weight * weight + 2.0 * places[5, i] * (
+            _sum_overlapping(places, i, i + 1, overlap_stop)
+            + _sum_touching(places, i, overlap_stop, stop)
         )
 
 
@@ -324,9 +325,9 @@ def _pair_sums(mask, begin, end, grid, k, sums):  # type: ignore[no-untyped-def]
     places = np.empty((6, min(total, many + lags.size - 1)))
     sums[:] = 0.0
     for section in range(sections):
-        one = int((section + section * _GOLDEN % 1.0) / sections * (total - many))
-        part = places[:, : min(total - one, places.shape[1])]
-        _fill_grid(mask, begin + one * grid, grid, k, part)
+        first = int((section + section * _GOLDEN % 1.0) / sections * (total - many))
+        part = places[:, : min(total - first, places.shape[1])]
+        _fill_grid(mask, begin + first * grid, grid, k, part)
         _add_section(part, lags, close, many, sums)
 
 

@@ -55,11 +55,11 @@ def gap_edge_ratio(x, starts, length):  # type: ignore[no-untyped-def]
         while last < x.size and x[last] == x[last]:
             last += 1
         for i in range(first + 1, last - 1):
-            second = abs(np.float64(x[i - 1]) - 2.0 * np.float64(x[i]) + np.float64(x[i + 1]))
+            difference = abs(np.float64(x[i - 1]) - 2.0 * np.float64(x[i]) + np.float64(x[i + 1]))
             early = first > 0 and i - 1 - first < EDGE_SAMPLES
             late = last < x.size and last - (i + 2) < EDGE_SAMPLES
             kind = 0 if early or late else 1
-            total[i + 1, kind] = second
+            total[i + 1, kind] = difference
             count[i + 1, kind] = 1
         first = last + 1
     for i in range(x.size):
@@ -71,9 +71,9 @@ def gap_edge_ratio(x, starts, length):  # type: ignore[no-untyped-def]
         high = starts[window] + length - EDGE_SAMPLES - 1
         if high <= low or high > x.size:
             continue
-        near, elsewhere = count[high] - count[low]
-        if min(near, elsewhere) >= MIN_DIFFERENCES:
+        near_gaps, elsewhere = count[high] - count[low]
+        if min(near_gaps, elsewhere) >= MIN_DIFFERENCES:
             sums = total[high] - total[low]
             if sums[1] > 0.0:
-                out[window] = (sums[0] / near) / (sums[1] / elsewhere)
+                out[window] = (sums[0] / near_gaps) / (sums[1] / elsewhere)
     return out

@@ -46,9 +46,9 @@ _PLAIN = 1e7
 def first_present(x: NDArray[np.generic]) -> float:
     """Find the first finite value of `x` as double; NaN without any."""
     for a in range(0, x.size, _SEARCH):
-        found = np.flatnonzero(np.isfinite(x[a : a + _SEARCH]))
-        if found.size:
-            return float(x[a + found[0]])
+        finite = np.flatnonzero(np.isfinite(x[a : a + _SEARCH]))
+        if finite.size:
+            return float(x[a + finite[0]])
     return np.nan
 
 
@@ -67,9 +67,9 @@ def _sum_present(x, base):  # type: ignore[no-untyped-def]
     count = 0
     for a in range(0, x.size, _LOOK):
         part = x[a : a + _LOOK]
-        one = _sum_samples(part, base)
-        if np.isfinite(one):
-            total += one
+        part_sum = _sum_samples(part, base)
+        if np.isfinite(part_sum):
+            total += part_sum
             count += part.size
             continue
         for i in range(part.size):
@@ -82,28 +82,28 @@ def _sum_present(x, base):  # type: ignore[no-untyped-def]
 @njit(**KERNEL)
 def block_sums(x, base, window, step, n_windows):  # type: ignore[no-untyped-def]
     """Sum ``x - base`` over present samples, and count them, for heads and tails (n_blocks, 2)."""
-    whole = window // step
-    head = window - whole * step
-    heads, tails = np.zeros((n_windows + whole, 2)), np.zeros((n_windows + whole, 2))
-    for block in range(n_windows + whole):
+    whole_blocks = window // step
+    head = window - whole_blocks * step
+    heads, tails = np.zeros((n_windows + whole_blocks, 2)), np.zeros((n_windows + whole_blocks, 2))
+    for block in range(n_windows + whole_blocks):
         a = block * step
         heads[block, 0], heads[block, 1] = _sum_present(x[a : a + head], base)
-        if block < n_windows + whole - 1:
+        if block < n_windows + whole_blocks - 1:
             tails[block, 0], tails[block, 1] = _sum_present(x[a + head : a + step], base)
     return heads, tails
 
 
 @njit(**INNER)
-def _find_runs(x, step, known, starts, stops):  # type: ignore[no-untyped-def]
+def _find_runs(x, step, finite_counts, starts, stops):  # type: ignore[no-untyped-def]
     """Count the runs of finite samples, and write as many as fit to `starts` and `stops`."""
     run = 0
     inside = False
-    for block in range(known.size):
+    for block in range(finite_counts.size):
         first, last = (
             block * step,
-            min((block + 1) * step, x.size) if block + 1 < known.size else x.size,
+            min((block + 1) * step, x.size) if block + 1 < finite_counts.size else x.size,
         )
-        if inside and known[block] == last - first:
+        if inside and finite_counts[block] == last - first:
             continue
         for a in range(first, last, _STRIP):
             b = min(a + _STRIP, last)
@@ -130,7 +130,7 @@ def _find_runs(x, step, known, starts, stops):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def present_runs(x, step, known):  # type: ignore[no-untyped-def]
+def present_runs(x, step, finite_counts):  # type: ignore[no-untyped-def]
     """Find first and one-past-last index of every run of finite samples, as two int64 arrays.
 
     Parameters
@@ -139,14 +139,14 @@ def present_runs(x, step, known):  # type: ignore[no-untyped-def]
         Samples.
     step : int
         Samples of a block; the last one has the rest.
-    known : float64 (n_blocks,)
+    finite_counts : float64 (n_blocks,)
         Finite samples of each block, or -1 if unknown; samples of complete blocks are not checked.
     """
     runs = np.empty((2, x.size // 256 + 16), np.int64)
-    count = _find_runs(x, step, known, runs[0], runs[1])
+    count = _find_runs(x, step, finite_counts, runs[0], runs[1])
     if count > runs.shape[1]:
         runs = np.empty((2, count), np.int64)
-        _find_runs(x, step, known, runs[0], runs[1])
+        _find_runs(x, step, finite_counts, runs[0], runs[1])
     return runs[0, :count], runs[1, :count]
 
 
@@ -154,8 +154,8 @@ def present_runs(x, step, known):  # type: ignore[no-untyped-def]
 def _integrate_run(x, offset, total, theta):  # type: ignore[no-untyped-def]
     """``theta[i] = total + sum(x[: i + 1] - offset)`` of an unbroken run; returns the last."""
     # Four at a time: one addition instead of four in the chain from sample to sample.
-    whole = x.size - x.size % 4
-    for i in range(0, whole, 4):
+    unrolled_size = x.size - x.size % 4
+    for i in range(0, unrolled_size, 4):
         a, b, c, d = x[i] - offset, x[i + 1] - offset, x[i + 2] - offset, x[i + 3] - offset
         ab = a + b
         theta[i] = total + a
@@ -163,7 +163,7 @@ def _integrate_run(x, offset, total, theta):  # type: ignore[no-untyped-def]
         theta[i + 2] = total + (ab + c)
         total += ab + (c + d)
         theta[i + 3] = total
-    for i in range(whole, x.size):
+    for i in range(unrolled_size, x.size):
         total += x[i] - offset
         theta[i] = total
     return total
@@ -234,37 +234,37 @@ def integrate(x, offset, starts, stops, theta):  # type: ignore[no-untyped-def]
 def integrate_two(x, offset, starts, stops, high, low):  # type: ignore[no-untyped-def]
     """Integrate to about 32 digits as a sum of two doubles (two-sum of Knuth)."""
     total = 0.0
-    rest = 0.0
+    remainder = 0.0
     high[:] = 0.0
     low[:] = 0.0
     done = 0
     for r in range(starts.size):
         high[done + 1 : starts[r] + 1] = total
-        low[done + 1 : starts[r] + 1] = rest
+        low[done + 1 : starts[r] + 1] = remainder
         for i in range(starts[r], stops[r]):
             value = x[i] - offset
             new = total + value
             part = new - total
-            rest += (total - (new - part)) + (value - part)
+            remainder += (total - (new - part)) + (value - part)
             total = new
             high[i + 1] = total
-            low[i + 1] = rest
+            low[i + 1] = remainder
         done = stops[r]
     high[done + 1 :] = total
-    low[done + 1 :] = rest
+    low[done + 1 :] = remainder
 
 
 @njit(**KERNEL)
 def sum_two(high, low):  # type: ignore[no-untyped-def]
     """Replace numbers of two doubles by the sums of those before them, the last by that of all."""
     total = 0.0
-    rest = 0.0
+    remainder = 0.0
     for i in range(high.size):
         value, small = high[i], low[i]
-        high[i], low[i] = total, rest
+        high[i], low[i] = total, remainder
         new = total + value
         part = new - total
-        rest += ((total - (new - part)) + (value - part)) + small
+        remainder += ((total - (new - part)) + (value - part)) + small
         total = new
 
 

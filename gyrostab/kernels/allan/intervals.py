@@ -111,8 +111,8 @@ def _third_differences_two(high, low, a, b, k, out):  # type: ignore[no-untyped-
     )
     for i in range(h0.size):
         middle = h2[i] - h1[i]
-        whole = ((h3[i] - h2[i]) - middle) - (middle - (h1[i] - h0[i]))
-        out[i] = whole + ((l3[i] - l0[i]) - 3.0 * (l2[i] - l1[i]))
+        high_part = ((h3[i] - h2[i]) - middle) - (middle - (h1[i] - h0[i]))
+        out[i] = high_part + ((l3[i] - l0[i]) - 3.0 * (l2[i] - l1[i]))
 
 
 @njit(fastmath=_FAST, **INNER)
@@ -140,10 +140,10 @@ def _energy_two(high, low, a, b, k, order):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _add_part(high, low, begin, end, near, a, b, k, shift, order, sums, counts):  # type: ignore[no-untyped-def]
-    """Add the valid terms in ``a <= m < b``; interval `near` is the first that ends after a."""
+def _add_part(high, low, begin, end, first_interval, a, b, k, shift, order, sums, counts):  # type: ignore[no-untyped-def]
+    """Add the valid terms in ``a <= m < b``; `first_interval` is the first that ends after a."""
     up = (1 << shift) - 1
-    for v in range(near, begin.size):
+    for v in range(first_interval, begin.size):
         if begin[v] >= b:
             break
         first = (max(begin[v], a) + up) >> shift
@@ -158,32 +158,32 @@ def _add_part(high, low, begin, end, near, a, b, k, shift, order, sums, counts):
 
 @njit(**KERNEL)
 def single_blocks(  # type: ignore[no-untyped-def]
-    high, low, places, starts, stops, order, spans, points, step, ks, shifts, head_lengths, whole,
-    n_windows
+    high, low, places, starts, stops, order, spans, points, step, ks, shifts, head_lengths,
+    whole_blocks, n_windows
 ):  # fmt: skip
     """Sum heads and tails as `grouped_blocks`; `low` is the remainder of `high`, or empty.
 
     `order` is that of the differences; `spans` (n_tau,) and `points` as for `valid_intervals`.
     """
-    n_blocks = n_windows + whole[0]
+    n_blocks = n_windows + whole_blocks[0]
     heads, tails = np.zeros((n_blocks, ks.size)), np.zeros((n_blocks, ks.size))
     head_counts, tail_counts = np.zeros((n_blocks, ks.size)), np.zeros((n_blocks, ks.size))
     for i in range(ks.size):
         begin, end = valid_intervals(starts, stops, ks[i], spans[i], points)
-        theta, rest = high[places[i] :], low[places[i] :]
-        last = n_windows + whole[i] - 1
-        near = 0
+        theta, remainder = high[places[i] :], low[places[i] :]
+        last = n_windows + whole_blocks[i] - 1
+        first_interval = 0
         for block in range(last + 1):
             a = block * step
             b = a + head_lengths[i]
-            while near < end.size and end[near] <= a:
-                near += 1
+            while first_interval < end.size and end[first_interval] <= a:
+                first_interval += 1
             _add_part(
                 theta,
-                rest,
+                remainder,
                 begin,
                 end,
-                near,
+                first_interval,
                 a,
                 b,
                 ks[i],
@@ -192,13 +192,13 @@ def single_blocks(  # type: ignore[no-untyped-def]
                 heads[block, i : i + 1],
                 head_counts[block, i : i + 1],
             )
-            if whole[i] > 0 and block < last:
+            if whole_blocks[i] > 0 and block < last:
                 _add_part(
                     theta,
-                    rest,
+                    remainder,
                     begin,
                     end,
-                    near,
+                    first_interval,
                     b,
                     a + step,
                     ks[i],

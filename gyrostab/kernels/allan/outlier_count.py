@@ -48,14 +48,14 @@ def _measure_noise(x: NDArray[Any], places: NDArray[np.int64]) -> NDArray[np.flo
     """
     inside = (places >= 1) & (places < x.size - 1)
     place = np.where(inside, places, 1)
-    before, here, after = (x[place + shift].astype(np.float64) for shift in (-1, 0, 1))
-    second = np.abs(before - 2.0 * here + after)
-    known = inside & (second > 0.0)
-    known &= np.cumsum(known, axis=1) <= _MEDIAN_OF
-    count = known.sum(axis=1)
-    second = np.sort(np.where(known, second, np.nan), axis=1)
+    before, sample, after = (x[place + shift].astype(np.float64) for shift in (-1, 0, 1))
+    difference = np.abs(before - 2.0 * sample + after)
+    is_usable = inside & (difference > 0.0)
+    is_usable &= np.cumsum(is_usable, axis=1) <= _MEDIAN_OF
+    count = is_usable.sum(axis=1)
+    difference = np.sort(np.where(is_usable, difference, np.nan), axis=1)
     row, last = np.arange(count.size), np.maximum(count - 1, 0)
-    median = (second[row, last // 2] + second[row, count // 2 * (count > 1)]) / 2.0
+    median = (difference[row, last // 2] + difference[row, count // 2 * (count > 1)]) / 2.0
     return np.where(count > 0, _TO_DIFFERENCE * median, 0.0)
 
 
@@ -67,13 +67,13 @@ def _find_candidates(x, limits, places):  # type: ignore[no-untyped-def]
         begin, limit = np.int64(1 + segment * _SEGMENT_SAMPLES), limits[segment]
         end = min(begin + _SEGMENT_SAMPLES, x.size - 1)
         # A loop over slices that only counts, because it vectorises.
-        found = 0
+        hits = 0
         first, middle, last = x[begin - 1 : end - 1], x[begin:end], x[begin + 1 : end + 1]
         for i in range(middle.size):
             rise = np.float64(middle[i]) - np.float64(first[i])
             fall = np.float64(middle[i]) - np.float64(last[i])
-            found += 1 if (rise * fall > 0.0) & (min(abs(rise), abs(fall)) > limit) else 0
-        if found == 0 or limit == 0.0:
+            hits += 1 if (rise * fall > 0.0) & (min(abs(rise), abs(fall)) > limit) else 0
+        if hits == 0 or limit == 0.0:
             continue
         for i in range(middle.size):
             rise = np.float64(middle[i]) - np.float64(first[i])
@@ -100,17 +100,17 @@ def _find_outliers(x: NDArray[Any]) -> NDArray[np.int64]:
         places = np.empty(count, np.int64)
         _find_candidates(x, LIMIT_SIGMA * noise, places)
     around = np.arange(2, _AROUND_SAMPLES + 2)
-    kept = []
+    outliers = []
     for chunk in range(0, count, 4096):
         place = places[chunk : min(chunk + 4096, count)]
         level = np.maximum(
             _measure_noise(x, place[:, None] - around[:-1]),
             _measure_noise(x, place[:, None] + around),
         )
-        before, here, after = (x[place + shift].astype(np.float64) for shift in (-1, 0, 1))
-        nearest = np.minimum(np.abs(here - before), np.abs(here - after))
-        kept.append(place[nearest > LIMIT_SIGMA * level])
-    return np.concatenate([np.empty(0, np.int64), *kept])
+        before, sample, after = (x[place + shift].astype(np.float64) for shift in (-1, 0, 1))
+        nearest = np.minimum(np.abs(sample - before), np.abs(sample - after))
+        outliers.append(place[nearest > LIMIT_SIGMA * level])
+    return np.concatenate([np.empty(0, np.int64), *outliers])
 
 
 def count_outliers(x: NDArray[Any], starts: NDArray[np.int64], length: int) -> NDArray[np.float64]:

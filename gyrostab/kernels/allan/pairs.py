@@ -34,9 +34,9 @@ def white_pair_sum(n, k):  # type: ignore[no-untyped-def]
     """Sum ``rho(i - j)^2`` over n consecutive second differences, for angle random walk."""
     if n < 1:
         return 0.0
-    near = _weighted_moment(float(n), 1.5 / k, np.int64(1), min(n - 1, k))
-    far = _weighted_moment(float(n), 0.5 / k, k + 1, min(n - 1, 2 * k - 1))
-    return n + 2.0 * (near + far)
+    short_lags = _weighted_moment(float(n), 1.5 / k, np.int64(1), min(n - 1, k))
+    long_lags = _weighted_moment(float(n), 0.5 / k, k + 1, min(n - 1, 2 * k - 1))
+    return n + 2.0 * (short_lags + long_lags)
 
 
 #: Products of the weights of a third difference with themselves, moved by -3 k to 3 k.
@@ -50,16 +50,16 @@ def _third_pair_moments(k, summed):  # type: ignore[no-untyped-def]
     The angle has the generalised autocovariance -|l| / 2, its running sum (|l|^3 - |l|) / 12.
     """
     out = np.zeros((2, 3 * k + 1))
-    whole = 1.0
+    variance = 1.0
     for lag in range(out.shape[1]):
         total = 0.0
         for i in range(7):
             t = float(abs(lag + (i - 3) * k))
             total += _THIRD_WEIGHTS[i] * (t * (t * t - 1.0) / 12.0 if summed else -0.5 * t)
         if lag == 0:
-            whole = total
+            variance = total
         else:
-            square = (total / whole) ** 2
+            square = (total / variance) ** 2
             out[0, lag] = out[0, lag - 1] + square
             out[1, lag] = out[1, lag - 1] + lag * square
     return out

@@ -47,13 +47,13 @@ def reference_theta(
         Missing rate samples before the angle; zeros for angles.
     """
     values = np.asarray(x, dtype=np.float64)
-    here = np.isfinite(values)
+    is_finite = np.isfinite(values)
     if angle:
-        return np.where(here, values, 0.0), here, np.zeros(values.size, dtype=np.int64)
-    theta = np.cumsum(np.where(here, values, 0.0))
-    missing = np.cumsum(~here)
+        return np.where(is_finite, values, 0.0), is_finite, np.zeros(values.size, dtype=np.int64)
+    theta = np.cumsum(np.where(is_finite, values, 0.0))
+    missing = np.cumsum(~is_finite)
     if paper:
-        return theta, here, missing
+        return theta, is_finite, missing
     return (
         np.concatenate(([0.0], theta)),
         np.ones(theta.size + 1, dtype=np.bool_),
@@ -75,10 +75,15 @@ def direct_sums(
     counts = np.zeros((n_windows, ks.size), dtype=np.int64)
     for j in range(n_windows):
         part = slice(j * step, j * step + window_points)
-        angle, here, lost = theta[part] - theta[j * step], present[part], missing[part]
+        angle, has_angle, lost = theta[part] - theta[j * step], present[part], missing[part]
         for i, k in enumerate(ks):
             d = angle[2 * k :] - 2.0 * angle[k:-k] + angle[: -2 * k]
-            valid = here[2 * k :] & here[k:-k] & here[: -2 * k] & (lost[2 * k :] == lost[: -2 * k])
+            valid = (
+                has_angle[2 * k :]
+                & has_angle[k:-k]
+                & has_angle[: -2 * k]
+                & (lost[2 * k :] == lost[: -2 * k])
+            )
             sums[j, i] = np.sum(d[valid] ** 2)
             counts[j, i] = np.count_nonzero(valid)
     return sums, counts
@@ -89,8 +94,8 @@ def _square_differences(theta, present, missing, k, squares, valid):  # type: ig
     """Compute the square of each second difference; zero where it is missing (Eq. 21-22)."""
     begin, middle, end = theta, theta[k:], theta[2 * k :]
     for m in range(end.size):
-        here = present[m] and present[m + k] and present[m + 2 * k]
-        is_valid = here and missing[m] == missing[m + 2 * k]
+        has_angles = present[m] and present[m + k] and present[m + 2 * k]
+        is_valid = has_angles and missing[m] == missing[m + 2 * k]
         difference = end[m] - 2.0 * middle[m] + begin[m]
         squares[m] = difference * difference if is_valid else 0.0
         valid[m] = is_valid

@@ -161,12 +161,12 @@ def _bridge_gaps(theta, starts, stops, window, step, ks, strides, poor, cells): 
         bridged = cluster_cells(theta, places, mask, window, step, ks[i], strides[i], poor[:, i])
         for j in range(poor.shape[0]):
             if poor[j, i]:
-                found = bridged[j, 4] > 0.0
-                cells[0, j, i] = bridged[j, 0] if found else np.nan
+                has_pairs = bridged[j, 4] > 0.0
+                cells[0, j, i] = bridged[j, 0] if has_pairs else np.nan
                 cells[1, j, i] = bridged[j, 4]
                 cells[2, j, i] = bridged[j, 3]
                 cells[3, j, i] = (
-                    cluster_factor(mask, j * step, window, ks[i], strides[i]) if found else 0.0
+                    cluster_factor(mask, j * step, window, ks[i], strides[i]) if has_pairs else 0.0
                 )
                 cells[4, j, i] = WEIGHTED
                 cells[5, j, i] = bridged[j, 1]
@@ -203,16 +203,16 @@ def _strict_sums(
 ) -> tuple[Floats, Floats]:
     """Sum squared second differences of every window and factor, and count terms if any miss."""
     lengths = unit.lengths
-    whole = lengths // unit.step
-    rest = lengths - whole * unit.step
-    blocks = space.array("blocks", 4 if gaps else 2, n_windows + int(whole[0]), unit.ks.size)
+    whole_blocks = lengths // unit.step
+    head_lengths = lengths - whole_blocks * unit.step
+    blocks = space.array("blocks", 4 if gaps else 2, n_windows + int(whole_blocks[0]), unit.ks.size)
     add = _angle_blocks if unit.angle else _rate_blocks
     if unit.order == 3:
         add = _third_blocks
-    add(x, unit, present, (rest, whole, n_windows), blocks, space)
+    add(x, unit, present, (head_lengths, whole_blocks, n_windows), blocks, space)
     sums = space.array("sums", len(blocks) // 2, n_windows, unit.ks.size)
     for heads_and_tails, out in zip((blocks[:2], blocks[2:]), sums, strict=False):
-        windows_from_blocks(*heads_and_tails, whole, out)
+        windows_from_blocks(*heads_and_tails, whole_blocks, out)
     return sums[0], sums[1] if gaps else np.empty((0, 0))
 
 
@@ -255,8 +255,14 @@ def _angle_of(
     apart = np.flatnonzero(begins[1:] > ends[:-1])
     for first, last in zip(begins[np.r_[0, apart + 1]], ends[np.r_[apart, -1]], strict=True):
         starts, stops = (np.clip(edges, first, last) - first for edges in present[:2])
-        some = starts < stops
-        integrate(x[first:last], present.offset, starts[some], stops[some], angle[first : last + 1])
+        is_inside = starts < stops
+        integrate(
+            x[first:last],
+            present.offset,
+            starts[is_inside],
+            stops[is_inside],
+            angle[first : last + 1],
+        )
     return angle
 
 
@@ -363,10 +369,10 @@ def surface_unit(
     n_windows = _number_of_windows(x, unit)
     if np.isnan(first_present(x)):
         return _empty_cells(n_windows, unit.ks.size)
-    means, mean, known = _average_windows(x, unit, n_windows)
-    gaps = int(known.sum()) < x.size
+    means, mean, finite_counts = _average_windows(x, unit, n_windows)
+    gaps = int(finite_counts.sum()) < x.size
     starts, stops = (
-        present_runs(x, unit.step if known.size > 1 else x.size, known)
+        present_runs(x, unit.step if finite_counts.size > 1 else x.size, finite_counts)
         if gaps
         else (np.zeros(1, np.int64), np.full(1, x.size))
     )
@@ -380,9 +386,9 @@ def surface_unit(
     if gaps:
         full = np.ascontiguousarray(np.broadcast_to(full, counts.shape))
         return _cells_with_gaps(x, unit, present, sums / scale, counts, full, space), means
-    one = np.ones((1, unit.ks.size))
-    others = one, STRICT * one, one, one, one, np.nan * one
-    return Cells(sums / (scale * full), full, one, *others), means
+    ones = np.ones((1, unit.ks.size))
+    other_fields = ones, STRICT * ones, ones, ones, ones, np.nan * ones
+    return Cells(sums / (scale * full), full, ones, *other_fields), means
 
 
 def _empty_cells(n_windows: int, n_tau: int) -> tuple[Cells, Floats]:

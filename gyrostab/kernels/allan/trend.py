@@ -34,14 +34,14 @@ def _add_moments(x, angle, base, first, last, out):  # type: ignore[no-untyped-d
 
 @njit(**KERNEL)
 def _block_moments(x, angle, base, window, step, n_windows):  # type: ignore[no-untyped-def]
-    whole = window // step
-    head = window - whole * step
-    heads = np.zeros((n_windows + whole, _MOMENTS))
-    tails = np.zeros((n_windows + whole, _MOMENTS))
-    for block in range(n_windows + whole):
+    whole_blocks = window // step
+    head = window - whole_blocks * step
+    heads = np.zeros((n_windows + whole_blocks, _MOMENTS))
+    tails = np.zeros((n_windows + whole_blocks, _MOMENTS))
+    for block in range(n_windows + whole_blocks):
         a = block * step
         _add_moments(x, angle, base, a, a + head, heads[block])
-        if block < n_windows + whole - 1:
+        if block < n_windows + whole_blocks - 1:
             _add_moments(x, angle, base, a + head, a + step, tails[block])
     return heads, tails
 
@@ -138,9 +138,11 @@ def difference_slopes(theta, starts, stops, window, step, n_windows, ks, points)
         for j in range(n_windows):
             a = j * step
             count, total = _sum_before(a + window - 2 * k + 1, begin, end, sums, totals, k)
-            before, lower = _sum_before(a, begin, end, sums, totals, k)
+            earlier_count, lower = _sum_before(a, begin, end, sums, totals, k)
             slope = (
-                (total - lower) / (float(k) * k * (count - before)) if count > before else np.nan
+                (total - lower) / (float(k) * k * (count - earlier_count))
+                if count > earlier_count
+                else np.nan
             )
             out[j, i] = slope
     return out

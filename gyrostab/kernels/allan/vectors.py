@@ -47,10 +47,10 @@ def _spread_value(builder: Any, value: Any) -> Any:
 
 
 def _select_extreme(builder: Any, values: list[Any], sign: str) -> Any:
-    found = values[0]
+    extreme = values[0]
     for value in values[1:]:
-        found = builder.select(builder.icmp_signed(sign, value, found), value, found)
-    return found
+        extreme = builder.select(builder.icmp_signed(sign, value, extreme), value, extreme)
+    return extreme
 
 
 @contextmanager
@@ -83,12 +83,12 @@ def _second_difference(builder: Any, first: Any, middle: Any, last: Any) -> Any:
 def _second_differences(builder: Any, theta: Any, at: Any, lags: list[Any]) -> list[Any]:
     """Second differences of each lag at ``at ... at + LANES - 1``."""
     first = _load_vector(builder, theta, at)
-    found = []
+    differences = []
     for lag in lags:
         middle = _load_vector(builder, theta, builder.add(at, lag))
         last = _load_vector(builder, theta, builder.add(at, builder.add(lag, lag)))
-        found.append(_second_difference(builder, first, middle, last))
-    return found
+        differences.append(_second_difference(builder, first, middle, last))
+    return differences
 
 
 def _consecutive_differences(builder: Any, theta: Any, at: Any, lags: list[Any]) -> list[Any]:
@@ -101,14 +101,14 @@ def _consecutive_differences(builder: Any, theta: Any, at: Any, lags: list[Any])
             for by in range(0, reach + 1, LANES)
         ]
 
-    def taken(found: list[Any], by: int) -> Any:
+    def taken(loaded: list[Any], by: int) -> Any:
         place, by = divmod(by, LANES)
         return (
             builder.shuffle_vector(
-                found[place], found[place + 1], _shuffle_mask(list(range(by, by + LANES)))
+                loaded[place], loaded[place + 1], _shuffle_mask(list(range(by, by + LANES)))
             )
             if by
-            else found[place]
+            else loaded[place]
         )
 
     first = _load_vector(builder, theta, at)
@@ -159,12 +159,12 @@ def _sum_heads_and_tails(builder: Any, heads: list[list[Any]], tails: list[list[
     count = len(heads)
     if 2 * count > LANES:
         return [_sum_vectors(builder, sums) for sums in (heads, tails)]
-    both = heads + tails
-    found = _sum_vectors(
-        builder, [both[place % len(both)] for place in range(LANES)]
+    vectors = heads + tails
+    totals = _sum_vectors(
+        builder, [vectors[place % len(vectors)] for place in range(LANES)]
     )  # what is left over is filled with any
     return [
-        builder.shuffle_vector(found, found, _shuffle_mask(list(range(begin, begin + count))))
+        builder.shuffle_vector(totals, totals, _shuffle_mask(list(range(begin, begin + count))))
         for begin in (0, count)
     ]
 
@@ -226,11 +226,11 @@ def _emit_loop(
                 _spread_value(builder, at), ir.Constant(_INDICES, list(range(LANES)))
             )
             for lag, value in enumerate(differences(builder, theta, at, lags)):
-                before = builder.icmp_signed("<", index, wide_splits[lag])
+                in_head = builder.icmp_signed("<", index, wide_splits[lag])
                 inside = builder.icmp_signed("<", index, wide_sizes[lag])
-                _add_square(builder, heads[lag][0], value, where=before)
+                _add_square(builder, heads[lag][0], value, where=in_head)
                 _add_square(
-                    builder, tails[lag][0], value, where=builder.and_(inside, builder.not_(before))
+                    builder, tails[lag][0], value, where=builder.and_(inside, builder.not_(in_head))
                 )
             builder.store(advanced(LANES), position)
     return _sum_heads_and_tails(builder, heads, tails)
@@ -252,11 +252,11 @@ def _intrinsic_of_lags(count: int, *, in_a_row: bool = False) -> Any:
                 [builder.load(builder.gep(start, [ir.Constant(_INDEX, i)])) for i in range(count)]
                 for start in (lags, starts[2], starts[3])
             ]
-            some = ir.VectorType(ir.DoubleType(), count).as_pointer()
+            pointer_type = ir.VectorType(ir.DoubleType(), count).as_pointer()
             for total, start in zip(
                 _emit_loop(builder, theta, *values, in_a_row=in_a_row), starts[4:], strict=True
             ):
-                row = builder.bitcast(builder.gep(start, [args[8]]), some)
+                row = builder.bitcast(builder.gep(start, [args[8]]), pointer_type)
                 builder.store(builder.fadd(builder.load(row, align=8), total), row, align=8)
             return context.get_dummy_value()
 

@@ -36,22 +36,22 @@ def fletcher32(data: NDArray[np.uint8]) -> int:
     '0x4ff029c7'
     """
     even = data.size // 2
-    total, sums, some = _add_words(data[: 2 * even].view("<u2"))
+    total, sums, nonzero = _add_words(data[: 2 * even].view("<u2"))
     if data.size % 2:
         last = int(data[-1])
-        total, sums, some = total + last, sums + total + last, some | last
-    return _half_sum(sums, some) << 16 | _half_sum(total, some)
+        total, sums, nonzero = total + last, sums + total + last, nonzero | last
+    return _half_sum(sums, nonzero) << 16 | _half_sum(total, nonzero)
 
 
-def _half_sum(amount: int, some: int) -> int:
+def _half_sum(amount: int, nonzero: int) -> int:
     """Fold a sum of words whose bytes are swapped; nonzero input gives 65535, never 0."""
-    return int(amount) * 256 % 65535 or (65535 if some else 0)
+    return int(amount) * 256 % 65535 or (65535 if nonzero else 0)
 
 
 @njit(**KERNEL)
 def _add_words(words):  # type: ignore[no-untyped-def]
     """Sum the words and their running sums modulo 65535, and whether any word is not 0."""
-    total, sums, some = np.int64(0), np.int64(0), np.int64(0)
+    total, sums, nonzero = np.int64(0), np.int64(0), np.int64(0)
     for begin in range(0, words.size, 256):
         block = words[begin : begin + 256]
         plain, weighted = np.int64(0), np.int64(0)
@@ -60,5 +60,5 @@ def _add_words(words):  # type: ignore[no-untyped-def]
             weighted += (block.size - i) * np.int64(block[i])
         sums = (sums + block.size * total + weighted) % 65535
         total = (total + plain) % 65535
-        some |= plain
-    return total, sums, some
+        nonzero |= plain
+    return total, sums, nonzero

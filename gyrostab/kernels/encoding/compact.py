@@ -70,9 +70,9 @@ def pack_counts(values, step, divisor, counts):  # type: ignore[no-untyped-def]
         for i in range(begin, min(begin + _STRETCH, n)):
             value = values[i]
             finite = value - value == 0.0
-            near = np.rint(value * scale)
-            inside = abs(near) < _LARGEST
-            count = np.int32(near) if finite and inside else _FILL
+            nearest = np.rint(value * scale)
+            inside = abs(nearest) < _LARGEST
+            count = np.int32(nearest) if finite and inside else _FILL
             back = np.float64(count) * step / divisor
             off += finite and back != value
             absent += not finite
@@ -127,11 +127,11 @@ def find_grid(values: NDArray[np.float64]) -> tuple[float, float] | None:
     >>> find_grid(np.array([np.pi, np.e])) is None
     True
     """
-    some = np.ascontiguousarray(values[np.isfinite(values)][:_LOOKED_AT])
-    counts = np.empty(some.size, np.int32)
+    sample = np.ascontiguousarray(values[np.isfinite(values)][:_LOOKED_AT])
+    counts = np.empty(sample.size, np.int32)
     decimals = ((1.0, 10.0**n) for n in range(_MOST_DECIMALS + 1))
-    for grid in itertools.chain(decimals, _guess_grids(some)):
-        if pack_counts(some, *grid, counts)[0]:
+    for grid in itertools.chain(decimals, _guess_grids(sample)):
+        if pack_counts(sample, *grid, counts)[0]:
             return grid
     return None
 
@@ -186,10 +186,10 @@ def even_steps(stamps: NDArray[np.int64]) -> NDArray[np.int64] | None:
     array([[  0,   0,   5],
            [100, 900,   5]])
     """
-    most = _count_steps(stamps) + 2
-    if 3 * most > max(stamps.size // 8, 12):
+    max_runs = _count_steps(stamps) + 2
+    if 3 * max_runs > max(stamps.size // 8, 12):
         return None
-    table = np.empty((most, 3), np.int64)
+    table = np.empty((max_runs, 3), np.int64)
     return table[: _find_steps(stamps, table)].copy()
 
 

@@ -39,11 +39,11 @@ def to_counts(
     limits = np.iinfo(dtype)
     missing = np.isnan(values)
     with np.errstate(over="ignore", invalid="ignore"):
-        whole = np.rint(values / scale)
-        whole[missing] = fill
-        if not ((whole >= limits.min) & (whole <= limits.max)).all():
+        rounded = np.rint(values / scale)
+        rounded[missing] = fill
+        if not ((rounded >= limits.min) & (rounded <= limits.max)).all():
             return None
-    counts = whole.astype(dtype)
+    counts = rounded.astype(dtype)
     same = counts * np.float64(scale) == values
     same &= counts != fill
     same |= missing

@@ -105,8 +105,8 @@ def _multiply_words(a, b):  # type: ignore[no-untyped-def]
     a0, a1, b0, b1 = a & _HALF, a >> half, b & _HALF, b >> half
     low = a0 * b0
     middle = a1 * b0 + (low >> half)
-    other = a0 * b1 + (middle & _HALF)
-    return a1 * b1 + (middle >> half) + (other >> half), (other << half) | (low & _HALF)
+    cross = a0 * b1 + (middle & _HALF)
+    return a1 * b1 + (middle >> half) + (cross >> half), (cross << half) | (low & _HALF)
 
 
 @njit(**INNER)
@@ -135,17 +135,19 @@ def _nearest_double(mantissa, power):  # type: ignore[no-untyped-def]
         return 0.0, False
     top = np.int64(high >> np.uint64(63))
     shift = np.uint64(top + 9)
-    kept = high >> shift
+    significand = high >> shift
     if (
         low <= np.uint64(1)
         and -4 <= power <= 23
-        and kept & np.uint64(3) == np.uint64(1)
-        and kept << shift == high
+        and significand & np.uint64(3) == np.uint64(1)
+        and significand << shift == high
     ):
-        kept &= ~np.uint64(1)
-    kept += kept & np.uint64(1)
-    kept >>= np.uint64(1)
-    return math.ldexp(np.float64(kept), ((217706 * power) >> 16) + 63 + top - shifted - 52), True
+        significand &= ~np.uint64(1)
+    significand += significand & np.uint64(1)
+    significand >>= np.uint64(1)
+    return math.ldexp(
+        np.float64(significand), ((217706 * power) >> 16) + 63 + top - shifted - 52
+    ), True
 
 
 @njit(**INNER)
@@ -156,8 +158,8 @@ def _read_digits(text, at, size, mantissa):  # type: ignore[no-untyped-def]
     """
     while at + 8 <= size:
         bare = _load_eight(text, at) ^ _ZEROS
-        other = ((bare + _TO_TEN) | bare) & _TOPS
-        count = _zeros_behind(other) >> np.uint64(3)
+        non_digits = ((bare + _TO_TEN) | bare) & _TOPS
+        count = _zeros_behind(non_digits) >> np.uint64(3)
         if count == np.uint64(0):
             return mantissa, at
         bare <<= (np.uint64(8) - count) << np.uint64(3)
@@ -185,9 +187,9 @@ def _read_decimal(text, at, size, point):  # type: ignore[no-untyped-def]
     mantissa, at = _read_digits(text, at, size, np.uint64(0))
     count, decimals = at - first, np.int64(0)
     if text[at] == point:
-        after = at + 1
-        mantissa, at = _read_digits(text, after, size, mantissa)
-        decimals = at - after
+        first_decimal = at + 1
+        mantissa, at = _read_digits(text, first_decimal, size, mantissa)
+        decimals = at - first_decimal
         count += decimals
     if count > _DIGITS:
         while text[first] == _ZERO or text[first] == point:  # zeros in front do not count
@@ -215,8 +217,8 @@ def _read_number(text, at, size, point):  # type: ignore[no-untyped-def]
         if not 0 < end - first < 4:
             return 0.0, np.int64(-1)
         power += -np.int64(exponent) if down else np.int64(exponent)
-    value, found = _nearest_double(mantissa, power)
-    return -value if negative else value, end if found else np.int64(-1)
+    value, is_exact = _nearest_double(mantissa, power)
+    return -value if negative else value, end if is_exact else np.int64(-1)
 
 
 @njit(**INNER)
@@ -232,9 +234,9 @@ def _count_of_time(text, at, size, point, digits):  # type: ignore[no-untyped-de
         count = np.int64(mantissa * scale)
     else:
         scale = _WHOLE_TENS[decimals - digits]
-        whole, rest = mantissa // scale, mantissa % scale
-        odd = whole & np.uint64(1)
-        count = np.int64(whole + np.uint64(np.uint64(2) * rest + odd > scale))
+        quotient, remainder = mantissa // scale, mantissa % scale
+        odd = quotient & np.uint64(1)
+        count = np.int64(quotient + np.uint64(np.uint64(2) * remainder + odd > scale))
     return -count if negative else count, end
 
 
@@ -384,8 +386,8 @@ def _past_void(text, at, separator):  # type: ignore[no-untyped-def]
     while end < first + 4 and text[end] > _BLANK and not _is_end(text[end], separator):
         word = word << 8 | np.int64(text[end] | 32)
         end += 1
-    known = word == _NAN or (first == at and (word in (_NA, _N_A, _NULL, _NONE)))
-    return end if known else np.int64(-1)
+    is_void = word == _NAN or (first == at and (word in (_NA, _N_A, _NULL, _NONE)))
+    return end if is_void else np.int64(-1)
 
 
 @njit(**INNER)
@@ -418,14 +420,14 @@ def _read_cell(text, at, size, role, separator, point, digits, between, may_quot
 def _next_row(text, at, size):  # type: ignore[no-untyped-def]
     """Find the next line that is neither blank nor a comment."""
     while at < size:
-        here = _past_blanks(text, at, np.int64(_TAB))
-        if text[here] == _HASH or text[here] == _PERCENT:
-            while text[here] != _LINE:
-                here += 1
-        here += text[here] == _RETURN
-        if text[here] != _LINE:
+        cursor = _past_blanks(text, at, np.int64(_TAB))
+        if text[cursor] == _HASH or text[cursor] == _PERCENT:
+            while text[cursor] != _LINE:
+                cursor += 1
+        cursor += text[cursor] == _RETURN
+        if text[cursor] != _LINE:
             break
-        at = here + 1
+        at = cursor + 1
     return at
 
 
@@ -501,10 +503,10 @@ def clean_column(values, factor, offset):  # type: ignore[no-untyped-def]
         Values that are not finite.
     low, high : float
         Range of the others, before conversion; infinite without any.
-    whole : bool
+    is_whole : bool
         Whether they are whole numbers.
     """
-    missing, low, high, whole = np.int64(0), np.inf, -np.inf, True
+    missing, low, high, is_whole = np.int64(0), np.inf, -np.inf, True
     same = factor == 1.0 and offset == 0.0
     for i in range(len(values)):
         value = values[i]
@@ -513,8 +515,8 @@ def clean_column(values, factor, offset):  # type: ignore[no-untyped-def]
             values[i] = np.nan
             continue
         low, high = min(low, value), max(high, value)
-        if whole:
-            whole = value == np.rint(value)
+        if is_whole:
+            is_whole = value == np.rint(value)
         if not same:
             values[i] = value * factor + offset
-    return missing, low, high, whole
+    return missing, low, high, is_whole

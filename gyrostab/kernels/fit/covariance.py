@@ -98,11 +98,11 @@ def _add_quantization(window, k1, k2, thin, logarithm, products, means):  # type
     r = np.zeros(STOCHASTIC)
     for p in range(9):
         lag = (p // 3) * k1 - (p % 3) * k2
-        seen = False
+        is_repeated = False
         for q in range(p):
-            seen = seen or lag == (q // 3) * k1 - (q % 3) * k2
+            is_repeated = is_repeated or lag == (q // 3) * k1 - (q % 3) * k2
         weight = _count_pairs(lag, n1, n2) * thin
-        if seen or weight == 0:
+        if is_repeated or weight == 0:
             continue
         _smooth_covariance(lag, k1, k2, logarithm, r)
         r[0] = _quantization_covariance(lag, k1, k2)
@@ -143,8 +143,8 @@ def _add_every(window, k1, k2, differences, products, means):  # type: ignore[no
     terms = float(window - 2 * k1 + 1)
     apart = float(k2 - k1)
     reach = min(2 * (k1 + k2), window)
-    here = np.uint64(differences.shape[1] // 2)
-    near, far = here - np.uint64(k2), here + np.uint64(k2)
+    centre = np.uint64(differences.shape[1] // 2)
+    lower, upper = centre - np.uint64(k2), centre + np.uint64(k2)
     white, flicker, walk = differences[0], differences[1], differences[2]
     n = b = k = nn = bb = kk = nb = nk = bk = 0.0
     for u in range(np.uint64(0), np.uint64(reach + 1)):
@@ -152,9 +152,9 @@ def _add_every(window, k1, k2, differences, products, means):  # type: ignore[no
         weight = max(terms - (apart + lag) - max(apart - lag, 0.0), 0.0) * (
             2.0 if lag > 0.0 else 1.0
         )
-        r1 = (white[near + u] - 2.0 * white[here + u] + white[far + u]) * scale
-        r2 = (flicker[near + u] - 2.0 * flicker[here + u] + flicker[far + u]) * scale
-        r3 = (walk[near + u] - 2.0 * walk[here + u] + walk[far + u]) * scale
+        r1 = (white[lower + u] - 2.0 * white[centre + u] + white[upper + u]) * scale
+        r2 = (flicker[lower + u] - 2.0 * flicker[centre + u] + flicker[upper + u]) * scale
+        r3 = (walk[lower + u] - 2.0 * walk[centre + u] + walk[upper + u]) * scale
         n += weight * r1
         b += weight * r2
         k += weight * r3
@@ -193,7 +193,7 @@ def _fill_tables(window, ks, shifts, logarithm):  # type: ignore[no-untyped-def]
     n_tau = ks.size
     products = np.zeros((STOCHASTIC, STOCHASTIC, n_tau, n_tau))
     means = np.zeros((STOCHASTIC, n_tau, n_tau))
-    one = np.empty((STOCHASTIC, STOCHASTIC))
+    pair_products = np.empty((STOCHASTIC, STOCHASTIC))
     mean = np.empty(STOCHASTIC)
     widest = 2 * ks[-1] + min(4 * ks[-1], window) + 1
     differences = np.empty((3, 2 * widest + 1))
@@ -210,13 +210,13 @@ def _fill_tables(window, ks, shifts, logarithm):  # type: ignore[no-untyped-def]
                 1 << min(shifts[i], shifts[j]),
                 logarithm,
                 differences,
-                one,
+                pair_products,
                 mean,
             )
             for a in range(STOCHASTIC):
                 means[a, i, j] = means[a, j, i] = mean[a]
                 for b in range(STOCHASTIC):
-                    products[a, b, i, j] = products[a, b, j, i] = one[a, b]
+                    products[a, b, i, j] = products[a, b, j, i] = pair_products[a, b]
     return products, means
 
 
@@ -251,14 +251,16 @@ def product_tables(
 def _fill_diagonals(window, ks, shifts, logarithm):  # type: ignore[no-untyped-def]
     products = np.zeros((STOCHASTIC, STOCHASTIC, ks.size))
     means = np.zeros((STOCHASTIC, ks.size))
-    one = np.empty((STOCHASTIC, STOCHASTIC))
+    pair_products = np.empty((STOCHASTIC, STOCHASTIC))
     mean = np.empty(STOCHASTIC)
     for i in range(ks.size):
-        _sum_pairs(window, ks[i], ks[i], 1 << shifts[i], logarithm, np.empty((3, 0)), one, mean)
+        _sum_pairs(
+            window, ks[i], ks[i], 1 << shifts[i], logarithm, np.empty((3, 0)), pair_products, mean
+        )
         for a in range(STOCHASTIC):
             means[a, i] = mean[a]
             for b in range(STOCHASTIC):
-                products[a, b, i] = one[a, b]
+                products[a, b, i] = pair_products[a, b]
     return products, means
 
 

@@ -73,12 +73,12 @@ def eliminate(system, n, width, ok):  # type: ignore[no-untyped-def]
                 take(system, third + i),
                 take(system, fourth + i),
             )
-            after, above, below = i + 1, width * i, width * i + width
+            next_column, above, below = i + 1, width * i, width * i + width
             e, f, g, h = (
-                take(system, first + after),
-                take(system, second + after),
-                take(system, third + after),
-                take(system, fourth + after),
+                take(system, first + next_column),
+                take(system, second + next_column),
+                take(system, third + next_column),
+                take(system, fourth + next_column),
             )
             for j in range(i, width):
                 s, t, u, v = (
@@ -96,13 +96,13 @@ def back_substitute(system, n, width):  # type: ignore[no-untyped-def]
     """Replace the first five right-hand sides Y of an eliminated U by ``U^-1 Y``."""
     for i in range(n - 1, -1, -1):
         at = width * i
-        own = at + n
+        target = at + n
         a, b, c, d, e = (
-            take(system, own),
-            take(system, own + 1),
-            take(system, own + 2),
-            take(system, own + 3),
-            take(system, own + 4),
+            take(system, target),
+            take(system, target + 1),
+            take(system, target + 2),
+            take(system, target + 3),
+            take(system, target + 4),
         )
         for j in range(i + 1, n):
             share, right = take(system, at + j), width * j + n
@@ -112,11 +112,11 @@ def back_substitute(system, n, width):  # type: ignore[no-untyped-def]
             d = d - share * take(system, right + 3)
             e = e - share * take(system, right + 4)
         inverse = 1.0 / take(system, at + i)
-        put(system, own, a * inverse)
-        put(system, own + 1, b * inverse)
-        put(system, own + 2, c * inverse)
-        put(system, own + 3, d * inverse)
-        put(system, own + 4, e * inverse)
+        put(system, target, a * inverse)
+        put(system, target + 1, b * inverse)
+        put(system, target + 2, c * inverse)
+        put(system, target + 3, d * inverse)
+        put(system, target + 4, e * inverse)
 
 
 @njit(**INNER)
@@ -149,13 +149,13 @@ def solve_terms(scaled, right, terms, solution, work):  # type: ignore[no-untype
     for i in range(
         _TERMS
     ):  # Cholesky factor, its diagonal inverted, and forward solution, row by row
-        here = take(terms, i)
-        pivot = take(scaled, 6 * i) * (1.0 + 1e-12) * here + (
-            1.0 - here
+        member = take(terms, i)
+        pivot = take(scaled, 6 * i) * (1.0 + 1e-12) * member + (
+            1.0 - member
         )  # a term outside the set stands alone
-        total = take(right, i) * here
+        total = take(right, i) * member
         for j in range(i):
-            share = take(scaled, 5 * i + j) * here * take(terms, j)
+            share = take(scaled, 5 * i + j) * member * take(terms, j)
             for p in range(j):
                 share = share - take(work, 5 * i + p) * take(work, 5 * j + p)
             share = share * take(work, 6 * j)
@@ -177,16 +177,16 @@ def solve_terms(scaled, right, terms, solution, work):  # type: ignore[no-untype
 @njit(**INNER)
 def _is_optimal(scaled, right, allowed, terms, solution, ok):  # type: ignore[no-untyped-def]
     """Check the solution for `terms` by the Karush-Kuhn-Tucker conditions: `ok`, else zero."""
-    some = ok * 0.0
+    members = ok * 0.0
     for i in range(_TERMS):
-        here, slope = take(terms, i), take(right, i)
+        member, slope = take(terms, i), take(right, i)
         for j in range(_TERMS):
             slope = slope - take(scaled, 5 * i + j) * take(solution, j)
         inside = where_above(take(solution, i), 0.0, ok, 0.0)
         outside = where_above(slope, 0.0, 0.0, ok) if allowed >> i & 1 else ok
-        ok = where_above(here, 0.5, inside, outside)
-        some = some + here
-    return where_above(some, 0.5, ok, 0.0)
+        ok = where_above(member, 0.5, inside, outside)
+        members = members + member
+    return where_above(members, 0.5, ok, 0.0)
 
 
 @njit(**INNER)
@@ -236,8 +236,8 @@ def solve_nonnegative_eights(normal, right, allowed, terms, squares, room):  # t
     scale_equations(normal, scale, scaled)
     for i in range(_TERMS):
         put(scaled_right, i, take(right, i) * take(scale, i))
-    found = solve_terms(scaled, scaled_right, terms, solution, work)
-    done = _is_optimal(scaled, scaled_right, allowed, terms, solution, found)
+    solvable = solve_terms(scaled, scaled_right, terms, solution, work)
+    done = _is_optimal(scaled, scaled_right, allowed, terms, solution, solvable)
     put(tried, 0, done)
     everywhere = True
     for place in range(PLACES):

@@ -66,10 +66,10 @@ def _register_operator(symbol: Any, emit: Callable[[Any, Any, Any], Any]) -> Non
 
     class Typing(AbstractTemplate):  # type: ignore[misc]
         def generic(self, args: Any, kws: Any) -> Any:
-            known = [isinstance(one, _EightType) for one in args]
-            if any(known) and all(
-                eight or isinstance(one, types.Float)
-                for eight, one in zip(known, args, strict=True)
+            eight_flags = [isinstance(argument, _EightType) for argument in args]
+            if any(eight_flags) and all(
+                eight or isinstance(argument, types.Float)
+                for eight, argument in zip(eight_flags, args, strict=True)
             ):
                 return signature(_EIGHT, _EIGHT, _EIGHT)
             return None

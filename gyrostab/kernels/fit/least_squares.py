@@ -93,11 +93,11 @@ def _make_cells(size):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _make_room(size):  # type: ignore[no-untyped-def]
-    units, roots, whole = eights(5 * size), eights(5 * size), eights(size * (size + WIDTH))
+    units, roots, augmented = eights(5 * size), eights(5 * size), eights(size * (size + WIDTH))
     return _Room(
         units,
         roots,
-        whole,
+        augmented,
         eights(25),
         eights(5),
         eights(75),
@@ -234,14 +234,19 @@ def cell_freedoms(  # type: ignore[no-untyped-def]
                 to_samples, diagonal, out[w],
             )  # fmt: skip
     else:
-        own, lanes, columns, diagonal = eights(5), eights(1), columns.ravel(), diagonal.ravel()
+        eight_squares, lanes, columns, diagonal = (
+            eights(5),
+            eights(1),
+            columns.ravel(),
+            diagonal.ravel(),
+        )
         for start in range(0, n_windows, PLACES):
             count = min(PLACES, n_windows - start)
             for place in range(count):
                 for a in range(5):
-                    own[a, place] = squares[start + place, a]
+                    eight_squares[a, place] = squares[start + place, a]
             whole_degrees_of_freedom(
-                own, columns, to_samples, diagonal, lanes, out[start : start + count]
+                eight_squares, columns, to_samples, diagonal, lanes, out[start : start + count]
             )
     for w in range(n_windows):
         shares = factor[min(w, factor.shape[0] - 1)]
@@ -279,42 +284,47 @@ def _observe_eight(  # type: ignore[no-untyped-def]
 @njit(**INNER)
 def _factor_covariance(cells, fit, room, tables):  # type: ignore[no-untyped-def]
     """Eliminate the covariance of the noise `fit.basis` with columns and data; sets `fit.state`."""
-    system, inverse, whole, state = cells.system, cells.inverse, room.whole, fit.state
+    system, inverse, augmented, state = cells.system, cells.inverse, room.whole, fit.state
     n = inverse.shape[0]
     width = n + WIDTH
     put(state, 2, 1e-7)  # the sums over lags are good to about this; a strong ramp may need more
     root_squares(fit.basis, cells.seen, room.units, room.roots)
-    again = True
-    while again:
-        covariance_rows(room.roots, inverse, tables, whole, width)
+    needs_retry = True
+    while needs_retry:
+        covariance_rows(room.roots, inverse, tables, augmented, width)
         jitter = take(state, 2)
         for i in range(n):
             at, y = width * i, take(cells.avar, i)
-            own = take(whole, at + i)  # the second part keeps a window without any noise solvable
-            put(whole, at + i, where_above(y, 0.0, own + jitter * own + 1e-16 * y * y, 1.0))
+            diagonal = take(augmented, at + i)
+            # the second part keeps a window without any noise solvable
+            put(
+                augmented,
+                at + i,
+                where_above(y, 0.0, diagonal + jitter * diagonal + 1e-16 * y * y, 1.0),
+            )
             for a in range(WIDTH):
-                put(whole, at + n + a, take(system, WIDTH * i + a))
-        eliminate(whole, n, width, state[3:4])
-        again = False
+                put(augmented, at + n + a, take(system, WIDTH * i + a))
+        eliminate(augmented, n, width, state[3:4])
+        needs_retry = False
         for place in range(PLACES):
             if state[3, place] < 0.5 and state[1, place] < 0.5:
                 state[2, place] *= 10.0
                 if state[2, place] < 1.0:
-                    again = True
+                    needs_retry = True
                 else:
                     state[1, place] = 1.0
 
 
 @njit(**INNER)
-def _normal_equations(whole, n, normal, right):  # type: ignore[no-untyped-def]
+def _normal_equations(augmented, n, normal, right):  # type: ignore[no-untyped-def]
     """Form normal matrix and right-hand side from the eliminated covariance, columns and data."""
     for row in range(25):
         put(normal, row, 0.0)
     for a in range(5):
         put(right, a, 0.0)
-    one = take(whole, 0) * 0.0 + 1.0
+    weight = take(augmented, 0) * 0.0 + 1.0
     for i in range(n):
-        _add_equation(whole, (n + WIDTH) * i + n, one, normal, right)
+        _add_equation(augmented, (n + WIDTH) * i + n, weight, normal, right)
     _mirror_triangle(normal)
 
 
@@ -355,19 +365,19 @@ def _refit_windows(allowed, cells, fit, room, tables):  # type: ignore[no-untype
 @njit(**INNER)
 def _find_ramp(trend, squares):  # type: ignore[no-untyped-def]
     """Write the squared trend less its variance under the other terms to row 4 of `squares`."""
-    left = take(trend, 4)
+    remainder = take(trend, 4)
     for a in range(4):
-        left = left - take(trend, a) * take(squares, a)
-    put(squares, 4, where_above(left, 0.0, left, 0.0))
+        remainder = remainder - take(trend, a) * take(squares, a)
+    put(squares, 4, where_above(remainder, 0.0, remainder, 0.0))
 
 
 @njit(**INNER)
 def _has_positive(rows, row):  # type: ignore[no-untyped-def]
     """Whether one of the eight numbers of a row is above zero."""
-    found = False
+    is_positive = False
     for place in range(PLACES):
-        found = found or rows[row, place] > 0.0
-    return found
+        is_positive = is_positive or rows[row, place] > 0.0
+    return is_positive
 
 
 @njit(**INNER)

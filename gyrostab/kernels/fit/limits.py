@@ -33,18 +33,18 @@ def _bound_square(estimate, a, b, c, score):  # type: ignore[no-untyped-def]
     Newton steps in the integral of 1 / sigma, of which square and sigma are hyperbolic functions.
     """
     root, rate = math.sqrt(a), math.sqrt(c)
-    most = _integrate_scatter(estimate, root, b, c)
-    if (estimate / root + 2.0 * most) / 3.0 <= score:
+    integral = _integrate_scatter(estimate, root, b, c)
+    if (estimate / root + 2.0 * integral) / 3.0 <= score:
         return 0.0
-    place = max(most - score, 0.0)
+    place = max(integral - score, 0.0)
     square = 0.0
     for _ in range(_STEPS):
         half = math.sinh(0.5 * rate * place)
-        other = math.sqrt(1.0 + half * half)
-        square = 2.0 * root * half * other / rate + b * half * half / c
-        sigma = root * (1.0 + 2.0 * half * half) + b * half * other / rate
+        cosh = math.sqrt(1.0 + half * half)
+        square = 2.0 * root * half * cosh / rate + b * half * half / c
+        sigma = root * (1.0 + 2.0 * half * half) + b * half * cosh / rate
         away = (estimate - square) / sigma
-        value = (away + 2.0 * (most - place)) / 3.0 - score
+        value = (away + 2.0 * (integral - place)) / 3.0 - score
         slope = 1.0 + away * (b + 2.0 * c * square) / (6.0 * sigma)
         step = min(max(value / max(slope, 0.5), -place), 3.0)
         place += step
@@ -102,37 +102,41 @@ def chi_square_quantile(freedom, start, step, curve):  # type: ignore[no-untyped
     t = position - i
     if t < -1.0:  # below the table, where the quantile is below the smallest number
         return 0.0
-    before, here = curve[i - 1], curve[i]
-    after, beyond = curve[i + 1], curve[i + 2]
+    before, lower = curve[i - 1], curve[i]
+    upper, beyond = curve[i + 1], curve[i + 2]
     value = (
-        -t * (t - 1.0) * (t - 2.0) / 6.0 * before + (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0 * here
+        -t * (t - 1.0) * (t - 2.0) / 6.0 * before + (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0 * lower
     )
-    value += -(t + 1.0) * t * (t - 2.0) / 2.0 * after + (t + 1.0) * t * (t - 1.0) / 6.0 * beyond
+    value += -(t + 1.0) * t * (t - 2.0) / 2.0 * upper + (t + 1.0) * t * (t - 1.0) / 6.0 * beyond
     return np.exp(value / freedom)
 
 
 @njit(**INNER)
-def _predict_cell(columns, white, quantization, ramp, squares, seen):  # type: ignore[no-untyped-def]
-    """Compute the Allan variance of one cell under the fitted model, and per square in `seen`."""
+def _predict_cell(columns, white, quantization, ramp, squares, per_square):  # type: ignore[no-untyped-def]
+    """Compute the Allan variance of one cell under the fitted model, and `per_square`."""
     model = 0.0
     for a in range(5):
-        seen[a] = columns[a] * (
+        per_square[a] = columns[a] * (
             quantization if a == 0 else white if a == 1 else ramp if a == 4 else 1.0
         )
         if squares[a] > 0.0:
-            model += seen[a] * squares[a]
+            model += per_square[a] * squares[a]
     return model
 
 
 @njit(**INNER)
-def _cell_quantile(a, whole, own_dof, share, dof, most, start, step, curve):  # type: ignore[no-untyped-def]
-    """Find the quantile of a cell with term `a` alone; `whole` without gaps.
+def _cell_quantile(a, full_quantile, own_dof, share, dof, max_freedom, start, step, curve):  # type: ignore[no-untyped-def]
+    """Find the quantile of a cell with term `a` alone; `full_quantile` without gaps.
 
     For a ramp, the degrees of freedom of the cell are used.
     """
     if a == 4:
-        return chi_square_quantile(min(own_dof, most, dof), start, step, curve)
-    return whole if share == 1.0 else chi_square_quantile(min(own_dof, most), start, step, curve)
+        return chi_square_quantile(min(own_dof, max_freedom, dof), start, step, curve)
+    return (
+        full_quantile
+        if share == 1.0
+        else chi_square_quantile(min(own_dof, max_freedom), start, step, curve)
+    )
 
 
 @njit(**KERNEL)
@@ -148,7 +152,7 @@ def cell_limits(  # type: ignore[no-untyped-def]
     own_dof,
     ks,
     span,
-    most,
+    max_freedom,
     start,
     step,
     curve,
@@ -174,7 +178,7 @@ def cell_limits(  # type: ignore[no-untyped-def]
     span : float64 (5,)
         A cell may bound a term if the longest averaging factor of its window is at most this many
         times its own.
-    most : float
+    max_freedom : float
         Degrees of freedom are not taken above this.
     start, step, curve
         As in `chi_square_quantile`.
@@ -186,10 +190,12 @@ def cell_limits(  # type: ignore[no-untyped-def]
     """
     n_windows, n_tau = avar.shape
     out = np.full((n_windows, 5), np.inf)
-    whole, seen, lowest = np.empty((n_tau, 5)), np.empty(5), np.empty(5)
+    full_quantiles, per_square, lowest = np.empty((n_tau, 5)), np.empty(5), np.empty(5)
     for i in range(n_tau):
         for a in range(5):
-            whole[i, a] = chi_square_quantile(min(own_dof[a, i], most), start, step, curve)
+            full_quantiles[i, a] = chi_square_quantile(
+                min(own_dof[a, i], max_freedom), start, step, curve
+            )
     for w in range(n_windows):
         lowest[:] = np.inf
         last = n_tau - 1
@@ -199,29 +205,29 @@ def cell_limits(  # type: ignore[no-untyped-def]
             if not np.isfinite(avar[w, i]):
                 continue
             model = _predict_cell(
-                columns[i], white[w, i], quantization[w, i], ramp[w, i], squares[w], seen
+                columns[i], white[w, i], quantization[w, i], ramp[w, i], squares[w], per_square
             )
             share = factor[w, i]
             for a in range(5):
                 if ks[i] * span[a] < ks[last]:
                     continue
                 best = (
-                    whole[i, a] if share <= 1.0 else 1.0
+                    full_quantiles[i, a] if share <= 1.0 else 1.0
                 )  # fewer degrees of freedom have a lower quantile
-                if model >= lowest[a] * best * seen[a]:
+                if model >= lowest[a] * best * per_square[a]:
                     continue
                 quantile = _cell_quantile(
                     a,
-                    whole[i, a],
+                    full_quantiles[i, a],
                     own_dof[a, i] * share,
                     share,
                     dof[w, i],
-                    most,
+                    max_freedom,
                     start,
                     step,
                     curve,
                 )
-                reach = 1.0 / (quantile * seen[a]) if quantile > 0.0 else np.inf
+                reach = 1.0 / (quantile * per_square[a]) if quantile > 0.0 else np.inf
                 if model * reach < lowest[a]:
                     lowest[a] = model * reach
                     out[w, a] = avar[w, i] * reach

@@ -84,16 +84,16 @@ def observe(  # type: ignore[no-untyped-def]
     quantization noise comes from the ends of many runs spread over each cluster, so it scatters
     like white noise and is counted there (row 2), the most of it in ``cells.excess``.
     """
-    system, seen = cells.system, cells.seen
+    system, responses = cells.system, cells.seen
     n = 0
     cells.excess[0, place] = 0.0
     for i in range(cells.inverse.shape[0]):
-        here = i < avar.size and np.isfinite(avar[i]) and avar[i] > 0.0 and factor[i] > 0.0
+        is_valid = i < avar.size and np.isfinite(avar[i]) and avar[i] > 0.0 and factor[i] > 0.0
         cells.inverse[i, place] = 1.0
         cells.avar[i, place] = 0.0
         for row in range(WIDTH * i, WIDTH * i + WIDTH):
-            system[row, place] = seen[row, place] = 0.0
-        if not here:
+            system[row, place] = responses[row, place] = 0.0
+        if not is_valid:
             continue
         at = WIDTH * i
         for a in range(5):
@@ -105,30 +105,30 @@ def observe(  # type: ignore[no-untyped-def]
             system[at + a, place] -= system[at + 4, place] * trend[a]
         system[at + DATA, place] = avar[i] - system[at + 4, place] * trend_square
         cells.avar[i, place] = avar[i]
-        seen[at, place] = min(quantization[i], 1.0) * to_samples[0]
-        seen[at + 1, place] = white[i] * to_samples[1]
-        seen[at + 2, place] = (
+        responses[at, place] = min(quantization[i], 1.0) * to_samples[0]
+        responses[at + 1, place] = white[i] * to_samples[1]
+        responses[at + 2, place] = (
             max(quantization[i] - 1.0, 0.0) * columns[i, 0] / columns[i, 1] * to_samples[1]
         )
-        seen[at + 3, place] = to_samples[2]
-        seen[at + 4, place] = to_samples[3]
-        seen[at + 5, place] = trend[5] * ramp[i] * to_samples[4]
+        responses[at + 3, place] = to_samples[2]
+        responses[at + 4, place] = to_samples[3]
+        responses[at + 5, place] = trend[5] * ramp[i] * to_samples[4]
         cells.inverse[i, place] = 1.0 / factor[i]
-        cells.excess[0, place] = max(cells.excess[0, place], seen[at + 2, place])
+        cells.excess[0, place] = max(cells.excess[0, place], responses[at + 2, place])
         n += 1
     return n
 
 
 @njit(**INNER)
-def root_units(seen, units):  # type: ignore[no-untyped-def]
+def root_units(responses, units):  # type: ignore[no-untyped-def]
     """Compute the roots of unit squared coefficients in sample units: row ``5 cell + term``."""
-    for i in range(seen.shape[0] // 6):
+    for i in range(responses.shape[0] // 6):
         for a in range(5):
-            put(units, 5 * i + a, root(take(seen, 6 * i + _SEEN[a])))
+            put(units, 5 * i + a, root(take(responses, 6 * i + _SEEN[a])))
 
 
 @njit(**INNER)
-def root_squares(squares, seen, units, roots):  # type: ignore[no-untyped-def]
+def root_squares(squares, responses, units, roots):  # type: ignore[no-untyped-def]
     """Compute the roots of the squared coefficients in sample units: row ``5 cell + term``."""
     s0, s1 = take(squares, 0), take(squares, 1)
     r0, r2, r3, r4 = (
@@ -137,9 +137,13 @@ def root_squares(squares, seen, units, roots):  # type: ignore[no-untyped-def]
         root(take(squares, 3)),
         root(take(squares, 4)),
     )
-    for i in range(seen.shape[0] // 6):
+    for i in range(responses.shape[0] // 6):
         put(roots, 5 * i, r0 * take(units, 5 * i))
-        put(roots, 5 * i + 1, root(s1 * take(seen, 6 * i + 1) + s0 * take(seen, 6 * i + 2)))
+        put(
+            roots,
+            5 * i + 1,
+            root(s1 * take(responses, 6 * i + 1) + s0 * take(responses, 6 * i + 2)),
+        )
         put(roots, 5 * i + 2, r2 * take(units, 5 * i + 2))
         put(roots, 5 * i + 3, r3 * take(units, 5 * i + 3))
         put(roots, 5 * i + 4, r4 * take(units, 5 * i + 4))
@@ -205,18 +209,18 @@ def _add_products(rows, first, second, inverse, tables, table, factor, scaled, o
     """
     n = inverse.shape[0]
     for i in range(n):
-        both = take(first, i) * take(second, i)
+        root_product = take(first, i) * take(second, i)
         for c in range(4):
-            put(scaled, 4 * i + c, take(rows, 4 * i + c) * both)
+            put(scaled, 4 * i + c, take(rows, 4 * i + c) * root_product)
     for i in range(n):
-        own = 0.5 * number(tables, PRODUCTS * (i * n + i) + table) * take(inverse, i)
+        diagonal = 0.5 * number(tables, PRODUCTS * (i * n + i) + table) * take(inverse, i)
         s0, s1, s2, s3 = (
             take(scaled, 4 * i),
             take(scaled, 4 * i + 1),
             take(scaled, 4 * i + 2),
             take(scaled, 4 * i + 3),
         )
-        a0, a1, a2, a3 = own * s0, own * s1, own * s2, own * s3
+        a0, a1, a2, a3 = diagonal * s0, diagonal * s1, diagonal * s2, diagonal * s3
         for j in range(i + 1, n):
             share = number(tables, PRODUCTS * (i * n + j) + table) * _find_share(inverse, i, j)
             a0 = a0 + share * take(scaled, 4 * j)
@@ -237,7 +241,7 @@ def _add_products(rows, first, second, inverse, tables, table, factor, scaled, o
 
 
 @njit(**INNER)
-def compress_products(rows, units, seen, inverse, tables, roots, scaled, has_excess, out):  # type: ignore[no-untyped-def]
+def compress_products(rows, units, responses, inverse, tables, roots, scaled, has_excess, out):  # type: ignore[no-untyped-def]
     """Compute ``A C_ab A^T`` for every product (a, b) of terms of the covariance C of the cells.
 
     Parameters
@@ -246,7 +250,7 @@ def compress_products(rows, units, seen, inverse, tables, roots, scaled, has_exc
         A, four weighted sums of the cells (row ``4 cell + row``).
     units : eights (5 * n,)
         `root_units`.
-    seen, inverse, tables
+    responses, inverse, tables
         As elsewhere.
     roots, scaled : eights (6 * n,), eights (4 * n,)
         Scratch.
@@ -259,7 +263,7 @@ def compress_products(rows, units, seen, inverse, tables, roots, scaled, has_exc
     for i in range(n):
         for a in range(5):
             put(roots, n * a + i, take(units, 5 * i + a))
-        put(roots, n * 5 + i, root(take(seen, WIDTH * i + 2)))
+        put(roots, n * 5 + i, root(take(responses, WIDTH * i + 2)))
     for row in range(10 * PRODUCTS):
         put(out, row, 0.0)
     for a in range(4):
@@ -270,8 +274,8 @@ def compress_products(rows, units, seen, inverse, tables, roots, scaled, has_exc
     if not has_excess:
         return
     excess = roots[n * 5 : n * 6]
-    own, at = np.int64(_TABLE[1][1]), np.int64(0)
-    _add_products(rows, excess, excess, inverse, tables, own, 1.0, scaled, out, at)
+    square_table, at = np.int64(_TABLE[1][1]), np.int64(0)
+    _add_products(rows, excess, excess, inverse, tables, square_table, 1.0, scaled, out, at)
     for b in range(5):
         table, factor = _TABLE[1][b], 2.0 if b == 1 else 1.0
         second = roots[n * b : n * b + n]

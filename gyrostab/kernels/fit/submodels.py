@@ -157,9 +157,9 @@ def _factor_data(room):  # type: ignore[no-untyped-def]
         for j in range(i, 4):
             room.whitener[j, i] = room.covariance[entry]
             entry += 1
-        own = room.whitener[i, i]
-        largest = max(largest, own)
-        room.whitener[i, i] = own * (1.0 + 1e-9) if own > 0.0 else 1.0
+        variance = room.whitener[i, i]
+        largest = max(largest, variance)
+        room.whitener[i, i] = variance * (1.0 + 1e-9) if variance > 0.0 else 1.0
     return _invert_factor(room.whitener, np.int64(4)) if largest > 0.0 else np.inf
 
 
@@ -301,11 +301,11 @@ def _quadratic_form(form, products, table):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _best_likelihood(a, wanted, room):  # type: ignore[no-untyped-def]
+def _best_likelihood(a, has_term, room):  # type: ignore[no-untyped-def]
     """Find the largest likelihood of the feasible sets with the term `a`, or without it."""
     best = -np.inf
     for index in range(1, _SETS):
-        if (index >> a & 1) == wanted and _is_feasible(index, room):
+        if (index >> a & 1) == has_term and _is_feasible(index, room):
             best = max(best, room.likelihood[index])
     return best
 
@@ -389,7 +389,7 @@ def _weigh_low_end(a, base, low_sigma, room):  # type: ignore[no-untyped-def]
     To ``room.squares`` go the squares with the term at its lower end: those of `base`, more where
     another term would replace a part of it.
     """
-    total = mean = own = variance = 0.0
+    total = mean = variance_sum = variance = 0.0
     for b in range(4):
         room.shared[b] = 0.0
     for index in range(1, _SETS):
@@ -404,10 +404,10 @@ def _weigh_low_end(a, base, low_sigma, room):  # type: ignore[no-untyped-def]
         room.weights[index, 1] *= variance * variance
         total += room.weights[index, 1]
         mean += room.weights[index, 1] * room.estimates[index, a]
-        own += room.weights[index, 1] * variance
+        variance_sum += room.weights[index, 1] * variance
     if not total > 0.0:
         return False
-    fall = min(max(mean / total, 0.0), low_sigma * math.sqrt(own / total))
+    fall = min(max(mean / total, 0.0), low_sigma * math.sqrt(variance_sum / total))
     for b in range(4):
         room.squares[b] = base[b] + max(-room.shared[b] / room.shared[a], 0.0) * fall
     room.squares[4] = base[4]
@@ -499,10 +499,10 @@ def _scale_window(allowed, room):  # type: ignore[no-untyped-def]
     What belongs to other terms becomes zero.
     """
     for a in range(4):
-        own = room.normal[a, a]
-        if not own > 0.0:
+        diagonal = room.normal[a, a]
+        if not diagonal > 0.0:
             allowed &= ~(1 << a)
-        room.scale[a] = math.sqrt(own) if allowed >> a & 1 else np.inf
+        room.scale[a] = math.sqrt(diagonal) if allowed >> a & 1 else np.inf
     table = 0
     for a in range(4):
         room.data[a] /= room.scale[a]

@@ -72,19 +72,19 @@ def _add_lag(lag, weight, first, k2, crossed, scale, r, products, means):  # typ
 @njit(**INNER)
 def _add_points(n1, n2, k1, k2, thin, crossed, scale, r, products, means):  # type: ignore[no-untyped-def]
     """Add the pairs of white angle noise with every term: at most sixteen lags, times `thin`."""
-    both, sums = np.zeros((STOCHASTIC, STOCHASTIC)), np.zeros(STOCHASTIC)
+    pair_products, sums = np.zeros((STOCHASTIC, STOCHASTIC)), np.zeros(STOCHASTIC)
     for p in range(16):
         lag = (p // 4) * k1 - (p % 4) * k2
-        seen = False
+        is_repeated = False
         for q in range(p):
-            seen = seen or lag == (q // 4) * k1 - (q % 4) * k2
+            is_repeated = is_repeated or lag == (q // 4) * k1 - (q % 4) * k2
         weight = max(0, min(n1, n2 - lag) - max(0, -lag)) * thin
-        if seen or weight == 0:
+        if is_repeated or weight == 0:
             continue
-        _add_lag(lag, weight, 0, k2, crossed, scale, r, both, sums)
+        _add_lag(lag, weight, 0, k2, crossed, scale, r, pair_products, sums)
     means[0] = sums[0]
     for a in range(STOCHASTIC):
-        products[0, a] = products[a, 0] = both[0, a]
+        products[0, a] = products[a, 0] = pair_products[0, a]
 
 
 @njit(**INNER)
@@ -117,22 +117,22 @@ def _fill_tables(window, ks, shifts, summed, diagonal, table):  # type: ignore[n
     width = 1 if diagonal else n_tau
     products = np.zeros((STOCHASTIC, STOCHASTIC, n_tau, width))
     means = np.zeros((STOCHASTIC, n_tau, width))
-    one, mean = np.empty((STOCHASTIC, STOCHASTIC)), np.empty(STOCHASTIC)
+    pair_products, mean = np.empty((STOCHASTIC, STOCHASTIC)), np.empty(STOCHASTIC)
     r, room = np.empty(STOCHASTIC), np.empty((2 * (table.shape[1] - 3 * ks[-1]) - 1, STOCHASTIC))
     for i in range(n_tau):
         last = i + 1 if diagonal else n_tau
-        far = 2 * (3 * (ks[i] + ks[last - 1]) + 2 + min(3 * (ks[i] + ks[last - 1]), window))
-        crossed = room[: min(far, room.shape[0] - 1) + 1]
+        reach = 2 * (3 * (ks[i] + ks[last - 1]) + 2 + min(3 * (ks[i] + ks[last - 1]), window))
+        crossed = room[: min(reach, room.shape[0] - 1) + 1]
         _cross_covariances(ks[i], table, crossed)
         for j in range(i, last):
             thin = 1 << min(shifts[i], shifts[j])
-            _sum_pairs(window, ks[i], ks[j], thin, summed, crossed, r, one, mean)
+            _sum_pairs(window, ks[i], ks[j], thin, summed, crossed, r, pair_products, mean)
             at, mirrored = (i, 0) if diagonal else (i, j), (i, 0) if diagonal else (j, i)
             for a in range(STOCHASTIC):
                 means[a, at[0], at[1]] = means[a, mirrored[0], mirrored[1]] = mean[a]
                 for b in range(STOCHASTIC):
-                    products[a, b, at[0], at[1]] = one[a, b]
-                    products[a, b, mirrored[0], mirrored[1]] = one[a, b]
+                    products[a, b, at[0], at[1]] = pair_products[a, b]
+                    products[a, b, mirrored[0], mirrored[1]] = pair_products[a, b]
     return products, means
 
 
@@ -149,9 +149,9 @@ def _tabulate_covariance(
     table = _autocovariances(lags, summed=summed)
     products, means = _fill_tables(window, ks, shifts, summed, diagonal, table)
     factors = ks.astype(np.float64)
-    seen = 1.0 if summed else 0.0  # a third difference of the angle does not see a ramp
-    other = factors[:, None] if diagonal else factors[None, :]
-    return 2.0 * products, 2.0 * seen * factors[:, None] * other * means
+    ramp_response = 1.0 if summed else 0.0  # a third difference of the angle does not see a ramp
+    other_factors = factors[:, None] if diagonal else factors[None, :]
+    return 2.0 * products, 2.0 * ramp_response * factors[:, None] * other_factors * means
 
 
 def third_tables(

@@ -63,11 +63,11 @@ def _keep_hypothesis(table, n, level, phase, cost, parent):  # type: ignore[no-u
 
 
 @njit(**INNER)
-def _switch_nats(far):  # type: ignore[no-untyped-def]
-    """Compute the cost of going `far` samples ahead (a loss), or back (rows without a sample)."""
-    if far > 0:
-        return _LOSS_NATS + np.log(far)
-    return min(-_DROP_NATS * far, _LATE_NATS)
+def _switch_nats(jump):  # type: ignore[no-untyped-def]
+    """Compute the cost of going `jump` samples ahead (a loss), or back (rows without a sample)."""
+    if jump > 0:
+        return _LOSS_NATS + np.log(jump)
+    return min(-_DROP_NATS * jump, _LATE_NATS)
 
 
 @njit(**INNER)
@@ -85,18 +85,18 @@ def _prune_hypotheses(table, n):  # type: ignore[no-untyped-def]
         if table[h, 2] < table[best, 2]:
             best = np.int64(h)
     level, cost = table[best, 0], table[best, 2]
-    kept = np.int64(0)
+    size = np.int64(0)
     for h in range(n):
-        far = table[h, 0] - level
-        if far == 0.0 or table[h, 2] < cost + _switch_nats(far):
+        jump = table[h, 0] - level
+        if jump == 0.0 or table[h, 2] < cost + _switch_nats(jump):
             for c in range(4):
-                table[kept, c] = table[h, c]
-            kept += 1
-    return kept
+                table[size, c] = table[h, c]
+            size += 1
+    return size
 
 
 @njit(**INNER)
-def _extend_hypothesis(new, kept, old, h, position, following, sigma, gain, hold, most):  # type: ignore[no-untyped-def]
+def _extend_hypothesis(new, size, old, h, position, following, sigma, gain, hold, max_lost):  # type: ignore[no-untyped-def]
     """Add the successors of hypothesis h for a row at `position`, and the next at `following`."""
     level, phase, cost = old[h, 0], old[h, 1], old[h, 2]
     weight = 0.5 / sigma**2
@@ -106,32 +106,35 @@ def _extend_hypothesis(new, kept, old, h, position, following, sigma, gain, hold
         level, phase = level - 1.0, phase + 1.0
     off = position - level - phase
     step = gain * off if weight * off * off < _OUTLIER_NATS else 0.0
-    kept = _keep_hypothesis(new, kept, level, phase + step, cost + _stamp_nats(off, weight), h)
-    low, far = np.rint(off - _REACH_SIGMA * sigma), min(np.rint(off + _REACH_SIGMA * sigma), most)
-    while far >= low:  # a loss whose end this row may be, or a row too many
-        if far > 0.0 or (far < 0.0 and far == np.rint(off)):
-            rest = off - far
-            dear = cost + _switch_nats(far) + _stamp_nats(rest, weight)
-            kept = _keep_hypothesis(new, kept, level + far, phase + gain * rest, dear, h)
-        far -= 1.0
+    size = _keep_hypothesis(new, size, level, phase + step, cost + _stamp_nats(off, weight), h)
+    low, jump = (
+        np.rint(off - _REACH_SIGMA * sigma),
+        min(np.rint(off + _REACH_SIGMA * sigma), max_lost),
+    )
+    while jump >= low:  # a loss whose end this row may be, or a row too many
+        if jump > 0.0 or (jump < 0.0 and jump == np.rint(off)):
+            residual = off - jump
+            dear = cost + _switch_nats(jump) + _stamp_nats(residual, weight)
+            size = _keep_hypothesis(new, size, level + jump, phase + gain * residual, dear, h)
+        jump -= 1.0
     ahead = np.rint(following - level - phase)
     if (
-        1.0 <= ahead <= most and abs(ahead - off) > _REACH_SIGMA * sigma + 0.5
+        1.0 <= ahead <= max_lost and abs(ahead - off) > _REACH_SIGMA * sigma + 0.5
     ):  # a loss of which the next row shows the end
         dear = cost + _switch_nats(ahead) + _stamp_nats(off - ahead, weight)
-        kept = _keep_hypothesis(new, kept, level + ahead, phase, dear, h)
-    return kept
+        size = _keep_hypothesis(new, size, level + ahead, phase, dear, h)
+    return size
 
 
 @njit(**INNER)
-def _seed_hypotheses(table, level, phase, first, most):  # type: ignore[no-untyped-def]
+def _seed_hypotheses(table, level, phase, first, max_lost):  # type: ignore[no-untyped-def]
     """Start with a hypothesis; samples may be lost between the first rows of a piece."""
     table[0, 0], table[0, 1], table[0, 2] = level, phase, 0.0
     size = np.int64(1)
     if not np.isnan(first):
         for lost in range(1, 1 + _EARLY_LOSSES):
             size = _keep_hypothesis(table, size, level - lost, phase, 0.0, np.int64(0))
-        if np.rint(first - phase) <= most:
+        if np.rint(first - phase) <= max_lost:
             size = _keep_hypothesis(
                 table, size, np.rint(first - phase), phase, _LOSS_NATS, np.int64(0)
             )  # or many, just after the first
@@ -148,10 +151,10 @@ def trace(  # type: ignore[no-untyped-def]
     sigma,
     gain,
     hold,
-    most,
+    max_lost,
     level0,
     phase0,
-    seen,
+    averaged_rows,
     levels,
     phases,
 ):
@@ -173,12 +176,12 @@ def trace(  # type: ignore[no-untyped-def]
     hold : float
         A phase further from zero than this is turned into a sample left out, or a row dropped
         [samples].
-    most : float
+    max_lost : float
         Samples that may be lost at one time: damaged stamps far ahead are outliers, and not the end
         of a loss.
     level0, phase0 : int, float
         Samples lost so far, and phase of the clock [samples].
-    seen : int
+    averaged_rows : int
         Rows that `phase0` averages; 0 at the beginning, where `level0` and fewer by up to 3 are all
         as likely.
     levels, phases : ndarray of int64 and float64, shape (n,)
@@ -193,19 +196,23 @@ def trace(  # type: ignore[no-untyped-def]
     old, new = np.empty((_MOST, 4)), np.empty((_MOST, 4))
     parents = np.empty((n, _MOST), dtype=np.int8)
     table = np.empty((n, _MOST, 2))
-    first = (stamps[0] - stamp0) / period - (count[0] - count0) if seen == 0 and n > 0 else np.nan
-    size = _seed_hypotheses(old, level0, phase0, first, most)
+    first = (
+        (stamps[0] - stamp0) / period - (count[0] - count0)
+        if averaged_rows == 0 and n > 0
+        else np.nan
+    )
+    size = _seed_hypotheses(old, level0, phase0, first, max_lost)
     for i in range(n):
         position = (stamps[i] - stamp0) / period - (count[i] - count0)
-        after = min(i + 1, n - 1)
-        following = (stamps[after] - stamp0) / period - (count[after] - count0)
-        follows = max(gain, 1.0 / (max(seen, _FIRST_ROWS) + i + 1.0))
-        kept = np.int64(0)
+        next_row = min(i + 1, n - 1)
+        following = (stamps[next_row] - stamp0) / period - (count[next_row] - count0)
+        follows = max(gain, 1.0 / (max(averaged_rows, _FIRST_ROWS) + i + 1.0))
+        new_size = np.int64(0)
         for h in range(size):
-            kept = _extend_hypothesis(
-                new, kept, old, h, position, following, sigma, follows, hold, most
+            new_size = _extend_hypothesis(
+                new, new_size, old, h, position, following, sigma, follows, hold, max_lost
             )
-        size = _prune_hypotheses(new, kept) if kept > 1 else kept
+        size = _prune_hypotheses(new, new_size) if new_size > 1 else new_size
         for h in range(size):
             table[i, h, 0], table[i, h, 1], parents[i, h] = new[h, 0], new[h, 1], np.int8(new[h, 3])
         old, new = new, old
@@ -245,7 +252,7 @@ def find_breaks(stamps, n, latest, reach, longest):  # type: ignore[no-untyped-d
         Latest stamp of the first `n` [ns].
     """
     breaks = np.empty((n, 2), dtype=np.int64)
-    found = np.int64(0)
+    count = np.int64(0)
     for j in range(n):
         end = min(len(stamps), j + 1 + _PERSIST_ROWS)
         if stamps[j] < latest - reach or stamps[j] > latest + longest:
@@ -257,17 +264,17 @@ def find_breaks(stamps, n, latest, reach, longest):  # type: ignore[no-untyped-d
                     break
             if not lasting:
                 continue
-            breaks[found, 0], breaks[found, 1] = j, latest
-            found += 1
+            breaks[count, 0], breaks[count, 1] = j, latest
+            count += 1
             latest = stamps[j]
         elif stamps[j] > latest:
-            after = stamps[j]  # a damaged stamp is ahead of all that follow
-            if j + 1 < end and stamps[j + 1] < after - reach:
-                after = stamps[j + 1]
+            later_stamp = stamps[j]  # a damaged stamp is ahead of all that follow
+            if j + 1 < end and stamps[j + 1] < later_stamp - reach:
+                later_stamp = stamps[j + 1]
                 if j + 2 < end:
-                    after = max(after, stamps[j + 2])
-            latest = max(latest, min(stamps[j], after))
-    return breaks[:found].copy(), latest
+                    later_stamp = max(later_stamp, stamps[j + 2])
+            latest = max(latest, min(stamps[j], later_stamp))
+    return breaks[:count].copy(), latest
 
 
 @njit(**KERNEL)

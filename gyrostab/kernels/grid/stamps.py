@@ -100,7 +100,7 @@ def track(stamps, period, gain, longest):  # type: ignore[no-untyped-def]
     count = np.zeros(n, dtype=np.int64)
     piece = np.zeros(n, dtype=np.int64)
     phase = 0.0  # of the latest sample, behind its stamp [ns]
-    least, most = (0.5 + _NEAR) * period, (1.5 - _NEAR) * period
+    low, high = (0.5 + _NEAR) * period, (1.5 - _NEAR) * period
     for i in range(1, n):
         step = float(stamps[i] - stamps[i - 1])
         piece[i] = piece[i - 1]
@@ -110,7 +110,7 @@ def track(stamps, period, gain, longest):  # type: ignore[no-untyped-def]
             continue
         moved = step + phase
         if (
-            least < moved < most
+            low < moved < high
         ):  # nearly always one sample; the next stamp shows it without a division
             count[i] = count[i - 1] + 1
             phase = (1.0 - gain) * (moved - period)
@@ -154,14 +154,14 @@ def piece_sums(stamps, count, piece, period):  # type: ignore[no-untyped-def]
             mean_count += count[i] - count0
             mean_stamp += stamps[i] - stamp0
         mean_count, mean_stamp = mean_count / size, mean_stamp / size
-        squares = products = rest = 0.0
+        squares = products = residuals = 0.0
         for i in range(begin, end):
             c, t = count[i] - count0 - mean_count, stamps[i] - stamp0 - mean_stamp
             squares += c * c
             products += c * t
         slope = products / squares if squares > 0.0 else period
         for i in range(begin, end):
-            rest += (
+            residuals += (
                 stamps[i] - stamp0 - mean_stamp - slope * (count[i] - count0 - mean_count)
             ) ** 2
         table[row, 0], table[row, 1], table[row, 2] = (
@@ -169,7 +169,7 @@ def piece_sums(stamps, count, piece, period):  # type: ignore[no-untyped-def]
             mean_count + count0,
             mean_stamp + (stamp0 - stamps[0]),
         )
-        table[row, 3], table[row, 4], table[row, 5] = squares, products, rest
+        table[row, 3], table[row, 4], table[row, 5] = squares, products, residuals
         begin = end
     return table
 
@@ -199,18 +199,18 @@ def scan_cells(cells, present):  # type: ignore[no-untyped-def]
     present[:] = False
     nans = infinite = np.int64(0)
     for axis in range(axes):
-        least, most = np.inf, -np.inf
+        smallest, largest = np.inf, -np.inf
         for row in range(n):
             value = cells[axis, row]
             if np.isfinite(value):
-                least, most = min(least, value), max(most, value)
+                smallest, largest = min(smallest, value), max(largest, value)
                 present[row] = True
             elif np.isnan(value):
                 nans += 1
             else:
                 infinite += 1
                 present[row] = True
-        low[axis], high[axis] = least, most
+        low[axis], high[axis] = smallest, largest
     absent = np.int64(0)
     for row in range(n):
         absent += not present[row]
@@ -220,7 +220,7 @@ def scan_cells(cells, present):  # type: ignore[no-untyped-def]
 @njit(**INNER)
 def _fits_counting(stamps, j, expected, period, state):  # type: ignore[no-untyped-def]
     """Check whether the next readable stamps after row j agree with unbroken counting."""
-    found = 0
+    count = 0
     zero = state[_GRID0] - state[_PHASE] * _UNIT
     for m in range(j + 1, min(len(stamps), j + 1 + LOOK_AHEAD)):
         if stamps[m] == NO_STAMP:
@@ -228,8 +228,8 @@ def _fits_counting(stamps, j, expected, period, state):  # type: ignore[no-untyp
         position = zero + (stamps[m] - state[_STAMP0]) / period
         if abs(position - (expected + (m - j))) > 0.5:
             return False
-        found += 1
-        if found == 2:
+        count += 1
+        if count == 2:
             return True
     return False
 
@@ -237,30 +237,30 @@ def _fits_counting(stamps, j, expected, period, state):  # type: ignore[no-untyp
 @njit(**INNER)
 def _stays_behind(stamps, j, n, latest):  # type: ignore[no-untyped-def]
     """Check whether the stamps after row j stay behind the latest one: the clock was set back."""
-    found = 0
+    count = 0
     for m in range(j + 1, min(n, j + 1 + LOOK_AHEAD)):
         if stamps[m] == NO_STAMP:
             continue
         if stamps[m] > latest:
             return False
-        found += 1
-        if found == _ORDER:
+        count += 1
+        if count == _ORDER:
             break
-    return found > 1
+    return count > 1
 
 
 @njit(**INNER)
 def _estimate_origin(stamps, j, period):  # type: ignore[no-untyped-def]
     """Estimate the true stamp [ns] of sample j from later stamps, so that its jitter is removed."""
-    total, found = 0.0, 0
+    total, count = 0.0, 0
     for m in range(j, min(len(stamps), j + 32)):
         if stamps[m] == NO_STAMP:
             continue
         position = (stamps[m] - stamps[j]) / period
         if abs(position) < 500:
             total += position - np.rint(position)
-            found += 1
-    return stamps[j] + np.int64(np.rint(total / found * period))
+            count += 1
+    return stamps[j] + np.int64(np.rint(total / count * period))
 
 
 @njit(**INNER)

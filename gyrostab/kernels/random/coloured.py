@@ -206,23 +206,23 @@ def read_process(
     """
     n, d = normal.shape[0], position.size
     values = np.empty(n)
-    here, there = position.copy(), np.empty(d)
+    state, next_state = position.copy(), np.empty(d)
     for i in range(n):
         value = 0.0
         for k in range(d):
-            value += read[k] * here[k]
+            value += read[k] * state[k]
         for k in range(d + 1):
             value += kick[d, k] * normal[i, k]
         values[i] = value
         for j in range(d):
             x = 0.0
             for k in range(d):
-                x += step[j, k] * here[k]
+                x += step[j, k] * state[k]
             for k in range(j + 1):
                 x += kick[j, k] * normal[i, k]
-            there[j] = x
-        here, there = there, here
-    return values, here
+            next_state[j] = x
+        state, next_state = next_state, state
+    return values, state
 
 
 # --------------------------------------------------------------------------------------------------

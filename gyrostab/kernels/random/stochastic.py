@@ -74,7 +74,7 @@ def brownian_means(steps: Array, inner: Array, carry: float) -> tuple[Array, flo
 
 @njit(**KERNEL)
 def ornstein_uhlenbeck(
-    normal: Array, decay: Array, weight: Array, rest: float, position: Array
+    normal: Array, decay: Array, weight: Array, rest_deviation: float, position: Array
 ) -> tuple[Array, Array]:
     """Sum the sample means of Ornstein-Uhlenbeck processes of unit variance.
 
@@ -87,7 +87,7 @@ def ornstein_uhlenbeck(
         ``1 - exp(-1 / T)`` for the correlation times T [samples].
     weight : ndarray, shape (m,)
         Factor of each process's ends in its mean.
-    rest : float
+    rest_deviation : float
         Standard deviation of the sum of the means, given the ends.
     position : ndarray, shape (m,)
         State of the processes at the start of the first sample.
@@ -104,11 +104,11 @@ def ornstein_uhlenbeck(
     x = position.copy()
     kick = np.sqrt(decay * (2.0 - decay))
     for i in range(n):
-        s = rest * normal[i, m]
+        s = rest_deviation * normal[i, m]
         for j in range(m):
-            before = x[j]
-            x[j] = before - decay[j] * before + kick[j] * normal[i, j]
-            s += weight[j] * (before + x[j])
+            start = x[j]
+            x[j] = start - decay[j] * start + kick[j] * normal[i, j]
+            s += weight[j] * (start + x[j])
         total[i] = s
     return total, x
 
@@ -120,10 +120,10 @@ def _mean_moments(samples: Array) -> tuple[Array, Array, Array]:
     weight = np.tanh(a / 2.0) / a
     with np.errstate(over="ignore"):
         exact = 2.0 * (a - decay) / a**2 - 2.0 * weight * decay / a
-    rest = np.where(
+    rest_variance = np.where(
         a < 0.01, a / 6.0 - a**3 / 60.0, exact
     )  # the difference loses its digits where the process is slow
-    return decay, weight, rest
+    return decay, weight, rest_variance
 
 
 def ornstein_uhlenbeck_means(normal: Array, samples: float, position: float) -> tuple[Array, float]:
@@ -150,9 +150,9 @@ def ornstein_uhlenbeck_means(normal: Array, samples: float, position: float) -> 
     >>> means.round(4), round(position, 4)  # (1 - 1/e) e^-n and e^-3
     (array([0.6321, 0.2325, 0.0855]), 0.0498)
     """
-    decay, weight, rest = _mean_moments(np.array([float(samples)]))
+    decay, weight, rest_variance = _mean_moments(np.array([float(samples)]))
     total, last = ornstein_uhlenbeck(
-        normal, decay, weight, math.sqrt(rest[0]), np.array([position])
+        normal, decay, weight, math.sqrt(rest_variance[0]), np.array([position])
     )
     return total, float(last[0])
 
@@ -194,9 +194,9 @@ def flicker_means(
     means : ndarray, shape (n,)
     position : ndarray, shape (m,)
     """
-    decay, weight, rest = _mean_moments(times * rate)
+    decay, weight, rest_variance = _mean_moments(times * rate)
     variance = math.log(RATIO) / math.pi  # of each process
-    inner = rest.sum()
+    inner = rest_variance.sum()
     if endless:  # sum of 2 T over the correlation times that would follow; together they are white
         inner += 2.0 * times[-1] * rate / (RATIO - 1.0)
     total, last = ornstein_uhlenbeck(normal, decay, weight, math.sqrt(inner), position)

@@ -136,14 +136,14 @@ def remaining_information(innovation, gain, decay, out):  # type: ignore[no-unty
             out[t] = later
             continue
         along = np.zeros(q)
-        both = 1.0 / innovation[t]
+        information = 1.0 / innovation[t]
         for i in range(q):
             for j in range(q):
                 along[i] += later[i, j] * gain[t, j]
-            both += along[i] * gain[t, i]
+            information += along[i] * gain[t, i]
         for i in range(q):
             for j in range(q):
-                out[t, i, j] = later[i, j] - along[i] - along[j] + both
+                out[t, i, j] = later[i, j] - along[i] - along[j] + information
 
 
 @njit(**KERNEL)

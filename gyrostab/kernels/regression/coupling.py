@@ -99,7 +99,10 @@ def decompose(family: list[Array], prior: Array) -> Laws:
     """Factor covariances (n, n), each with the logarithm of its prior weight."""
     factor, n = np.linalg.cholesky(np.array(family)), family[0].shape[0]
     whiten = np.array(
-        [solve_triangular(one, np.eye(n), lower=True, check_finite=False) for one in factor]
+        [
+            solve_triangular(triangle, np.eye(n), lower=True, check_finite=False)
+            for triangle in factor
+        ]
     )
     log_det = 2.0 * np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
     return Laws(factor, whiten, log_det, np.asarray(prior), n - 1)
@@ -142,11 +145,11 @@ def fit_lags(laws: Laws, series: Array, driver: Array) -> LagFit:
     xx = np.maximum((x * x).sum(axis=1), 1e-30)[:, None, :]
     yy = (y * y).sum(axis=1)[:, :, None]
     xy = np.swapaxes(y, 1, 2) @ x
-    rest = np.maximum(yy - xy**2 / xx, 1e-12 * yy + 1e-30)
+    residual = np.maximum(yy - xy**2 / xx, 1e-12 * yy + 1e-30)
     const = (laws.prior - 0.5 * laws.log_det)[:, None, None]
-    weight = const - 0.5 * (np.log(xx) + laws.freedom * np.log(rest / n))
+    weight = const - 0.5 * (np.log(xx) + laws.freedom * np.log(residual / n))
     without = const[:, :, 0] - 0.5 * (laws.freedom + 1) * np.log(yy[:, :, 0] / n + 1e-30)
-    return LagFit(xy / xx, np.sqrt(rest / laws.freedom / xx), weight, without, laws.freedom)
+    return LagFit(xy / xx, np.sqrt(residual / laws.freedom / xx), weight, without, laws.freedom)
 
 
 def weights(fit: LagFit) -> Array:
@@ -198,7 +201,7 @@ def simulate_p_values(
         np.cumsum(weight), (np.arange(draws) + 0.5) / draws * weight.sum() * (1.0 - 1e-12)
     )
     made = np.concatenate(
-        [laws.factor[one] @ normal[:, law == one] for one in np.unique(law)], axis=1
+        [laws.factor[number] @ normal[:, law == number] for number in np.unique(law)], axis=1
     )
     # single precision takes half the time, and is enough for a share
     short = laws._replace(
@@ -224,9 +227,9 @@ def calibrated(p: float, chance: Array) -> float:
 def uncalibrated(share: float, chance: Array) -> float:
     """Find the p-value below which this share of simulated noise lies: inverse of `calibrated`."""
     sample = np.sort(chance)
-    edge, least, power = _lower_tail(sample)
-    if share < least:
-        return float(edge * (share / least) ** (1.0 / power))
+    edge, edge_share, power = _lower_tail(sample)
+    if share < edge_share:
+        return float(edge * (share / edge_share) ** (1.0 / power))
     return float(
         np.interp(
             share,

@@ -50,11 +50,11 @@ def smooth_curve(values: Array, *, longest: float) -> Array:
     if n < _FEWEST or np.abs(np.diff(values, 2)).max() <= 1e-12 * np.abs(values).max():
         return values
     bands = np.zeros((3, n))  # below the diagonal of D' D, for the second differences D
-    for row, one in enumerate(_DIFFERENCE):
+    for row, coefficient in enumerate(_DIFFERENCE):
         for offset, other in enumerate(_DIFFERENCE[row:]):
-            bands[offset, row : row + n - 2] += one * other
+            bands[offset, row : row + n - 2] += coefficient * other
     stiffness = (2.0 - 2.0 * np.cos(math.pi * np.arange(n) / n)) ** 2
-    best, kept = np.inf, values
+    best, best_curve = np.inf, values
     middle = values.mean()
     for length in np.geomspace(_LEAST, max(longest, _LEAST), _STEPS):
         ridge = length**4 * bands
@@ -63,5 +63,5 @@ def smooth_curve(values: Array, *, longest: float) -> Array:
         freedom = float(np.mean(1.0 / (1.0 + length**4 * stiffness)))
         score = float(np.mean((values - curve) ** 2)) / (1.0 - freedom) ** 2
         if score < best:
-            best, kept = score, np.asarray(curve)
-    return kept
+            best, best_curve = score, np.asarray(curve)
+    return best_curve

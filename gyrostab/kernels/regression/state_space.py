@@ -62,7 +62,7 @@ def _block_moments(step, K2, ou_variance, ou_time, decay, weight, drive, shared)
     the covariance of the innovation with the mean.
     """
     decay[0], weight[0], drive[0], shared[0] = 1.0, 1.0, K2 * step, K2 * step / 2.0
-    rest = K2 * step / 3.0
+    mean_variance = K2 * step / 3.0
     for j in range(ou_variance.size):
         v, a = ou_variance[j], step / ou_time[j]
         lost = -np.expm1(-a)
@@ -71,10 +71,10 @@ def _block_moments(step, K2, ou_variance, ou_time, decay, weight, drive, shared)
         drive[j + 1] = v * lost * (2.0 - lost)
         shared[j + 1] = v * lost * lost / a
         if a < 1e-3:  # the differences below lose their digits
-            rest += v * a * (2.0 / 3.0 - a / 2.0 + 7.0 * a * a / 30.0)
+            mean_variance += v * a * (2.0 / 3.0 - a / 2.0 + 7.0 * a * a / 30.0)
         else:
-            rest += v * (2.0 * (a - lost) - lost * lost) / (a * a)
-    return rest
+            mean_variance += v * (2.0 * (a - lost) - lost * lost) / (a * a)
+    return mean_variance
 
 
 @njit(**INNER)
@@ -168,11 +168,13 @@ def whiten(
     covariance = np.zeros((m, m))
     for j in range(1, m):
         covariance[j, j] = ou_variance[j - 1]
-    total, known, last, walked, rest = 0.0, False, np.nan, np.nan, 0.0
+    total, has_level, last, walked, mean_variance = 0.0, False, np.nan, np.nan, 0.0
     for i in range(n):
         if step_seconds[i] != last or K2[i] != walked:
             last, walked = step_seconds[i], K2[i]
-            rest = _block_moments(last, walked, ou_variance, ou_time, decay, weight, drive, shared)
+            mean_variance = _block_moments(
+                last, walked, ou_variance, ou_time, decay, weight, drive, shared
+            )
         if not present[i]:
             for j in range(m):
                 for c in range(width):
@@ -180,10 +182,12 @@ def whiten(
             _advance_states(covariance, decay, drive)
             continue
         F = (
-            variance[i] + rest + _project_covariance(covariance, weight, 0 if known else 1, gain)
+            variance[i]
+            + mean_variance
+            + _project_covariance(covariance, weight, 0 if has_level else 1, gain)
         )  # of the innovation; the level counts once known
-        if not known:  # the level becomes what the mean says, with the error of all the rest
-            known = True
+        if not has_level:  # the level becomes what the mean says, with the error of all the rest
+            has_level = True
             _advance_states(covariance, decay, drive)
             covariance[0, 0] = F + drive[0] - 2.0 * shared[0]
             for j in range(1, m):

@@ -65,10 +65,12 @@ def window_trend(values, seconds, first, last):  # type: ignore[no-untyped-def]
             values[begin],
             seconds[begin],
         )  # near the mean, so that the sums lose no digits
-        here, there = values[begin:end], seconds[begin:end]
-        count, total, elapsed = _sum_finite(here, there, origin, start)
+        window_values, window_seconds = values[begin:end], seconds[begin:end]
+        count, total, elapsed = _sum_finite(window_values, window_seconds, origin, start)
         out[0, j] = mean = origin + total / count
-        covariance, variance = _sum_products(here, there, mean, start + elapsed / count)
+        covariance, variance = _sum_products(
+            window_values, window_seconds, mean, start + elapsed / count
+        )
         if variance > 0.0:
             out[1, j] = covariance / variance
     return out

@@ -72,9 +72,9 @@ def slow_covariance(mean: Any, time: Array, length: float, memory: float) -> Arr
     ahead, behind = np.asarray(mean @ grown), np.asarray(mean @ (1.0 / grown))
     upper = np.triu(np.exp(-np.abs(np.subtract.outer(centre, centre)) / memory), 1)
     upper *= np.outer(ahead, behind)
-    before = np.cumsum(grown) - np.append(0.0, np.cumsum(grown))[mean.indptr[:-1]][block]
+    running_sum = np.cumsum(grown) - np.append(0.0, np.cumsum(grown))[mean.indptr[:-1]][block]
     size = np.diff(mean.indptr)
-    within = (2.0 * np.asarray(mean @ (before / grown)) - 1.0) / size
+    within = (2.0 * np.asarray(mean @ (running_sum / grown)) - 1.0) / size
     distant = (2.0 * memory / length * np.sinh(0.5 * length / memory)) ** 2
     rows, columns = _find_overlaps(time, length)
     x = (length - (time[columns] - time[rows])) / memory

@@ -45,10 +45,10 @@ def sample_covariance(size: int, rate: float) -> Array:
     out[0, :2] = 2.0 * rate**2, -(rate**2)
     out[1, 0] = rate
     inner = np.log(np.maximum(lag, 1.0)) * lag**2
-    far = np.maximum(lag[:-1], 1.0)
+    distance = np.maximum(lag[:-1], 1.0)
     out[2] = _second_difference(0.75 * lag**2 - 0.5 * inner) / math.pi
     series = (
-        -(np.log(far) - 1.0 / (12.0 * far**2)) / math.pi
+        -(np.log(distance) - 1.0 / (12.0 * distance**2)) / math.pi
     )  # of the second difference, which loses its digits far out
     out[2] = np.where(lag[:-1] > 1000.0, series, out[2])
     out[3] = np.where(lag[:-1] > 0.0, -lag[:-1] / 2.0, -1.0 / 6.0) / rate
@@ -112,12 +112,12 @@ def expected_powers(weights: Array, rate: float, ordinates: int) -> Array:
     )
     density = np.fft.fft(wrapped, axis=1).real
     taper, box = np.fft.fft(weights, 2 * size), np.fft.fft(np.ones(size), 2 * size)
-    found = np.empty((4, places.size))
+    powers = np.empty((4, places.size))
     for number, k in enumerate(places):
-        seen = np.roll(taper, 2 * k) - taper[2 * k] * box / size
-        found[:, number] = density @ (seen.real**2 + seen.imag**2) / (2 * size)
-    found /= found[1]
-    ratio = found / _plain_spectra(places * rate / size, rate)
-    wanted = np.arange(1, ordinates + 1)
-    between = np.stack([np.interp(np.log(wanted), np.log(places), row) for row in ratio])
-    return np.asarray(between * _plain_spectra(wanted * rate / size, rate))
+        response = np.roll(taper, 2 * k) - taper[2 * k] * box / size
+        powers[:, number] = density @ (response.real**2 + response.imag**2) / (2 * size)
+    powers /= powers[1]
+    ratio = powers / _plain_spectra(places * rate / size, rate)
+    lines = np.arange(1, ordinates + 1)
+    between = np.stack([np.interp(np.log(lines), np.log(places), row) for row in ratio])
+    return np.asarray(between * _plain_spectra(lines * rate / size, rate))

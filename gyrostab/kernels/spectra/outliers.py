@@ -75,21 +75,21 @@ def _insert_sorted(values, count, value):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _median_pairs(row, i, near):  # type: ignore[no-untyped-def]
+def _median_pairs(row, i, neighbours):  # type: ignore[no-untyped-def]
     """Median of the pairs of samples that are both there, and their number."""
     count = 0
     for apart in range(1, _PAIRS + 1):
         if i - apart < 0 or i + apart >= row.size:
             break
-        one, other = row[i - apart], row[i + apart]
-        if one != one or other != other:
+        left, right = row[i - apart], row[i + apart]
+        if left != left or right != right:
             continue
-        _insert_sorted(near, count, one)
-        _insert_sorted(near, count + 1, other)
+        _insert_sorted(neighbours, count, left)
+        _insert_sorted(neighbours, count + 1, right)
         count += 2
     if count == 0:
         return np.nan, 0
-    return 0.5 * (near[count // 2 - 1] + near[count // 2]), count // 2
+    return 0.5 * (neighbours[count // 2 - 1] + neighbours[count // 2]), count // 2
 
 
 @njit(**INNER)
@@ -97,14 +97,14 @@ def _one_sided(row, i):  # type: ignore[no-untyped-def]
     """Compute the departure at an edge from the level or slope of four samples on one side."""
     for side in (1, -1):
         if 0 <= i + _PAIRS * side < row.size:
-            one, two = row[i + side], row[i + 2 * side]
-            _, low, high, _ = _sorted_four(one, two, row[i + 3 * side], row[i + 4 * side])
+            first, second = row[i + side], row[i + 2 * side]
+            _, low, high, _ = _sorted_four(first, second, row[i + 3 * side], row[i + 4 * side])
             level = (row[i] - 0.5 * (low + high)) * math.sqrt(
                 (1.0 + _MEDIANS[4]) / (1.0 + _MEDIANS[2])
             )
-            slope = (row[i] - 2.0 * one + two) * math.sqrt((1.0 + _MEDIANS[4]) / 6.0)
-            both = one + two + row[i + 3 * side] + row[i + 4 * side]
-            if both == both:
+            slope = (row[i] - 2.0 * first + second) * math.sqrt((1.0 + _MEDIANS[4]) / 6.0)
+            total = first + second + row[i + 3 * side] + row[i + 4 * side]
+            if total == total:
                 if level * slope <= 0.0:
                     return 0.0
                 return level if abs(level) < abs(slope) else slope
@@ -126,7 +126,7 @@ def departures(x, out, histogram):  # type: ignore[no-untyped-def]
         The number of absolute departures by size is added to it.
     """
     size = x.shape[1]
-    near = np.empty(2 * _PAIRS)
+    neighbours = np.empty(2 * _PAIRS)
     share = np.empty(_PAIRS + 1)
     for pairs in range(_PAIRS + 1):
         share[pairs] = math.sqrt((1.0 + _MEDIANS[_PAIRS]) / (1.0 + _MEDIANS[pairs]))
@@ -148,7 +148,7 @@ def departures(x, out, histogram):  # type: ignore[no-untyped-def]
                 if total == total:
                     middle = _median_eight(row, i)
             if middle != middle:
-                middle, pairs = _median_pairs(row, i, near)
+                middle, pairs = _median_pairs(row, i, neighbours)
             away = _one_sided(row, i) if pairs < 2 else np.nan
             if away != away:
                 away = (row[i] - middle) * share[pairs]
@@ -174,25 +174,25 @@ def _noise_level(away, low, high, room):  # type: ignore[no-untyped-def]
 @njit(**INNER)
 def _largest_noise_level(away, i, room):  # type: ignore[no-untyped-def]
     """Find a lower bound of the noise level directly before or after a sample."""
-    found = 0.0
+    level = 0.0
     for window in _WINDOWS:
-        found = max(
-            found,
+        level = max(
+            level,
             _noise_level(away, i - 1 - window, i - 1, room),
             _noise_level(away, i + 2, i + 2 + window, room),
         )
-    return found
+    return level
 
 
 @njit(**INNER)
 def _is_outlier(row, away, i, limit):  # type: ignore[no-untyped-def]
     """Check that a sample exceeds both neighbours by far, with no half as large one nearby."""
     side = 1.0 if away[i] > 0.0 else -1.0
-    least = _ALONE * abs(away[i])
+    min_excess = _ALONE * abs(away[i])
     for j in range(max(i - 2, 0), min(i + 3, row.size)):
         if j != i and (
             abs(away[j]) > max(limit, 0.5 * abs(away[i]))
-            or (abs(i - j) == 1 and side * (row[i] - row[j]) < least)
+            or (abs(i - j) == 1 and side * (row[i] - row[j]) < min_excess)
         ):
             return False
     return True
@@ -229,7 +229,7 @@ def peaks(x, away, deviation, limit):  # type: ignore[no-untyped-def]
     block, size, level = np.empty(count, np.int64), np.empty(count), np.empty(count)
     place, loud = np.empty(count, np.int64), np.empty(count)
     room = np.empty(_WINDOWS[-1])
-    found = 0
+    n_peaks = 0
     for b in range(x.shape[0]):
         beyond = 0
         for i in range(x.shape[1]):
@@ -245,6 +245,6 @@ def peaks(x, away, deviation, limit):  # type: ignore[no-untyped-def]
             if abs(away[b, i]) > limit * level_here and _is_outlier(
                 x[b], away[b], i, limit * deviation[b]
             ):
-                block[found], size[found], level[found] = b, abs(away[b, i]), level_here
-                found += 1
-    return block[:found], size[:found], level[:found]
+                block[n_peaks], size[n_peaks], level[n_peaks] = b, abs(away[b, i]), level_here
+                n_peaks += 1
+    return block[:n_peaks], size[:n_peaks], level[:n_peaks]

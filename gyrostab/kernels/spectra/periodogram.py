@@ -76,7 +76,7 @@ def band_edges(size: int, bands: int = 16) -> NDArray[np.int64]:
 
 
 @njit(**KERNEL)
-def resent_samples(bits, least, out):  # type: ignore[no-untyped-def]
+def resent_samples(bits, min_length, out):  # type: ignore[no-untyped-def]
     """Count the samples of each block that repeat earlier ones in their order.
 
     Such samples belong to a run in which each equals the one at the same distance before, at least
@@ -86,7 +86,7 @@ def resent_samples(bits, least, out):  # type: ignore[no-untyped-def]
     ----------
     bits : ndarray of int64, shape (block, sample)
         Values as bit patterns; 0 where missing or exactly zero.
-    least : int
+    min_length : int
         Samples that a run has at least.
     out : ndarray of int64, shape (block, 2)
         Overwritten with the samples in runs, and the runs.
@@ -105,18 +105,18 @@ def resent_samples(bits, least, out):  # type: ignore[no-untyped-def]
             slot = (value ^ (value >> 23) ^ (value >> 41)) & mask
             while table[slot] >= 0 and row[table[slot]] != value:
                 slot = (slot + 1) & mask
-            found = table[slot]
-            is_new = value == 0 or found < 0 or found == i - 1
+            earlier = table[slot]
+            is_new = value == 0 or earlier < 0 or earlier == i - 1
             if value != 0:
                 table[slot] = i
             goes_on = not is_new and length > 0 and row[i - lag] == value
             if not goes_on:
-                length, lag = 0, i - found
+                length, lag = 0, i - earlier
             length = 0 if is_new else length + 1
-            if length == least:
-                samples += least
+            if length == min_length:
+                samples += min_length
                 runs += 1
-            elif length > least:
+            elif length > min_length:
                 samples += 1
         out[b, 0], out[b, 1] = samples, runs
 
@@ -156,11 +156,11 @@ def block_samples(x, centred, moments, counts):  # type: ignore[no-untyped-def]
             present += 1
             total += value - first
             zeros += value == 0.0
-            again = i > 0 and value == row[i - 1] and value != 0.0
-            repeats += again
-            runs += again and not repeated
+            is_repeat = i > 0 and value == row[i - 1] and value != 0.0
+            repeats += is_repeat
+            runs += is_repeat and not repeated
             zero_runs += value == 0.0 and not zeroed
-            repeated, zeroed = again, value == 0.0
+            repeated, zeroed = is_repeat, value == 0.0
             low, high = min(low, value), max(high, value)
         mean = first + total / max(present, 1)
         second, fourth = 0.0, 0.0
@@ -270,9 +270,14 @@ def shape_of_bands(mask, squared, expected, present, edges, size):  # type: igno
                             if k < other
                             else _squared_at(squared, b, k - other, size)
                         )
-                        one = at - share * back
-                        two = _squared_at(squared, b, k + other, size) - share * mask[b, other]
-                        variance += one.real**2 + one.imag**2 + two.real**2 + two.imag**2
+                        difference_term = at - share * back
+                        sum_term = _squared_at(squared, b, k + other, size) - share * mask[b, other]
+                        variance += (
+                            difference_term.real**2
+                            + difference_term.imag**2
+                            + sum_term.real**2
+                            + sum_term.imag**2
+                        )
             else:
                 for apart in range(stop - first):
                     power = squared[b, apart].real ** 2 + squared[b, apart].imag ** 2
@@ -309,21 +314,25 @@ def band_covariance(size: int) -> Array:
     for apart in range(1, min(_APART, n)):
         k = np.arange(1, n + 1 - apart)
         share = mask[k] / size
-        one = squared[apart].conj() - share * mask[k + apart].conj()
-        two = squared[2 * k + apart] - share * mask[k + apart]
-        np.add.at(out, (band[k - 1], band[k + apart - 1]), np.abs(one) ** 2 + np.abs(two) ** 2)
+        difference_term = squared[apart].conj() - share * mask[k + apart].conj()
+        sum_term = squared[2 * k + apart] - share * mask[k + apart]
+        np.add.at(
+            out,
+            (band[k - 1], band[k + apart - 1]),
+            np.abs(difference_term) ** 2 + np.abs(sum_term) ** 2,
+        )
     np.fill_diagonal(out, 0.0)
     total = np.add.reduceat(expected, edges[:-1] - 1)
     return np.asarray((out + out.T) / np.outer(total, total))
 
 
 @njit(**KERNEL)
-def band_powers(one, other, expected, place, edges, rate):  # type: ignore[no-untyped-def]
+def band_powers(first, second, expected, place, edges, rate):  # type: ignore[no-untyped-def]
     """Average the cross-periodogram of each block and band, as a complex two-sided density.
 
     Parameters
     ----------
-    one, other : ndarray of complex, shape (block, ordinate)
+    first, second : ndarray of complex, shape (block, ordinate)
         Ordinates of two signals (or of one, twice) with the same mask.
     expected : ndarray, shape (mask, ordinate)
         Expected powers, from `gap_spectra`, of the masks that occur.
@@ -334,12 +343,12 @@ def band_powers(one, other, expected, place, edges, rate):  # type: ignore[no-un
     rate : float
         Sampling rate [Hz].
     """
-    out = np.empty((one.shape[0], edges.size - 1), np.complex128)
-    for b in range(one.shape[0]):
+    out = np.empty((first.shape[0], edges.size - 1), np.complex128)
+    for b in range(first.shape[0]):
         for band in range(edges.size - 1):
             total, norm = 0.0 + 0.0j, 0.0
             for k in range(edges[band] - 1, edges[band + 1] - 1):
-                total += one[b, k] * np.conj(other[b, k])
+                total += first[b, k] * np.conj(second[b, k])
                 norm += expected[place[b], k]
             out[b, band] = total / (norm * rate)
     return out
