@@ -181,8 +181,10 @@ class Effect:
     driver: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for known in self.parameters():
-            object.__setattr__(self, known.name, known.check(getattr(self, known.name), self.name))
+        for definition in self.parameters():
+            object.__setattr__(
+                self, definition.name, definition.check(getattr(self, definition.name), self.name)
+            )
         for name in ("axes", "driver"):
             value = getattr(self, name)
             object.__setattr__(self, name, (value,) if isinstance(value, str) else tuple(value))
@@ -196,9 +198,9 @@ class Effect:
                 f"effect {self.name!r}: driver names {len(self.driver)} channels; "
                 f"it takes {needs}, in this order"
             )
-        for known in self.parameters():
-            if known.many and self.axes:
-                self.each(known.name, self.axes)
+        for definition in self.parameters():
+            if definition.many and self.axes:
+                self.each(definition.name, self.axes)
 
     @classmethod
     def parameters(cls) -> tuple[Parameter, ...]:
@@ -221,13 +223,17 @@ class Effect:
     @classmethod
     def example(cls, **values: Any) -> Self:
         """Make the effect with its typical sizes, except for `values`."""
-        return cls(**{known.name: known.typical for known in cls.parameters()} | values)
+        return cls(
+            **{definition.name: definition.typical for definition in cls.parameters()} | values
+        )
 
     def switched_off(self) -> Self:
         """Make the same effect with zero size."""
         zero: dict[str, Any] = {
-            known.name: (0.0,) * len(getattr(self, known.name)) if known.many else 0.0
-            for known in self.parameters()
+            definition.name: (0.0,) * len(getattr(self, definition.name))
+            if definition.many
+            else 0.0
+            for definition in self.parameters()
         }
         return replace(self, **{name: zero[name] for name in self.size_parameters})
 
@@ -264,9 +270,9 @@ class Effect:
         """
         numbers = np.asarray(getattr(self, name), dtype=np.float64)
         if numbers.size not in (0, 1, len(axes)):
-            given = f"{numbers.size} numbers for {len(axes)} axes"
+            problem = f"{numbers.size} numbers for {len(axes)} axes"
             raise OptionError(
-                f"effect {self.name!r}, parameter {name!r}: {given}; give one number for each "
+                f"effect {self.name!r}, parameter {name!r}: {problem}; give one number for each "
                 f"of the axes {list(axes)}, or one for all"
             )
         return np.array(np.broadcast_to(numbers if numbers.size else 0.0, len(axes)))
@@ -322,11 +328,11 @@ class Effect:
 
     def quantity(self, name: str, errors: Mapping[str, float] | None = None) -> str:
         """Format a parameter with its error and unit: ``"0.4 ± 0.1 deg/h"``."""
-        unit = next(known.unit for known in self.parameters() if known.name == name)
+        unit = next(definition.unit for definition in self.parameters() if definition.name == name)
         value = getattr(self, name)
         error = (errors or {}).get(name)
         values = value if isinstance(value, tuple) else (value,)
-        text = join_words([format_value(one, error) for one in values])
+        text = join_words([format_value(number, error) for number in values])
         if error is not None:
             text += f" ± {error:.2g}"
         return text if unit in ("1", "text") else f"{text} {unit}"

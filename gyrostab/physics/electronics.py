@@ -104,11 +104,11 @@ class SupplyBias(Effect):
         bias = np.zeros(chunk.size)
         if not chunk.size:
             return bias, state
-        seen = {name: self._lag_channel(chunk, name, state) for name in self.needs()}
+        lagged = {name: self._lag_channel(chunk, name, state) for name in self.needs()}
         if self.voltage:
-            bias += self.voltage * (seen["supply_voltage"] - self.reference_voltage)
+            bias += self.voltage * (lagged["supply_voltage"] - self.reference_voltage)
         if self.power:
-            bias += self.power * (seen["light_power"] * 1e6 - self.reference_power)
+            bias += self.power * (lagged["light_power"] * 1e6 - self.reference_power)
         if self.ripple:
             cycles = self.frequency / chunk.rate
             middle = (
@@ -124,10 +124,8 @@ class SupplyBias(Effect):
         values = chunk.drivers[name]
         if not self.lag:
             return values
-        before = state.get(name, (float(values[0]), np.zeros(1)))
-        speed, state[name] = relax(
-            values, chunk.rate, np.array([self.lag]), np.ones((1, 1)), before
-        )
+        carry = state.get(name, (float(values[0]), np.zeros(1)))
+        speed, state[name] = relax(values, chunk.rate, np.array([self.lag]), np.ones((1, 1)), carry)
         return np.asarray(values - self.lag * speed[0])
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
@@ -232,14 +230,14 @@ class GaussMarkov(Effect):
         """Compute the rate contribution [degree hour-1] of every sample."""
         from gyrostab.kernels.random.stochastic import ornstein_uhlenbeck_means
 
-        unit, after = np.empty(chunk.shape), []
+        unit, new_state = np.empty(chunk.shape), []
         for row, (child, position) in enumerate(state):
             normal = child.standard_normal((chunk.size, 2))
             unit[row], position = ornstein_uhlenbeck_means(
                 normal, self.correlation_time * chunk.rate, position
             )
-            after.append((child, position))
-        return self.each("rms", chunk.setup.axes)[:, None] * unit, after
+            new_state.append((child, position))
+        return self.each("rms", chunk.setup.axes)[:, None] * unit, new_state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """List correlation times from ten samples to a quarter of the record."""
@@ -420,25 +418,27 @@ class ClockError(Effect):
             return chunk.signal, state
         if memory is None:
             memory = np.repeat(chunk.signal[:, :1], keep, axis=1)
-        known = np.concatenate([memory, chunk.signal], axis=1)
-        start = chunk.first - keep  # first sample of the instrument in `known`
+        history = np.concatenate([memory, chunk.signal], axis=1)
+        start = chunk.first - keep  # first sample of the instrument in `history`
         edges = np.arange(chunk.first, chunk.first + chunk.size + 1, dtype=np.float64)
         read = edges - self.slip(edges / chunk.rate, chunk.setup.size / chunk.rate) * chunk.rate
         latest = self.reading == "latest"
         values = (
-            known[:, np.floor(read[:-1]).astype(np.int64) - start]
+            history[:, np.floor(read[:-1]).astype(np.int64) - start]
             if latest
-            else _means_between(known, start, read)
+            else _means_between(history, start, read)
         )
         if self.output == "angle":
             middle = (edges[:-1] + 0.5) / chunk.rate
             values = values * (1.0 - (self.error + self.drift * middle / HOUR) * _PPM)
-        return values, (keep, known[:, known.shape[1] - keep :])
+        return values, (keep, history[:, history.shape[1] - keep :])
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict window means proportional to the rate, if the gyro gives angle increments."""
-        own = np.stack([windows.own[axis] for axis in windows.axes]) * (self.output == "angle")
-        return Prediction(mean={"error": -_PPM * own, "drift": -_PPM * own * windows.centre / HOUR})
+        rates = np.stack([windows.own[axis] for axis in windows.axes]) * (self.output == "angle")
+        return Prediction(
+            mean={"error": -_PPM * rates, "drift": -_PPM * rates * windows.centre / HOUR}
+        )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Describe the effect in one sentence."""
@@ -448,18 +448,18 @@ class ClockError(Effect):
         return f"The clock of the samples is {fast} by {number}{more} {self.on_axes()}."
 
 
-def _means_between(known: Array, start: int, read: Array) -> Array:
+def _means_between(history: Array, start: int, read: Array) -> Array:
     """Average held samples between successive positions less than two samples apart.
 
-    `known` begins with sample `start`.
+    `history` begins with sample `start`.
     """
     begin, end = read[:-1], read[1:]
-    whole = np.floor(begin)
-    column = whole.astype(np.int64) - start
-    total = np.zeros((known.shape[0], begin.size))
+    sample = np.floor(begin)
+    column = sample.astype(np.int64) - start
+    total = np.zeros((history.shape[0], begin.size))
     for step in range(3):
         share = np.clip(
-            np.minimum(end, whole + step + 1) - np.maximum(begin, whole + step), 0.0, 1.0
+            np.minimum(end, sample + step + 1) - np.maximum(begin, sample + step), 0.0, 1.0
         )
-        total += share * known[:, np.minimum(column + step, known.shape[1] - 1)]
+        total += share * history[:, np.minimum(column + step, history.shape[1] - 1)]
     return total / (end - begin)

@@ -47,8 +47,8 @@ def step_means(positions: Sequence[float], levels: Sequence[Any], first: int, si
     means = values[np.searchsorted(where, first + np.arange(size), side="right")]
     index = np.floor(where).astype(np.int64) - first
     inside = (index >= 0) & (index < size) & (where > np.floor(where))
-    left = (index + first + 1 - where)[inside]
-    np.add.at(means, index[inside], steps[inside] * left.reshape(-1, *(1,) * (values.ndim - 1)))
+    share = (index + first + 1 - where)[inside]
+    np.add.at(means, index[inside], steps[inside] * share.reshape(-1, *(1,) * (values.ndim - 1)))
     return np.ascontiguousarray(means.T)
 
 
@@ -166,17 +166,19 @@ class BiasJump(Effect):
             )
             process.next += _draw_wait(process.rng, mean)
 
-        known = step_means(places, levels, chunk.first, chunk.size)
-        return known + step_means(
+        listed_jumps = step_means(places, levels, chunk.first, chunk.size)
+        return listed_jumps + step_means(
             *_run_process(process, chunk.first + chunk.size, jump), chunk.first, chunk.size
         ), state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """List times of the jump: returns of power, and edges and centres of the windows."""
-        known = windows.restarts[:, 1] if windows.restarts.size else np.empty(0)
+        restart_times = windows.restarts[:, 1] if windows.restarts.size else np.empty(0)
         return {
             "at": np.unique(
-                np.concatenate([known, windows.begin[1:], (windows.begin + windows.end) / 2.0])
+                np.concatenate(
+                    [restart_times, windows.begin[1:], (windows.begin + windows.end) / 2.0]
+                )
             )
         }
 

@@ -124,11 +124,11 @@ class LoggerFilter(Effect):
             signal, inner = sosfilt(sections, signal, zi=inner)
         if taps > 1:
             memory = np.repeat(signal[:, :1], taps - 1, axis=1) if memory is None else memory
-            known = np.concatenate([memory, signal], axis=1)
-            memory = known[:, known.shape[1] - (taps - 1) :]
+            history = np.concatenate([memory, signal], axis=1)
+            memory = history[:, history.shape[1] - (taps - 1) :]
             total = np.zeros_like(signal)
             for lag in range(taps):
-                total += known[:, lag : lag + chunk.size]
+                total += history[:, lag : lag + chunk.size]
             signal = total / taps
         if self.pick:
             signal = signal[:, :: chunk.setup.oversampling]
@@ -137,26 +137,26 @@ class LoggerFilter(Effect):
     def points(self, windows: Windows) -> list[Mapping[str, float | str]]:
         """List low-passes and averages, for slow and fast instruments; one filter at a time."""
         cutoff = windows.rate * np.geomspace(0.02, 1.5, 27)
-        found: list[dict[str, float]] = []
+        points: list[dict[str, float]] = []
         for order in (1.0, 2.0, 4.0):
-            found += [
+            points += [
                 {"cutoff": f, "order": order, "instrument": 1.0}
                 for f in cutoff[cutoff < 0.49 * windows.rate].tolist()
             ]
-            found += [{"cutoff": f, "order": order, "instrument": 0.0} for f in cutoff.tolist()]
-        found += [
+            points += [{"cutoff": f, "order": order, "instrument": 0.0} for f in cutoff.tolist()]
+        points += [
             {"cutoff": f, "order": 1.0, "instrument": 0.0, "pick": 1.0} for f in cutoff.tolist()
         ]
-        found += [
+        points += [
             {"length": taps / windows.rate, "instrument": 1.0}
             for taps in (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
         ]
-        found += [
+        points += [
             {"length": taps / windows.rate, "instrument": 0.0}
             for taps in (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
         ]
         nothing = {"cutoff": 0.0, "order": 2.0, "length": 0.0, "pick": 0.0, "instrument": 0.0}
-        return [nothing | point for point in found]
+        return [nothing | point for point in points]
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict the factor on the spectrum of white noise."""
@@ -215,7 +215,7 @@ class LoggerFilter(Effect):
             else []
         )
         parts += [f"average over {self.quantity('length', errors)}"] if self.length else []
-        taken = (
+        sampling = (
             "filtered at the rate of the log"
             if self.instrument == 1.0
             else "picked"
@@ -223,7 +223,7 @@ class LoggerFilter(Effect):
             else "means"
         )
         filters = ", ".join(parts) or "nothing"
-        return f"The logger filters {self.on_axes()}: {filters}; its samples are {taken}."
+        return f"The logger filters {self.on_axes()}: {filters}; its samples are {sampling}."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -352,14 +352,14 @@ class Spikes(Effect):
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Corrupt samples of the signal [degree hour-1]."""
-        signal, chance, after = chunk.signal.copy(), self._sample_probability(chunk.rate), []
+        signal, chance, new_state = chunk.signal.copy(), self._sample_probability(chunk.rate), []
         for row, (child, following) in enumerate(state):
             while following is not None and following < chunk.first + chunk.size:
                 place = following - chunk.first
                 signal[row, place] = self._corrupt_value(float(signal[row, place]), child)
                 following += int(child.geometric(chance))
-            after.append((child, following))
-        return signal, after
+            new_state.append((child, following))
+        return signal, new_state
 
     def _corrupt_value(self, value: float, rng: np.random.Generator) -> float:
         if self.kind == "outlier":
@@ -385,9 +385,9 @@ class Spikes(Effect):
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Describe the effect in one sentence."""
         bit = f"one of {int(self.bits)} bits of {self.quantity('lsb', errors)}"
-        what = bit if self.kind == "bit" else f"by {self.quantity('size', errors)} rms"
+        deviation = bit if self.kind == "bit" else f"by {self.quantity('size', errors)} rms"
         often = self.quantity("per_hour", errors).removesuffix(" 1/h")
-        return f"Single samples are wrong {self.on_axes()}: {what}, {often} times per hour."
+        return f"Single samples are wrong {self.on_axes()}: {deviation}, {often} times per hour."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -443,12 +443,12 @@ class HeldSamples(Effect):
         return rng, self._draw_loss(rng, 0, setup.rate), None
 
     def _draw_loss(
-        self, rng: np.random.Generator, after: int, rate: float
+        self, rng: np.random.Generator, previous_end: int, rate: float
     ) -> tuple[int, int] | None:
         """Draw the next loss, with at least one good sample before it."""
         if self.per_hour == 0.0:
             return None
-        first = after + int(rng.geometric(min(1.0, self.per_hour / HOUR / rate)))
+        first = previous_end + int(rng.geometric(min(1.0, self.per_hour / HOUR / rate)))
         count = int(rng.geometric(1.0 / max(1.0, self.length * rate)))
         if self.fill == "frame":
             count = min(count, first, self._longest_frame(rate))
@@ -475,35 +475,35 @@ class HeldSamples(Effect):
             loss = self._draw_loss(rng, loss[1], chunk.rate)
         if self.fill == "zero":
             return np.where(held, 0.0, chunk.signal), (rng, loss, None)
-        before = chunk.signal[:, :1] if last is None else last
-        known = np.concatenate([before, chunk.signal], axis=1)
-        signal = known[:, source + 1]
+        memory = chunk.signal[:, :1] if last is None else last
+        history = np.concatenate([memory, chunk.signal], axis=1)
+        signal = history[:, source + 1]
         return signal, (rng, loss, signal[:, -1:].copy())
 
     def _send_frames_twice(
         self, chunk: Chunk, rng: np.random.Generator, loss: tuple[int, int] | None, last: Any
     ) -> tuple[Array, Any]:
         """Replace each loss by as many samples before it, of which `last` are known."""
-        kept = self._longest_frame(chunk.rate)
-        before = np.zeros((chunk.signal.shape[0], kept)) if last is None else last
-        known = np.concatenate([before, chunk.signal], axis=1)
-        end, offset = chunk.first + chunk.size, kept - chunk.first
+        longest = self._longest_frame(chunk.rate)
+        memory = np.zeros((chunk.signal.shape[0], longest)) if last is None else last
+        history = np.concatenate([memory, chunk.signal], axis=1)
+        end, offset = chunk.first + chunk.size, longest - chunk.first
         while loss is not None and loss[0] < end:
             low, high = max(loss[0], chunk.first) + offset, min(loss[1], end) + offset
             count = loss[1] - loss[0]
-            known[:, low:high] = known[:, low - count : high - count]
+            history[:, low:high] = history[:, low - count : high - count]
             if loss[1] > end:
                 break
             loss = self._draw_loss(rng, loss[1], chunk.rate)
-        return known[:, kept:], (rng, loss, known[:, known.shape[1] - kept :].copy())
+        return history[:, longest:], (rng, loss, history[:, history.shape[1] - longest :].copy())
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict a larger N, or window means biased towards zero."""
         count = max(1.0, self.length * windows.rate)
         if self.fill == "zero":
             share = count / windows.rate / HOUR
-            own = np.stack([windows.own[axis] for axis in windows.axes])
-            return Prediction(mean={"per_hour": -share * own}, marks=("filled",))
+            rates = np.stack([windows.own[axis] for axis in windows.axes])
+            return Prediction(mean={"per_hour": -share * rates}, marks=("filled",))
         growth = 2.0 * (count if self.fill == "frame" else count**2) / (HOUR * windows.rate)
         return Prediction(
             level={("N", "per_hour"): np.full(windows.begin.size, growth)}, marks=("repeats",)
@@ -511,10 +511,10 @@ class HeldSamples(Effect):
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Describe the effect in one sentence."""
-        what = {"repeat": "earlier ones", "zero": "zero", "frame": "the frame before"}[self.fill]
+        filling = {"repeat": "earlier ones", "zero": "zero", "frame": "the frame before"}[self.fill]
         often, length = (
             self.quantity("per_hour", errors).removesuffix(" 1/h"),
             self.quantity("length", errors),
         )
         times = f"{often} times per hour for {length} on average"
-        return f"Samples are lost and filled with {what} {self.on_axes()}, {times}."
+        return f"Samples are lost and filled with {filling} {self.on_axes()}, {times}."

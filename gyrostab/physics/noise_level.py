@@ -201,9 +201,9 @@ class LightPowerNoise(Effect):
         """
         loss = self.nominal / drivers["light_power"]
         thermal, shot = self.thermal * loss**2, self.shot * loss
-        most = max(thermal + shot, 1.0)
+        scale = max(thermal + shot, 1.0)
         return replace(
-            self, thermal=thermal / most, shot=shot / most, nominal=drivers["light_power"]
+            self, thermal=thermal / scale, shot=shot / scale, nominal=drivers["light_power"]
         )
 
     def courses(self) -> tuple[str, ...]:

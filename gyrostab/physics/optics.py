@@ -223,8 +223,8 @@ class FeedbackReset(Effect):
         turns, reading, tail = state
         if self.phase == "channel":
             ramp = chunk.drivers["ramp"] / self.full
-            before = np.concatenate([ramp[:1] if reading is None else [reading], ramp])
-            moves = np.diff(before)
+            readings = np.concatenate([ramp[:1] if reading is None else [reading], ramp])
+            moves = np.diff(readings)
             moves = (moves - np.round(moves))[None]
             turns = np.array([ramp[0] % 1.0]) if reading is None else turns
             reading = ramp[-1]
@@ -251,9 +251,11 @@ class FeedbackReset(Effect):
         samples = self.decay * rate
         keep = math.exp(-1.0 / samples)
         size = self.tail * _NRAD_PER_S * rate
-        left, _ = lfilter([1.0], [1.0, -keep], size / samples * ages, zi=keep * tail)
-        before = np.concatenate([tail, left[:, :-1]], axis=1)
-        return before * samples * -math.expm1(-1.0 / samples) + size * (resets - ages), left[:, -1:]
+        tail_at_end, _ = lfilter([1.0], [1.0, -keep], size / samples * ages, zi=keep * tail)
+        tail_at_start = np.concatenate([tail, tail_at_end[:, :-1]], axis=1)
+        return tail_at_start * samples * -math.expm1(-1.0 / samples) + size * (
+            resets - ages
+        ), tail_at_end[:, -1:]
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """List decay times from the sampling interval to half a turn, and diameters.
@@ -276,8 +278,8 @@ class FeedbackReset(Effect):
         if turns == 0.0 or not rates.size:
             return {"diameter": np.geomspace(0.03, 0.3, 8), "decay": decay}
         diameter = self.index * self.wavelength * np.abs(turns * _NRAD_PER_S / rates)
-        known = next(item for item in self.parameters() if item.name == "diameter")
-        likely = diameter[(diameter >= known.low) & (diameter <= known.high)]
+        definition = next(item for item in self.parameters() if item.name == "diameter")
+        likely = diameter[(diameter >= definition.low) & (diameter <= definition.high)]
         full = np.unique(np.sign(turns * rates))
         return {
             "diameter": likely if likely.size else np.array([self.diameter]),
@@ -287,16 +289,16 @@ class FeedbackReset(Effect):
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict window means proportional to the rate, and the comb at the first axis's rate."""
-        own = np.stack([windows.own[axis] for axis in windows.axes])
-        resets = own / self.turn  # deg/h per nrad
+        rates = np.stack([windows.own[axis] for axis in windows.axes])
+        resets = rates / self.turn  # deg/h per nrad
         frequency = np.abs(resets[0]) / _NRAD_PER_S
         number = np.arange(1.0, _HARMONICS + 1)[:, None]
         cycles = number * frequency
         place = fold(cycles, windows.rate)
-        seen = 2.0 * np.sinc(cycles / windows.rate) ** 2
-        kick = seen * resets[0] ** 2
+        response = 2.0 * np.sinc(cycles / windows.rate) ** 2
+        kick = response * resets[0] ** 2
         tail = kick / (1.0 + (2.0 * np.pi * cycles * self.decay) ** 2)
-        power = {"kick": kick, "tail": tail, "sawtooth": seen / (np.pi * number) ** 2}
+        power = {"kick": kick, "tail": tail, "sawtooth": response / (np.pi * number) ** 2}
         spectrum = {
             name: sum(
                 (line_density(windows, *line) for line in zip(place, strength, strict=True)),
@@ -328,8 +330,10 @@ class FeedbackReset(Effect):
         begin, decay = end - step, step * self.decay * windows.rate
 
         def lost_slowly(at: Array) -> Array:
-            whole = np.floor(at)
-            return np.asarray(whole + np.expm1((whole - at) / decay) / np.expm1(-1.0 / decay))
+            whole_turns = np.floor(at)
+            return np.asarray(
+                whole_turns + np.expm1((whole_turns - at) / decay) / np.expm1(-1.0 / decay)
+            )
 
         angle = direction * _NRAD_PER_S * windows.rate
         sawtooth = _sawtooth_means(np.stack([turns - direction * step, turns], axis=-1))[:, 0]
@@ -370,12 +374,12 @@ def _sawtooth_means(edges: Array) -> Array:
 
 def _count_resets(edges: Array, samples: float) -> tuple[Array, Array]:
     """Count the signed resets in every sample, and sum exp(-age / samples) at its end."""
-    whole = np.floor(edges)
-    resets = np.diff(whole, axis=1)
+    whole_turns = np.floor(edges)
+    resets = np.diff(whole_turns, axis=1)
     moved = np.abs(np.diff(edges, axis=1))
     forward = resets >= 0
     last = np.where(
-        forward, edges[:, 1:] - whole[:, 1:], whole[:, 1:] + 1.0 - edges[:, 1:]
+        forward, edges[:, 1:] - whole_turns[:, 1:], whole_turns[:, 1:] + 1.0 - edges[:, 1:]
     )  # turns since the last reset
     between = 1.0 / np.where(resets == 0, 1.0, moved) / samples
     many = -np.expm1(-np.abs(resets) * between) / -np.expm1(-between)

@@ -57,10 +57,10 @@ class Parameter:
             if value not in self.choices:
                 raise OptionError(f"{where}: {value!r} is not one of {', '.join(self.choices)}")
             return value
-        given = tuple(value) if isinstance(value, list | tuple) else (value,)
+        numbers = tuple(value) if isinstance(value, list | tuple) else (value,)
         if isinstance(value, list | tuple) and not self.many:
             raise OptionError(f"{where}: give one number in {self.unit}, not the list {value!r}")
-        for number in given:
+        for number in numbers:
             if (
                 isinstance(number, bool)
                 or not isinstance(number, int | float | np.number)
@@ -72,7 +72,7 @@ class Parameter:
                     f"{where}: {number:g} {self.unit} is outside of the allowed range "
                     f"{self.low:g} to {self.high:g}"
                 )
-        return tuple(float(number) for number in given) if self.many else float(value)
+        return tuple(float(number) for number in numbers) if self.many else float(value)
 
 
 def parameter(
@@ -88,16 +88,16 @@ def parameter(
     source: str = "estimate",
 ) -> Any:
     """Declare a field of an effect; see `Parameter`. Without a default a model must give it."""
-    known = {
+    properties = {
         "unit": unit,
         "meaning": meaning,
         "typical": default if typical is None else typical,
         "low": low,
         "high": high,
     }
-    known |= {"choices": choices, "many": many, "source": source, "default": default}
+    properties |= {"choices": choices, "many": many, "source": source, "default": default}
     return (
-        field(metadata={"parameter": known})
+        field(metadata={"parameter": properties})
         if default is None
-        else field(default=default, metadata={"parameter": known})
+        else field(default=default, metadata={"parameter": properties})
     )

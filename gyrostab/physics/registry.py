@@ -31,7 +31,7 @@ def effects() -> Mapping[str, type[Effect]]:
     'bias follows T'
     """
     package = importlib.import_module("gyrostab.physics")
-    found: dict[str, type[Effect]] = {}
+    classes: dict[str, type[Effect]] = {}
     for module in pkgutil.iter_modules(package.__path__):
         home = f"{package.__name__}.{module.name}"
         for item in vars(importlib.import_module(home)).values():
@@ -42,13 +42,13 @@ def effects() -> Mapping[str, type[Effect]]:
                 and item.name
             ):
                 continue
-            if item.name in found:
+            if item.name in classes:
                 raise TypeError(
                     f"two effects have the name {item.name!r}: "
-                    f"{found[item.name].__module__} and {home}"
+                    f"{classes[item.name].__module__} and {home}"
                 )
-            found[item.name] = item
-    return MappingProxyType(dict(sorted(found.items())))
+            classes[item.name] = item
+    return MappingProxyType(dict(sorted(classes.items())))
 
 
 def make_effect(table: Mapping[str, Any], *, where: str = "effect") -> Effect:
@@ -88,24 +88,25 @@ def make_effect(table: Mapping[str, Any], *, where: str = "effect") -> Effect:
             f"there are {', '.join(effects())}"
         )
     kind = effects()[name]
-    known = {item.name: item for item in kind.parameters()}
+    parameters = {item.name: item for item in kind.parameters()}
     values = {key: value for key, value in table.items() if key != "name"}
     for key in values:
-        if key not in known and key not in ("axes", "driver"):
-            listed = ", ".join(f"{item.name} [{item.unit}]" for item in known.values())
+        if key not in parameters and key not in ("axes", "driver"):
+            listed = ", ".join(f"{item.name} [{item.unit}]" for item in parameters.values())
             raise OptionError(
-                f"{where}: effect {name!r} has no parameter {key!r}{close_to(key, list(known))}; "
+                f"{where}: effect {name!r} has no parameter "
+                f"{key!r}{close_to(key, list(parameters))}; "
                 f"it has {listed}, and axes and driver"
             )
     for key in ("axes", "driver"):
-        given = values.get(key, [])
-        if not isinstance(given, str) and not (
-            isinstance(given, list | tuple) and all(isinstance(entry, str) for entry in given)
+        names = values.get(key, [])
+        if not isinstance(names, str) and not (
+            isinstance(names, list | tuple) and all(isinstance(entry, str) for entry in names)
         ):
-            raise OptionError(f"{where}: effect {name!r}: {key} = {given!r} is not a list of names")
+            raise OptionError(f"{where}: effect {name!r}: {key} = {names!r} is not a list of names")
     for key in kind.required():
         if key not in values:
-            item = known[key]
+            item = parameters[key]
             raise OptionError(
                 f"{where}: effect {name!r} lacks the parameter {key!r} ({item.meaning}); "
                 f"give a number in {item.unit}, for instance {item.typical}"
@@ -113,7 +114,7 @@ def make_effect(table: Mapping[str, Any], *, where: str = "effect") -> Effect:
     try:
         return kind(
             **{
-                key: _read_value(value, known[key]) if key in known else value
+                key: _read_value(value, parameters[key]) if key in parameters else value
                 for key, value in values.items()
             }
         )
@@ -158,17 +159,17 @@ def amount(value: Any, unit: str, where: str) -> Any:
         raise OptionError(
             f"{where}: {value!r} is not a number with a unit; write for instance '1 {unit}'"
         )
-    number, given = float(match.group(1)), match.group(2)
-    if given in ("", unit):
+    number, symbol = float(match.group(1)), match.group(2)
+    if symbol in ("", unit):
         return number
     for table in (_SECONDS, _HERTZ):
-        if given in table and unit in table:
-            return number * table[given] / table[unit]
+        if symbol in table and unit in table:
+            return number * table[symbol] / table[unit]
     with contextlib.suppress(UnitError):
-        source, wanted = parse_unit(given), parse_unit(unit)
-        if source.quantity == wanted.quantity:
-            return (number * source.factor + source.offset - wanted.offset) / wanted.factor
-    raise OptionError(f"{where}: the unit {given!r} is not known here; give the number in {unit}")
+        source, target = parse_unit(symbol), parse_unit(unit)
+        if source.quantity == target.quantity:
+            return (number * source.factor + source.offset - target.offset) / target.factor
+    raise OptionError(f"{where}: the unit {symbol!r} is not known here; give the number in {unit}")
 
 
 def effect_table() -> pd.DataFrame:

@@ -325,14 +325,14 @@ class EarthRate(Effect):
         if self.off or self.around:  # across the tool by default
             off = self.each("off", axes) if self.off else np.full(len(axes), 90.0)
             return np.radians(off), np.radians(self.each("around", axes))
-        known = {"x": (90.0, 0.0), "y": (90.0, 90.0), "z": (0.0, 0.0)}
+        angles = {"x": (90.0, 0.0), "y": (90.0, 90.0), "z": (0.0, 0.0)}
         for axis in axes:
-            if axis[-1:].lower() not in known:
+            if axis[-1:].lower() not in angles:
                 raise OptionError(
                     f"effect {self.name!r}: axis {axis!r} is not x, y or z; "
                     "give its direction with off and around [deg]"
                 )
-        off, around = np.radians(np.array([known[axis[-1].lower()] for axis in axes])).T
+        off, around = np.radians(np.array([angles[axis[-1].lower()] for axis in axes])).T
         return off, around
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
@@ -363,13 +363,13 @@ class EarthRate(Effect):
     def explain(self, windows: Windows) -> Prediction:
         """Predict window means, and the frequency of the line."""
         rotation = windows.drivers["rotation_rate"]
-        seen = self._average_rate(*turns_of_windows(windows, rotation), windows.axes)
+        rates = self._average_rate(*turns_of_windows(windows, rotation), windows.axes)
         off, around = self.directions(windows.axes)
         across = math.hypot(*self.components()[1:]) / self.rate if self.rate else 0.0
         pattern = np.zeros((len(windows.axes), 3), np.complex128)
         pattern[:, 0] = across * np.sin(off) * np.exp(1j * around)
         return Prediction(
-            mean={"rate": seen / self.rate if self.rate else 0.0 * seen},
+            mean={"rate": rates / self.rate if self.rate else 0.0 * rates},
             line=fold(np.abs(rotation) / TURN, windows.rate),
             order={"rate": pattern},
         )
@@ -378,9 +378,11 @@ class EarthRate(Effect):
         """Describe the effect in one sentence."""
         along, high, right = self.components()
         across = math.hypot(high, right)
-        seen = f"{across:.4g} deg/h across and {along:.4g} deg/h along itself, {self.on_axes()}"
+        components = (
+            f"{across:.4g} deg/h across and {along:.4g} deg/h along itself, {self.on_axes()}"
+        )
         earth = f"The earth turns with {self.quantity('rate', errors)}"
-        return f"{earth}; the tool at latitude {self.quantity('latitude')} sees {seen}."
+        return f"{earth}; the tool at latitude {self.quantity('latitude')} sees {components}."
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -198,11 +198,11 @@ class Shupe(Effect):
         if not chunk.size:
             return np.zeros(0), state
         times, whole, halves = slab(self.lag, int(self.modes))
-        before = (float(temperature[0]), np.zeros(times.size)) if state is None else state
-        change = np.diff(temperature, prepend=before[0]) * chunk.rate
+        carry = (float(temperature[0]), np.zeros(times.size)) if state is None else state
+        change = np.diff(temperature, prepend=carry[0]) * chunk.rate
         ahead = self.sensor_lag / times  # (T' - v) / t is the lagged second derivative
         felt, state = relax(
-            temperature, chunk.rate, times, np.stack([whole, halves]) * (1.0 - ahead), before
+            temperature, chunk.rate, times, np.stack([whole, halves]) * (1.0 - ahead), carry
         )
         felt = felt + np.stack([whole @ ahead * change, halves @ ahead * change])
         return _MINUTE * (self.sensitivity * felt[0] + self.transient * felt[1]), state
@@ -333,8 +333,8 @@ class ThermalGradient(Effect):
         difference = chunk.drivers["temperature"] - chunk.drivers["temperature_2"]
         if not (self.change and chunk.size):
             return self.sensitivity * difference, state
-        before = (float(difference[0]), np.zeros(1)) if state is None else state
-        felt, state = relax(difference, chunk.rate, np.array([self.lag]), np.ones((1, 1)), before)
+        carry = (float(difference[0]), np.zeros(1)) if state is None else state
+        felt, state = relax(difference, chunk.rate, np.array([self.lag]), np.ones((1, 1)), carry)
         return self.sensitivity * difference + _MINUTE * self.change * felt[0], state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:

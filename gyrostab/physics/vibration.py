@@ -305,7 +305,7 @@ class AliasedVibration(Effect):
         """List point samples and averages of the band of the vibration channel, if known."""
         low, high = windows.bands.get("vibration", (self.low, self.high))
         edges = {"low": max(low, _MIN_EDGE_HZ), "high": max(high, 2.0 * _MIN_EDGE_HZ)}
-        return [edges | {"sampling": taken} for taken in ("point", "average")]
+        return [edges | {"sampling": sampling} for sampling in ("point", "average")]
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict the aliased spectrum of one process on all axes."""
@@ -328,11 +328,11 @@ class AliasedVibration(Effect):
             if self.resonance
             else ""
         )
-        taken = "a point of it" if self.sampling == "point" else "its mean over the interval"
+        sampling = "a point of it" if self.sampling == "point" else "its mean over the interval"
         size = self.quantity("sensitivity", errors)
         band = f"{self.low:.4g} to {self.high:.4g} Hz"
         folds = f"Vibration at {band} folds into the samples {self.on_axes()}"
-        return f"{folds}, with a sensitivity of {size}{mount}; each sample is {taken}."
+        return f"{folds}, with a sensitivity of {size}{mount}; each sample is {sampling}."
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -88,22 +88,22 @@ class WarmUp(Effect):
             self.slow_time,
         )
 
-    def _list_losses(self, gaps: NDArray[Any], restarts: NDArray[Any], second: float) -> Array:
-        """List losses of power [s] from gaps and restarts in units of 1 / `second` s."""
-        long = (gaps[:, 1] - gaps[:, 0]) >= self.gap * second * (1.0 - 1e-9)
-        return _merge_spans(np.concatenate([restarts, gaps[long]])) / second
+    def _list_losses(self, gaps: NDArray[Any], restarts: NDArray[Any], per_second: float) -> Array:
+        """List losses of power [s] from gaps and restarts in units of 1 / `per_second` s."""
+        long = (gaps[:, 1] - gaps[:, 0]) >= self.gap * per_second * (1.0 - 1e-9)
+        return _merge_spans(np.concatenate([restarts, gaps[long]])) / per_second
 
     def _initial_shares(self, losses: Array, time: float) -> Array:
         """Compute the share of the amplitude at the start and after every loss of power."""
-        on, share, found = 0.0, self.cold, [self.cold]
+        on, share, shares = 0.0, self.cold, [self.cold]
         for gone, back in losses.tolist():
-            left = share * math.exp(-(gone - on) / time)
-            share = 1.0 - (1.0 - left) * (
+            remaining = share * math.exp(-(gone - on) / time)
+            share = 1.0 - (1.0 - remaining) * (
                 math.exp(-(back - gone) / self.cooling) if self.cooling else 0.0
             )
             on = back
-            found.append(share)
-        return np.array(found)
+            shares.append(share)
+        return np.array(shares)
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """Compute the times of power-on, and the initial share of each part."""
@@ -199,10 +199,10 @@ def _integrate_windows(
 ) -> Array:
     """Integrate over every window; ``part(row, t)`` is the integral from begin[row] to t."""
     until = np.maximum(np.minimum(end, windows.end.max()), begin)
-    before = np.concatenate([[0.0], np.cumsum(part(np.arange(begin.size), until))])
+    integral_before = np.concatenate([[0.0], np.cumsum(part(np.arange(begin.size), until))])
 
     def up_to(t: Array) -> Array:
         row = np.searchsorted(begin, t, side="right") - 1
-        return np.asarray(before[row] + part(row, np.minimum(t, end[row])))
+        return np.asarray(integral_before[row] + part(row, np.minimum(t, end[row])))
 
     return up_to(windows.end) - up_to(windows.begin)

@@ -103,7 +103,7 @@ def next_block(
     for number, step in enumerate(plan.steps):
         by_stage[step.effect.stage].append(number)
 
-    def act(number: int, fast: bool = True, **given: Any) -> tuple[Step, Any]:
+    def act(number: int, fast: bool = True, **fields: Any) -> tuple[Step, Any]:
         step = plan.steps[number]
         size, skip = (index.size, 1) if fast else (count, factor)
         drivers = {
@@ -116,7 +116,7 @@ def next_block(
             size=size,
             drivers=drivers,
             recorded={axis: channels[name][::skip] for axis, name in plan.recorded.items()},
-            **given,
+            **fields,
         )
         values, state.effects[number] = step.effect.generate(chunk, state.effects[number])
         return step, values
@@ -169,14 +169,16 @@ def _add_noise(
     ]
     for number in numbers:
         rows = plan.steps[number].rows
-        before = {
+        level = {
             term: np.stack([levels[row][term] for row in rows])
             for term in plan.steps[number].effect.terms
         }
-        step, changed = act(number, true=true, level=before)
+        step, changed = act(number, true=true, level=level)
         for term, values in changed.items():
-            for row, one in zip(step.rows, np.broadcast_to(values, (len(rows), size)), strict=True):
-                levels[row][term] = np.maximum(one, 0.0)
+            for row, row_values in zip(
+                step.rows, np.broadcast_to(values, (len(rows), size)), strict=True
+            ):
+                levels[row][term] = np.maximum(row_values, 0.0)
     signal = np.empty((len(plan.axes), size))
     for row, axis in enumerate(plan.axes):
         noise, state.noise[axis] = shape(
@@ -196,16 +198,16 @@ def _sample_log(
     """The samples of the log: those that an effect picked, or means over the sampling interval."""
     rows: list[Array] = list(signal)
     for number in numbers:
-        before = [rows[row] for row in plan.steps[number].rows]
-        if any(row.size != count * plan.oversampling for row in before):
+        inputs = [rows[row] for row in plan.steps[number].rows]
+        if any(row.size != count * plan.oversampling for row in inputs):
             name = plan.steps[number].effect.name
             raise OptionError(
                 f"effect {name!r} follows another effect that has decimated the log already; "
                 "leave one of them out"
             )
-        step, values = act(number, true=true, signal=np.stack(before))
-        for row, one in zip(step.rows, values, strict=True):
-            rows[row] = one
+        step, values = act(number, true=true, signal=np.stack(inputs))
+        for row, row_values in zip(step.rows, values, strict=True):
+            rows[row] = row_values
     return np.stack(
         [
             row if row.size == count else row.reshape(count, plan.oversampling).mean(axis=1)

@@ -30,14 +30,14 @@ def inner_unit(unit: str, values: Any) -> tuple[str, Any]:
     if unit in INNER.values():
         return unit, values
     try:
-        known = parse_unit(unit)
+        source = parse_unit(unit)
     except ValueError:
         return unit, values
-    if known.quantity == "rate":  # of a tool, not of a gyro's output
+    if source.quantity == "rate":  # of a tool, not of a gyro's output
         return INNER["rotation_rate"], np.asarray(values) * (
-            known.factor / parse_unit(INNER["rotation_rate"]).factor
+            source.factor / parse_unit(INNER["rotation_rate"]).factor
         )
-    return INNER[known.quantity], np.asarray(values) * known.factor + known.offset
+    return INNER[source.quantity], np.asarray(values) * source.factor + source.offset
 
 
 def check_points(points: Any, where: str, columns: Sequence[str]) -> Array:
@@ -159,7 +159,7 @@ def combine(*parts: xr.Dataset) -> xr.Dataset:
     ['temperature', 'vibration']
     """
     names: list[Any] = []
-    rest, tables = [], []
+    channel_groups, tables = [], []
     for part in parts:
         gaps = [name for name, variable in part.variables.items() if variable.dims == ("gap",)]
         if gaps:
@@ -172,8 +172,11 @@ def combine(*parts: xr.Dataset) -> xr.Dataset:
                 "or rename it (channel = ...)"
             )
         names += list(channels.data_vars)
-        rest.append(channels)
+        channel_groups.append(channels)
     table = [xr.concat(tables, dim="gap", data_vars="all").sortby("gap_start")] if tables else []
     return xr.merge(
-        [*rest, *table], combine_attrs="drop_conflicts", join="exact", compat="no_conflicts"
+        [*channel_groups, *table],
+        combine_attrs="drop_conflicts",
+        join="exact",
+        compat="no_conflicts",
     )

@@ -168,8 +168,8 @@ def _make_frame(
         raise OptionError(f"seed={seed!r}: give a whole number from 0 up")
     factor = int(model.log.get("oversampling", 1))
     if like is not None:
-        given = {"duration": duration, "rate": rate, "start": start}
-        extra = [name for name, value in given.items() if value is not None]
+        grid_options = {"duration": duration, "rate": rate, "start": start}
+        extra = [name for name, value in grid_options.items() if value is not None]
         if extra:
             raise OptionError(
                 f"{extra[0]} is taken from the recording given as like; "
@@ -238,21 +238,21 @@ def _make_world(
     """Channels and gaps from all that there are."""
     parts = []
     if like is not None:
-        kept = {
+        names = {
             *log_channels(like),
             *(name for name, variable in like.variables.items() if variable.dims == ("gap",)),
         }
         parts.append(
-            like[[name for name in like.variables if name in kept]].drop_vars(
+            like[[name for name in like.variables if name in names]].drop_vars(
                 "axis", errors="ignore"
             )
         )
     for name, values in model.environment:
         function = PROFILES[name][0]
-        given = {"duration": frame.size / frame.rate, "start": frame.start, **values}
+        arguments = {"duration": frame.size / frame.rate, "start": frame.start, **values}
         if "seed" in inspect.signature(function).parameters:
-            given.setdefault("seed", frame.seed)
-        parts.append(function(**given))
+            arguments.setdefault("seed", frame.seed)
+        parts.append(function(**arguments))
     if environment is not None:
         parts.append(environment)
     return combine(*parts).drop_attrs(deep=False) if parts else xr.Dataset()
@@ -306,7 +306,9 @@ def _list_steps(model: Model, frame: _Frame, table: NDArray[np.int64]) -> list[S
             size=frame.size * factor,
             start=frame.start,
             axes=tuple(frame.axes[row] for row in rows),
-            noise={term: np.array([one[term] for one in noise]) for term in TERMS},
+            noise={
+                term: np.array([coefficients[term] for coefficients in noise]) for term in TERMS
+            },
             gaps=table[:, :2] * factor,
             restarts=table[table[:, 4] == _RESTART, :2] * factor,
             oversampling=frame.oversampling,
@@ -322,16 +324,17 @@ def _convert_units(effect: Effect, environment: xr.Dataset, present: list[str]) 
     for role in effect.needs():
         if names[role] not in present:
             raise driver_error(effect, role, present)
-        wanted, found = effect.channels[role], str(environment[names[role]].attrs.get("units"))
-        if found == wanted:
+        expected, units = effect.channels[role], str(environment[names[role]].attrs.get("units"))
+        if units == expected:
             continue
         with contextlib.suppress(UnitError):
-            one, other = parse_unit(found), parse_unit(wanted)
-            if one.quantity == other.quantity and one.offset == other.offset:
-                factors[role] = one.factor / other.factor
+            source, target = parse_unit(units), parse_unit(expected)
+            if source.quantity == target.quantity and source.offset == target.offset:
+                factors[role] = source.factor / target.factor
                 continue
         raise SchemaError(
-            f"effect {effect.name!r} needs {names[role]!r} in {wanted}; the channel is in {found!r}"
+            f"effect {effect.name!r} needs {names[role]!r} in {expected}; "
+            f"the channel is in {units!r}"
         )
     return factors
 
@@ -406,7 +409,7 @@ def _recorded_rates(
     model: Model, frame: _Frame, steps: list[Step], like: xr.Dataset | None
 ) -> dict[str, Source]:
     """The recorded rates that effects need, by axis."""
-    found: dict[str, Source] = {}
+    sources: dict[str, Source] = {}
     for effect in (step.effect for step in steps):
         for axis in effect.recorded_axes():
             if like is None or signal_name(like) != "rate":
@@ -420,8 +423,8 @@ def _recorded_rates(
                     f"{model.source}: effect {effect.name!r} needs the rate of axis {axis!r}, "
                     f"which the log does not have; it has {', '.join(frame.axes)}"
                 )
-            found[axis] = make_source(like["rate"].sel(axis=axis).to_dataset(name="rate"), "rate")
-    return found
+            sources[axis] = make_source(like["rate"].sel(axis=axis).to_dataset(name="rate"), "rate")
+    return sources
 
 
 def _noise_terms(plan: Plan, row: int) -> str:

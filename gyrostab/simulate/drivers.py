@@ -85,8 +85,8 @@ class Source:
             return self._interpolate_between(instants), None
         assert part is not None
         stretch, values = part
-        known = np.asarray(values, dtype=np.float64)
-        whole = _fill_gaps(np.concatenate([[self.first if carry is None else carry], known]))
+        samples = np.asarray(values, dtype=np.float64)
+        filled = _fill_gaps(np.concatenate([[self.first if carry is None else carry], samples]))
         position = grid_index(self.start, self.rate, instants)
         position = np.where(
             np.abs(position - np.rint(position)) < 1e-6, np.rint(position), position
@@ -94,11 +94,13 @@ class Source:
         position = np.clip(position, 0, self.size - 1)
         base = np.floor(position).astype(np.int64)
         place = base - stretch.low + 1
-        after = whole[place]
+        interpolated = filled[place]
         # from the number of the sample itself, so that the last bit is the same in every stretch
         if not self.held:
-            after = after + (position - base) * (whole[np.minimum(place + 1, known.size)] - after)
-        return after, float(whole[place[-1]])
+            interpolated = interpolated + (position - base) * (
+                filled[np.minimum(place + 1, samples.size)] - interpolated
+            )
+        return interpolated, float(filled[place[-1]])
 
     def _interpolate_between(self, instants: NDArray[np.int64]) -> Array:
         stamps = self.stamps
@@ -110,11 +112,11 @@ class Source:
         low = max(0, int(np.searchsorted(stamps, instants[0], side="right")) - 1)
         high = int(np.searchsorted(stamps, instants[-1], side="left")) + 1
         origin = stamps[low]
-        at, known = (
+        at, knots = (
             (instants - origin).astype(np.float64),
             (stamps[low:high] - origin).astype(np.float64),
         )
-        return np.asarray(np.interp(at, known, self.values[low:high]))
+        return np.asarray(np.interp(at, knots, self.values[low:high]))
 
 
 def _fill_gaps(values: Array) -> Array:
@@ -197,15 +199,15 @@ def make_course(log: xr.Dataset, name: str) -> Source:
     bridged = np.interp(stamps - stamps[0], stamps[present] - stamps[0], means[present])
     smooth = smooth_curve(bridged, longest=LONGEST_PARTS)
     if source.units == INNER["power"]:
-        least = LEAST_POWER_SHARE * float(np.median(smooth))
-        if float(smooth.min()) < least:
+        minimum = LEAST_POWER_SHARE * float(np.median(smooth))
+        if float(smooth.min()) < minimum:
             warnings.warn(
                 f"the channel {name!r} falls to {smooth.min():g} {source.units} without its noise; "
-                f"effects take {least:g} {source.units} at least. Correct the channel, or leave "
+                f"effects take {minimum:g} {source.units} at least. Correct the channel, or leave "
                 "its bad values out",
                 stacklevel=2,
             )
-            smooth = np.maximum(smooth, least)
+            smooth = np.maximum(smooth, minimum)
     return replace(source, stamps=stamps, values=smooth)
 
 

@@ -157,8 +157,8 @@ def _apply_lag(values: Array, lag: float, sensor_rate: float) -> Array:
     keep = math.exp(-a)
     new = 1.0 - -math.expm1(-a) / a  # weight of the new end of a straight piece
     drive = new * values[1:] + (1.0 - keep - new) * values[:-1]
-    rest, _ = lfilter([1.0], [1.0, -keep], drive, zi=[keep * values[0]])
-    return np.concatenate([values[:1], rest])
+    lagged, _ = lfilter([1.0], [1.0, -keep], drive, zi=[keep * values[0]])
+    return np.concatenate([values[:1], lagged])
 
 
 def chamber(

@@ -57,8 +57,8 @@ class Chain:
         """Result of a step."""
         with self._lock:
             if number not in self._recent:
-                known = max(place for place in self._states if place <= number)
-                for place in range(known, number + 1):
+                latest = max(place for place in self._states if place <= number)
+                for place in range(latest, number + 1):
                     self._recent[place], self._states[place + 1] = self._step(
                         place, self._states[place]
                     )
@@ -114,7 +114,7 @@ class _Log:
             plan,
             sources={
                 **plan.sources,
-                **{name: replace(one, values=None) for name, one in long.items()},
+                **{name: replace(source, values=None) for name, source in long.items()},
             },
         )
         self.firsts, self.counts = np.concatenate([[0], np.cumsum(counts)]).tolist(), list(counts)
@@ -135,16 +135,16 @@ class _Log:
             assert stretch is not None
             parts[name] = (stretch, channel(stretch))
         return next_block(
-            self.plan, state, first, count, [one(number) for one in self.draws], parts
+            self.plan, state, first, count, [draw(number) for draw in self.draws], parts
         )
 
 
-def _go_draw(log: _Log, row: int, number: int, *before: Any) -> None:
+def _go_draw(log: _Log, row: int, number: int, *predecessors: Any) -> None:
     """Draw a block of an axis; its predecessor delays it, which keeps blocks in order."""
     log.draws[row].go(number)
 
 
-def _go_block(log: _Log, number: int, *before: Any) -> Any:
+def _go_block(log: _Log, number: int, *predecessors: Any) -> Any:
     """Rates of a block; None if it was made before."""
     return log.blocks.go(number)
 
@@ -185,9 +185,9 @@ def lazy_rates(
     for number in range(len(counts)):
         earlier = [(f"{log}-block", number - 1)] if number else []
         for row in rows:
-            before = [(f"{log}-draw", row, number - 1)] if number else []
+            predecessors = [(f"{log}-draw", row, number - 1)] if number else []
             gate = [(f"{log}-block", number - RECENT)] if number >= RECENT else []
-            tasks[(f"{log}-draw", row, number)] = (_go_draw, log, row, number, *before, *gate)
+            tasks[(f"{log}-draw", row, number)] = (_go_draw, log, row, number, *predecessors, *gate)
         tasks[(f"{log}-block", number)] = (
             _go_block,
             log,

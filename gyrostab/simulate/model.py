@@ -155,11 +155,11 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
             raise FormatError(f"{path}: cannot be read ({error.strerror})") from error
         except (ValueError, RecursionError) as error:
             raise FormatError(f"{path}: not a TOML file ({error})") from error
-    known = ("log", "noise", "bias", "effect", "environment")
+    sections = ("log", "noise", "bias", "effect", "environment")
     for key, table in tables.items():
-        if key not in known:
+        if key not in sections:
             raise OptionError(
-                f"{where}: there is no section {key!r}{close_to(key, known)}; "
+                f"{where}: there is no section {key!r}{close_to(key, sections)}; "
                 "there are [log], [noise], [bias], [[effect]], [[environment]]"
             )
         if not isinstance(table, list if key in ("effect", "environment") else Mapping):
@@ -185,7 +185,7 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
     ]
     log = _read_log_section(tables.get("log", {}), where)
     axes = tuple(log.pop("axes", ())) or _list_axes(noise, effects)
-    found = Model(
+    parsed_model = Model(
         axes,
         noise,
         band,
@@ -196,8 +196,8 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
         source=where,
         text=text,
     )
-    _check_axes(found)
-    return found
+    _check_axes(parsed_model)
+    return parsed_model
 
 
 def _read_noise(
@@ -228,7 +228,7 @@ def _read_noise(
 
 
 def _read_bias(table: Mapping[str, Any], where: str) -> dict[str, float]:
-    found = {}
+    biases = {}
     for axis, value in table.items():
         number = amount(value, "deg/h", f"{where}: bias of {axis}")
         if (
@@ -240,8 +240,8 @@ def _read_bias(table: Mapping[str, Any], where: str) -> dict[str, float]:
                 f"{where}, [bias]: {axis} = {value!r} is not a number; give one in deg/h for an "
                 "axis of the log"
             )
-        found[axis] = float(number)
-    return found
+        biases[axis] = float(number)
+    return biases
 
 
 def _read_coefficient(term: str, value: Any, where: str) -> float:
@@ -266,29 +266,29 @@ def _read_coefficient(term: str, value: Any, where: str) -> float:
 
 
 def _read_log_section(table: Mapping[str, Any], where: str) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    section: dict[str, Any] = {}
     for key, value in table.items():
         if key not in _LOG:
             raise OptionError(
                 f"{where}, [log]: there is no {key!r}{close_to(key, _LOG)}; "
                 f"there are {', '.join(_LOG)}"
             )
-        found[key] = (
+        section[key] = (
             amount(value, {"rate": "Hz", "duration": "s"}[key], f"{where}: {key}")
             if key in ("rate", "duration")
             else value
         )
     for key in ("seed", "oversampling"):
-        if key in found and (
-            not isinstance(found[key], int)
-            or isinstance(found[key], bool)
-            or found[key] < (key == "oversampling")
+        if key in section and (
+            not isinstance(section[key], int)
+            or isinstance(section[key], bool)
+            or section[key] < (key == "oversampling")
         ):
             raise OptionError(
-                f"{where}, [log]: {key} = {found[key]!r} is not a whole number "
+                f"{where}, [log]: {key} = {section[key]!r} is not a whole number "
                 f"{'above 0' if key != 'seed' else 'from 0 up'}"
             )
-    axes = found.get("axes", ["x"])
+    axes = section.get("axes", ["x"])
     if (
         not isinstance(axes, list | tuple)
         or not axes
@@ -299,13 +299,13 @@ def _read_log_section(table: Mapping[str, Any], where: str) -> dict[str, Any]:
             f"{where}, [log]: axes = {axes!r} is not a list of different names; "
             'write for instance axes = ["x", "y", "z"]'
         )
-    if found.get("oversampling", 1) > 1000:
+    if section.get("oversampling", 1) > 1000:
         raise OptionError(
-            f"{where}, [log]: oversampling = {found['oversampling']!r} is more than 1000"
+            f"{where}, [log]: oversampling = {section['oversampling']!r} is more than 1000"
         )
-    if "start" in found:
-        found["start"] = str(found["start"])
-    return found
+    if "start" in section:
+        section["start"] = str(section["start"])
+    return section
 
 
 def _list_axes(noise: Mapping[str, Any], effects: list[Effect]) -> tuple[str, ...]:
@@ -330,12 +330,12 @@ def _check_axes(model: Model) -> None:
 def _read_profile(table: Mapping[str, Any], where: str) -> tuple[str, Mapping[str, Any]]:
     name = table.get("profile")
     if not isinstance(name, str) or name not in PROFILES:
-        what = (
+        problem = (
             "an environment has no profile"
             if name is None
             else f"there is no profile {name!r}{close_to(name, list(PROFILES))}"
         )
-        raise OptionError(f"{where}: {what}; there are {', '.join(PROFILES)}")
+        raise OptionError(f"{where}: {problem}; there are {', '.join(PROFILES)}")
     function, units = PROFILES[str(name)]
     arguments = {
         key: item
@@ -359,7 +359,7 @@ def _read_profile(table: Mapping[str, Any], where: str) -> tuple[str, Mapping[st
                 f"see gyrostab.simulate.environment.{name} for its parameters"
             )
     for key, value in values.items():
-        kind, what = (
+        kind, expected = (
             (str, "text")
             if key in _WORDS
             else (list | tuple, "a list")
@@ -367,7 +367,7 @@ def _read_profile(table: Mapping[str, Any], where: str) -> tuple[str, Mapping[st
             else (object, "")
         )
         if not isinstance(value, kind) or value == "":
-            raise OptionError(f"{where}: {key} = {value!r} is not {what or 'a value'}")
+            raise OptionError(f"{where}: {key} = {value!r} is not {expected or 'a value'}")
     converted = {
         key: amount(value, units[key], f"{where}: {key}") if key in units else value
         for key, value in values.items()

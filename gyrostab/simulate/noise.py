@@ -122,19 +122,19 @@ def _draw_uniform(rng: np.random.Generator, size: int) -> Array:
 def draw(state: NoiseState, first: int, size: int) -> tuple[Units, NoiseState]:
     """Draw the numbers of the next `size` samples; `state` is left as it was."""
     state = copy.deepcopy(state)
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for term, rng in state.streams.items():
         if term == "Q":
             angle = np.concatenate([[state.angle], _draw_uniform(rng, size)])
             state.angle = float(angle[-1])
-            found[term] = angle
+            values[term] = angle
         elif term == "N":
-            found[term] = rng.standard_normal(size)
+            values[term] = rng.standard_normal(size)
         elif term == "B":
-            found[term] = _draw_flicker(state, rng, size)
+            values[term] = _draw_flicker(state, rng, size)
         else:
-            found[term] = rng.standard_normal((size, 2))
-    return Units(first, size, found), state
+            values[term] = rng.standard_normal((size, 2))
+    return Units(first, size, values), state
 
 
 def _draw_flicker(state: NoiseState, rng: np.random.Generator, size: int) -> Array:
@@ -182,12 +182,12 @@ def shape(
     total: Array = np.asarray(
         ramp * (units.first + 0.5 + np.arange(units.size)) / (HOUR * rate), dtype=np.float64
     )
-    after = dict(carry)
+    new_carry = dict(carry)
     for term, values in units.values.items():
         strength = np.sqrt(np.broadcast_to(level[term], units.size))
         if term == "Q":
-            angle = values * np.concatenate([[after.get("Q", strength[0])], strength])
-            after["Q"] = float(strength[-1])
+            angle = values * np.concatenate([[new_carry.get("Q", strength[0])], strength])
+            new_carry["Q"] = float(strength[-1])
             total += np.diff(angle) * (URAD_PER_S * rate)
         elif term == "N":
             total += strength * math.sqrt(HOUR * rate) * values
@@ -195,9 +195,9 @@ def shape(
             total += strength * values
         else:
             steps, inner = values.T * (strength / math.sqrt(HOUR * rate))
-            walk, after["K"] = brownian_means(steps, inner, after.get("K", 0.0))
+            walk, new_carry["K"] = brownian_means(steps, inner, new_carry.get("K", 0.0))
             total += walk
-    return total, after
+    return total, new_carry
 
 
 @dataclass(frozen=True)
@@ -294,8 +294,8 @@ def make_noise(
     """
     coefficients = {"Q": Q, "N": N, "B": B, "K": K, "R": R}
     for name, value in {"rate": rate, "size": size, "chunk": chunk, **coefficients}.items():
-        least = 0.0 if name in TERMS else 1e-9
-        if not (math.isfinite(value) and (value >= least or name == "R")):
+        minimum = 0.0 if name in TERMS else 1e-9
+        if not (math.isfinite(value) and (value >= minimum or name == "R")):
             raise OptionError(
                 f"{name}={value!r}: give a number {'from 0 up' if name in TERMS else 'above 0'}"
             )

@@ -24,7 +24,7 @@ def _integrate_turns(table: Array, stick_slip: float, period: float) -> tuple[An
     if times.size == 1:
         times, rates = np.append(times, times + 1.0), np.repeat(rates, 2)
     slope = np.diff(rates) / np.maximum(np.diff(times), 1e-9)
-    whole = np.concatenate([[0.0], np.cumsum((rates[1:] + rates[:-1]) / 2.0 * np.diff(times))])
+    angles = np.concatenate([[0.0], np.cumsum((rates[1:] + rates[:-1]) / 2.0 * np.diff(times))])
     omega = 2.0 * math.pi / period
 
     def pieces(t: Array) -> tuple[Array, NDArray[np.int64]]:
@@ -47,7 +47,7 @@ def _integrate_turns(table: Array, stick_slip: float, period: float) -> tuple[An
     def angle(t: Array) -> Array:
         inside, j = pieces(t)
         base = rates[j] + slope[j] * (inside - times[j])
-        plain = whole[j] + (rates[j] + base) / 2.0 * (inside - times[j])
+        plain = angles[j] + (rates[j] + base) / 2.0 * (inside - times[j])
         wave = swung[j] + swing(inside, base, slope[j]) - swing(times[j], rates[j], slope[j])
         beyond = t - inside  # before the first and after the last point the drive holds its rate
         edge = np.where(beyond < 0, rates[0], rates[-1])
