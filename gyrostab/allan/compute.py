@@ -89,8 +89,8 @@ def read_spans(
         return
     together = 1 if data.shape[0] * (end - begin) > _MAX_SAMPLES_READ_AT_ONCE else data.shape[0]
     for row in range(0, data.shape[0], together):
-        for whole in read_slice(data[row : row + together], begin, end):
-            yield from (whole[first - begin : last - begin] for first, last in spans)
+        for samples in read_slice(data[row : row + together], begin, end):
+            yield from (samples[first - begin : last - begin] for first, last in spans)
 
 
 def compute_unit(
@@ -196,10 +196,10 @@ def tabulate_noise(
 def estimate_freedoms(cells: Cells, tables: NoiseTables) -> Floats:
     """Compute the degrees of freedom of cells (n_windows, n_tau) from a quick fit of the noise."""
     chosen, columns, weight, to_samples, diagonal = tables
-    seen = (cells.avar, *cells[5:8], cells.gap_factor)
-    few = [np.ascontiguousarray(field[:, chosen]) for field in seen]
+    fields = (cells.avar, *cells[5:8], cells.gap_factor)
+    few = [np.ascontiguousarray(field[:, chosen]) for field in fields]
     squares = identify_noise(*few, columns[chosen], weight[chosen], to_samples)
-    return np.asarray(cell_freedoms(squares, *seen, columns, to_samples, diagonal))
+    return np.asarray(cell_freedoms(squares, *fields, columns, to_samples, diagonal))
 
 
 def run_units(data: Any, plan: Plan) -> tuple[Any, Any]:
@@ -266,17 +266,17 @@ def run_published_method(
         coverage = counts / full
         if not unit.zero_fill:
             avar[coverage < unit.min_coverage] = np.nan
-        one = np.ones_like(avar)
+        ones = np.ones_like(avar)
         cells = Cells(
             avar,
             counts.astype(np.float64),
             coverage,
             coverage,
-            STRICT * one,
-            one,
-            one,
-            one,
-            np.nan * one,
+            STRICT * ones,
+            ones,
+            ones,
+            ones,
+            np.nan * ones,
         )
         means = window_means(x, unit)[:, :n_windows]
         means[0] *= HOUR if unit.angle else 1.0

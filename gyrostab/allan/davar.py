@@ -201,8 +201,8 @@ def davar_parts(log: xr.Dataset, *, samples: int = 2**24, **options: Any) -> lis
         ),
     )
     edges = [0]
-    while left := len(units) - edges[-1]:
-        edges.append(edges[-1] + max(1, min(together, int(left * _MAX_SHARE_OF_REST))))
+    while remaining := len(units) - edges[-1]:
+        edges.append(edges[-1] + max(1, min(together, int(remaining * _MAX_SHARE_OF_REST))))
     return [slice(units[a].start, units[b - 1].stop) for a, b in pairwise(edges)]
 
 
@@ -272,13 +272,13 @@ def davar_sample(log: xr.Dataset, *, numbers: Sequence[int], **options: Any) -> 
     plan, space = _plan_blocks(log, options), Workspace()
     data, unit = plan.signal.data, plan.unit
     tables = make_noise_tables(plan)
-    found = []
+    results = []
     for number in numbers:
         span = number * unit.step, last_sample(slice(number, number + 1), unit)
-        found.append(
+        results.append(
             [compute_unit(x, unit, tables, space) for x in read_spans(data, [span], space)]
         )
-    cells, means = join_units(list(chain.from_iterable(zip(*found, strict=True))), data.shape[0])
+    cells, means = join_units(list(chain.from_iterable(zip(*results, strict=True))), data.shape[0])
     return _attach_labels(cells, means, log, plan, numbers=numbers)
 
 

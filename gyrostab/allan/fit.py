@@ -148,18 +148,18 @@ def refit(product: xr.Dataset, **options: Any) -> xr.Dataset:
         "tau_min": "fit_tau_min_s",
         "tau_max": "fit_tau_max_s",
     }
-    own = {
+    stored_options = {
         name: product.attrs[attribute]
         for name, attribute in option_attributes.items()
         if attribute in product.attrs
     }
     if "fit_tau_min" in product and "tau_min" not in options:
-        own.update(tau_min=None, bands=_stored_bands(product))
+        stored_options.update(tau_min=None, bands=_stored_bands(product))
     if "window_trend" not in product:  # of an earlier version: without the ramp
         none = xr.zeros_like(product["window_mean"])
         product = product.assign(window_trend=none, trend_response=none)
-        own["terms"] = str(own.get("terms", "QNBK")).replace("R", "")
-    return _fit_checked(product, **{**own, "observed_only": False, **options})
+        stored_options["terms"] = str(stored_options.get("terms", "QNBK")).replace("R", "")
+    return _fit_checked(product, **{**stored_options, "observed_only": False, **options})
 
 
 def _stored_bands(product: xr.Dataset) -> Bands:
@@ -207,23 +207,28 @@ def _fit_checked(
     immediate: bool = False,
     bands: Bands | None = None,
 ) -> xr.Dataset:
-    wanted, chosen = _check_options(surface, terms, method, tau_min, tau_max)
+    fitted_terms, chosen = _check_options(surface, terms, method, tau_min, tau_max)
     if bands is None:
         bands = find_bands(surface, terms=terms, method=method, tau_min=tau_min, tau_max=tau_max)
     limits = [BandLimit(*bands[str(axis)]) for axis in surface["axis"].values]
     if method == "gls":
         product = _fit_gls(
-            surface, _bits(wanted), chosen, limits, immediate=immediate, observed_only=observed_only
+            surface,
+            _bits(fitted_terms),
+            chosen,
+            limits,
+            immediate=immediate,
+            observed_only=observed_only,
         )
     else:
-        product = _fit_adev(surface, wanted, chosen)
-    own = {
+        product = _fit_adev(surface, fitted_terms, chosen)
+    band_variables = {
         name: ("axis", np.array(values), attributes(name))
         for name, values in zip(_BAND_VARIABLES, zip(*limits, strict=True), strict=True)
     }
-    return product.assign(own).assign_attrs(
+    return product.assign(band_variables).assign_attrs(
         fit_method=method,
-        fit_terms="".join(wanted),
+        fit_terms="".join(fitted_terms),
         fit_tau_min_s=min(limit.tau_min for limit in limits),
         fit_tau_max_s=surface["tau"].values[chosen[-1]],
     )
@@ -266,7 +271,7 @@ def find_bands(
     >>> find_bands(davar(make_log(smooth, rate=100.0, unit="deg/h"), window="1min"))
     {'x': BandLimit(tau_min=0.13, time_constant=0.0292, white_error=0.0122)}
     """
-    wanted, chosen = _check_options(surface, terms, method, tau_min, tau_max)
+    fitted_terms, chosen = _check_options(surface, terms, method, tau_min, tau_max)
     tau, axes = surface["tau"].values, list(map(str, surface["axis"].values))
     allan = surface.attrs.get("variance", "avar") == "avar"
     if tau_min is not None or method != "gls" or not allan:
@@ -275,7 +280,7 @@ def find_bands(
     step = int(surface.attrs.get("step_samples", window))
     part = surface[[name for name in (*_FIT_VARIABLES, "difference_trend") if name in surface]]
     part = part.isel(time=choose_windows(part.sizes["time"], window, step)).compute()
-    cells, tables, chosen = _prepare_fit(part, chosen, _bits(wanted))
+    cells, tables, chosen = _prepare_fit(part, chosen, _bits(fitted_terms))
 
     def fit(
         rows: list[NDArray[np.float64]],
@@ -291,7 +296,7 @@ def find_bands(
             tau[chosen],
             [cell[row][:, chosen] for cell in cells[:5]],
             *(cell[row, :, 0] for cell in cells[5:7]),
-            allowed=_bits(wanted),
+            allowed=_bits(fitted_terms),
             columns=tables.columns,
             fit=fit,
         )
@@ -308,10 +313,10 @@ def _check_options(
 ) -> tuple[list[str], NDArray[np.int64]]:
     """Check the options of a fit; return the terms, and the positions of the averaging times."""
     check_surface(surface)
-    wanted = list(terms)
-    unknown = [term for term in wanted if term not in TERMS]
-    if unknown or not wanted:
-        raise OptionError(f"terms {unknown or wanted}: choose among {', '.join(TERMS)}")
+    fitted_terms = list(terms)
+    unknown = [term for term in fitted_terms if term not in TERMS]
+    if unknown or not fitted_terms:
+        raise OptionError(f"terms {unknown or fitted_terms}: choose among {', '.join(TERMS)}")
     if method not in ("gls", "adev"):
         raise OptionError(f"method={method!r}: give 'gls' or 'adev'")
     variance = surface.attrs.get("variance", "avar")
@@ -319,9 +324,9 @@ def _check_options(
         raise OptionError(
             f"method='adev' is for Allan variances; the surface has variance={variance!r}"
         )
-    if variance == "hadamard" and wanted == ["R"]:
+    if variance == "hadamard" and fitted_terms == ["R"]:
         raise OptionError("terms 'R': the Hadamard variance does not see a ramp")
-    return wanted, _select_taus(surface["tau"].values, tau_min, tau_max)
+    return fitted_terms, _select_taus(surface["tau"].values, tau_min, tau_max)
 
 
 def _select_taus(tau: NDArray[np.float64], tau_min: Any, tau_max: Any) -> NDArray[np.int64]:
@@ -369,10 +374,10 @@ def _fit_inputs(
     cells = [surface[name].data for name in _FIT_VARIABLES]
     cells[5:] = [plane[..., None] for plane in cells[5:]]
     if "difference_trend" in surface and allowed >> STOCHASTIC & 1:
-        trend, seen = cells[5], surface["difference_trend"].data
-        excess = cells[3] * (surface["tau"].values / HOUR) ** 2 * trend * (seen - trend)
+        trend, difference_trend = cells[5], surface["difference_trend"].data
+        excess = cells[3] * (surface["tau"].values / HOUR) ** 2 * trend * (difference_trend - trend)
         cells[0] = cells[0] - np.nan_to_num(excess)
-        exact = np.isfinite(seen).any(axis=-1, keepdims=True)
+        exact = np.isfinite(difference_trend).any(axis=-1, keepdims=True)
     else:
         exact = np.zeros_like(cells[5], dtype=bool)
     return [*cells, exact], ks, rate, window
@@ -453,14 +458,14 @@ def _fit_gls(
         fitted = block(*cells)
     else:
         lazy = isinstance(cells[0], da.Array)
-        whole = [
+        chunked = [
             cell.rechunk({2: -1}) if lazy else da.from_array(cell, chunks=(1, 256, -1))
             for cell in cells[:-2]
         ]
-        planes = (*whole[-1].chunks[:2], -1)
-        whole += [da.from_array(cell, chunks=planes) for cell in cells[-2:]]
+        planes = (*chunked[-1].chunks[:2], -1)
+        chunked += [da.from_array(cell, chunks=planes) for cell in cells[-2:]]
         fitted = da.map_blocks(
-            block, *whole, chunks=(*whole[0].chunks[:2], (width,)), dtype=np.float64
+            block, *chunked, chunks=(*chunked[0].chunks[:2], (width,)), dtype=np.float64
         )
         if not lazy:
             fitted = fitted.compute()
@@ -507,10 +512,12 @@ def _assemble_product(
 _SQUARED_NAMES = ("N_squared", "K_squared")
 
 
-def _fit_adev(surface: xr.Dataset, wanted: list[str], chosen: NDArray[np.int64]) -> xr.Dataset:
+def _fit_adev(
+    surface: xr.Dataset, fitted_terms: list[str], chosen: NDArray[np.int64]
+) -> xr.Dataset:
     """Fit the Allan deviation of each window in half-integer powers of tau (P15 Eq. 3-4)."""
     deviation = np.sqrt(np.asarray(surface["avar"].data[..., chosen], dtype=np.float64))
-    members = [TERMS.index(term) for term in wanted]
+    members = [TERMS.index(term) for term in fitted_terms]
     columns = np.sqrt(avar_columns(surface["tau"].values[chosen]))[:, members]
     scale = np.linalg.norm(columns, axis=0)
     values = np.full((*deviation.shape[:2], len(TERMS)), np.nan)

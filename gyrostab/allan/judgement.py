@@ -160,35 +160,35 @@ def _judge_changes(product: xr.Dataset, changes: dict[tuple[str, str], dict[str,
 
 def _find_states(product: xr.Dataset) -> list[tuple[str, NDArray[np.bool_], NDArray[np.bool_]]]:
     """List the channels that change, with the windows in the lowest and highest quarter."""
-    found = []
+    states = []
     for name, channel in product.data_vars.items():
         if channel.dims != ("time",) or channel.dtype.kind != "f":
             continue
         values = np.asarray(channel.values)
         if str(name).endswith("_rate") and str(name) != "rotation_rate":
             values = np.abs(values)
-        known = values[np.isfinite(values)]
-        if not known.size or np.ptp(known) <= _MIN_RANGE_SHARE * np.abs(known).max():
+        finite = values[np.isfinite(values)]
+        if not finite.size or np.ptp(finite) <= _MIN_RANGE_SHARE * np.abs(finite).max():
             continue
-        low = values < known.min() + 0.25 * np.ptp(known)
-        high = values > known.max() - 0.25 * np.ptp(known)
+        low = values < finite.min() + 0.25 * np.ptp(finite)
+        high = values > finite.max() - 0.25 * np.ptp(finite)
         if min(low.sum(), high.sum()) >= _MIN_WINDOWS:
-            found.append((str(name), low, high))
-    return found
+            states.append((str(name), low, high))
+    return states
 
 
 def _compare_states(
     part: xr.Dataset, term: str, low: NDArray[np.bool_], high: NDArray[np.bool_]
 ) -> tuple[float, str]:
     """Compare a term between two states: ratio of the medians, and the only state that shows it."""
-    seen = part["observable"].sel(term=term).values == OBSERVED
+    observed = part["observable"].sel(term=term).values == OBSERVED
     values = part[term].values
-    in_low, in_high = float(seen[low].mean()), float(seen[high].mean())
+    in_low, in_high = float(observed[low].mean()), float(observed[high].mean())
     if max(in_low, in_high) >= _MOST and min(in_low, in_high) <= _FEW:
         return 1.0, "high" if in_high > in_low else "low"
     if min(in_low, in_high) < _MOST:
         return 1.0, ""
-    below, above = values[low & seen], values[high & seen]
+    below, above = values[low & observed], values[high & observed]
     ratio = float(np.median(above) / np.median(below))
     rises = np.quantile(above, 0.05) > np.quantile(below, 0.95)
     falls = np.quantile(above, 0.95) < np.quantile(below, 0.05)
@@ -207,10 +207,10 @@ def _judge_steadiness(product: xr.Dataset) -> str:
     spreads = []
     for axis in map(str, product["axis"].values):
         part = product.sel(axis=axis)
-        seen = part["observable"].sel(term="N").values == OBSERVED
-        if seen.sum() >= _MIN_WINDOWS:
-            low, middle, high = np.quantile(part["N"].values[seen], [0.05, 0.5, 0.95])
-            when = part["time"].values[seen][np.argmax(part["N"].values[seen])]
+        observed = part["observable"].sel(term="N").values == OBSERVED
+        if observed.sum() >= _MIN_WINDOWS:
+            low, middle, high = np.quantile(part["N"].values[observed], [0.05, 0.5, 0.95])
+            when = part["time"].values[observed][np.argmax(part["N"].values[observed])]
             spreads.append((axis, (high - low) / (2.0 * middle), high / max(low, 1e-300), when))
     if not spreads:
         return "N is observed in too few windows to judge how steady it is."
@@ -230,8 +230,8 @@ def _judge_steadiness(product: xr.Dataset) -> str:
 
 def _judge_terms(product: xr.Dataset, absences: dict[tuple[str, str], list[str]]) -> str:
     """Say which terms no axis observes more often than by chance, and which windows would."""
-    seen = (product["observable"] == OBSERVED).mean("time").max("axis")
-    hidden = [term for term in LAWS if seen.sel(term=term) <= _FALSE_ALARMS]
+    observed_share = (product["observable"] == OBSERVED).mean("time").max("axis")
+    hidden = [term for term in LAWS if observed_share.sel(term=term) <= _FALSE_ALARMS]
     window = float(product.attrs.get("window_s", np.nan))
     where = f"in windows of {format_duration(window)}" if np.isfinite(window) else "in any window"
     if not hidden:
@@ -239,7 +239,7 @@ def _judge_terms(product: xr.Dataset, absences: dict[tuple[str, str], list[str]]
     if len(hidden) == len(LAWS):  # the terms do not describe the record, which has a sentence
         return f"No term is observed {where}."
     text = f"{join_words(hidden)} {'is' if len(hidden) == 1 else 'are'} not observed {where}"
-    if seen.sel(term=hidden).any():
+    if observed_share.sel(term=hidden).any():
         text += f" more often than by chance (in up to {100 * _FALSE_ALARMS:.0f} % of them)"
     white = float(product["N"].where(product["observable"].sel(term="N") == OBSERVED).median())
     if hidden == ["Q"]:

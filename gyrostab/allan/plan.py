@@ -146,13 +146,13 @@ def _check_choices(*, method: str, gaps: str, overlap: str, convention: str, var
 
 
 def _select_axes(signal: xr.DataArray, axis: str | Sequence[str]) -> xr.DataArray:
-    wanted = [axis] if isinstance(axis, str) else list(axis)
-    known = [str(name) for name in signal["axis"].values]
-    unknown = [name for name in wanted if name not in known]
-    if unknown or not wanted:
-        given = ", ".join(map(repr, unknown)) or "''"
-        raise OptionError(f"axis {given} is not in the log; it has {', '.join(known)}")
-    return signal.sel(axis=wanted)
+    axes = [axis] if isinstance(axis, str) else list(axis)
+    available = [str(name) for name in signal["axis"].values]
+    unknown = [name for name in axes if name not in available]
+    if unknown or not axes:
+        quoted = ", ".join(map(repr, unknown)) or "''"
+        raise OptionError(f"axis {quoted} is not in the log; it has {', '.join(available)}")
+    return signal.sel(axis=axes)
 
 
 def _window_and_step(window: Any, step: Any, rate: float, available: int) -> tuple[int, int]:
@@ -198,5 +198,5 @@ def thin_factors(ks: NDArray[np.int64]) -> NDArray[np.int64]:
     """Choose the averaging factors to fit: all, or `MOST_TAUS` of them, evenly spaced in log."""
     if ks.size <= MOST_TAUS:
         return np.arange(ks.size)
-    wanted = np.geomspace(ks[0], ks[-1], MOST_TAUS)
-    return np.unique(np.abs(np.log(ks)[:, None] - np.log(wanted)[None, :]).argmin(axis=0))
+    targets = np.geomspace(ks[0], ks[-1], MOST_TAUS)
+    return np.unique(np.abs(np.log(ks)[:, None] - np.log(targets)[None, :]).argmin(axis=0))

@@ -85,11 +85,11 @@ class FitTables:
             self.trend.variance * self.to_samples[:STOCHASTIC] * (rate * HOUR) ** 2
         )
         self.weight = white_freedoms(variance, window, ks, diagonal)
-        own = np.einsum("aaii,a->ai", self.pairs, self.to_samples[:STOCHASTIC] ** 2)
+        term_variance = np.einsum("aaii,a->ai", self.pairs, self.to_samples[:STOCHASTIC] ** 2)
         #: Degrees of freedom of a cell in which a term is alone, (term, tau); a ramp alone does not
         #: scatter.
         self.own_dof = np.vstack(
-            [2.0 * self.columns.T[:STOCHASTIC] ** 2 / own, np.full(ks.size, np.inf)]
+            [2.0 * self.columns.T[:STOCHASTIC] ** 2 / term_variance, np.full(ks.size, np.inf)]
         )
         self.ks = ks.astype(np.float64)
         self.quantile = quantile_curve(0.05)
@@ -251,8 +251,8 @@ def _bound_estimates(
     """
     scores = (NORMAL_95, -NORMAL_95, -_LIMIT_SIGMA)
     low, high, limit = _solve_bounds(field, "free", "variance", *scores)
-    (own,) = _solve_bounds(field, "low", "low", NORMAL_95)
-    low = np.where(own < field["free"], own, low)
+    (lower_end,) = _solve_bounds(field, "low", "low", NORMAL_95)
+    low = np.where(lower_end < field["free"], lower_end, low)
     half = 0.5 * (np.sqrt(high) - np.sqrt(low))
     half = np.where(low > 0, half, np.maximum(half, np.sqrt(high) - value))
     trend = np.sqrt(field["free"][:, 4])

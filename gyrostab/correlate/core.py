@@ -94,7 +94,7 @@ def correlate(
     lags = _choose_lags(max_lag, float(time[-1] - time[0]) if time.size else 0.0, step)
     channels = [channel] if isinstance(channel, str | xr.DataArray) else list(channel)
     drivers = align_drivers(product, channels, lags, step)
-    others = [product[name].values for name in other_channels(product, drivers)]
+    other_series = [product[name].values for name in other_channels(product, drivers)]
     entries: dict[tuple[int, int, int], dict[str, Any]] = {}
     groups: dict[bytes, list[tuple[int, int]]] = {}
     masks, lags, drivers = _usable_windows(product, names, lags, drivers)
@@ -110,7 +110,7 @@ def correlate(
             else np.empty((0, len(places)))
         )
         fitted = [
-            fit_driver(blocks, series, driver, others, lags.astype(np.float64) * step, level)
+            fit_driver(blocks, series, driver, other_series, lags.astype(np.float64) * step, level)
             for driver in drivers
         ]
         if len(channels) > 1:
@@ -128,10 +128,10 @@ def correlate(
 
 def _select_variables(product: xr.Dataset, variables: str | Sequence[str] | None) -> list[str]:
     if variables is None:
-        seen = [
+        observed = [
             term for term in TERMS if bool((product["observable"].sel(term=term) == OBSERVED).any())
         ]
-        return ["window_mean", *seen]
+        return ["window_mean", *observed]
     names = [variables] if isinstance(variables, str) else list(variables)
     for name in names:
         if name not in product or product[name].dims != ("axis", "time"):
@@ -164,8 +164,10 @@ def _choose_lags(max_lag: Any, span: float, step: float) -> NDArray[np.int64]:
         raise OptionError(
             f"max_lag {max_lag} is longer than the record ({span:g} s); give a shorter --max-lag"
         )
-    most = int(longest / step + 1e-9)
-    return np.unique(np.rint(np.linspace(0, most, min(most + 1, _MAX_LAGS))).astype(np.int64))
+    max_steps = int(longest / step + 1e-9)
+    return np.unique(
+        np.rint(np.linspace(0, max_steps, min(max_steps + 1, _MAX_LAGS))).astype(np.int64)
+    )
 
 
 def _usable_windows(
@@ -175,13 +177,17 @@ def _usable_windows(
 
     Lags that would cost more than a third of the windows are left out.
     """
-    known = np.logical_and.accumulate(
+    is_known = np.logical_and.accumulate(
         np.all([np.isfinite(driver.values) for driver in drivers], axis=0), axis=0
     )
-    most = int(np.flatnonzero(known.sum(axis=1) >= min(2 / 3 * known[0].sum(), known[0].sum()))[-1])
-    lags = lags[: most + 1]
+    last_lag = int(
+        np.flatnonzero(is_known.sum(axis=1) >= min(2 / 3 * is_known[0].sum(), is_known[0].sum()))[
+            -1
+        ]
+    )
+    lags = lags[: last_lag + 1]
     drivers = [
-        Driver(driver.name, driver.label, driver.units, driver.values[: most + 1])
+        Driver(driver.name, driver.label, driver.units, driver.values[: last_lag + 1])
         for driver in drivers
     ]
     masks = {}
@@ -190,7 +196,7 @@ def _usable_windows(
         if name in TERMS:
             good &= product["observable"].sel(term=name).values == OBSERVED
         for a in range(product.sizes["axis"]):
-            masks[a, v] = good[a] & known[most]
+            masks[a, v] = good[a] & is_known[last_lag]
     return masks, lags, drivers
 
 

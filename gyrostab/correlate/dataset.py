@@ -50,14 +50,14 @@ _SLOPES |= {f"_{name}": name for name in ("rising", "rising_stderr", "falling", 
 def assemble(
     product: xr.Dataset,
     names: list[str],
-    found: list[Driver],
+    drivers: list[Driver],
     entries: dict[tuple[int, int, int], dict[str, Any]],
     *,
     level: float,
     longest: float,
 ) -> xr.Dataset:
     """Build the dataset of entries by (axis, variable, driver), with the series they describe."""
-    shape = (product.sizes["axis"], len(names), len(found))
+    shape = (product.sizes["axis"], len(names), len(drivers))
     dims = ("axis", "variable", "driver")
 
     def table(key: str, dtype: Any = np.float64) -> Any:
@@ -71,7 +71,7 @@ def assemble(
         product[copied].drop_attrs(deep=False).assign_coords(time_bounds=product["time_bounds"])
     )
     made: dict[str, Any] = {}
-    for driver in found:
+    for driver in drivers:
         attributes = {"long_name": f"{driver.label}, mean of the window", "units": driver.units}
         made[driver.name] = (
             product[driver.name]
@@ -98,7 +98,7 @@ def assemble(
     )
     made["coupling_limits"] = (dims, *_limit_flags(shape, entries))
     for v, name in enumerate(names):
-        for d, driver in enumerate(found):
+        for d, driver in enumerate(drivers):
             attributes = {
                 "units": slope_units(str(product[name].attrs.get("units", "1")), driver.units),
                 "unit_label": slope_label(product[name], driver.units),
@@ -119,7 +119,7 @@ def assemble(
     result = result.assign(made)
     labels = {
         "variable": (names, "variable of the product"),
-        "driver": ([driver.name for driver in found], "channel that may drive the variable"),
+        "driver": ([driver.name for driver in drivers], "channel that may drive the variable"),
     }
     result = result.assign_coords(
         {

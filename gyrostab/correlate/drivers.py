@@ -114,8 +114,8 @@ def _align_channel(
 def other_channels(product: xr.Dataset, drivers: Sequence[Driver]) -> list[str]:
     """List the channels of the product except the drivers and their rates of change."""
     bare = {driver.name.removesuffix("_of_file").removesuffix("_rate") for driver in drivers}
-    taken = bare | {f"{name}_rate" for name in bare} | {driver.name for driver in drivers}
-    return [name for name in _channel_names(product) if name not in taken]
+    excluded = bare | {f"{name}_rate" for name in bare} | {driver.name for driver in drivers}
+    return [name for name in _channel_names(product) if name not in excluded]
 
 
 def _channel_names(product: xr.Dataset) -> list[str]:
@@ -136,21 +136,21 @@ def _grid_positions(product: xr.Dataset, step: float) -> NDArray[np.int64]:
 
 
 def _shift_by_lags(
-    whole: Array, before: int, place: NDArray[np.int64], lags: NDArray[np.int64]
+    series: Array, lead: int, place: NDArray[np.int64], lags: NDArray[np.int64]
 ) -> Array:
-    """Take the values one lag earlier, for each lag; `whole` begins `before` steps early."""
-    at = place[None, :] - lags[:, None] + before
-    return np.where(at >= 0, whole[np.maximum(at, 0)], np.nan)
+    """Take the values one lag earlier, for each lag; `series` begins `lead` steps early."""
+    at = place[None, :] - lags[:, None] + lead
+    return np.where(at >= 0, series[np.maximum(at, 0)], np.nan)
 
 
-def _bridge_gaps(whole: Array, most: float) -> Array:
-    """Interpolate over gaps of at most `most` windows, in place; nothing is extrapolated."""
-    known = np.flatnonzero(np.isfinite(whole))
-    wide = np.diff(known)
-    for hole in np.flatnonzero((wide > 1) & (wide - 1 <= most)):
-        left, right = known[hole], known[hole + 1]
-        whole[left : right + 1] = np.linspace(whole[left], whole[right], right - left + 1)
-    return whole
+def _bridge_gaps(series: Array, max_windows: float) -> Array:
+    """Interpolate over gaps of at most `max_windows` windows, in place; nothing is extrapolated."""
+    present = np.flatnonzero(np.isfinite(series))
+    wide = np.diff(present)
+    for hole in np.flatnonzero((wide > 1) & (wide - 1 <= max_windows)):
+        left, right = present[hole], present[hole + 1]
+        series[left : right + 1] = np.linspace(series[left], series[right], right - left + 1)
+    return series
 
 
 def _window_length_ns(product: xr.Dataset) -> int:
@@ -166,18 +166,18 @@ def _align_product_channel(
     mean = np.full(int(place[-1]) + 1, np.nan)
     mean[place] = product[name].values
     apart = np.diff(np.flatnonzero(np.isfinite(mean)))
-    most = (
+    max_windows = (
         max(
             _window_length_ns(product) / 1e9 / step,
             _MAX_GAP_SPACINGS * float(np.median(apart)) if apart.size else 0.0,
         )
         + 1e-6
     )
-    mean = _bridge_gaps(mean, most)
+    mean = _bridge_gaps(mean, max_windows)
     if f"{name}_rate" in product.data_vars:
         rate = np.full(mean.size, np.nan)
         rate[place] = product[f"{name}_rate"].values
-        rate = _bridge_gaps(rate, most)
+        rate = _bridge_gaps(rate, max_windows)
     else:
         rate = _difference_means(mean, step)
     return [_shift_by_lags(row, 0, place, lags) for row in (mean, rate)]
@@ -198,10 +198,10 @@ def _align_file_channel(
     A channel with fewer than two values per window is interpolated to the window centres instead.
     """
     values, stamps = _check_channel(channel, product)
-    place, before = _grid_positions(product, step), int(lags[-1])
-    start = np.rint(np.arange(-before, place[-1] + 1) * step * 1e9).astype(np.int64)
+    place, lead = _grid_positions(product, step), int(lags[-1])
+    start = np.rint(np.arange(-lead, place[-1] + 1) * step * 1e9).astype(np.int64)
     start += to_nanoseconds(product["time_bounds"].values[0, 0])
-    start[before + place] = to_nanoseconds(product["time_bounds"].values[:, 0])
+    start[lead + place] = to_nanoseconds(product["time_bounds"].values[:, 0])
     length = _window_length_ns(product)
     first, last = np.searchsorted(stamps, start), np.searchsorted(stamps, start + length)
     held = last - first
@@ -214,22 +214,24 @@ def _align_file_channel(
         mean, rate = window_trend(values, (stamps - stamps[0]) / 1e9, first, last)
         thin = held < 0.5 * np.median(held[held > 0])
         mean[thin] = rate[thin] = np.nan
-        most = longest / 1e9 / step + 1e-6
-        mean, rate = _bridge_gaps(mean, most), _bridge_gaps(rate * HOUR, most)
-    return [_shift_by_lags(row, before, place, lags) for row in (mean, rate)]
+        max_windows = longest / 1e9 / step + 1e-6
+        mean, rate = _bridge_gaps(mean, max_windows), _bridge_gaps(rate * HOUR, max_windows)
+    return [_shift_by_lags(row, lead, place, lags) for row in (mean, rate)]
 
 
 def _interpolate_values(
     values: Array, stamps: NDArray[np.int64], at: NDArray[np.int64], longest: float
 ) -> Array:
     """Interpolate between values that are at most `longest` apart; NaN elsewhere."""
-    after = np.clip(np.searchsorted(stamps, at), 1, max(stamps.size - 1, 1))
+    following = np.clip(np.searchsorted(stamps, at), 1, max(stamps.size - 1, 1))
     if stamps.size < 2:
         return np.full(at.size, np.nan)
-    apart = stamps[after] - stamps[after - 1]
-    share = (at - stamps[after - 1]) / np.maximum(apart, 1)
+    apart = stamps[following] - stamps[following - 1]
+    share = (at - stamps[following - 1]) / np.maximum(apart, 1)
     inside = (at >= stamps[0]) & (at <= stamps[-1]) & (apart <= longest)
-    return np.where(inside, values[after - 1] + share * (values[after] - values[after - 1]), np.nan)
+    return np.where(
+        inside, values[following - 1] + share * (values[following] - values[following - 1]), np.nan
+    )
 
 
 def _check_channel(channel: xr.DataArray, product: xr.Dataset) -> tuple[Array, NDArray[np.int64]]:

@@ -97,7 +97,7 @@ def fit_driver(
     blocks: Blocks | None,
     series: Array,
     driver: Driver,
-    others: list[Array],
+    other_series: list[Array],
     lags: Array,
     level: float,
 ) -> list[dict[str, Any]]:
@@ -118,13 +118,14 @@ def fit_driver(
             limits = limits | {"one_moment"}
     if limits & {"constant", "too_few", "one_moment"}:
         return [_empty_entry(limits, windows=blocks.windows.size) for _ in range(series.shape[1])]
-    others = [
+    other_series = [
         np.asarray(blocks.average @ np.nan_to_num(row[blocks.windows]))
-        for row in others
+        for row in other_series
         if np.isfinite(row[blocks.windows]).all()
     ]
     with_channels = np.concatenate(
-        [timed, *(_standardise_series(row)[:, None] for row in others if np.ptp(row) > 0)], axis=1
+        [timed, *(_standardise_series(row)[:, None] for row in other_series if np.ptp(row) > 0)],
+        axis=1,
     )
     laws = project_out(blocks.laws, nuisance)
     white_laws = (
@@ -152,8 +153,8 @@ def fit_driver(
         if white_laws is not None:
             white = _estimate_sensitivity(white_laws, row, x, lags, level)
             entry |= {
-                f"{key}_white": white[other]
-                for key, other in (("p", "p_search"), ("slope", "slope"), ("lag", "lag"))
+                f"{key}_white": white[white_key]
+                for key, white_key in (("p", "p_search"), ("slope", "slope"), ("lag", "lag"))
             }
         if timed.shape[1] < with_channels.shape[1] < row.size - 3:
             channel_fit = fit_lags(
@@ -185,22 +186,22 @@ def fit_partial_effects(
         for d in fitted
     }
     for d in fitted:
-        others = [_standardise_series(columns[e])[:, None] for e in fitted if e != d]
-        nuisance = np.concatenate([blocks.offsets, blocks.trend, *others], axis=1)
+        other_columns = [_standardise_series(columns[e])[:, None] for e in fitted if e != d]
+        nuisance = np.concatenate([blocks.offsets, blocks.trend, *other_columns], axis=1)
         if (
             y.size - nuisance.shape[1] - 1 < _MIN_BLOCKS // 2
             or _unexplained_share(columns[d], nuisance) < _MIN_UNEXPLAINED
         ):
             continue
-        found = _estimate_sensitivity(
+        sensitivity = _estimate_sensitivity(
             project_out(blocks.laws, nuisance), y, columns[d][:, None], np.zeros(1), level
         )
-        entries[d].update({partial: found[name] for name, partial in _PARTIAL.items()})
+        entries[d].update({partial: sensitivity[name] for name, partial in _PARTIAL.items()})
 
 
-def _unexplained_share(x: Array, given: Array) -> float:
+def _unexplained_share(x: Array, columns: Array) -> float:
     """Compute the share of the variance of a series that a linear fit leaves."""
-    return float(np.sum(_subtract_fit(x, given) ** 2) / max(float(np.var(x)) * x.size, 1e-300))
+    return float(np.sum(_subtract_fit(x, columns) ** 2) / max(float(np.var(x)) * x.size, 1e-300))
 
 
 def _estimate_sensitivity(
@@ -264,15 +265,15 @@ def _empty_entry(limits: set[str], *, windows: int = 0) -> dict[str, Any]:
     return {**empty, "limits": limits, "windows": windows}
 
 
-def _largest_leverage(x: Array, given: Array) -> float:
+def _largest_leverage(x: Array, columns: Array) -> float:
     """Find the largest share of one block in the variance of the driver."""
-    left = _subtract_fit(x, given) ** 2
-    return float(left.max() / max(float(left.sum()), 1e-300))
+    squares = _subtract_fit(x, columns) ** 2
+    return float(squares.max() / max(float(squares.sum()), 1e-300))
 
 
-def _subtract_fit(x: Array, given: Array) -> Array:
-    """Return what the least-squares fit of the columns `given` leaves of a series."""
-    q, _ = np.linalg.qr(given)
+def _subtract_fit(x: Array, columns: Array) -> Array:
+    """Return what the least-squares fit of the `columns` leaves of a series."""
+    q, _ = np.linalg.qr(columns)
     return np.asarray(x - q @ (q.T @ x))
 
 
@@ -280,8 +281,8 @@ def _standardise_series(row: Array) -> Array:
     return np.asarray((row - row.mean()) / np.std(row))
 
 
-def _partial_correlation(y: Array, x: Array, given: Array) -> float:
-    y, x = _subtract_fit(y, given), _subtract_fit(x, given)
+def _partial_correlation(y: Array, x: Array, columns: Array) -> float:
+    y, x = _subtract_fit(y, columns), _subtract_fit(x, columns)
     size = float(np.sqrt((y @ y) * (x @ x)))
     return float(np.clip(y @ x / size, -1.0, 1.0)) if size > 0 else np.nan
 
@@ -291,12 +292,14 @@ def _effective_samples(y: Array, x: Array, nuisance: Array, error: float) -> flo
 
     The count is at most the number of blocks.
     """
-    rest = _subtract_fit(y, np.concatenate([nuisance, x[:, None]], axis=1))
-    left = _subtract_fit(x, nuisance)
-    wanted = (
-        float(rest.var() / (max(float(left.var()), 1e-300) * error**2)) if error > 0 else np.inf
+    residual = _subtract_fit(y, np.concatenate([nuisance, x[:, None]], axis=1))
+    driver_residual = _subtract_fit(x, nuisance)
+    samples = (
+        float(residual.var() / (max(float(driver_residual.var()), 1e-300) * error**2))
+        if error > 0
+        else np.inf
     )
-    return float(min(y.size, wanted + nuisance.shape[1] + 1))
+    return float(min(y.size, samples + nuisance.shape[1] + 1))
 
 
 def _fit_ramps(blocks: Blocks, law: int, nuisance: Array, y: Array, x: Array) -> dict[str, float]:

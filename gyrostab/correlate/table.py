@@ -77,8 +77,8 @@ def format_correlation(result: xr.Dataset) -> str:
     Couplings that the record cannot show are counted in one line.
     """
     rows = correlation_rows(result)
-    told = [row for row in rows if row["verdict"] != "cannot tell"]
-    table = [tuple(rows[0]), *(tuple(row.values()) for row in told)] if told else []
+    shown = [row for row in rows if row["verdict"] != "cannot tell"]
+    table = [tuple(rows[0]), *(tuple(row.values()) for row in shown)] if shown else []
     verdicts = result["coupling_verdict"].values.ravel()
     sentences = result["statement"].values.ravel()
     statements = [
@@ -97,7 +97,7 @@ def format_correlation(result: xr.Dataset) -> str:
         "Lag, sensitivity and interval are those of the best-fitting lag; "
         "p adjusted is for the whole search."
     )
-    lines += [note, ""] if told else []
+    lines += [note, ""] if shown else []
     return "\n".join([*lines, *(statements or ["No coupling is seen."])])
 
 
