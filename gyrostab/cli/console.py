@@ -63,7 +63,7 @@ def read_config(tokens: Sequence[str], commands: Collection[str]) -> Any:
 @contextmanager
 def show_plain_warnings() -> Iterator[None]:
     """Show each warning of the package once, as one plain line."""
-    seen: set[str] = set()
+    shown: set[str] = set()
 
     def show(
         message: Warning | str,
@@ -74,8 +74,8 @@ def show_plain_warnings() -> Iterator[None]:
         line: str | None = None,
     ) -> None:
         text = str(message)
-        if text not in seen:
-            seen.add(text)
+        if text not in shown:
+            shown.add(text)
             print(f"note: {text}", file=sys.stderr)
 
     with warnings.catch_warnings():
@@ -111,12 +111,12 @@ def sigterm_as_interrupt() -> Iterator[None]:
 @contextmanager
 def relaxed_gc() -> Iterator[None]:
     """Run the garbage collector less often: by default it scans all modules four times at start."""
-    before = gc.get_threshold()
-    gc.set_threshold(15 * before[0], *before[1:])
+    thresholds = gc.get_threshold()
+    gc.set_threshold(15 * thresholds[0], *thresholds[1:])
     try:
         yield
     finally:
-        gc.set_threshold(*before)
+        gc.set_threshold(*thresholds)
 
 
 def print_error(text: str, code: int) -> int:

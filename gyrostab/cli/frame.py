@@ -56,11 +56,11 @@ def find_inputs(arguments: Mapping[str, Any]) -> list[Path]:
     >>> find_inputs({"logs": [Path("run7.csv")], "output": output, "map": ["names.toml"]})
     [PosixPath('run7.csv'), PosixPath('names.toml')]
     """
-    found: list[Path] = []
+    paths: list[Path] = []
     for value in (value for name, value in arguments.items() if name != "output"):
         if is_dataclass(value) and not isinstance(value, type):
-            found += find_inputs(asdict(value))
+            paths += find_inputs(asdict(value))
         for item in value if isinstance(value, list | tuple) else [value]:
             if isinstance(item, Path) or (isinstance(item, str) and item.lower().endswith(".toml")):
-                found.append(Path(item))
-    return found
+                paths.append(Path(item))
+    return paths

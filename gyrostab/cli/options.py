@@ -282,12 +282,12 @@ class Survey:
 
     def options(self) -> dict[str, Any]:
         """Return the keyword arguments of `gyrostab.to_iscwsa`."""
-        given = {name: value for name, value in asdict(self).items() if value is not None}
+        options = {name: value for name, value in asdict(self).items() if value is not None}
         if self.diagnosis:
             from gyrostab.report.diagnosis_folder import open_diagnosis
 
-            given["diagnosis"] = open_diagnosis(self.diagnosis).content
-        return given
+            options["diagnosis"] = open_diagnosis(self.diagnosis).content
+        return options
 
 
 @Parameter(name="*", group=_COMMON)
@@ -318,20 +318,20 @@ class Common:
 
 def _parse_pairs(items: Sequence[str] | None, option: str) -> dict[str, str]:
     """Parse ``["wx=gyro_x"]`` to a dict; an item may also name a TOML file of such pairs."""
-    found: dict[str, str] = {}
+    pairs: dict[str, str] = {}
     for item in items or ():
         # a header may contain "="; a name or a unit does not
         name, equals, value = item.rpartition("=")
         if equals and name.strip() and value.strip():
-            found[name.strip()] = value.strip()
+            pairs[name.strip()] = value.strip()
         elif item.endswith(".toml"):
-            found.update({key: str(value) for key, value in read_toml(Path(item)).items()})
+            pairs.update({key: str(value) for key, value in read_toml(Path(item)).items()})
         else:
             raise OptionError(
                 f"{option} {item!r}: write NAME=VALUE, "
                 f"for instance {option} {_PAIR_EXAMPLES[option]}"
             )
-    return found
+    return pairs
 
 
 _PAIR_EXAMPLES = {"--map": "wx=gyro_x", "--unit": "gyro=deg/s", "--limit": "columns=50000"}

@@ -192,8 +192,8 @@ def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours:
         state = int(window["observable"].sel(term=symbol))
         value, error, upper = (float(window[f"{symbol}{end}"]) for end in ("", "_stderr", "_upper"))
         term = columns[:, number] * np.nan_to_num(float(estimates[symbol])) ** 2
-        seen = window[responses[symbol]].values if responses.get(symbol) in window else 1.0
-        term = term * np.where(np.isfinite(seen), seen, 1.0)
+        response = window[responses[symbol]].values if responses.get(symbol) in window else 1.0
+        term = term * np.where(np.isfinite(response), response, 1.0)
         total += term * (limit_response(window, tau) if symbol == "N" else 1.0)
         if state == OBSERVED:
             label = f"{symbol} = {value:.3g} ± {error:.1g} {unit_symbol(law.label)} ({law.name})"

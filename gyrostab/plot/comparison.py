@@ -302,13 +302,13 @@ def _draw_allan_correlation(panel: Axes, logs: Any) -> None:
             unit="deg/h",
             axis=["x", "y", "sum", "difference"],
         )
-        whole = davar(sums, window=f"{sums.sizes['time']}samples", taus=30).isel(time=0).load()
-        a, b, plus, minus = whole["avar"].values
+        surface = davar(sums, window=f"{sums.sizes['time']}samples", taus=30).isel(time=0).load()
+        a, b, plus, minus = surface["avar"].values
         with np.errstate(divide="ignore", invalid="ignore"):
-            panel.semilogx(whole["tau"], (plus - minus) / 4.0 / np.sqrt(a * b), **style)
+            panel.semilogx(surface["tau"], (plus - minus) / 4.0 / np.sqrt(a * b), **style)
         if log is logs[0]:
-            chance = 2.0 / np.sqrt(whole["edf"].values[0])
-            panel.fill_between(whole["tau"].values, -chance, chance, color=GREY, alpha=0.15, lw=0)
+            chance = 2.0 / np.sqrt(surface["edf"].values[0])
+            panel.fill_between(surface["tau"].values, -chance, chance, color=GREY, alpha=0.15, lw=0)
     panel.set(
         title=f"Allan correlation of {_join_axis_names(logs[0])}",
         xlabel="averaging time [s]",

@@ -179,12 +179,12 @@ def _shift_driver(driver: xr.DataArray, lag: float) -> tuple[Any, Any]:
     """Shift the driver by the lag, and find where it rises; NaN before the record and in gaps."""
     seconds = (driver["time"].values - driver["time"].values[0]) / np.timedelta64(1, "s")
     values = driver.values.astype(np.float64)
-    known = np.isfinite(values)
-    if known.sum() < 3:
+    is_finite = np.isfinite(values)
+    if is_finite.sum() < 3:
         return np.full(values.size, np.nan), np.zeros(values.size, bool)
     at = seconds - lag
-    moved = np.interp(at, seconds[known], values[known], left=np.nan, right=np.nan)
-    slope = np.interp(at, seconds[known], np.gradient(values[known], seconds[known]))
+    moved = np.interp(at, seconds[is_finite], values[is_finite], left=np.nan, right=np.nan)
+    slope = np.interp(at, seconds[is_finite], np.gradient(values[is_finite], seconds[is_finite]))
     return moved, slope > 0
 
 

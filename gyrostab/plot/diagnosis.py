@@ -87,9 +87,9 @@ def _frame_mismatches(
             _seconds_since(region["start"], start) / size,
             _seconds_since(region["end"], start) / size,
         )
-        least = MIN_FRAME_SHARE * (right - left)
-        if end - begin < least:
-            begin, end = (begin + end - least) / 2.0, (begin + end + least) / 2.0
+        min_width = MIN_FRAME_SHARE * (right - left)
+        if end - begin < min_width:
+            begin, end = (begin + end - min_width) / 2.0, (begin + end + min_width) / 2.0
         low, high = (
             max(region["tau_min_s"] / 1.3, low_edge),
             min(region["tau_max_s"] * 1.3, high_edge),
@@ -268,20 +268,20 @@ def plot_means(
         len(ratios), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": ratios}
     )[:, 0]
     for panel, name in zip(panels, names, strict=False):
-        one = surfaces.sel(axis=name)
-        single = one["block_mean"].values
+        part = surfaces.sel(axis=name)
+        single = part["block_mean"].values
         panel.plot(block, single, ".", color=GREY, ms=2.5, label="recording, blocks")
         panel.plot(
             time,
-            one["mean"].sel(case="recording").values,
+            part["mean"].sel(case="recording").values,
             color="black",
             lw=1.2,
             label="recording, windows",
         )
         for case in ("before", "after"):
             mean, error = (
-                one["mean"].sel(case=case).values,
-                one["mean_stderr"].sel(case=case).values,
+                part["mean"].sel(case=case).values,
+                part["mean_stderr"].sel(case=case).values,
             )
             panel.plot(time, mean, **_STYLES[case], label=f"{_TITLES[case].lower()}, 95 %")
             panel.fill_between(
@@ -378,12 +378,12 @@ def plot_deviations(surfaces: xr.Dataset, *, width: float = PAGE_MM) -> Figure:
     names, tau = [str(name) for name in surfaces["axis"].values], surfaces["tau"].values
     figure, panels = _make_row(names, width)
     with np.errstate(invalid="ignore"):
-        whole = surfaces["avar"].mean("window", skipna=True) ** 0.5
+        deviation = surfaces["avar"].mean("window", skipna=True) ** 0.5
     for panel, name in zip(panels, names, strict=True):
         for case in ("recording", "before", "after"):
             panel.plot(
                 tau,
-                whole.sel(axis=name, case=case).values,
+                deviation.sel(axis=name, case=case).values,
                 **_STYLES[case],
                 label=_TITLES[case].lower(),
             )

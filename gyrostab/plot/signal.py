@@ -81,11 +81,12 @@ def plot_signal(
     """
     log = as_log(log)
     name = signal_name(log)
-    axes, known = axis_names(log, axis), log_channels(log)
-    shown = known if channels is None else list(channels)
-    if missing := [channel for channel in shown if channel not in known]:
+    axes, available = axis_names(log, axis), log_channels(log)
+    shown = available if channels is None else list(channels)
+    if missing := [channel for channel in shown if channel not in available]:
         raise OptionError(
-            f"channel {', '.join(missing)} is not in the log; it has {', '.join(known) or 'none'}"
+            f"channel {', '.join(missing)} is not in the log; "
+            f"it has {', '.join(available) or 'none'}"
         )
     height = 0.9 + 1.2 * len(axes) + 1.0 * len(shown)
     figure = new_figure(width / INCH_MM, height, stacked=True)

@@ -342,13 +342,13 @@ def save_png(
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    before = figure.dpi
+    figure_dpi = figure.dpi
     drawn: Any = io.BytesIO() if colours else target
     try:
         figure.set_dpi(dpi)
         FigureCanvasAgg(figure).print_png(drawn, pil_kwargs={"compress_level": 3})  # type: ignore[no-untyped-call]
     finally:
-        figure.set_dpi(before)
+        figure.set_dpi(figure_dpi)
     if colours:
         from PIL import Image
 

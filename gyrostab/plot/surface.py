@@ -237,18 +237,18 @@ def _merge_windows(
         weighted = np.logical_or.reduceat(part["estimator"].values == _WEIGHTED, edges, axis=0)
         number = np.add.reduceat(np.isfinite(avar).astype(float), edges, axis=0)
         total = np.add.reduceat(np.nan_to_num(avar, nan=0.0), edges, axis=0)
-        known = (number > 0) & (
+        has_mean = (number > 0) & (
             total >= 0.0
         )  # the published recursion drifts below zero where there is almost no noise
-        mean = np.divide(total, number, out=np.full_like(total, np.nan), where=known)
+        mean = np.divide(total, number, out=np.full_like(total, np.nan), where=has_mean)
         cells.append((np.sqrt(mean), weighted & np.isfinite(mean)))
     return cells, merged
 
 
 def _divide_by_median(deviation: NDArray[Any]) -> NDArray[Any]:
     out = np.full_like(deviation, np.nan)
-    known = np.isfinite(deviation).any(axis=0)
-    out[:, known] = deviation[:, known] / np.nanmedian(deviation[:, known], axis=0)
+    has_values = np.isfinite(deviation).any(axis=0)
+    out[:, has_values] = deviation[:, has_values] / np.nanmedian(deviation[:, has_values], axis=0)
     return out
 
 
@@ -301,8 +301,8 @@ def _mark_weighted(
     panel: Axes, time_edges: NDArray[Any], tau: NDArray[Any], weighted: NDArray[Any]
 ) -> None:
     """Mark weighted cells with dots, thinned so that they stay distinguishable."""
-    most = 30 if is_narrow(panel.figure) else 60
-    columns = np.arange(0, weighted.shape[0], -(-weighted.shape[0] // most))
+    max_columns = 30 if is_narrow(panel.figure) else 60
+    columns = np.arange(0, weighted.shape[0], -(-weighted.shape[0] // max_columns))
     rows = np.arange(0, weighted.shape[1], max(1, weighted.shape[1] // 12))
     chosen = np.zeros_like(weighted)
     chosen[np.ix_(columns, rows)] = True

@@ -260,8 +260,8 @@ def _evidence_rows(content: Mapping[str, Any]) -> list[tuple[str, str, str, str]
 def _limit_rows(content: Mapping[str, Any]) -> list[dict[str, str]]:
     rows = []
     rejected = {
-        one["name"]: rejection_text(one["beaten_by"], one["nats"])
-        for one in content.get("rejected", [])
+        rejection["name"]: rejection_text(rejection["beaten_by"], rejection["nats"])
+        for rejection in content.get("rejected", [])
     }
     for name, entry in content["not_found"].items():
         unit = unit_symbol(entry["unit"])

@@ -152,17 +152,17 @@ def _draw_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
     figure = stacked_panels(len(names) + len(channels), height=170)
     window, block = _centre_stamps(surfaces, content), _centre_stamps(surfaces, content, "block_")
     for row, name in enumerate(names):
-        panel, one = f"y{row + 1 if row else ''}", surfaces.sel(axis=name)
+        panel, part = f"y{row + 1 if row else ''}", surfaces.sel(axis=name)
         label_panel(figure, panel, f"axis {plain_text(name)}, mean rate [deg/h]")
         shared = {"yaxis": panel, "showlegend": row == 0}
         figure.add_scatter(
-            x=block, y=single(one["block_mean"].values), mode="markers", name="recording",
+            x=block, y=single(part["block_mean"].values), mode="markers", name="recording",
             legendgroup="recording", marker={"color": "#595959", "size": 3}, **shared,
         )  # fmt: skip
         for number, (case, title) in enumerate(_CASES.items()):
             colour = COLOURS[1 - number]
-            mean = one["mean"].sel(case=case).values
-            band = NORMAL_95 * one["mean_stderr"].sel(case=case).values
+            mean = part["mean"].sel(case=case).values
+            band = NORMAL_95 * part["mean_stderr"].sel(case=case).values
             for values, look in (
                 (mean - band, {"line": {"width": 0}, "showlegend": False}),
                 (
@@ -218,20 +218,22 @@ def _add_cases(
 def _draw_deviations(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
     tau = surfaces["tau"].values
     with np.errstate(invalid="ignore"):
-        whole = surfaces["avar"].mean("window", skipna=True) ** 0.5
+        deviation = surfaces["avar"].mean("window", skipna=True) ** 0.5
     figure = new_chart(
-        xaxis=log_axis(TAU_LABEL, tau), yaxis=log_axis(DEVIATION_LABEL, whole.values), height=460
+        xaxis=log_axis(TAU_LABEL, tau),
+        yaxis=log_axis(DEVIATION_LABEL, deviation.values),
+        height=460,
     )
     for row, name in enumerate(_axis_names(surfaces)):
         figure.add_scatter(
-            x=tau, y=single(whole.sel(axis=name, case="recording").values), mode="markers",
+            x=tau, y=single(deviation.sel(axis=name, case="recording").values), mode="markers",
             name=f"axis {plain_text(name)}, recording", legendgroup=name,
             marker={
                 "color": axis_style(surfaces, name)["color"], "size": 8,
                 "symbol": SYMBOLS[row % len(SYMBOLS)],
             },
         )  # fmt: skip
-    _add_cases(figure, surfaces, tau, whole)
+    _add_cases(figure, surfaces, tau, deviation)
     return figure
 
 

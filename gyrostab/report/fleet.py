@@ -235,8 +235,8 @@ def _plot_noise(done: pd.DataFrame, axes: list[str]) -> Any:
     common = list(done["tool"].value_counts().index[: len(COLOURS)])
     for panel, axis in zip(panels, axes, strict=True):
         values = done[_column_name("N", axis)].to_numpy()
-        others = ~done["tool"].isin(common).to_numpy()
-        panel.plot(times[others], values[others], "o", color=GREY, markersize=3)
+        is_other = ~done["tool"].isin(common).to_numpy()
+        panel.plot(times[is_other], values[is_other], "o", color=GREY, markersize=3)
         for tool, colour in zip(common, COLOURS, strict=False):
             part = (done["tool"] == tool).to_numpy()
             label = str(tool) or None

@@ -158,14 +158,14 @@ def _describe_findings(
 
     lines = []
     for axis, rows in table:
-        seen = [
+        medians = [
             f"{row['symbol']} = {row['median']} {row['unit']}{row['rare']}"
             for row in rows
             if row["median"] != "–"
         ]
         text = (
-            f"Axis {axis}, medians: {', '.join(seen)}."
-            if seen
+            f"Axis {axis}, medians: {', '.join(medians)}."
+            if medians
             else f"Axis {axis}: no coefficient is observed in any window."
         )
         lines.append(text)

@@ -130,14 +130,14 @@ def _encode_floats(values: NDArray[np.float64]) -> str:
 def _thin_product(product: xr.Dataset, windows: int, taus: int) -> xr.Dataset:
     """Select at most so many windows and averaging times, evenly spaced."""
     chosen = {
-        dim: np.unique(np.linspace(0, product.sizes[dim] - 1, most).round().astype(int))
-        for dim, most in (("time", windows), ("tau", taus))
-        if product.sizes[dim] > most
+        dim: np.unique(np.linspace(0, product.sizes[dim] - 1, limit).round().astype(int))
+        for dim, limit in (("time", windows), ("tau", taus))
+        if product.sizes[dim] > limit
     }
     if "tau" in chosen:  # evenly in the logarithm
         tau = product["tau"].values
-        wanted = np.geomspace(tau[0], tau[-1], taus)
-        chosen["tau"] = np.unique(np.searchsorted(tau, wanted * (1 - 1e-9)).clip(0, tau.size - 1))
+        targets = np.geomspace(tau[0], tau[-1], taus)
+        chosen["tau"] = np.unique(np.searchsorted(tau, targets * (1 - 1e-9)).clip(0, tau.size - 1))
     return product.isel(chosen).compute()
 
 

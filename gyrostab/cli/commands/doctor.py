@@ -69,17 +69,17 @@ def _check_requirements() -> dict[str, list[tuple[str, bool]]]:
     """Compare installed versions with the requirements, by extra: text, and whether it is wrong."""
     from packaging.requirements import Requirement
 
-    found = defaultdict(list)
+    requirements = defaultdict(list)
     for text in metadata.requires("gyrostab") or ():
         need = Requirement(text)
-        wanted = [
+        extras = [
             extra
             for extra in ("", *_EXTRAS)
             if need.marker is None or need.marker.evaluate({"extra": extra})
         ]
-        if wanted:
-            found[wanted[0]].append(_check_version(need))
-    return found
+        if extras:
+            requirements[extras[0]].append(_check_version(need))
+    return requirements
 
 
 def _check_version(need: Requirement) -> tuple[str, bool]:
@@ -98,8 +98,8 @@ def _has_engine() -> bool:
 
 def _describe_kernels() -> str:
     """Describe the cache of numba: where, how much, and whether it can be written."""
-    given = os.environ.get("NUMBA_CACHE_DIR")
-    folder = Path(given) if given else _package_folder() / "kernels"
+    configured = os.environ.get("NUMBA_CACHE_DIR")
+    folder = Path(configured) if configured else _package_folder() / "kernels"
     files = [*folder.rglob("*.nbi"), *folder.rglob("*.nbc")]
     size = sum(file.stat().st_size for file in files) / 1e6
     state = f"{len(files)} files of {size:.0f} MB" if files else "none yet, compiled when first run"

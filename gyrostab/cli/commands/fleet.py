@@ -135,9 +135,9 @@ def fleet(
 def _print_left_out(table: pd.DataFrame, path: Path) -> None:
     """Print on stderr how many files of a table are logs, and which are not."""
     print(f"{int(table['is_log'].sum())} of {len(table)} files are logs", file=sys.stderr)
-    others: Any = table[~table["is_log"].astype(bool) & (table["format"] != "diagnosis")]
-    if len(others):
-        names = list_some([Path(name).name for name in others["file"]])
+    left_out: Any = table[~table["is_log"].astype(bool) & (table["format"] != "diagnosis")]
+    if len(left_out):
+        names = list_some([Path(name).name for name in left_out["file"]])
         print(
             f"note: not logs, or not without options: {names}; {find_url(path) or path} lists "
             "them with the reasons, and gyrostab scan FILE prints the options that a file needs",

@@ -45,10 +45,10 @@ def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common
     if len(readable):
         print_next(next_command(list(readable["file"]), options), apart=True)
         _print_suggestions(readable, examined.white_noise)
-    for found in examined.inspected:
-        print_inspection(found)
-        if found.row is not None:
-            print_next(next_command(found.paths, found.options))
+    for inspection in examined.inspected:
+        print_inspection(inspection)
+        if inspection.row is not None:
+            print_next(next_command(inspection.paths, inspection.options))
     if options and examined.errors:
         raise examined.errors[0]
     if len(lost):

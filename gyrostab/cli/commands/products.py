@@ -104,7 +104,7 @@ def correlate(
     from gyrostab.plot.style import save_png
     from gyrostab.store.output import check_output, new_output
 
-    given, file = other.options(), other.channel
+    options, file = other.options(), other.channel
     target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite) if output else None
     picture = (
         check_output(target.with_suffix(".png"), overwrite=common.overwrite) if target else None
@@ -115,15 +115,15 @@ def correlate(
         names = [name.strip() for part in with_ or ["temperature"] for name in part.split(",")]
         from_file = {name for name in names if len(names) == 1 or name not in dataset}
         channels = [
-            read_channel(file, name, **given) if file and name in from_file else name
+            read_channel(file, name, **options) if file and name in from_file else name
             for name in names
         ]
-        found = compute(dataset, channel=channels, max_lag=max_lag)
+        correlation = compute(dataset, channel=channels, max_lag=max_lag)
         if target and picture:
             with new_output(picture, overwrite=common.overwrite) as temporary:
-                save_png(plot_correlation(found), temporary)
-                to_netcdf(join(dataset, found), target, overwrite=common.overwrite)
-    print(format_correlation(found))
+                save_png(plot_correlation(correlation), temporary)
+                to_netcdf(join(dataset, correlation), target, overwrite=common.overwrite)
+    print(format_correlation(correlation))
     if target:
         print(f"\n{target}\n{picture}")
 

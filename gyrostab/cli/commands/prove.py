@@ -100,7 +100,7 @@ def prove(
     if proof.failed:
         print(
             "\nfailed diagnoses:",
-            *(f"  {name}: {why}" for name, why in proof.failed.items()),
+            *(f"  {name}: {reason}" for name, reason in proof.failed.items()),
             sep="\n",
         )
     print("\nwritten:", *(f"  {file}" for file in proof.files), sep="\n")
@@ -122,9 +122,9 @@ def _print_progress(stage: Any, *, quiet: bool) -> Iterator[Any]:
         worked = (done or 0) - now["first"]
         if worked and total and clock - now["printed"] > _PROGRESS_INTERVAL_S:
             now["printed"] = clock
-            left = (clock - now["begun"]) / worked * (total - (done or 0))
+            remaining = (clock - now["begun"]) / worked * (total - (done or 0))
             print(
-                f"{label} {done} of {total} {unit}, {_format_duration(left)} left",
+                f"{label} {done} of {total} {unit}, {_format_duration(remaining)} left",
                 file=sys.stderr,
                 flush=True,
             )
