@@ -35,8 +35,8 @@ def _discretise_diffusion(
     rate[0, 0] -= 2 * a  # half a cell from the face
     drive = np.zeros(layers)
     drive[0] = 2 * a
-    left = np.linalg.inv(np.eye(layers) - dt / 2 * rate)
-    return left @ (np.eye(layers) + dt / 2 * rate), left @ drive * dt
+    inverse = np.linalg.inv(np.eye(layers) - dt / 2 * rate)
+    return inverse @ (np.eye(layers) + dt / 2 * rate), inverse @ drive * dt
 
 
 def layer_temperatures(

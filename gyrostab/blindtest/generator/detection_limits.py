@@ -103,13 +103,13 @@ def _mean_spectra(scenario: Scenario, mean: Array) -> Iterator[tuple[int, Array,
     """Yield axis number, frequencies [Hz] and recorded power [(deg/h)2/Hz] of each nonzero row."""
     present = ~scenario.missing
     for axis, values in enumerate(mean):
-        whole = float(((values - values.mean()) ** 2).sum())
-        if whole == 0:
+        total = float(((values - values.mean()) ** 2).sum())
+        if total == 0:
             continue
         lines = fft.dct(values - values.mean(), norm="ortho")[1:]
         f = np.arange(1, scenario.size) * scenario.rate / (2 * scenario.size)
-        seen = float(((values[present] - values[present].mean()) ** 2).sum()) / whole
-        yield axis, f, seen * lines**2 / scenario.rate
+        recorded_share = float(((values[present] - values[present].mean()) ** 2).sum()) / total
+        yield axis, f, recorded_share * lines**2 / scenario.rate
 
 
 def learned_nats(scenario: Scenario, mean: Array) -> float:
@@ -143,9 +143,11 @@ def learned_random_nats(
         Two-sided density [(deg/h)2/Hz] of a share of 1 at frequencies [Hz].
     """
     f = np.arange(1, scenario.size) * scenario.rate / (2 * scenario.size)
-    seen = float((~scenario.missing).mean())
+    recorded_share = float((~scenario.missing).mean())
     return sum(
-        _divergence_from_noise(scenario, axis, f, seen * share**2 * density(f), random=True)
+        _divergence_from_noise(
+            scenario, axis, f, recorded_share * share**2 * density(f), random=True
+        )
         for axis, share in enumerate(shares)
         if share
     )
@@ -176,14 +178,14 @@ def learned_filter_nats(scenario: Scenario, gain: Array) -> float:
     )
 
 
-def _filter_divergence(density: Array, alone: Array) -> float:
+def _filter_divergence(density: Array, term_densities: Array) -> float:
     """Return twice the least divergence, per sample, of two noise terms from a density [nats]."""
 
     def apart(logarithms: Array) -> float:
-        ratio = density / (np.exp(logarithms) @ alone)
+        ratio = density / (np.exp(logarithms) @ term_densities)
         return float((ratio - 1 - np.log(ratio)).mean())
 
-    level = np.log(density.mean() / alone.mean(axis=1))
+    level = np.log(density.mean() / term_densities.mean(axis=1))
     return min(
         float(
             minimize(
@@ -210,34 +212,35 @@ def _divergence_from_noise(
     f, power = (np.add.reduceat(values, first) / count for values in (f, power))
     terms = {term: floor_psd(f, noise={term: 1.0}, rate=rate) for term in "NBK"}
     if measured is None:
-        known = floor_psd(f, noise=noise, rate=rate)
-        alone = np.stack(
+        density = floor_psd(f, noise=noise, rate=rate)
+        term_densities = np.stack(
             [floor_psd(f, noise={"Q": noise.get("Q", 0.0)}, rate=rate), *terms.values()]
         )
     else:
-        known = np.add.reduceat(measured.lines[axis], first) / count
-        alone = np.stack([np.zeros_like(known), known, terms["B"], terms["K"]])
+        density = np.add.reduceat(measured.lines[axis], first) / count
+        term_densities = np.stack([np.zeros_like(density), density, terms["B"], terms["K"]])
     if random:
-        known, power = known + power, np.zeros_like(power)
+        density, power = density + power, np.zeros_like(power)
 
     def apart(logarithms: Array) -> float:
-        ratio = known / (alone[0] + np.exp(logarithms) @ alone[1:])
-        return 0.5 * float((count * (ratio * (1 + power / known) - 1 - np.log(ratio))).sum())
+        ratio = density / (term_densities[0] + np.exp(logarithms) @ term_densities[1:])
+        return 0.5 * float((count * (ratio * (1 + power / density) - 1 - np.log(ratio))).sum())
 
-    white = known[-1] / alone[1, -1]
+    white = density[-1] / term_densities[1, -1]
     meets = [
-        known[place] / alone[2:, place] for place in range(0, f.size, max(1, f.size // 4))
+        density[place] / term_densities[2:, place]
+        for place in range(0, f.size, max(1, f.size // 4))
     ]  # levels at which either term equals the known density
     starts = [
         np.log([white, *np.where(chosen, level, level * 1e-3)])
         for level in meets
         for chosen in ([True, False], [False, True])
     ]
-    found = [
+    divergences = [
         minimize(apart, start, method="Nelder-Mead", options={"maxiter": 400}).fun
         for start in starts
     ]
-    return float(max(0.0, min(found)))
+    return float(max(0.0, min(divergences)))
 
 
 def _samples_per_second(scenario: Scenario, ratio: Array) -> Array:

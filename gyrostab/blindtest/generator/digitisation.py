@@ -88,15 +88,15 @@ def clipping(scenario: Scenario, rng: np.random.Generator, *, strength: float) -
     """Draw a range that clips one axis on one side or both, with a hard edge or a soft knee."""
     axis = int(rng.integers(3))
     number = _count_stuck_samples(strength)
-    both, soft = bool(rng.random() < 0.5), bool(rng.random() < 0.4)
+    is_two_sided, soft = bool(rng.random() < 0.5), bool(rng.random() < 0.4)
 
     def after(record: Array) -> Array:
         out = record.copy()
         row = np.where(scenario.missing, np.nan, record[axis])
         ends = np.nanquantile(
-            row, [number / 2 / row.size, 1 - number / (2 if both else 1) / row.size]
+            row, [number / 2 / row.size, 1 - number / (2 if is_two_sided else 1) / row.size]
         )
-        low = ends[0] if both else -np.inf
+        low = ends[0] if is_two_sided else -np.inf
         if soft:  # compress the last tenth of a standard deviation before the limit
             knee = 0.1 * _sample_sd(scenario, axis)
             row = np.where(
@@ -111,7 +111,8 @@ def clipping(scenario: Scenario, rng: np.random.Generator, *, strength: float) -
         name="clipping",
         axes=(AXES[axis],),
         driver=None,
-        form=("on both sides" if both else "above") + (", with a soft knee" if soft else ""),
+        form=("on both sides" if is_two_sided else "above")
+        + (", with a soft knee" if soft else ""),
         form_differs=soft,
         size=strength,
         nats=NATS * strength**2,

@@ -95,18 +95,18 @@ def supply_bias(scenario: Scenario, rng: np.random.Generator, *, strength: float
         regressor=("voltage", to_samples(scenario, v), "deg/h/V"),
     )
     if slow and effect.mean is not None:  # the diagnosis fits a linear response with a lag
-        found = {
+        fits = {
             axis: fit_lagged_driver(
                 scenario, effect.mean[AXES.index(axis)], v, axis=AXES.index(axis)
             )
             for axis in effect.axes
         }
         effect.parameters["voltage"] = {
-            "values": {axis: slope for axis, (slope, _) in found.items()},
+            "values": {axis: slope for axis, (slope, _) in fits.items()},
             "unit": "deg/h/V",
         }
         effect.parameters["lag"] = {
-            "values": {axis: late for axis, (_, late) in found.items()},
+            "values": {axis: late for axis, (_, late) in fits.items()},
             "unit": "s",
         }
     return effect
@@ -190,7 +190,7 @@ def shared_source(scenario: Scenario, rng: np.random.Generator, *, strength: flo
         else rng.standard_normal(scenario.size)
     )
     below = _level_below(corner) if coloured else 1.0
-    own = np.stack([rng.standard_normal(scenario.size) for _ in AXES])
+    independent = np.stack([rng.standard_normal(scenario.size) for _ in AXES])
     size = shared_size(scenario, rho * pairs)
     return Effect(
         name="shared_source",
@@ -203,7 +203,7 @@ def shared_source(scenario: Scenario, rng: np.random.Generator, *, strength: flo
         size=size,
         nats=NATS * size**2,
         tau=(1 / scenario.rate, 30.0),
-        white=light.share_source(own, common, shares=shares),
+        white=light.share_source(independent, common, shares=shares),
         common=shares[:, None] * common,
         parameters={
             "correlation": {"value": float(np.abs(rho * pairs).max()), "unit": "1"},
@@ -331,17 +331,17 @@ def held_samples(scenario: Scenario, rng: np.random.Generator, *, strength: floa
     number = max(1, min(round(NATS / math.log(1e3) * strength**2) + 1, scenario.size // frame // 8))
     seed = int(rng.integers(2**31))
     pairs = number * (frame if hold else 1)
-    seen = telemetry.repeat_frames(
+    starts = telemetry.repeat_frames(
         np.random.default_rng(seed),
         np.zeros((1, scenario.size)),
         number=number,
         frame=frame,
         hold=hold,
     )[1]
-    seen = seen[~scenario.missing[seen]]
+    starts = starts[~scenario.missing[starts]]
     hours = float((~scenario.missing).sum()) / scenario.rate / 3600.0
     held = {
-        "per_hour": {"value": seen.size / hours, "unit": "1/h"},
+        "per_hour": {"value": starts.size / hours, "unit": "1/h"},
         "length": {"value": frame / scenario.rate, "unit": "s"},
     }
     return Effect(
@@ -357,7 +357,7 @@ def held_samples(scenario: Scenario, rng: np.random.Generator, *, strength: floa
             np.random.default_rng(seed), record, number=number, frame=frame, hold=hold
         )[0],
         parameters={
-            "number": {"value": int(seen.size), "unit": "1"},
+            "number": {"value": int(starts.size), "unit": "1"},
             "frame": {"value": frame, "unit": "1"},
         }
         | (held if hold else {}),

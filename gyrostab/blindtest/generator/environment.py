@@ -156,11 +156,11 @@ def read_sensor(
 
     Examples
     --------
-    >>> seen = read_sensor(np.random.default_rng(0), np.full(1000, 20.0), noise=0.03, lsb=0.0625)
-    >>> bool(np.allclose(seen / 0.0625, np.rint(seen / 0.0625)))
+    >>> reading = read_sensor(np.random.default_rng(0), np.full(1000, 20.0), noise=0.03, lsb=0.0625)
+    >>> bool(np.allclose(reading / 0.0625, np.rint(reading / 0.0625)))
     True
     """
-    seen = lag(values, tau, dt=dt) * (
+    reading = lag(values, tau, dt=dt) * (
         1 + relative * rng.standard_normal(values.size)
     ) + noise * rng.standard_normal(values.size)
-    return np.asarray(np.rint(seen / lsb) * lsb if lsb else seen)
+    return np.asarray(np.rint(reading / lsb) * lsb if lsb else reading)

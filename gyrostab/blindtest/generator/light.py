@@ -69,8 +69,8 @@ def relative_psd(power: Array, *, depth: float = 0.75 * math.pi, **detector: flo
     >>> bool(abs(weak / strong - 1) < 0.02)  # excess noise is independent of power
     True
     """
-    seen = np.asarray(power, dtype=float) * (1 + math.cos(depth))
-    total = sum(detector_psd(seen, **detector).values())
+    detected_power = np.asarray(power, dtype=float) * (1 + math.cos(depth))
+    total = sum(detector_psd(detected_power, **detector).values())
     slope = detector.get("responsivity", 0.9) * np.asarray(power) * math.sin(depth)
     return np.asarray(total / slope**2)
 
@@ -97,12 +97,12 @@ def loss_db(
     )
 
 
-def share_source(own: Array, common: Array, *, shares: Array) -> Array:
+def share_source(independent: Array, common: Array, *, shares: Array) -> Array:
     """Replace a part of each axis's white noise by that of a common source, at unchanged level.
 
     Parameters
     ----------
-    own : ndarray, shape (axis, time)
+    independent : ndarray, shape (axis, time)
         Independent noise of the axes, any unit.
     common : ndarray, shape (time,)
         Noise of the source, of unit variance.
@@ -113,10 +113,12 @@ def share_source(own: Array, common: Array, *, shares: Array) -> Array:
     Examples
     --------
     >>> rng = np.random.default_rng(0)
-    >>> own, common = rng.normal(size=(2, 100_000)), rng.normal(size=100_000)
-    >>> noise = share_source(own, common, shares=np.array([0.5, -0.5]))
+    >>> independent, common = rng.normal(size=(2, 100_000)), rng.normal(size=100_000)
+    >>> noise = share_source(independent, common, shares=np.array([0.5, -0.5]))
     >>> round(float(np.corrcoef(noise)[0, 1]), 2)
     -0.25
     """
-    level = own.std(axis=1, keepdims=True)
-    return np.asarray(np.sqrt(1 - shares**2)[:, None] * own + shares[:, None] * level * common)
+    level = independent.std(axis=1, keepdims=True)
+    return np.asarray(
+        np.sqrt(1 - shares**2)[:, None] * independent + shares[:, None] * level * common
+    )

@@ -121,8 +121,8 @@ def _fit_slope(lines: Array) -> Callable[[Array], Array]:
     """Fit white, flicker and random walk to the first lines by Whittle's likelihood."""
     level = float(np.median(lines)) / math.log(2.0) + 1e-300
     power, shapes = lines / level, _slope_terms(np.arange(1.0, lines.size + 1))
-    found = [_fit_from_start(power, shapes, np.array(start)) for start in _STARTS]
-    best = min(found, key=lambda size: _minus_log_likelihood(power, shapes @ size))
+    fits = [_fit_from_start(power, shapes, np.array(start)) for start in _STARTS]
+    best = min(fits, key=lambda size: _minus_log_likelihood(power, shapes @ size))
     return lambda k: level * (_slope_terms(k) @ best)
 
 
@@ -132,16 +132,16 @@ def _fit_from_start(power: Array, shapes: Array, size: Array) -> Array:
     misfit = _minus_log_likelihood(power, density)
     for _ in range(_MAX_ROUNDS):
         way = nnls(shapes / density[:, None], power / density)[0] - size
-        before = misfit
+        previous_misfit = misfit
         for step in _STEPS:
             density = shapes @ (size + step * way)
             misfit = _minus_log_likelihood(power, density)
-            if misfit < before:
+            if misfit < previous_misfit:
                 break
         else:
             return size
         size = size + step * way
-        if before - misfit < _MIN_STEP_NATS:
+        if previous_misfit - misfit < _MIN_STEP_NATS:
             break
     return size
 
@@ -178,9 +178,9 @@ def _outlier_sigma(values: Array, lines: Array, *, rate: float) -> float:
     present = np.isfinite(values)
     white = fft.dct(np.where(present, values - values[present].mean(), 0.0), norm="ortho")
     white[0], white[1:] = 0.0, white[1:] / (lines * rate)
-    seen = fft.idct(white, norm="ortho")  # matched filter of each sample
+    filtered = fft.idct(white, norm="ortho")  # matched filter of each sample
     worth = float((1.0 / (lines * rate)).mean())
-    wildest = float(np.abs(seen[present]).max()) / math.sqrt(worth)
+    wildest = float(np.abs(filtered[present]).max()) / math.sqrt(worth)
     return max(1.0, wildest / math.sqrt(2.0 * math.log(values.size))) / math.sqrt(worth)
 
 
@@ -214,7 +214,10 @@ def measure_noise(record: Array, *, rate: float, axes: int | None = None) -> Mea
         float(special.gammaincinv(half, 0.5)) / half
     )
     jump = np.array(
-        [_outlier_sigma(row, own, rate=rate) for row, own in zip(record, lines, strict=True)]
+        [
+            _outlier_sigma(row, row_lines, rate=rate)
+            for row, row_lines in zip(record, lines, strict=True)
+        ]
     )
     of = np.r_[0 : len(record), np.zeros(max(0, (axes or 0) - len(record)), dtype=int)]
     return MeasuredNoise(

@@ -111,7 +111,7 @@ def _make_shaking_noise(
     kind: str,
     form: str,
 ) -> Effect:
-    shares = draw_shares(rng, alone=0.4)
+    shares = draw_shares(rng, single_probability=0.4)
     f = (np.arange(BANDS) + 0.5) * scenario.rate / 2 / BANDS
     density = vibration.folded_psd(
         f, rate=scenario.rate, kind=kind, low=band[0], high=band[1], mount=mount

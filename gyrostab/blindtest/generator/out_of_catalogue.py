@@ -29,7 +29,7 @@ def breathing_noise(scenario: Scenario, rng: np.random.Generator, *, strength: f
         + rng.uniform(0, 6)
         + 0.8 * np.sin(2 * math.pi * t / (3.7 * period))
     )
-    shares = np.abs(draw_shares(rng, alone=0.5))
+    shares = np.abs(draw_shares(rng, single_probability=0.5))
     effect, _ = make_variance_effect(
         scenario,
         lambda a: np.exp(a * shares[:, None] * swell[None, :]),
@@ -121,7 +121,7 @@ def informative_gaps(scenario: Scenario, rng: np.random.Generator, *, strength: 
     )
     trouble = np.maximum(trouble - np.percentile(trouble, 60), 0.0)
     trouble /= trouble.max()
-    shares = np.abs(draw_shares(rng, alone=0.3))
+    shares = np.abs(draw_shares(rng, single_probability=0.3))
     lost = np.repeat(rng.random(trouble.size) < 0.7 * trouble, math.ceil(scenario.rate))[
         : scenario.size
     ]

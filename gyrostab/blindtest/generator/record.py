@@ -198,10 +198,12 @@ def add_channels(
     log: xr.Dataset, channels: dict[str, tuple[Array, float]], *, start: int, rate: float
 ) -> xr.Dataset:
     """Add the channels of `make_channels` to a log, slower ones with a separate time coordinate."""
-    for name, (values, own) in channels.items():
-        dim = "time" if own == rate and values.size == log.sizes["time"] else f"time_{name}"
+    for name, (values, channel_rate) in channels.items():
+        dim = (
+            "time" if channel_rate == rate and values.size == log.sizes["time"] else f"time_{name}"
+        )
         if dim != "time":
-            log = log.assign_coords(time_coordinate(start, own, values.size, name=dim))
+            log = log.assign_coords(time_coordinate(start, channel_rate, values.size, name=dim))
         log[name] = ((dim,), values, {"units": UNITS[name]})
     check_log(log)
     return log

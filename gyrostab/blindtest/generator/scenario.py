@@ -153,10 +153,10 @@ def _draw_noise(
     )  # of the steps in the variance at the shortest time
     axes = []
     for _ in AXES:
-        own = {key: value * rng.uniform(0.8, 1.25) for key, value in base.items()}
+        coefficients = {key: value * rng.uniform(0.8, 1.25) for key, value in base.items()}
         urad = math.degrees(1e-6) * 3600.0
-        own["Q"] = math.sqrt(share / 3.0) * 60 * own["N"] / math.sqrt(rate) / urad
-        axes.append(own)
+        coefficients["Q"] = math.sqrt(share / 3.0) * 60 * coefficients["N"] / math.sqrt(rate) / urad
+        axes.append(coefficients)
     return tuple(axes)
 
 

@@ -36,10 +36,10 @@ Array = NDArray[np.float64]
 _MIN_LAG_S, _LAG_COUNT = 1.0, 24
 
 
-def draw_shares(rng: np.random.Generator, *, alone: float = 0.6) -> Array:
-    """Draw signed shares (axis,): one axis with probability `alone`, else all, unequally."""
+def draw_shares(rng: np.random.Generator, *, single_probability: float = 0.6) -> Array:
+    """Draw signed shares (axis,): one axis with `single_probability`, else all, unequally."""
     shares = rng.choice([-1.0, 1.0], 3) * rng.uniform(0.4, 1.0, 3)
-    if rng.random() < alone:
+    if rng.random() < single_probability:
         keep = np.zeros(3)
         keep[rng.integers(3)] = 1.0
         shares *= keep

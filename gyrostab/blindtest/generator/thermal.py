@@ -186,14 +186,14 @@ def _make_light_noise(
     form_differs: bool,
 ) -> Effect:
     """Make a noise effect from a scalable `loss` of light [dB] by the budget of the detector."""
-    shares = np.abs(draw_shares(rng, alone=0.4))
+    shares = np.abs(draw_shares(rng, single_probability=0.4))
     power = 10 ** rng.uniform(-6.0, -4.6)
     budget = {"rin": 10 ** rng.uniform(-13.5, -12.3)}
-    before = light.relative_psd(np.array([power]), **budget)[0]
+    nominal = light.relative_psd(np.array([power]), **budget)[0]
 
     def ratio(amplitude: float) -> Array:
         drop = np.clip(amplitude * shares[:, None] * loss[None, :], -20, 20)
-        return np.asarray(light.relative_psd(power * 10 ** (-drop / 10), **budget) / before)
+        return np.asarray(light.relative_psd(power * 10 ** (-drop / 10), **budget) / nominal)
 
     effect, _ = make_variance_effect(
         scenario,

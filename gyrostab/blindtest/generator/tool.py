@@ -44,7 +44,7 @@ def rotation(
     """
     size = math.ceil(seconds / dt) + 1
     t = np.arange(size) * dt
-    wanted = np.zeros(size)
+    rate = np.zeros(size)
     begin = rng.uniform(0.05, 0.15) * seconds
     while begin < 0.9 * seconds:
         end = begin + rng.uniform(0.1, 0.35) * seconds
@@ -53,11 +53,11 @@ def rotation(
         swing = rng.uniform(0.3, 0.95) if stick_slip and rng.random() < 0.5 else 0.0
         beat = rng.uniform(0.1, 0.5)
         drift = 1 + 0.02 * np.sin(2 * math.pi * t / rng.uniform(40, 200))
-        wanted[inside] = (
-            mean / (1 + swing) * drift * (1 + swing * np.sin(2 * math.pi * beat * t))
-        )[inside]
+        rate[inside] = (mean / (1 + swing) * drift * (1 + swing * np.sin(2 * math.pi * beat * t)))[
+            inside
+        ]
         begin = end + rng.uniform(0.08, 0.25) * seconds
-    return wanted
+    return rate
 
 
 def toolface(rotation_rate: Array, *, dt: float, first: float = 0.0) -> Array:

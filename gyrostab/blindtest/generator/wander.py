@@ -43,11 +43,11 @@ def wander_size(
     f = np.arange(1, min(scenario.size, math.ceil(20 * scenario.seconds / time) + 50)) / (
         2 * scenario.seconds
     )
-    seen = float((~scenario.missing).mean())
+    recorded_share = float((~scenario.missing).mean())
     size = nats = 0.0
     for share, noise in zip(shares, scenario.noise, strict=True):
         density = (share * rms) ** 2 * _lorentz_density(f, time)
-        ratio = 1 + seen * density / floor_psd(f, noise=noise, rate=scenario.rate)
+        ratio = 1 + recorded_share * density / floor_psd(f, noise=noise, rate=scenario.rate)
         size += float((np.log(ratio) ** 2).sum())
         nats += 0.5 * float((ratio - 1 - np.log(ratio)).sum())
     return math.sqrt(size / 4 / NATS), nats

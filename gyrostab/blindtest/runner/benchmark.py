@@ -128,10 +128,10 @@ def prove(
         "seed": FIRST_PUBLIC_SEED + secrets.randbelow(10**9),
         "injected": injected,
     }
-    wanted = {"cases": cases, "seed": seed, "nulls": nulls, "counterparts": counterparts}
-    inspect_folder(folder, wanted, fresh, resume=resume, overwrite=overwrite)
+    requested = {"cases": cases, "seed": seed, "nulls": nulls, "counterparts": counterparts}
+    inspect_folder(folder, requested, fresh, resume=resume, overwrite=overwrite)
     with lock_job(folder):
-        job = begin_run(folder, wanted, fresh, resume=resume, overwrite=overwrite)
+        job = begin_run(folder, requested, fresh, resume=resume, overwrite=overwrite)
         tell(_describe_run(job, folder))
         number = (
             len(os.sched_getaffinity(0))
@@ -188,19 +188,19 @@ def _draw_and_commit(
     folder: Path, plans: dict[str, dict[str, Any]], workers: int, stage: Stage, real: Path | None
 ) -> tuple[dict[str, str], str]:
     """Draw the missing cases and commit all truths; committed cases are never drawn again."""
-    kept = read_sums(folder)
-    if kept is not None:
-        return kept
+    committed = read_sums(folder)
+    if committed is not None:
+        return committed
     if real is None and any("recording" in plan for plan in plans.values()):
         raise ResumeError(
             f"{folder}: was begun with real recordings that are not drawn yet; "
             "give their folder again with --real DIR"
         )
     jobs = [(folder, name, plan, real) for name, plan in plans.items()]
-    found = run_in_processes(
+    hashes = run_in_processes(
         draw_case, jobs, workers=workers, report=_count_cases(stage, "drawing", len(jobs))
     )
-    sums = dict(zip(plans, found, strict=True))
+    sums = dict(zip(plans, hashes, strict=True))
     return sums, write_sums(folder, sums)
 
 
@@ -208,7 +208,7 @@ def _diagnose_all(
     folder: Path, job: dict[str, Any], names: list[str], workers: int, stage: Stage
 ) -> dict[str, str]:
     """Diagnose the remaining cases; return the name of each that fails -> reason."""
-    left = [name for name in names if not (folder / "diagnoses" / f"{name}.json").exists()]
+    remaining = [name for name in names if not (folder / "diagnoses" / f"{name}.json").exists()]
     jobs = [
         (
             folder / "recordings" / f"{name}.nc",
@@ -216,11 +216,11 @@ def _diagnose_all(
             folder / "failed" / f"{name}.txt",
             job["nulls"],
         )
-        for name in left
+        for name in remaining
     ]
-    report = _count_cases(stage, "diagnosing", len(names), len(names) - len(left))
+    report = _count_cases(stage, "diagnosing", len(names), len(names) - len(remaining))
     good = run_in_processes(diagnose_case, jobs, workers=workers, report=report)
-    lost = [name for name, flag in zip(left, good, strict=True) if not flag]
+    lost = [name for name, flag in zip(remaining, good, strict=True) if not flag]
     return {
         name: (folder / "failed" / f"{name}.txt").read_text(encoding="utf-8").splitlines()[0]
         for name in lost
@@ -259,13 +259,13 @@ def _score_and_write(
     baseline_scores = run_in_processes(
         compare_case, jobs, workers=workers, report=_count_cases(stage, "comparing", len(drawn))
     )
-    found = {
+    diagnoses = {
         name: json.loads((folder / "diagnoses" / f"{name}.json").read_text(encoding="utf-8"))
         for name in names
         if name not in failed
     }
     stage("counting", 0)
-    rows = score_rows(found, truths, dict(zip(drawn, baseline_scores, strict=True)))
+    rows = score_rows(diagnoses, truths, dict(zip(drawn, baseline_scores, strict=True)))
     table = score_table(rows)
     files = write_outcome(folder, rows, table, job=job, commitment=commitment, failed=failed)
     return Proof(job["seed"], commitment, table, list_missed(table), failed, files)

@@ -214,7 +214,7 @@ def draw_roc(curves: pd.DataFrame) -> Callable[[Path], None]:
         for place, name in enumerate(dict.fromkeys(part["detector"])):
             mine = part[part["detector"] == name]
             colour, marker = COLOURS[place % len(COLOURS)], MARKERS[place % len(MARKERS)]
-            points, own = mine[~mine["own"]], mine[mine["own"]]
+            points, operating_point = mine[~mine["own"]], mine[mine["own"]]
             panel.step(
                 points["false_alarms"],
                 points["detected"],
@@ -223,7 +223,12 @@ def draw_roc(curves: pd.DataFrame) -> Callable[[Path], None]:
                 linewidth=1.2,
             )
             panel.plot(
-                own["false_alarms"], own["detected"], marker, color=colour, markersize=6, label=name
+                operating_point["false_alarms"],
+                operating_point["detected"],
+                marker,
+                color=colour,
+                markersize=6,
+                label=name,
             )
         panel.set_xscale("symlog", linthresh=0.01, linscale=0.3)
         panel.set_xticks([0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1])

@@ -112,21 +112,23 @@ def read_request(directory: Path) -> dict[str, Any] | None:
 
 def inspect_folder(
     directory: Path,
-    wanted: Mapping[str, int | None],
+    requested: Mapping[str, int | None],
     usual: Mapping[str, int],
     *,
     resume: bool,
     overwrite: bool,
 ) -> tuple[dict[str, Any] | None, dict[str, int]]:
     """Find the run to continue (or None) and its options; see `begin_run`. Changes nothing."""
-    before = read_request(directory) if directory.is_dir() and (resume or not overwrite) else None
+    previous = read_request(directory) if directory.is_dir() and (resume or not overwrite) else None
     check_target(
         directory,
         overwrite=True,
-        find_foreign=find_foreign_file if before is None else lambda _: None,
+        find_foreign=find_foreign_file if previous is None else lambda _: None,
     )
-    if before is None:
-        chosen = dict(usual) | {name: value for name, value in wanted.items() if value is not None}
+    if previous is None:
+        chosen = dict(usual) | {
+            name: value for name, value in requested.items() if value is not None
+        }
         _check_request(chosen)
         _check_is_empty(directory, overwrite=overwrite)
         return None, chosen
@@ -135,22 +137,22 @@ def inspect_folder(
             f"{directory} holds a benchmark already: --resume continues it, "
             "--overwrite replaces it; or give another -o"
         )
-    other = [
-        f"{name} {before[name]}, not {value}"
-        for name, value in wanted.items()
-        if value is not None and value != before[name]
+    differences = [
+        f"{name} {previous[name]}, not {value}"
+        for name, value in requested.items()
+        if value is not None and value != previous[name]
     ]
-    if other:
+    if differences:
         raise ResumeError(
-            f"{directory}: was begun with {', '.join(other)}; leave that out, "
+            f"{directory}: was begun with {', '.join(differences)}; leave that out, "
             "or begin again with --overwrite"
         )
-    return before, {name: before[name] for name in wanted}
+    return previous, {name: previous[name] for name in requested}
 
 
 def begin_run(
     directory: Path,
-    wanted: Mapping[str, int | None],
+    requested: Mapping[str, int | None],
     usual: Mapping[str, int],
     *,
     resume: bool,
@@ -162,10 +164,10 @@ def begin_run(
     ----------
     directory : pathlib.Path
         Folder of the run; its parent must exist.
-    wanted : mapping
+    requested : mapping
         ``cases``, ``seed``, ``nulls`` and ``counterparts`` as given, None where not given.
     usual : mapping
-        Defaults; keys that are not in `wanted` are stored as they are.
+        Defaults; keys that are not in `requested` are stored as they are.
 
     Returns
     -------
@@ -181,17 +183,19 @@ def begin_run(
     ResumeError
         When the run in the folder has other options.
     """
-    before, chosen = inspect_folder(directory, wanted, usual, resume=resume, overwrite=overwrite)
+    previous, chosen = inspect_folder(
+        directory, requested, usual, resume=resume, overwrite=overwrite
+    )
     state = fingerprint_code()
-    if before is not None:
+    if previous is not None:
         # files of a run that was killed
         for leftover in (*directory.glob(".*.part"), *directory.glob("*/.*.part")):
             if is_leftover(leftover.name):
                 _remove_path(leftover)
-        if state != before["code"][-1]:
-            before["code"].append(state)
-            write_json(directory / "benchmark.json", before)
-        return before
+        if state != previous["code"][-1]:
+            previous["code"].append(state)
+            write_json(directory / "benchmark.json", previous)
+        return previous
     directory.mkdir(exist_ok=True)
     for item in directory.iterdir():
         if item.name != "lock":
@@ -236,12 +240,12 @@ def _check_request(chosen: Mapping[str, int]) -> None:
 
 
 def _check_is_empty(directory: Path, *, overwrite: bool) -> None:
-    found = (
+    names = (
         [item.name for item in directory.iterdir() if item.name != "lock"]
         if directory.is_dir()
         else []
     )
-    if found and not overwrite:
+    if names and not overwrite:
         raise OutputError(
             f"output {str(directory)!r} is not empty; give --overwrite to replace its content, "
             "or another name with -o"
@@ -256,8 +260,8 @@ def find_foreign_file(directory: Path) -> str | None:
         place = path.relative_to(directory)
         if path.is_symlink() or not (path.is_file() or place.as_posix() in _FOLDERS):
             return str(place)
-        known = is_lock(path) if str(place) == "lock" else ours and _is_of_benchmark(place)
-        if path.is_file() and not known:
+        is_known = is_lock(path) if str(place) == "lock" else ours and _is_of_benchmark(place)
+        if path.is_file() and not is_known:
             return str(place)
     return None
 

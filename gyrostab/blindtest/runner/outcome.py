@@ -72,16 +72,16 @@ _COLUMNS = 118
 
 
 def score_rows(
-    found: Mapping[str, dict[str, Any]],
+    diagnoses: Mapping[str, dict[str, Any]],
     truths: Mapping[str, dict[str, Any]],
     baseline_scores: Mapping[str, Mapping[str, float]],
 ) -> Rows:
     """Score all cases; a case without a diagnosis counts as "nothing detected"."""
     return [
-        {"name": name, "failed": name not in found, **row}
+        {"name": name, "failed": name not in diagnoses, **row}
         for name, truth in truths.items()
         for row in score_case(
-            found.get(name, _EMPTY_DIAGNOSIS), truth, baseline_scores=baseline_scores.get(name)
+            diagnoses.get(name, _EMPTY_DIAGNOSIS), truth, baseline_scores=baseline_scores.get(name)
         )
     ]
 
@@ -190,7 +190,7 @@ def page_text(
         "### Cost",
         markdown(_tabulate_cost(drawn)),
         "### Failed diagnoses",
-        _format_list([f"{name}: {why}" for name, why in failed.items()], "none"),
+        _format_list([f"{name}: {reason}" for name, reason in failed.items()], "none"),
     ]
     return "\n\n".join(part if "\n" in part else _wrap_text(part) for part in parts) + "\n"
 
@@ -238,8 +238,8 @@ def _describe_counterparts(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _describe_injections(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    found = injection_differences(rows)
-    if not found:
+    differences = injection_differences(rows)
+    if not differences:
         return [
             "None: the folder of the real recordings was not given to this run, or it had too few "
             "cases."
@@ -253,7 +253,7 @@ def _describe_injections(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         + "".join(
             f"; {label} {', '.join(line[key])}" for key, label in _COPY_LABELS.items() if line[key]
         )
-        for line in found
+        for line in differences
     ]
     about = (
         "An effect is injected into a piece of a real recording, which contains unknown effects. "
@@ -273,16 +273,16 @@ _COPY_LABELS = {
 
 def _tabulate_cost(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Tabulate the time of a diagnosis [s] by rate and length."""
-    each = pd.DataFrame(
+    costs = pd.DataFrame(
         [{key: row[key] for key in ("rate", "length", "seconds")} for row in _first_rows(rows)]
     )
-    each["length"] = pd.cut(
-        each["length"],
+    costs["length"] = pd.cut(
+        costs["length"],
         [0, 1200, 3600, 10800, math.inf],
         labels=["< 20 min", "< 1 h", "< 3 h", "longer"],
         right=False,
     )
-    parts = each.groupby(["rate", "length"], observed=True)["seconds"]
+    parts = costs.groupby(["rate", "length"], observed=True)["seconds"]
     table = parts.agg(["count", "median", "max", "sum"]).reset_index()
     return table.rename(
         columns={

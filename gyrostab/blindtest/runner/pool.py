@@ -79,12 +79,12 @@ def _report_done(result: T, report: Callable[[int], None], done: int) -> T:
 @contextlib.contextmanager
 def _limit_threads() -> Iterator[None]:
     """Limit libraries in processes started inside to one thread; they read this when loaded."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    previous = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     try:
         yield
     finally:
-        for name, value in before.items():
+        for name, value in previous.items():
             if value is None:
                 os.environ.pop(name, None)
             else:
@@ -93,7 +93,7 @@ def _limit_threads() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _open_executor(workers: int) -> Iterator[ProcessPoolExecutor]:
-    others = set(multiprocessing.active_children())
+    other_processes = set(multiprocessing.active_children())
     executor = ProcessPoolExecutor(
         workers, mp_context=multiprocessing.get_context("spawn"), initializer=_prepare_process
     )
@@ -101,7 +101,7 @@ def _open_executor(workers: int) -> Iterator[ProcessPoolExecutor]:
         yield executor
     except BaseException:
         executor.shutdown(wait=False, cancel_futures=True)
-        for process in set(multiprocessing.active_children()) - others:
+        for process in set(multiprocessing.active_children()) - other_processes:
             process.terminate()
         raise
     executor.shutdown()

@@ -57,9 +57,9 @@ def diagnose_case(recording: Path, target: Path, failed: Path, nulls: int) -> bo
 
     try:
         log = load_log([recording])
-        found = diagnose(log, nulls=nulls, seed=int(recording.stem[:7], 16))
-        checked = _check_model(log, found) if found.model.get("effect") else None
-        write_json(target, json.loads(found.to_json()) | {"model_check": checked})
+        diagnosis = diagnose(log, nulls=nulls, seed=int(recording.stem[:7], 16))
+        checked = _check_model(log, diagnosis) if diagnosis.model.get("effect") else None
+        write_json(target, json.loads(diagnosis.to_json()) | {"model_check": checked})
     except Exception as error:  # a case that breaks the diagnosis is reported as a result
         lines = traceback.format_exc() if not isinstance(error, GyrostabError) else ""
         write_text(failed, f"{type(error).__name__}: {error}\n{lines}")
@@ -68,15 +68,15 @@ def diagnose_case(recording: Path, target: Path, failed: Path, nulls: int) -> bo
     return True
 
 
-def _check_model(log: xr.Dataset, found: Any) -> dict[str, Any]:
+def _check_model(log: xr.Dataset, diagnosis: Any) -> dict[str, Any]:
     """Compare a recording with its model and with the noise that was calibrated first."""
     from gyrostab.blindtest.scoring.resimulation import check_model
 
     calibrated = {
-        axis: {term: one["value"] for term, one in terms.items()}
-        for axis, terms in found.content["baseline"]["noise"].items()
+        axis: {term: entry["value"] for term, entry in terms.items()}
+        for axis, terms in diagnosis.content["baseline"]["noise"].items()
     }
-    return check_model(log.compute(), found.model, calibrated)
+    return check_model(log.compute(), diagnosis.model, calibrated)
 
 
 def compare_case(recording: Path, truth: dict[str, Any], target: Path) -> dict[str, float]:
@@ -93,9 +93,9 @@ def compare_case(recording: Path, truth: dict[str, Any], target: Path) -> dict[s
     from gyrostab.jobs import load_log
 
     if target.exists():
-        kept: dict[str, float] = json.loads(target.read_text(encoding="utf-8"))
-        if RANDOM in kept:  # earlier versions did not keep scores
-            return kept
+        stored: dict[str, float] = json.loads(target.read_text(encoding="utf-8"))
+        if RANDOM in stored:  # earlier versions did not keep scores
+            return stored
     log = load_log([recording]).compute()
     rng = np.random.default_rng(int(recording.stem[:7], 16))
     scores = {

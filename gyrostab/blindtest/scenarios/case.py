@@ -99,9 +99,9 @@ def _weaken_plan(plan: dict[str, Any], attempt: int) -> dict[str, Any]:
 
 def draw_effects(plan: dict[str, Any], scenario: Scenario, *, attempt: int = 0) -> list[Effect]:
     """Draw the effects of a plan in a scenario."""
-    known = CATALOGUE | OUT_OF_CATALOGUE
+    catalogue = CATALOGUE | OUT_OF_CATALOGUE
     return [
-        known[name].make(
+        catalogue[name].make(
             scenario,
             stream(plan["seed"], "effect", plan["index"], attempt, name),
             strength=strength,
@@ -141,11 +141,11 @@ def make_case(plan: dict[str, Any]) -> tuple[xr.Dataset, dict[str, Any]]:
     >>> truth["effects"][0]["name"], log.sizes["time"]
     ('ageing_noise', 6000)
     """
-    known = CATALOGUE | OUT_OF_CATALOGUE
-    unknown = [name for name in plan["names"] if name not in known]
+    catalogue = CATALOGUE | OUT_OF_CATALOGUE
+    unknown = [name for name in plan["names"] if name not in catalogue]
     if unknown:
-        raise OptionError(f"{unknown[0]!r} is not in the catalogue; it has {', '.join(known)}")
-    entries = [known[name] for name in plan["names"]]
+        raise OptionError(f"{unknown[0]!r} is not in the catalogue; it has {', '.join(catalogue)}")
+    entries = [catalogue[name] for name in plan["names"]]
     seed = int(stream(plan["seed"], "case", plan["index"]).integers(2**40))
     for attempt in range(_MAX_TRIES):
         plan = _weaken_plan(plan, attempt)
@@ -203,8 +203,10 @@ def list_intervals(scenario: Scenario, active: NDArray[np.bool_] | None) -> list
 
 def _block_means(scenario: Scenario, values: NDArray[np.float64]) -> list[float]:
     length = round(WAVEFORM_BLOCK_S * scenario.rate)
-    whole = math.ceil(values.size / length) * length
-    padded = np.concatenate([values, np.full(whole - values.size, np.nan)]).reshape(-1, length)
+    padded_size = math.ceil(values.size / length) * length
+    padded = np.concatenate([values, np.full(padded_size - values.size, np.nan)]).reshape(
+        -1, length
+    )
     return [float(f"{value:.6g}") for value in np.nanmean(padded, axis=1)]
 
 

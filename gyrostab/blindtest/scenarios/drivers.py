@@ -19,8 +19,8 @@ def _delay_values(values: Array, steps: int) -> Array:
 
 def _make_substitute(driver: str, values: Array, rng: np.random.Generator) -> tuple[str, Array]:
     """Make a channel of another name that moves like `values`, with some independent wander."""
-    own = np.cumsum(rng.standard_normal(values.size))
-    parts = [(part - part.mean()) / (float(part.std()) or 1.0) for part in (values, own)]
+    wander = np.cumsum(rng.standard_normal(values.size))
+    parts = [(part - part.mean()) / (float(part.std()) or 1.0) for part in (values, wander)]
     motion = parts[0] + 0.3 * parts[1]
     if driver == "supply_voltage":
         return "light_power", np.asarray(1e-5 * (1 + 0.01 * motion))
@@ -56,34 +56,36 @@ def degrade_driver(
     >>> sorted(degrade_driver(channels, "temperature", how="confounded", rng=rng))
     ['supply_voltage', 'temperature']
     """
-    left = dict(channels)
-    values, rate = left.get(driver, (np.zeros(0), 1.0))
+    remaining = dict(channels)
+    values, rate = remaining.get(driver, (np.zeros(0), 1.0))
     if how == "withheld" or how == "substituted":
-        left.pop(driver, None)
+        remaining.pop(driver, None)
         if driver == "rotation_rate":
-            left = {
-                name: channel for name, channel in left.items() if not name.startswith("accel_")
+            remaining = {
+                name: channel
+                for name, channel in remaining.items()
+                if not name.startswith("accel_")
             }
         if how == "substituted" and values.size:
             name, like = _make_substitute(
                 driver, np.roll(values[::-1], int(rng.integers(values.size))), rng
             )
-            left[name] = (like, rate)
+            remaining[name] = (like, rate)
     elif how == "lagged":
-        left[driver] = (
+        remaining[driver] = (
             _delay_values(values, min(round(rng.uniform(30, 180) * rate), values.size // 4)),
             rate,
         )
     elif how == "confounded":
         name, like = _make_substitute(driver, values, rng)
-        left[name] = (like, rate)
+        remaining[name] = (like, rate)
     elif how == "noisy":
-        left[driver] = (values + rng.normal(0.0, float(values.std()), values.size), rate)
+        remaining[driver] = (values + rng.normal(0.0, float(values.std()), values.size), rate)
     elif how == "clipped":
-        left[driver] = (np.minimum(values, 0.5 * (values.min() + values.max())), rate)
+        remaining[driver] = (np.minimum(values, 0.5 * (values.min() + values.max())), rate)
     else:
         raise OptionError(
             f"how={how!r}: give 'withheld', 'substituted', 'lagged', 'confounded', 'noisy' "
             "or 'clipped'"
         )
-    return left
+    return remaining

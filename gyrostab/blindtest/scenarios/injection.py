@@ -47,11 +47,11 @@ def estimate_noise(record: Array, *, rate: float) -> dict[str, float]:
     tau = np.array(factors) / rate
     white = float(np.nanmin((variance * tau)[tau <= max(1.0, tau[0])]))
     last = int(np.flatnonzero(np.isfinite(variance))[-1])
-    left = max(0.0, float(variance[last]) - 1.5 * white / tau[last])
+    excess = max(0.0, float(variance[last]) - 1.5 * white / tau[last])
     return {
         "N": math.sqrt(white) / 60.0,
         "B": 0.0,
-        "K": math.sqrt(3 * left / (tau[last] / 3600.0)),
+        "K": math.sqrt(3 * excess / (tau[last] / 3600.0)),
         "Q": 0.0,
     }
 
@@ -102,7 +102,7 @@ def _filter_like_record(scenario: Scenario, noise: Array) -> Array:
     """Remove from white noise (axis, time) what the logger's filter removed from the record."""
     assert scenario.measured is not None
     level = scenario.measured.level
-    white = np.array([white_level(one["N"]) ** 2 for one in scenario.noise])
+    white = np.array([white_level(coefficients["N"]) ** 2 for coefficients in scenario.noise])
     response = np.minimum(white_shares(scenario) * level / white[:, None], 1.0)
     lines = fft.rfft(noise, axis=1)
     band = np.minimum(np.arange(lines.shape[1]) * BANDS // lines.shape[1], BANDS - 1)

@@ -124,20 +124,21 @@ def plan_case(index: int, *, seed: int) -> dict[str, Any]:
     lap, place = divmod(index, len(deck))
     order = stream(seed, "kinds", lap).permutation(len(deck))
     kind = deck[int(order[place])]
-    before = sum(deck[int(order[i])] == kind for i in range(place)) + lap * KINDS[kind]
+    turn = sum(deck[int(order[i])] == kind for i in range(place)) + lap * KINDS[kind]
     rng = stream(seed, "plan", index)
     rate, seconds = _draw_shape(rng, kind, index)
     names, strengths = [], []
     if kind != "null":
-        name, strength = _deal_effect(seed, kind, before)
+        name, strength = _deal_effect(seed, kind, turn)
         names, strengths = [name], [strength]
     for _ in range({"pair": 1, "triple": 2}.get(kind, 0)):
-        others = [
-            other
-            for other in CATALOGUE
-            if other not in names and not any({other, name} in INCOMPATIBLE for name in names)
+        candidates = [
+            candidate
+            for candidate in CATALOGUE
+            if candidate not in names
+            and not any({candidate, name} in INCOMPATIBLE for name in names)
         ]
-        names.append(str(rng.choice(others)))
+        names.append(str(rng.choice(candidates)))
         strengths.append(float(rng.choice(STRENGTHS)))
     channel = (CATALOGUE | OUT_OF_CATALOGUE)[names[0]].channel if names else None
     possible = [

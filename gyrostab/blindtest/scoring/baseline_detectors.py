@@ -46,8 +46,8 @@ def octaves(size: int) -> list[int]:
     >>> octaves(100)
     [1, 2, 4, 8]
     """
-    most = max(1, size // 10)
-    return [2**k for k in range(most.bit_length())]
+    largest = max(1, size // 10)
+    return [2**k for k in range(largest.bit_length())]
 
 
 def allan_variance(
@@ -85,9 +85,9 @@ def allan_variance(
         number = (count[k:] - count[:-k]).astype(float)
         mean = (total[k:] - total[:-k]) / np.maximum(number, 1)
         good = 2 * number >= k * full
-        both = good[k:] & good[:-k]
+        is_valid = good[k:] & good[:-k]
         step = mean[k:] - mean[:-k]
-        out.append(0.5 * float((step[both] ** 2).mean()) if both.any() else math.nan)
+        out.append(0.5 * float((step[is_valid] ** 2).mean()) if is_valid.any() else math.nan)
     return np.asarray(out)
 
 
@@ -287,8 +287,8 @@ def channel_means(log: xr.Dataset, length: int, number: int) -> dict[str, Array]
         if variable.dims not in (("time",), (f"time_{name}",)):
             continue
         values = np.asarray(variable.values, dtype=float)
-        own = values.size / log.sizes["time"]
-        edges = np.minimum((np.arange(number) * length * own).astype(int), values.size - 1)
+        rate_ratio = values.size / log.sizes["time"]
+        edges = np.minimum((np.arange(number) * length * rate_ratio).astype(int), values.size - 1)
         out[str(name)] = np.add.reduceat(values, edges) / np.diff(np.append(edges, values.size))
     return out
 
@@ -309,11 +309,11 @@ def channel_detector(log: xr.Dataset, *, block: float = 10.0) -> float:
     pairs = [
         _correlation_p(series[present > 0], driver[present > 0])
         for driver in channel_means(log, length, means.shape[1]).values()
-        for both in (means, powers)
-        for series, present in zip(both, counts, strict=True)
+        for statistic in (means, powers)
+        for series, present in zip(statistic, counts, strict=True)
     ]
-    found = [p for p in pairs if math.isfinite(p)]
-    return math.log(LEVEL / len(found) / max(min(found), 1e-300)) if found else -math.inf
+    p_values = [p for p in pairs if math.isfinite(p)]
+    return math.log(LEVEL / len(p_values) / max(min(p_values), 1e-300)) if p_values else -math.inf
 
 
 def _correlation_p(x: Array, y: Array) -> float:

@@ -43,18 +43,18 @@ def curves(rows: Sequence[Row]) -> pd.DataFrame:
         ``effect``, ``strength``, ``n``, ``detected``, ``detected_low``, ``detected_high``,
         ``named``, ``named_low``, ``named_high``.
     """
-    here = [
+    selected = [
         row
         for row in rows
         if row["kind"] in ("single", "pair", "triple", "sub_threshold", "out_of_catalogue")
         and row["effect"]
     ]
     out = []
-    for effect in ["all", *sorted({row["effect"] for row in here})]:
-        for strength in sorted({row["strength"] for row in here}):
+    for effect in ["all", *sorted({row["effect"] for row in selected})]:
+        for strength in sorted({row["strength"] for row in selected}):
             part = [
                 row
-                for row in here
+                for row in selected
                 if row["strength"] == strength
                 and (
                     row["effect"] == effect
@@ -76,7 +76,7 @@ def fitted_noise_curve(rows: Sequence[Row]) -> pd.DataFrame:
         ``strength`` (range), ``n``, and the shares as in `curves`, of catalogue effects with an
         undisturbed driver.
     """
-    here = [
+    selected = [
         (row, row["learned_strength"])
         for row in rows
         if row["kind"] in ("single", "pair", "triple", "sub_threshold")
@@ -85,7 +85,7 @@ def fitted_noise_curve(rows: Sequence[Row]) -> pd.DataFrame:
     ]
     out = []
     for low, high in pairwise((0.0, *_FITTED_LIMITS, math.inf)):
-        part = [row for row, strength in here if low <= strength < high]
+        part = [row for row, strength in selected if low <= strength < high]
         if part:
             name = f"{low:g} to {high:g}" if high < math.inf else f"{low:g} and more"
             out.append({"strength": name, **_count_shares(part)})
@@ -175,16 +175,18 @@ def names_given(rows: Sequence[Row]) -> pd.DataFrame:
     out = []
     single = [row for row in rows if row["kind"] in ("single", "sub_threshold")]
     for effect in sorted({row["effect"] for row in single}):
-        here = [row for row in single if row["effect"] == effect]
-        names = Counter(row["identifications"][0]["name"] for row in here if row["identifications"])
-        nothing = sum(not row["detected"] for row in here)
+        selected = [row for row in single if row["effect"] == effect]
+        names = Counter(
+            row["identifications"][0]["name"] for row in selected if row["identifications"]
+        )
+        nothing = sum(not row["detected"] for row in selected)
         out.append(
             {
                 "effect": effect,
-                "n": len(here),
+                "n": len(selected),
                 "itself": names.pop(effect, 0),
                 "other names": ", ".join(f"{name} {n}" for name, n in names.most_common()),
-                "unidentified": sum(not row["identifications"] for row in here) - nothing,
+                "unidentified": sum(not row["identifications"] for row in selected) - nothing,
                 "nothing": nothing,
             }
         )
@@ -205,15 +207,15 @@ def by_effect(rows: Sequence[Row]) -> pd.DataFrame:
         95 % intervals. None where there is nothing to count.
     """
     identifications = {line["name"]: line for line in reliability(rows).to_dict("records")}
-    here = [
+    selected = [
         row
         for row in rows
         if row["kind"] in ("single", "pair", "triple", "sub_threshold") and row["effect"]
     ]
     out = []
-    for effect in sorted({row["effect"] for row in here} | set(identifications)):
+    for effect in sorted({row["effect"] for row in selected} | set(identifications)):
         clear = [
-            row for row in here if row["effect"] == effect and row["strength"] >= CLEAR_STRENGTH
+            row for row in selected if row["effect"] == effect and row["strength"] >= CLEAR_STRENGTH
         ]
         numbers = [number["covered"] for row in clear for number in row["parameter_scores"]]
         out.append(

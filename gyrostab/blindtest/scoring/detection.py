@@ -94,13 +94,15 @@ def detection_shares(rows: Sequence[Row]) -> pd.DataFrame:
             "n": cases.size,
             "noise": noise.size,
         }
-        others, chosen = (
+        resampled_noise, resampled_cases = (
             values[rng.integers(values.size, size=(_RESAMPLINGS, values.size))]
             for values in (noise, cases)
         )
         for rate in FALSE_ALARM_RATES:
             (value,) = _shares_detected(noise[None], cases[None], rate)
-            low, high = np.quantile(_shares_detected(others, chosen, rate), _INTERVAL)
+            low, high = np.quantile(
+                _shares_detected(resampled_noise, resampled_cases, rate), _INTERVAL
+            )
             label = f"at {100 * rate:g} %"
             line |= {label: float(value), f"{label}, low": low, f"{label}, high": high}
         lines.append(line)
@@ -125,9 +127,9 @@ def roc_curves(rows: Sequence[Row]) -> pd.DataFrame:
                 "detector": name,
                 "false_alarms": float((noise > threshold).mean()),
                 "detected": float((cases > threshold).mean()),
-                "own": own,
+                "own": is_own,
             }
-            for threshold, own in [(0.0, True), *((value, False) for value in thresholds)]
+            for threshold, is_own in [(0.0, True), *((value, False) for value in thresholds)]
         ]
     return pd.DataFrame(lines, columns=["cases", "detector", "false_alarms", "detected", "own"])
 
@@ -148,11 +150,11 @@ def counterpart_table(rows: Sequence[Row]) -> pd.DataFrame:
     noise = [row for row in rows if row["kind"] in ("null", "counterpart")]
     names = [
         (
-            one["name"],
+            identification["name"],
             {other["name"] for other in counterpart["identifications"]},
         )
         for case, counterpart in pairs
-        for one in case["identifications"]
+        for identification in case["identifications"]
     ]
     return pd.DataFrame(
         [
@@ -180,7 +182,7 @@ def counterpart_table(rows: Sequence[Row]) -> pd.DataFrame:
             ),
             share(
                 "names of a case that its counterpart has too",
-                (name in others for name, others in names),
+                (name in counterpart_names for name, counterpart_names in names),
             ),
         ]
     )

@@ -36,7 +36,7 @@ def injection_differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
     for index, copies in sorted(groups.items()):
         if set(copies) != {"injected", "untouched", "flipped", "reversed"}:
             continue
-        known = _merged_names(copies["untouched"])
+        untouched_names = _merged_names(copies["untouched"])
         injected = copies["injected"]
         mine = merge_ambiguous(injected["effect"])
         out.append(
@@ -49,9 +49,9 @@ def injection_differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
                 "before": sorted(_names_given(copies["untouched"])),
                 "there_before": bool(_names_given(copies["untouched"]) & mine),
                 "named": bool(_names_given(injected) & mine),
-                "others": sorted(_names_given(injected) - mine - known),
-                "flipped": sorted(_names_given(copies["flipped"]) - known),
-                "reversed": sorted(_names_given(copies["reversed"]) - known),
+                "others": sorted(_names_given(injected) - mine - untouched_names),
+                "flipped": sorted(_names_given(copies["flipped"]) - untouched_names),
+                "reversed": sorted(_names_given(copies["reversed"]) - untouched_names),
             }
         )
     return out
@@ -70,10 +70,10 @@ def injection_table(rows: Sequence[Row]) -> pd.DataFrame:
 
     An effect counts as named only where the untouched copy does not have its name already.
     """
-    found = injection_differences(rows)
-    if not found:
+    differences = injection_differences(rows)
+    if not differences:
         return pd.DataFrame(columns=["quantity", "value", "low", "high", "n", "target", "state"])
-    new = [line for line in found if not line["there_before"]]
+    new = [line for line in differences if not line["there_before"]]
     lines = [
         share(
             f"injections of strength {CLEAR_STRENGTH:g} or more: named correctly",
@@ -84,9 +84,11 @@ def injection_table(rows: Sequence[Row]) -> pd.DataFrame:
             "correctly",
             (line["named"] for line in new if (line["learned_strength"] or 0.0) >= SURE_STRENGTH),
         ),
-        share("injection adds another name", (bool(line["others"]) for line in found)),
-        share("reversing the sign adds a name", (bool(line["flipped"]) for line in found)),
-        share("reversing time adds a name", (bool(line["reversed"]) for line in found)),
-        share("effect already named without injection", (line["there_before"] for line in found)),
+        share("injection adds another name", (bool(line["others"]) for line in differences)),
+        share("reversing the sign adds a name", (bool(line["flipped"]) for line in differences)),
+        share("reversing time adds a name", (bool(line["reversed"]) for line in differences)),
+        share(
+            "effect already named without injection", (line["there_before"] for line in differences)
+        ),
     ]
     return pd.DataFrame(lines)

@@ -33,10 +33,10 @@ _INTERVAL = (0.025, 0.975)
 def _collect_probabilities(rows: Sequence[Row]) -> tuple[Array, Array]:
     """Return the probability of each identification, and 1 where its name is right."""
     pairs = [
-        (one["probability"], one["exact"])
+        (identification["probability"], identification["exact"])
         for row in first_rows(drawn_rows(rows))
-        for one in row["identifications"]
-        if one["probability"] is not None
+        for identification in row["identifications"]
+        if identification["probability"] is not None
     ]
     stated, right = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
     return stated, right
@@ -100,19 +100,25 @@ def risk_coverage(rows: Sequence[Row]) -> pd.DataFrame:
         ``risk`` (share of all such names that is wrong).
     """
     stated, right = _collect_probabilities(rows)
-    least = np.unique(stated)[::-1]
-    above = stated >= least[:, None]
+    thresholds = np.unique(stated)[::-1]
+    above = stated >= thresholds[:, None]
     records = first_rows([row for row in drawn_rows(rows) if row["kind"] != "null"])
     surest = np.array(
         [
-            max((one["probability"] or 0.0 for one in row["identifications"]), default=0.0)
+            max(
+                (identification["probability"] or 0.0 for identification in row["identifications"]),
+                default=0.0,
+            )
             for row in records
         ]
     )
     return pd.DataFrame(
         {
-            "least": least,
-            "coverage": [float((surest >= one).mean()) if records else math.nan for one in least],
+            "least": thresholds,
+            "coverage": [
+                float((surest >= threshold).mean()) if records else math.nan
+                for threshold in thresholds
+            ],
             "risk": above @ (1.0 - right) / above.sum(axis=1),
         }
     )
@@ -144,7 +150,7 @@ def probability_lines(rows: Sequence[Row]) -> list[Line]:
     chosen = rng.integers(stated.size, size=(_RESAMPLINGS, stated.size))
     lines = []
     for name, (score, target) in scores.items():
-        resampled = [score(stated[several], right[several]) for several in chosen]
+        resampled = [score(stated[selection], right[selection]) for selection in chosen]
         low, high = np.quantile(resampled, _INTERVAL)
         lines.append(make_line(name, score(stated, right), low, high, stated.size, target))
     outcomes = (rng.random(chosen.shape) < stated).astype(float)

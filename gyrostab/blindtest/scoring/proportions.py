@@ -84,8 +84,8 @@ def make_line(
 
 def share(name: str, flags: Iterable[bool], target: Target = NO_TARGET) -> Line:
     """Make the line of a share of cases, with Wilson's interval."""
-    found = [bool(flag) for flag in flags]
-    hits, total = sum(found), len(found)
+    outcomes = [bool(flag) for flag in flags]
+    hits, total = sum(outcomes), len(outcomes)
     return make_line(
         name,
         hits / total if total else math.nan,
@@ -97,29 +97,32 @@ def share(name: str, flags: Iterable[bool], target: Target = NO_TARGET) -> Line:
 
 def median(name: str, values: Iterable[float | None], target: Target = NO_TARGET) -> Line:
     """Make the line of a median, with its order-statistic interval."""
-    found = np.sort([value for value in values if value is not None and math.isfinite(value)])
-    if found.size == 0:
+    ordered = np.sort([value for value in values if value is not None and math.isfinite(value)])
+    if ordered.size == 0:
         return make_line(name, math.nan, math.nan, math.nan, 0, target)
-    reach = 0.98 * math.sqrt(found.size)
-    low, high = math.floor((found.size - 1) / 2 - reach), math.ceil((found.size - 1) / 2 + reach)
+    reach = 0.98 * math.sqrt(ordered.size)
+    low, high = (
+        math.floor((ordered.size - 1) / 2 - reach),
+        math.ceil((ordered.size - 1) / 2 + reach),
+    )
     ends = (
         (-math.inf, math.inf)
-        if found.size < 6
-        else (found[max(0, low)], found[min(found.size - 1, high)])
+        if ordered.size < 6
+        else (ordered[max(0, low)], ordered[min(ordered.size - 1, high)])
     )
     return make_line(
-        name, float(np.median(found)), float(ends[0]), float(ends[1]), found.size, target
+        name, float(np.median(ordered)), float(ends[0]), float(ends[1]), ordered.size, target
     )
 
 
 def spread(name: str, pulls: Iterable[float | None], target: Target = NO_TARGET) -> Line:
     """Make the line of the 68 % quantile of normalised errors, 1 where these are right."""
-    found = np.abs([pull for pull in pulls if pull is not None and math.isfinite(pull)])
-    if found.size == 0:
+    sizes = np.abs([pull for pull in pulls if pull is not None and math.isfinite(pull)])
+    if sizes.size == 0:
         return make_line(name, math.nan, math.nan, math.nan, 0, target)
-    value = float(np.quantile(found, 0.6827))
-    off = 0.96 / math.sqrt(found.size)  # 95 % interval of the share, by the binomial law
+    value = float(np.quantile(sizes, 0.6827))
+    off = 0.96 / math.sqrt(sizes.size)  # 95 % interval of the share, by the binomial law
     low, high = (
-        float(np.quantile(found, min(max(0.6827 + step, 0.0), 1.0))) for step in (-off, off)
+        float(np.quantile(sizes, min(max(0.6827 + step, 0.0), 1.0))) for step in (-off, off)
     )
-    return make_line(name, value, low, high, found.size, target)
+    return make_line(name, value, low, high, sizes.size, target)

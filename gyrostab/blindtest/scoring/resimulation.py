@@ -74,15 +74,17 @@ def check_model(
     if rivals[0] == rivals[1]:
         del rivals[1]
     try:
-        with_effects, *others = (
-            simulate_statistics(log, read_model(dict(one))) for one in (model, *rivals)
+        with_effects, *rival_ensembles = (
+            simulate_statistics(log, read_model(dict(tables))) for tables in (model, *rivals)
         )
     except GyrostabError as error:
         return {"runs": False, "reason": str(error)}
     measured = measure_statistics(log)
     return {
         "runs": True,
-        "nats": min(likelihood_ratio(measured, with_effects, other) for other in others),
+        "nats": min(
+            likelihood_ratio(measured, with_effects, ensemble) for ensemble in rival_ensembles
+        ),
     }
 
 
@@ -94,13 +96,13 @@ def simulate_statistics(log: xr.Dataset, model: Any) -> list[dict[str, Array]]:
     from gyrostab import simulate
 
     lost = ~np.isfinite(log["rate"].values)
-    found = []
+    statistics = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for seed in range(1, _RECORDS + 1):
             rate = simulate(model, like=log, seed=seed)["rate"].values
-            found.append(record_statistics(np.where(lost, np.nan, rate), log))
-    return found
+            statistics.append(record_statistics(np.where(lost, np.nan, rate), log))
+    return statistics
 
 
 def measure_statistics(log: xr.Dataset) -> dict[str, Array]:
@@ -121,12 +123,14 @@ def likelihood_ratio(
     """
     total = 0.0
     for name, values in recorded.items():
-        drawn = np.stack([[record[name] for record in one] for one in (with_effects, without)])
+        drawn = np.stack(
+            [[record[name] for record in ensemble] for ensemble in (with_effects, without)]
+        )
         good = np.isfinite(drawn).all(axis=(0, 1)) & np.isfinite(values)
         logs = []
         for ensemble in drawn[..., good] if good.any() else ():
-            least = _MIN_SCATTER.get(re.split("[ /]", name)[0], 1e-12)
-            scatter = max(_fit_scatter(ensemble), least)
+            min_scatter = _MIN_SCATTER.get(re.split("[ /]", name)[0], 1e-12)
+            scatter = max(_fit_scatter(ensemble), min_scatter)
             z = (values[good] - np.median(ensemble, axis=0)) / scatter
             logs.append(-np.log(scatter) - (_TAIL_FREEDOM + 1) / 2 * np.log1p(z**2 / _TAIL_FREEDOM))
         if logs:
@@ -174,8 +178,8 @@ def record_statistics(rate: Array, log: xr.Dataset) -> dict[str, Array]:
         with np.errstate(divide="ignore"):
             out[f"lines/{row}"] = np.log([np.mean(line) for line in lines if line.size])
             out[f"peaks/{row}"] = np.log([np.max(line) for line in lines if line.size])
-    for one, other in combinations(range(len(rate)), 2):
-        out[f"coherency/{one}{other}"] = _measure_coherencies(spectra[one], spectra[other])
+    for first, second in combinations(range(len(rate)), 2):
+        out[f"coherency/{first}{second}"] = _measure_coherencies(spectra[first], spectra[second])
     return out
 
 
@@ -216,12 +220,12 @@ def _octave_powers(values: Array) -> dict[str, Array]:
         }
 
 
-def _measure_coherencies(one: NDArray[Any], other: NDArray[Any]) -> Array:
+def _measure_coherencies(spectrum: NDArray[Any], other_spectrum: NDArray[Any]) -> Array:
     """Return real and imaginary coherency of two axes by octave, in standard deviations."""
-    edges = np.unique(one.shape[1] // 2 ** np.arange(_BANDS + 1))
+    edges = np.unique(spectrum.shape[1] // 2 ** np.arange(_BANDS + 1))
     out = []
     for low, high in zip(edges[edges > 0][:-1], edges[edges > 0][1:], strict=True):
-        first, second = one[:, low:high], other[:, low:high]
+        first, second = spectrum[:, low:high], other_spectrum[:, low:high]
         size = np.sqrt((np.abs(first) ** 2).sum() * (np.abs(second) ** 2).sum())
         out.append((first * second.conj()).sum() / size * np.sqrt(2.0 * first.size))
     return np.array([part for number in out for part in (number.real, number.imag)])
@@ -253,9 +257,9 @@ def _count_outliers(values: Array) -> int:
 
     Normal noise has one such sample in a record.
     """
-    several = sliding_window_view(values, 2 * _NEIGHBOURS + 1)
-    neighbours = np.delete(several, _NEIGHBOURS, axis=1)
-    departure = np.abs(several[:, _NEIGHBOURS] - np.median(neighbours, axis=1))
+    windows = sliding_window_view(values, 2 * _NEIGHBOURS + 1)
+    neighbours = np.delete(windows, _NEIGHBOURS, axis=1)
+    departure = np.abs(windows[:, _NEIGHBOURS] - np.median(neighbours, axis=1))
     limit = -1.4826 * np.nanmedian(departure) * float(ndtri(0.5 / departure.size))
     return int((departure > limit).sum())
 
@@ -295,13 +299,13 @@ def _channels_at_samples(log: xr.Dataset) -> dict[str, Array]:
     from gyrostab.schema import log_channels
 
     at = log["time"].values.astype("datetime64[ns]").astype(np.int64)
-    found = {}
+    channels = {}
     for name in log_channels(log):
         channel = log[name]
         if channel.ndim != 1 or channel.size < _MIN_CHANNEL_SHARE * at.size:
             continue
-        known = channel[channel.dims[0]].values.astype("datetime64[ns]").astype(np.int64)
-        nearest = np.clip(np.searchsorted(known, at), 1, known.size - 1)
-        nearest -= at - known[nearest - 1] < known[nearest] - at
-        found[name] = channel.values.astype(np.float64)[nearest]
-    return found
+        stamps = channel[channel.dims[0]].values.astype("datetime64[ns]").astype(np.int64)
+        nearest = np.clip(np.searchsorted(stamps, at), 1, stamps.size - 1)
+        nearest -= at - stamps[nearest - 1] < stamps[nearest] - at
+        channels[name] = channel.values.astype(np.float64)[nearest]
+    return channels

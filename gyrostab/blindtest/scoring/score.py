@@ -44,17 +44,17 @@ def _merge_intervals(intervals: Intervals) -> list[tuple[float, float]]:
     return joined
 
 
-def intersection_over_union(found: Intervals, true: Intervals) -> float:
+def intersection_over_union(diagnosed: Intervals, true: Intervals) -> float:
     """Compute the overlap in time of two lists of ISO 8601 intervals (IoU).
 
     Examples
     --------
-    >>> found = [["2026-01-01T00:00:00", "2026-01-01T00:00:10"]]
+    >>> diagnosed = [["2026-01-01T00:00:00", "2026-01-01T00:00:10"]]
     >>> true = [["2026-01-01T00:00:05Z", "2026-01-01T00:00:15Z"]]
-    >>> intersection_over_union(found, true)
+    >>> intersection_over_union(diagnosed, true)
     0.3333333333333333
     """
-    a, b = _merge_intervals(found), _merge_intervals(true)
+    a, b = _merge_intervals(diagnosed), _merge_intervals(true)
     overlap = sum(max(0.0, min(x[1], y[1]) - max(x[0], y[0])) for x in a for y in b)
     either = sum(end - begin for begin, end in (*a, *b)) - overlap
     return overlap / either if either > 0 else 0.0
@@ -91,30 +91,30 @@ def _score_parameters(
     """
     out = []
     for name, true in effect["parameters"].items():
-        wanted = true.get("values") or {None: true["value"]}
-        for axis, value in wanted.items():
-            known = [
+        true_values = true.get("values") or {None: true["value"]}
+        for axis, value in true_values.items():
+            entries = [
                 _find_parameter(table, name, axis, unless=true.get("unless", ()))
                 for table in identification["tables"]
             ]
-            near = [
+            matches = [
                 (_frequency_distance(table, effect), entry)
-                for table, entry in zip(identification["tables"], known, strict=True)
+                for table, entry in zip(identification["tables"], entries, strict=True)
                 if entry is not None
             ]
-            if not near:
+            if not matches:
                 continue
-            found = min(near, key=lambda item: item[0])[1]
+            estimate = min(matches, key=lambda item: item[0])[1]
             if (
-                found.get("unit") != true["unit"]
-                or found.get("low") is None
-                or found.get("high") is None
+                estimate.get("unit") != true["unit"]
+                or estimate.get("low") is None
+                or estimate.get("high") is None
             ):
                 continue
-            turned = -1.0 if name in _UNSIGNED and (found["value"] or 0.0) < 0 else 1.0
-            low, high = sorted((turned * found["low"], turned * found["high"]))
-            sure = found.get("value") is not None and found.get("stderr")
-            pull = (turned * found["value"] - value) / found["stderr"] if sure else None
+            turned = -1.0 if name in _UNSIGNED and (estimate["value"] or 0.0) < 0 else 1.0
+            low, high = sorted((turned * estimate["low"], turned * estimate["high"]))
+            sure = estimate.get("value") is not None and estimate.get("stderr")
+            pull = (turned * estimate["value"] - value) / estimate["stderr"] if sure else None
             last = _RELATIVE_TOLERANCE * abs(value)  # exact values may differ by rounding
             out.append(
                 {
@@ -135,21 +135,21 @@ def _find_parameter(
         axis is not None and axis not in axes
     ):
         return None
-    found: Mapping[str, Any] | None = parameters.get(
+    entry: Mapping[str, Any] | None = parameters.get(
         f"{name}.{axis}" if axis is not None and len(axes) > 1 else name
     )
-    return found
+    return entry
 
 
 def _frequency_distance(table: Mapping[str, Any], effect: Mapping[str, Any]) -> float:
     """Compute the distance in frequency between table and effect, to match the nearest line."""
-    true, found = (
+    true, estimate = (
         effect["parameters"].get("frequency"),
         table.get("parameters", {}).get("frequency"),
     )
     return (
-        abs(found["value"] - true["value"])
-        if true and found and found.get("value") is not None
+        abs(estimate["value"] - true["value"])
+        if true and estimate and estimate.get("value") is not None
         else 0.0
     )
 
@@ -185,10 +185,10 @@ def drawn_rows(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
 
 def first_rows(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     """Keep one row per case."""
-    seen: dict[Any, Mapping[str, Any]] = {}
+    rows_by_case: dict[Any, Mapping[str, Any]] = {}
     for i, row in enumerate(rows):
-        seen.setdefault(row["index"] if row["index"] is not None else ("no number", i), row)
-    return list(seen.values())
+        rows_by_case.setdefault(row["index"] if row["index"] is not None else ("no number", i), row)
+    return list(rows_by_case.values())
 
 
 def detection_score(diagnosis: Mapping[str, Any]) -> float:
@@ -217,9 +217,9 @@ def detection_score(diagnosis: Mapping[str, Any]) -> float:
         if mismatch.get("p_value") is not None
     ]
     margins += [
-        -one["nats"]
-        for one in diagnosis.get("rejected", ())
-        if one["beaten_by"] == "noise" and one["nats"] is not None
+        -rejection["nats"]
+        for rejection in diagnosis.get("rejected", ())
+        if rejection["beaten_by"] == "noise" and rejection["nats"] is not None
     ]
     return max(margins, default=-math.inf)
 
@@ -331,14 +331,16 @@ def _score_effect(
     true: Sequence[str],
 ) -> dict[str, Any]:
     name = effect["name"]
-    others = accepted.union(
+    other_names = accepted.union(
         *(merge_ambiguous(other) for other in true if other != name)
     ) - merge_ambiguous(name)
     mine = [
-        identification for identification in identifications if identification["name"] not in others
+        identification
+        for identification in identifications
+        if identification["name"] not in other_names
     ]
     top = mine[0] if mine else None
-    own = next(
+    match = next(
         (
             identification
             for identification in mine
@@ -365,9 +367,9 @@ def _score_effect(
     if top is not None:
         row["in_set"] = name in _ambiguity_set(top)
         row["set_size"] = len(_ambiguity_set(top))
-    if own is not None:
-        row["parameter_scores"] = _score_parameters(own, effect) if own["name"] == name else []
-        row["tau_hit"] = _tau_hit(diagnosis, own["name"], effect)
-        if effect["localised"] and own["intervals"]:
-            row["iou"] = intersection_over_union(own["intervals"], effect["intervals"])
+    if match is not None:
+        row["parameter_scores"] = _score_parameters(match, effect) if match["name"] == name else []
+        row["tau_hit"] = _tau_hit(diagnosis, match["name"], effect)
+        if effect["localised"] and match["intervals"]:
+            row["iou"] = intersection_over_union(match["intervals"], effect["intervals"])
     return row

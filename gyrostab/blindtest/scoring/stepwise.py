@@ -87,27 +87,32 @@ def _gain_of_terms(
     for ratio in walk_ratios:
         white, half_determinant = _whiten_differences(columns, variance, ratio * np.diff(at))
         best = np.maximum(best, _select_terms(white, costs) - half_determinant)
-    each = 0.5 * math.log(at.size)
-    return float((best[1:] - best[0] - each * np.arange(1, _MAX_TERMS + 1)).max())
+    term_cost = 0.5 * math.log(at.size)
+    return float((best[1:] - best[0] - term_cost * np.arange(1, _MAX_TERMS + 1)).max())
 
 
 def _select_terms(white: Array, costs: Array) -> Array:
     """Regress the first column on the others step by step; return log likelihood less costs."""
-    rest, candidates = white[:, 0].copy(), white[:, 1:].copy()
+    residual, candidates = white[:, 0].copy(), white[:, 1:].copy()
     half = 0.5 * white.shape[0]
     size = np.einsum("ij,ij->j", candidates, candidates)
-    least = 1e-6 * size
-    value = -half * math.log(max(float(rest @ rest), 1e-300))
+    min_size = 1e-6 * size
+    value = -half * math.log(max(float(residual @ residual), 1e-300))
     values = [value]
     for _ in range(_MAX_TERMS):
         share = np.zeros(size.size)
-        np.divide((rest @ candidates) ** 2, size * (rest @ rest), out=share, where=size > least)
+        np.divide(
+            (residual @ candidates) ** 2,
+            size * (residual @ residual),
+            out=share,
+            where=size > min_size,
+        )
         gain = -half * np.log1p(-np.minimum(share, 1.0 - 1e-12)) - costs
         chosen = int(gain.argmax())
         value += float(gain[chosen])
         values.append(value)
         direction = candidates[:, chosen] / math.sqrt(max(float(size[chosen]), 1e-300))
-        rest = rest - (rest @ direction) * direction
+        residual = residual - (residual @ direction) * direction
         candidates -= np.outer(direction, direction @ candidates)
         size = np.einsum("ij,ij->j", candidates, candidates)
     return np.array(values)
@@ -128,8 +133,8 @@ def stepwise_detector(log: xr.Dataset) -> float:
     gains = np.array(
         [
             _gain_of_terms(series, present, terms, costs, walk_ratios)
-            for both, walk_ratios in ((means, _WALK_RATIOS), (powers, (0.0,)))
-            for series, present in zip(both, counts, strict=True)
+            for statistic, walk_ratios in ((means, _WALK_RATIOS), (powers, (0.0,)))
+            for series, present in zip(statistic, counts, strict=True)
         ]
     )
     return float(gains[gains > 0.0].sum() if (gains > 0.0).any() else gains.max())

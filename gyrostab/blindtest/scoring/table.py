@@ -56,14 +56,14 @@ def score_table(rows: Sequence[Row]) -> pd.DataFrame:
     return pd.DataFrame([line for group in groups for line in group(rows)])
 
 
-def _catalogue_rows(rows: Sequence[Row], *, least: float = 0.0) -> list[Row]:
+def _catalogue_rows(rows: Sequence[Row], *, min_strength: float = 0.0) -> list[Row]:
     """Select rows of catalogue effects with an undisturbed driver."""
     return [
         row
         for row in rows
         if row["kind"] in ("single", "pair", "triple", "sub_threshold")
         and row["effect"]
-        and row["strength"] >= least
+        and row["strength"] >= min_strength
     ]
 
 
@@ -81,10 +81,10 @@ def _false_alarm_lines(rows: Sequence[Row]) -> list[Line]:
 
 
 def _naming_lines(rows: Sequence[Row]) -> list[Line]:
-    clear = _catalogue_rows(rows, least=CLEAR_STRENGTH)
-    seen = [row for row in clear if row["detected"]]
-    alone = [row for row in clear if row["kind"] in ("single", "sub_threshold")]
-    shown = [row for row in alone if (row.get("learned_strength") or 0.0) >= CLEAR_STRENGTH]
+    clear = _catalogue_rows(rows, min_strength=CLEAR_STRENGTH)
+    detected = [row for row in clear if row["detected"]]
+    single = [row for row in clear if row["kind"] in ("single", "sub_threshold")]
+    shown = [row for row in single if (row.get("learned_strength") or 0.0) >= CLEAR_STRENGTH]
     sure = [row for row in _catalogue_rows(rows) if _is_sure(row)]
     claimed = [row for row in clear if row["set_size"]]
     percent = Target(">= 95 %", least=0.95)
@@ -95,7 +95,7 @@ def _naming_lines(rows: Sequence[Row]) -> list[Line]:
             Target(">= 33 %", least=0.33),
         ),
         share("detected, strength 1.5 or more", (row["detected"] for row in clear), percent),
-        share("detected, single effects", (row["detected"] for row in alone)),
+        share("detected, single effects", (row["detected"] for row in single)),
         share(
             "detected, single effects of that strength with fitted noise",
             (row["detected"] for row in shown),
@@ -117,21 +117,21 @@ def _naming_lines(rows: Sequence[Row]) -> list[Line]:
         ),
         share(
             "named correctly, of the detected (sets merged)",
-            (row["named"] for row in seen),
+            (row["named"] for row in detected),
             percent,
         ),
         share(
             "named correctly, single effects",
-            (row["named"] for row in alone if row["detected"]),
+            (row["named"] for row in single if row["detected"]),
         ),
         share(
             "named correctly, in pairs and triples",
-            (row["named"] for row in seen if row["kind"] in ("pair", "triple")),
+            (row["named"] for row in detected if row["kind"] in ("pair", "triple")),
         ),
-        share("named exactly, of the detected", (row["named_exactly"] for row in seen)),
+        share("named exactly, of the detected", (row["named_exactly"] for row in detected)),
         share(
             "named exactly where the form differs",
-            (row["named_exactly"] for row in seen if row["form_differs"]),
+            (row["named_exactly"] for row in detected if row["form_differs"]),
         ),
         share("cases with a wrong name", (row["wrong"] > 0 for row in first_rows(clear))),
         share(
@@ -174,17 +174,17 @@ def _out_of_catalogue_lines(rows: Sequence[Row]) -> list[Line]:
         for row in rows
         if row["kind"] == "out_of_catalogue" and row["strength"] >= CLEAR_STRENGTH
     ]
-    seen = [row for row in strange if row["detected"]]
+    detected = [row for row in strange if row["detected"]]
     return [
         share("out of catalogue: detected", (row["detected"] for row in strange)),
         share(
             "out of catalogue: unidentified",
-            (row["unidentified"] for row in seen),
+            (row["unidentified"] for row in detected),
             Target(">= 90 %", least=0.90),
         ),
         share(
             "out of catalogue: wrong name",
-            (row["wrong"] > 0 for row in seen),
+            (row["wrong"] > 0 for row in detected),
             Target("<= 5 %", most=0.05),
         ),
     ]
@@ -225,8 +225,8 @@ def _degraded_driver_lines(rows: Sequence[Row]) -> list[Line]:
 
 
 def _parameter_lines(rows: Sequence[Row]) -> list[Line]:
-    clear = _catalogue_rows(rows, least=CLEAR_STRENGTH)
-    found = [(row, number) for row in clear for number in row["parameter_scores"]]
+    clear = _catalogue_rows(rows, min_strength=CLEAR_STRENGTH)
+    scores = [(row, number) for row in clear for number in row["parameter_scores"]]
     coverage = Target("92-98 %", least=0.92, most=0.98)
     gains = [
         (row["gain"] / row["oracle"], _all_named(row, rows))
@@ -238,7 +238,7 @@ def _parameter_lines(rows: Sequence[Row]) -> list[Line]:
         for row in first_rows(clear)
         if row["named"] and _has_gain(row) and row.get("learned", 0.0) > 0
     ]
-    others = [number["covered"] for row, number in found if row["effect"] != "shared_source"]
+    covered = [number["covered"] for row, number in scores if row["effect"] != "shared_source"]
     return [
         median(
             "overlap in time (IoU), median",
@@ -251,24 +251,28 @@ def _parameter_lines(rows: Sequence[Row]) -> list[Line]:
         ),
         share(
             "95 % intervals that contain the truth",
-            (number["covered"] for _, number in found),
+            (number["covered"] for _, number in scores),
             coverage,
         ),
         share(
             "of those, form as fitted",
-            (number["covered"] for row, number in found if not row["form_differs"]),
+            (number["covered"] for row, number in scores if not row["form_differs"]),
         ),
-        share("of those, without shared_source", others),
+        share("of those, without shared_source", covered),
         *(
             share(
                 f"errors within the {level} % interval of a normal law",
-                (abs(number["pull"]) <= sigma for _, number in found if number["pull"] is not None),
+                (
+                    abs(number["pull"]) <= sigma
+                    for _, number in scores
+                    if number["pull"] is not None
+                ),
             )
             for level, sigma in _NORMAL_INTERVALS.items()
         ),
         spread(
             "errors in standard errors, 68 % quantile",
-            (number["pull"] for _, number in found),
+            (number["pull"] for _, number in scores),
             Target("0.8-1.25", 0.8, 1.25),
         ),
         median(
@@ -278,7 +282,7 @@ def _parameter_lines(rows: Sequence[Row]) -> list[Line]:
         ),
         median(
             "evidence relative to the oracle, all effects named correctly, median",
-            (gain for gain, whole in gains if whole),
+            (gain for gain, all_named in gains if all_named),
         ),
         median(
             "evidence relative to the oracle with fitted noise, median",
@@ -325,7 +329,7 @@ def _baseline_lines(rows: Sequence[Row]) -> list[Line]:
     """Make the lines of the baseline detectors and of the cost per case."""
     nulls, clear = (
         [row for row in rows if row["kind"] == "null"],
-        _catalogue_rows(rows, least=CLEAR_STRENGTH),
+        _catalogue_rows(rows, min_strength=CLEAR_STRENGTH),
     )
     names = sorted({name for row in rows for name in row["baseline_detectors"]} - {RANDOM})
     lines = [
