@@ -73,28 +73,28 @@ def analyse(x: np.ndarray, **options: object) -> xr.Dataset:
 
 
 def describe_term(product: xr.Dataset, term: str, truth: dict[str, float]) -> str:
-    seen = product.observable.sel(term=term) == 2
+    is_observed = product.observable.sel(term=term) == 2
     if term not in truth:
-        return f"claimed {float(seen.mean()):.3f}"
+        return f"claimed {float(is_observed.mean()):.3f}"
     value = float(product[term].mean()) / truth[term]
-    return f"{value:.3f} in {float(seen.mean()):.2f}"
+    return f"{value:.3f} in {float(is_observed.mean()):.2f}"
 
 
 def make_row(name: str, seconds: int, terms: str) -> str:
     records, B, K = LENGTHS[seconds]
     truth = {term: {"N": N, "B": B, "K": K}[term] for term in terms}
-    found, ignored = [], []
+    products, ignored = [], []
     for record in range(records):
         rng = np.random.default_rng([7, seconds, len(terms), record])
         x = lfilter(*FILTERS[name], simulate(rng, seconds, truth))[:, SETTLING:]
-        found.append(analyse(x))
-        ignored.append(fit_noise(found[-1], tau_min="all", observed_only=False))
-    product, plain = (xr.concat(parts, "time", data_vars="all") for parts in (found, ignored))
+        products.append(analyse(x))
+        ignored.append(fit_noise(products[-1], tau_min="all", observed_only=False))
+    product, plain = (xr.concat(parts, "time", data_vars="all") for parts in (products, ignored))
     ratio = product.fit_chi2 / product.fit_dof
     plain_ratio = float((plain.fit_chi2 / plain.fit_dof).median())
     flagged = (product.observable == 2).any("term") == 0
-    limits = [float(part.fit_tau_min.item()) for part in found]
-    constants = [float(part.filter_time_constant.item()) for part in found]
+    limits = [float(part.fit_tau_min.item()) for part in products]
+    constants = [float(part.filter_time_constant.item()) for part in products]
     return " | ".join(
         [
             name,

@@ -81,21 +81,21 @@ def seen(
     warm, mean = product["temperature"].values, product["window_mean"].values[0]
     good = np.isfinite(mean)
     stretch = np.cumsum(np.diff(good, prepend=True) & good)[good]
-    beside = np.column_stack(
+    nuisance = np.column_stack(
         [stretch == 0, stretch > 0, np.arange(mean.size)[good] / mean.size]
     ).astype(float)
-    q, _ = np.linalg.qr(inverse @ beside)
+    q, _ = np.linalg.qr(inverse @ nuisance)
     x = inverse @ warm[good]
     x -= q @ (q.T @ x)
     error = 1.0 / np.sqrt(x @ x)
     coupled_mean = mean + strength * error * warm
     product["window_mean"] = product["window_mean"].copy(data=coupled_mean[None])
-    found = gyrostab.correlate(product, variables="window_mean", max_lag=0)
+    correlation = gyrostab.correlate(product, variables="window_mean", max_lag=0)
     oracle = abs(x @ (inverse @ coupled_mean[good])) * error > 1.959964
     swing = strength * error * np.ptp(warm[good]) / np.std(mean[good])
     return (
         bool(oracle),
-        float(found["p_value"].sel(axis="x", driver="temperature").item()) < 0.05,
+        float(correlation["p_value"].sel(axis="x", driver="temperature").item()) < 0.05,
         float(swing),
     )
 

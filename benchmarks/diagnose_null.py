@@ -67,11 +67,11 @@ def main() -> None:
             "| rate [Hz] | lost | in | noise | p < 0.01 | p < 0.05 | p < 0.1 | uniform "
             "(Kolmogorov-Smirnov) | gain at 99 %: null, raw |"
         )
-    said = (
+    summary = (
         f"{machine()}; {options.records} records of 1 h, one axis, N = 0.003, B = 0.004, "
         f"K = 0.02; {options.nulls} null records each."
     )
-    print(f"{said}\n", head, "|" + "---|" * head.count(" | ") + "---|", *rows, sep="\n")
+    print(f"{summary}\n", head, "|" + "---|" * head.count(" | ") + "---|", *rows, sep="\n")
 
 
 def logs(rate: float, lost: float, seeds: range) -> Iterator[tuple[int, xr.Dataset]]:
@@ -96,7 +96,9 @@ def candidates(reduced: xr.Dataset) -> dict[str, dict[str, list[np.ndarray]]]:
     """Shapes of all kinds that an effect could have, by view."""
     n, bands = reduced.sizes["block"], reduced.sizes["band"]
     t, x = np.arange(n) / n, np.linspace(0.0, 1.0, bands)
-    curves = np.stack([np.interp(t, np.linspace(0, 1, 13), one) for one in np.eye(13)], axis=1)
+    curves = np.stack(
+        [np.interp(t, np.linspace(0, 1, 13), unit_vector) for unit_vector in np.eye(13)], axis=1
+    )
     events = [((t > edge) & (t < edge + 0.08)).astype(float) for edge in (0.2, 0.4, 0.6)]
     flat = np.ones((n, bands))
     means = {
@@ -109,7 +111,7 @@ def candidates(reduced: xr.Dataset) -> dict[str, dict[str, list[np.ndarray]]]:
     }
     powers = {
         "trend": [t[:, None] * flat],
-        "event": [one[:, None] * flat for one in events],
+        "event": [event[:, None] * flat for event in events],
         "filter": [-(x**power) * flat for power in (4, 8)],
         "band": [
             np.exp(-0.5 * ((x - place) / 0.07) ** 2) * events[1][:, None]
@@ -122,7 +124,7 @@ def candidates(reduced: xr.Dataset) -> dict[str, dict[str, list[np.ndarray]]]:
 
 def ranks(rate: float, lost: float, options: argparse.Namespace, *, first: int) -> list[str]:
     """Rows of the table for one kind of record; no two kinds have a record of the same noise."""
-    found: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
+    scores: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
     for seed, log in logs(rate, lost, range(first, first + options.records)):
         reduced = reduce_log(log)
         baseline = calibrate_noise(reduced)
@@ -146,11 +148,11 @@ def ranks(rate: float, lost: float, options: argparse.Namespace, *, first: int) 
                     VIEWS[view](nulls, baseline, tried, axis="x", tier=tier).max("candidate").values
                 )
                 p = (1 + int((others >= own).sum())) / (1 + others.size)
-                found.setdefault((view, tier), []).append(
+                scores.setdefault((view, tier), []).append(
                     (p, own, float(np.quantile(others, 0.99)))
                 )
     rows = []
-    for (view, tier), values in found.items():
+    for (view, tier), values in scores.items():
         p, own, limit = np.array(values).T
         shares = " | ".join(f"{(p < level).mean():.3f}" for level in (0.01, 0.05, 0.1))
         uniform = kstest(p, "uniform").pvalue
@@ -165,17 +167,18 @@ def whole(rate: float, lost: float, options: argparse.Namespace, *, first: int) 
     """Row of the table of claims for one kind of record."""
     import gyrostab
 
-    named, found, begin = 0, 0, time.monotonic()
+    named, mismatched, begin = 0, 0, time.monotonic()
     for seed, log in logs(rate, lost, range(first, first + options.records)):
-        told = gyrostab.diagnose(log, nulls=options.nulls, seed=seed)
-        named += bool(told.effects)
-        found += told.verdict != "no mismatch"
-        if told.verdict != "no mismatch":
+        diagnosis = gyrostab.diagnose(log, nulls=options.nulls, seed=seed)
+        named += bool(diagnosis.effects)
+        mismatched += diagnosis.verdict != "no mismatch"
+        if diagnosis.verdict != "no mismatch":
             boxes = "; ".join(
-                f"{box['statement']} (p = {box['p_value']:.2g})" for box in told.mismatches
+                f"{box['statement']} (p = {box['p_value']:.2g})" for box in diagnosis.mismatches
             )
             print(
-                f"record {seed}: {told.verdict}; {[one['name'] for one in told.effects]}; {boxes}",
+                f"record {seed}: {diagnosis.verdict}; "
+                f"{[effect['name'] for effect in diagnosis.effects]}; {boxes}",
                 file=sys.stderr,
                 flush=True,
             )
@@ -183,7 +186,7 @@ def whole(rate: float, lost: float, options: argparse.Namespace, *, first: int) 
     bound = float(levels[binom.cdf(named, options.records, levels) >= 0.05].max())
     seconds = (time.monotonic() - begin) / options.records
     return [
-        f"| {rate:g} | {lost:g} | {options.records} | {named} | {found} | {bound:.3f} | "
+        f"| {rate:g} | {lost:g} | {options.records} | {named} | {mismatched} | {bound:.3f} | "
         f"{seconds:.1f} |"
     ]
 

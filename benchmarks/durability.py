@@ -49,13 +49,13 @@ class Outcome(NamedTuple):
 class Trials:
     """Counts of the trials of one kind."""
 
-    def __init__(self, what: str, expected: str):
-        self.what, self.expected, self.count, self.wrong = what, expected, 0, list[str]()
+    def __init__(self, action: str, expected: str):
+        self.what, self.expected, self.count, self.wrong = action, expected, 0, list[str]()
 
-    def add(self, good: bool, what: str = "") -> None:
+    def add(self, good: bool, detail: str = "") -> None:
         self.count += 1
         if not good:
-            self.wrong.append(what)
+            self.wrong.append(detail)
 
     def row(self) -> str:
         return f"| {self.what} | {self.count} | {self.expected} | {self.count - len(self.wrong)} |"
@@ -107,10 +107,10 @@ def begin(*arguments: object, before: Callable[[], object] | None = None) -> tup
 
 def finish(begun: tuple[int, Path]) -> Outcome:
     """Wait for a command."""
-    child, said = begun
+    child, output = begun
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    message = said.read_text(errors="replace")
-    said.unlink()
+    message = output.read_text(errors="replace")
+    output.unlink()
     return Outcome(code, message)
 
 
@@ -179,10 +179,10 @@ class Bench:
             return output.read_bytes()
         import json
 
-        found = json.loads((output / "diagnosis.json").read_text())
-        found.pop("seconds")
+        diagnosis = json.loads((output / "diagnosis.json").read_text())
+        diagnosis.pop("seconds")
         return (
-            json.dumps(found),
+            json.dumps(diagnosis),
             (output / "model.toml").read_text(),
             sorted(path.name for path in output.iterdir()),
         )
@@ -196,7 +196,7 @@ class Bench:
     def kill(self, name: str, kills: int, deadline: float) -> Trials:
         """Kill a command at random moments; then let it finish, and compare."""
         command, output = self.commands[name]
-        again = ["--resume"] if name == "run" else []
+        resume_flags = ["--resume"] if name == "run" else []
         trials = Trials(f"`kill -9` of `{name}` at a random moment, then the same "
                         f"command{_AFTER_KILL.get(name, '')}",
                         "no output or the whole one after the kill, inputs unchanged, the same "
@@ -217,7 +217,7 @@ class Bench:
                     for item in folder.iterdir()
                     if item.name != output and not is_hidden(folder, item.name)
                 ]
-                flags = again or (["--overwrite"] if after is not None else [])
+                flags = resume_flags or (["--overwrite"] if after is not None else [])
                 good = (
                     after in (None, self.whole[name])
                     and not strange
@@ -259,9 +259,9 @@ class Bench:
     def damage(self, count: int) -> list[Trials]:
         """Cut or flip the files of a killed run, and continue it."""
         kinds = []
-        for what in ("cut short", "with one bit flipped"):
+        for fault in ("cut short", "with one bit flipped"):
             trials = Trials(
-                f"a file of a killed run {what}, then `--resume`", "the same product, bit for bit"
+                f"a file of a killed run {fault}, then `--resume`", "the same product, bit for bit"
             )
             for _ in range(count):
                 with self.trial() as folder:
@@ -269,7 +269,7 @@ class Bench:
                     path = self.draw.choice(sorted(folder.glob(".product.nc.job/*[!k]")))
                     content = bytearray(path.read_bytes())
                     place = self.draw.randrange(len(content))
-                    if what == "cut short":
+                    if fault == "cut short":
                         del content[place:]
                     else:
                         content[place] ^= 1 << self.draw.randrange(8)
@@ -277,7 +277,7 @@ class Bench:
                     outcome = call(*self.commands["run"][0], "-o", target, "--resume")
                     trials.add(
                         outcome.code == 0 and target.read_bytes() == self.whole["run"],
-                        f"{path.name} {what}: {outcome}",
+                        f"{path.name} {fault}: {outcome}",
                     )
             kinds.append(trials)
         return kinds
@@ -318,20 +318,20 @@ class Bench:
                     else (lambda room=room: resource.setrlimit(resource.RLIMIT_FSIZE, (room, room)))
                 )
                 outcome = call(*command, "-o", old, "--overwrite", before=limit)
-                kept = old.read_text() == "old" if number % 4 > 1 else not old.exists()
+                is_kept = old.read_text() == "old" if number % 4 > 1 else not old.exists()
                 left = [
                     item.name
                     for item in mount.iterdir()
                     if item.name != output and not item.name.endswith(".job")
                 ]
-                one = (
+                has_one_line = (
                     sum(not line.startswith("note: ") for line in outcome.message.splitlines()) == 1
                 )
                 trials.add(
                     outcome.code == 2
-                    and kept
+                    and is_kept
                     and not left
-                    and one
+                    and has_one_line
                     and "cannot be written" in outcome.message,
                     f"{name}: {left}, {outcome}",
                 )
@@ -364,9 +364,9 @@ class Bench:
     def changed_input(self, count: int) -> list[Trials]:
         """Change or remove the input of a command while it works."""
         kinds = []
-        for what in ("changes", "vanishes"):
+        for change in ("changes", "vanishes"):
             trials = Trials(
-                f"an input that {what} during `run` or `ingest`",
+                f"an input that {change} during `run` or `ingest`",
                 "exit code 2 and no output, or the whole output of the old input",
             )
             for number in range(count):
@@ -377,20 +377,20 @@ class Bench:
                     shutil.copy2(command[1], own)
                     begun = begin(command[0], own, *command[2:], "-o", folder / output)
                     time.sleep(self.draw.uniform(0.2, 0.8) * self.seconds[name])
-                    if what == "vanishes":
+                    if change == "vanishes":
                         own.unlink()
                     else:
                         with own.open("r+b") as file:
                             file.seek(own.stat().st_size // 2)
                             file.write(b"9" * 64)
                     outcome = finish(begun)
-                    found = self.content(name, folder / output)
-                    good = (outcome.code == 2 and found is None) or (
-                        outcome.code == 0 and found == self.whole[name]
+                    content = self.content(name, folder / output)
+                    good = (outcome.code == 2 and content is None) or (
+                        outcome.code == 0 and content == self.whole[name]
                     )
                     trials.add(
                         good and "please report" not in outcome.message,
-                        f"{name}, {what}: {outcome}",
+                        f"{name}, {change}: {outcome}",
                     )
             kinds.append(trials)
         return kinds
@@ -409,7 +409,7 @@ class Bench:
                     begun = [begin(*command, "-o", folder / output)]
                     time.sleep(self.draw.uniform(0.0, 0.5) * self.seconds[name])
                     begun.append(begin(*command, "-o", folder / output))
-                    outcomes = [finish(one) for one in begun]
+                    outcomes = [finish(process) for process in begun]
                     left = [item.name for item in folder.iterdir()]
                     codes = sorted(outcome.code for outcome in outcomes)
                     good = (
@@ -422,7 +422,7 @@ class Bench:
         return kinds
 
 
-def publish(page: Path, trials: list[Trials], said: str) -> None:
+def publish(page: Path, trials: list[Trials], summary: str) -> None:
     """Put the table between the two marks of a page."""
     table = [
         "| what was done | trials | what must follow | so it was |",
@@ -431,7 +431,7 @@ def publish(page: Path, trials: list[Trials], said: str) -> None:
     ]
     text = page.read_text()
     head, tail = text.partition(START)[0], text.partition(END)[2]
-    page.write_text(f"{head}{START}\n{said}\n\n" + "\n".join(table) + f"\n{END}{tail}")
+    page.write_text(f"{head}{START}\n{summary}\n\n" + "\n".join(table) + f"\n{END}{tail}")
 
 
 def main() -> int:
@@ -467,8 +467,8 @@ def main() -> int:
             for name in bench.commands
         ]
         for step in (*kills, *steps):
-            found = step()
-            for kind in found if isinstance(found, list) else [found]:
+            result = step()
+            for kind in result if isinstance(result, list) else [result]:
                 trials.append(kind)
                 print(kind.row(), *kind.wrong, sep="\n", flush=True)
     if given.write:

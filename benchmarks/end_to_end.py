@@ -54,7 +54,7 @@ def main() -> None:
     )
     options = parser.parse_args()
     if options.measure:
-        what, workers, folder = options.measure
+        work, workers, folder = options.measure
         files = sorted(Path(folder).glob("log-*"))
         works = {
             "xarray": read_xarray,
@@ -63,7 +63,7 @@ def main() -> None:
             "full": partial(run_whole, "full"),
             "octave": partial(run_whole, "octave"),
         }
-        print(json.dumps(works[what](files, int(workers), options.repeat)))
+        print(json.dumps(works[work](files, int(workers), options.repeat)))
         return
     with tempfile.TemporaryDirectory(prefix="gyrostab-io-") as root:
         rows = [row for form in options.formats for row in compare(form, Path(root, form), options)]
@@ -72,11 +72,11 @@ def main() -> None:
         "Msamples/s | run / peer | target "
         "| run / own reader | processor: peer [s] | own reader [s] | run [s] | run / peer |"
     )
-    said = (
+    summary = (
         f"{machine()}; {options.rate:g} Hz, 3 axes, files of one hour with gaps; best of "
         f"{options.repeat}."
     )
-    text = "\n".join([f"{said}\n", head, "|" + "---|" * 15, *rows])
+    text = "\n".join([f"{summary}\n", head, "|" + "---|" * 15, *rows])
     print(text)
     if options.output:
         renew(options.output, "end to end", text)
@@ -106,7 +106,8 @@ def compare(form: str, folder: Path, options: argparse.Namespace) -> list[str]:
         for terms in ("full", "octave"):
             run = measure(terms, workers, folder, options)
             clock, processor = (
-                [f"{one[i]:.2f}" if one else "" for one in (peer, own, run)] for i in range(2)
+                [f"{timing[i]:.2f}" if timing else "" for timing in (peer, own, run)]
+                for i in range(2)
             )
             ratios = [
                 f"{run[0] / peer[0]:.2f}",
@@ -128,7 +129,7 @@ def compare(form: str, folder: Path, options: argparse.Namespace) -> list[str]:
 
 
 def measure(
-    what: str, workers: int, folder: Path, options: argparse.Namespace
+    work: str, workers: int, folder: Path, options: argparse.Namespace
 ) -> tuple[float, float]:
     """Seconds on the clock and of the processor, measured in a separate process."""
     command = [
@@ -137,7 +138,7 @@ def measure(
         "--repeat",
         str(options.repeat),
         "--measure",
-        what,
+        work,
         str(workers),
         str(folder),
     ]

@@ -156,14 +156,16 @@ class Cosines:
             power[:SINGLE] = (low - slope * self.ramp) ** 2 + self.ramp**2 / information
             root = np.sqrt(self.count) / expected
             scale = 1.0 / np.linalg.norm(self.columns * root[:, None], axis=0)
-            found = nnls(self.columns * root[:, None] * scale, root * power)[0] * scale
-            change = np.abs(self.columns @ found / expected - 1.0).max()
-            squares = found if step < 20 else 0.5 * (found + squares)
+            estimate = nnls(self.columns * root[:, None] * scale, root * power)[0] * scale
+            change = np.abs(self.columns @ estimate / expected - 1.0).max()
+            squares = estimate if step < 20 else 0.5 * (estimate + squares)
             if change < 1e-5:
                 break
-        both, ramp = self.information(squares, free_ramp=True)
-        scale = 1.0 / np.sqrt(np.diag(both))
-        covariance = np.linalg.pinv(both * np.outer(scale, scale)) * np.outer(scale, scale)
+        final_information, ramp = self.information(squares, free_ramp=True)
+        scale = 1.0 / np.sqrt(np.diag(final_information))
+        covariance = np.linalg.pinv(final_information * np.outer(scale, scale)) * np.outer(
+            scale, scale
+        )
         error = np.append(np.sqrt(np.diag(covariance)), 1.0 / np.sqrt(ramp))
         return np.append(squares, slope), error
 
@@ -210,19 +212,19 @@ def fit_relative(records: Records) -> Estimates:
     """Fit non-negative least squares of relative residuals (nmayorov/allan-variance)."""
     ks, avar = records.dense
     columns = avar_columns(ks / records.rate)
-    found = []
+    estimates = []
     for data in avar:
         weighted = columns / data[:, None]
         scale = np.linalg.norm(weighted, axis=0)
-        found.append(nnls(weighted / scale, np.ones(ks.size))[0] / scale)
-    return without_intervals(np.sqrt(found))
+        estimates.append(nnls(weighted / scale, np.ones(ks.size))[0] / scale)
+    return without_intervals(np.sqrt(estimates))
 
 
 def fit_logarithms(records: Records) -> Estimates:
     """Fit the logarithm of the Allan variance (imu_utils)."""
     ks, avar = records.dense
     columns = avar_columns(ks / records.rate)
-    found = []
+    estimates = []
     for data in avar:
         scale = np.sqrt(data.mean() / columns.mean(axis=0))
         own = columns * scale**2 / data[:, None]
@@ -232,8 +234,8 @@ def fit_logarithms(records: Records) -> Estimates:
             start,
             jac=lambda root, own=own: 2 * own * root / (own @ root**2 * np.log(10))[:, None],
         )
-        found.append(np.abs(result.x) * scale)
-    return without_intervals(np.array(found))
+        estimates.append(np.abs(result.x) * scale)
+    return without_intervals(np.array(estimates))
 
 
 def read_slopes(records: Records) -> Estimates:

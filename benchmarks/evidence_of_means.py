@@ -50,7 +50,10 @@ DESIGNS = [shape for shapes in SHAPES.values() for shape in shapes]
 OWNER = np.repeat(np.arange(len(SHAPES)), [len(shapes) for shapes in SHAPES.values()])
 CANDIDATES = [
     Candidate(
-        name, find_statistic("mean"), (), tuple(Variant({}, ("0",), one[None]) for one in shapes)
+        name,
+        find_statistic("mean"),
+        (),
+        tuple(Variant({}, ("0",), shape[None]) for shape in shapes),
     )
     for name, shapes in SHAPES.items()
 ]
@@ -97,13 +100,15 @@ def compute_evidence(axes: list[Array], baseline: xr.Dataset) -> tuple[Array, Ar
         )[:, 1:]
         for means in axes
     ]
-    found = collect_evidence(CANDIDATES, [(str(row),) for row in range(len(axes))], factors)
+    results = collect_evidence(CANDIDATES, [(str(row),) for row in range(len(axes))], factors)
     numbers = range(len(SHAPES))
-    alone = np.stack(
+    separate = np.stack(
         [[intervals_alone(row[:, number == OWNER]) for number in numbers] for row in factors],
         axis=-1,
     )
-    return combine_rows(alone), combine_rows(np.array([one.evidence_nats for one in found]))
+    return combine_rows(separate), combine_rows(
+        np.array([result.evidence_nats for result in results])
+    )
 
 
 def intervals_alone(factors: Array) -> Array:
@@ -141,8 +146,8 @@ def main() -> None:
     records = parser.parse_args().records
     rng, baseline = np.random.default_rng(5), make_baseline()
     none = compute_evidence([draw_noise(rng, records) for _ in range(AXES)], baseline)
-    for name, found in zip(("alone", "now"), none, strict=True):
-        quantiles = np.quantile(found.max(axis=0), (0.5, 0.9, 0.99)).round(1)
+    for name, evidence in zip(("alone", "now"), none, strict=True):
+        quantiles = np.quantile(evidence.max(axis=0), (0.5, 0.9, 0.99)).round(1)
         print(f"noise, {name}: best of all effects at 50, 90, 99 %: {quantiles} nats")
     print("| effect | axes | strength | expected | alone | now | above 8, alone | now |")
     print("|---|---|---|---|---|---|---|---|")
@@ -151,13 +156,13 @@ def main() -> None:
         for count in (1, AXES):
             for strength in (3.0, 4.0, 6.0, 8.0):
                 mean = size_at(shape, strength) / np.sqrt(count) * shape
-                alone, now = compute_evidence(
+                separate, now = compute_evidence(
                     [draw_noise(rng, records) + mean * (row < count) for row in range(AXES)],
                     baseline,
                 )
                 print(f"| {name} | {count} | {strength:g} | {count * expected_nats(mean):.0f} | "
-                      f"{np.median(alone[number]):.1f} | {np.median(now[number]):.1f} | "
-                      f"{(alone[number] > 8).mean():.2f} | {(now[number] > 8).mean():.2f} |",
+                      f"{np.median(separate[number]):.1f} | {np.median(now[number]):.1f} | "
+                      f"{(separate[number] > 8).mean():.2f} | {(now[number] > 8).mean():.2f} |",
                       flush=True)  # fmt: skip
 
 

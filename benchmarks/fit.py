@@ -60,7 +60,7 @@ def measure(x: np.ndarray, taus: int, repeats: int) -> tuple[int, list[float]]:
     trends = [cell.reshape(-1) for cell in cells[5:]]
     shifts = np.zeros_like(ks)
     tables = window_fit.fit_tables(tuple(ks.tolist()), tuple(shifts.tolist()), rate, window)
-    seen = (tables.columns, tables.weight, tables.to_samples)
+    noise_tables = (tables.columns, tables.weight, tables.to_samples)
     diagonal = combine_diagonal(*diagonal_products(window, ks, shifts))
     whole = best(lambda: fit_noise(surface), repeats)
     kernel = best(lambda: window_fit.run_kernel(flat, *trends, tables, 31), repeats)
@@ -73,7 +73,11 @@ def measure(x: np.ndarray, taus: int, repeats: int) -> tuple[int, list[float]]:
         max(whole - block, 0.0),
         best(
             lambda: cell_freedoms(
-                identify_noise(*flat, *seen), *flat, tables.columns, tables.to_samples, diagonal
+                identify_noise(*flat, *noise_tables),
+                *flat,
+                tables.columns,
+                tables.to_samples,
+                diagonal,
             ),
             repeats,
         ),

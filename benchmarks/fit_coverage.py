@@ -54,18 +54,18 @@ def simulate_units(rng: np.random.Generator, trials: int, n: int, rate: float, s
     """Return surfaces of unit records, alone and in pairs."""
     units, records = make_units(rng, trials, n, rate)
     lost = lose(rng, np.zeros((trials, n)), share, 50.0)
-    alone = [surface_of(record + lost, rate) for record in records]
+    singles = [surface_of(record + lost, rate) for record in records]
     parts = {}
     for a, b in PAIRS:
         if a == b:
-            parts[a, b] = alone[a].avar / units[a] ** 2
+            parts[a, b] = singles[a].avar / units[a] ** 2
         else:
-            both = surface_of(records[a] + records[b] + lost, rate).avar
-            cross = 0.5 * (both - alone[a].avar - alone[b].avar)
+            pair_avar = surface_of(records[a] + records[b] + lost, rate).avar
+            cross = 0.5 * (pair_avar - singles[a].avar - singles[b].avar)
             parts[a, b] = cross / (units[a] * units[b])
     names = ["window_trend", "difference_trend"]
-    trends = [surface[names] / unit for surface, unit in zip(alone, units, strict=True)]
-    return alone[1], parts, trends
+    trends = [surface[names] / unit for surface, unit in zip(singles, units, strict=True)]
+    return singles[1], parts, trends
 
 
 def mix(white_surface: xr.Dataset, parts, trends, squares: np.ndarray) -> xr.Dataset:  # type: ignore[no-untyped-def]
@@ -78,7 +78,7 @@ def mix(white_surface: xr.Dataset, parts, trends, squares: np.ndarray) -> xr.Dat
 def choose_squares(tables: window_fit.FitTables, mixture: str) -> np.ndarray:
     """Find the squared coefficients of a mixture such as ``QmKs`` on white noise."""
 
-    def excess(log_square: float, term: int, wanted: float) -> float:
+    def excess(log_square: float, term: int, target: float) -> float:
         squares = np.array([0.0, N**2, 0.0, 0.0])
         squares[term] = np.exp(log_square)
         amounts = squares * tables.to_samples[:4]
@@ -86,15 +86,15 @@ def choose_squares(tables: window_fit.FitTables, mixture: str) -> np.ndarray:
         covariance += 1e-9 * np.diag(np.diag(covariance))
         columns = tables.columns[:, [1, term]]
         normal = columns.T @ np.linalg.solve(covariance, columns)
-        return float(np.exp(log_square) / np.sqrt(np.linalg.inv(normal)[1, 1]) - wanted)
+        return float(np.exp(log_square) / np.sqrt(np.linalg.inv(normal)[1, 1]) - target)
 
     squares = np.array([0.0, N**2, 0.0, 0.0, 0.0])
     for symbol, level in zip(mixture[::2], mixture[1::2], strict=True):
-        term, wanted = TERMS.index(symbol), 2.5 if level == "m" else 8.0
+        term, target = TERMS.index(symbol), 2.5 if level == "m" else 8.0
         if term < 4:
-            squares[term] = np.exp(brentq(excess, -40, 40, args=(term, wanted)))
+            squares[term] = np.exp(brentq(excess, -40, 40, args=(term, target)))
         else:
-            squares[4] = wanted**2 * (squares[:4] @ tables.trend_variance)
+            squares[4] = target**2 * (squares[:4] @ tables.trend_variance)
     return squares
 
 
@@ -102,17 +102,17 @@ def judge(product: xr.Dataset, squares: np.ndarray) -> list[str]:
     """Describe each term: how often it is observed, and how often interval and limit fail."""
     cells = []
     for term, true in zip(TERMS, np.sqrt(squares), strict=True):
-        seen = (product.observable.sel(term=term) == 2).values
+        is_observed = (product.observable.sel(term=term) == 2).values
         if true == 0:
-            cells.append(f"claimed {seen.mean():.3f}")
+            cells.append(f"claimed {is_observed.mean():.3f}")
             continue
         value, upper = product[term].values, product[f"{term}_upper"].values
         holds = abs(value - true) <= NORMAL_95 * product[f"{term}_stderr"].values
         exceeded = [(upper < true).mean()]
-        exceeded += [(upper < true)[~seen].mean()] if (~seen).sum() >= 100 else []
+        exceeded += [(upper < true)[~is_observed].mean()] if (~is_observed).sum() >= 100 else []
         cells.append(
             f"{value.mean() / true:.2f} ({(value.mean() - true) / value.std():+.2f}); seen "
-            f"{seen.mean():.2f}; holds {holds.mean():.3f}; exceeded "
+            f"{is_observed.mean():.2f}; holds {holds.mean():.3f}; exceeded "
             + " / ".join(f"{share:.3f}" for share in exceeded)
         )
     return cells

@@ -74,8 +74,8 @@ def row(rng: np.random.Generator, truth: dict[str, float], share: float, block: 
     )
     cells = [f"{float(hit.min()):.3f} .. {float(hit.max()):.3f}"]
     for term in TERMS:
-        seen = product.observable.sel(term=term)
-        claimed = float((seen == 2).mean())
+        flags = product.observable.sel(term=term)
+        claimed = float((flags == 2).mean())
         if term not in truth:
             cells.append(f"claimed {claimed:.3f}")
             continue
@@ -84,10 +84,10 @@ def row(rng: np.random.Generator, truth: dict[str, float], share: float, block: 
             f"{float(product[term].mean()) / truth[term]:.3f}; z {float(z.mean()):+.2f} ± "
             f"{float(z.std()):.2f}; seen {claimed:.2f}"
         )
-        if (seen == 1).sum() >= 100:
+        if (flags == 1).sum() >= 100:
             text += (
                 "; limit holds "
-                f"{float((product[f'{term}_upper'] >= truth[term]).where(seen == 1).mean()):.3f}"
+                f"{float((product[f'{term}_upper'] >= truth[term]).where(flags == 1).mean()):.3f}"
             )
         cells.append(text)
     return " | ".join(cells)

@@ -81,23 +81,31 @@ def main() -> None:
     parser.add_argument("--output", type=Path)
     given = parser.parse_args()
     few, many = sorted(given.runs)
-    found = []
+    measurements = []
     with tempfile.TemporaryDirectory() as name:
         for runs in (1, few, many):  # the first compiles
             archive, output = Path(name, f"archive{runs}"), Path(name, f"fleet{runs}")
             write_archive(archive, runs)
-            found.append(measure_all(archive, output, reports=runs < many))
-            print(runs, found[-1], flush=True)
+            measurements.append(measure_all(archive, output, reports=runs < many))
+            print(runs, measurements[-1], flush=True)
         size = sum(path.stat().st_size for path in output.glob("tool*/*")) / many
         pages = [path.stat().st_size for path in Path(name).glob("fleet*/reports/*/*")]
     rows = []
-    for step in found[0]:
-        sizes = [runs for runs, one in zip((1, few, many), found, strict=True) if step in one][-2:]
-        before, after = [one[step].processor for one in found if step in one][-2:]
+    for step in measurements[0]:
+        sizes = [
+            runs
+            for runs, measurement in zip((1, few, many), measurements, strict=True)
+            if step in measurement
+        ][-2:]
+        before, after = [
+            measurement[step].processor for measurement in measurements if step in measurement
+        ][-2:]
         cost = (after - before) / (sizes[1] - sizes[0])
         fixed = max(after - sizes[1] * cost, 0.0)
         total = (fixed + TARGET * cost) / 60.0
-        _, elapsed, peak = next(one[step] for one in reversed(found) if step in one)
+        _, elapsed, peak = next(
+            measurement[step] for measurement in reversed(measurements) if step in measurement
+        )
         rows.append(
             f"| {step} | {sizes[1]} | {after:.1f} | {elapsed:.1f} | {peak:.0f} "
             f"| {fixed:.2f} | {1e3 * cost:.1f} | {total:.1f} |"

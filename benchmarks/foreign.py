@@ -236,7 +236,7 @@ FORMATS: dict[str, tuple[str, Callable[[Path, float, float], Path]]] = {
 
 def measure(work: str, path: Path, given: argparse.Namespace) -> dict[str, float] | None:
     """Return the shortest time and the largest peak of several runs; None if the work fails."""
-    found = []
+    results = []
     for _ in range(given.rounds):
         request = json.dumps(
             [work, str(path), str(path.with_name("product.nc")), WINDOW, given.workers]
@@ -252,14 +252,17 @@ def measure(work: str, path: Path, given: argparse.Namespace) -> dict[str, float
         if done.returncode:
             print(f"{work} {path.name}: {done.stderr.strip().splitlines()[-1:]}", file=sys.stderr)
             return None
-        found.append(json.loads(done.stdout.splitlines()[-1]))
-    return {**min(found, key=lambda one: one["seconds"]), "peak": max(one["peak"] for one in found)}
+        results.append(json.loads(done.stdout.splitlines()[-1]))
+    return {
+        **min(results, key=lambda result: result["seconds"]),
+        "peak": max(result["peak"] for result in results),
+    }
 
 
 def size_of(path: Path) -> int:
     """Bytes of a file or of the files of a store."""
     return (
-        sum(one.stat().st_size for one in path.rglob("*") if one.is_file())
+        sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
         if path.is_dir()
         else path.stat().st_size
     )

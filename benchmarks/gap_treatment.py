@@ -112,14 +112,14 @@ TREATMENTS: dict[str, Treatment] = {
 
 def measure(rows: np.ndarray, term: str, truth: float, treat: Treatment) -> tuple[str, float]:
     """Return the cell of a table, and the median scatter next to gaps over the rest."""
-    found = []
+    results = []
     for row in rows:
         product = gyrostab.fit_noise(treat(row), observed_only=False).isel(axis=0, time=0)
         value, error = float(product[term]), float(product[f"{term}_stderr"])
         misfit = float(product["fit_chi2"] / product["fit_dof"])
         held = abs(value - truth) <= NORMAL_95 * error
-        found.append([value / truth, held, misfit, float(product["gap_edge_ratio"])])
-    value, held, misfit, ratio = np.transpose(found)
+        results.append([value / truth, held, misfit, float(product["gap_edge_ratio"])])
+    value, held, misfit, ratio = np.transpose(results)
     edges = float(np.nanmedian(ratio)) if np.isfinite(ratio).any() else np.nan
     return f"{np.mean(value):.2f}; {np.mean(held):.0%}; {np.median(misfit):.2g}", edges
 

@@ -61,21 +61,21 @@ def readers_of(path: Path) -> tuple[dict[str, Read], list[tuple[int, int, int]]]
         read_into(data, row, begin, out)
         return out
 
-    found: dict[str, Read] = {
+    readers: dict[str, Read] = {
         "xarray": lambda row, begin, end: np.asarray(lazy[row, begin:end].values),
         "netCDF4": read_netcdf,
         "gyrostab": read_directly,
     }
     if path.stem == "zlib":
         stored = h5py.File(path)["rate"]
-        found["h5py"] = lambda row, begin, end: decode(stored[row, begin:end])
+        readers["h5py"] = lambda row, begin, end: decode(stored[row, begin:end])
     size = data.shape[1]
     spans = [
         (row, begin, min(begin + length, size))
         for row in range(data.shape[0])
         for begin in range(0, size, length)
     ]
-    return found, spans
+    return readers, spans
 
 
 def measure(read: Read, spans: list[tuple[int, int, int]], threads: int) -> tuple[float, float]:
@@ -108,7 +108,7 @@ def main() -> None:
                 for _ in range(given.rounds):
                     for name, read in readers.items():
                         times[name].append(measure(read, spans, threads))
-                best = {name: np.min(found, axis=0) for name, found in times.items()}
+                best = {name: np.min(timings, axis=0) for name, timings in times.items()}
                 for name, (wall, used) in best.items():
                     ratio = wall / best["gyrostab"][0]
                     figures = (f"{1e3 * wall:.0f}", f"{1e3 * used:.0f}", f"{ratio:.2f}")

@@ -35,14 +35,16 @@ from tests.support.named import COEFFICIENT, record
 def frames(reduced, baseline, effect, view, column):
     """A naming of the effect on x, with the usual values of its other parameters."""
     known, reasons = effect_candidates(reduced, COEFFICIENT)
-    one = next(one for one in known if one.effect == effect and one.view == view)
+    candidate = next(
+        candidate for candidate in known if candidate.effect == effect and candidate.view == view
+    )
     variant = next(
         variant
-        for variant in one.variants
+        for variant in candidate.variants
         if variant.columns == (column,) and variant.values.get("exponent", 1.0) == 1.0
     )
     claim = Identification(
-        effect, one.driver, ("x",), (Component(one, variant, ("x",), 50.0),), 50.0, 8.0
+        effect, candidate.driver, ("x",), (Component(candidate, variant, ("x",), 50.0),), 50.0, 8.0
     )
     return Identifications(
         (claim,),
@@ -61,15 +63,15 @@ def held(reduced, baseline, drawn, effect, view, column, truth, change):
     frame = frames(reduced, baseline, effect, view, column)
     inside, ratio = [], []
     for number in range(drawn.sizes["record"]):
-        one = reduced.assign(
+        record = reduced.assign(
             mean=drawn["mean"].isel(record=number).transpose("axis", "block"),
             power=drawn["power"].isel(record=number).transpose("axis", "block", "band"),
         )
-        state = condition_on(initial_state(change(one), baseline), list(frame.claims[0].parts))
+        state = condition_on(initial_state(change(record), baseline), list(frame.claims[0].parts))
         (fitted,) = fit_identifications(replace(frame, state=state), baseline)
-        found = fitted.parameters[column]
-        inside.append(found.low <= truth <= found.high)
-        ratio.append(found.value / truth)
+        parameter = fitted.parameters[column]
+        inside.append(parameter.low <= truth <= parameter.high)
+        ratio.append(parameter.value / truth)
     return np.mean(inside), np.mean(ratio) - 1.0, np.std(ratio)
 
 
@@ -79,10 +81,12 @@ def cases(reduced):
     warm = (heat - 25.0) / np.ptp(heat)
 
     def shifted(shape):
-        return lambda one: one.assign(mean=one["mean"] + xr.DataArray(shape, dims="block"))
+        return lambda record: record.assign(mean=record["mean"] + xr.DataArray(shape, dims="block"))
 
     def scale_noise(factor):
-        return lambda one: one.assign(power=one["power"] * xr.DataArray(factor, dims="block"))
+        return lambda record: record.assign(
+            power=record["power"] * xr.DataArray(factor, dims="block")
+        )
 
     for level, size in (("low", 0.1), ("high", 0.5)):
         for form, power in (("right", 2.0), ("wrong", 1.9)):

@@ -118,7 +118,7 @@ def rooflines() -> dict[str, float]:
     """Terms per second of the bare loop [1e9/s], n = 1000, k = 100."""
     n, k, turns = 1000, 100, 20_000
     theta = np.cumsum(np.random.default_rng(0).standard_normal(n + 2 * k + 8))
-    found = {"numba": n * turns / seconds(lambda: numba_loop(theta, n, k, turns), 9) / 1e9}
+    speeds = {"numba": n * turns / seconds(lambda: numba_loop(theta, n, k, turns), 9) / 1e9}
     if shutil.which("gcc"):
         with tempfile.TemporaryDirectory() as folder:
             for width in ("256", "512"):
@@ -145,8 +145,8 @@ def rooflines() -> dict[str, float]:
                 pointer = theta.ctypes.data_as(ctypes.c_void_p)
                 arguments = [ctypes.c_long(value) for value in (n, k, turns)]
                 took = seconds(functools.partial(loop, pointer, *arguments), 9)
-                found[f"C, {width}-bit vectors"] = n * turns / took / 1e9
-    return found
+                speeds[f"C, {width}-bit vectors"] = n * turns / took / 1e9
+    return speeds
 
 
 def make_unit(ks: np.ndarray, window: int, step: int, rate: float, octave: bool) -> Unit:
@@ -167,9 +167,9 @@ def make_unit(ks: np.ndarray, window: int, step: int, rate: float, octave: bool)
 
 def pieces(x: np.ndarray, unit: Unit) -> list[np.ndarray]:
     return [
-        row[one.start * unit.step : last_sample(one, unit)]
+        row[part.start * unit.step : last_sample(part, unit)]
         for row in np.atleast_2d(x)
-        for one in units_of_work(row.size, unit)
+        for part in units_of_work(row.size, unit)
     ]
 
 
@@ -195,13 +195,13 @@ def recompute(x: np.ndarray, window: int, step: int, ks: np.ndarray) -> np.ndarr
 
 
 @numba.njit(fastmath=True)
-def double_means(near: np.ndarray, far: np.ndarray, longer: np.ndarray) -> float:
+def double_means(earlier: np.ndarray, later: np.ndarray, longer: np.ndarray) -> float:
     """Sum the squared changes from mean to mean, and write the means of twice the length."""
     total = 0.0
-    for i in range(near.size):
-        change = far[i] - near[i]
+    for i in range(earlier.size):
+        change = later[i] - earlier[i]
         total += change * change
-        longer[i] = 0.5 * (near[i] + far[i])
+        longer[i] = 0.5 * (earlier[i] + later[i])
     return total
 
 
@@ -307,8 +307,8 @@ def archive(repeats: int, quick: bool) -> Iterator[str]:
         took = in_turns(calls, repeats + 2)
         for name, record in records.items():
             speeds = [
-                record.size / took[f"{name} {what} {workers}"] / 1e6
-                for what in ("kernel", "davar")
+                record.size / took[f"{name} {work} {workers}"] / 1e6
+                for work in ("kernel", "davar")
                 for workers in (1, 2)
             ]
             share = took[f"{name} bare"] / took[f"{name} kernel 1"]

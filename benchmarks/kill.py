@@ -81,8 +81,8 @@ if __name__ == "__main__":
 
 
 def finish(run: subprocess.Popen[str]) -> tuple[int, str]:
-    _, said = run.communicate(timeout=900)
-    return run.returncode, said
+    _, message = run.communicate(timeout=900)
+    return run.returncode, message
 
 
 def main() -> int:
@@ -99,9 +99,9 @@ def main() -> int:
         log = write_log(folder / "log.nc", given.hours)
         finish(start(log, folder / "whole.nc"))  # compiles
         begun = time.perf_counter()
-        code, said = finish(start(log, folder / "whole.nc", "--overwrite"))
+        code, message = finish(start(log, folder / "whole.nc", "--overwrite"))
         seconds = time.perf_counter() - begun
-        assert code == 0, said
+        assert code == 0, message
         whole = hashlib.sha256((folder / "whole.nc").read_bytes()).hexdigest()
         kills = parts = runs = 0
         bad: list[str] = []
@@ -122,22 +122,22 @@ def main() -> int:
                 if not output.exists() and draw.random() < 0.3:
                     break
             parts += len(list(folder.joinpath(f".{output.name}.job").glob("*.block")))
-            code, said = finish(start(log, output, "--resume", *options))
+            code, message = finish(start(log, output, "--resume", *options))
             left = [
                 path.name
                 for path in folder.iterdir()
                 if output.name in path.name and path != output
             ]
             if code or left or hashlib.sha256(output.read_bytes()).hexdigest() != whole:
-                bad.append(f"run {runs}: exit {code}, left {left}: {said}")
+                bad.append(f"run {runs}: exit {code}, left {left}: {message}")
             runs += 1
-        code, said = finish(start(log, output, "--resume", "--terms", "N"))
+        code, message = finish(start(log, output, "--resume", "--terms", "N"))
         print(
             f"seed {given.seed}: {kills} kills in {runs} runs of {seconds:.1f} s; {parts} parts "
             "were found again"
         )
         print(f"{len(bad)} of {runs} products differ from the undisturbed one")
-        print(f"resume with another option: exit {code}, {said.strip()}")
+        print(f"resume with another option: exit {code}, {message.strip()}")
         print(*bad, sep="\n")
     return 1 if bad or code != 2 else 0
 

@@ -130,13 +130,13 @@ def gaps(options: argparse.Namespace, rng: np.random.Generator) -> list[tuple[in
     """Return the gaps of a file; the last one extends beyond the end of the file."""
     whole = round(options.file_hours * 3600 * options.rate)
     left = round(options.gaps * whole)
-    found = []
+    spans = []
     while left > 0:
         length = min(left, max(1, round(rng.uniform(*GAP_SECONDS) * options.rate)))
-        begin = whole - length if not found else int(rng.integers(1, max(2, whole - length)))
-        found.append((begin, begin + length))
+        begin = whole - length if not spans else int(rng.integers(1, max(2, whole - length)))
+        spans.append((begin, begin + length))
         left -= length
-    return found
+    return spans
 
 
 def write(

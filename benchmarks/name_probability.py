@@ -51,8 +51,10 @@ def main() -> None:
     errors = np.sqrt(np.diagonal(np.linalg.inv(curvature(best, names))))
     ends = np.column_stack([best - errors, best + errors])
     print(f"{names.right.size} names, {names.right.mean():.3f} right")
-    alone = names.rivals == 0.0
-    print(f"{alone.sum()} without alternatives, {names.right[alone].mean():.3f} right")
+    has_no_rival = names.rivals == 0.0
+    print(
+        f"{has_no_rival.sum()} without alternatives, {names.right[has_no_rival].mean():.3f} right"
+    )
     for label, value, (low, high) in zip(
         ("set_probability", "weight of an alternative"),
         (expit(best[0]), math.exp(best[1])),
@@ -76,9 +78,9 @@ def collect_names(runs: list[Path]) -> Names:
             diagnosis = json.loads(path.read_text(encoding="utf-8"))
             truth = json.loads((run / "truth" / path.name).read_text(encoding="utf-8"))
             for case in drawn_rows(score_case(diagnosis, truth))[:1]:
-                for one in case["identifications"]:
-                    rivals.append(sum_rivals(one["name"], diagnosis))
-                    right.append(one["exact"])
+                for identification in case["identifications"]:
+                    rivals.append(sum_rivals(identification["name"], diagnosis))
+                    right.append(identification["exact"])
     return Names(np.array(rivals), np.array(right))
 
 
@@ -89,9 +91,13 @@ def sum_rivals(name: str, diagnosis: dict[str, Any]) -> float:
         key=lambda table: table["held_out_gain"]["nats"],
     )
     differences = {
-        one["name"]: one["nats"] or 0.0 for one in diagnosis["rejected"] if one["beaten_by"] == name
+        rejection["name"]: rejection["nats"] or 0.0
+        for rejection in diagnosis["rejected"]
+        if rejection["beaten_by"] == name
     }
-    return sum(float(np.exp(-differences.get(one, 0.0))) for one in table["alternatives"])
+    return sum(
+        float(np.exp(-differences.get(alternative, 0.0))) for alternative in table["alternatives"]
+    )
 
 
 def probabilities(law: Array, rivals: Array) -> Array:

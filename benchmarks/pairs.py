@@ -71,12 +71,12 @@ def main() -> None:
     counts: Counter[str] = Counter()
     for index in range(options.first, options.first + options.draws):
         plan = plan_pair(index, options.seed, GROUPS[options.group])
-        kept = options.folder / f"{options.group}-{options.seed}-{index}.pickle"
-        if not kept.exists():
-            kept.write_bytes(pickle.dumps(prepare_searches(plan)))
+        stored = options.folder / f"{options.group}-{options.seed}-{index}.pickle"
+        if not stored.exists():
+            stored.write_bytes(pickle.dumps(prepare_searches(plan)))
         effects = zip(plan["names"], plan["strengths"], strict=True)
         print(f"{index}:", " + ".join(f"{name} {size:g}" for name, size in effects), flush=True)
-        counts.update(count_draw(pickle.loads(kept.read_bytes())))
+        counts.update(count_draw(pickle.loads(stored.read_bytes())))
     print(", ".join(f"{key} {value}" for key, value in counts.items()))
 
 
@@ -107,7 +107,7 @@ def prepare_searches(plan: dict[str, Any]) -> dict[str, tuple[Search, Any, dict[
     effects = draw_effects(plan, scenario)
     seed = int(stream(plan["seed"], "case", plan["index"]).integers(2**40))
     channels = make_channels(scenario, effects, stream(seed, "channels"))
-    found: dict[str, tuple[Search, Any, dict[str, Any]]] = {}
+    searches: dict[str, tuple[Search, Any, dict[str, Any]]] = {}
     null: Any = None
     for part, members in MEMBERS.items():
         chosen = [effects[member] for member in members]
@@ -126,41 +126,47 @@ def prepare_searches(plan: dict[str, Any]) -> dict[str, tuple[Search, Any, dict[
         search = Search(candidates, fold_blocks(blocks), null.count_evidence, null.threshold)
         strengths = [plan["strengths"][member] for member in members]
         truth = describe_truth(scenario, chosen, strengths=strengths)
-        found[part] = search, initial_state(blocks, baseline), truth
-    return found
+        searches[part] = search, initial_state(blocks, baseline), truth
+    return searches
 
 
 def count_draw(searches: dict[str, tuple[Search, Any, dict[str, Any]]]) -> Counter[str]:
     """Repeat the searches of a draw, print the names, and count what is named."""
     counts: Counter[str] = Counter()
-    alone = True
+    singles_named = True
     for part, (search, start, truth) in searches.items():
         started = time.process_time()
         identified, unidentified, *_ = search.run(start)
         seconds = time.process_time() - started
         true = [effect["name"] for effect in truth["effects"]]
-        sets = [{one.effect, *one.alternatives} for one in identified]
-        found = [any(names & merge_ambiguous(name) for names in sets) for name in true]
+        sets = [
+            {identification.effect, *identification.alternatives} for identification in identified
+        ]
+        named = [any(names & merge_ambiguous(name) for names in sets) for name in true]
         right = set(truth["accepted"]).union(*map(merge_ambiguous, true))
-        wrong = [one.effect for one in identified if not {one.effect, *one.alternatives} & right]
+        wrong = [
+            identification.effect
+            for identification in identified
+            if not {identification.effect, *identification.alternatives} & right
+        ]
         kind = part if part in ("null", "both") else "single"
-        possible = kind != "both" or alone
+        possible = kind != "both" or singles_named
         counts.update({
-            kind: 1, f"{kind} named": bool(true) and all(found), f"{kind} wrong": len(wrong),
-            "pairs possible": kind == "both" and alone,
-            "pairs named": kind == "both" and alone and all(found),
+            kind: 1, f"{kind} named": bool(true) and all(named), f"{kind} wrong": len(wrong),
+            "pairs possible": kind == "both" and singles_named,
+            "pairs named": kind == "both" and singles_named and all(named),
             "seconds": round(seconds),
         })  # fmt: skip
-        alone = alone and (kind == "null" or all(found))
-        told = [
-            f"{name}({','.join(one.axes)}) {one.evidence_nats:.0f}"
-            for name, one in (
-                *((one.effect, one) for one in identified),
-                *((one.generic, one) for one in unidentified),
+        singles_named = singles_named and (kind == "null" or all(named))
+        labels = [
+            f"{name}({','.join(finding.axes)}) {finding.evidence_nats:.0f}"
+            for name, finding in (
+                *((identification.effect, identification) for identification in identified),
+                *((mismatch.generic, mismatch) for mismatch in unidentified),
             )
         ]
-        flag = "" if all(found) else "MISSED" if possible else "missed"
-        print(f"  {part}: {', '.join(told) or '-'} {flag} {'WRONG' if wrong else ''}", flush=True)
+        flag = "" if all(named) else "MISSED" if possible else "missed"
+        print(f"  {part}: {', '.join(labels) or '-'} {flag} {'WRONG' if wrong else ''}", flush=True)
     return counts
 
 

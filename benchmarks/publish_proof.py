@@ -96,8 +96,8 @@ def register(page: Path, job: dict[str, Any], table: str) -> None:
         if column == "named on null records" and value != "-":
             value = f"{round(float(value) * int(number))} of {number}"
         cells.append(value)
-    kept = [line for line in lines if not line.startswith(mine)]
-    renew(page, "register", "\n".join([*kept, f"| {' | '.join(cells)} |"]))
+    other_lines = [line for line in lines if not line.startswith(mine)]
+    renew(page, "register", "\n".join([*other_lines, f"| {' | '.join(cells)} |"]))
 
 
 def split_line(line: str) -> list[str]:

@@ -81,7 +81,7 @@ def write_store(path: Path, hours: float) -> Path:
 
 def measure(store: Path, windows: dict[str, str], options: dict[str, object], rounds: int) -> dict:
     """Return the best wall and processor time of several runs, and their largest memory peak."""
-    found = []
+    results = []
     for _ in range(rounds):
         command = [
             sys.executable,
@@ -92,12 +92,12 @@ def measure(store: Path, windows: dict[str, str], options: dict[str, object], ro
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             raise SystemExit(done.stderr)
-        found.append(json.loads(done.stdout.splitlines()[-1]))
-    quickest = min(found, key=lambda one: one["seconds"])
+        results.append(json.loads(done.stdout.splitlines()[-1]))
+    quickest = min(results, key=lambda result: result["seconds"])
     return {
         **quickest,
-        "processor": min(one["processor"] for one in found),
-        "peak": max(one["peak"] for one in found),
+        "processor": min(result["processor"] for result in results),
+        "peak": max(result["peak"] for result in results),
     }
 
 
@@ -131,21 +131,21 @@ def against_length(folder: Path, given: argparse.Namespace, options: dict[str, o
     rows: list[list[str]] = []
     times: dict[str, list[float]] = {"seconds": [], "processor": []}
     for hours in given.hours:
-        one = measure(write_store(folder / "log.zarr", hours), WINDOW, options, given.rounds)
+        result = measure(write_store(folder / "log.zarr", hours), WINDOW, options, given.rounds)
         samples = AXES * hours * 3600 * RATE
         for name, values in times.items():
-            values.append(one[name])
-        spans = [one["spans"].get(name, 0.0) for name in ("reading", "computing", "writing")]
+            values.append(result[name])
+        spans = [result["spans"].get(name, 0.0) for name in ("reading", "computing", "writing")]
         rows.append(
             [
                 f"{hours:g} h",
                 f"{samples / 1e6:.1f}",
-                f"{one['seconds']:.2f}",
+                f"{result['seconds']:.2f}",
                 *(f"{span:.2f}" for span in spans),
-                f"{samples / one['seconds'] / 1e6:.1f}",
-                f"{one['processor']:.2f}",
-                f"{1e9 * one['processor'] / samples:.1f}",
-                f"{one['peak']:.0f}",
+                f"{samples / result['seconds'] / 1e6:.1f}",
+                f"{result['processor']:.2f}",
+                f"{1e9 * result['processor'] / samples:.1f}",
+                f"{result['peak']:.0f}",
             ]
         )
         print(rows[-1], flush=True)
@@ -162,9 +162,9 @@ def against_length(folder: Path, given: argparse.Namespace, options: dict[str, o
         "peak MiB",
     ]
     text = table(head, rows)
-    for name, said in (("seconds", "Time"), ("processor", "Processor time")):
+    for name, label in (("seconds", "Time"), ("processor", "Processor time")):
         if len(given.hours) > 4:
-            text += f"\n\n{said}: {exponent(given.hours, times[name])}."
+            text += f"\n\n{label}: {exponent(given.hours, times[name])}."
     return text
 
 
@@ -182,7 +182,7 @@ def against_options(folder: Path, given: argparse.Namespace, options: dict[str, 
         {"overlap": "octave"},
     ):
         windows = {**WINDOW, **change}
-        one = measure(store, windows, options, given.rounds)
+        result = measure(store, windows, options, given.rounds)
         samples = AXES * hours * 3600 * RATE
         named = [
             windows["window"],
@@ -191,10 +191,10 @@ def against_options(folder: Path, given: argparse.Namespace, options: dict[str, 
             windows.get("overlap", "full"),
         ]
         cost = [
-            f"{one['seconds']:.2f}",
-            f"{one['processor']:.2f}",
-            f"{1e9 * one['processor'] / samples:.1f}",
-            f"{one['peak']:.0f}",
+            f"{result['seconds']:.2f}",
+            f"{result['processor']:.2f}",
+            f"{1e9 * result['processor'] / samples:.1f}",
+            f"{result['peak']:.0f}",
         ]
         rows.append([*named, *cost])
     return f"Log of {hours:g} h.\n\n" + table(

@@ -218,14 +218,14 @@ def _angle_across_gaps() -> Erratum:
     )
 
 
-def _windows(size: int, window: int, step: int, where: str, said: int) -> Erratum:
+def _windows(size: int, window: int, step: int, where: str, stated: int) -> Erratum:
     log = make_log(_white(size), rate=100.0, unit="deg/h")
     return Erratum(
         where,
-        f"{said} windows",
+        f"{stated} windows",
         "both ends count",
         f"windows of {window} in {size} samples, step {step}",
-        float(said),
+        float(stated),
         float(
             davar(log, window=f"{window}samples", step=f"{step}samples", taus=[0.01]).sizes["time"]
         ),

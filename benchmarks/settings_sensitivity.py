@@ -67,7 +67,7 @@ def main() -> None:
     factors = " | ".join(f"times {factor:g}" for factor in options.factors)
     print(f"\n| number | {factors} |\n|---|{'---|' * len(options.factors)}")
     kind = modules() if options.local else {item.name: item.name for item in fields(Settings)}
-    for name, what in kind.items():
+    for name, target in kind.items():
         if options.only and name not in options.only:
             continue
         cells = []
@@ -75,7 +75,7 @@ def main() -> None:
             changed = [
                 record
                 for record in logs
-                if decide_scaled(logs[record], what, factor) != usual[record]
+                if decide_scaled(logs[record], target, factor) != usual[record]
             ]
             cells.append(", ".join(changed))
         print(f"| `{name}` | {' | '.join(cells)} |", flush=True)
@@ -96,19 +96,21 @@ def make_record(name: str) -> xr.Dataset:
 def decide(log: xr.Dataset, settings: Settings = DEFAULTS) -> tuple[str, list[tuple[str, ...]]]:
     """Return verdict and names, each with its axes."""
     try:
-        found = gyrostab.diagnose(log, nulls=100, settings=settings)
+        diagnosis = gyrostab.diagnose(log, nulls=100, settings=settings)
     except GyrostabError as error:
         return type(error).__name__, []
-    return found.verdict, sorted((effect["name"], *effect["axes"]) for effect in found.effects)
+    return diagnosis.verdict, sorted(
+        (effect["name"], *effect["axes"]) for effect in diagnosis.effects
+    )
 
 
 def decide_scaled(
-    log: xr.Dataset, what: str | ModuleType, factor: float
+    log: xr.Dataset, target: str | ModuleType, factor: float
 ) -> tuple[str, list[tuple[str, ...]]]:
     """Return verdict and names with one setting, or the constants of a module, scaled."""
-    if isinstance(what, str):
-        return decide(log, replace(DEFAULTS, **{what: scale(getattr(DEFAULTS, what), factor)}))
-    with scaled_constants(what, factor):
+    if isinstance(target, str):
+        return decide(log, replace(DEFAULTS, **{target: scale(getattr(DEFAULTS, target), factor)}))
+    with scaled_constants(target, factor):
         return decide(log)
 
 
@@ -131,11 +133,11 @@ def modules() -> dict[str, ModuleType]:
     """Return the modules of the diagnosis that have numeric constants."""
     package = importlib.import_module("gyrostab.diagnose.core").__package__
     place = sys.modules[package].__path__
-    found = {
+    loaded = {
         item.name: importlib.import_module(item.name)
         for item in pkgutil.walk_packages(place, f"{package}.")
     }
-    return {name: module for name, module in found.items() if constants(module)}
+    return {name: module for name, module in loaded.items() if constants(module)}
 
 
 def constants(module: ModuleType) -> dict[str, Any]:

@@ -59,25 +59,27 @@ def ladder(name: str, strength: float, number: int) -> list[float]:
             "present": np.isfinite(mean),
             **noise,
         }
-        seen = mean_products(
+        products = mean_products(
             np.nan_to_num(mean)[:, None],
             column[:, None],
             step=float(reduced.attrs["block_s"]),
             **known,
         )
-        told = {
+        noise_grids = {
             f"grid_{term}": (("axis", "grid"), np.full(baseline["grid_K"].shape, value[0]))
             for term, value in noise.items()
         }
         total += [
-            float(seen.cross[0, 0, 0] - 0.5 * seen.gram[0, 0, 0]),
-            mean_factors(reduced, baseline.assign(told), [column], axis=axis, folds=folds)[0, 1, 0],
+            float(products.cross[0, 0, 0] - 0.5 * products.gram[0, 0, 0]),
+            mean_factors(reduced, baseline.assign(noise_grids), [column], axis=axis, folds=folds)[
+                0, 1, 0
+            ],
             mean_factors(reduced, baseline, [column], axis=axis, folds=folds)[0, 1, 0],
         ]
     tried = [
-        one
-        for one in effect_candidates(reduced, baseline["coefficient"])[0]
-        if one.effect == name and one.statistic.is_in_means
+        candidate
+        for candidate in effect_candidates(reduced, baseline["coefficient"])[0]
+        if candidate.effect == name and candidate.statistic.is_in_means
     ]
     scored = evidence_by_effect(
         compute_evidence(tried, reduced, initial_state(reduced, baseline), folds)

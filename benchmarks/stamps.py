@@ -58,14 +58,14 @@ def main() -> None:
     print("|---|---|---|---|---|---|")
     for jitter, losses in itertools.product(JITTER, LOSSES):
         cases = itertools.product(SCATTERS, UNITS)
-        found = [
+        results = [
             measure(jitter, losses, scatter, unit, rows, seed)
             for seed, (scatter, unit) in enumerate(cases)
         ]
-        kept, error, size, far = (list(column) for column in zip(*found, strict=True))
+        kept_share, error, size, row_error = (list(column) for column in zip(*results, strict=True))
         print(
-            f"| {jitter} | {losses} | {100 * min(kept):.2f} % | {max(error):.2f} | {max(size)} | "
-            f"{max(far)} |",
+            f"| {jitter} | {losses} | {100 * min(kept_share):.2f} % | {max(error):.2f} | "
+            f"{max(size)} | {max(row_error)} |",
             flush=True,
         )
 

@@ -221,12 +221,12 @@ def spoil(rows: list[list[str]], rng: np.random.Generator) -> list[list[str]]:
     present = np.ones(len(rows), dtype=bool)
     for start, length in (*DROPOUTS, (LOST[0], LOST[1] - LOST[0])):
         present[round(start * RATE) : round((start + length) * RATE)] = False
-    kept = np.flatnonzero(present)
-    for number, index in enumerate(rng.choice(kept, 60, replace=False)):
+    present_rows = np.flatnonzero(present)
+    for number, index in enumerate(rng.choice(present_rows, 60, replace=False)):
         columns = (1, 2, 3) if number % 4 == 0 else (1 + int(rng.integers(3)),)
         for column in columns:
             rows[index][column] = WORDS[number % 3]
-    order = [int(index) for index in kept]
+    order = [int(index) for index in present_rows]
     for place in (15_321, 54_002):  # sent twice
         order.insert(place + 1, order[place])
     for place in (8_123, 47_710, 71_404):  # four rows late

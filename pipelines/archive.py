@@ -50,11 +50,11 @@ def show(product):
 def main(plan_file):
     """Run the steps; every path in the TOML is relative to the folder of the TOML."""
     plan = tomllib.loads(plan_file.read_text(encoding="utf-8"))
-    here = plan_file.resolve().parent
-    results = here / plan["results"]["folder"]
+    folder = plan_file.resolve().parent
+    results = folder / plan["results"]["folder"]
     results.mkdir(parents=True, exist_ok=True)
 
-    logs = find_logs(here / plan["logs"]["folder"], pattern=plan["logs"]["pattern"])
+    logs = find_logs(folder / plan["logs"]["folder"], pattern=plan["logs"]["pattern"])
     if not is_current(results / "log.nc", sources=[*logs, plan_file]):
         make_log(logs, results / "log.nc", reading=plan["reading"])
     target, steps = results / "product.nc", {key: plan[key] for key in ("windows", "fitting")}

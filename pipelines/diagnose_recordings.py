@@ -24,15 +24,15 @@ def log_of(name, start=0.0, end=np.inf):
     return log.isel(time=slice(round(start * rate), round(min(end * rate, log.sizes["time"]))))
 
 
-def row(name, found):
+def row(name, diagnosis):
     """Return one row of the table: verdict, and each effect with its axes and evidence."""
     named = [
-        f"{one['name']} ({', '.join(one['axes'])}): {one['held_out_gain']['nats']:.0f}"
-        for one in found.effects
+        f"{effect['name']} ({', '.join(effect['axes'])}): {effect['held_out_gain']['nats']:.0f}"
+        for effect in diagnosis.effects
     ]
-    coverage = [found.content["held_out"][f"coverage95_{when}"] for when in ("before", "after")]
+    coverage = [diagnosis.content["held_out"][f"coverage95_{when}"] for when in ("before", "after")]
     shares = " | ".join(f"{100 * share:.0f} %" for share in coverage)
-    return f"| {name} | {found.verdict} | {'; '.join(named)} | {shares} |"
+    return f"| {name} | {diagnosis.verdict} | {'; '.join(named)} | {shares} |"
 
 
 def halves(name, *, nulls=400):
@@ -40,16 +40,16 @@ def halves(name, *, nulls=400):
     whole = log_of(name)
     seconds = whole.sizes["time"] / whole.attrs["sampling_rate_hz"]
     first, second = log_of(name, end=seconds / 2), log_of(name, start=seconds / 2)
-    found = gyrostab.diagnose(first, nulls=nulls)
+    diagnosis = gyrostab.diagnose(first, nulls=nulls)
     before = {
-        axis: {term: one["value"] for term, one in terms.items()}
-        for axis, terms in found.content["baseline"]["noise"].items()
+        axis: {term: entry["value"] for term, entry in terms.items()}
+        for axis, terms in diagnosis.content["baseline"]["noise"].items()
     }
-    resets = [one for one in found.model["effect"] if one["name"] == "feedback_reset"]
+    resets = [effect for effect in diagnosis.model["effect"] if effect["name"] == "feedback_reset"]
     ratio = {}
     for case, given in (
         ("five terms", {"noise": before}),
-        ("with resets", {"noise": found.model["noise"], "effect": resets}),
+        ("with resets", {"noise": diagnosis.model["noise"], "effect": resets}),
     ):
         made = gyrostab.simulate(given, like=second, seed=1)
         options = {
@@ -57,11 +57,11 @@ def halves(name, *, nulls=400):
             "step": f"{second.sizes['time']}samples",
             "taus": TAUS,
         }
-        both = [
+        variances = [
             gyrostab.davar(log, **options)["avar"].isel(axis=0, time=0) for log in (second, made)
         ]
-        ratio[case] = both[0].values / both[1].values
-    return both[0]["tau"].values, ratio
+        ratio[case] = variances[0].values / variances[1].values
+    return variances[0]["tau"].values, ratio
 
 
 if __name__ == "__main__":
@@ -71,4 +71,4 @@ if __name__ == "__main__":
     for tau, *cases in zip(
         *(lambda taus, ratio: (taus, *ratio.values()))(*halves("fog-blueseis-ramp")), strict=True
     ):
-        print(f"| {tau:g} | {' | '.join(f'{one:.2f}' for one in cases)} |")
+        print(f"| {tau:g} | {' | '.join(f'{value:.2f}' for value in cases)} |")

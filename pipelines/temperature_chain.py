@@ -13,19 +13,19 @@ def chain(plan, folder):
     channel = gyrostab.read_channel(
         folder / plan["channel"]["file"], plan["channel"]["name"], **plan["channel"].get("read", {})
     )
-    found = gyrostab.correlate(product, channel=channel, **plan["correlate"])
-    gyrostab.to_netcdf(found, folder / plan["output"], overwrite=True)
-    gyrostab.plot_correlation(found).savefig(folder / plan["figure"], dpi=150)
-    return found
+    correlation = gyrostab.correlate(product, channel=channel, **plan["correlate"])
+    gyrostab.to_netcdf(correlation, folder / plan["output"], overwrite=True)
+    gyrostab.plot_correlation(correlation).savefig(folder / plan["figure"], dpi=150)
+    return correlation
 
 
-def sentences(found):
+def sentences(correlation):
     """List the statements about every axis, variable and driver that is or may be coupled."""
-    meanings = found["coupling_verdict"].attrs["flag_meanings"].split()
-    said = found["statement"].where(
-        found["coupling_verdict"] >= meanings.index("not_told_apart"), ""
+    meanings = correlation["coupling_verdict"].attrs["flag_meanings"].split()
+    statements = correlation["statement"].where(
+        correlation["coupling_verdict"] >= meanings.index("not_told_apart"), ""
     )
-    return [str(sentence) for sentence in said.values.ravel() if sentence] or [
+    return [str(sentence) for sentence in statements.values.ravel() if sentence] or [
         "No dependence is seen."
     ]
 

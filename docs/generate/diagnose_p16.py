@@ -44,8 +44,8 @@ def sizes(effect):
     """Write what an effect measures, with its 95 % interval."""
     entries = effect["parameters"].items()
     return "; ".join(
-        f"{name} {one['value']:.3g} ({one['low']:.3g} to {one['high']:.3g}) {one['unit']}"
-        for name, one in entries
+        f"{name} {entry['value']:.3g} ({entry['low']:.3g} to {entry['high']:.3g}) {entry['unit']}"
+        for name, entry in entries
     )
 
 
@@ -55,7 +55,7 @@ def found(runs):
     for name, run in runs.items():
         for effect in run.effects or [{}]:
             gain = effect["held_out_gain"] if effect else {"nats": 0.0, "threshold": 0.0}
-            told = [
+            cells = [
                 effect.get("name", "nothing"),
                 ", ".join(effect.get("axes", [])),
                 sizes(effect) if effect else "",
@@ -65,7 +65,7 @@ def found(runs):
                 [
                     name,
                     run.verdict,
-                    *told,
+                    *cells,
                     f"{gain['nats']:.3g}, threshold {gain['threshold']:.2g}",
                     others,
                 ]
@@ -88,8 +88,8 @@ def proof(runs):
     for name, run in runs.items():
         held = run.content["held_out"]
         shares = [
-            held[f"{what}_{when}"]
-            for what in ("misfit", "coverage95")
+            held[f"{measure}_{when}"]
+            for measure in ("misfit", "coverage95")
             for when in ("before", "after")
         ]
         gain = held["forecast_gain"]  # None where no effect acts before and after 70 %

@@ -107,8 +107,8 @@ def rows(pages):
 
 
 if __name__ == "__main__":
-    for wanted in sys.argv[1:] or PLAN:
-        print(draw(wanted, ROOT / "docs" / "figures" / "effects"))
+    for effect in sys.argv[1:] or PLAN:
+        print(draw(effect, ROOT / "docs" / "figures" / "effects"))
     index = ROOT / "docs" / "physics" / "README.md"
     sections = [page for page in index.parent.glob("*.md") if page != index]
     for section in sections:

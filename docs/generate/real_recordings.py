@@ -55,22 +55,22 @@ def examine(entry, file):
     log = gyrostab.regularise(gyrostab.read_log(entry["files"], **entry["read"]))
     product = gyrostab.fit_noise(gyrostab.davar(log, **entry["davar"]), **entry.get("fit", {}))
     product = gyrostab.open_product(gyrostab.to_netcdf(product, file)).load()
-    found = {
+    results = {
         "hertz": log.attrs["sampling_rate_hz"],
         "minutes": np.ptp(log["time"].values) / np.timedelta64(1, "m"),
     }
-    found["missing"] = float(log["rate"].isnull().mean())
+    results["missing"] = float(log["rate"].isnull().mean())
     for name, value in entry["values"].items():
         numbers = (
-            np.divide(*map(found.get, value["ratio"]))
+            np.divide(*map(results.get, value["ratio"]))
             if "ratio" in value
             else np.asarray(pick(value, log, product))
         )
         scale = value.get("times", 1.0) / (
             parse_unit(value["unit"]).factor if "unit" in value else 1.0
         )
-        found[name] = float(getattr(np, value.get("over", "nanmedian"))(numbers)) * scale
-    return log, product, found
+        results[name] = float(getattr(np, value.get("over", "nanmedian"))(numbers)) * scale
+    return log, product, results
 
 
 def refusal(entry):
@@ -100,7 +100,7 @@ def command(entry):
 
 def describe(name, entry, folder):
     """Process one recording: its table row, its section, and its rows of the temperature table."""
-    log, product, found = examine(entry, Path(folder, f"{name}.nc"))
+    log, product, results = examine(entry, Path(folder, f"{name}.nc"))
     notes = "".join(
         f"- {note}\n"
         for note in log.attrs["notes"]
@@ -113,13 +113,13 @@ def describe(name, entry, folder):
     about = {
         **entry,
         **entry["davar"],
-        **found,
+        **results,
         "name": name,
         "axes": ", ".join(log["axis"].values),
         "gaps": log.sizes["gap"],
     }
     about |= {
-        "text": entry["text"].format_map(found | {"refusal": refusal(entry)}),
+        "text": entry["text"].format_map(results | {"refusal": refusal(entry)}),
         "command": command(entry),
         "notes": notes,
     }

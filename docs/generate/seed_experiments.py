@@ -18,8 +18,10 @@ PLAN = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf
 def simulate(name, run):
     """Make the log of a model, with the changes of this run, and cut out its stretch of time."""
     model = tomllib.loads(Path(ROOT, "data", "models", f"{name}.toml").read_text(encoding="utf-8"))
-    kept = [part for part in model.get("effect", []) if part["name"] not in run.get("without", [])]
-    model["effect"] = [part | run.get("effects", {}).get(part["name"], {}) for part in kept]
+    effects = [
+        part for part in model.get("effect", []) if part["name"] not in run.get("without", [])
+    ]
+    model["effect"] = [part | run.get("effects", {}).get(part["name"], {}) for part in effects]
     log = gyrostab.simulate(model, seed=PLAN["seed"])
     first, last = (
         round(run.get(edge, 0) * log.attrs["sampling_rate_hz"]) or None for edge in ("from", "to")
@@ -37,27 +39,27 @@ def analyse(log, run):
     )
 
 
-def number(wanted, products):
+def number(entry, products):
     """Find one number of the table by run, variable, axis, averaging time and time."""
-    product = products[wanted["run"]].sel(tau=wanted.get("tau", 1.0), method="nearest")
-    product = product.sel(axis=wanted["axis"]) if "axis" in wanted else product.isel(axis=0)
+    product = products[entry["run"]].sel(tau=entry.get("tau", 1.0), method="nearest")
+    product = product.sel(axis=entry["axis"]) if "axis" in entry else product.isel(axis=0)
     begin, end = (
         (product["time_bounds"] - product["time_bounds"].min()) / np.timedelta64(1, "s")
     ).values.T
-    inside = (begin > wanted.get("from", 0) - 1e-6) & (end < wanted.get("to", np.inf) + 1e-6)
+    inside = (begin > entry.get("from", 0) - 1e-6) & (end < entry.get("to", np.inf) + 1e-6)
     inside &= np.any(
-        [(begin < at) & (at < end) for at in wanted.get("across", [begin + 1e-6])], axis=0
+        [(begin < at) & (at < end) for at in entry.get("across", [begin + 1e-6])], axis=0
     )
     product, over = (
         product.assign(adev=product["avar"].clip(0) ** 0.5).isel(time=inside),
-        getattr(np, wanted.get("over", "nanmedian")),
+        getattr(np, entry.get("over", "nanmedian")),
     )
-    if wanted["of"] + "_upper" in product:
-        seen = product["observable"].sel(term=wanted["of"]) == 2
-        if not seen.any() or (over is np.nanmedian and seen.mean() < 0.5):
-            return f"< {float(np.nanmedian(product[wanted['of'] + '_upper'])):.3g}"
-        return f"{float(over(product[wanted['of']].where(seen))):.4g}"
-    return f"{float(over(product[wanted['of']])):.4g}"
+    if entry["of"] + "_upper" in product:
+        is_observed = product["observable"].sel(term=entry["of"]) == 2
+        if not is_observed.any() or (over is np.nanmedian and is_observed.mean() < 0.5):
+            return f"< {float(np.nanmedian(product[entry['of'] + '_upper'])):.3g}"
+        return f"{float(over(product[entry['of']].where(is_observed))):.4g}"
+    return f"{float(over(product[entry['of']])):.4g}"
 
 
 def lines(head, rows):
@@ -83,8 +85,11 @@ def experiment(name, figures):
         [(label, row, iter(row.get("paper", []))) for label, row in entry["rows"].items()],
     )
     cells = [
-        [label, *(next(said, "") if "paper" in to else number(row | to, products) for to in head)]
-        for label, row, said in rows
+        [
+            label,
+            *(next(printed, "") if "paper" in to else number(row | to, products) for to in head),
+        ]
+        for label, row, printed in rows
     ]
     return lines(["", *(column["title"] for column in head)], cells)
 
