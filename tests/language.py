@@ -215,8 +215,8 @@ def files_in(places: list[str]) -> Iterator[Path]:
     """The files of these places that hold prose."""
     for place in places:
         path = ROOT / place
-        found = [path] if path.is_file() else sorted(path.rglob("*"))
-        for file in found:
+        paths = [path] if path.is_file() else sorted(path.rglob("*"))
+        for file in paths:
             hidden = any(part.startswith(".") or part == "__pycache__" for part in file.parts)
             if file.suffix in (".py", ".md", ".jinja", ".toml") and not hidden:
                 yield file
@@ -224,15 +224,15 @@ def files_in(places: list[str]) -> Iterator[Path]:
 
 def find_all(places: list[str]) -> list[Finding]:
     """Everything in these places that does not follow the vocabulary."""
-    found = []
+    findings = []
     for path in files_in(places):
         name = str(path.relative_to(ROOT))
-        found += find_phrases(path, name)
+        findings += find_phrases(path, name)
         if path.suffix == ".py":
-            found += find_names(path, name)
+            findings += find_names(path, name)
         if path.suffix == ".md":
-            found += find_long_lines(path, name)
-    return found
+            findings += find_long_lines(path, name)
+    return findings
 
 
 def single_word_share(folder: Path) -> tuple[int, int]:
@@ -249,13 +249,13 @@ def single_word_share(folder: Path) -> tuple[int, int]:
 
 def main(arguments: list[str]) -> int:
     """Print the findings; 1 if there are any."""
-    found = find_all(arguments or list(PLACES))
-    for finding in found:
+    findings = find_all(arguments or list(PLACES))
+    for finding in findings:
         print(f"{finding.path}:{finding.line}: {finding.text}  [{finding.advice}]")
     single, total = single_word_share(ROOT / (arguments[0] if arguments else "gyrostab"))
     share = single / max(total, 1)
-    print(f"{len(found)} findings; {single} of {total} private functions have a one-word name")
-    return int(bool(found) or share > MAX_SINGLE_WORD_SHARE)
+    print(f"{len(findings)} findings; {single} of {total} private functions have a one-word name")
+    return int(bool(findings) or share > MAX_SINGLE_WORD_SHARE)
 
 
 if __name__ == "__main__":

@@ -26,12 +26,12 @@ def direct_surface(
     count = np.zeros((n_windows, len(ks)), dtype=np.int64)
     for j in range(n_windows):
         rate = x[j * step : j * step + window].astype(np.longdouble)
-        here = np.isfinite(rate)
-        if not here.any():
+        is_finite = np.isfinite(rate)
+        if not is_finite.any():
             continue
-        rate = np.where(here, rate - rate[here].mean(), 0)
+        rate = np.where(is_finite, rate - rate[is_finite].mean(), 0)
         theta = np.concatenate(([0], np.cumsum(rate)))
-        lost = np.concatenate(([0], np.cumsum(~here)))
+        lost = np.concatenate(([0], np.cumsum(~is_finite)))
         for i, k in enumerate(ks):
             d = theta[2 * k :] - 2 * theta[k:-k] + theta[: -2 * k]
             keep = lost[2 * k :] == lost[: -2 * k]
@@ -69,14 +69,14 @@ def cluster_cell(
     Pairs begin where ``first + m`` is a multiple of `stride`. Degrees of freedom are those under
     white noise.
     """
-    here = np.isfinite(x)
+    is_finite = np.isfinite(x)
     rows, offered = [], 0
     for m in range(-first % stride, x.size - 2 * k + 1, stride):
         offered += 1
         clusters = np.zeros((2, x.size))
         clusters[0, m : m + k], clusters[1, m + k : m + 2 * k] = (
-            here[m : m + k],
-            here[m + k : m + 2 * k],
+            is_finite[m : m + k],
+            is_finite[m + k : m + 2 * k],
         )
         number = clusters.sum(axis=1)
         if (2 * number >= k).all():
@@ -85,7 +85,7 @@ def cluster_cell(
         return {"count": 0}
     weight = np.array([row[0] for row in rows])
     design = np.array([row[1] for row in rows]) * np.sqrt(weight)[:, None]
-    values = np.where(here, x - x[here].mean(), 0.0)
+    values = np.where(is_finite, x - x[is_finite].mean(), 0.0)
     angles = -np.diff(
         design, axis=1, prepend=0.0, append=0.0
     )  # the same terms of an angle instead of its differences
@@ -214,9 +214,9 @@ def average_plainly(plain: dict[str, Any]) -> dict[str, NDArray[np.float64]]:
             costs[members] = below / np.einsum("pi,ij,pj->p", rows, covariance, rows)
             fits.append((members, squares, rows, likelihood, costs))
 
-    def weigh(some: list[Any], a: int | None = None) -> Any:
-        costs = [0.0 if a is None else fit[4].sum() - fit[4][a] for fit in some]
-        logs = np.array([fit[3] for fit in some]) - costs
+    def weigh(fits: list[Any], a: int | None = None) -> Any:
+        costs = [0.0 if a is None else fit[4].sum() - fit[4][a] for fit in fits]
+        logs = np.array([fit[3] for fit in fits]) - costs
         return np.exp(logs - logs.max())
 
     feasible = [fit for fit in fits if (fit[1][fit[0]] > 0).all()]
@@ -229,14 +229,14 @@ def average_plainly(plain: dict[str, Any]) -> dict[str, NDArray[np.float64]]:
         free, penalised = np.array([fit[1][a] for fit in having]), weigh(having, a)
         mean = np.average(free, weights=penalised)
         best = [
-            max((fit[3] for fit in feasible if (a in fit[0]) == there), default=-np.inf)
-            for there in (True, False)
+            max((fit[3] for fit in feasible if (a in fit[0]) == included), default=-np.inf)
+            for included in (True, False)
         ]
 
         def scatter(
-            some: list[Any], weights: Any, noise: NDArray[np.float64], a: int = a
+            fits: list[Any], weights: Any, noise: NDArray[np.float64], a: int = a
         ) -> tuple[float, float, float]:
-            rows = [fit[2][fit[0].index(a)] for fit in some]
+            rows = [fit[2][fit[0].index(a)] for fit in fits]
 
             def variance(squares: NDArray[np.float64]) -> Any:
                 covariance = plain["products"](squares)
@@ -244,8 +244,8 @@ def average_plainly(plain: dict[str, Any]) -> dict[str, NDArray[np.float64]]:
 
             noise = np.where(np.arange(5) == a, 0.0, noise)
             unit = np.eye(5)[a] * spread[a]
-            null, both, own = variance(noise), variance(noise + unit), variance(unit)
-            return null, (both - null - own) / spread[a], own / spread[a] ** 2
+            null, combined, own = variance(noise), variance(noise + unit), variance(unit)
+            return null, (combined - null - own) / spread[a], own / spread[a] ** 2
 
         noise = np.append(average, plain["square"][4])
         null, linear, own = scatter(able, weigh(able), noise)

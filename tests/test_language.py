@@ -8,8 +8,8 @@ from tests import language
 
 
 def test_no_wording_that_the_glossary_replaces():
-    found = language.find_all(list(language.PLACES))
-    assert not found, "\n".join(f"{item.path}:{item.line}: {item.text}" for item in found)
+    findings = language.find_all(list(language.PLACES))
+    assert not findings, "\n".join(f"{item.path}:{item.line}: {item.text}" for item in findings)
 
 
 def test_private_functions_have_a_verb_and_an_object():

@@ -61,14 +61,14 @@ def test_the_entry_point_names_the_class():
 @pytest.mark.filterwarnings("ignore:The specified chunks separate the stored chunks")
 def test_the_engine_opens_what_gyrostab_opens(case, chunks):
     path, opener = case
-    with xr.open_dataset(path, engine="gyrostab", chunks=chunks) as seen, opener(path) as own:
-        assert seen.sizes == own.sizes
+    with xr.open_dataset(path, engine="gyrostab", chunks=chunks) as opened, opener(path) as own:
+        assert opened.sizes == own.sizes
         lazy = [name for name in own if own[name].chunks]
-        assert all((seen[name].chunks is None) is (chunks is None) for name in lazy)
-        xr.testing.assert_identical(seen.compute(), own.compute())
-        assert isinstance(seen.xindexes["time"], type(own.xindexes["time"]))
+        assert all((opened[name].chunks is None) is (chunks is None) for name in lazy)
+        xr.testing.assert_identical(opened.compute(), own.compute())
+        assert isinstance(opened.xindexes["time"], type(own.xindexes["time"]))
         if chunks == {}:
-            assert all(seen[name].chunks == own[name].chunks for name in lazy)
+            assert all(opened[name].chunks == own[name].chunks for name in lazy)
 
 
 @pytest.mark.parametrize("form", WRITERS)
@@ -82,31 +82,31 @@ def test_only_the_chunks_of_a_selection_are_read(tmp_path, form, monkeypatch):
 
     read_chunk = read.read_chunk
     monkeypatch.setattr(read, "read_chunk", count)
-    with xr.open_dataset(path, engine="gyrostab") as seen:
+    with xr.open_dataset(path, engine="gyrostab") as opened:
         assert not done
-        assert not is_in_memory(seen.rate.variable)
-        part = seen.rate.sel(axis="y", time="2026-01-01T02:00:00")
+        assert not is_in_memory(opened.rate.variable)
+        part = opened.rate.sel(axis="y", time="2026-01-01T02:00:00")
         assert float(part) == float(log.rate[1, 72_000])
         assert done == [("rate", (1, 1))]
         for key in (np.s_[0, ::-30_000], np.s_[:, [5, 140_000, 1]], np.s_[1, 10:20:3]):
-            np.testing.assert_array_equal(seen.rate[key].values, log.rate[key].values)
+            np.testing.assert_array_equal(opened.rate[key].values, log.rate[key].values)
 
 
 @pytest.mark.parametrize("opened", ["gyrostab", "netcdf4"])
 def test_davar_reads_lazy_variables_in_parts(tmp_path, opened):
     log = long_log()
-    with xr.open_dataset(to_netcdf(log, tmp_path / "log.nc"), engine=opened) as seen:
-        one = gyrostab.davar(seen, window="600s", taus="octave")
-        assert not is_in_memory(seen.rate.variable)
-    xr.testing.assert_equal(one, gyrostab.davar(log, window="600s", taus="octave"))
+    with xr.open_dataset(to_netcdf(log, tmp_path / "log.nc"), engine=opened) as dataset:
+        surface = gyrostab.davar(dataset, window="600s", taus="octave")
+        assert not is_in_memory(dataset.rate.variable)
+    xr.testing.assert_equal(surface, gyrostab.davar(log, window="600s", taus="octave"))
 
 
 @pytest.mark.parametrize(("form", "engine"), [("nc", "netcdf4"), ("zarr", "zarr")])
 def test_xarray_opens_files_with_its_own_engines(tmp_path, form, engine):
     path = WRITERS[form](synthetic.log(), tmp_path / f"log.{form}")
     assert not GyrostabBackend().guess_can_open(path)
-    with xr.open_dataset(path) as guessed, xr.open_dataset(path, engine=engine) as wanted:
-        xr.testing.assert_identical(guessed, wanted)
+    with xr.open_dataset(path) as guessed, xr.open_dataset(path, engine=engine) as expected:
+        xr.testing.assert_identical(guessed, expected)
         assert not isinstance(guessed.xindexes["time"], TimeGridIndex)
 
 
@@ -116,27 +116,27 @@ def test_several_logs_are_one(tmp_path):
         to_netcdf(log.isel(time=part), tmp_path / f"{number}.nc")
         for number, part in enumerate((slice(0, 70_000), slice(70_000, None)))
     ]
-    with xr.open_mfdataset(paths, engine="gyrostab", combine="nested", concat_dim="time") as seen:
-        assert isinstance(seen.xindexes["time"], TimeGridIndex)
-        np.testing.assert_array_equal(seen.rate.values, log.rate.values)
-        np.testing.assert_array_equal(seen.time.values, log.time.values)
+    with xr.open_mfdataset(paths, engine="gyrostab", combine="nested", concat_dim="time") as opened:
+        assert isinstance(opened.xindexes["time"], TimeGridIndex)
+        np.testing.assert_array_equal(opened.rate.values, log.rate.values)
+        np.testing.assert_array_equal(opened.time.values, log.time.values)
 
 
 def test_options_of_the_engine(tmp_path):
     path = to_zarr(long_log(), tmp_path / "log.zarr")
-    with xr.open_dataset(path, engine="gyrostab", drop_variables=["rate", "none"]) as seen:
-        assert "rate" not in seen
+    with xr.open_dataset(path, engine="gyrostab", drop_variables=["rate", "none"]) as opened:
+        assert "rate" not in opened
     (path / "rate" / "0.1").write_bytes(b"damaged")
-    with xr.open_dataset(path, engine="gyrostab", strict=True) as seen:
-        assert np.isfinite(seen.rate[1]).all()
+    with xr.open_dataset(path, engine="gyrostab", strict=True) as opened:
+        assert np.isfinite(opened.rate[1]).all()
         with pytest.raises(FormatError, match=r"axis x: the chunk from .* is damaged"):
-            seen.rate.load()
+            opened.rate.load()
 
 
 def test_a_dataset_of_the_engine_can_be_sent_to_another_process(tmp_path):
     log = long_log()
-    with xr.open_dataset(to_netcdf(log, tmp_path / "log.nc"), engine="gyrostab") as seen:
-        sent = pickle.loads(pickle.dumps(seen))
+    with xr.open_dataset(to_netcdf(log, tmp_path / "log.nc"), engine="gyrostab") as opened:
+        sent = pickle.loads(pickle.dumps(opened))
     np.testing.assert_array_equal(sent.rate[:, -5:].values, log.rate[:, -5:].values)
 
 
@@ -144,12 +144,12 @@ def test_a_dataset_of_the_engine_can_be_sent_to_another_process(tmp_path):
 @pytest.mark.parametrize("form", WRITERS)
 def test_what_the_engine_opened_can_be_written(tmp_path, form, chunks):
     path = WRITERS[form](long_log(), tmp_path / f"log.{form}")
-    with xr.open_dataset(path, engine="gyrostab", chunks=chunks) as seen:
-        again = WRITERS[form](seen, tmp_path / f"again.{form}")
+    with xr.open_dataset(path, engine="gyrostab", chunks=chunks) as opened:
+        copy = WRITERS[form](opened, tmp_path / f"again.{form}")
         with pytest.raises(OptionError, match="is also an input"):
-            WRITERS[form](seen, path, overwrite=True)
-    with open_log(path) as one, open_log(again) as other:
-        xr.testing.assert_equal(one.compute(), other.compute())
+            WRITERS[form](opened, path, overwrite=True)
+    with open_log(path) as original, open_log(copy) as other:
+        xr.testing.assert_equal(original.compute(), other.compute())
 
 
 @pytest.mark.parametrize("form", WRITERS)
@@ -158,9 +158,9 @@ def test_what_xarray_wrote_is_opened(tmp_path, form, name):
     make, opener = CASES[name]
     data, path = make(), tmp_path / f"data.{form}"
     data.to_zarr(path) if form == "zarr" else data.to_netcdf(path)
-    with opener(path) as own, xr.open_dataset(path, engine="gyrostab") as seen:
+    with opener(path) as own, xr.open_dataset(path, engine="gyrostab") as opened:
         xr.testing.assert_equal(own.compute(), data)
-        xr.testing.assert_equal(seen.compute(), data)
+        xr.testing.assert_equal(opened.compute(), data)
 
 
 def test_other_files_are_refused(tmp_path):

@@ -68,10 +68,12 @@ def test_the_error_of_n_includes_that_of_the_time_constant():
         product = gyrostab.fit_noise(surface, observed_only=False)
         limit = [product[name].item() for name in fit._BAND_VARIABLES]
         assert 0.003 < limit[2] < 0.05
-        alone = fit.fit_part(surface, bands={"x": limit[:2]}, observed_only=False)
-        squares = alone.N_stderr**2 + (limit[2] * product.N) ** 2
+        without_error = fit.fit_part(surface, bands={"x": limit[:2]}, observed_only=False)
+        squares = without_error.N_stderr**2 + (limit[2] * product.N) ** 2
         np.testing.assert_allclose(product.N_stderr, np.sqrt(squares), rtol=0.05)
-        scores.append([((one.N - N) / one.N_stderr).values for one in (product, alone)])
+        scores.append(
+            [((fitted.N - N) / fitted.N_stderr).values for fitted in (product, without_error)]
+        )
     with_error, without = np.std(scores, axis=(0, 2, 3))
     assert with_error < 1.2 < without
 
@@ -119,15 +121,15 @@ def test_each_axis_has_its_filter_and_gaps_and_motion_do_not_hide_it():
     log = gyrostab.make_log(x.reshape(2, -1), rate=RATE, unit="deg/h")
     surface = gyrostab.davar(log, window="80s", step="80s", taus=30)
     product = gyrostab.fit_noise(surface)
-    found = product.filter_time_constant.values
-    assert found[0] == pytest.approx(0.033, abs=0.005)
-    assert found[1] == 0.0
+    constants = product.filter_time_constant.values
+    assert constants[0] == pytest.approx(0.033, abs=0.005)
+    assert constants[1] == 0.0
     assert (product.observable.isel(axis=0, time=3) < 2).all()
     assert (product.observable.isel(axis=1).sel(term="Q") > 0).all()
     # the filter stays with the product, also where few windows are fitted again
-    again = gyrostab.allan.fit.refit(product.isel(time=[5]))
-    assert again.filter_time_constant.values.tolist() == found.tolist()
-    assert float(again.N[0, 0]) == float(product.N[0, 5])
+    refitted = gyrostab.allan.fit.refit(product.isel(time=[5]))
+    assert refitted.filter_time_constant.values.tolist() == constants.tolist()
+    assert float(refitted.N[0, 0]) == float(product.N[0, 5])
     plain = gyrostab.fit_noise(surface, tau_min="all")
     assert (plain.filter_time_constant == 0).all()
     assert (plain.observable.isel(axis=0) < 2).all()

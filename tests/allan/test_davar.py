@@ -295,8 +295,8 @@ class TestInvariance:
         x = np.random.default_rng(10).standard_normal((3, 5000))
         x[1, 100:200] = np.nan
         together = davar(log_of(x), window="1000samples")
-        alone = davar(log_of(x), window="1000samples", axis="y")
-        xr.testing.assert_identical(together.avar.sel(axis=["y"]), alone.avar)
+        single = davar(log_of(x), window="1000samples", axis="y")
+        xr.testing.assert_identical(together.avar.sel(axis=["y"]), single.avar)
 
     def test_scaling_and_constant(self):
         x = np.random.default_rng(11).standard_normal(5000)
@@ -358,19 +358,21 @@ class TestGaps:
         assert bridged.size >= 8
         assert np.diff(bridged).max() > 20
         for j in bridged:
-            alone, _ = surface_unit(x[j * 300 : j * 300 + 1000], unit)
-            np.testing.assert_allclose(np.stack(cells)[:, j], np.stack(alone)[:, 0], rtol=1e-9)
+            single, _ = surface_unit(x[j * 300 : j * 300 + 1000], unit)
+            np.testing.assert_allclose(np.stack(cells)[:, j], np.stack(single)[:, 0], rtol=1e-9)
 
     @pytest.mark.parametrize("block", [5, 60])
     def test_responses_predict_what_gaps_do_to_white_and_quantization_noise(self, block):
         rng = np.random.default_rng(13)
         n, trials = 3000, 150
-        here = np.ones(n, dtype=bool)
-        while here.mean() > 0.75:
+        present = np.ones(n, dtype=bool)
+        while present.mean() > 0.75:
             start = int(rng.integers(0, n))
-            here[start : start + int(rng.geometric(1 / block))] = False
-        white = np.where(here, rng.standard_normal((trials, n)), np.nan)
-        quantization = np.where(here, np.diff(rng.standard_normal((trials, n + 1)), axis=1), np.nan)
+            present[start : start + int(rng.geometric(1 / block))] = False
+        white = np.where(present, rng.standard_normal((trials, n)), np.nan)
+        quantization = np.where(
+            present, np.diff(rng.standard_normal((trials, n + 1)), axis=1), np.nan
+        )
         names = [str(i) for i in range(trials)]
         for x, law, response in (
             (white, lambda k: 1 / k, "white_response"),
@@ -535,11 +537,11 @@ def test_trend_is_that_of_a_straight_line_through_the_present_samples(kind, meth
     spread = np.sum((hours - hours.mean()) ** 2)
     for j in range(surface.sizes["time"]):
         part = x[300 * j : 300 * j + 1000]
-        there = np.isfinite(part)
-        if there.sum() < 2:
+        present = np.isfinite(part)
+        if present.sum() < 2:
             assert np.isnan(surface.window_trend[0, j])
             continue
-        slope = np.polyfit(hours[there], part[there], 1)[0]
+        slope = np.polyfit(hours[present], part[present], 1)[0]
         assert float(surface.window_trend[0, j]) == pytest.approx(slope, rel=1e-6, abs=1e-3)
-        share = spread / np.sum((hours[there] - hours[there].mean()) ** 2)
+        share = spread / np.sum((hours[present] - hours[present].mean()) ** 2)
         assert float(surface.trend_response[0, j]) == pytest.approx(share, rel=1e-9)

@@ -40,9 +40,9 @@ def covariances():
 
 
 def test_expected_squares_of_the_cosine_transform_are_exact(estimators, covariances):
-    found = estimators.Cosines(SAMPLES, RATE).columns[: estimators.SINGLE]
+    columns = estimators.Cosines(SAMPLES, RATE).columns[: estimators.SINGLE]
     exact = np.einsum("aii->ia", covariances)[: estimators.SINGLE]
-    np.testing.assert_allclose(found, exact, rtol=1e-6)
+    np.testing.assert_allclose(columns, exact, rtol=1e-6)
 
 
 @pytest.mark.parametrize("ramp", [False, True])
@@ -52,12 +52,12 @@ def test_the_bound_is_that_of_the_exact_likelihood(estimators, covariances, ramp
     inverse = np.linalg.inv(np.einsum("a,aij->ij", squares, covariances))
     if ramp:
         time = dct((np.arange(SAMPLES) - (SAMPLES - 1) / 2) / RATE / 3600, norm="ortho")[1:]
-        seen = inverse @ time
-        inverse -= np.outer(seen, seen) / (time @ seen)
+        whitened = inverse @ time
+        inverse -= np.outer(whitened, whitened) / (time @ whitened)
     parts = [inverse @ covariance for covariance in covariances]
     exact = 0.5 * np.array([[np.sum(a * b.T) for b in parts] for a in parts])
-    found, _ = estimators.Cosines(SAMPLES, RATE).information(squares, free_ramp=ramp)
-    bounds = [np.sqrt(np.diag(np.linalg.inv(matrix))) for matrix in (found, exact)]
+    information, _ = estimators.Cosines(SAMPLES, RATE).information(squares, free_ramp=ramp)
+    bounds = [np.sqrt(np.diag(np.linalg.inv(matrix))) for matrix in (information, exact)]
     np.testing.assert_allclose(*bounds, rtol=0.05)
 
 
@@ -65,13 +65,13 @@ def test_wavelet_variances_are_those_published_for_the_method_of_wavelet_moments
     """Manual of the R package gmwm, processes to Haar wavelet variance, at scale 2 k."""
     ks = 2 ** np.arange(9)
     tables = window_fit.fit_tables(tuple(ks.tolist()), (0,) * ks.size, RATE, 2048)
-    found = tables.columns / 2 / tables.to_samples
+    variances = tables.columns / 2 / tables.to_samples
     scale = 2.0 * ks
-    np.testing.assert_allclose(found[:, 0], 6 / scale**2, rtol=1e-9)
-    np.testing.assert_allclose(found[:, 1], 1 / scale, rtol=1e-9)
-    np.testing.assert_allclose(found[:, 4], scale**2 / 16, rtol=1e-9)
+    np.testing.assert_allclose(variances[:, 0], 6 / scale**2, rtol=1e-9)
+    np.testing.assert_allclose(variances[:, 1], 1 / scale, rtol=1e-9)
+    np.testing.assert_allclose(variances[:, 4], scale**2 / 16, rtol=1e-9)
     # theirs is a walk in steps; samples that are means of it have less by white noise of 1 / 6
-    np.testing.assert_allclose(found[:, 3], (scale**2 + 2) / (12 * scale) - 1 / (6 * scale))
+    np.testing.assert_allclose(variances[:, 3], (scale**2 + 2) / (12 * scale) - 1 / (6 * scale))
 
 
 def test_short_form_of_the_table(estimators):

@@ -65,9 +65,13 @@ def test_95_percent_intervals_hold_the_truth(kind, share, block):
     whole = surface.expand_dims("axis").transpose("axis", "time", "tau", "bnds")
     for product in (whole, fit_noise(whole)):
         limits = confidence_interval(product).isel(axis=0)
-        here = limits.avar_lower.notnull()
-        assert here.mean() > 0.99
-        hit = ((limits.avar_lower <= truth) & (truth <= limits.avar_upper)).where(here).mean("time")
+        has_interval = limits.avar_lower.notnull()
+        assert has_interval.mean() > 0.99
+        hit = (
+            ((limits.avar_lower <= truth) & (truth <= limits.avar_upper))
+            .where(has_interval)
+            .mean("time")
+        )
         assert 0.93 <= float(hit.mean()) <= 0.97
         assert float(hit.min()) >= 0.92
         assert float(hit.max()) <= 0.98
@@ -270,10 +274,12 @@ def test_coefficient_and_error_are_nan_where_the_term_is_not_observed():
         windows_of(white(np.random.default_rng(25), 50, 2000, N=0.01, rate=RATE), taus=20)
     )
     for term in TERMS:
-        seen = product.observable.sel(term=term) == OBSERVABLE.index("observed")
-        np.testing.assert_array_equal(product[term].notnull(), seen, err_msg=term)
-        np.testing.assert_array_equal(product[f"{term}_stderr"].notnull(), seen, err_msg=term)
-        assert product[f"{term}_upper"].where(seen).isnull().all(), term
+        is_observed = product.observable.sel(term=term) == OBSERVABLE.index("observed")
+        np.testing.assert_array_equal(product[term].notnull(), is_observed, err_msg=term)
+        np.testing.assert_array_equal(
+            product[f"{term}_stderr"].notnull(), is_observed, err_msg=term
+        )
+        assert product[f"{term}_upper"].where(is_observed).isnull().all(), term
     assert (product.observable == OBSERVABLE.index("upper_limit_only")).any()
 
 
@@ -572,9 +578,9 @@ def test_windows_have_the_same_fit_alone_and_together():
     surface = windows_of(x, taus=21)
     together = fit_noise(surface)
     for w in (0, 4, 8):
-        alone = fit_noise(surface.isel(time=[w]))
+        single = fit_noise(surface.isel(time=[w]))
         for name in (*TERMS, "N_stderr", "K_upper", "fit_chi2", "edf"):
-            np.testing.assert_array_equal(alone[name].values[:, 0], together[name].values[:, w])
+            np.testing.assert_array_equal(single[name].values[:, 0], together[name].values[:, w])
 
 
 @pytest.fixture(scope="module")
@@ -634,9 +640,9 @@ def test_limit_of_a_cell_is_the_smallest_of_all_cells(quantile_curve, decades):
     freedom[..., 4] = np.minimum(freedom[..., 4], dof)
     reach = 1.0 / (chi2.ppf(0.05, freedom) / freedom * part)
     for w in range(40):
-        seen = np.isfinite(avar[w])
+        is_finite = np.isfinite(avar[w])
         for a in range(5):
-            able = np.flatnonzero(seen & (ks * span[a] >= ks[seen].max()))
+            able = np.flatnonzero(is_finite & (ks * span[a] >= ks[is_finite].max()))
             best = able[np.argmin(model[w, able] * reach[w, able, a])]
             assert got[w, a] == pytest.approx(avar[w, best] * reach[w, best, a], rel=1e-6)
 
@@ -738,8 +744,8 @@ def test_strong_ramp_fits_in_windows_with_gaps(block):
     surface = windows_of(lose(rng, x, 0.2, block), taus=24)
     bare = surface.assign(ramp_response=xr.ones_like(surface.ramp_response))
     fails = [
-        float((chi2.sf(one.fit_chi2, one.fit_dof) < 1e-3).mean())
-        for one in (fit_noise(surface), fit_noise(bare))
+        float((chi2.sf(product.fit_chi2, product.fit_dof) < 1e-3).mean())
+        for product in (fit_noise(surface), fit_noise(bare))
     ]
     assert fails[0] <= 0.02
     assert block == 5 or fails[1] > 0.15

@@ -69,14 +69,14 @@ def test_edge_ratio_equals_its_definition_and_ignores_gaps_outside_the_window():
     rng = np.random.default_rng(8)
     x = rng.normal(size=3000)
     x[::150] = x[1000:1040] = np.nan
-    found = gap_edge_ratio(x, np.array([300, 500]), 2000)
-    for start, ratio in zip((300, 500), found, strict=True):
+    ratios = gap_edge_ratio(x, np.array([300, 500]), 2000)
+    for start, ratio in zip((300, 500), ratios, strict=True):
         part = x[start : start + 2000]
-        beside, elsewhere = [], []
+        near_gaps, elsewhere = [], []
         for i in range(EDGE_SAMPLES + 1, 2000 - EDGE_SAMPLES - 1):
             second = abs(part[i - 1] - 2 * part[i] + part[i + 1])
             around = part[i - 1 - EDGE_SAMPLES : i + 2 + EDGE_SAMPLES]
             if np.isfinite(second):
-                (beside if np.isnan(around).any() else elsewhere).append(second)
-        assert ratio == pytest.approx(np.mean(beside) / np.mean(elsewhere), rel=1e-12)
+                (near_gaps if np.isnan(around).any() else elsewhere).append(second)
+        assert ratio == pytest.approx(np.mean(near_gaps) / np.mean(elsewhere), rel=1e-12)
     assert np.isnan(gap_edge_ratio(np.arange(3000), np.array([0]), 3000)[0])  # integers

@@ -26,8 +26,8 @@ def test_half_of_the_windows_observe_the_smallest_observable_coefficient(term):
             {"noise": {"N": WHITE, term: factor * size}}, duration=14 * window, rate=10.0, seed=3
         )
         product = fit_noise(davar(log.load(), window="600s", step="600s"))
-        seen = product["observable"].sel(term=term) == OBSERVED
-        shares.append(float(seen.mean()))
+        is_observed = product["observable"].sel(term=term) == OBSERVED
+        shares.append(float(is_observed.mean()))
     assert shares[0] < 0.5 < shares[1]
 
 

@@ -89,8 +89,8 @@ def test_generator_gives_the_printed_numbers():
     ],
 )
 def test_overlapping_allan_deviations_are_the_printed_ones(frequencies, printed, method):
-    found = whole_record(frequencies, list(printed), method=method)
-    np.testing.assert_allclose(np.sqrt(found["avar"]), list(printed.values()), rtol=2e-7)
+    surface = whole_record(frequencies, list(printed), method=method)
+    np.testing.assert_allclose(np.sqrt(surface["avar"]), list(printed.values()), rtol=2e-7)
 
 
 def test_degrees_of_freedom_and_interval_are_the_printed_ones():
@@ -124,6 +124,6 @@ def clock_frequencies(name: str) -> np.ndarray:
     [("cs5071a_phase", STABLE32_CS5071A), ("ocxo_frequency", STABLE32_OCXO)],
 )
 def test_deviations_of_clocks_are_those_of_stable32(name, printed, variance, place):
-    found = whole_record(clock_frequencies(name), [float(k) for k in printed], variance=variance)
+    surface = whole_record(clock_frequencies(name), [float(k) for k in printed], variance=variance)
     expected = [1e12 * row[place] for row in printed.values()]
-    np.testing.assert_allclose(np.sqrt(found["avar"]), expected, rtol=5e-5)
+    np.testing.assert_allclose(np.sqrt(surface["avar"]), expected, rtol=5e-5)

@@ -43,11 +43,11 @@ def test_a_term_counts_as_observed_where_most_windows_observe_it():
     product["observable"][:, :2, number] = 2
     product["K"][:] = np.where(product["observable"].sel(term="K") == 2, 7.0, np.nan)
     product["K_upper"][:] = np.where(product["observable"].sel(term="K") == 1, 30.0, np.nan)
-    found = {term.symbol: term for term in summarise_terms(product)}
-    assert (found["K"].status, found["K"].value) == ("upper_limit_only", 30.0)
-    assert (found["K"].median, found["K"].observed_share) == (7.0, 0.1)
-    assert found["N"].status == "observed"
-    assert found["N"].value == pytest.approx(float(product.N.median()))
+    terms = {term.symbol: term for term in summarise_terms(product)}
+    assert (terms["K"].status, terms["K"].value) == ("upper_limit_only", 30.0)
+    assert (terms["K"].median, terms["K"].observed_share) == (7.0, 0.1)
+    assert terms["N"].status == "observed"
+    assert terms["N"].value == pytest.approx(float(product.N.median()))
 
 
 def test_white_noise_is_described_and_a_filter_is_not():
@@ -69,11 +69,11 @@ def test_fit_from_the_proposed_averaging_time_describes_the_record():
     assert 0.05 < start < 1.0
     text = format_product(product)
     assert f"--fit-from {start:.3g}s" in text
-    again = gyrostab.fit_noise(product, tau_min=start)
-    assert not summarise_fit(again)[0].fails
+    refitted = gyrostab.fit_noise(product, tau_min=start)
+    assert not summarise_fit(refitted)[0].fails
     # 1.005: the boxcar leaves the noise at averaging times of ten filter lengths and more as it was
-    found = {term.symbol: term for term in summarise_terms(again)}["N"]
-    assert (found.status, found.value) == ("observed", pytest.approx(0.01, rel=0.1))
+    white = {term.symbol: term for term in summarise_terms(refitted)}["N"]
+    assert (white.status, white.value) == ("observed", pytest.approx(0.01, rel=0.1))
 
 
 def test_single_outliers_are_counted_and_noisy_spans_are_not():
@@ -110,9 +110,9 @@ def test_outliers_and_motion_are_named_with_the_axis():
     values = np.stack([white(60_000, 7), white(60_000, 8)])
     values[0, [100, 30_000]] += 500.0
     values[1, 20_000:30_000] += 200.0  # turns at 200 deg/h for 100 s
-    said = "\n".join(describe_record(make_product(values)))
-    assert re.search(r"Outliers.*: x in 2 windows \(at most 1 in one\)", said)
-    assert re.search(r"Earth rate from its median: y in [23] windows", said)
+    text = "\n".join(describe_record(make_product(values)))
+    assert re.search(r"Outliers.*: x in 2 windows \(at most 1 in one\)", text)
+    assert re.search(r"Earth rate from its median: y in [23] windows", text)
 
 
 def test_a_shorter_record_gets_a_shorter_window():

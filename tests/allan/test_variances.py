@@ -154,12 +154,12 @@ def test_degrees_of_freedom_with_gaps_are_those_of_simulated_records(variance):
     x = rng.standard_normal((3000, window))
     x[:, lost] = np.nan
     unit = Unit(window, window, ks, np.zeros_like(ks), False, 1.0, False, 0.0, 0.0, variance)
-    found = [surface_unit(row, unit)[0] for row in x]
-    avar = np.concatenate([cells.avar for cells in found])
+    surfaces = [surface_unit(row, unit)[0] for row in x]
+    avar = np.concatenate([cells.avar for cells in surfaces])
     pairs, _ = third_tables(variance, window, ks, np.zeros_like(ks))
     own = 2.0 * third_columns(variance, ks)[:, 1] ** 2 / pairs[1, 1].diagonal()
     edf = 2.0 * avar.mean(axis=0) ** 2 / avar.var(axis=0)
-    np.testing.assert_allclose(own * found[0].gap_factor[0], edf, rtol=0.12)
+    np.testing.assert_allclose(own * surfaces[0].gap_factor[0], edf, rtol=0.12)
 
 
 @pytest.mark.parametrize("variance", VARIANCES)
@@ -173,17 +173,17 @@ def test_fit_finds_the_noise_and_says_what_it_cannot_see(variance):
     surface = davar(log, window="1min", step="1min", variance=variance)
     product = fit_noise(surface, terms="QNKR", observed_only=False)
     for term, value in truth.items():
-        found = float(np.sqrt(np.mean(product[term] ** 2)))
-        assert found == pytest.approx(value, rel=0.01 if term == "N" else 0.05)
+        size = float(np.sqrt(np.mean(product[term] ** 2)))
+        assert size == pytest.approx(value, rel=0.01 if term == "N" else 0.05)
         error = np.abs(product[term] - value) / product[f"{term}_stderr"]
         assert 0.9 < float((error < 1.96).mean()) <= 1.0
-    seen = product.observable.sel(term="R")
+    flags = product.observable.sel(term="R")
     if variance == "hadamard":
-        assert not seen.any()
+        assert not flags.any()
         assert np.isnan(product.R).all()
         assert np.isnan(product.R_upper).all()
     else:
-        assert float((seen == 2).mean()) > 0.9
+        assert float((flags == 2).mean()) > 0.9
         assert float(product.R.median()) == pytest.approx(5000.0, rel=0.05)
     described = product.fit_chi2 / product.fit_dof
     assert 0.7 < float(described.median()) < 1.3
@@ -200,8 +200,8 @@ def test_a_surface_says_which_variance_it_holds(variance):
     xr.testing.assert_identical(lazy.compute(), surface)
     octave = davar(log, window="10s", overlap="octave", variance=variance)
     ks = np.rint(octave.tau * RATE).astype(int).values
-    near = np.interp(octave.tau, surface.tau, surface.avar[0].mean("time"))
-    np.testing.assert_allclose(octave.avar[0].mean("time"), near, rtol=0.3)
+    interpolated = np.interp(octave.tau, surface.tau, surface.avar[0].mean("time"))
+    np.testing.assert_allclose(octave.avar[0].mean("time"), interpolated, rtol=0.3)
     assert thin(ks).max() > 0
     with pytest.raises(OptionError, match="published"):
         davar(log, window="10s", variance=variance, method="direct")

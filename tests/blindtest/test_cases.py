@@ -86,9 +86,9 @@ def test_lagged_driver_fit_recovers_static_sensitivity_and_lag(size, time):
         if time
         else 1.5 * size * np.interp(since, [0, 1e-9], [0, 1])
     )
-    found = fit_lagged_driver(scenario, np.asarray(mean), step, axis=0)
-    assert found[0] == pytest.approx(size, rel=0.01)
-    assert found[1] == pytest.approx(time, abs=1.5)  # the driver has one value a second
+    fitted = fit_lagged_driver(scenario, np.asarray(mean), step, axis=0)
+    assert fitted[0] == pytest.approx(size, rel=0.01)
+    assert fitted[1] == pytest.approx(time, abs=1.5)  # the driver has one value a second
 
 
 def test_true_parameters_of_a_slow_supply_bias_explain_it():
@@ -105,11 +105,11 @@ def test_true_parameters_of_a_slow_supply_bias_explain_it():
     assert len(slow) >= 4
     for effect in slow:
         for axis in effect.axes:
-            seen = effect.mean[AXES.index(axis)]
+            mean = effect.mean[AXES.index(axis)]
             size, late = (effect.parameters[name]["values"][axis] for name in ("voltage", "lag"))
             decay = math.exp(-0.1 / late)
             followed = volt[0] + lfilter([1 - decay], [1, -decay], volt - volt[0])
-            assert np.var(seen - size * followed) < 0.05 * np.var(seen)
+            assert np.var(mean - size * followed) < 0.05 * np.var(mean)
 
 
 def test_latitude_follows_from_the_cross_axis_earth_rate():
@@ -139,10 +139,10 @@ def test_nonlinear_response_is_not_compared_with_a_single_term(name, term):
     )
     made = [CATALOGUE[name].make(scenario, stream(s, "bend"), strength=4.0) for s in range(12)]
     marks = {
-        effect.form_differs: [one.get("unless", ()) for one in effect.parameters.values()]
+        effect.form_differs: [entry.get("unless", ()) for entry in effect.parameters.values()]
         for effect in made
     }
-    assert any(term in one for one in marks[True])
+    assert any(term in names for names in marks[True])
     assert not any(marks[False])
 
 
@@ -164,13 +164,13 @@ def test_fitted_noise_absorbs_random_walk_and_not_a_fast_random_bias():
     shares = np.array([1.0, 0.0, 0.0])
     assert learned_random_nats(scenario, shares, lambda f: 1e-5 / f**2) < 0.01
     assert learned_random_nats(scenario, shares, lambda f: 1e-3 / f) < 0.01
-    found = []
+    shares_left = []
     for time in (0.2, 20.0):
         rms = amplitude_for(
             lambda rms, time=time: wander_size(scenario, shares, time=time, rms=rms)[0], 8.0
         )
         known = wander_size(scenario, shares, time=time, rms=rms)[1]
-        found.append(
+        shares_left.append(
             learned_random_nats(
                 scenario,
                 shares,
@@ -180,7 +180,7 @@ def test_fitted_noise_absorbs_random_walk_and_not_a_fast_random_bias():
             )
             / known
         )
-    fast, slow = found
+    fast, slow = shares_left
     assert 0.0 < slow < 0.1 < fast < 1.0
 
 
@@ -282,19 +282,19 @@ def test_every_effect_gives_a_case_of_its_strength(name):
 
 def test_case_is_reproducible_and_differs_from_others():
     plan = small("shupe")
-    (one, truth), (again, same) = make_case(plan), make_case(plan)
-    xr.testing.assert_identical(one, again)
+    (log, truth), (repeated, same) = make_case(plan), make_case(plan)
+    xr.testing.assert_identical(log, repeated)
     assert truth_text(truth) == truth_text(same)
     assert not np.array_equal(
-        one.rate.values, make_case(plan | {"index": 5})[0].rate.values, equal_nan=True
+        log.rate.values, make_case(plan | {"index": 5})[0].rate.values, equal_nan=True
     )
 
 
 def test_effect_is_the_difference_to_the_record_without_it():
     scenario = white_scenario(seconds=900)
     effect = CATALOGUE["temperature_bias"].make(scenario, np.random.default_rng(0), strength=2.0)
-    both = make_record(scenario, [effect], seed=3) - make_record(scenario, [], seed=3)
-    np.testing.assert_allclose(both, effect.mean, atol=1e-9)
+    difference = make_record(scenario, [effect], seed=3) - make_record(scenario, [], seed=3)
+    np.testing.assert_allclose(difference, effect.mean, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["vibration_noise", "aliased_vibration"])
@@ -306,9 +306,9 @@ def test_vibration_adds_the_variance_of_its_size(name):
     busy = effect.extra[row] != 0
     v = np.log1p(np.mean(effect.extra[row][busy] ** 2) / sd**2)
     n = busy.sum() * (1 - busy.mean())
-    alone = math.sqrt(n * v**2 / 4 / NATS)
+    size = math.sqrt(n * v**2 / 4 / NATS)
     assert (
-        0.3 < alone / effect.size < 1.1
+        0.3 < size / effect.size < 1.1
     )  # a flat density has the smallest size for its power, and other axes may add to it
 
 
@@ -410,8 +410,8 @@ def test_recordings_hold_nothing_of_the_truth(tmp_path):
     attributes, dimensions = set(), set()
     for number, (log, truth) in enumerate(cases):
         digest = commit_case(log, truth, tmp_path, name=f"{number:04d}")
-        found = open_truth(tmp_path / "truth" / f"{number:04d}.json", sha256=digest)
-        assert found["plan"]["names"] == truth["plan"]["names"]
+        opened = open_truth(tmp_path / "truth" / f"{number:04d}.json", sha256=digest)
+        assert opened["plan"]["names"] == truth["plan"]["names"]
         attributes.add(tuple(sorted(log.attrs)))
         dimensions |= set(map(str, log.variables))
     assert attributes == {("kind", "sampling_rate_hz")}
@@ -445,11 +445,11 @@ def test_null_records_have_the_same_channels_as_others():
 def test_committed_recording_is_read_as_a_log(tmp_path):
     log, truth = make_case(small("vibration_rectification"))
     digest = commit_case(log, truth, tmp_path, name="a")
-    again = gyrostab.regularise(gyrostab.read_log(tmp_path / "recordings" / "a.nc"))
-    np.testing.assert_array_equal(again.rate.values, log.rate.values)
-    np.testing.assert_array_equal(again.time.values, log.time.values)
-    np.testing.assert_array_equal(again.vibration.values, log.vibration.values)
-    assert again.vibration.attrs["units"] == log.vibration.attrs["units"] == "g"
+    log_read = gyrostab.regularise(gyrostab.read_log(tmp_path / "recordings" / "a.nc"))
+    np.testing.assert_array_equal(log_read.rate.values, log.rate.values)
+    np.testing.assert_array_equal(log_read.time.values, log.time.values)
+    np.testing.assert_array_equal(log_read.vibration.values, log.vibration.values)
+    assert log_read.vibration.attrs["units"] == log.vibration.attrs["units"] == "g"
     path = tmp_path / "truth" / "a.json"
     path.write_text(path.read_text().replace("vibration_rectification", "shupe"))
     with pytest.raises(FormatError, match="changed after it was committed"):
@@ -559,11 +559,13 @@ def test_baseline_detectors_see_strong_effects_only():
     log, truth = make_case(small("vibration_noise", strength=120.0, seconds=1800))
     assert allan_detector(log.rate.values, truth, rng=np.random.default_rng(0), nulls=30) > 0.0
     assert channel_detector(log) > 0.0
-    seen = 0
+    alarms = 0
     for i in range(5):
         log, truth = make_case(small(None, index=30 + i, seconds=600))
-        seen += allan_detector(log.rate.values, truth, rng=np.random.default_rng(i), nulls=30) > 0.0
-    assert seen <= 2
+        alarms += (
+            allan_detector(log.rate.values, truth, rng=np.random.default_rng(i), nulls=30) > 0.0
+        )
+    assert alarms <= 2
 
 
 def test_injection_adds_the_effect_and_leaves_controls_unchanged():
@@ -598,13 +600,13 @@ def test_injection_into_a_quantized_log_keeps_step_and_mean():
         np.random.default_rng(2),
     )
     injected, truth = copies["injected"]
-    seen = np.isfinite(counted)
+    is_finite = np.isfinite(counted)
     assert quantization_step(counted[0]) == pytest.approx(0.5)
     np.testing.assert_allclose(
-        np.remainder(injected.rate.values[seen] / 0.5 + 0.25, 1.0), 0.25, atol=1e-6
+        np.remainder(injected.rate.values[is_finite] / 0.5 + 0.25, 1.0), 0.25, atol=1e-6
     )
     sent = {axis: np.array(values) for axis, values in truth["effects"][0]["waveform_10s"].items()}
-    axis, expected = max(sent.items(), key=lambda one: np.ptp(one[1]))
+    axis, expected = max(sent.items(), key=lambda item: np.ptp(item[1]))
     row = list(injected.axis.values).index(axis)
     added = np.nanmean((injected.rate.values - counted)[row].reshape(-1, 100), axis=1)
     scatter = 0.5 / math.sqrt(12 * 100)

@@ -48,8 +48,8 @@ def test_threshold_of_each_detector_is_exceeded_by_the_same_share_of_noise(rows)
 
 
 def test_records_of_equal_score_are_on_one_side_of_the_threshold(rows):
-    for one in rows:
-        one["baseline_detectors"] = {"other": 0.0}
+    for row in rows:
+        row["baseline_detectors"] = {"other": 0.0}
     assert detection_shares(rows).set_index("detector").loc["other", "at 5 %"] == 0.0
 
 
@@ -91,12 +91,12 @@ def test_score_of_a_diagnosis_is_zero_at_its_threshold():
         {"name": "shupe", "beaten_by": "noise", "nats": 1.5},
         {"name": "telegraph", "beaten_by": "the bias wanders", "nats": 0.1},
     ]
-    found = {"effects": [], "mismatches": [], "rejected": lacking, "false_alarm_level": 0.01}
-    assert detection_score(found) == -1.5
-    assert detection_score(found | {"mismatches": [{"p_value": 1e-4}]}) == pytest.approx(
+    answer = {"effects": [], "mismatches": [], "rejected": lacking, "false_alarm_level": 0.01}
+    assert detection_score(answer) == -1.5
+    assert detection_score(answer | {"mismatches": [{"p_value": 1e-4}]}) == pytest.approx(
         math.log(100.0)
     )
-    assert detection_score(found | {"effects": [{"held_out_gain": gain}]}) == 3.5
+    assert detection_score(answer | {"effects": [{"held_out_gain": gain}]}) == 3.5
     assert detection_score({"effects": [], "mismatches": []}) == -math.inf
 
 

@@ -79,9 +79,9 @@ def test_detector_noise_terms_have_their_power_laws():
 
 def test_shot_noise_level_matches_textbook():
     power, depth = 20e-6, math.pi / 2
-    seen = power * (1 + math.cos(depth))
+    detected = power * (1 + math.cos(depth))
     phase = (
-        math.sqrt(2 * light.CHARGE / (0.9 * seen))
+        math.sqrt(2 * light.CHARGE / (0.9 * detected))
         * (1 + math.cos(depth))
         / math.sin(depth)
         / math.sqrt(2)
@@ -95,9 +95,9 @@ def test_shot_noise_level_matches_textbook():
 def test_shared_source_keeps_the_level_of_each_axis(shares):
     rng = np.random.default_rng(1)
     own, common = rng.normal(size=(len(shares), 20_000)) * 3.0, rng.normal(size=20_000)
-    both = light.share_source(own, common, shares=np.array(shares))
-    np.testing.assert_allclose(both.std(axis=1), 3.0, rtol=0.04)
-    assert np.corrcoef(both)[0, 1] == pytest.approx(shares[0] * shares[1], abs=0.04)
+    noise = light.share_source(own, common, shares=np.array(shares))
+    np.testing.assert_allclose(noise.std(axis=1), 3.0, rtol=0.04)
+    assert np.corrcoef(noise)[0, 1] == pytest.approx(shares[0] * shares[1], abs=0.04)
 
 
 def test_reset_count_follows_the_rate():

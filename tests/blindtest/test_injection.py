@@ -52,7 +52,7 @@ def test_the_stop_band_of_an_anti_alias_filter_does_not_count():
     lines = fft.rfft(record, axis=1)
     lines[:, round(0.9 * lines.shape[1]) :] *= 1e-3
     plain, real = (draw_both(values)[1] for values in (record, fft.irfft(lines, axis=1)))
-    plain, real = (replace(one, noise=scenario_of(record).noise) for one in (plain, real))
+    plain, real = (replace(scenario, noise=scenario_of(record).noise) for scenario in (plain, real))
     assert 0.8 < variance_size(real, bursts()) / variance_size(plain, bursts()) < 1.3
     pairs = np.array([0.05, -0.03, 0.0])
     assert 0.8 < shared_size(real, pairs) / shared_size(plain, pairs) < 1.3
@@ -105,9 +105,9 @@ def test_size_of_a_wave_in_coloured_noise_is_its_power_over_the_density(frequenc
 
 def test_line_density_is_right_at_the_lowest_lines():
     steps = np.random.default_rng(2).normal(0, 0.01, (200, 4000))
-    found = np.mean([line_density(np.cumsum(row), rate=1.0)[:4] for row in steps], axis=0)
+    density = np.mean([line_density(np.cumsum(row), rate=1.0)[:4] for row in steps], axis=0)
     k = np.arange(1, 5)
-    np.testing.assert_allclose(found, 0.01**2 / (2 * math.pi * k / 8000) ** 2, rtol=0.5)
+    np.testing.assert_allclose(density, 0.01**2 / (2 * math.pi * k / 8000) ** 2, rtol=0.5)
 
 
 @pytest.mark.parametrize("strong", [1.0, 1e2, 1e4])
@@ -122,9 +122,9 @@ def test_slope_fit_is_the_likelihood_maximum_with_a_strong_line(strong):
     for truth in np.exp(rng.normal(0.0, 3.0, (8, 3))):
         lines = (truth[0] + truth[1] / number + truth[2] / number**2) * rng.exponential(size=60)
         lines[rng.integers(60)] *= strong
-        found = _fit_slope(lines)(number)
+        fitted = _fit_slope(lines)(number)
         mine, others = (
-            (np.log(density) + lines / density).sum(axis=-1) for density in (found, tried)
+            (np.log(density) + lines / density).sum(axis=-1) for density in (fitted, tried)
         )
         assert mine < others.min() + 1e-6
 
@@ -138,7 +138,7 @@ def test_fluctuating_level_hides_slow_changes_only():
     quick[1] = np.where(np.arange(walk.size) // 40 % 2 == 0, 1.2, 1.0)
     slow = np.ones_like(quick)
     slow[1] = np.linspace(1.0, 1.4, walk.size)
-    lost = [variance_size(real, one) / variance_size(plain, one) for one in (slow, quick)]
+    lost = [variance_size(real, level) / variance_size(plain, level) for level in (slow, quick)]
     assert lost[0] < 0.25 < 0.6 < lost[1]
 
 
@@ -187,9 +187,9 @@ def test_injected_shared_source_has_its_signs_and_axes():
         assert [str(axis) for axis in made.axis.values[has]] == truth["effects"][0]["axes"]
         tied = np.corrcoef(added[has])
         assert np.abs(tied).min() > 0.999  # one source
-        wanted = truth["effects"][0]["parameters"]["correlation"]["value"]
+        correlation = truth["effects"][0]["parameters"]["correlation"]["value"]
         shares = np.sort((added.std(axis=1) / 0.8)[has])
-        assert shares[-1] * shares[-2] == pytest.approx(wanted, rel=0.1)
+        assert shares[-1] * shares[-2] == pytest.approx(correlation, rel=0.1)
         two += has.sum() == 2 or bool((tied < 0).any())
     assert two > 0
 

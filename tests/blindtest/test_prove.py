@@ -53,8 +53,8 @@ class NothingFound:
     model: ClassVar = {"noise": {"x": {"N": 0.003}}}
 
     def to_json(self) -> str:
-        found = {"mismatches": [], "effects": [], "unexplained": [], "held_out": {}}
-        return json.dumps({"verdict": self.verdict, **found})
+        content = {"mismatches": [], "effects": [], "unexplained": [], "held_out": {}}
+        return json.dumps({"verdict": self.verdict, **content})
 
 
 @pytest.fixture
@@ -136,10 +136,10 @@ def test_every_case_is_scored(tmp_path):
     assert list(scores["effect"].fillna("")) == ["", "spectral_line"]
     line = scores.iloc[1]
     assert bool(line["detected"])
-    found = json.loads((folder / "diagnoses" / f"{line['name']}.json").read_text())
-    assert line["verdict"] == found["verdict"]
-    assert [one["name"] for one in json.loads(line["identifications"])] == [
-        effect["name"] for effect in found["effects"]
+    diagnosis = json.loads((folder / "diagnoses" / f"{line['name']}.json").read_text())
+    assert line["verdict"] == diagnosis["verdict"]
+    assert [identification["name"] for identification in json.loads(line["identifications"])] == [
+        effect["name"] for effect in diagnosis["effects"]
     ]
     check = json.loads(line["model_check"])
     assert check["runs"]
@@ -161,13 +161,13 @@ def test_every_case_is_scored(tmp_path):
 
 def test_resumed_finished_run_repeats_the_scores(finished, small):
     folder, _, before = finished
-    kept = {path: path.stat().st_mtime_ns for path in folder.glob("*/*")}
+    times = {path: path.stat().st_mtime_ns for path in folder.glob("*/*")}
     scores = (folder / "scores.csv").read_bytes()
-    again = gyrostab.prove(folder, workers=0, resume=True)
-    assert {path: path.stat().st_mtime_ns for path in folder.glob("*/*")} == kept
+    resumed = gyrostab.prove(folder, workers=0, resume=True)
+    assert {path: path.stat().st_mtime_ns for path in folder.glob("*/*")} == times
     assert (folder / "scores.csv").read_bytes() == scores
-    assert again.seed == 5
-    assert again.commitment == before.commitment
+    assert resumed.seed == 5
+    assert resumed.commitment == before.commitment
 
 
 def test_changed_truth_is_refused(finished, small):
@@ -230,10 +230,10 @@ def test_resumed_run_equals_an_uninterrupted_one(finished, small, tmp_path, monk
     assert (folder / "SHA256SUMS").read_bytes() == sums == (unbroken / "SHA256SUMS").read_bytes()
     for recording in (unbroken / "recordings").iterdir():
         with (
-            xr.open_dataset(recording) as one,
+            xr.open_dataset(recording) as expected,
             xr.open_dataset(folder / "recordings" / recording.name) as other,
         ):
-            xr.testing.assert_identical(one, other)
+            xr.testing.assert_identical(expected, other)
     assert (folder / "scores.csv").read_bytes() == (unbroken / "scores.csv").read_bytes()
 
 
@@ -251,10 +251,10 @@ def test_failed_diagnosis_is_reported_and_retried(small, tmp_path, monkeypatch):
         verdict = "unknown"
 
     monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: Unknown())
-    again = gyrostab.prove(tmp_path / "proof", workers=0, resume=True)
-    assert again.failed == {}
+    resumed = gyrostab.prove(tmp_path / "proof", workers=0, resume=True)
+    assert resumed.failed == {}
     assert not list((tmp_path / "proof" / "failed").iterdir())
-    assert again.table.set_index("quantity").loc["detected, strength 1.5 or more", "value"] == 1.0
+    assert resumed.table.set_index("quantity").loc["detected, strength 1.5 or more", "value"] == 1.0
 
 
 @pytest.mark.slow
@@ -517,8 +517,8 @@ def wait_for(truth, *, seconds: float = 30.0):
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         try:
-            if found := truth():
-                return found
+            if value := truth():
+                return value
         except OSError:
             pass
         time.sleep(0.05)

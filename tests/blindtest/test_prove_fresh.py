@@ -86,18 +86,18 @@ def check_run(folder: Path, proof: Proof, *, cases: int) -> pd.DataFrame:
     assert len(names) == cases + (rows["kind"] == "counterpart").sum()
     assert not rows["failed"].any()
     for name in names:
-        found = json.loads((folder / "diagnoses" / f"{name}.json").read_text())
-        check_diagnosis(found)
+        diagnosis = json.loads((folder / "diagnoses" / f"{name}.json").read_text())
+        check_diagnosis(diagnosis)
         truth = json.loads((folder / "truth" / f"{name}.json").read_text())
         mine = rows[rows["name"] == name]
         assert len(mine) == max(1, len(truth["effects"]))
         assert sorted(mine["effect"].dropna()) == sorted(
             effect["name"] for effect in truth["effects"]
         )
-        assert set(mine["verdict"]) == {found["verdict"]}
+        assert set(mine["verdict"]) == {diagnosis["verdict"]}
         assert {
             identification["name"] for identification in json.loads(mine.iloc[0]["identifications"])
-        } == {effect["name"] for effect in found["effects"]}
+        } == {effect["name"] for effect in diagnosis["effects"]}
 
     assert list(proof.table["quantity"][:10]) == list(
         score_table([])["quantity"][:10]

@@ -113,8 +113,8 @@ def test_record_with_the_effect_is_nearer_only_if_the_recording_has_it(
 
 def test_model_is_compared_with_records_of_its_own(noise_alone: xr.Dataset):
     for recording in (noise_alone, recording_and_nats(EFFECTS[0])[0]):
-        found = check_model(recording, {"noise": NOISE, "effect": EFFECTS[:1]}, NOISE)
-        assert found == {"runs": True, "nats": nats_of(recording, EFFECTS[0])}
+        check = check_model(recording, {"noise": NOISE, "effect": EFFECTS[:1]}, NOISE)
+        assert check == {"runs": True, "nats": nats_of(recording, EFFECTS[0])}
 
 
 def test_an_effect_that_replaces_noise_is_not_nearer_than_the_calibrated_noise(
@@ -132,9 +132,9 @@ def test_equal_models_are_equally_near(noise_alone: xr.Dataset):
 
 def test_model_that_cannot_be_simulated_is_reported(noise_alone: xr.Dataset):
     model = {"noise": NOISE, "effect": [{"name": "light_power_noise", "thermal": 0.2}]}
-    found = check_model(noise_alone, model, NOISE)
-    assert not found["runs"]
-    assert "light_power" in found["reason"]
+    check = check_model(noise_alone, model, NOISE)
+    assert not check["runs"]
+    assert "light_power" in check["reason"]
 
 
 JUMP = {"name": "bias_jump", "step": [0.2], "at": 600.0}
@@ -170,7 +170,7 @@ EASIER_MODELS: list[tuple[dict[str, Any], dict[str, Any]]] = [
 @pytest.mark.parametrize(
     ("effect", "wrong"),
     [*WRONG_MODELS, *(pytest.param(*pair, marks=pytest.mark.slow) for pair in EASIER_MODELS)],
-    ids=lambda one: " ".join(str(value) for value in one.values()),
+    ids=lambda value: " ".join(str(value) for value in value.values()),
 )
 def test_wrong_model_loses_against_the_right_one(effect: dict[str, Any], wrong: dict[str, Any]):
     """Half or twice the size, the wrong sign, another instant, frequency or replacement."""
@@ -183,8 +183,8 @@ def test_means_are_compared_across_gaps():
     """No difference is lost in a gap: what begins at a restart shows against the time before."""
     recording = recording_of()
     recording["rate"][:, 9000:9300] = np.nan
-    found = record_statistics(recording["rate"].values, recording)
-    means = {name: values for name, values in found.items() if name.startswith("means")}
+    statistics = record_statistics(recording["rate"].values, recording)
+    means = {name: values for name, values in statistics.items() if name.startswith("means")}
     assert means
     assert all(np.isfinite(values).all() for values in means.values())
 
@@ -192,9 +192,11 @@ def test_means_are_compared_across_gaps():
 def test_amplitudes_locked_to_the_rotation_are_measured_where_the_tool_turns():
     """The channel has stamps of its own; at rest, all orders would show the mean."""
     recording = recording_of(EFFECTS[9])
-    found = record_statistics(recording["rate"].values, recording)["order 1/0"].reshape(2, -1)
-    assert np.isfinite(found).all(axis=0).sum() == pytest.approx(32 * 1200 / 1800, abs=2)
-    assert 2.0 * abs(np.nanmean(found[0] + 1j * found[1])) == pytest.approx(0.05, abs=0.01)
+    amplitudes = record_statistics(recording["rate"].values, recording)["order 1/0"].reshape(2, -1)
+    assert np.isfinite(amplitudes).all(axis=0).sum() == pytest.approx(32 * 1200 / 1800, abs=2)
+    assert 2.0 * abs(np.nanmean(amplitudes[0] + 1j * amplitudes[1])) == pytest.approx(
+        0.05, abs=0.01
+    )
 
 
 def test_rare_large_values_do_not_widen_the_law_of_all():
@@ -202,9 +204,9 @@ def test_rare_large_values_do_not_widen_the_law_of_all():
     rng = np.random.default_rng(3)
     draws = {rare: rng.standard_normal((9, 1000)) for rare in (False, True)}
     draws[True][rng.random((9, 1000)) < 0.005] += 30.0
-    several = [[{"means": one} for one in draws[rare][1:]] for rare in (True, False)]
-    assert likelihood_ratio({"means": draws[True][0]}, *several) > 10.0
-    assert abs(likelihood_ratio({"means": draws[False][0]}, *several)) < 5.0
+    ensembles = [[{"means": values} for values in draws[rare][1:]] for rare in (True, False)]
+    assert likelihood_ratio({"means": draws[True][0]}, *ensembles) > 10.0
+    assert abs(likelihood_ratio({"means": draws[False][0]}, *ensembles)) < 5.0
 
 
 def test_outliers_are_counted_that_noise_hardly_has():

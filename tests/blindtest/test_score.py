@@ -114,13 +114,13 @@ def test_correct_identification_scores_in_every_column():
     parameters = {
         "sensitivity": {"value": 0.48, "stderr": 0.05, "low": 0.4, "high": 0.6, "unit": "deg/h/g^2"}
     }
-    found = identification(
+    named = identification(
         "vibration_rectification",
         alternatives=["g_sensitivity"],
         intervals=[(150, 200)],
         parameters=parameters,
     )
-    row = score_one(diagnosis(found, mismatches=[band], gain=9.0), truth("vibration_rectification"))
+    row = score_one(diagnosis(named, mismatches=[band], gain=9.0), truth("vibration_rectification"))
     assert row["detected"]
     assert row["named"]
     assert row["named_exactly"]
@@ -263,7 +263,7 @@ def test_accepted_name_in_addition_is_not_wrong():
 
 
 @pytest.mark.parametrize(
-    ("found", "unknown", "wrong"),
+    ("answer", "unknown", "wrong"),
     [
         (diagnosis(verdict="unknown"), True, 0),
         (diagnosis(identification("shupe")), False, 1),
@@ -271,8 +271,8 @@ def test_accepted_name_in_addition_is_not_wrong():
         (diagnosis(), False, 0),
     ],
 )
-def test_effect_out_of_catalogue_should_be_unidentified(found, unknown, wrong):
-    row = score_one(found, truth("chirped_line", kind="out_of_catalogue"))
+def test_effect_out_of_catalogue_should_be_unidentified(answer, unknown, wrong):
+    row = score_one(answer, truth("chirped_line", kind="out_of_catalogue"))
     assert (row["unidentified"], row["wrong"]) == (unknown, wrong)
 
 
@@ -282,7 +282,7 @@ def test_null_record_is_one_row_and_any_name_a_false_alarm():
         score_one(diagnosis(identification("shupe")), truth(kind="null")),
     )
     assert not silent["detected"]
-    assert [one["right"] for one in alarm["identifications"]] == [False]
+    assert [entry["right"] for entry in alarm["identifications"]] == [False]
     table = score_table([silent | {"index": 1}, alarm | {"index": 2}]).set_index("quantity")
     assert table.loc["false alarms: effect named on a null record", "value"] == 0.5
 
@@ -290,13 +290,13 @@ def test_null_record_is_one_row_and_any_name_a_false_alarm():
 def test_table_of_known_scores():
     rows = []
     for i in range(20):
-        found = (
+        answer = (
             diagnosis(identification("shupe", intervals=[(100, 200)]), gain=9.5)
             if i < 18
             else diagnosis()
         )
         rows += score_case(
-            found, truth("shupe", index=i), baseline_scores={"plain Allan plot": i < 5}
+            answer, truth("shupe", index=i), baseline_scores={"plain Allan plot": i < 5}
         )
     rows += [
         row
@@ -337,7 +337,7 @@ def test_table_of_known_scores():
     ]
     assert strong["n"] == 0
     stronger = score_table([row | {"learned_strength": 2.0} for row in rows]).set_index("quantity")
-    alone = table.loc["named correctly, single effects", "n"] + sum(
+    single = table.loc["named correctly, single effects", "n"] + sum(
         row["kind"] in ("single", "sub_threshold")
         and row["strength"] >= 1.5
         and not row["detected"]
@@ -348,7 +348,7 @@ def test_table_of_known_scores():
             "detected, single effects of that strength with fitted noise",
             "n",
         ]
-        == alone
+        == single
         > 0
     )
     assert table.loc["detected by the plain Allan plot, strength 1.5 or more", "value"] == 0.25
@@ -379,13 +379,13 @@ def test_curves_and_reliability():
     rows = []
     for strength, hits in ((0.5, 1), (1.5, 8)):
         for i in range(10):
-            found = (
+            answer = (
                 diagnosis(identification("shupe"))
                 if i < hits
                 else diagnosis(identification("spikes"))
             )
             rows += score_case(
-                found, truth("shupe", strength=strength, index=100 * round(strength * 2) + i)
+                answer, truth("shupe", strength=strength, index=100 * round(strength * 2) + i)
             )
     line = curves(rows).set_index(["effect", "strength"])
     assert line.loc[("shupe", 0.5), "named"] == pytest.approx(0.1)
@@ -411,9 +411,9 @@ def test_completeness_against_strength_in_fitted_noise():
 
 def test_an_effect_out_of_catalogue_counts_as_named_when_left_unidentified():
     rows = []
-    for i, found in enumerate((diagnosis(verdict="unknown"), diagnosis(identification("shupe")))):
+    for i, answer in enumerate((diagnosis(verdict="unknown"), diagnosis(identification("shupe")))):
         rows += score_case(
-            found,
+            answer,
             truth("flicker_step", kind="out_of_catalogue", strength=3.0, index=900 + i),
         )
     line = curves(rows).set_index(["effect", "strength"])
@@ -436,8 +436,8 @@ def test_target_without_cases_is_neither_met_nor_missed():
 def test_by_effect_has_a_line_for_every_effect():
     rows = []
     for i in range(4):
-        found = diagnosis(identification("shupe")) if i else diagnosis(identification("spikes"))
-        rows += score_case(found, truth("shupe", index=i, strength=0.5 if i == 3 else 2.0))
+        answer = diagnosis(identification("shupe")) if i else diagnosis(identification("spikes"))
+        rows += score_case(answer, truth("shupe", index=i, strength=0.5 if i == 3 else 2.0))
     table = by_effect(rows).set_index("effect")
     assert table.loc[
         "shupe", ["n", "detected", "identifications", "right", "parameters"]
@@ -458,8 +458,8 @@ def test_a_pair_counts_if_both_of_its_strong_effects_are_named():
     named = (("shupe", "spikes"), ("shupe",), ("shupe",))
     for number, (names, strength) in enumerate(zip(named, (3.0, 3.0, 2.0), strict=True)):
         pair = truth("shupe", "spikes", index=number, kind="pair")
-        found = diagnosis(*map(identification, names))
-        rows += [row | {"learned_strength": strength} for row in score_case(found, pair)]
+        answer = diagnosis(*map(identification, names))
+        rows += [row | {"learned_strength": strength} for row in score_case(answer, pair)]
     table = score_table(rows).set_index("quantity")
     pairs = table.loc["both effects of a pair named correctly, each of that strength"]
     assert (pairs["value"], pairs["n"]) == (0.5, 2)
@@ -468,7 +468,7 @@ def test_a_pair_counts_if_both_of_its_strong_effects_are_named():
 
 
 def test_names_given_to_a_single_effect_are_counted():
-    found = [
+    answers = [
         diagnosis(identification("shupe")),
         diagnosis(identification("warm_up", nats=30.0), identification("shupe")),
         diagnosis(verdict="unknown"),
@@ -476,10 +476,10 @@ def test_names_given_to_a_single_effect_are_counted():
     ]
     rows = [
         row
-        for number, one in enumerate(found)
-        for row in score_case(one, truth("shupe", index=number))
+        for number, answer in enumerate(answers)
+        for row in score_case(answer, truth("shupe", index=number))
     ]
-    (line,) = names_given([*rows, *score_case(found[0], truth(kind="null"))]).to_dict("records")
+    (line,) = names_given([*rows, *score_case(answers[0], truth(kind="null"))]).to_dict("records")
     assert line == {
         "effect": "shupe",
         "n": 4,
@@ -530,13 +530,13 @@ def test_only_names_added_by_an_injection_count():
         [],
         ["spikes"],
     )
-    (again,) = injection_differences(
+    (difference,) = injection_differences(
         injection_rows(
             injected=["warm_up", "spikes"], untouched=["ageing_bias"], flipped=["temperature_bias"]
         )
     )
-    assert again["there_before"]  # a name of its set was found without the injection
-    assert (again["others"], again["flipped"]) == (["spikes"], [])
+    assert difference["there_before"]  # a name of its set was found without the injection
+    assert (difference["others"], difference["flipped"]) == (["spikes"], [])
     table = injection_table(injection_rows(injected=["shupe"])).set_index("quantity")
     assert table.loc[
         "injections of strength 1.5 or more: named correctly", ["value", "n"]
@@ -614,8 +614,8 @@ def test_identification_without_evidence_comes_last():
 def test_single_effects_and_shared_source_have_separate_lines():
     number = {"value": 0.5, "stderr": 0.1, "unit": "deg/h/g^2"}
     sure, off = number | {"low": 0.3, "high": 0.7}, number | {"low": 0.1, "high": 0.3}
-    alone = score_case(diagnosis(), truth("shupe", index=1))
-    both = score_case(
+    single = score_case(diagnosis(), truth("shupe", index=1))
+    pair = score_case(
         diagnosis(
             identification("shared_source", parameters={"sensitivity": off}),
             identification("shupe", parameters={"sensitivity": sure}),
@@ -626,7 +626,7 @@ def test_single_effects_and_shared_source_have_separate_lines():
     half = score_case(
         diagnosis(identification("shupe"), gain=4.0), truth("shupe", "spikes", kind="pair", index=3)
     )
-    table = score_table([*alone, *both, *half]).set_index("quantity")
+    table = score_table([*single, *pair, *half]).set_index("quantity")
     assert table.loc["detected, strength 1.5 or more", ["value", "n"]].tolist() == [
         0.8,
         5,

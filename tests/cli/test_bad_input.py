@@ -250,8 +250,8 @@ def test_the_reading_options_stand_in_the_history(log, tmp_path):
 
 def test_options_that_do_not_fit_a_regular_log(log, tmp_path, capfd):
     regular = tmp_path / "log.nc"
-    far = tmp_path / "far.csv"
-    far.write_text("time,temperature [degC]\n2026-01-01T00:00:00,20\n2026-01-01T00:00:10,21\n")
+    distant = tmp_path / "far.csv"
+    distant.write_text("time,temperature [degC]\n2026-01-01T00:00:00,20\n2026-01-01T00:00:10,21\n")
     assert call("ingest", log, "-o", regular) == 0
     assert call("run", regular, "-o", tmp_path / "a.nc", *WINDOW, "--rate", RATE / 2) == 2
     assert "regular log of 100 Hz, not of 50 Hz" in capfd.readouterr().err
@@ -262,7 +262,7 @@ def test_options_that_do_not_fit_a_regular_log(log, tmp_path, capfd):
         == 0
     )
     assert "--unit is not used" in capfd.readouterr().err
-    assert call("run", regular, "-o", tmp_path / "b.nc", *WINDOW, "--channel", far) == 0
+    assert call("run", regular, "-o", tmp_path / "b.nc", *WINDOW, "--channel", distant) == 0
     assert "none of its 2 values" in capfd.readouterr().err
 
 

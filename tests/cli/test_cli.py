@@ -61,8 +61,8 @@ def product(log, tmp_path_factory) -> Path:
 def test_run_finds_the_noise_that_was_put_in(product):
     dataset = open_product(product)
     assert list(dataset["axis"].values) == ["x", "y"]
-    found, error = (dataset[name].isel(time=[0, -1]).values for name in ("N", "N_stderr"))
-    assert np.all(np.abs(found - N_TRUE) < 5.0 * error)
+    size, error = (dataset[name].isel(time=[0, -1]).values for name in ("N", "N_stderr"))
+    assert np.all(np.abs(size - N_TRUE) < 5.0 * error)
     assert np.all(error < 0.1 * N_TRUE)
 
 
@@ -72,10 +72,10 @@ def test_davar_takes_any_log_and_no_product(log, product, tmp_path, capfd):
         open_surface(tmp_path / "davar.nc")["avar"], open_product(product)["avar"]
     )
     capfd.readouterr()
-    for none, what in ((product, "a product"), (tmp_path / "davar.nc", "a dynamic Allan variance")):
+    for none, kind in ((product, "a product"), (tmp_path / "davar.nc", "a dynamic Allan variance")):
         assert call("davar", none, "-o", tmp_path / "again.nc", *WINDOW) == 2
         assert (
-            f"{none.name}: is {what} that gyrostab wrote, not a log; give the log"
+            f"{none.name}: is {kind} that gyrostab wrote, not a log; give the log"
             in capfd.readouterr().err
         )
 
@@ -108,9 +108,9 @@ def test_scan_suggests_windows_for_the_noise_it_finds(tmp_path, capsys):
     path = to_netcdf(long, tmp_path / "long.nc")
     assert call("scan", path) == 0
     shown = capsys.readouterr()
-    found = re.search(r"N is about ([\d.]+) deg/sqrt\(h\)", shown.err)
-    assert found is not None
-    assert float(found[1]) == pytest.approx(0.01, rel=0.1)
+    match = re.search(r"N is about ([\d.]+) deg/sqrt\(h\)", shown.err)
+    assert match is not None
+    assert float(match[1]) == pytest.approx(0.01, rel=0.1)
     assert "--window 5min: B from 0.2" in shown.err
     assert "N is about" not in shown.out
 
@@ -156,10 +156,10 @@ def test_ingest_to_zarr_holds_the_same_log(log, tmp_path):
 
 def test_one_axis_only(log, product, tmp_path):
     assert call("run", log, "-o", tmp_path / "y.nc", *WINDOW, "--axis", "y") == 0
-    one = open_product(tmp_path / "y.nc")
-    assert list(one["axis"].values) == ["y"]
+    product_y = open_product(tmp_path / "y.nc")
+    assert list(product_y["axis"].values) == ["y"]
     np.testing.assert_allclose(
-        one["avar"].values[0], open_product(product)["avar"].sel(axis="y").values
+        product_y["avar"].values[0], open_product(product)["avar"].sel(axis="y").values
     )
 
 
@@ -328,17 +328,17 @@ def test_an_interrupt_while_the_program_loads_is_exit_code_3(monkeypatch, capsys
 
 
 def test_cycles_are_looked_for_seldom_and_afterwards_as_before(monkeypatch):
-    before, found = gc.get_threshold(), []
+    before, thresholds = gc.get_threshold(), []
 
     class Failing(list):
         def parse_args(self, *arguments, **options) -> None:
-            found.append(gc.get_threshold())
+            thresholds.append(gc.get_threshold())
             raise RuntimeError("no")
 
     monkeypatch.setattr("gyrostab.cli.app", Failing())
     assert call("scan", "log.csv") == 1
-    assert found[0][0] >= 10 * before[0]
-    assert found[0][1:] == before[1:]
+    assert thresholds[0][0] >= 10 * before[0]
+    assert thresholds[0][1:] == before[1:]
     assert gc.get_threshold() == before
 
 

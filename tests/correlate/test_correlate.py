@@ -31,22 +31,26 @@ from tests.support.cf_checker import assert_follows_cf
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def verdict(found: xr.Dataset, **where: str) -> str:
-    return VERDICTS[int(found["coupling_verdict"].sel(**where))]
+def verdict(correlation: xr.Dataset, **where: str) -> str:
+    return VERDICTS[int(correlation["coupling_verdict"].sel(**where))]
 
 
 def test_slope_and_lag_are_found_and_other_axes_show_no_coupling():
-    found = gyrostab.correlate(coupled.product(slope=0.3, lag=4, noises="white"), max_lag="5min")
-    place = {"axis": "x", "variable": "window_mean", "driver": "temperature"}
-    assert verdict(found, **place) == "coupled"
-    assert abs(float(found["coupling_lag"].sel(place)) - 120) <= 60
-    assert (
-        float(found["window_mean_per_temperature_low"][0])
-        < 0.3
-        < float(found["window_mean_per_temperature_high"][0])
+    correlation = gyrostab.correlate(
+        coupled.product(slope=0.3, lag=4, noises="white"), max_lag="5min"
     )
-    assert (found["coupling_verdict"].sel(axis=["y", "z"]) == VERDICTS.index("none_seen")).all()
-    assert "follows temperature" in str(found["statement"].sel(place).values)
+    place = {"axis": "x", "variable": "window_mean", "driver": "temperature"}
+    assert verdict(correlation, **place) == "coupled"
+    assert abs(float(correlation["coupling_lag"].sel(place)) - 120) <= 60
+    assert (
+        float(correlation["window_mean_per_temperature_low"][0])
+        < 0.3
+        < float(correlation["window_mean_per_temperature_high"][0])
+    )
+    assert (
+        correlation["coupling_verdict"].sel(axis=["y", "z"]) == VERDICTS.index("none_seen")
+    ).all()
+    assert "follows temperature" in str(correlation["statement"].sel(place).values)
 
 
 def test_statement_and_table_give_the_units_of_the_coefficients():
@@ -54,34 +58,38 @@ def test_statement_and_table_give_the_units_of_the_coefficients():
     product["N"] = product["window_mean"].assign_attrs(
         units="degree hour-1", unit_label="deg/sqrt(h)"
     )
-    found = gyrostab.correlate(product, variables=["N", "window_mean"], max_lag=0)
+    correlation = gyrostab.correlate(product, variables=["N", "window_mean"], max_lag=0)
     units = {"N": "deg/sqrt(h)/K", "window_mean": "deg/h/K"}
     for name, unit in units.items():
         place = {"axis": "x", "variable": name, "driver": "temperature"}
-        assert f") {unit}, p" in str(found["statement"].sel(place).values)
-    rows = gyrostab.correlation_rows(found)
+        assert f") {unit}, p" in str(correlation["statement"].sel(place).values)
+    rows = gyrostab.correlation_rows(correlation)
     assert {row["variable"]: row["unit"] for row in rows if row["driver"] == "temperature"} == units
-    assert found["N_per_temperature_rate"].attrs["unit_label"] == "deg/sqrt(h) h/K"
+    assert correlation["N_per_temperature_rate"].attrs["unit_label"] == "deg/sqrt(h) h/K"
 
 
 def test_coupling_with_the_rate_of_change_is_found():
-    found = gyrostab.correlate(
+    correlation = gyrostab.correlate(
         coupled.product(pace=0.05, noises="white"), variables="window_mean", max_lag=0
     )
-    assert verdict(found, axis="x", variable="window_mean", driver="temperature_rate") == "coupled"
+    assert (
+        verdict(correlation, axis="x", variable="window_mean", driver="temperature_rate")
+        == "coupled"
+    )
     low, high = (
-        float(found[f"window_mean_per_temperature_rate_{end}"][0]) for end in ("low", "high")
+        float(correlation[f"window_mean_per_temperature_rate_{end}"][0]) for end in ("low", "high")
     )
     assert low < 0.05 < high
 
 
 def test_rising_and_falling_slopes_are_fitted_separately():
-    found = gyrostab.correlate(
+    correlation = gyrostab.correlate(
         coupled.product(slope=0.3, noises="white", windows=240), variables="window_mean", max_lag=0
     )
     for way in ("rising", "falling"):
         slope, error = (
-            float(found[f"window_mean_per_temperature_{way}{end}"][0]) for end in ("", "_stderr")
+            float(correlation[f"window_mean_per_temperature_{way}{end}"][0])
+            for end in ("", "_stderr")
         )
         assert abs(slope - 0.3) < 4 * error < 0.2
 
@@ -90,39 +98,45 @@ def shaken_product(**options):
     """Make a product with a vibration that moves mostly with temperature."""
     product = coupled.product(noises="white", terms=False, **options)
     warm = product["temperature"].values
-    alike = (warm - warm.mean()) / warm.std()
-    shaking = alike + 0.15 * np.sin(np.linspace(0, 40, warm.size))
+    standardised = (warm - warm.mean()) / warm.std()
+    shaking = standardised + 0.15 * np.sin(np.linspace(0, 40, warm.size))
     product["vibration"] = ("time", 2 + 0.5 * shaking, {"units": "9.80665 m s-2"})
     return product
 
 
 def test_partial_effects_separate_two_drivers_that_move_together():
     product = shaken_product(slope=0.3)
-    alone = gyrostab.correlate(product, channel="vibration", variables="window_mean", max_lag=0)
-    assert float(alone["p_value"].sel(axis="x", driver="vibration").item()) < 0.01
-    found = gyrostab.correlate(
+    single = gyrostab.correlate(product, channel="vibration", variables="window_mean", max_lag=0)
+    assert float(single["p_value"].sel(axis="x", driver="vibration").item()) < 0.01
+    correlation = gyrostab.correlate(
         product, channel=["temperature", "vibration"], variables="window_mean", max_lag=0
     )
-    assert list(found["driver"].values) == ["temperature", "vibration"]
+    assert list(correlation["driver"].values) == ["temperature", "vibration"]
     warmed = {"axis": "x", "variable": "window_mean", "driver": "temperature"}
     shaken = warmed | {"driver": "vibration"}
-    assert verdict(found, **warmed) == "coupled"
-    assert verdict(found, **shaken) == "not_told_apart"
-    low, high = (found[f"window_mean_per_temperature_partial_{end}"][0] for end in ("low", "high"))
+    assert verdict(correlation, **warmed) == "coupled"
+    assert verdict(correlation, **shaken) == "not_told_apart"
+    low, high = (
+        correlation[f"window_mean_per_temperature_partial_{end}"][0] for end in ("low", "high")
+    )
     assert low < 0.3 < high
-    low, high = (found[f"window_mean_per_vibration_partial_{end}"][0] for end in ("low", "high"))
+    low, high = (
+        correlation[f"window_mean_per_vibration_partial_{end}"][0] for end in ("low", "high")
+    )
     assert low < 0.0 < high
-    assert found["p_value_partial"].sel(shaken) > 0.05
-    assert "another channel explains it equally well" in str(found["statement"].sel(shaken).values)
-    assert "given the other drivers" in format_correlation(found)
+    assert correlation["p_value_partial"].sel(shaken) > 0.05
+    assert "another channel explains it equally well" in str(
+        correlation["statement"].sel(shaken).values
+    )
+    assert "given the other drivers" in format_correlation(correlation)
 
 
 def test_rate_of_change_is_a_driver_only_if_it_is_named_with_others():
     product = shaken_product().drop_vars("temperature_rate")
-    found = gyrostab.correlate(
+    correlation = gyrostab.correlate(
         product, channel=["vibration", "temperature_rate"], variables="window_mean", max_lag=0
     )
-    assert list(found["driver"].values) == ["vibration", "temperature_rate"]
+    assert list(correlation["driver"].values) == ["vibration", "temperature_rate"]
     with pytest.raises(OptionError, match="name each once"):
         gyrostab.correlate(product, channel=["vibration", "vibration"])
     with pytest.raises(OptionError, match="at least one channel"):
@@ -145,11 +159,15 @@ def test_losses_that_follow_a_channel_are_found():
     product["vibration"] = ("time", shaking, {"units": "9.80665 m s-2"})
     lost = 0.1 * shaking + 0.02 * np.random.default_rng(1).random(120)
     product["window_coverage"][:] = 1 - lost
-    found = gyrostab.correlate(product, channel="vibration", variables="window_coverage", max_lag=0)
-    assert verdict(found, axis="x", variable="window_coverage", driver="vibration") == "coupled"
-    slope = float(found["window_coverage_per_vibration"].item())
+    correlation = gyrostab.correlate(
+        product, channel="vibration", variables="window_coverage", max_lag=0
+    )
+    assert (
+        verdict(correlation, axis="x", variable="window_coverage", driver="vibration") == "coupled"
+    )
+    slope = float(correlation["window_coverage_per_vibration"].item())
     assert slope == pytest.approx(-0.1, rel=0.1)
-    assert found["window_coverage_per_vibration"].attrs["unit_label"] == "1/g"
+    assert correlation["window_coverage_per_vibration"].attrs["unit_label"] == "1/g"
 
 
 def test_combinations_that_cannot_be_judged_take_one_line():
@@ -203,17 +221,17 @@ def test_intervals_have_their_coverage_and_agree_with_the_p_values(noises, heat,
             terms=False,
             gap=gap,
         )
-        found = gyrostab.correlate(product, max_lag=0)
+        correlation = gyrostab.correlate(product, max_lag=0)
         low, high = (
-            found["window_mean_per_temperature_low"].values,
-            found["window_mean_per_temperature_high"].values,
+            correlation["window_mean_per_temperature_low"].values,
+            correlation["window_mean_per_temperature_high"].values,
         )
         hold += list((low < [0.5, 0, 0]) & (high > [0.5, 0, 0]))
-        p = found["p_value"].sel(variable="window_mean", driver="temperature").values
+        p = correlation["p_value"].sel(variable="window_mean", driver="temperature").values
         np.testing.assert_array_equal((low > 0) | (high < 0), p < 0.05)
         assert (
-            (found["p_value_adjusted"] >= found["p_value"])
-            .where(found["p_value"].notnull(), True)
+            (correlation["p_value_adjusted"] >= correlation["p_value"])
+            .where(correlation["p_value"].notnull(), True)
             .all()
         )
     assert np.mean(hold) > 0.80  # 0.95 less three standard errors of 24 shares
@@ -243,11 +261,13 @@ def test_adjusted_p_value_accounts_for_the_search_over_lags():
     product["temperature"] = product["temperature"].copy(
         data=30 + rng.normal(size=120).cumsum() * 0.2 + rng.normal(size=120)
     )
-    found = gyrostab.correlate(product).sel(axis="x", variable="window_mean", driver="temperature")
-    both = gyrostab.correlate(product, max_lag=0).sel(axis="x", variable="window_mean")
-    assert float(found["p_value_adjusted"]) > 4 * float(found["p_value"])
-    smaller = both["p_value"].min()
-    assert float(both["p_value_adjusted"].min()) == pytest.approx(
+    correlation = gyrostab.correlate(product).sel(
+        axis="x", variable="window_mean", driver="temperature"
+    )
+    without_lags = gyrostab.correlate(product, max_lag=0).sel(axis="x", variable="window_mean")
+    assert float(correlation["p_value_adjusted"]) > 4 * float(correlation["p_value"])
+    smaller = without_lags["p_value"].min()
+    assert float(without_lags["p_value_adjusted"].min()) == pytest.approx(
         min(1.0, 2 * float(smaller))
     )  # two drivers, Holm
 
@@ -287,11 +307,11 @@ def test_two_clusters_across_a_gap_give_no_slope():
     )
     product["window_mean"] = product["window_mean"] + 30.0 * late
     product["window_mean"][:, 50:110] = np.nan
-    found = gyrostab.correlate(product, variables="window_mean", max_lag=0)
-    assert set(found["coupling_verdict"].sel(driver="temperature").values.ravel()) == {
+    correlation = gyrostab.correlate(product, variables="window_mean", max_lag=0)
+    assert set(correlation["coupling_verdict"].sel(driver="temperature").values.ravel()) == {
         VERDICTS.index("cannot_tell")
     }
-    assert "separated by a gap" in str(found["statement"].values[0, 0, 0])
+    assert "separated by a gap" in str(correlation["statement"].values[0, 0, 0])
 
 
 def test_channel_of_a_file_is_averaged_and_never_extrapolated(tmp_path):
@@ -307,9 +327,9 @@ def test_channel_of_a_file_is_averaged_and_never_extrapolated(tmp_path):
         name="probe",
         attrs={"units": "degree_Celsius"},
     )
-    found = gyrostab.correlate(product, channel=probe, variables="window_mean", max_lag=0)
-    np.testing.assert_allclose(found["probe"][3], probe[90:150].mean())
-    assert np.isnan(found["probe"].values[80:]).all()
+    correlation = gyrostab.correlate(product, channel=probe, variables="window_mean", max_lag=0)
+    np.testing.assert_allclose(correlation["probe"][3], probe[90:150].mean())
+    assert np.isnan(correlation["probe"].values[80:]).all()
     with pytest.raises(TimeError, match="do not overlap"):
         gyrostab.correlate(product, channel=probe.assign_coords(t=stamps - np.timedelta64(9, "D")))
 
@@ -330,21 +350,21 @@ def test_short_gaps_of_a_channel_are_interpolated_and_long_ones_are_not():
     holed = course.copy()
     holed[600:655] = np.nan  # less than a window of 60 s
     holed[2000:2300] = np.nan  # five windows, a twelfth of the record
-    seen = gyrostab.correlate(
+    aligned = gyrostab.correlate(
         product, channel=probe_channel(holed, product, 1.0), variables="window_mean", max_lag=0
     )["probe"].values
     whole = np.array([course[30 * i : 30 * i + 60].mean() for i in range(120)])
     inside = np.flatnonzero((np.arange(120) * 30 >= 1990) & (np.arange(120) * 30 + 60 <= 2310))
     assert inside.size > 5
-    assert np.isnan(seen[inside]).all()
-    np.testing.assert_allclose(seen[15:30], whole[15:30], atol=0.6)
-    assert np.isnan(seen).sum() < inside.size + 5
+    assert np.isnan(aligned[inside]).all()
+    np.testing.assert_allclose(aligned[15:30], whole[15:30], atol=0.6)
+    assert np.isnan(aligned).sum() < inside.size + 5
 
 
 def test_a_slow_channel_is_interpolated_between_its_values_only():
     product = coupled.product(noises="white", gap=False, terms=False)
     at = np.arange(0.0, 3300.0, 150.0)
-    seen = gyrostab.correlate(
+    aligned = gyrostab.correlate(
         product,
         channel=probe_channel(20 + at / 100, product, 150.0),
         variables="window_mean",
@@ -352,8 +372,8 @@ def test_a_slow_channel_is_interpolated_between_its_values_only():
     )["probe"].values
     middle = np.arange(120) * 30 + 30.0
     known = middle <= at[-1]
-    np.testing.assert_allclose(seen[known], 20 + middle[known] / 100, rtol=1e-12)
-    assert np.isnan(seen[~known]).all()
+    np.testing.assert_allclose(aligned[known], 20 + middle[known] / 100, rtol=1e-12)
+    assert np.isnan(aligned[~known]).all()
 
 
 def test_command_refuses_options_that_it_does_not_use(stored, capsys):
@@ -401,8 +421,8 @@ def test_command_writes_legal_units_and_a_figure(stored, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "Window mean of axis x follows temperature" in printed
     assert target.with_suffix(".png").stat().st_size > 10_000
-    with gyrostab.open_product(target) as found:
-        units = found["window_mean_per_temperature"].attrs["units"]
+    with gyrostab.open_product(target) as correlation:
+        units = correlation["window_mean_per_temperature"].attrs["units"]
         assert cf_units.Unit(units) == cf_units.Unit("degree hour-1") / cf_units.Unit("K")
     assert_follows_cf(target)
 
@@ -456,9 +476,9 @@ def test_real_recordings(recordings, name, read, window, step, following, quiet)
     log = gyrostab.regularise(gyrostab.read_log(recordings(name), **read))
     product = gyrostab.fit_noise(gyrostab.davar(log, window=window, step=step, taus=8))
     whole = gyrostab.correlate(product, variables="window_mean")
-    found = whole["coupling_verdict"].sel(variable="window_mean")
+    verdicts = whole["coupling_verdict"].sel(variable="window_mean")
     for axis in following:
-        assert VERDICTS[int(found.sel(axis=axis, driver="temperature"))] in (
+        assert VERDICTS[int(verdicts.sel(axis=axis, driver="temperature"))] in (
             "coupled",
             "not_told_apart",
         )
@@ -472,7 +492,7 @@ def test_real_recordings(recordings, name, read, window, step, following, quiet)
             < 0.05
         )
     for axis in quiet:
-        assert set(found.sel(axis=axis).values) <= {
+        assert set(verdicts.sel(axis=axis).values) <= {
             VERDICTS.index("cannot_tell"),
             VERDICTS.index("none_seen"),
         }
@@ -481,12 +501,14 @@ def test_real_recordings(recordings, name, read, window, step, following, quiet)
 def test_term_observed_in_scattered_windows_only_gives_no_verdict():
     """Where each window is a separate segment, no slope can be estimated."""
     product = synthetic.product()
-    found = gyrostab.correlate(product)
-    assert np.isfinite(found["p_value"].sel(variable="window_mean")).any()
-    seen = product["observable"].sel(axis="x", term="Q").values == 2
-    assert 12 < seen.sum() < 20
-    assert not (seen[1:] & seen[:-1]).any()  # enough windows, but no two next to each other
+    correlation = gyrostab.correlate(product)
+    assert np.isfinite(correlation["p_value"].sel(variable="window_mean")).any()
+    is_observed = product["observable"].sel(axis="x", term="Q").values == 2
+    assert 12 < is_observed.sum() < 20
+    assert not (
+        is_observed[1:] & is_observed[:-1]
+    ).any()  # enough windows, but no two next to each other
     assert (
-        VERDICTS[int(found["coupling_verdict"].sel(axis="x", variable="Q").values[0])]
+        VERDICTS[int(correlation["coupling_verdict"].sel(axis="x", variable="Q").values[0])]
         == "cannot_tell"
     )

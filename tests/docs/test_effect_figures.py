@@ -26,14 +26,14 @@ SCRIPT = load_script("docs/generate/effect_figures.py")
 def section(name: str) -> str:
     """The section of an effect; there is one, on one page."""
     texts = [page.read_text(encoding="utf-8") for page in PAGES.glob("*.md")]
-    found = [
+    sections = [
         part
         for text in texts
         for part in re.split(r"(?m)^## ", text)[1:]
         if part.startswith(f"{name}\n")
     ]
-    assert len(found) == 1, name
-    return found[0]
+    assert len(sections) == 1, name
+    return sections[0]
 
 
 @pytest.mark.parametrize("name", list(effects()))
@@ -65,12 +65,12 @@ def test_the_table_of_confusions_names_effects() -> None:
 @pytest.mark.parametrize("name", ["shared_source", "earth_rate"])
 def test_the_script_draws_an_effect(name: str, tmp_path: Path) -> None:
     shown = np.asarray(Image.open(SCRIPT.draw(name, tmp_path)).convert("L"), float)
-    kept = np.asarray(
+    published = np.asarray(
         Image.open(ROOT / "docs" / "figures" / "effects" / f"{name}.png").convert("L"), float
     )
-    assert shown.shape == kept.shape
+    assert shown.shape == published.shape
     assert (
-        np.sqrt(np.mean((shown - kept) ** 2)) < 40
+        np.sqrt(np.mean((shown - published) ** 2)) < 40
     )  # of 255; other fonts make less, another panel more
 
 
@@ -105,9 +105,9 @@ def test_coherency_tells_quadrature_and_its_sign() -> None:
     panel = plot_comparison(*logs, window="1min", coherency=True).axes[3]
     lines = panel.get_lines()[2:]
     at = np.abs(np.asarray(lines[0].get_xdata(), float) - 0.5).argmin()
-    found = {str(line.get_label()): float(np.asarray(line.get_ydata())[at]) for line in lines}
-    assert found["in quadrature"] == pytest.approx(1.0, abs=0.02)  # y is a quarter turn ahead
-    assert found["in phase"] == pytest.approx(0.0, abs=0.05)
+    values = {str(line.get_label()): float(np.asarray(line.get_ydata())[at]) for line in lines}
+    assert values["in quadrature"] == pytest.approx(1.0, abs=0.02)  # y is a quarter turn ahead
+    assert values["in phase"] == pytest.approx(0.0, abs=0.05)
 
 
 def test_logs_that_do_not_belong_together_are_refused() -> None:

@@ -195,8 +195,8 @@ def test_page_has_every_experiment_and_figure():
 
 def parse(cell: str) -> tuple[str, float]:
     """Split a cell into its text, without the number, and the number; NaN without one."""
-    found = re.search(r"-?[\d.]+(e[+-]?\d+)?$", cell)
-    return (cell[: found.start()], float(found[0])) if found else (cell, math.nan)
+    match = re.search(r"-?[\d.]+(e[+-]?\d+)?$", cell)
+    return (cell[: match.start()], float(match[0])) if match else (cell, math.nan)
 
 
 @pytest.mark.parametrize(
@@ -212,8 +212,8 @@ def test_page_holds_the_current_figures_of_each_experiment(name, tmp_path, monke
     monkeypatch.setitem(SCRIPT.PLAN["experiment"][name], "figure", {})
     made, written = cells(SCRIPT.experiment(name, tmp_path)), cells(on_the_page(name))
     for label in written.keys() - {"time [s]"}:
-        for here, there in zip(made[label], written[label], strict=True):
-            (text, number), (old_text, old_number) = parse(here), parse(there)
+        for new_cell, old_cell in zip(made[label], written[label], strict=True):
+            (text, number), (old_text, old_number) = parse(new_cell), parse(old_cell)
             assert text == old_text, label
             assert number == pytest.approx(old_number, rel=2e-3, nan_ok=True), label
 

@@ -121,8 +121,8 @@ def replay(folder: Path) -> int:
         outcome = server().try_input(item.files, item.command, item.main, item.options)
         right = outcome.is_right(may_be_interrupted=item.format == "checkpoint")
         failed += not right
-        said = f"{outcome.code}, {outcome.seconds:.2f} s {outcome.text[-400:].strip()}"
-        print(f"{'right' if right else 'WRONG'} {place.name} {item.command}: {said}")
+        result = f"{outcome.code}, {outcome.seconds:.2f} s {outcome.text[-400:].strip()}"
+        print(f"{'right' if right else 'WRONG'} {place.name} {item.command}: {result}")
     return failed
 
 

@@ -80,11 +80,11 @@ def space_bytes() -> int:
     return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 
 
-def call(arguments: list[str], seen: dict[str, Any]) -> dict[str, Any]:
+def call(arguments: list[str], state: dict[str, Any]) -> dict[str, Any]:
     """Run the command line once."""
     from gyrostab import cli
 
-    seen["error"] = None
+    state["error"] = None
     out, err = io.StringIO(), io.StringIO()
     peak_bytes(reset=True)
     before = peak_bytes()
@@ -93,10 +93,10 @@ def call(arguments: list[str], seen: dict[str, Any]) -> dict[str, Any]:
         try:
             code: int | str = cli.main(arguments)
         except BaseException as error:
-            code, seen["error"] = "traceback", error
+            code, state["error"] = "traceback", error
     seconds = time.perf_counter() - begun
     text = err.getvalue()
-    error = seen["error"]
+    error = state["error"]
     package = str(Path(cli.__file__).parent.parent)
     return {
         "code": "traceback" if "Traceback (most recent" in text else code,
@@ -117,23 +117,23 @@ def serve() -> None:
     os.fsync = lambda handle: None  # the disk is not under test
     from gyrostab import cli
 
-    seen: dict[str, Any] = {"error": None}
+    state: dict[str, Any] = {"error": None}
     describe_error = cli.describe_error
 
     def spy(error: Exception) -> int:
-        seen["error"] = error
+        state["error"] = error
         return describe_error(error)
 
     cli.describe_error = spy
     warm = json.loads(sys.stdin.readline())
     for arguments in warm:
-        call(arguments, seen)
+        call(arguments, state)
     limit = space_bytes() + SPACE_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     print(json.dumps({"ready": True}), file=answers)
     for line in sys.stdin:
-        print(json.dumps(call(json.loads(line), seen)), file=answers)
+        print(json.dumps(call(json.loads(line), state)), file=answers)
     shutil.rmtree(Path(sys.argv[1]).parent, ignore_errors=True)  # the parent has gone
 
 

@@ -155,9 +155,9 @@ def parquet_seeds() -> Iterator[Seed]:
     import pyarrow as pa
     from pyarrow import parquet
 
-    found = columns()
-    stamps = pa.array(found["time"][1] * 1000, pa.timestamp("ns"))
-    named = {f"{name} [{unit}]": values for name, (unit, values) in found.items()}
+    table_columns = columns()
+    stamps = pa.array(table_columns["time"][1] * 1000, pa.timestamp("ns"))
+    named = {f"{name} [{unit}]": values for name, (unit, values) in table_columns.items()}
     for table, options in (
         (pa.table(named), {}),
         (
@@ -277,12 +277,12 @@ def matlab_seeds() -> Iterator[Seed]:
     import h5py
     from scipy.io import savemat
 
-    found = {name: values for name, (_, values) in columns().items()}
-    table = np.stack([values.astype(float) for name, values in found.items() if name != "time"])
+    variables = {name: values for name, (_, values) in columns().items()}
+    table = np.stack([values.astype(float) for name, values in variables.items() if name != "time"])
     fields = ("gyro_x", "gyro_y", "temperature")
     with folder() as place:
         for number, packed in enumerate((False, True)):
-            savemat(place / f"v{number}.mat", found, do_compression=packed)
+            savemat(place / f"v{number}.mat", variables, do_compression=packed)
             undate(place / f"v{number}.mat")
             yield Seed(
                 "matlab5", contents(place / f"v{number}.mat", place), f"v{number}.mat", UNITS
@@ -290,7 +290,7 @@ def matlab_seeds() -> Iterator[Seed]:
         savemat(
             place / "s.mat",
             {
-                "log": {"t": found["time"], "DATA": table},
+                "log": {"t": variables["time"], "DATA": table},
                 "note": "text",
                 "cells": np.array(["a", 1.0], dtype=object),
             },
@@ -309,7 +309,7 @@ def matlab_seeds() -> Iterator[Seed]:
         )
         with h5py.File(place / "hdf.mat", "w", userblock_size=512) as file:
             file["DATA"] = table
-            file["stamp"] = found["time"].reshape(1, -1)
+            file["stamp"] = variables["time"].reshape(1, -1)
         with (place / "hdf.mat").open("r+b") as raw:
             raw.write(b"MATLAB 7.3 MAT-file, Platform: none".ljust(124) + b"\x00\x02IM")
         names = [
@@ -466,10 +466,10 @@ def field_seeds() -> Iterator[Seed]:
             command = [
                 text
                 for key, value in options.items()
-                for one in (
+                for item in (
                     [f"{k}={v}" for k, v in value.items()] if isinstance(value, dict) else [value]
                 )
-                for text in (f"--{key}", str(one))
+                for text in (f"--{key}", str(item))
             ]
             yield Seed(name, contents(path, place), path.name, tuple(command), ("scan", "ingest"))
 
@@ -694,10 +694,10 @@ MAKERS: tuple[Callable[[], Iterator[Seed]], ...] = (
 
 def make_seeds() -> dict[str, list[Seed]]:
     """Return valid inputs by format."""
-    found: dict[str, list[Seed]] = {}
+    seeds: dict[str, list[Seed]] = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SOURCE_DATE_EPOCH", "1767225600")
         for maker in MAKERS:
             for seed in maker():
-                found.setdefault(seed.format, []).append(seed)
-    return found
+                seeds.setdefault(seed.format, []).append(seed)
+    return seeds

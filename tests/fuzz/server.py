@@ -157,7 +157,7 @@ class Server:
                 self.child.wait(0.5)
             status = self.child.poll()
             self._stop()
-            what = (
+            cause = (
                 "hang"
                 if status is None
                 else f"signal {-status}"
@@ -166,7 +166,7 @@ class Server:
             )
             crash = (self.folder / "crash").read_text()[:600]
             return Outcome(
-                what,
+                cause,
                 LIMIT_SECONDS if status is None else 0.0,
                 LIMIT_SECONDS if status is None else 0.0,
                 0,

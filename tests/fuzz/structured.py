@@ -303,7 +303,7 @@ STRATEGIES = {
 
 def draw_inputs(form: str, seed: str, count: int) -> Iterator[Parts]:
     """Draw inputs of a kind, determined by the seed."""
-    found: list[Parts] = []
+    inputs: list[Parts] = []
 
     @seeded(seed)
     @settings(
@@ -315,9 +315,9 @@ def draw_inputs(form: str, seed: str, count: int) -> Iterator[Parts]:
     )
     @given(STRATEGIES[form])
     def collect(parts: Parts) -> None:
-        found.append(parts)
+        inputs.append(parts)
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         collect()
-    return iter(found[:count])
+    return iter(inputs[:count])

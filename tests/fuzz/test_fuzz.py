@@ -61,15 +61,15 @@ def test_an_input_that_once_failed(
         (tmp_path / name).write_bytes(
             move_job(data, "@FOLDER@", str(tmp_path)) if name.endswith("job.json") else data
         )
-    seen: dict = {"error": None}
+    state: dict = {"error": None}
     describe_error = cli.describe_error
 
     def spy(error: Exception) -> int:
-        seen["error"] = error
+        state["error"] = error
         return describe_error(error)
 
     monkeypatch.setattr(cli, "describe_error", spy)
-    answer = call(arguments_of(item.command, tmp_path, item.main, item.options), seen)
+    answer = call(arguments_of(item.command, tmp_path, item.main, item.options), state)
     assert answer["code"] in ((0, 2, 3) if item.format == "checkpoint" else (0, 2)), answer
     assert not answer["fault"]
 

@@ -51,15 +51,16 @@ def compare_datasets(a: xr.Dataset, b: xr.Dataset, rtol: float) -> Iterator[str]
     if set(a.variables) != set(b.variables):
         yield f"variables {sorted(set(map(str, a.variables)) ^ set(map(str, b.variables)))}"
     for name in sorted(set(map(str, a.variables)) & set(map(str, b.variables))):
-        one, two = a[name], b[name]
-        if one.dims != two.dims or not same(one.values, two.values, rtol):
-            is_prose = one.dtype.kind in "OUS" and one.shape == two.shape
+        first, second = a[name], b[name]
+        if first.dims != second.dims or not same(first.values, second.values, rtol):
+            is_prose = first.dtype.kind in "OUS" and first.shape == second.shape
             yield Text(name) if is_prose else f"{name}: values"
         if any(
-            not np.array_equal(one.attrs.get(key, ""), two.attrs.get(key, "")) for key in ATTRIBUTES
+            not np.array_equal(first.attrs.get(key, ""), second.attrs.get(key, ""))
+            for key in ATTRIBUTES
         ):
             yield f"{name}: attributes"
-        if str(one.attrs) != str(two.attrs):
+        if str(first.attrs) != str(second.attrs):
             yield Text(name)
 
 
@@ -72,8 +73,8 @@ def compare_trees(a: Any, b: Any, rtol: float, path: str = "") -> Iterator[str]:
             differences = compare_trees(a[key], b[key], rtol, f"{path}.{key}")
             yield from map(Text, differences) if key in PROSE else differences
     elif isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
-        for number, (one, two) in enumerate(zip(a, b, strict=True)):
-            yield from compare_trees(one, two, rtol, f"{path}[{number}]")
+        for number, (first, second) in enumerate(zip(a, b, strict=True)):
+            yield from compare_trees(first, second, rtol, f"{path}[{number}]")
     elif isinstance(a, float) and isinstance(b, float):
         if not (
             a == b
@@ -117,10 +118,10 @@ def compare_items(a: Path, b: Path, rtol: float) -> Iterator[str]:
             tomllib.loads(a.read_text("utf-8")), tomllib.loads(b.read_text("utf-8")), rtol
         )
     elif a.suffix == ".txt":
-        one, two = a.read_text("utf-8").split("\n", 1), b.read_text("utf-8").split("\n", 1)
-        if one[0] != two[0]:
-            yield f"{one[0]} became {two[0]}"
-        if one[1] != two[1]:
+        first, second = a.read_text("utf-8").split("\n", 1), b.read_text("utf-8").split("\n", 1)
+        if first[0] != second[0]:
+            yield f"{first[0]} became {second[0]}"
+        if first[1] != second[1]:
             yield Text("printed text")
     elif a.suffix == ".html" and a.read_bytes() != b.read_bytes():
         yield Text("page")
@@ -128,7 +129,7 @@ def compare_items(a: Path, b: Path, rtol: float) -> Iterator[str]:
 
 def items(folder: Path) -> set[str]:
     """Name the outputs of a job, without its inputs; a Zarr store counts as one output."""
-    found = set()
+    outputs = set()
     for path in folder.rglob("*"):
         relative = path.relative_to(folder)
         if relative.parts[0] == "input" or any(
@@ -136,8 +137,8 @@ def items(folder: Path) -> set[str]:
         ):
             continue
         if path.is_file() or path.suffix == ".zarr":
-            found.add(str(relative))
-    return found
+            outputs.add(str(relative))
+    return outputs
 
 
 def compare_folders(
@@ -146,9 +147,9 @@ def compare_folders(
     """All differences in numbers and structure, and how many there are in text alone."""
     differences, texts = [], 0
     for name in names:
-        one, two = items(reference / name), items(made / name)
-        differences += [f"{name}: {item} is in one of both only" for item in sorted(one ^ two)]
-        for item in sorted(one & two):
+        first, second = items(reference / name), items(made / name)
+        differences += [f"{name}: {item} is in one of both only" for item in sorted(first ^ second)]
+        for item in sorted(first & second):
             for difference in compare_items(reference / name / item, made / name / item, rtol):
                 if isinstance(difference, Text):
                     texts += 1

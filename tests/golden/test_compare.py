@@ -51,9 +51,9 @@ def write_outputs(
 def test_changes_are_reported(tmp_path, change, rtol, differences, texts):
     write_outputs(tmp_path / "before")
     write_outputs(tmp_path / "after", **change)
-    found, in_text = compare_folders(tmp_path / "before", tmp_path / "after", ["job"], rtol=rtol)
-    assert len(found) == len(differences)
-    assert all(any(f"job: {text}" in line for line in found) for text in differences)
+    lines, in_text = compare_folders(tmp_path / "before", tmp_path / "after", ["job"], rtol=rtol)
+    assert len(lines) == len(differences)
+    assert all(any(f"job: {text}" in line for line in lines) for text in differences)
     assert in_text == texts
 
 
@@ -61,5 +61,5 @@ def test_a_missing_output_is_reported(tmp_path):
     for name in ("before", "after"):
         write_outputs(tmp_path / name)
     (tmp_path / "after" / "job" / "out.nc").unlink()
-    found, _ = compare_folders(tmp_path / "before", tmp_path / "after", ["job"], rtol=0.0)
-    assert found == ["job: out.nc is in one of both only"]
+    lines, _ = compare_folders(tmp_path / "before", tmp_path / "after", ["job"], rtol=0.0)
+    assert lines == ["job: out.nc is in one of both only"]

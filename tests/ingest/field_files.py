@@ -97,16 +97,16 @@ def write_dlis(place: Path) -> Made:
         body = b"\xf0" + text(kind)
         for label, code in labels.items():
             body += b"\x34" + text(label) + bytes([code])
-        for one, values in objects.items():
-            body += b"\x70" + name(one) + b"".join(values)
+        for object_name, values in objects.items():
+            body += b"\x70" + name(object_name) + b"".join(values)
         return body
 
     names = ("TIME", "GYRO_X", "GYRO_Y", "GYRO_Z", "TEMPERATURE")
     units = ("ms", *["rad/s"] * 3, "degC")
-    one = b"\x29\x01"
+    count = b"\x29\x01"
     header = {"0": [b"\x21" + text("1".rjust(10)), b"\x21" + text("run7".ljust(65))]}
     channels = {
-        channel: [b"\x21\x07", b"\x21" + text(unit), one + b"\x01"]
+        channel: [b"\x21\x07", b"\x21" + text(unit), count + b"\x01"]
         for channel, unit in zip(names, units, strict=True)
     }
     listed = b"\x29" + bytes([len(names)]) + b"".join(map(name, names))
@@ -135,7 +135,8 @@ def write_dlis(place: Path) -> Made:
     label = b"   1V1.00RECORD08192" + b"gyrostab".ljust(60)
     path = place / "run.dlis"
     path.write_bytes(
-        label + b"".join(struct.pack(">HBB", len(one) + 4, 0xFF, 1) + one for one in records)
+        label
+        + b"".join(struct.pack(">HBB", len(record) + 4, 0xFF, 1) + record for record in records)
     )
     return Made(path, "dlis", {"epoch": str(START)})
 
@@ -168,10 +169,10 @@ def write_rosbag(place: Path, form: str) -> Made:
     from rosbags import rosbag1, rosbag2
     from rosbags.typesys import Stores, get_typestore
 
-    one = form == "bag"
-    store = get_typestore(Stores.ROS1_NOETIC if one else Stores.ROS2_HUMBLE)
-    path = place / ("run.bag" if one else "bag")
-    plugin = None if one else getattr(rosbag2.StoragePlugin, form.upper())
+    is_first_version = form == "bag"
+    store = get_typestore(Stores.ROS1_NOETIC if is_first_version else Stores.ROS2_HUMBLE)
+    path = place / ("run.bag" if is_first_version else "bag")
+    plugin = None if is_first_version else getattr(rosbag2.StoragePlugin, form.upper())
     types = store.types
     vector, header = types["geometry_msgs/msg/Vector3"], types["std_msgs/msg/Header"]
     turn, time = types["geometry_msgs/msg/Quaternion"], types["builtin_interfaces/msg/Time"]
@@ -179,7 +180,7 @@ def write_rosbag(place: Path, form: str) -> Made:
     none = np.zeros(9)
     with (
         rosbag1.Writer(path)
-        if one
+        if is_first_version
         else rosbag2.Writer(path, version=9, storage_plugin=plugin) as bag
     ):
         topics = {
@@ -188,7 +189,7 @@ def write_rosbag(place: Path, form: str) -> Made:
         }
         for row in range(ROWS):
             stamp = int(STAMPS[row].astype(np.int64))
-            first = {"seq": row} if one else {}
+            first = {"seq": row} if is_first_version else {}
             head = header(**first, stamp=time(*divmod(stamp, 10**9)), frame_id="imu")
             rates = vector(*(float(rate) for rate in RATES[:, row] * 1e-3 * RAD))
             flat = vector(0.0, 0.0, 9.81)
@@ -199,7 +200,7 @@ def write_rosbag(place: Path, form: str) -> Made:
                 kind = message.__msgtype__
                 raw = (
                     store.serialize_ros1(message, kind)
-                    if one
+                    if is_first_version
                     else store.serialize_cdr(message, kind)
                 )
                 bag.write(topics[kind], stamp + 5_000_000, raw)

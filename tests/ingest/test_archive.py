@@ -102,8 +102,8 @@ def test_every_sample_of_any_piece_appears_once(data: st.DataObject) -> None:
         part = values[:, a : a + length].copy()
         lost = data.draw(st.integers(0, part.shape[1] - 40), label="lost")
         part[:, lost : lost + data.draw(st.integers(0, 30), label="length of loss")] = np.nan
-        here = expected[:, a : a + part.shape[1]]
-        here[np.isnan(here)] = part[np.isnan(here)]
+        window = expected[:, a : a + part.shape[1]]
+        window[np.isnan(window)] = part[np.isnan(window)]
         pieces.append(rechunked(log_of(part, a), data.draw(st.integers(20, 500), label="chunk")))
     joined = join(*pieces)
     first, last = min(a for a, _ in spans), max(min(a + n, size) for a, n in spans)
@@ -212,10 +212,10 @@ def test_a_slightly_different_clock_is_followed_sample_by_sample(ppm: float) -> 
     )
     joined = join(first, second)
     position = 200 + np.arange(size) * RATE / rate
-    taken = np.rint(position).astype(int)
+    samples = np.rint(position).astype(int)
     expected = np.full(joined.sizes["time"], np.nan)
     expected[:100] = values[0, :100]
-    expected[taken[::-1]] = values[0, ::-1]  # the earlier of two samples for one
+    expected[samples[::-1]] = values[0, ::-1]  # the earlier of two samples for one
     np.testing.assert_array_equal(joined.rate[0], expected)
     assert f"up to {abs(ppm):.3g} parts per million" in said(joined)
     assert gap_table(joined)["samples"].sum() == np.isnan(expected).sum()
@@ -231,14 +231,14 @@ def test_runs_are_the_nearest_samples(off: float, ratio: float, size: int, first
     runs = runs_of(first, off, size, ratio)
     position = first + off + np.arange(size) * ratio
     assume(ratio != 1.0 and np.abs(position % 1 - 0.5).min() > 1e-9)
-    taken: list[int] = []
+    samples: list[int] = []
     for sample, own, length in runs:
         assert (
             np.abs(np.arange(sample, sample + length) - position[own : own + length]).max()
             <= 0.5 + 1e-6
         )
-        taken += range(sample, sample + length)
-    assert sorted(taken) == sorted(set(np.rint(position).astype(int)))
+        samples += range(sample, sample + length)
+    assert sorted(samples) == sorted(set(np.rint(position).astype(int)))
 
 
 def test_a_run_that_is_extended_twice_stays_one() -> None:
@@ -296,15 +296,15 @@ def test_restarted_clock_is_not_an_overlap() -> None:
 
 def test_a_long_pause_is_a_step_of_the_clock() -> None:
     values = signal(400, holes=0)
-    far = log_of(values, 20 * 86400 * 50)
-    joined = join(log_of(values), far, log_of(values, 20 * 86400 * 50 + 500))
+    distant = log_of(values, 20 * 86400 * 50)
+    joined = join(log_of(values), distant, log_of(values, 20 * 86400 * 50 + 500))
     np.testing.assert_array_equal(joined.rate[:, 401:801], values)
     np.testing.assert_array_equal(joined.rate[:, 901:], values)
     assert gap_table(joined)["cause"].tolist() == ["clock_step", "missing"]
     assert "if the pause is real, raise max_gap" in said(joined)
-    assert join(log_of(values), far, max_gap="30D").sizes["time"] == 20 * 86400 * 50 + 400
+    assert join(log_of(values), distant, max_gap="30D").sizes["time"] == 20 * 86400 * 50 + 400
     with pytest.raises(OptionError, match="max_gap 'long'"):
-        join(log_of(values), far, max_gap="long")
+        join(log_of(values), distant, max_gap="long")
 
 
 def test_small_overlap_is_not_a_step_of_the_clock() -> None:

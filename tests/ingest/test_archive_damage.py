@@ -144,11 +144,11 @@ def test_raw_files_and_regular_logs_do_not_mix(archive: list[Path], tmp_path: Pa
 
 
 def test_progress_is_reported_for_each_file(archive: list[Path]) -> None:
-    told: list[tuple[int, int, str]] = []
+    reports: list[tuple[int, int, str]] = []
     log = load_log(
-        archive, on_file=lambda number, total, path: told.append((number, total, path.name))
+        archive, on_file=lambda number, total, path: reports.append((number, total, path.name))
     )
-    assert told == [(number, 5, f"run_{number + 7}.csv") for number in range(1, 6)]
+    assert reports == [(number, 5, f"run_{number + 7}.csv") for number in range(1, 6)]
     assert "on_file" not in log.attrs["history"]
 
 

@@ -36,18 +36,18 @@ def write(
     extra: bool = False,
 ) -> Path:
     """Make one axis at some samples of the grid, with its stamps `skew` samples late."""
-    kept = np.arange(N) if samples is None else samples
-    stamps = START + np.rint((kept + skew) * PERIOD_NS).astype(np.int64)
-    columns = {f"gyro_{axis} [deg/h]": truth(axis)[kept]}
+    positions = np.arange(N) if samples is None else samples
+    stamps = START + np.rint((positions + skew) * PERIOD_NS).astype(np.int64)
+    columns = {f"gyro_{axis} [deg/h]": truth(axis)[positions]}
     if extra:
-        columns["temperature [degC]"] = 20.0 + kept / 100
+        columns["temperature [degC]"] = 20.0 + positions / 100
     if stamped:
         columns = {"time [ns]": stamps, **columns}
     if path.suffix == ".parquet":
         parquet.write_table(pa.table(columns), path)
     elif path.suffix == ".nc":
         with netCDF4.Dataset(path, "w") as file:
-            file.createDimension("row", kept.size)
+            file.createDimension("row", positions.size)
             for header, values in columns.items():
                 name, unit = header.rstrip("]").split(" [")
                 variable = file.createVariable(name, values.dtype, ("row",))
@@ -92,19 +92,21 @@ def test_a_skew_is_stated_and_each_sample_is_the_nearest(tmp_path, skew, shift):
         f"{late} in {late}.csv (begins {abs(skew):.3g} samples later)" in note
         for note in log.attrs["notes"]
     )
-    said = [note for note in log.attrs["notes"] if "between two samples" in note]
+    notes = [note for note in log.attrs["notes"] if "between two samples" in note]
     if skew == shift:
-        assert not said
+        assert not notes
     else:
-        (note,) = said
+        (note,) = notes
         assert "y.csv" in note or "x.csv" in note
         assert f"{abs(skew - round(skew)):.2g} of a sample" in note
 
 
 def test_missing_samples_of_one_axis_are_a_gap(tmp_path):
-    kept = np.setdiff1d(np.arange(N), np.arange(500, 520))
+    positions = np.setdiff1d(np.arange(N), np.arange(500, 520))
     log = regularise(
-        read_log([write(tmp_path / "x.csv", "x"), write(tmp_path / "y.csv", "y", samples=kept)])
+        read_log(
+            [write(tmp_path / "x.csv", "x"), write(tmp_path / "y.csv", "y", samples=positions)]
+        )
     )
     np.testing.assert_array_equal(log.rate.sel(axis="x").values, truth("x"))
     np.testing.assert_array_equal(

@@ -350,18 +350,18 @@ def write_wide_csv(path: Path, header: str, columns: int) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("header", "kept"), [("c{} [V]", 200), ("c{}", 0), ("c", 0)])
+@pytest.mark.parametrize(("header", "channels"), [("c{} [V]", 200), ("c{}", 0), ("c", 0)])
 def test_table_of_20_000_columns_is_read_for_those_that_are_used(
-    header: str, kept: int, tmp_path: Path
+    header: str, channels: int, tmp_path: Path
 ) -> None:
     path = write_wide_csv(tmp_path / "log.csv", header, 20_000)
     begun = time.process_time()
     raw = read_log(path)
     assert time.process_time() - begun < 10.0  # above two minutes before
-    assert len(raw.data_vars) == 1 + kept
+    assert len(raw.data_vars) == 1 + channels
     np.testing.assert_array_equal(raw["rate"], np.full((1, 6), 2.5))
     assert any("left out" in note for note in raw.attrs["notes"])
-    if kept:
+    if channels:
         assert any(
             "the limit is 200 channels, and --limit channels=2e+04 lifts it" in note
             for note in raw.attrs["notes"]
@@ -433,15 +433,15 @@ def test_even_stamps_are_placed_from_the_beginning_alone(
     monkeypatch.setattr(regularise_module, "_EVEN_ROWS", 2**14)
     path = write_stamped_netcdf(tmp_path / "log.nc", 100_000)
     whole, lazy = (read_with(limit, path) for limit in (2**27, 1000))
-    seen = []
+    blocks_read = []
     rate = regularise_module.estimate_rate
     monkeypatch.setattr(
         regularise_module,
         "estimate_rate",
-        lambda stamps, **where: seen.append(list(stamps())) or rate(stamps, **where),
+        lambda stamps, **where: blocks_read.append(list(stamps())) or rate(stamps, **where),
     )
     logs = [regularise(raw) for raw in (whole, lazy)]
-    assert [sum(len(rows) for rows, _ in blocks) for blocks in seen] == [100_000, 2**14]
+    assert [sum(len(rows) for rows, _ in blocks) for blocks in blocks_read] == [100_000, 2**14]
     xr.testing.assert_identical(
         logs[0].drop_attrs(deep=False), logs[1].load().drop_attrs(deep=False)
     )

@@ -130,10 +130,10 @@ def test_channels_of_another_file_are_cut_too(files):
     (name,) = [name for name in log.data_vars if str(name).startswith("temperature")]
     dim = log[name].dims[0]
     seconds = (log[dim].values - np.datetime64(START)) / np.timedelta64(1, "s")
-    there = seconds[np.isfinite(log[name].values)]
-    assert there.min() >= 60
-    assert there.max() < 120
-    assert not ((there >= 70) & (there < 80)).any()
+    present = seconds[np.isfinite(log[name].values)]
+    assert present.min() >= 60
+    assert present.max() < 120
+    assert not ((present >= 70) & (present < 80)).any()
 
 
 def test_lazy_log_stays_lazy():
@@ -156,7 +156,7 @@ def test_lazy_log_stays_lazy():
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "message"),
     [
         (
             {"time_from": "10min"},
@@ -180,8 +180,8 @@ def test_lazy_log_stays_lazy():
         ({"exclude": ["0s/5min"]}, "leaves nothing"),
     ],
 )
-def test_invalid_input_is_refused(given, said):
-    with pytest.raises(OptionError, match=said):
+def test_invalid_input_is_refused(given, message):
+    with pytest.raises(OptionError, match=message):
         cut_log(make(), **given)
 
 

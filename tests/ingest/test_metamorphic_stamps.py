@@ -106,10 +106,14 @@ def test_the_same_file_under_two_names(whole, tmp_path):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_single_repeated_rows(whole, tmp_path, seed):
-    again = np.sort(np.random.default_rng(seed).choice(np.arange(50, ROWS - 50), 20, replace=False))
+    repeated = np.sort(
+        np.random.default_rng(seed).choice(np.arange(50, ROWS - 50), 20, replace=False)
+    )
     assert_same(
         whole,
-        regular([write_rows(tmp_path / "log.csv", np.insert(np.arange(ROWS), again + 1, again))]),
+        regular(
+            [write_rows(tmp_path / "log.csv", np.insert(np.arange(ROWS), repeated + 1, repeated))]
+        ),
     )
 
 
@@ -146,6 +150,6 @@ def test_blocks_and_chunks(block, chunk, scatter):
 @pytest.mark.parametrize("shift", [1, 10**15, -(10**17)])
 def test_different_start_time(shift):
     noise = np.random.default_rng(5).normal(0, 0.4 / RATE * 1e9, ROWS).astype(np.int64)
-    one, other = (gyrostab.regularise(raw_log(STAMPS + noise + by, VALUES)) for by in (0, shift))
-    np.testing.assert_array_equal(one.rate.values, other.rate.values)
-    assert np.unique((other.time.values - one.time.values).astype(np.int64)).tolist() == [shift]
+    log, other = (gyrostab.regularise(raw_log(STAMPS + noise + by, VALUES)) for by in (0, shift))
+    np.testing.assert_array_equal(log.rate.values, other.rate.values)
+    assert np.unique((other.time.values - log.time.values).astype(np.int64)).tolist() == [shift]

@@ -139,8 +139,8 @@ def test_interpolation_to_another_rate():
     x = record()
     log = make(x)
     fine = log.interp(time=pd.date_range(START, periods=2 * SIZE - 1, freq="5ms"))
-    there = np.interp(np.arange(2 * SIZE - 1) / 2, np.arange(SIZE), x[0])
-    check_against(fine.sel(axis=["x"]), there, rate=2 * RATE)
+    expected = np.interp(np.arange(2 * SIZE - 1) / 2, np.arange(SIZE), x[0])
+    check_against(fine.sel(axis=["x"]), expected, rate=2 * RATE)
 
 
 ORDER = {
@@ -164,7 +164,7 @@ ORDER = {
         [
             log.isel(time=slice(0, 900)),
             log.isel(time=slice(1000, 2000)).pipe(
-                lambda one: one.assign_coords(time=one.time.values + np.timedelta64(5, "ms"))
+                lambda log: log.assign_coords(time=log.time.values + np.timedelta64(5, "ms"))
             ),
         ],
         "time",
@@ -315,21 +315,21 @@ def test_grid_is_found_for_any_subset_of_samples(
     log = make_log(np.arange(float(size)), rate=rate, unit="deg/h", start=START)
     log = log.assign_coords(
         time=log.time.values.astype(np.int64) // resolution * resolution
-    ).assign_coords(time=lambda one: ("time", one.time.values.astype("datetime64[ns]")))
+    ).assign_coords(time=lambda log: ("time", log.time.values.astype("datetime64[ns]")))
     if not declared:
         del log.attrs["sampling_rate_hz"]
-    kept = np.flatnonzero(rng.random(size) >= lost)
-    kept = kept[kept % stride == 0]
-    if kept.size < 2:
+    samples = np.flatnonzero(rng.random(size) >= lost)
+    samples = samples[samples % stride == 0]
+    if samples.size < 2:
         return
     try:
-        back = as_log(log.isel(time=kept))
+        back = as_log(log.isel(time=samples))
     except TimeError:
         assert not declared or lost > 0  # few samples of an unknown rate
         return
     present = ~np.isnan(back.rate.values[0])
-    np.testing.assert_array_equal(back.rate.values[0][present], kept)
-    stamps = log.time.values[kept]
+    np.testing.assert_array_equal(back.rate.values[0][present], samples)
+    stamps = log.time.values[samples]
     assert (
         np.abs((back.time.values[present] - stamps).astype(np.int64)).max()
         <= 0.1e9 / back.attrs["sampling_rate_hz"]
@@ -339,7 +339,9 @@ def test_grid_is_found_for_any_subset_of_samples(
         declared
     ):  # two stamps, each cut to the resolution, bound the rate by one step of it over their span
         rounding = resolution / float(np.ptp(stamps.astype(np.int64)))
-        assert ratio == pytest.approx(np.gcd.reduce(np.diff(kept)), rel=max(1.001 * rounding, 1e-7))
+        assert ratio == pytest.approx(
+            np.gcd.reduce(np.diff(samples)), rel=max(1.001 * rounding, 1e-7)
+        )
 
 
 def gap_rows(log: xr.Dataset) -> list[list]:
@@ -477,15 +479,15 @@ class TestDataArray:
             gyrostab.from_dataarray(array.isel(time=rng.permutation(SIZE)))
 
     @pytest.mark.parametrize(
-        ("change", "said"),
+        ("change", "message"),
         [
             (lambda a: a.rename(time="t"), "rename them"),
             (lambda a: a.drop_vars("time"), "no datetime64 coordinate 'time'"),
             (lambda a: a.expand_dims("run"), "rename them"),
         ],
     )
-    def test_other_inputs_are_refused(self, change, said):
-        with pytest.raises(SchemaError, match=said):
+    def test_other_inputs_are_refused(self, change, message):
+        with pytest.raises(SchemaError, match=message):
             gyrostab.davar(change(make().rate), window="8s")
 
 
@@ -628,5 +630,7 @@ class TestSurface:
         path = tmp_path / f"log.{form}"
         thinned = make(x).isel(time=slice(None, None, 2)).dropna("time", subset=["rate"])
         thinned.to_netcdf(path) if form == "nc" else thinned.to_zarr(path)
-        here = np.flatnonzero(~np.isnan(x[0, ::2]))
-        check_against(reader(path), x[:, ::2][:, here[0] : here[-1] + 1], rate=50.0, window=400)
+        present = np.flatnonzero(~np.isnan(x[0, ::2]))
+        check_against(
+            reader(path), x[:, ::2][:, present[0] : present[-1] + 1], rate=50.0, window=400
+        )

@@ -71,8 +71,8 @@ def test_damaged_row_does_not_part_date_and_time_of_day(damage: str, tmp_path: P
     lines = path.read_text().splitlines()
     path.write_text("\n".join([*lines[:3], damage, *lines[4:]]) + "\n")
     raw = read_log(path)
-    kept = np.isfinite(raw["rate"].values[0])
-    np.testing.assert_array_equal(stamps_of(raw)[kept], np.delete(STAMPS.values, 2))
+    is_finite = np.isfinite(raw["rate"].values[0])
+    np.testing.assert_array_equal(stamps_of(raw)[is_finite], np.delete(STAMPS.values, 2))
 
 
 def test_pair_that_is_not_the_time_is_left_out(tmp_path: Path) -> None:
@@ -127,8 +127,8 @@ def test_cells_in_any_order_give_the_same_stamp(stamp, mark, order):  # type: ig
     cell = f"{stamp:{form.replace('|', mark)} %H:%M:%S.%f}"
     if stamp.year < 1000:
         return
-    wanted = np.datetime64(stamp, "ns").astype(np.int64)
-    assert cells_to_ns([cell], None, 0, order)[0] == wanted
+    expected = np.datetime64(stamp, "ns").astype(np.int64)
+    assert cells_to_ns([cell], None, 0, order)[0] == expected
     assert find_order([cell]) in (order, None)
 
 

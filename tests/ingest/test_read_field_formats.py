@@ -54,11 +54,11 @@ def test_a_file_that_is_cut_off_is_read_in_part_or_named(made: Made, tmp_path: P
         path = tmp_path / made.path.name
         path.write_bytes(data[:size])
         try:
-            rows, said = read_log(path, **made.options).sizes["row"], path.name
+            rows, text = read_log(path, **made.options).sizes["row"], path.name
         except GyrostabError as error:
-            rows, said = 0, str(error)
+            rows, text = 0, str(error)
         assert rows < ROWS
-        assert path.name in said
+        assert path.name in text
 
 
 @pytest.mark.parametrize(
@@ -197,9 +197,9 @@ def test_unusable_layouts_are_named(tmp_path: Path, layout: str) -> None:
 
 def test_items_of_wits_are_channels(tmp_path: Path) -> None:
     path, form, options = write_wits0(tmp_path)
-    found = read_channel(path, **options)
-    assert found.values.tolist() == [60.5, 62.5, 64.5, 66.5, 68.5]
-    assert found.time_temperature.values[1] == np.datetime64("2026-03-14T08:00:02")
+    channel = read_channel(path, **options)
+    assert channel.values.tolist() == [60.5, 62.5, 64.5, 66.5, 68.5]
+    assert channel.time_temperature.values[1] == np.datetime64("2026-03-14T08:00:02")
     assert scan_file(path).format == form
     assert {column.name for column in scan_file(path).columns} >= {"0110", "0921"}
 

@@ -230,9 +230,9 @@ def test_channels_of_another_file_keep_their_own_time(tmp_path: Path) -> None:
     assert raw.temperature.attrs["units"] == "degree_Celsius"
     np.testing.assert_array_equal(raw.rate[0], np.arange(10))
     more = write(tmp_path / "more.csv", "time [s],temperature [K]\n-2,273.15\n-1,274.15\n")
-    both = read_log(log, channel=[slow, more])
-    np.testing.assert_allclose(both.temperature, [0, 1, 20, 22])
-    assert both.attrs["channel_files"] == ["slow.csv", "more.csv"]
+    joined = read_log(log, channel=[slow, more])
+    np.testing.assert_allclose(joined.temperature, [0, 1, 20, 22])
+    assert joined.attrs["channel_files"] == ["slow.csv", "more.csv"]
 
 
 def test_unusable_channel_files_are_explained(tmp_path: Path) -> None:
@@ -434,5 +434,7 @@ def test_heavy_libraries_load_when_they_are_used() -> None:
         "import sys, gyrostab.ingest; print([m for m in ('pyarrow.csv', 'netCDF4', 'h5py', "
         "'scipy.io', 'dask.array') if m in sys.modules])"
     )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "[]"
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == "[]"

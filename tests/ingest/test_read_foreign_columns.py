@@ -82,14 +82,14 @@ def test_advice_of_the_note_on_a_dropped_channel_works(
     path = write(tmp_path, f"time [s],gyro_x [deg/h],{header}\n0,1,2\n1,2,3\n")
     name = header.split(" ")[0]
     advice = next(
-        found[1]
+        match[1]
         for note in read_log(path).attrs["notes"]
-        if (found := re.search(r"--unit (\S+?=[^\s,;)]+)", note))
+        if (match := re.search(r"--unit (\S+?=[^\s,;)]+)", note))
     )
     assert advice.startswith(f"{name}=")
     key, _, value = advice.partition("=")
-    kept = read_log(path, unit={key: unit if value == "UNIT" else value})
-    assert kept[name].values.tolist() == [2, 3]
+    log = read_log(path, unit={key: unit if value == "UNIT" else value})
+    assert log[name].values.tolist() == [2, 3]
 
 
 @pytest.mark.parametrize(

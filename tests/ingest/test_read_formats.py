@@ -373,14 +373,14 @@ def test_buffers_spill_to_disk_and_read_back(monkeypatch: pytest.MonkeyPatch) ->
         buffers = Buffers({"a": np.float64, "b": np.int64})
         for block in blocks:
             buffers.add(block)
-        found = buffers.finish()
-        assert isinstance(found["a"], PiecewiseColumn) == (limit < 10**6)
+        columns = buffers.finish()
+        assert isinstance(columns["a"], PiecewiseColumn) == (limit < 10**6)
         for key in "ab":
-            np.testing.assert_array_equal(np.asarray(as_lazy(found[key])), expected[key])
+            np.testing.assert_array_equal(np.asarray(as_lazy(columns[key])), expected[key])
             for part in (slice(3, 38), slice(6, 6), slice(1, 40, 7), slice(-9, None)):
-                np.testing.assert_array_equal(found[key][part], expected[key][part])
+                np.testing.assert_array_equal(columns[key][part], expected[key][part])
         rows = np.array([4, 5, 6, 42])
-        column = found["b"]
+        column = columns["b"]
         if not isinstance(column, PiecewiseColumn):
             continue
         np.testing.assert_array_equal(column.take_rows(rows), expected["b"][rows])

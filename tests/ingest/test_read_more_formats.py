@@ -51,8 +51,8 @@ def test_rotation_and_ground_motion_keep_separate_stamps(recordings: Find) -> No
     text = pd.read_csv(recordings("fog-rotation-earthquake/bspf_M5.2_6c.csv.gz"))
     axes = {"HJE": "gyro_x", "HJN": "gyro_y", "HJZ": "gyro_z", "HHZ": "ground [m/s]"}
     log = read_log(path, map=axes, unit={"gyro": "rad/s"})
-    wanted = np.rad2deg(text[["HJE", "HJN", "HJZ"]].to_numpy().T) * 3600.0
-    assert np.allclose(log.rate.values, wanted, rtol=1e-6, atol=1e-9)
+    expected = np.rad2deg(text[["HJE", "HJN", "HJZ"]].to_numpy().T) * 3600.0
+    assert np.allclose(log.rate.values, expected, rtol=1e-6, atol=1e-9)
     assert np.allclose(log.ground.values, text.HHZ, rtol=1e-6)
     assert log.time.values[0] - log.time_ground.values[0] == np.timedelta64(3_700_000, "ns")
 
@@ -172,9 +172,9 @@ def las(tmp_path: Path) -> Path:
 
 def test_las(las: Path) -> None:
     log = read_log(las, epoch="2026-03-01T12:00:00")
-    wanted = VALUES.astype(float)
-    wanted[1, 3] = np.nan
-    assert np.array_equal(log.rate.values, wanted, equal_nan=True)
+    expected = VALUES.astype(float)
+    expected[1, 3] = np.nan
+    assert np.array_equal(log.rate.values, expected, equal_nan=True)
     assert np.array_equal(log.time.values, STAMPS)
     assert (log.temperature.values == 21.5).all()
     summary = scan_file(las, ReadOptions(epoch="2026-03-01T12:00:00"))
@@ -274,7 +274,7 @@ def test_any_file_with_a_layout_file_is_binary(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("layout", "said"),
+    ("layout", "message"),
     [
         (None, r"the layout of its records is unknown; write run\.bin\.toml"),
         ("fields = [", "not valid TOML"),
@@ -284,11 +284,11 @@ def test_any_file_with_a_layout_file_is_binary(tmp_path: Path) -> None:
         ('byte_order = "mixed"\nfields = []', "byte_order"),
     ],
 )
-def test_wrong_layout_is_explained(tmp_path: Path, layout: str | None, said: str) -> None:
+def test_wrong_layout_is_explained(tmp_path: Path, layout: str | None, message: str) -> None:
     write_binary(tmp_path / "run.bin", "little")
     if layout is not None:
         (tmp_path / "run.bin.toml").write_text(layout)
-    with pytest.raises(OptionError, match=said):
+    with pytest.raises(OptionError, match=message):
         read_log(tmp_path / "run.bin")
 
 

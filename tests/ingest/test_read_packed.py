@@ -62,9 +62,9 @@ def test_packed_decimals_equal_parsed_ones(wholes, digits, law, missing):
         assert (low, high) == (known.min(), known.max())
     back = np.empty(values.size)
     unpack_counts(counts, 1.0, 10.0**digits, factor, offset, back)
-    wanted = np.where(np.isfinite(values), values, np.nan) * factor + offset
+    expected = np.where(np.isfinite(values), values, np.nan) * factor + offset
     np.testing.assert_array_equal(
-        bits(back[np.isfinite(values)]), bits(wanted[np.isfinite(values)])
+        bits(back[np.isfinite(values)]), bits(expected[np.isfinite(values)])
     )
     assert np.isnan(back[~np.isfinite(values)]).all()
 
@@ -136,7 +136,7 @@ def test_pieces_of_every_kind_in_memory_and_on_disk(where):
             PlainPiece(bits(floats)),
         ],
     )
-    wanted = np.array([1.5 * 3600 + 1, np.nan, 0.7 * 3600 + 1, *floats])
+    expected = np.array([1.5 * 3600 + 1, np.nan, 0.7 * 3600 + 1, *floats])
     stamps = np.array([5, 10, 15, 20, 100, 200])
     times = PiecewiseColumn(
         "datetime64[ns]", [EvenStampsPiece(np.array([[0, 5, 5]]), 4), PlainPiece(stamps[4:].copy())]
@@ -151,7 +151,7 @@ def test_pieces_of_every_kind_in_memory_and_on_disk(where):
         assert pieces.memory_bytes == 0
         assert times.memory_bytes == 24
     for begin, end in [(0, 6), (2, 4), (3, 6), (5, 5)]:
-        np.testing.assert_array_equal(bits(pieces[begin:end]), bits(wanted[begin:end]))
+        np.testing.assert_array_equal(bits(pieces[begin:end]), bits(expected[begin:end]))
         np.testing.assert_array_equal(times[begin:end].view(np.int64), stamps[begin:end])
     times.changed, times.value = np.array([1, 5]), NO_STAMP
     stamps[[1, 5]] = NO_STAMP
@@ -194,12 +194,12 @@ def test_reading_ahead_stops_with_an_error(tmp_path, monkeypatch):
     paths = [
         text_log(tmp_path / f"{number}.csv", 2000 * number, 2000, decimals=3) for number in range(3)
     ]
-    taken: list[int] = []
+    sizes: list[int] = []
     take = text._parse_block
 
     def slowly(block, **options):
         time.sleep(0.005)
-        taken.append(len(block))
+        sizes.append(len(block))
         return take(block, **options)
 
     def refuse(number, count, path):
@@ -210,7 +210,7 @@ def test_reading_ahead_stops_with_an_error(tmp_path, monkeypatch):
     monkeypatch.setattr(text, "BLOCK_BYTES", 256)
     with pytest.raises(KeyboardInterrupt):
         read_log(paths, on_file=refuse)
-    assert sum(taken) < paths[0].stat().st_size / 3
+    assert sum(sizes) < paths[0].stat().st_size / 3
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("gyrostab-")]
 
 
@@ -223,13 +223,13 @@ def test_whole_numbers_at_even_steps_take_less_than_half_the_memory(tmp_path, mo
 def test_even_stamps_are_placed_like_nearly_even_ones():
     """With a nanosecond of jitter the kernel takes another path; the log exceeds its memory."""
     rng = np.random.default_rng(5)
-    kept = np.sort(rng.choice(50_000, 49_900, replace=False))
+    samples = np.sort(rng.choice(50_000, 49_900, replace=False))
     rows = np.concatenate(
-        [kept[:30_000], kept[30_001:30_006], kept[30_000:30_001], kept[30_006:]]
+        [samples[:30_000], samples[30_001:30_006], samples[30_000:30_001], samples[30_006:]]
     )  # one row comes late
     stamps = 7_000_000_000 + rows * 2_500_000
     stamps[123] = NO_STAMP
-    found = []
+    placements = []
     for jitter in (0, 1):
         state, ring = new_state()
         shaken = np.where(
@@ -238,11 +238,11 @@ def test_even_stamps_are_placed_like_nearly_even_ones():
         runs, events = place(
             np.arange(stamps.size), shaken, stamps.size, 2_500_000.0, 0.75, 1e9, state, ring
         )
-        found.append((runs, events[:, :3], state[:3], np.array(ring)))
-    for one, other in zip(*found, strict=True):
-        np.testing.assert_array_equal(one, other)
-    assert len(found[0][1]) == 1  # the late row
-    assert len(found[0][0]) > 90  # the gaps
+        placements.append((runs, events[:, :3], state[:3], np.array(ring)))
+    for first, second in zip(*placements, strict=True):
+        np.testing.assert_array_equal(first, second)
+    assert len(placements[0][1]) == 1  # the late row
+    assert len(placements[0][0]) > 90  # the gaps
 
 
 def test_results_come_in_the_order_of_the_items_and_few_are_fetched_ahead():
@@ -253,9 +253,9 @@ def test_results_come_in_the_order_of_the_items_and_few_are_fetched_ahead():
             fetched.append(n)
             yield n
 
-    found = map_in_order(lambda n: n * n, items(), workers=2)
-    assert next(found) == 0
+    results = map_in_order(lambda n: n * n, items(), workers=2)
+    assert next(results) == 0
     assert len(fetched) <= 5
-    assert list(found) == [n * n for n in range(1, 50)]
+    assert list(results) == [n * n for n in range(1, 50)]
     with pytest.raises(ZeroDivisionError):
         list(map_in_order(lambda n: 1 / n, [2, 1, 0, 3]))

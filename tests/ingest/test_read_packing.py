@@ -149,13 +149,13 @@ CASES = {
 @pytest.mark.parametrize("form", ["NETCDF4", "NETCDF3_CLASSIC", "hdf5"])
 @pytest.mark.parametrize("case", list(CASES))
 def test_packed_numbers_are_decoded_by_the_cf_conventions(tmp_path, case, form):
-    stored, attributes, wanted = CASES[case]
+    stored, attributes, expected = CASES[case]
     if (form, case) == ("NETCDF3_CLASSIC", "signed"):
         pytest.skip("this format has no unsigned type")
     path = tmp_path / ("log.h5" if form == "hdf5" else "log.nc")
     raw = read_log(write(path, stored, dict(attributes), form=form))
-    np.testing.assert_allclose(raw.rate.values[0], wanted, rtol=1e-12, atol=0.0)
-    assert raw.attrs["unreadable_cells"] == np.isnan(wanted).sum()
+    np.testing.assert_allclose(raw.rate.values[0], expected, rtol=1e-12, atol=0.0)
+    assert raw.attrs["unreadable_cells"] == np.isnan(expected).sum()
 
 
 @pytest.mark.filterwarnings("ignore:variable 'gyro_x' has multiple fill values")
@@ -196,9 +196,9 @@ TIMES = {
 def test_packed_stamps_keep_every_row(tmp_path, case, suffix):
     attributes, step, start = TIMES[case]
     raw = read_log(write(tmp_path / f"log{suffix}", COUNTS, {}, time=dict(attributes)))
-    wanted = np.rint((start + step * np.arange(ROWS)) * 1e9)
+    expected = np.rint((start + step * np.arange(ROWS)) * 1e9)
     np.testing.assert_allclose(
-        raw.time.values.astype(np.int64), wanted, atol=300.0 if start > 1e9 else 1.0, rtol=0.0
+        raw.time.values.astype(np.int64), expected, atol=300.0 if start > 1e9 else 1.0, rtol=0.0
     )
 
 
@@ -267,10 +267,10 @@ def write_regular(
     ],
 )
 def test_regular_log_of_another_program_is_decoded_like_a_raw_log(tmp_path, case, suffix):
-    stored, attributes, wanted = CASES[case]
+    stored, attributes, expected = CASES[case]
     log = read_log(write_regular(tmp_path / f"log{suffix}", stored, attributes))
-    np.testing.assert_allclose(log.rate.values[0], wanted, rtol=1e-12)
-    np.testing.assert_allclose(log.rate[:, 7:11].values[0], wanted[7:11], rtol=1e-12)
+    np.testing.assert_allclose(log.rate.values[0], expected, rtol=1e-12)
+    np.testing.assert_allclose(log.rate[:, 7:11].values[0], expected[7:11], rtol=1e-12)
     assert log.time.values[5] == np.datetime64("2026-01-01T00:00:00.05")
 
 

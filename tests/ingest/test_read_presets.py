@@ -216,10 +216,10 @@ def test_a_file_of_a_known_program_needs_no_options(tmp_path: Path, name: str) -
     sample = SAMPLES[name]
     path = tmp_path / sample.file
     path.write_text(sample.text)
-    told = f"(preset {key_of(name)})"
-    assert any(told in note for note in scan_file(path).notes)
+    note_text = f"(preset {key_of(name)})"
+    assert any(note_text in note for note in scan_file(path).notes)
     raw = read_log(path, rate=100.0 if name == "x-io, x-IMU" else None)
-    assert any(told in note for note in raw.attrs["notes"])
+    assert any(note_text in note for note in raw.attrs["notes"])
     assert raw.attrs["unreadable_rows"] == 0
     assert raw.axis.values.tolist() == ["x", "y", "z"]
     np.testing.assert_allclose(raw.rate.values[:, 0], sample.rate, rtol=1e-12)

@@ -215,8 +215,8 @@ def test_whole_numbers_become_exact_stamps_or_nat(unit):
         [0, 1, -1, 2**31, -(2**40), 62_900_000_000, 2**62, -(2**62), 2**63 - 1, -(2**63) + 1]
     )
     zero = parsed.epoch or 0
-    found = integers_to_ns(counts, parsed, 0)
-    for count, stamp in zip(counts.tolist(), found.tolist(), strict=True):
+    stamps = integers_to_ns(counts, parsed, 0)
+    for count, stamp in zip(counts.tolist(), stamps.tolist(), strict=True):
         exact = count * parsed.ns + zero
         if stamp != NAT:
             assert abs(stamp - exact) <= 0.5

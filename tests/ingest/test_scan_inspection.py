@@ -139,11 +139,11 @@ def test_the_printed_command_makes_a_product(
     assert call(*next_command(shown), "--quiet-progress") == 0
     capsys.readouterr()
     with open_product("product.nc") as product:
-        found = product.window_mean.mean("time").values
+        means = product.window_mean.mean("time").values
     factor = {"deg/s": 3600.0, "rad/s": 3600.0 * DEG_PER_RAD, "deg/h": 1.0}[unit]
     expected = np.array([axis.mean() for axis in gyro]) * factor
     scatter = max(axis.std() for axis in gyro) * factor / np.sqrt(ROWS)
-    np.testing.assert_allclose(found, expected, atol=5 * scatter)
+    np.testing.assert_allclose(means, expected, atol=5 * scatter)
 
 
 def test_readable_log_prints_its_table_and_the_next_command(
@@ -215,8 +215,8 @@ def test_angles_get_a_kind_in_the_command_and_keep_their_unit(
     assert call(*words, "--quiet-progress") == 0
     capsys.readouterr()
     with open_product("product.nc") as product:
-        found = float(product.window_mean.mean())
-    assert found == pytest.approx(3600 * GX.mean(), abs=5 * 3600 * GX.std() / np.sqrt(ROWS))
+        mean = float(product.window_mean.mean())
+    assert mean == pytest.approx(3600 * GX.mean(), abs=5 * 3600 * GX.std() / np.sqrt(ROWS))
 
 
 def test_a_header_with_an_equals_sign_can_be_mapped(tmp_path: Path, monkeypatch, capsys) -> None:
@@ -338,6 +338,6 @@ def test_the_unit_is_guessed_from_the_noise_and_the_rotation_of_the_earth(
         scatter = walk * 60 * np.sqrt(rate) / factors[unit]
         top = abs(means).max() + 5 * scatter
         right += unit == max(
-            factors, key=lambda one: rate_plausibility(means, scatter, top, factors[one], rate)
+            factors, key=lambda name: rate_plausibility(means, scatter, top, factors[name], rate)
         )
     assert right >= 0.85 * 300

@@ -110,21 +110,21 @@ def test_the_cases_hold_missing_values():
 
 def test_xarray_alone(case):
     made, path, *_ = case
-    with xr.open_dataset(path) as seen:
+    with xr.open_dataset(path) as opened:
         for name in names(made):
             if made[name].dtype.kind == "M":
                 np.testing.assert_array_equal(
-                    disk_order(seen[name]).astype("M8[ns]"), disk_order(made[name])
+                    disk_order(opened[name]).astype("M8[ns]"), disk_order(made[name])
                 )
             else:
-                np.testing.assert_array_equal(disk_order(seen[name]), disk_order(made[name]))
+                np.testing.assert_array_equal(disk_order(opened[name]), disk_order(made[name]))
 
 
 def test_xarray_opens_zarr(case, tmp_path):
     made, _, source, options = case
-    with xr.open_zarr(to_zarr(source, tmp_path / "case.zarr", **options)) as seen:
+    with xr.open_zarr(to_zarr(source, tmp_path / "case.zarr", **options)) as opened:
         for name in names(made):
-            np.testing.assert_array_equal(disk_order(seen[name]), disk_order(made[name]))
+            np.testing.assert_array_equal(disk_order(opened[name]), disk_order(made[name]))
 
 
 def test_zarr_alone(case, tmp_path):
@@ -134,15 +134,15 @@ def test_zarr_alone(case, tmp_path):
     group = zarr.open_group(to_zarr(source, tmp_path / "case.zarr", **options), mode="r")
     for name in names(made):
         if made[name].dtype.kind == "f":
-            found = group[name][:]
+            values = group[name][:]
             if "scale_factor" in group[name].attrs:
-                assert found.dtype.kind == "i"
-                found = np.where(
-                    found == group[name].fill_value,
+                assert values.dtype.kind == "i"
+                values = np.where(
+                    values == group[name].fill_value,
                     np.nan,
-                    found * group[name].attrs["scale_factor"],
+                    values * group[name].attrs["scale_factor"],
                 )
-            np.testing.assert_array_equal(found, disk_order(made[name]))
+            np.testing.assert_array_equal(values, disk_order(made[name]))
             assert group[name].attrs.get("units", "") == DEGREES_AND_HOURS.get(
                 name, group[name].attrs.get("units", "")
             )
@@ -154,15 +154,15 @@ def test_netcdf4_python_alone(case):
     made, path, *_ = case
     with netCDF4.Dataset(path) as file:
         for name in names(made):
-            stored, wanted = file[name][:], disk_order(made[name])
-            if wanted.dtype.kind == "f":
-                np.testing.assert_array_equal(np.ma.getmaskarray(stored), np.isnan(wanted))
-                np.testing.assert_array_equal(stored.compressed(), wanted[np.isfinite(wanted)])
-            elif wanted.dtype.kind in "iu":
+            stored, expected = file[name][:], disk_order(made[name])
+            if expected.dtype.kind == "f":
+                np.testing.assert_array_equal(np.ma.getmaskarray(stored), np.isnan(expected))
+                np.testing.assert_array_equal(stored.compressed(), expected[np.isfinite(expected)])
+            elif expected.dtype.kind in "iu":
                 assert not np.ma.is_masked(stored)
-                np.testing.assert_array_equal(stored, wanted)
-            elif wanted.dtype.kind == "U":
-                assert [str(text) for text in np.ravel(stored)] == wanted.ravel().tolist()
+                np.testing.assert_array_equal(stored, expected)
+            elif expected.dtype.kind == "U":
+                assert [str(text) for text in np.ravel(stored)] == expected.ravel().tolist()
         for name in DEGREES_AND_HOURS.keys() & set(names(made)):
             assert file[name].units == DEGREES_AND_HOURS[name]
 
@@ -192,29 +192,31 @@ def test_ncdump(case):
     ).stdout
     head, data = text.split("\ndata:\n")
     for name in names(made):
-        (found,) = re.findall(rf"^ {name} =\s(.*?) ;$", data, re.M | re.S)
-        wanted = disk_order(made[name]).ravel()
-        if wanted.dtype.kind == "f":
+        (text_values,) = re.findall(rf"^ {name} =\s(.*?) ;$", data, re.M | re.S)
+        expected = disk_order(made[name]).ravel()
+        if expected.dtype.kind == "f":
             factor = [
                 float(number)
                 for number in re.findall(rf"^\t\t{name}:scale_factor = (\S+) ;", head, re.M)
             ]
             numbers = [
                 np.nan if number == "_" else float(number)
-                for number in re.split(r",\s*", found.strip())
+                for number in re.split(r",\s*", text_values.strip())
             ]
-            np.testing.assert_array_equal(np.array(numbers) * (factor or [1.0])[0], wanted)
-        elif wanted.dtype.kind in "iu":
-            assert [int(number) for number in re.split(r",\s*", found.strip())] == wanted.tolist()
-        elif wanted.dtype.kind == "M":
+            np.testing.assert_array_equal(np.array(numbers) * (factor or [1.0])[0], expected)
+        elif expected.dtype.kind in "iu":
+            assert [
+                int(number) for number in re.split(r",\s*", text_values.strip())
+            ] == expected.tolist()
+        elif expected.dtype.kind == "M":
             (unit,) = re.findall(
                 r'time(?:_start)?:units = "(\w+) since 1970-01-01T00:00:00"', head
             )[:1]
-            assert [int(number) for number in re.split(r",\s*", found.strip())] == since_1970(
-                wanted, unit
+            assert [int(number) for number in re.split(r",\s*", text_values.strip())] == since_1970(
+                expected, unit
             ).tolist()
-        elif wanted.dtype.kind == "U":
-            assert re.findall(r'"(.*?)"', found) in (wanted.tolist(), ["".join(wanted)])
+        elif expected.dtype.kind == "U":
+            assert re.findall(r'"(.*?)"', text_values) in (expected.tolist(), ["".join(expected)])
     for name in DEGREES_AND_HOURS.keys() & set(names(made)):
         assert f'{name}:units = "{DEGREES_AND_HOURS[name]}"' in head
 
@@ -251,19 +253,19 @@ def test_octave(case, octave, tmp_path):
     done = run_octave(octave, str(HERE / "read_all.m"), str(path), str(tmp_path / "seen.txt"))
     assert (tmp_path / "seen.txt").exists(), done.stderr
     lines = (tmp_path / "seen.txt").read_text().splitlines()
-    seen = {
+    variables = {
         head.split("|")[0]: (*head.split("|")[1:], values)
         for head, values in zip(lines[::2], lines[1::2], strict=True)
     }
-    assert set(seen) == set(names(made))
-    for name, (kind, units, text) in seen.items():
-        wanted = disk_order(made[name]).ravel()
+    assert set(variables) == set(names(made))
+    for name, (kind, units, text) in variables.items():
+        expected = disk_order(made[name]).ravel()
         assert units == DEGREES_AND_HOURS.get(name, units)
-        if wanted.dtype.kind == "f":
+        if expected.dtype.kind == "f":
             assert kind == "double"
-            np.testing.assert_array_equal(np.array(text.split(), dtype=float), wanted)
-        elif wanted.dtype.kind == "U":
-            assert text.replace("\0", "") == "".join(wanted)  # strings are padded to one length
+            np.testing.assert_array_equal(np.array(text.split(), dtype=float), expected)
+        elif expected.dtype.kind == "U":
+            assert text.replace("\0", "") == "".join(expected)  # strings are padded to one length
         else:
             numbers = (
                 [
@@ -274,8 +276,8 @@ def test_octave(case, octave, tmp_path):
                 else None
             )
             numbers = numbers or [int(number) for number in text.split()]
-            unit = (units or (seen.get("time") or seen["time_start"])[1]).split(" ")[0]
+            unit = (units or (variables.get("time") or variables["time_start"])[1]).split(" ")[0]
             assert (
                 numbers
-                == (since_1970(wanted, unit) if wanted.dtype.kind == "M" else wanted).tolist()
+                == (since_1970(expected, unit) if expected.dtype.kind == "M" else expected).tolist()
             )

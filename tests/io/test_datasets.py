@@ -70,8 +70,8 @@ def test_comes_back_as_it_was(tmp_path, kind, write):
     before = KINDS[kind]()
     with OPEN[kind](write(before, tmp_path / "it")) as after:
         assert_same(before, after)
-        again = write(after, tmp_path / "again")
-        with OPEN[kind](again) as twice:
+        copy = write(after, tmp_path / "again")
+        with OPEN[kind](copy) as twice:
             assert_same(before, twice)
             assert (
                 len(twice.attrs["history"].splitlines())
@@ -370,12 +370,12 @@ def test_foreign_and_damaged_files(tmp_path, files):
         ):
             open_product(tmp_path / name)
     xr.Dataset({"sst": ("x", [1.0])}).to_netcdf(tmp_path / "sea.nc")
-    for opener, what in (
+    for opener, kind in (
         (open_product, "a product"),
         (open_surface, "a DAVAR surface"),
         (open_log, "a regular log"),
     ):
-        with pytest.raises(FormatError, match=f"sea.nc: does not hold {what}"):
+        with pytest.raises(FormatError, match=f"sea.nc: does not hold {kind}"):
             opener(tmp_path / "sea.nc")
     with pytest.raises(FormatError, match=r"nothing\.nc: there is no such file"):
         open_log(tmp_path / "nothing.nc")
@@ -454,29 +454,30 @@ def test_chunks_that_threads_compress_are_those_of_the_library(tmp_path, monkeyp
     by_threads = to_netcdf(
         product.chunk({"axis": 1, "time": 3}) if lazy else product, tmp_path / "threads.nc"
     )
-    with netCDF4.Dataset(by_library) as wanted, netCDF4.Dataset(by_threads) as found:
-        assert set(found.variables) == set(wanted.variables)
-        for name, one in wanted.variables.items():
-            other = found[name]
-            assert str({key: one.getncattr(key) for key in one.ncattrs()}) == str(
+    with netCDF4.Dataset(by_library) as expected, netCDF4.Dataset(by_threads) as threaded:
+        assert set(threaded.variables) == set(expected.variables)
+        for name, reference in expected.variables.items():
+            other = threaded[name]
+            assert str({key: reference.getncattr(key) for key in reference.ncattrs()}) == str(
                 {key: other.getncattr(key) for key in other.ncattrs()}
             )
-            assert (one.dtype, one.dimensions, one.chunking()) == (
+            assert (reference.dtype, reference.dimensions, reference.chunking()) == (
                 other.dtype,
                 other.dimensions,
                 other.chunking(),
             )
-            assert one.filters() == other.filters()
-    several = 0
-    with h5py.File(by_library) as wanted, h5py.File(by_threads) as found:
+            assert reference.filters() == other.filters()
+    multichunk = 0
+    with h5py.File(by_library) as expected, h5py.File(by_threads) as threaded:
         for name in product.data_vars:
-            one, other = wanted[name].id, found[name].id
-            if wanted[name].chunks is None:
+            reference, other = expected[name].id, threaded[name].id
+            if expected[name].chunks is None:
                 continue
-            several += one.get_num_chunks() > 1
-            assert one.get_num_chunks() == other.get_num_chunks()
+            multichunk += reference.get_num_chunks() > 1
+            assert reference.get_num_chunks() == other.get_num_chunks()
             for place in (
-                one.get_chunk_info(number).chunk_offset for number in range(one.get_num_chunks())
+                reference.get_chunk_info(number).chunk_offset
+                for number in range(reference.get_num_chunks())
             ):
-                assert one.read_direct_chunk(place) == other.read_direct_chunk(place)
-    assert several > 5
+                assert reference.read_direct_chunk(place) == other.read_direct_chunk(place)
+    assert multichunk > 5

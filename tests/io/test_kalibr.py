@@ -64,13 +64,13 @@ def parse(path) -> dict:
 
 
 def test_units_are_those_worked_out_by_hand(product):
-    found = kalibr_noise(product)["x"]
+    noise = kalibr_noise(product)["x"]
     for key, value in {
         "gyroscope_noise_density": 2.0,
         "gyroscope_random_walk": 3.0,
         "gyroscope_bias_instability": 5.0,
     }.items():
-        assert found[key].value == pytest.approx(value * BY_HAND[key], rel=1e-12)
+        assert noise[key].value == pytest.approx(value * BY_HAND[key], rel=1e-12)
     assert KEYS["gyroscope_random_walk"][2] == "rad/s^2/sqrt(Hz)"
 
 
@@ -192,13 +192,13 @@ class TestAccelerometers:
         log = make_accelerometers()
         product = gyrostab.fit_noise(gyrostab.davar(log, window="1min"))
         text = parse(to_kalibr(product, tmp_path / "imu.yaml", log=log))
-        found = {
+        densities = {
             axis: values.get("accelerometer_noise_density") for axis, values in text["axes"].items()
         }
-        assert float(found["x"]) == pytest.approx(1e-4, rel=0.02)
-        assert float(found["z"]) == pytest.approx(2e-4, rel=0.02)
-        assert found["y"] is None
-        assert text["accelerometer_noise_density"] == found["z"]
+        assert float(densities["x"]) == pytest.approx(1e-4, rel=0.02)
+        assert float(densities["z"]) == pytest.approx(2e-4, rel=0.02)
+        assert densities["y"] is None
+        assert text["accelerometer_noise_density"] == densities["z"]
         assert text["accelerometer_random_walk_meaning"] == "upper_limit_only"
 
     def test_random_walk_is_that_of_the_samples(self):
@@ -210,8 +210,8 @@ class TestAccelerometers:
             np.zeros(40_000), rate=rate, unit="deg/h", channels={"accel_y": (acceleration, "g")}
         )
         product = xr.Dataset(attrs={"window_s": 1000.0, "step_s": 500.0})
-        found = convert_terms(fit_accelerometers(log, product), ACCELEROMETER_KEYS)
-        assert found["y"]["accelerometer_random_walk"].value == pytest.approx(walk, rel=0.05)
+        terms = convert_terms(fit_accelerometers(log, product), ACCELEROMETER_KEYS)
+        assert terms["y"]["accelerometer_random_walk"].value == pytest.approx(walk, rel=0.05)
 
     def test_slow_or_missing_channels_are_named(self, product, tmp_path):
         log = make_accelerometers(samples=2_000).drop_vars(["accel_x", "accel_z"])

@@ -52,9 +52,9 @@ def test_figures_show_names_and_units_as_they_are(tmp_path):
     formula = FORMULA
     log = formula_log(formula)
     product = fit_noise(davar(log, window="1min", step="20s", taus=8)).compute()
-    found = correlate(product, channel=formula, max_lag="20s")
+    correlation = correlate(product, channel=formula, max_lag="20s")
     figures = [
-        plot.plot_correlation(found),
+        plot.plot_correlation(correlation),
         plot.plot_signal(log),
         plot.plot_adev(product, formula),
     ]

@@ -104,8 +104,8 @@ def test_what_is_never_missing_is_not(product):
                 assert not np.ma.is_masked(variable[:]), variable.name
 
 
-def snippet(text: str, language: str, what: str = "product.nc") -> str:
-    (code,) = (code for code in re.findall(rf"```{language}\n(.*?)```", text, re.S) if what in code)
+def snippet(text: str, language: str, mark: str = "product.nc") -> str:
+    (code,) = (code for code in re.findall(rf"```{language}\n(.*?)```", text, re.S) if mark in code)
     assert len(code.splitlines()) == 3
     return code
 
@@ -114,9 +114,9 @@ def wanted(path: Path) -> float:
     import netCDF4
 
     with netCDF4.Dataset(path) as file:
-        seen = file["observable"][0, 1] == OBSERVABLE.index("observed")
-        assert 0 < seen.sum() < seen.size
-        return float(np.median(file["N"][0][seen].compressed()))
+        is_observed = file["observable"][0, 1] == OBSERVABLE.index("observed")
+        assert 0 < is_observed.sum() < is_observed.size
+        return float(np.median(file["N"][0][is_observed].compressed()))
 
 
 @pytest.fixture

@@ -68,15 +68,17 @@ def open_plainly(path) -> xr.Dataset:
 def test_a_log_with_stamps_comes_back(tmp_path, form, lazy, name):
     log = LOGS[name]()
     path = WRITERS[form](log.chunk(time=997) if lazy else log, tmp_path / f"log.{form}")
-    wanted = as_log(log)
+    expected = as_log(log)
     with open_log(path) as back:
         assert isinstance(back.xindexes["time"], TimeGridIndex)
-        xr.testing.assert_equal(back.load(), wanted)
-        kept = {key: value for key, value in back.attrs.items() if key not in ADDED}
-        assert kept == {key: value for key, value in wanted.attrs.items() if key not in ADDED}
-        for name, variable in wanted.variables.items():
-            units, found = (item.attrs.get("units") for item in (variable, back[name]))
-            assert units == found
+        xr.testing.assert_equal(back.load(), expected)
+        attributes = {key: value for key, value in back.attrs.items() if key not in ADDED}
+        assert attributes == {
+            key: value for key, value in expected.attrs.items() if key not in ADDED
+        }
+        for name, variable in expected.variables.items():
+            units, stored_units = (item.attrs.get("units") for item in (variable, back[name]))
+            assert units == stored_units
             assert back[name].encoding.get("scale_factor") == variable.encoding.get("scale_factor")
     with open_plainly(path) as plain:
         signal = "angle" if "angle" in log else "rate"
@@ -92,11 +94,11 @@ def test_a_log_with_stamps_comes_back(tmp_path, form, lazy, name):
 def test_logs_with_and_without_stamps_are_the_same(tmp_path, form):
     log = synthetic.log()
     with (
-        open_log(WRITERS[form](log, tmp_path / f"with.{form}", stamps=True)) as one,
+        open_log(WRITERS[form](log, tmp_path / f"with.{form}", stamps=True)) as stamped,
         open_log(WRITERS[form](log, tmp_path / f"without.{form}", stamps=False)) as other,
     ):
-        xr.testing.assert_equal(one.load(), other.load())
-        assert {**one.attrs, "date_created": "", "history": ""} == {
+        xr.testing.assert_equal(stamped.load(), other.load())
+        assert {**stamped.attrs, "date_created": "", "history": ""} == {
             **other.attrs,
             "date_created": "",
             "history": "",
@@ -108,12 +110,12 @@ def test_long_logs_have_no_stamps_unless_asked(tmp_path, form, monkeypatch):
     monkeypatch.setattr("gyrostab.io.datasets.MAX_STAMPED_SAMPLES", 3000)
     log = synthetic.log(samples=3000)
     assert log.sizes["time"] < MAX_STAMPED_SAMPLES
-    for stamps, size, wanted in ((None, 3000, False), (None, 2999, True), (True, 3000, True)):
+    for stamps, size, has_stamps in ((None, 3000, False), (None, 2999, True), (True, 3000, True)):
         part = log.isel(time=slice(size))
         path = WRITERS[form](part, tmp_path / f"log.{form}", overwrite=True, stamps=stamps)
         with open_plainly(path) as plain:
-            assert ("time" in plain.variables) is wanted
-            assert ("time_start" in plain.variables) is not wanted
+            assert ("time" in plain.variables) is has_stamps
+            assert ("time_start" in plain.variables) is not has_stamps
 
 
 @pytest.mark.parametrize(
@@ -153,8 +155,8 @@ def test_stamps_that_xarray_changed_are_read(tmp_path, form, change):
     path, changed = tmp_path / f"changed.{form}", changed.drop_encoding()
     changed.to_zarr(path) if form == "zarr" else changed.to_netcdf(path)
     with open_log(path) as back:
-        found = back.sel(time=changed.time.values)
-        np.testing.assert_array_equal(found.rate.values, changed.rate.values)
+        selection = back.sel(time=changed.time.values)
+        np.testing.assert_array_equal(selection.rate.values, changed.rate.values)
         assert back.time.values[[0, -1]].tolist() == changed.time.values[[0, -1]].tolist()
 
 
@@ -190,8 +192,8 @@ def test_davar_takes_what_xarray_opens(tmp_path):
     log = counts_log()
     path = to_netcdf(log, tmp_path / "log.nc")
     with xr.open_dataset(path) as plain, open_log(path) as own:
-        one, other = (gyrostab.davar(data, window="5s") for data in (plain, own))
-    xr.testing.assert_equal(one, other)
+        surface, other = (gyrostab.davar(data, window="5s") for data in (plain, own))
+    xr.testing.assert_equal(surface, other)
 
 
 def test_a_plain_plot_of_xarray_is_right(tmp_path, monkeypatch):

@@ -109,7 +109,7 @@ def propagate(path: Path, inclination: float = 40.0, azimuth: float = 30.0) -> d
 def test_welleng_propagates_stationary_terms_as_by_hand(axes, tmp_path):
     """A constant azimuth error moves the end by it times the horizontal length (1000 m sin I)."""
     model = to_iscwsa(make_product(axes), tmp_path / "tool.json")
-    found = propagate(tmp_path / "tool.json")
+    errors = propagate(tmp_path / "tool.json")
     inclination, azimuth = math.radians(40.0), math.radians(30.0)
     north = 15.041 * math.cos(math.radians(60.0))
     for term in model.terms:
@@ -120,9 +120,9 @@ def test_welleng_propagates_stationary_terms_as_by_hand(axes, tmp_path):
                 "GXYZ-ZB": math.sin(azimuth) * math.sin(inclination),
             }.get(term.code, math.cos(azimuth))
             expected = term.value * weight / north * 1000.0 * math.sin(inclination)
-            assert found[term.code] == pytest.approx(expected, rel=0.01), term.code
+            assert errors[term.code] == pytest.approx(expected, rel=0.01), term.code
         elif term.code.endswith("RN"):  # independent at 100 stations
-            assert found[term.code] < 0.2 * term.value / north * 1000.0
+            assert errors[term.code] < 0.2 * term.value / north * 1000.0
 
 
 @pytest.mark.parametrize(
@@ -138,15 +138,15 @@ def test_welleng_propagates_continuous_terms_as_by_hand(axes, name, factor, tmp_
     """The azimuth error grows as GD t and GRW sqrt(t), over the inclination's sine or cosine."""
     speed = 0.5
     model = to_iscwsa(make_product(axes), tmp_path / "tool.json", running_speed=speed)
-    found = propagate(tmp_path / "tool.json")
+    errors = propagate(tmp_path / "tool.json")
     values = {term.code: math.radians(term.value) for term in model.terms}
     hours = np.linspace(0.0, 1000.0, 101) / speed / 3600.0
     horizontal = 1000.0 * math.sin(math.radians(40.0))
     drift, walk = (np.trapezoid(error, hours) / hours[-1] for error in (hours, np.sqrt(hours)))
-    assert found[f"{name}-GD"] == pytest.approx(
+    assert errors[f"{name}-GD"] == pytest.approx(
         factor * values[f"{name}-GD"] * drift * horizontal, rel=0.02
     )
-    assert found[f"{name}-GRW"] == pytest.approx(
+    assert errors[f"{name}-GRW"] == pytest.approx(
         factor * values[f"{name}-GRW"] * walk * horizontal, rel=0.02
     )
 
@@ -172,13 +172,13 @@ class TestWitsml:
     def test_terms_with_units(self, tmp_path):
         root = self.make(tmp_path, running_speed=0.5)
         expected = {term.code: term.value for term in survey_terms(make_product("xy")).terms}
-        found = {
+        magnitudes = {
             value.find(f"{WITSML}ErrorTerm/{COMMON}Title").text: value.find(f"{WITSML}Magnitude")
             for value in root.iter(f"{WITSML}ErrorTermValue")
         }
-        assert {code: float(magnitude.text) for code, magnitude in found.items()} == expected
-        assert found["GXY-RN"].get("uom") == "dega/h"
-        assert found["GXY-GRW"].get("uom") == "dega/sqrt(h)"
+        assert {code: float(magnitude.text) for code, magnitude in magnitudes.items()} == expected
+        assert magnitudes["GXY-RN"].get("uom") == "dega/h"
+        assert magnitudes["GXY-GRW"].get("uom") == "dega/sqrt(h)"
 
     def test_names_are_escaped(self, tmp_path):
         assert "a & b <c>.csv" in self.make(tmp_path).find(f"{WITSML}Source").text
@@ -208,8 +208,10 @@ class TestWitsml:
         root = self.make(tmp_path, running_speed=speed)
         config = ParserConfig(fail_on_unknown_properties=True, fail_on_converter_warnings=True)
         model = XmlParser(config=config).from_path(tmp_path / "tool.xml", witsml.ToolErrorModel)
-        again = ET.fromstring(XmlSerializer().render(model))
-        assert [element.tag for element in again.iter()] == [element.tag for element in root.iter()]
+        reread = ET.fromstring(XmlSerializer().render(model))
+        assert [element.tag for element in reread.iter()] == [
+            element.tag for element in root.iter()
+        ]
         assert list(find_missing(model)) == []
 
 

@@ -196,8 +196,8 @@ def test_g_dependent_terms_come_from_the_diagnosis():
         make_effect(["z"], z=(0.6, 0.5, 0.7)),
     )
     model = survey_terms(make_product(), diagnosis=diagnosis)
-    found = {term.code: term for term in model.terms if term.unit == "deg/h/g"}
-    assert {code: term.value for code, term in found.items()} == pytest.approx(
+    terms = {term.code: term for term in model.terms if term.unit == "deg/h/g"}
+    assert {code: term.value for code, term in terms.items()} == pytest.approx(
         {
             "GXYZ-XYG1": 0.5,
             "GXYZ-XYG2": 0.1,
@@ -206,16 +206,16 @@ def test_g_dependent_terms_come_from_the_diagnosis():
             "GXYZ-ZG2": 0.6,
         }
     )
-    assert (found["GXYZ-XYG1"].low, found["GXYZ-XYG1"].high) == (0.3, 0.7)
-    assert (found["GXYZ-XYG2"].low, found["GXYZ-XYG2"].high) == (0.0, 0.3)
+    assert (terms["GXYZ-XYG1"].low, terms["GXYZ-XYG1"].high) == (0.3, 0.7)
+    assert (terms["GXYZ-XYG2"].low, terms["GXYZ-XYG2"].high) == (0.0, 0.3)
     assert any("earth_rate" in note for note in model.notes)
 
 
 def test_limit_of_a_diagnosis_is_the_limit_of_all_g_dependent_terms():
     model = survey_terms(make_product("xy"), diagnosis=make_diagnosis(limit=0.02))
-    found = [term for term in model.terms if term.unit == "deg/h/g"]
-    assert [term.code for term in found] == ["GXY-G1", "GXY-G2", "GXY-G3", "GXY-G4"]
-    assert {(term.value, term.status) for term in found} == {(0.02, "upper_limit_only")}
+    terms = [term for term in model.terms if term.unit == "deg/h/g"]
+    assert [term.code for term in terms] == ["GXY-G1", "GXY-G2", "GXY-G3", "GXY-G4"]
+    assert {(term.value, term.status) for term in terms} == {(0.02, "upper_limit_only")}
     missing = survey_terms(make_product("xy"), diagnosis=make_diagnosis())
     assert any("no acceleration channel" in note for note in missing.notes)
 

@@ -35,8 +35,8 @@ PARTS = 5
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
     """Start a scheduler and two workers; see `start_cluster`."""
-    with start_cluster(tmp_path_factory.mktemp("cluster"), workers=2) as found:
-        yield found
+    with start_cluster(tmp_path_factory.mktemp("cluster"), workers=2) as scheduler:
+        yield scheduler
 
 
 @contextmanager
@@ -80,8 +80,8 @@ def start_cluster(folder: Path, *, workers: int) -> Iterator[tuple[str, subproce
         _wait_for(where)
         with distributed.Client(scheduler_file=str(where)) as client:
             client.wait_for_workers(workers, timeout=60)
-            found = client.scheduler.address
-        yield found, process
+            address = client.scheduler.address
+        yield address, process
 
 
 @pytest.fixture
@@ -151,10 +151,12 @@ def test_two_worker_processes_make_the_same_bytes(address, log, whole, tmp_path)
     assert (tmp_path / "product.nc").read_bytes() == whole
     assert [path.name for path in tmp_path.iterdir()] == ["product.nc"]
     with distributed.Client(address) as client:
-        seen = client.run(_what_a_worker_knows)
-        assert len(seen) == 2
-        assert all("gyrostab.allan.davar" in loaded for loaded, _ in seen.values())
-        assert all(threads is None for _, threads in seen.values()), "a kernel has started threads"
+        workers = client.run(_what_a_worker_knows)
+        assert len(workers) == 2
+        assert all("gyrostab.allan.davar" in loaded for loaded, _ in workers.values())
+        assert all(threads is None for _, threads in workers.values()), (
+            "a kernel has started threads"
+        )
 
 
 def _what_a_worker_knows():
@@ -188,10 +190,10 @@ def test_zarr_store_and_text_on_workers(address, tmp_path):
             )
             made[source.suffix, scheduler] = open_arrays(output)
     for suffix in (".zarr", ".csv"):
-        one, other = made[suffix, "threads"], made[suffix, address]
-        assert one.keys() == other.keys()
-        for name in one:
-            np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+        local, other = made[suffix, "threads"], made[suffix, address]
+        assert local.keys() == other.keys()
+        for name in local:
+            np.testing.assert_array_equal(local[name], other[name], err_msg=name)
 
 
 def open_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -244,7 +246,7 @@ def test_what_is_sent_is_small_whatever_the_length(log, monkeypatch, tmp_path):
         del sent[:]
         run([path], tmp_path / f"{samples}.nc", windows=WINDOW, scheduler="processes")
         sizes[samples] = list(sent)
-    assert [len(found) for found in sizes.values()] == [1, PARTS]
+    assert [len(messages) for messages in sizes.values()] == [1, PARTS]
     assert max(sizes[1_270_000]) <= max(sizes[130_000]) + 200
     assert max(sizes[1_270_000]) < 5000
 

@@ -269,7 +269,7 @@ def test_a_store_whose_files_have_other_names_is_listed_again(tmp_path, monkeypa
     assert main(command) == 0
     assert read == []
     chunk = max(
-        (one for one in store.rglob("*") if one.is_file()), key=lambda one: one.stat().st_size
+        (file for file in store.rglob("*") if file.is_file()), key=lambda file: file.stat().st_size
     )
     chunk.rename(chunk.with_name("7"))  # as large, and as old, as before
     assert main(command) == 0
@@ -323,8 +323,8 @@ def memory(archive):
 
 @pytest.mark.parametrize("paths", [["memory://rig"], ["memory://rig/tool*"]])
 def test_a_fleet_of_an_object_store_is_that_of_its_folder(paths, memory, done, tmp_path):
-    found = find_archive(paths)
-    assert [find_url(path) for path in found.files] == [
+    archive = find_archive(paths)
+    assert [find_url(path) for path in archive.files] == [
         "memory://rig/tool 1/README.txt",
         "memory://rig/tool 1/run a/1.nc",
         "memory://rig/tool 1/run a/2.nc",
@@ -396,10 +396,10 @@ def test_a_fleet_is_written_to_an_object_store(archive, done, memory, tmp_path, 
     with open_product(done / "tool 1" / "run a.nc") as expected:
         xr.testing.assert_equal(open_product(f"{output}/run a").load(), expected.load())
         np.testing.assert_array_equal(tree["run a"]["N"].values, expected["N"].values)
-    found = {name.removeprefix("/results/fleet.zarr/") for name in memory.find("/results")}
+    objects = {name.removeprefix("/results/fleet.zarr/") for name in memory.find("/results")}
     tables = {"effects.parquet", "files.parquet", "index.parquet", "trends.parquet"}
     pages = {"index.html", "reports/plotly.js", "reports/run a.html", "reports/run <b>.html"}
-    assert found > tables | pages | {"fleet.json"}
+    assert objects > tables | pages | {"fleet.json"}
     page = memory.cat("/results/fleet.zarr/index.html").decode()
     assert 'href="reports/run%20a.html"' in page
     terms = tmp_path / "tool.csv"

@@ -18,11 +18,14 @@ from tests.support.diagnosed import content
 def write_diagnosis(folder: Path, nats: float | None) -> None:
     """A diagnosis that names the noise of vibration, or nothing."""
     made = content() | {"mismatches": []}
-    (effect,) = (one for one in made["effects"] if one["name"] == "vibration_noise")
+    (effect,) = (effect for effect in made["effects"] if effect["name"] == "vibration_noise")
     effect["held_out_gain"]["nats"] = nats
     folder.mkdir(parents=True)
-    found = {"effects": [effect] if nats else [], "verdict": "explained" if nats else "no mismatch"}
-    (folder / "diagnosis.json").write_text(json.dumps(made | found))
+    findings = {
+        "effects": [effect] if nats else [],
+        "verdict": "explained" if nats else "no mismatch",
+    }
+    (folder / "diagnosis.json").write_text(json.dumps(made | findings))
 
 
 def test_effects_of_one_name_are_combined_over_the_runs_of_a_tool(tmp_path):
@@ -56,18 +59,18 @@ def test_a_damaged_diagnosis_is_that_of_the_run_above_it(text, tmp_path):
     (tmp_path / "a" / "found").mkdir(parents=True)
     (tmp_path / "a" / "log.nc").touch()
     (tmp_path / "a" / "found" / "diagnosis.json").write_text(text)
-    (found,) = find_runs(find_archive([tmp_path]), table)
-    assert found.diagnosis == tmp_path / "a" / "found"
-    assert found.verdict == "not readable"
+    (run,) = find_runs(find_archive([tmp_path]), table)
+    assert run.diagnosis == tmp_path / "a" / "found"
+    assert run.verdict == "not readable"
 
 
 @pytest.mark.parametrize("text", ["{", '{"schema": "hospital/1"}'])
 def test_a_diagnosis_of_another_program_hides_no_logs(tmp_path, text):
     (tmp_path / "diagnosis.json").write_text(text)
     (tmp_path / "log.csv").touch()
-    found = find_archive([tmp_path])
-    assert not found.diagnoses
-    assert [path.name for path in found.files] == ["diagnosis.json", "log.csv"]
+    archive = find_archive([tmp_path])
+    assert not archive.diagnoses
+    assert [path.name for path in archive.files] == ["diagnosis.json", "log.csv"]
 
 
 # ------------------------------------------------------------------------------
@@ -98,25 +101,25 @@ def size_rows(table: pd.DataFrame, values: np.ndarray) -> pd.DataFrame:
 def test_a_coefficient_that_rises_with_age_is_a_trend():
     table = make_runs(np.random.default_rng(1))
     effects = size_rows(table, 2.0 * table["temperature [degC]"])
-    found = find_trends(table, effects).set_index(["quantity", "against"])
-    assert len(found) == 6
-    rising = found.loc[("N_x [deg/sqrt(h)]", "age [d]")]
+    trends = find_trends(table, effects).set_index(["quantity", "against"])
+    assert len(trends) == 6
+    rising = trends.loc[("N_x [deg/sqrt(h)]", "age [d]")]
     assert (rising["runs"], rising["tool"]) == (12, "tool")
     assert rising["low"] < 1.0 / 300.0 < rising["high"]
-    size = found.loc[("bias value x [deg/h]", "temperature [degC]")]
+    size = trends.loc[("bias value x [deg/h]", "temperature [degC]")]
     assert (size["low"], size["slope"], size["high"]) == pytest.approx((2.0, 2.0, 2.0))
-    assert set(found.index[found["p_value"] < 0.05]) == {rising.name, size.name}
+    assert set(trends.index[trends["p_value"] < 0.05]) == {rising.name, size.name}
 
 
 def test_trends_of_noise_are_rarely_found():
     """The probability that chance shows any trend of a fleet is at most 5 %."""
     draw = np.random.default_rng(2)
-    found = 0
+    rises = 0
     for _ in range(60):
         table = make_runs(draw, 8)
         table["N_x [deg/sqrt(h)]"] = draw.standard_cauchy(8)
-        found += bool((find_trends(table, size_rows(table, np.nan))["p_value"] < 0.05).any())
-    assert found <= 8  # of 60 with 5 % each, in all but 1 % of cases
+        rises += bool((find_trends(table, size_rows(table, np.nan))["p_value"] < 0.05).any())
+    assert rises <= 8  # of 60 with 5 % each, in all but 1 % of cases
 
 
 def test_few_or_failed_runs_have_no_trends():

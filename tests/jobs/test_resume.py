@@ -152,8 +152,8 @@ def test_parts_are_cuts_of_the_whole_bit_for_bit():
     assert len(parts) == 3
     assert parts[-1].stop == surface.sizes["time"]
     for part in [*parts, slice(370, 380), slice(0, 1), slice(5, surface.sizes["time"])]:
-        one = davar_part(log.chunk({"time": 77_777}), part=part, **options)
-        xr.testing.assert_identical(one, surface.isel(time=part))
+        cut = davar_part(log.chunk({"time": 77_777}), part=part, **options)
+        xr.testing.assert_identical(cut, surface.isel(time=part))
 
 
 @pytest.mark.parametrize(("hours", "workers"), [(12, 2), (24, 2), (100, 2), (100, 4)])

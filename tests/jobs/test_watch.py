@@ -132,15 +132,15 @@ def test_a_growing_file_gives_the_bits_of_a_run_over_the_whole(rows, whole, tmp_
             with (folder / "log.csv").open("a") as file:
                 file.write(pieces.pop(0))
 
-    seen = follow(folder, tmp_path / "live.zarr", Recorder(grow))
+    recorder = follow(folder, tmp_path / "live.zarr", Recorder(grow))
     assert not pieces
     assert_same_product(tmp_path / "live.zarr", whole)
     with open_product(whole) as product:
-        assert len(seen.windows) == product.sizes["time"]
-        assert [window["time"] for window in seen.windows] == [
+        assert len(recorder.windows) == product.sizes["time"]
+        assert [window["time"] for window in recorder.windows] == [
             str(stamp) for stamp in product["time"].values.astype("datetime64[ms]")
         ]
-    assert any("out of order" in note for note in seen.notes)
+    assert any("out of order" in note for note in recorder.notes)
 
 
 @pytest.mark.slow
@@ -157,13 +157,15 @@ def test_a_file_that_comes_late_changes_earlier_windows(rows, tmp_path):
 
     grow()
     first = follow(folder, tmp_path / "live.zarr")
-    seen = follow(folder, tmp_path / "live.zarr", Recorder(grow=None) if grow() else Recorder(grow))
+    recorder = follow(
+        folder, tmp_path / "live.zarr", Recorder(grow=None) if grow() else Recorder(grow)
+    )
     run(sorted(folder.glob("*.csv")), tmp_path / "run.nc", windows=WINDOWS)
     assert_same_product(tmp_path / "live.zarr", tmp_path / "run.nc")
     assert not parts
-    assert any("late rows changed 1 earlier part" in note for note in seen.notes)
-    assert len({window["time"] for window in first.windows + seen.windows}) == len(
-        first.windows + seen.windows
+    assert any("late rows changed 1 earlier part" in note for note in recorder.notes)
+    assert len({window["time"] for window in first.windows + recorder.windows}) == len(
+        first.windows + recorder.windows
     )
 
 
@@ -174,9 +176,9 @@ def test_standard_input_is_kept_and_continued(tmp_path):
     output = tmp_path / "live.zarr"
     first = follow("-", output, stream=io.BytesIO(text[:cut].encode()))
     second = follow("-", output, stream=io.BytesIO(text[cut:].rstrip().encode()))
-    kept = sorted(rows_folder(output).iterdir())
-    assert "".join(path.read_text() for path in kept) == text[:cut] + HEADER + text[cut:].rstrip()
-    run(kept, tmp_path / "kept.nc", windows=WINDOWS)
+    pieces = sorted(rows_folder(output).iterdir())
+    assert "".join(path.read_text() for path in pieces) == text[:cut] + HEADER + text[cut:].rstrip()
+    run(pieces, tmp_path / "kept.nc", windows=WINDOWS)
     assert_same_product(output, tmp_path / "kept.nc")
     assert first.windows[-1]["time"] < second.windows[0]["time"]
     with pytest.raises(OutputError, match="rows of an earlier live view"):
@@ -195,10 +197,10 @@ def test_lateness_delays_a_window_and_the_end_writes_it(tmp_path):
             if len(sizes) == 1:
                 raise KeyboardInterrupt
 
-    seen = follow(source, tmp_path / "live.zarr", Sizes(), lateness="70s", idle=None)
+    recorder = follow(source, tmp_path / "live.zarr", Sizes(), lateness="70s", idle=None)
     run([source], tmp_path / "run.nc", windows=WINDOWS)
     assert_same_product(tmp_path / "live.zarr", tmp_path / "run.nc")
-    assert len(seen.windows) == 6
+    assert len(recorder.windows) == 6
 
 
 def test_alarms_are_said_once_when_they_begin_and_end(tmp_path):
@@ -208,16 +210,16 @@ def test_alarms_are_said_once_when_they_begin_and_end(tmp_path):
     source = tmp_path / "log.csv"
     source.write_text("time [s],gyro_x [deg/h],temperature [degC]\n" + body)
     alarms = ["N>0.05 deg/sqrt(h)", "x:N>9 deg/sqrt(h)", "temperature<313.65 K", "loss>5%"]
-    seen = follow(source, tmp_path / "a.zarr", alarms=[parse_alarm(text) for text in alarms])
-    said = [(event["state"], event["text"].split(" (", 1)[1]) for event in seen.alarms]
-    assert said == [
+    recorder = follow(source, tmp_path / "a.zarr", alarms=[parse_alarm(text) for text in alarms])
+    events = [(event["state"], event["text"].split(" (", 1)[1]) for event in recorder.alarms]
+    assert events == [
         ("begins", "temperature<313.65 K)"),
         ("ends", "temperature<313.65 K)"),
         ("begins", "N>0.05 deg/sqrt(h))"),
         ("ends", "N>0.05 deg/sqrt(h))"),
     ]
-    again = follow(source, tmp_path / "a.zarr", alarms=[parse_alarm(text) for text in alarms])
-    assert (again.windows, again.alarms) == ([], [])
+    repeated = follow(source, tmp_path / "a.zarr", alarms=[parse_alarm(text) for text in alarms])
+    assert (repeated.windows, repeated.alarms) == ([], [])
 
 
 @pytest.mark.parametrize(

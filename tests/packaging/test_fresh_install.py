@@ -25,12 +25,14 @@ MODEL = "[noise]\nN = 0.006\nB = 0.03\nK = 0.05\n"
 def call(command: str | list[str], folder: Path, bin_folder: Path | None = None) -> str:
     """Run a command outside this environment and return what it prints."""
     path = os.environ["PATH"]
-    kept = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "VIRTUAL_ENV"))}
-    kept["PATH"] = f"{bin_folder}{os.pathsep}{path}" if bin_folder else path
+    environment = {
+        k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "VIRTUAL_ENV"))
+    }
+    environment["PATH"] = f"{bin_folder}{os.pathsep}{path}" if bin_folder else path
     done = subprocess.run(
         command,
         cwd=folder,
-        env=kept,
+        env=environment,
         shell=isinstance(command, str),
         text=True,
         stdout=subprocess.PIPE,

@@ -29,11 +29,11 @@ def recipe() -> dict[str, dict[str, object]]:
 
 
 def test_recipe_requires_what_the_package_requires(project, recipe) -> None:
-    found = [f"python {project['requires-python']}"]
+    requirements = [f"python {project['requires-python']}"]
     for requirement in project["dependencies"]:
         name, versions = re.fullmatch(r"([\w\-\[\]]+)(.*)", requirement).groups()
-        found.append(f"{CONDA_NAMES.get(name, name)} {versions}".strip())
-    assert sorted(recipe["requirements"]["run"]) == sorted(found)
+        requirements.append(f"{CONDA_NAMES.get(name, name)} {versions}".strip())
+    assert sorted(recipe["requirements"]["run"]) == sorted(requirements)
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from tests.support.effect_bench import random_cuts, run, same_whatever_the_cuts
 
 EFFECTS = list(effects().values())
 SIZE, RATE = 3000, 10.0
-each = pytest.mark.parametrize("kind", EFFECTS, ids=lambda kind: kind.name)
+with_each_effect = pytest.mark.parametrize("kind", EFFECTS, ids=lambda kind: kind.name)
 _TYPICAL = {
     "degree_Celsius": 60.0,
     "g": 1.0,
@@ -32,11 +32,11 @@ _TYPICAL = {
 def drivers(kind: type[Effect]) -> dict[str, np.ndarray]:
     """A lively record of each of its channels."""
     t = np.arange(SIZE) / RATE
-    found = {}
+    channels = {}
     for number, (name, unit) in enumerate(kind.channels.items()):
         shape = 1.0 + 0.3 * np.sin(2 * np.pi * t / (40.0 + 7 * number)) + 0.2 * (t > 120.0)
-        found[name] = _TYPICAL[unit] * shape
-    return found
+        channels[name] = _TYPICAL[unit] * shape
+    return channels
 
 
 def options(kind: type[Effect]) -> dict:
@@ -56,7 +56,7 @@ def options(kind: type[Effect]) -> dict:
     }
 
 
-@each
+@with_each_effect
 def test_declares_itself(kind):
     assert is_dataclass(kind)
     assert kind.stage in STAGES
@@ -73,7 +73,7 @@ def test_declares_itself(kind):
         item.check(item.typical, kind.name)
 
 
-@each
+@with_each_effect
 def test_acts_at_its_typical_size(kind):
     given = options(kind)
     changed = run(kind.example(), **given)
@@ -84,7 +84,7 @@ def test_acts_at_its_typical_size(kind):
         assert changed.shape != plain.shape or np.any(changed != plain)
 
 
-@each
+@with_each_effect
 def test_zero_size_changes_nothing(kind):
     given = options(kind)
     off = kind.example().switched_off()
@@ -98,24 +98,26 @@ def test_zero_size_changes_nothing(kind):
         np.testing.assert_array_equal(done, given["signal"])
 
 
-@each
+@with_each_effect
 @pytest.mark.parametrize("seed", [1, 2])
 def test_chunks_do_not_matter(kind, seed):
     same_whatever_the_cuts(kind.example(), random_cuts(seed, SIZE), **options(kind))
 
 
-@each
+@with_each_effect
 def test_say_returns_one_sentence(kind):
     text = kind.example().say()
     assert text.endswith(".")
     assert text[0].isupper()
     assert len(text) > 20
-    one = kind.example()
-    errors = {name: 0.125 for name in kind.size_parameters if isinstance(getattr(one, name), float)}
-    assert not errors or "0.12" in one.say(errors)
+    effect = kind.example()
+    errors = {
+        name: 0.125 for name in kind.size_parameters if isinstance(getattr(effect, name), float)
+    }
+    assert not errors or "0.12" in effect.say(errors)
 
 
-@each
+@with_each_effect
 def test_explains_reduced_data(kind):
     edges = np.arange(0.0, SIZE / RATE + 1, 20.0)
     means = {name: values.reshape(-1, 200).mean(axis=1) for name, values in drivers(kind).items()}
@@ -132,15 +134,18 @@ def test_explains_reduced_data(kind):
     )
     effect = kind.example()
     names = {item.name for item in kind.parameters()}
-    found = effect.explain(windows)
-    assert isinstance(found, Prediction)
+    prediction = effect.explain(windows)
+    assert isinstance(prediction, Prediction)
     assert (
-        set(found.mean) | set(found.spectrum) | {parameter for _, parameter in found.level} <= names
+        set(prediction.mean)
+        | set(prediction.spectrum)
+        | {parameter for _, parameter in prediction.level}
+        <= names
     )
-    for design in [*found.mean.values(), *found.level.values()]:
+    for design in [*prediction.mean.values(), *prediction.level.values()]:
         assert np.shape(design)[-1] == 15
         assert np.isfinite(design).all()
-    for density in found.spectrum.values():
+    for density in prediction.spectrum.values():
         assert np.broadcast_shapes(np.shape(density), (15, 14)) in ((15, 14), (3, 15, 14))
         assert np.all(density >= 0)
     grid = effect.nuisance(windows)
@@ -150,7 +155,7 @@ def test_explains_reduced_data(kind):
             kind.example(**{name: float(value)}).explain(windows)
 
 
-@each
+@with_each_effect
 def test_units_and_ranges_are_kept(kind):
     for item in kind.parameters():
         if item.choices:
@@ -164,7 +169,7 @@ def test_units_and_ranges_are_kept(kind):
                 kind.example(**{item.name: item.high * 2 + 1})
 
 
-@each
+@with_each_effect
 def test_missing_channel_is_named(kind):
     effect = kind.example()
     needs = effect.needs()
@@ -187,7 +192,7 @@ def test_missing_channel_is_named(kind):
         simulate(model)
 
 
-@each
+@with_each_effect
 def test_sizes_are_sourced_and_the_text_names_what_it_is_confused_with(kind):
     for word in (
         "*DAVAR*",

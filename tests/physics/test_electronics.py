@@ -34,8 +34,8 @@ NRAD_PER_S = math.degrees(1e-9) * 3600.0  # deg/h
 
 def test_dead_zone_removes_rates_near_zero():
     signal = np.array([[-0.5, -0.2, -0.05, 0.0, 0.15, 0.5]])
-    kept = run(make_effect({"name": "dead_zone", "width": 0.2}), size=6, axes="x", signal=signal)
-    np.testing.assert_allclose(kept, [[-0.3, 0.0, 0.0, 0.0, 0.0, 0.3]], atol=1e-15)
+    rates = run(make_effect({"name": "dead_zone", "width": 0.2}), size=6, axes="x", signal=signal)
+    np.testing.assert_allclose(rates, [[-0.3, 0.0, 0.0, 0.0, 0.0, 0.3]], atol=1e-15)
     jump = run(
         make_effect({"name": "dead_zone", "width": 0.2, "edge": "jump", "centre": 0.1}),
         size=6,
@@ -43,10 +43,10 @@ def test_dead_zone_removes_rates_near_zero():
         signal=signal,
     )
     np.testing.assert_allclose(jump, [[-0.5, -0.2, 0.1, 0.1, 0.1, 0.5]], atol=1e-15)
-    said = make_effect({"name": "dead_zone", "width": 0.2}).explain(
+    prediction = make_effect({"name": "dead_zone", "width": 0.2}).explain(
         windows_of(30, 1.0, 10.0, own={"x": np.array([-3.0, 0.0, 3.0])})
     )
-    np.testing.assert_array_equal(said.mean["width"], [[1.0, 0.0, -1.0]])
+    np.testing.assert_array_equal(prediction.mean["width"], [[1.0, 0.0, -1.0]])
 
 
 def test_noise_dithers_a_dead_zone_unless_the_loop_is_slow():
@@ -107,10 +107,10 @@ def test_resets_add_their_angles_in_both_directions(part):
     w = turn * (
         9.3 * np.cos(2 * np.pi * t / 4.1) + 1.7
     )  # up to eleven resets in a second, forth and back
-    found = run(effect, size=300, rate=50.0, axes="x", signal=w)[0] - w
+    error = run(effect, size=300, rate=50.0, axes="x", signal=w)[0] - w
     truth = reset_truth(effect, w, 50.0, 300)
-    np.testing.assert_allclose(found, truth, atol=0.012 * np.abs(truth).max())
-    assert found.min() < 0 < found.max()
+    np.testing.assert_allclose(error, truth, atol=0.012 * np.abs(truth).max())
+    assert error.min() < 0 < error.max()
 
 
 def test_resets_faster_than_samples_are_a_scale_factor():
@@ -120,9 +120,9 @@ def test_resets_faster_than_samples_are_a_scale_factor():
     w = 1e6 * effect.turn * NRAD_PER_S  # a million resets in a second
     error = run(effect, size=2000, rate=100.0, axes="x", signal=w)[0] - w
     np.testing.assert_allclose(error[5:], w * 13.0 / effect.turn, rtol=1e-4)
-    said = effect.explain(windows_of(2000, 100.0, 10.0, own={"x": np.full(2, w)})).mean
+    prediction = effect.explain(windows_of(2000, 100.0, 10.0, own={"x": np.full(2, w)})).mean
     np.testing.assert_allclose(
-        5 * said["kick"] + 8 * said["tail"], w * 13 / effect.turn, rtol=1e-12
+        5 * prediction["kick"] + 8 * prediction["tail"], w * 13 / effect.turn, rtol=1e-12
     )
 
 
@@ -134,11 +134,14 @@ def test_comb_of_resets_follows_the_rate():
         spectrum = np.abs(np.fft.rfft((rates - rates.mean()) * np.hanning(rates.size))) ** 2
         f = np.fft.rfftfreq(rates.size, 0.01)
         edges = np.geomspace(1.0, 40.0, 60)
-        said = effect.explain(windows_of(20_000, 100.0, 200.0, edges, own={"x": np.full(1, w)}))
+        prediction = effect.explain(
+            windows_of(20_000, 100.0, 200.0, edges, own={"x": np.full(1, w)})
+        )
         places.append(f[spectrum.argmax()])
-        assert places[-1] == pytest.approx(said.line[0, 0], rel=0.01)
+        assert places[-1] == pytest.approx(prediction.line[0, 0], rel=0.01)
         total = sum(
-            size**2 * said.spectrum[name][0] for name, size in (("sawtooth", 0.4), ("kick", 3.0))
+            size**2 * prediction.spectrum[name][0]
+            for name, size in (("sawtooth", 0.4), ("kick", 3.0))
         )
         assert edges[total.argmax()] == pytest.approx(places[-1], rel=0.07)
     assert places[1] / places[0] == pytest.approx(2.5, rel=0.01)
@@ -151,15 +154,17 @@ def test_comb_has_the_predicted_power():
         f = np.fft.rfftfreq(rates.size, 0.01)
         power = 2 * np.abs(np.fft.rfft(rates)) ** 2 / rates.size**2
         line = 11.15 / (effect.turn * NRAD_PER_S)
-        near = np.abs(f - line) < 0.1
+        is_near_line = np.abs(f - line) < 0.1
         bands = np.array([line / 1.05, line, line * 1.05])
-        said = effect.explain(windows_of(60_000, 100.0, 600.0, bands, own={"x": np.full(1, 11.15)}))
+        prediction = effect.explain(
+            windows_of(60_000, 100.0, 600.0, bands, own={"x": np.full(1, 11.15)})
+        )
         (name, size), width = (
             next(iter(part.items())),
             line * (math.sqrt(1.05) - 1 / math.sqrt(1.05)),
         )
-        assert power[near].sum() == pytest.approx(
-            2 * width * size**2 * said.spectrum[name][0, 1], rel=0.02
+        assert power[is_near_line].sum() == pytest.approx(
+            2 * width * size**2 * prediction.spectrum[name][0, 1], rel=0.02
         )
 
 
@@ -185,7 +190,7 @@ def test_resets_of_a_real_gyro_match_the_model(recordings):
     assert (11.5 + 18) * turns * NRAD_PER_S == pytest.approx(model.mean(), rel=0.01)
     parts = []
     for name in ("kick", "tail"):
-        one = make_effect(
+        unit_effect = make_effect(
             {
                 "name": "feedback_reset",
                 name: 1.0,
@@ -194,7 +199,9 @@ def test_resets_of_a_real_gyro_match_the_model(recordings):
                 "full": -32768,
             }
         )
-        parts.append(run(one, size=ramp.size, rate=200.0, axes="z", drivers={"ramp": ramp})[0])
+        parts.append(
+            run(unit_effect, size=ramp.size, rate=200.0, axes="z", drivers={"ramp": ramp})[0]
+        )
     design = np.column_stack([*parts, np.ones(ramp.size)])
     kick, tail, _ = np.linalg.lstsq(design, measured, rcond=None)[0]
     assert kick == pytest.approx(11.5, rel=0.06)
@@ -234,7 +241,7 @@ def test_profile_over_the_ramp_is_the_generated_one(decay, direction, full, othe
         drivers = {"ramp": phase * abs(full)}
         error = run(effect, size=turns.size, rate=100.0, axes="x", drivers=drivers)[0]
         place = np.minimum((phase[20_000:] * bins).astype(int), bins - 1)
-        found = np.bincount(place, error[20_000:], bins) / np.bincount(place, minlength=bins)
+        profile = np.bincount(place, error[20_000:], bins) / np.bincount(place, minlength=bins)
         windows = windows_of(
             1000,
             100.0,
@@ -244,7 +251,7 @@ def test_profile_over_the_ramp_is_the_generated_one(decay, direction, full, othe
             turns=np.array([math.copysign(1.37, rate * full)]),
         )
         expected = 3.0 * effect.explain(windows).phase_locked[part]
-        np.testing.assert_allclose(found, expected, atol=0.02 * np.abs(expected).max())
+        np.testing.assert_allclose(profile, expected, atol=0.02 * np.abs(expected).max())
 
 
 def test_ramp_from_rate_and_from_channel_agree():
@@ -253,7 +260,7 @@ def test_ramp_from_rate_and_from_channel_agree():
     w = np.full(500, 0.013 * 100 * own.turn * NRAD_PER_S)
     expected = run(own, size=500, rate=100.0, axes="x", signal=w)[0] - w
     ramp = 7.0 * ((0.013 * np.arange(1, 501)) % 1.0)
-    found = run(
+    by_channel = run(
         make_effect(common | {"phase": "channel", "full": 7.0}),
         size=500,
         rate=100.0,
@@ -261,7 +268,7 @@ def test_ramp_from_rate_and_from_channel_agree():
         signal=w,
         drivers={"ramp": ramp},
     )[0]
-    np.testing.assert_allclose(found[1:] - w[1:], expected[1:], atol=1e-9)
+    np.testing.assert_allclose(by_channel[1:] - w[1:], expected[1:], atol=1e-9)
     with pytest.raises(SchemaError, match="'feedback_reset' needs the channel 'ramp'"):
         simulate(
             {
@@ -323,16 +330,21 @@ def test_window_means_match_the_prediction(table):
         axis: values.reshape(12, 500).mean(axis=1)
         for axis, values in zip("xy", signal, strict=True)
     }
-    said = effect.explain(
+    prediction = effect.explain(
         windows_of(6000, 50.0, 10.0, axes=("x", "y"), drivers=means, own=own)
     ).mean
-    total = sum(np.atleast_1d(getattr(effect, name))[0] * design for name, design in said.items())
-    found = done.reshape(2, 12, 500).mean(axis=2)
+    total = sum(
+        np.atleast_1d(getattr(effect, name))[0] * design for name, design in prediction.items()
+    )
+    window_means = done.reshape(2, 12, 500).mean(axis=2)
     tolerance = (
         0.04 if effect.name in ("feedback_reset", "rate_quantization", "clock_error") else 1e-6
     )  # parts of a turn, a step, a sample
     np.testing.assert_allclose(
-        found, np.broadcast_to(total, (2, 12)), rtol=1e-3, atol=tolerance * np.abs(total).max()
+        window_means,
+        np.broadcast_to(total, (2, 12)),
+        rtol=1e-3,
+        atol=tolerance * np.abs(total).max(),
     )
 
 
@@ -375,14 +387,14 @@ def test_random_rate_has_the_predicted_density(table, parameter, size):
     effect = make_effect(table)
     rates = run(effect, size=60_000, rate=10.0)
     edges = np.array([0.02, 0.1, 0.5, 2.0, 4.0, 4.95])
-    found = band_powers(rates, 10.0, edges)
+    powers = band_powers(rates, 10.0, edges)
     np.testing.assert_allclose(
-        found, size**2 * said_density(effect, 10.0, edges, parameter), rtol=0.12
+        powers, size**2 * said_density(effect, 10.0, edges, parameter), rtol=0.12
     )
     total = np.array([rates.var()])
     f = np.linspace(1e-4, 5.0, 40_000)
-    said = effect.explain(windows_of(100, 10.0, 1.0, f)).spectrum[parameter][0]
-    np.testing.assert_allclose(total, size**2 * 2 * np.trapezoid(said, f), rtol=0.06)
+    density = effect.explain(windows_of(100, 10.0, 1.0, f)).spectrum[parameter][0]
+    np.testing.assert_allclose(total, size**2 * 2 * np.trapezoid(density, f), rtol=0.06)
 
 
 @pytest.mark.parametrize(
@@ -397,9 +409,9 @@ def test_logger_effects_have_the_predicted_density(table, parameter, size):
     effect = make_effect(table)
     signal = np.random.default_rng(4).normal(0.3, 4.0, (3, 60_000))
     edges = np.array([0.02, 1.0, 2.0, 3.0, 4.0, 4.95])
-    found = band_powers(run(effect, size=60_000, rate=10.0, signal=signal) - signal, 10.0, edges)
+    powers = band_powers(run(effect, size=60_000, rate=10.0, signal=signal) - signal, 10.0, edges)
     np.testing.assert_allclose(
-        found, size**2 * said_density(effect, 10.0, edges, parameter), rtol=0.12
+        powers, size**2 * said_density(effect, 10.0, edges, parameter), rtol=0.12
     )
 
 

@@ -24,14 +24,14 @@ from tests.support.effect_bench import avar, run, windows_of
 def test_means_of_steps_are_integrals(positions, cut):
     positions = sorted(positions)
     levels = np.random.default_rng(3).normal(size=(len(positions) + 1, 2))
-    found = np.concatenate(
+    means = np.concatenate(
         [step_means(positions, levels, 0, cut), step_means(positions, levels, cut, 20 - cut)],
         axis=1,
     )
     edges = np.array([0.0, *positions, 30.0])
     for i in range(20):
         inside = np.clip(np.minimum(edges[1:], i + 1) - np.maximum(edges[:-1], i), 0.0, None)
-        np.testing.assert_allclose(found[:, i], inside @ levels, atol=1e-12)
+        np.testing.assert_allclose(means[:, i], inside @ levels, atol=1e-12)
 
 
 def test_jump_has_the_allan_variance_of_a_step():
@@ -48,10 +48,10 @@ def test_jump_has_the_allan_variance_of_a_step():
     )
     assert surface.isel(time=slice(0, 3)).avar.values.max() < 1e-30
     np.testing.assert_allclose(surface.window_mean.values[[0, 4, -1]], [0.0, 0.05, 0.1], atol=1e-12)
-    said = make_effect(effect).explain(
+    prediction = make_effect(effect).explain(
         Windows(np.array([0.0, 200, 400]), np.array([200.0, 400, 600]), np.ones(1), 10.0, ("x",))
     )
-    np.testing.assert_allclose(said.mean["step"], [0.0, 0.5, 1.0])
+    np.testing.assert_allclose(prediction.mean["step"], [0.0, 0.5, 1.0])
 
 
 def test_jumps_come_at_restarts_and_shocks_only():
@@ -96,9 +96,9 @@ def test_gauss_markov_has_the_allan_variance_of_the_standard():
     effect = make_effect({"name": "gauss_markov", "rms": [0.05, 0.1, 0.0], "correlation_time": 20})
     rates = run(effect, size=400_000, rate=5.0)
     taus = np.array([0.2, 2.0, 10.0, 37.8, 100.0])
-    found = avar(rates, 5.0, taus)
+    variance = avar(rates, 5.0, taus)
     for row, rms in ((0, 0.05), (1, 0.1)):
-        np.testing.assert_allclose(found[row], gauss_markov_avar(rms, 20.0, taus), rtol=0.06)
+        np.testing.assert_allclose(variance[row], gauss_markov_avar(rms, 20.0, taus), rtol=0.06)
         assert rates[row].std() == pytest.approx(rms, rel=0.04)
     assert not rates[2].any()
     fine = np.linspace(1.0, 200.0, 4000)
@@ -160,10 +160,10 @@ def test_fringe_step_has_its_size_and_ends_at_power_loss():
 def test_supply_bias_follows_both_channels_and_ripple_folds():
     effect = make_effect({"name": "supply_bias", "voltage": 0.02, "power": -0.003, "axes": ["x"]})
     assert effect.needs() == ("supply_voltage", "light_power")
-    found = run(
+    bias = run(
         effect, size=2, drivers={"supply_voltage": [25.0, 20.0], "light_power": [110e-6, 100e-6]}
     )
-    np.testing.assert_allclose(found, [[0.02 - 0.03, -0.08]], rtol=1e-9)
+    np.testing.assert_allclose(bias, [[0.02 - 0.03, -0.08]], rtol=1e-9)
     ripple = make_effect({"name": "supply_bias", "ripple": 0.4, "frequency": 63.0})
     assert ripple.needs() == ()
     rates = run(ripple, size=2000, rate=50.0)[0]
@@ -197,7 +197,7 @@ def test_a_slow_supply_settles_after_a_step_and_trails_a_ramp():
     """A step D gives ``D (1 - exp(-t / lag))``, a ramp v t ``v (t - lag (1 - exp(-t / lag)))``."""
     t = (np.arange(8000) - 1000) / 20.0
     power = 1e-4 + 2e-8 * np.maximum(t, 0.0)
-    found = run(
+    bias = run(
         slow_supply(30.0),
         size=t.size,
         rate=20.0,
@@ -205,7 +205,7 @@ def test_a_slow_supply_settles_after_a_step_and_trails_a_ramp():
     )
     settled = -np.expm1(-np.maximum(t, 0.0) / 30.0)
     ramp = 100.0 + 0.02 * (np.maximum(t, 0.0) - 30.0 * settled)
-    np.testing.assert_allclose(found[0], 0.02 * -3.0 * settled - 0.003 * ramp, atol=0.002 * 0.06)
+    np.testing.assert_allclose(bias[0], 0.02 * -3.0 * settled - 0.003 * ramp, atol=0.002 * 0.06)
 
 
 @pytest.mark.parametrize("lag", [3.0, 20.0, 100.0, 2000.0])
@@ -216,7 +216,7 @@ def test_means_of_a_slow_supply_match_the_prediction(lag):
         "supply_voltage": 24.0 - 2.0 * ((t > 305.0) & (t < 707.5)),
         "light_power": 1e-4 * np.exp(-t / 900.0),
     }
-    found = (
+    bias_means = (
         run(slow_supply(lag), size=t.size, rate=20.0, drivers=drivers)[0]
         .reshape(-1, 400)
         .mean(axis=1)
@@ -229,9 +229,13 @@ def test_means_of_a_slow_supply_match_the_prediction(lag):
     )
     off = []
     for windows in (blunt, sharp):
-        said = slow_supply(lag).explain(windows).mean
-        off.append(np.abs(0.02 * said["voltage"] - 0.003 * said["power"] - found)[1:].max())
-    assert off[1] < 0.04 * np.ptp(found)
+        prediction = slow_supply(lag).explain(windows).mean
+        off.append(
+            np.abs(0.02 * prediction["voltage"] - 0.003 * prediction["power"] - bias_means)[
+                1:
+            ].max()
+        )
+    assert off[1] < 0.04 * np.ptp(bias_means)
     assert off[1] < 0.5 * off[0]
 
 
@@ -251,8 +255,8 @@ def test_a_supply_without_lag_is_the_limit_of_short_ones():
 
 
 def test_a_slow_supply_says_its_lag():
-    said = make_effect({"name": "supply_bias", "voltage": 0.02, "lag": 40.0}).say({"lag": 5.0})
+    sentence = make_effect({"name": "supply_bias", "voltage": 0.02, "lag": 40.0}).say({"lag": 5.0})
     assert (
-        said == "The bias follows the supply on all axes, by 0.02 deg/h/V of the voltage, "
+        sentence == "The bias follows the supply on all axes, by 0.02 deg/h/V of the voltage, "
         "with a lag of 40 ± 5 s."
     )

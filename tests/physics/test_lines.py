@@ -39,15 +39,15 @@ def test_a_steady_line_has_the_allan_variance_of_a_sinusoid():
         )
     assert not rates[2].any()
     fine = np.arange(1, 40) * 0.05
-    found = sigma(rates[0], 20.0, fine)[0]
-    assert fine[found.argmax()] == pytest.approx(0.371 / 0.53, abs=0.026)
-    assert found.max() == pytest.approx(0.7246 * 0.2, rel=0.005)
+    deviation = sigma(rates[0], 20.0, fine)[0]
+    assert fine[deviation.argmax()] == pytest.approx(0.371 / 0.53, abs=0.026)
+    assert deviation.max() == pytest.approx(0.7246 * 0.2, rel=0.005)
     t = np.arange(3) / 20.0
     expected = [
         0.2
-        * quad(lambda s: math.sin(2 * math.pi * 0.53 * s + math.pi / 6), one, one + 0.05)[0]
+        * quad(lambda s: math.sin(2 * math.pi * 0.53 * s + math.pi / 6), begin, begin + 0.05)[0]
         / 0.05
-        for one in t
+        for begin in t
     ]
     np.testing.assert_allclose(rates[0][:3], expected, rtol=1e-9)
 
@@ -143,5 +143,5 @@ def test_a_pump_is_another_channel():
     )
     taus = [0.1, 0.371 / 2, 0.4]
     taus = [round(tau * 40) / 40 for tau in taus]
-    found = sigma(log.rate.sel(axis="x").values, 40.0, taus)[0] ** 2
-    np.testing.assert_allclose(found, sinusoid_avar(0.3, 2.0, taus), rtol=0.01)
+    variance = sigma(log.rate.sel(axis="x").values, 40.0, taus)[0] ** 2
+    np.testing.assert_allclose(variance, sinusoid_avar(0.3, 2.0, taus), rtol=0.01)

@@ -24,13 +24,13 @@ def test_a_low_pass_has_the_response_of_its_design():
     effect = make_effect({"name": "logger_filter", "cutoff": 12.0, "order": 3})
     signal = np.random.default_rng(1).normal(size=(3, 100_000))
     edges = np.array([0.5, 4.0, 8.0, 12.0, 16.0, 20.0, 30.0, 45.0])
-    found = band_powers(
+    response_measured = band_powers(
         run(effect, size=100_000, rate=100.0, signal=signal), 100.0, edges
     ) / band_powers(signal, 100.0, edges)
     fine = np.stack([np.linspace(low, high, 50) for low, high in pairwise(edges)])
     _, response = sosfreqz(butter(3, 12.0, fs=100.0, output="sos"), fine.ravel(), fs=100.0)
     expected = (np.abs(response) ** 2).reshape(fine.shape).mean(axis=1)
-    np.testing.assert_allclose(found, expected, rtol=0.05)
+    np.testing.assert_allclose(response_measured, expected, rtol=0.05)
     steady = run(effect, size=50, rate=100.0, signal=3.0)
     np.testing.assert_allclose(steady, 3.0, rtol=1e-12)
 
@@ -96,10 +96,12 @@ def test_filter_has_the_predicted_response(table):
     rates = simulate(common | {"effect": [effect]}).rate.values
     edges = np.array([0.1, 2.0, 4.0, 6.0, 8.0, 9.9])
     centre = [np.linspace(low, high, 40) for low, high in pairwise(edges)]
-    said = [
+    response = [
         make_effect(effect).explain(windows_of(100, 20.0, 1.0, f)).response.mean() for f in centre
     ]
-    np.testing.assert_allclose(band_powers(rates, 20.0, edges), 0.36 * np.array(said), rtol=0.08)
+    np.testing.assert_allclose(
+        band_powers(rates, 20.0, edges), 0.36 * np.array(response), rtol=0.08
+    )
 
 
 def test_impossible_filter_is_refused():
@@ -170,8 +172,8 @@ def test_bit_errors_are_bits():
     wrong = done != counts
     assert wrong.sum() == pytest.approx(2 * 2500, rel=0.06)
     sizes = np.abs(done - counts)[wrong]
-    found, number = np.unique(sizes, return_counts=True)
-    np.testing.assert_array_equal(found, 2.0 ** np.arange(8))
+    bits, number = np.unique(sizes, return_counts=True)
+    np.testing.assert_array_equal(bits, 2.0 ** np.arange(8))
     assert number.max() / number.min() < 1.5
     assert done.min() >= -128
     assert done.max() <= 127
@@ -199,9 +201,9 @@ def test_held_samples_are_runs_that_raise_n_at_long_times():
         1 + 0.02 * 4
     )  # E[(1 + h)^2] / E[1 + h], h geometric of mean 4 with the chance 1/50
     assert ratio[1] == pytest.approx(exact, rel=0.08)
-    said = effect.explain(windows_of(1000, 10.0, 10.0)).level[("N", "per_hour")][0]
-    assert 720 * said == pytest.approx(2 * 0.02 * 16, rel=1e-9)
-    assert exact - 1 == pytest.approx(720 * said, rel=0.1)
+    growth = effect.explain(windows_of(1000, 10.0, 10.0)).level[("N", "per_hour")][0]
+    assert 720 * growth == pytest.approx(2 * 0.02 * 16, rel=1e-9)
+    assert exact - 1 == pytest.approx(720 * growth, rel=0.1)
 
 
 def test_zero_filled_samples_bias_the_mean():
@@ -209,8 +211,8 @@ def test_zero_filled_samples_bias_the_mean():
     done = run(effect, size=200_000, axes="x", signal=15.0)
     assert set(np.unique(done)) == {0.0, 15.0}
     assert done.mean() == pytest.approx(15 * (1 - 4 / 54), rel=0.01)
-    said = effect.explain(windows_of(100, 10.0, 10.0, own={"x": np.full(1, 15.0)})).mean["per_hour"]
-    assert 720 * said[0, 0] == pytest.approx(-15 * 4 / 50, rel=1e-9)
+    bias = effect.explain(windows_of(100, 10.0, 10.0, own={"x": np.full(1, 15.0)})).mean["per_hour"]
+    assert 720 * bias[0, 0] == pytest.approx(-15 * 4 / 50, rel=1e-9)
 
 
 def test_clipping_cuts_the_tails():
@@ -240,8 +242,10 @@ def test_a_fast_clock_reads_too_little_on_all_axes():
         done - w, -1e-4 * np.broadcast_to(w, done.shape), rtol=1e-9
     )  # 100 ppm of 180 r/min: 388.8 deg/h
     own = {axis: np.full(10, value) for axis, value in zip("xyz", w[:, 0], strict=True)}
-    said = effect.explain(windows_of(1000, 10.0, 10.0, axes=("x", "y", "z"), own=own)).mean["error"]
-    np.testing.assert_allclose(100 * said[:, 0], -1e-4 * w[:, 0])
+    prediction = effect.explain(windows_of(1000, 10.0, 10.0, axes=("x", "y", "z"), own=own)).mean[
+        "error"
+    ]
+    np.testing.assert_allclose(100 * prediction[:, 0], -1e-4 * w[:, 0])
     rated = run(
         make_effect({"name": "clock_error", "error": 100, "output": "rate"}), size=1000, signal=w
     )
@@ -345,9 +349,9 @@ def test_a_frame_sent_twice_repeats_the_samples_before_it():
     effect = make_effect({"name": "held_samples", "per_hour": 60.0, "length": 0.6, "fill": "frame"})
     size = 200_000
     numbers = np.tile(np.arange(float(size)), (2, 1))
-    found = run(effect, size=size, rate=10.0, axes="xy", signal=numbers)
-    np.testing.assert_array_equal(found[0], found[1])
-    late = numbers[0] - found[0]
+    sent = run(effect, size=size, rate=10.0, axes="xy", signal=numbers)
+    np.testing.assert_array_equal(sent[0], sent[1])
+    late = numbers[0] - sent[0]
     edges = np.flatnonzero(np.diff(late, prepend=0.0, append=0.0))
     runs = [(low, high) for low, high in pairwise(edges) if late[low] > 0.0]
     assert len(runs) == pytest.approx(333, abs=60)
@@ -355,5 +359,5 @@ def test_a_frame_sent_twice_repeats_the_samples_before_it():
     assert np.mean(as_before) > 0.95  # the others repeat a repeated sample
     assert np.mean([high - low for low, high in runs]) == pytest.approx(6.0, rel=0.2)
     cut = run(effect, size=size, rate=10.0, axes="xy", signal=numbers, cuts=[3, 777, 778, 90_000])
-    np.testing.assert_array_equal(cut, found)
+    np.testing.assert_array_equal(cut, sent)
     assert "filled with the frame before on all axes" in effect.say()

@@ -21,15 +21,15 @@ from tests.support.effect_bench import allan_of_density, run, sigma
 
 def test_scale_factor_errors_are_those_of_the_catalogue():
     speed = 6 * 180.0  # 180 r/min in deg/s
-    one = run(
+    error = run(
         make_effect({"name": "scale_factor", "linear": 100}),
         size=1,
         drivers={"rotation_rate": speed},
     )
-    np.testing.assert_allclose(one, 388.8, rtol=1e-12)
-    both = {"rotation_rate": [speed, -speed], "temperature": [35.0, 35.0]}
+    np.testing.assert_allclose(error, 388.8, rtol=1e-12)
+    drivers = {"rotation_rate": [speed, -speed], "temperature": [35.0, 35.0]}
     linear, lopsided, cubic, thermal = (
-        run(make_effect({"name": "scale_factor", **table}), size=2, drivers=both)[0]
+        run(make_effect({"name": "scale_factor", **table}), size=2, drivers=drivers)[0]
         for table in ({"linear": 1}, {"asymmetry": 1}, {"cubic": 1e-6}, {"thermal": 0.1})
     )
     np.testing.assert_allclose(linear, [3.888, -3.888], rtol=1e-12)
@@ -60,14 +60,14 @@ def test_a_ramp_of_rotation_is_a_rate_ramp_through_the_scale_factor():
 def test_scale_factor_of_the_true_rate_needs_no_channel():
     effect = make_effect({"name": "scale_factor", "linear": 1000, "rotation": "true"})
     assert effect.needs() == ()
-    found = run(effect, size=2, true={"x": 15.0, "z": [1.0, -1.0]})
-    np.testing.assert_allclose(found, [[0.015, 0.015], [0, 0], [0.001, -0.001]], rtol=1e-12)
+    error = run(effect, size=2, true={"x": 15.0, "z": [1.0, -1.0]})
+    np.testing.assert_allclose(error, [[0.015, 0.015], [0, 0], [0.001, -0.001]], rtol=1e-12)
 
 
 def test_misalignment_leaks_the_true_rate_of_other_axes_only():
     effect = make_effect({"name": "misalignment", "z": 0.5, "y": -1.0})
-    found = run(effect, size=2, true={"x": 7.0, "y": [100.0, 0.0], "z": [2000.0, 1000.0]})
-    np.testing.assert_allclose(found, [[1.0 - 0.1, 0.5], [1.0, 0.5], [-0.1, 0.0]], rtol=1e-12)
+    error = run(effect, size=2, true={"x": 7.0, "y": [100.0, 0.0], "z": [2000.0, 1000.0]})
+    np.testing.assert_allclose(error, [[1.0 - 0.1, 0.5], [1.0, 0.5], [-0.1, 0.0]], rtol=1e-12)
     with pytest.raises(
         SchemaError, match="needs the rate of axis 'z', which the log does not have; it has x, y"
     ):
@@ -95,12 +95,12 @@ def test_misalignment_leaks_the_recorded_rate_of_other_axes():
     recording["rate"][2] += 4000.0 * np.sin(np.arange(200) / 7.0)
     recording["rate"][2, 50:60] = np.nan  # the rate that leaks is interpolated here
     effect = {"name": "misalignment", "z": 2.0, "axes": ["x"], "motion": "recorded"}
-    found = simulate({"noise": {}, "effect": [effect]}, like=recording, chunk=37).compute()
+    simulated = simulate({"noise": {}, "effect": [effect]}, like=recording, chunk=37).compute()
     present = np.isfinite(recording["rate"].values[2])
     np.testing.assert_allclose(
-        found["rate"].values[0, present], 2e-3 * recording["rate"].values[2, present], rtol=1e-9
+        simulated["rate"].values[0, present], 2e-3 * recording["rate"].values[2, present], rtol=1e-9
     )
-    assert not found["rate"].values[1:, present].any()
+    assert not simulated["rate"].values[1:, present].any()
     with pytest.raises(SchemaError, match="follows the recorded rate of axis 'z'; give a record"):
         simulate({"noise": {"N": 0.003}, "effect": [effect]}, duration="20s", rate=10.0)
     with pytest.raises(SchemaError, match="needs the rate of axis 'z', which the log does not"):
@@ -130,11 +130,11 @@ def test_earth_rate_at_rest_is_the_rotated_vector(latitude, inclination, azimuth
             "toolface": toolface,
         }
     )
-    seen = run(effect, size=2, drivers={"rotation_rate": 0.0})[:, 1]
+    rates = run(effect, size=2, drivers={"rotation_rate": 0.0})[:, 1]
     lat = math.radians(latitude)
     earth = 15.041067 * np.array([math.cos(lat), 0.0, -math.sin(lat)])
     axes = tool_axes(*np.radians([inclination, azimuth, toolface]))
-    np.testing.assert_allclose(seen, axes.T @ earth, atol=1e-9)
+    np.testing.assert_allclose(rates, axes.T @ earth, atol=1e-9)
 
 
 def test_earth_rate_during_rotation_is_a_line_in_quadrature():
@@ -147,7 +147,7 @@ def test_earth_rate_during_rotation_is_a_line_in_quadrature():
     np.testing.assert_allclose(z, along, rtol=1e-9)
     whole = slice(0, size - size % 80)  # turns of 80 samples
     wave = np.exp(-2j * np.pi * 0.25 * (np.arange(size) + 0.5) / rate)[whole]
-    ax, ay = (2 * (one[whole] * wave).mean() for one in (x, y))
+    ax, ay = (2 * (rates[whole] * wave).mean() for rates in (x, y))
     assert abs(ax) == pytest.approx(across * np.sinc(0.25 / rate), rel=1e-6)
     assert ay / ax == pytest.approx(1j, abs=1e-6)  # y stands a quarter ahead of x
     top = sigma(x, rate, [0.371 / 0.25])[0, 0]
@@ -187,14 +187,14 @@ def test_axes_of_other_names_need_directions():
             drivers={"rotation_rate": 0.0},
         )
     across = make_effect({"name": "earth_rate", "latitude": 30, "around": [0, 180]})
-    seen = run(across, size=1, axes=("a", "b"), drivers={"rotation_rate": 0.0})[:, 0]
-    np.testing.assert_allclose(seen, 15.041067 * np.array([0.8660254, -0.8660254]), rtol=1e-6)
+    rates = run(across, size=1, axes=("a", "b"), drivers={"rotation_rate": 0.0})[:, 0]
+    np.testing.assert_allclose(rates, 15.041067 * np.array([0.8660254, -0.8660254]), rtol=1e-6)
     effect = make_effect(
         {"name": "earth_rate", "latitude": 30, "off": [90, 0, 45], "around": [0, 0, 0]}
     )
-    seen = run(effect, size=1, axes=("a", "b", "c"), drivers={"rotation_rate": 0.0})[:, 0]
+    rates = run(effect, size=1, axes=("a", "b", "c"), drivers={"rotation_rate": 0.0})[:, 0]
     np.testing.assert_allclose(
-        seen, 15.041067 * np.array([0.8660254, -0.5, (0.8660254 - 0.5) / math.sqrt(2)]), rtol=1e-6
+        rates, 15.041067 * np.array([0.8660254, -0.5, (0.8660254 - 0.5) / math.sqrt(2)]), rtol=1e-6
     )
 
 

@@ -72,9 +72,9 @@ def test_window_means_are_the_design_times_the_parameters(table):
     rates = run(effect, size=4000, rate=10.0, drivers=DRIVERS, true=TRUE)
     windows, means = windows_of(rates, 10.0, 400, DRIVERS, own=TRUE)
     design = effect.explain(windows).mean
-    each = {name: np.atleast_1d(getattr(effect, name)) for name in design}
+    sizes = {name: np.atleast_1d(getattr(effect, name)) for name in design}
     total = sum(
-        np.broadcast_to(values, means.shape) * each[name].reshape(-1, 1)
+        np.broadcast_to(values, means.shape) * sizes[name].reshape(-1, 1)
         for name, values in design.items()
     )
     assert np.abs(means).max() > 1e-3
@@ -128,11 +128,11 @@ def test_spectra_match_the_prediction(table):
     predicted = float(np.atleast_1d(getattr(effect, name))[0]) ** 2 * np.broadcast_to(
         prediction.spectrum[name], (count, 99)
     ).mean(axis=0)
-    found = power[:, 3:498].mean(axis=0).reshape(99, 5).mean(axis=1)
+    measured = power[:, 3:498].mean(axis=0).reshape(99, 5).mean(axis=1)
     for bands in (9, 11):
-        wide = [values.reshape(-1, bands).sum(axis=1) for values in (predicted, found)]
+        wide = [values.reshape(-1, bands).sum(axis=1) for values in (predicted, measured)]
         np.testing.assert_allclose(*wide, atol=0.04 * predicted.sum())
-    assert predicted.sum() == pytest.approx(found.sum(), rel=0.06)
+    assert predicted.sum() == pytest.approx(measured.sum(), rel=0.06)
     if prediction.line is not None:
         place = np.atleast_2d(prediction.line)[0, 0]
         assert place == pytest.approx(f[power.mean(axis=0).argmax()], abs=0.15)

@@ -29,12 +29,12 @@ def level(table, *, drivers=None, size=5, rate=10.0, **noise):
 
 def test_squared_noise_is_a_polynomial_of_temperature():
     table = {"name": "temperature_noise", "linear": 0.01, "quadratic": -1e-4, "reference": 20}
-    found = level(table, drivers={"temperature": [20, 30, 70, 0, 20]}, N=[0.1, 0.2, 0.3])["N"]
+    squares = level(table, drivers={"temperature": [20, 30, 70, 0, 20]}, N=[0.1, 0.2, 0.3])["N"]
     shares = [1.0, 1 + 0.1 - 0.01, 1 + 0.5 - 0.25, 1 - 0.2 - 0.04, 1.0]
-    np.testing.assert_allclose(found, np.outer([0.01, 0.04, 0.09], shares), rtol=1e-12)
+    np.testing.assert_allclose(squares, np.outer([0.01, 0.04, 0.09], shares), rtol=1e-12)
     with pytest.warns(UserWarning, match=r"less than 1 % of N\^2 at some values of temperature"):
-        found = level(table, drivers={"temperature": [20, 20, 20, -90, 20]}, N=0.1)["N"]
-    np.testing.assert_allclose(found, [[0.01, 0.01, 0.01, 0.0001, 0.01]] * 3, rtol=1e-12)
+        squares = level(table, drivers={"temperature": [20, 20, 20, -90, 20]}, N=0.1)["N"]
+    np.testing.assert_allclose(squares, [[0.01, 0.01, 0.01, 0.0001, 0.01]] * 3, rtol=1e-12)
 
 
 def test_squared_noise_is_that_of_a_detector_in_weak_light():
@@ -42,8 +42,8 @@ def test_squared_noise_is_that_of_a_detector_in_weak_light():
     thermal, shot, excess = 3e-12, 2e-8, 1e-3  # N^2 = thermal / P^2 + shot / P + excess
     at = thermal / 1e-8 + shot / 1e-4 + excess
     table = {"name": "light_power_noise", "thermal": thermal / 1e-8 / at, "shot": shot / 1e-4 / at}
-    found = level(table, drivers={"light_power": power}, N=math.sqrt(at))["N"][0]
-    np.testing.assert_allclose(found, thermal / power**2 + shot / power + excess, rtol=1e-12)
+    squares = level(table, drivers={"light_power": power}, N=math.sqrt(at))["N"][0]
+    np.testing.assert_allclose(squares, thermal / power**2 + shot / power + excess, rtol=1e-12)
     only = level(
         {"name": "light_power_noise", "thermal": 1.0, "nominal": "10 uW"},
         drivers={"light_power": [1e-5, 5e-6] * 2 + [1e-5]},
@@ -72,23 +72,25 @@ def test_invalid_light_power_is_refused():
 
 
 def test_excess_noise_does_not_depend_on_the_light():
-    found = level(
+    squares = level(
         {"name": "light_power_noise", "thermal": 0.0},
         drivers={"light_power": [1e-4, 1e-5, 1e-6, 1e-3, 1.0]},
         N=0.3,
     )["N"]
-    np.testing.assert_array_equal(found, 0.3**2)
+    np.testing.assert_array_equal(squares, 0.3**2)
 
 
 def test_squared_noise_ages_with_a_power_of_time():
-    found = level(
+    squares = level(
         {"name": "ageing_noise", "growth": 0.5, "exponent": 2},
         size=4,
         rate=1 / HOUR,
         N=[1.0, 2.0, 0.0],
     )["N"]
     np.testing.assert_allclose(
-        found, np.outer([1.0, 4.0, 0.0], 1 + 0.5 * np.array([0.5, 1.5, 2.5, 3.5]) ** 2), rtol=1e-12
+        squares,
+        np.outer([1.0, 4.0, 0.0], 1 + 0.5 * np.array([0.5, 1.5, 2.5, 3.5]) ** 2),
+        rtol=1e-12,
     )
 
 

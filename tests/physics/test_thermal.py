@@ -43,16 +43,16 @@ def heated_slab(surface, dt, lag, cells=200):
     main[0], main[-1] = -1.0, -3.0  # the face lies half a cell beyond the last centre
     left = np.zeros((3, cells))
     left[0, 1:], left[1], left[2, :-1] = -r / 2, 1.0 - r / 2 * main, -r / 2
-    here = np.full(cells, surface[0])
+    state = np.full(cells, surface[0])
     out = []
     for before, after in itertools.pairwise(surface):
-        laplace = main * here
-        laplace[1:] += here[:-1]
-        laplace[:-1] += here[1:]
-        right = here + r / 2 * laplace
+        laplace = main * state
+        laplace[1:] += state[:-1]
+        laplace[:-1] += state[1:]
+        right = state + r / 2 * laplace
         right[-1] += r / 2 * 2.0 * (before + after)
-        here = solve_banded((1, 1), left, right)
-        out.append((here[cells // 2 :].mean(), here[: cells // 2].mean()))
+        state = solve_banded((1, 1), left, right)
+        out.append((state[cells // 2 :].mean(), state[: cells // 2].mean()))
     return np.array([out[0], *out]).T
 
 
@@ -62,14 +62,14 @@ def test_shupe_matches_heat_conduction_through_a_winding():
     outer, inner = heated_slab(surface, 1.0 / rate, lag)
     truth = 0.2 * np.gradient((outer + inner) / 2) * 60 + 0.3 * np.gradient(outer - inner) * 60
     effect = make_effect({"name": "shupe", "sensitivity": 0.2, "transient": 0.3, "modes": 12})
-    found = run(effect, size=surface.size, rate=rate, drivers={"temperature": surface})[1]
+    bias = run(effect, size=surface.size, rate=rate, drivers={"temperature": surface})[1]
     away = np.min([np.abs(np.arange(2500) - edge) for edge in (100, 1300)], axis=0) > 5
-    np.testing.assert_allclose(found[away], truth[away], atol=0.004)
+    np.testing.assert_allclose(bias[away], truth[away], atol=0.004)
     assert abs(truth).max() > 0.25
-    assert found[1290] == pytest.approx(
+    assert bias[1290] == pytest.approx(
         0.2 * 1.5, rel=0.03
     )  # the plateau, where the halves climb alike
-    late = found[1700:2300]  # only the slowest mode is left
+    late = bias[1700:2300]  # only the slowest mode is left
     assert -1.0 / np.polyfit(np.arange(late.size), np.log(abs(late)), 1)[0] == pytest.approx(
         lag, rel=1e-3
     )
@@ -94,13 +94,13 @@ def test_one_mode_of_shupe_is_a_simple_lag():
     effect = make_effect({"name": "shupe", "sensitivity": 0.4, "modes": 1, "lag": 60})
     for rate in (1.0, 10.0, 100.0):
         warm = ramp_record(rate, begin=50, end=250, total=400, speed=2.0)
-        found = run(effect, size=warm.size, rate=rate, drivers={"temperature": warm})[0]
+        bias = run(effect, size=warm.size, rate=rate, drivers={"temperature": warm})[0]
         t = np.arange(warm.size) / rate
         rise = 0.8 * -np.expm1(-(np.clip(t, 50, 250) - 50) / 60)
         expected = rise * np.exp(-(np.maximum(t, 250) - 250) / 60)
-        np.testing.assert_allclose(found, expected, atol=1e-9)
+        np.testing.assert_allclose(bias, expected, atol=1e-9)
         down = run(effect, size=warm.size, rate=rate, drivers={"temperature": -warm})[0]
-        np.testing.assert_allclose(down, -found, atol=1e-12)
+        np.testing.assert_allclose(down, -bias, atol=1e-12)
 
 
 def test_shupe_is_constant_on_a_ramp_and_steps_at_its_start():
@@ -144,28 +144,28 @@ def test_lagged_temperature_bias_equals_two_effects():
             {"name": "temperature_bias", "sensitivity": a, "reference": 20.0},
             {"name": "shupe", "sensitivity": -a * lag / 60.0, "lag": lag, "modes": 1},
         )
-        found = sum(
+        bias = sum(
             run(make_effect(table), size=t.size, drivers={"temperature": warm})[0]
             for table in tables
         )
-        np.testing.assert_allclose(found, a * (late - 20.0), atol=1e-3 * a * 7.0)
+        np.testing.assert_allclose(bias, a * (late - 20.0), atol=1e-3 * a * 7.0)
 
 
 def test_sensor_lag_is_corrected_on_a_ramp():
     """A sensor with a lag of 40 s sees a ramp; one mode follows the true ramp."""
     rate, lag, late, v = 10.0, 60.0, 40.0, 2.0
     t = np.arange(6000) / rate
-    seen = 20.0 + v / 60.0 * (t - late * -np.expm1(-t / late))
+    reading = 20.0 + v / 60.0 * (t - late * -np.expm1(-t / late))
     table = {"name": "shupe", "sensitivity": 0.4, "modes": 1, "lag": lag}
     expected = 0.4 * v * -np.expm1(-t / lag)
-    found = run(
+    bias = run(
         make_effect(table | {"sensor_lag": late}),
         size=t.size,
         rate=rate,
-        drivers={"temperature": seen},
+        drivers={"temperature": reading},
     )[0]
-    np.testing.assert_allclose(found, expected, atol=0.002 * expected.max())
-    without = run(make_effect(table), size=t.size, rate=rate, drivers={"temperature": seen})[0]
+    np.testing.assert_allclose(bias, expected, atol=0.002 * expected.max())
+    without = run(make_effect(table), size=t.size, rate=rate, drivers={"temperature": reading})[0]
     assert np.abs(without - expected).max() > 0.2 * expected.max()
 
 
@@ -173,14 +173,14 @@ def test_sensor_lag_is_corrected_on_a_step():
     """A winding of one mode reads ``D / lag exp(-t / lag)`` after a step D of its surface."""
     rate, lag, late, step = 20.0, 60.0, 40.0, 5.0
     t = np.arange(12_000) / rate
-    seen = 20.0 - step * np.expm1(-np.maximum(t - 100.0, 0.0) / late)
+    reading = 20.0 - step * np.expm1(-np.maximum(t - 100.0, 0.0) / late)
     effect = make_effect(
         {"name": "shupe", "sensitivity": 0.4, "modes": 1, "lag": lag, "sensor_lag": late}
     )
-    found = run(effect, size=t.size, rate=rate, drivers={"temperature": seen})[0]
+    bias = run(effect, size=t.size, rate=rate, drivers={"temperature": reading})[0]
     expected = 0.4 * 60.0 * step / lag * np.exp(-(t - 100.0) / lag) * (t > 100.0)
     away = np.abs(t - 100.0) > 0.2
-    np.testing.assert_allclose(found[away], expected[away], atol=0.003 * expected.max())
+    np.testing.assert_allclose(bias[away], expected[away], atol=0.003 * expected.max())
 
 
 def test_shupe_refuses_invalid_modes():
@@ -193,9 +193,9 @@ def test_shupe_refuses_invalid_modes():
 def test_long_plateau_leaves_exactly_zero():
     effect = make_effect({"name": "shupe", "sensitivity": 1.0, "lag": 0.5})
     warm = np.concatenate([[20.0], np.full(20_000, 30.0)])
-    found = run(effect, size=warm.size, rate=10.0, drivers={"temperature": warm})[0]
-    assert found[1] > 1
-    assert found[-1] == 0.0
+    bias = run(effect, size=warm.size, rate=10.0, drivers={"temperature": warm})[0]
+    assert bias[1] > 1
+    assert bias[-1] == 0.0
 
 
 def test_temperature_ramp_is_a_rate_ramp_and_shupe_shifts_the_mean():
@@ -284,26 +284,26 @@ def test_warm_up_is_an_exponential_averaged_over_each_sample():
     effect = make_effect(
         {"name": "warm_up", "amplitude": 0.3, "time": 7, "slow_amplitude": -0.1, "slow_time": 50}
     )
-    found = run(effect, size=40, rate=0.5)[1]
+    bias = run(effect, size=40, rate=0.5)[1]
     for i in (0, 1, 7, 39):
         truth = (
             quad(lambda t: 0.3 * math.exp(-t / 7) - 0.1 * math.exp(-t / 50), 2 * i, 2 * i + 2)[0]
             / 2
         )
-        assert found[i] == pytest.approx(truth, rel=1e-9)
+        assert bias[i] == pytest.approx(truth, rel=1e-9)
 
 
 def test_warm_up_restarts_after_restarts_and_long_gaps():
     effect = make_effect({"name": "warm_up", "amplitude": 1.0, "time": 100})
     tables = {"gaps": np.array([[2000, 2100], [4000, 4600]]), "restarts": np.array([[4000, 4600]])}
-    found = run(effect, size=8000, **tables)[0]
+    bias = run(effect, size=8000, **tables)[0]
     first = run(effect, size=4000)[0]
-    np.testing.assert_array_equal(found[:4000], first)
-    np.testing.assert_allclose(found[4600:], first[:3400], rtol=1e-12)
+    np.testing.assert_array_equal(bias[:4000], first)
+    np.testing.assert_allclose(bias[4600:], first[:3400], rtol=1e-12)
     every = run(replace(effect, gap=10.0), size=8000, **tables)[0]
     np.testing.assert_allclose(every[2100:4000], first[:1900], rtol=1e-12)
     longer = run(replace(effect, gap=10.1), size=8000, **tables)[0]
-    np.testing.assert_array_equal(longer, found)
+    np.testing.assert_array_equal(longer, bias)
     warm = run(replace(effect, cold=0.0), size=8000, **tables)[0]
     assert not warm[:4000].any()
     np.testing.assert_allclose(warm[4600:], first[:3400], rtol=1e-12)
@@ -311,12 +311,12 @@ def test_warm_up_restarts_after_restarts_and_long_gaps():
 
 def test_short_power_loss_restores_only_a_part():
     effect = make_effect({"name": "warm_up", "amplitude": 1.0, "time": 100, "cooling": 300})
-    found = run(effect, size=9000, restarts=np.array([[5000, 5600], [7000, 7030]]))[0]
+    bias = run(effect, size=9000, restarts=np.array([[5000, 5600], [7000, 7030]]))[0]
     mean = -math.expm1(-1e-3) / 1e-3
     first = 1 - (1 - math.exp(-5)) * math.exp(-60 / 300)
-    assert found[5600] == pytest.approx(first * mean, rel=1e-9)
+    assert bias[5600] == pytest.approx(first * mean, rel=1e-9)
     second = 1 - (1 - first * math.exp(-140 / 100)) * math.exp(-3 / 300)
-    assert found[7030] == pytest.approx(second * mean, rel=1e-9)
+    assert bias[7030] == pytest.approx(second * mean, rel=1e-9)
 
 
 def test_warm_up_looks_like_a_rate_ramp_that_fades_after_every_restart():
@@ -405,17 +405,17 @@ def test_a_bias_that_ages_steadily_is_a_rate_ramp():
     effect = {"name": "ageing_bias", "slope": 24.0, "axes": ["x"]}
     log = simulate({"effect": [effect], "noise": {}, "log": {"rate": 1, "duration": "2h"}})
     taus = np.array([1.0, 60.0, 600.0])
-    found = avar(log.rate.sel(axis="x").values, 1.0, taus)[0]
+    variance = avar(log.rate.sel(axis="x").values, 1.0, taus)[0]
     np.testing.assert_allclose(
-        found, LAWS["R"].avar(taus, 1.0), rtol=1e-6
+        variance, LAWS["R"].avar(taus, 1.0), rtol=1e-6
     )  # 24 deg/h/day are 1 deg/h^2
     assert float(log.rate.sel(axis="x")[-1]) == pytest.approx(2.0, abs=3e-4)
 
 
 def test_a_bias_that_settles_is_a_logarithm():
     effect = make_effect({"name": "ageing_bias", "logarithmic": 0.3, "time": 2})
-    found = run(effect, size=361, rate=1 / 60)[0]
+    bias = run(effect, size=361, rate=1 / 60)[0]
     np.testing.assert_allclose(
-        found[[119, 359]], 0.3 * np.log([1 + (119.5 / 60) / 2, 1 + (359.5 / 60) / 2]), rtol=1e-9
+        bias[[119, 359]], 0.3 * np.log([1 + (119.5 / 60) / 2, 1 + (359.5 / 60) / 2]), rtol=1e-9
     )
     assert make_effect({"name": "ageing_bias", "logarithmic": 0.3, "time": "1 d"}).time == 24.0

@@ -38,7 +38,7 @@ OFF = HOLES[1:]
 
 def windows_of(kind, length=60.0, step=30.0):
     begin = np.arange(0.0, LENGTH - length + 1, step)
-    rows = [slice(int(one * RATE), int((one + length) * RATE)) for one in begin]
+    rows = [slice(int(start * RATE), int((start + length) * RATE)) for start in begin]
     means = {name: np.array([RECORD[name][row].mean() for row in rows]) for name in kind.channels}
     frequency = np.geomspace(0.02, 0.9, 9)
     gaps = {"gaps": HOLES, "restarts": OFF}
@@ -91,17 +91,19 @@ def test_predicted_window_means_are_the_generated_ones(table):
     effect = make_effect(table)
     rows, windows = windows_of(effect)
     bias = generated(effect)[0]
-    there = np.ones(_T.size, dtype=bool)
+    present = np.ones(_T.size, dtype=bool)
     for first, end in (HOLES * RATE).astype(int):
-        there[first:end] = False
-    found = np.array([bias[row][there[row]].mean() if there[row].any() else np.nan for row in rows])
+        present[first:end] = False
+    means = np.array(
+        [bias[row][present[row]].mean() if present[row].any() else np.nan for row in rows]
+    )
     design = effect.explain(windows).mean
     size = {name: getattr(effect, name) for name in design}
     predicted = sum(value * design[name] for name, value in size.items())
-    good = np.isfinite(found)
+    good = np.isfinite(means)
     assert good.sum() > 200
     if table["name"] not in ("warm_up",):  # the windows' mean temperature has no holes here
-        found = np.array([bias[row].mean() for row in rows])
+        means = np.array([bias[row].mean() for row in rows])
         good[:] = True
     good[0] = (
         table["name"] == "warm_up"
@@ -109,11 +111,11 @@ def test_predicted_window_means_are_the_generated_ones(table):
     good[-1] = (
         "sensor_lag" not in table
     )  # nor how the change goes on after the middle of the last one
-    spread = np.ptp(found[good])
+    spread = np.ptp(means[good])
     assert spread > 0
     np.testing.assert_allclose(
         predicted[good],
-        found[good],
+        means[good],
         atol=(0.05 if effect.name == "thermal_hysteresis" else 0.02) * spread,
     )
 
@@ -135,8 +137,8 @@ def test_predicted_levels_are_the_generated_ones(name, parameter):
     effect = effects()[name].example().switched_off()
     effect = replace(effect, **{parameter: size})
     rows, windows = windows_of(effect)
-    found = generated(effect, N=0.1)["N"][0]
-    share = np.array([found[row].mean() for row in rows]) / 0.01 - 1
+    squares = generated(effect, N=0.1)["N"][0]
+    share = np.array([squares[row].mean() for row in rows]) / 0.01 - 1
     np.testing.assert_allclose(
         size * effect.explain(windows).level["N", parameter], share, atol=0.01 * np.ptp(share)
     )
@@ -190,7 +192,7 @@ def test_fine_values_sharpen_the_predicted_change(table):
     """60 s windows resolve a corner of the temperature only with values inside of them."""
     warm = 20.0 + 2.0 / 60.0 * np.clip(_T - 3000.0, 0.0, 1200.0)
     effect = make_effect({"name": "shupe", "sensitivity": 1.0} | table)
-    found = (
+    rates = (
         run(effect, size=_T.size, rate=RATE, drivers={"temperature": warm})[0]
         .reshape(-1, 120)
         .mean(axis=1)
@@ -199,8 +201,11 @@ def test_fine_values_sharpen_the_predicted_change(table):
     means = {"temperature": warm.reshape(-1, 120).mean(axis=1)}
     blunt = Windows(begin, begin + 60.0, np.ones(1), RATE, ("x",), drivers=means)
     sharp = replace(blunt, fine={"temperature": warm.reshape(-1, 12, 10).mean(axis=2)})
-    off = [np.abs(effect.explain(one).mean["sensitivity"] - found).max() for one in (blunt, sharp)]
-    assert off[1] < 0.15 * found.max()
+    off = [
+        np.abs(effect.explain(windows).mean["sensitivity"] - rates).max()
+        for windows in (blunt, sharp)
+    ]
+    assert off[1] < 0.15 * rates.max()
     assert off[1] < 0.4 * off[0]
 
 
@@ -281,9 +286,9 @@ def test_a_simulated_log_does_not_depend_on_its_chunks():
         "noise": {"N": 0.01},
         "log": {"rate": 2, "duration": "1500s"},
     }
-    one, many = (simulate(model, seed=9, chunk=chunk).rate.values for chunk in (3000, 371))
-    np.testing.assert_array_equal(one, many)
-    assert np.isnan(one[:, 1000:1080]).all()
+    whole, many = (simulate(model, seed=9, chunk=chunk).rate.values for chunk in (3000, 371))
+    np.testing.assert_array_equal(whole, many)
+    assert np.isnan(whole[:, 1000:1080]).all()
 
 
 @pytest.mark.parametrize(

@@ -24,14 +24,14 @@ def density_of_reading(reading, f, rate):
     """Two-sided density of the samples, from the recursion itself."""
     size = reading.read.size
     noise = reading.kick @ reading.kick.T
-    found = []
-    for one in f:
+    densities = []
+    for frequency in f:
         gain = reading.read @ np.linalg.inv(
-            np.exp(2j * np.pi * one / rate) * np.eye(size) - reading.step
+            np.exp(2j * np.pi * frequency / rate) * np.eye(size) - reading.step
         )
         through = np.append(gain, 1.0)
-        found.append((through @ noise @ through.conj()).real / rate)
-    return np.array(found)
+        densities.append((through @ noise @ through.conj()).real / rate)
+    return np.array(densities)
 
 
 @pytest.mark.parametrize("average", [False, True], ids=["point", "average"])
@@ -45,9 +45,9 @@ def test_samples_of_a_band_have_its_folded_density(mount, rate, average):
     expected = folded_psd(
         lambda g: band_psd(g, 700.0, 800.0, **mount), f, rate, 20_000.0, average=average
     )
-    found = density_of_reading(reading, f, rate)
+    density_of_samples = density_of_reading(reading, f, rate)
     strong = expected > 1e-6 * expected.max()
-    np.testing.assert_allclose(found[strong], expected[strong], rtol=2e-3)
+    np.testing.assert_allclose(density_of_samples[strong], expected[strong], rtol=2e-3)
     assert strong.sum() >= 1
 
 
@@ -68,9 +68,9 @@ def test_samples_of_an_oscillator_have_its_folded_density(frequency, quality, ra
     "density", [lambda f: band_psd(f, 700.0, 800.0), lambda f: oscillator_psd(f, 700.0, 9.0)]
 )
 def test_densities_have_unit_power(density):
-    near = quad(density, 500.0, 1000.0, limit=400, epsabs=1e-12)[0]
-    far = quad(density, 1e-9, 500.0)[0] + quad(density, 1000.0, 1e7, limit=2000)[0]
-    assert 2.0 * (near + far) == pytest.approx(1.0, rel=1e-3)
+    inside = quad(density, 500.0, 1000.0, limit=400, epsabs=1e-12)[0]
+    outside = quad(density, 1e-9, 500.0)[0] + quad(density, 1000.0, 1e7, limit=2000)[0]
+    assert 2.0 * (inside + outside) == pytest.approx(1.0, rel=1e-3)
 
 
 def test_half_power_at_the_edges_of_the_band():
@@ -99,7 +99,7 @@ def vibrating(**effect):
         "log": {"rate": 400, "duration": "150s", "axes": ["x"]},
     }
     loud = model | {"effect": [{"name": "aliased_vibration", "sensitivity": 50 / 13.39, **effect}]}
-    return [simulate(one, seed=3).rate.values for one in (model, loud)]
+    return [simulate(tables, seed=3).rate.values for tables in (model, loud)]
 
 
 @pytest.mark.parametrize(
@@ -125,9 +125,9 @@ def test_a_band_on_a_multiple_of_the_sampling_rate_looks_like_n_or_q(sampling, t
     )
     expected = np.sqrt(1 + added / ((60 * 0.0031) ** 2 / np.array(taus)))
     np.testing.assert_allclose(expected, times, rtol=0.05)
-    found = sigma(loud, 400.0, taus[:3])[0] / sigma(quiet, 400.0, taus[:3])[0]
-    np.testing.assert_allclose(found[:2], expected[:2], rtol=0.04)
-    assert found[2] == pytest.approx(expected[2], rel=0.2 if sampling == "point" else 0.06)
+    ratio = sigma(loud, 400.0, taus[:3])[0] / sigma(quiet, 400.0, taus[:3])[0]
+    np.testing.assert_allclose(ratio[:2], expected[:2], rtol=0.04)
+    assert ratio[2] == pytest.approx(expected[2], rel=0.2 if sampling == "point" else 0.06)
 
 
 def test_band_is_aliased_to_the_expected_frequencies():

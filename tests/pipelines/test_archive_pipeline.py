@@ -61,16 +61,16 @@ def test_it_is_short():
 
 @pytest.mark.slow
 def test_product_spans_the_days_and_finds_the_noise(archive):
-    folder, said = archive
+    folder, printed = archive
     with gyrostab.open_product(folder / "results" / "product.nc") as product:
         bounds = product["time_bounds"].values
         assert bounds[0, 0] == np.datetime64(DAYS[0])
         assert bounds[-1, 1] > np.datetime64(DAYS[-1]) + np.timedelta64(19, "h")
         for axis, n in N_TRUE.items():
             part = product.sel(axis=axis).load()
-            seen = part["N"].where(part["observable"].sel(term="N") == 2)
-            assert float(seen.median()) == pytest.approx(n, rel=0.03)
-            assert f"axis {axis}: " in said
+            observed = part["N"].where(part["observable"].sel(term="N") == 2)
+            assert float(observed.median()) == pytest.approx(n, rel=0.03)
+            assert f"axis {axis}: " in printed
         night = product.sel(
             time=slice(f"{DAYS[0]}T21:05", f"{DAYS[0]}T22:55")
         )  # windows wholly in the gap
@@ -82,7 +82,7 @@ def test_product_spans_the_days_and_finds_the_noise(archive):
 
 @pytest.mark.slow
 def test_all_other_outputs_exist(archive):
-    folder, said = archive
+    folder, printed = archive
     results = folder / "results"
     assert {path.name for path in results.iterdir()} == {
         "log.nc",
@@ -98,7 +98,7 @@ def test_all_other_outputs_exist(archive):
         "davar_3d_y.png",
     }
     assert "3 files" in (results / "report.html").read_text()
-    assert all(f"run_{9 - number}.csv" in said for number in range(3))
+    assert all(f"run_{9 - number}.csv" in printed for number in range(3))
     with gyrostab.open_log(results / "log.nc") as log:
         assert gyrostab.gap_table(log)["samples"].tolist() == [4 * 3600 * HERTZ] * 2
 

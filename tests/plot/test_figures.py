@@ -48,14 +48,15 @@ def picture(figure: Figure) -> Image.Image:
     return whole.resize((WIDTH, round(whole.height * WIDTH / whole.width)), Image.Resampling.BOX)
 
 
-def difference(one: Image.Image, other: Image.Image) -> float:
+def difference(expected: Image.Image, drawn: Image.Image) -> float:
     """Root mean square difference after a blur of three pixels, which hides subpixel shifts."""
-    assert one.size == other.size
+    assert expected.size == drawn.size
     small = [
         np.asarray(
-            image.resize((one.width // 3, one.height // 3), Image.Resampling.BOX), dtype=float
+            image.resize((expected.width // 3, expected.height // 3), Image.Resampling.BOX),
+            dtype=float,
         )
-        for image in (one, other)
+        for image in (expected, drawn)
     ]
     return float(np.sqrt(np.mean((small[0] - small[1]) ** 2)))
 

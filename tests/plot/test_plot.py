@@ -202,9 +202,11 @@ def test_values_limits_and_unobservable_spans_of_the_coefficients(windows):
     part = product.sel(axis="y")
     for ax, symbol in zip(figure.axes, LAWS, strict=True):
         line = next(line for line in ax.lines if line.get_label() == "y")
-        seen = part.observable.sel(term=symbol) == 2
-        np.testing.assert_allclose(line.get_ydata(), part[symbol].where(seen).values)
-        assert ax.get_ylim()[0] <= np.nanmin(part[symbol].where(seen, part[f"{symbol}_upper"]))
+        is_observed = part.observable.sel(term=symbol) == 2
+        np.testing.assert_allclose(line.get_ydata(), part[symbol].where(is_observed).values)
+        assert ax.get_ylim()[0] <= np.nanmin(
+            part[symbol].where(is_observed, part[f"{symbol}_upper"])
+        )
         (limits,) = [item for item in ax.collections if str(item.get_gid()).startswith("upper")]
         drawn = limits.get_offsets()[:, 1]
         known = part[f"{symbol}_upper"].values
@@ -352,9 +354,9 @@ def test_negative_variance_has_no_deviation(product):
     before, after = (
         next(
             np.ma.filled(item.get_array(), np.nan)
-            for item in plot_davar(one, axis="x").axes[0].collections
+            for item in plot_davar(surface, axis="x").axes[0].collections
             if isinstance(item, QuadMesh)
         )
-        for one in (product, spoiled)
+        for surface in (product, spoiled)
     )
     assert np.isnan(after).sum() == np.isnan(before).sum() + 1

@@ -89,8 +89,8 @@ def test_coefficients_are_estimates_or_limits_on_one_time_axis():
     n_of_y = [
         trace for trace in figure["data"] if trace["yaxis"] == "y2" and trace["name"] == "axis y"
     ]
-    seen = product.observable.sel(axis="y", term="N").values == 2
-    expected = np.where(seen, product.N.sel(axis="y").values, np.nan)
+    is_observed = product.observable.sel(axis="y", term="N").values == 2
+    expected = np.where(is_observed, product.N.sel(axis="y").values, np.nan)
     np.testing.assert_allclose(_decode_numbers(n_of_y[0]["y"]), expected, rtol=1e-6)
     limits = [trace for trace in figure["data"] if trace["name"] == "axis z, upper limit"]
     assert limits
@@ -264,9 +264,9 @@ def _browse(path, width):
     )
     console = [line for line in ended.stderr.splitlines() if ":CONSOLE" in line]
     assert not [line for line in console if re.search(r"error|failed|refused|net::", line, re.I)]
-    found = re.search(r'<pre id="probe">(.*?)</pre>', ended.stdout, re.S)
-    assert found is not None
-    return json.loads(html.unescape(found[1]))
+    match = re.search(r'<pre id="probe">(.*?)</pre>', ended.stdout, re.S)
+    assert match is not None
+    return json.loads(html.unescape(match[1]))
 
 
 def _check_access(state, width):

@@ -86,9 +86,9 @@ def test_coefficient_table_holds_medians_ranges_and_shares(page):
     assert (low, high) == pytest.approx(tuple(np.nanquantile(values, [0.05, 0.95])), rel=0.01)
     assert n_of_y[4:] == ["deg/√h", "90 %", "0 %", "–"]
     q_of_x = rows[0]
-    seen = product.observable.sel(axis="x", term="Q") == 2
+    is_observed = product.observable.sel(axis="x", term="Q") == 2
     assert float(q_of_x[2]) == pytest.approx(
-        float(product.Q.sel(axis="x").where(seen).median()), rel=0.01
+        float(product.Q.sel(axis="x").where(is_observed).median()), rel=0.01
     )
     assert q_of_x[5:7] == ["45 %", "45 %"]
     r_of_z = rows[14]

@@ -139,16 +139,18 @@ def test_command_writes_a_log_that_run_takes(tmp_path, capsys):
         log.rate.values, simulate(path, duration="2min", rate=50.0, seed=3).rate.values
     )
     assert call("run", out, "-o", tmp_path / "p.nc", "--window", "30s", "--quiet-progress") == 0
-    again = tmp_path / "again.nc"
+    second_log = tmp_path / "again.nc"
     assert (
-        call("simulate", path, "-o", again, "--like", out, "--seed", "3", "--quiet-progress") == 2
+        call("simulate", path, "-o", second_log, "--like", out, "--seed", "3", "--quiet-progress")
+        == 2
     )  # temperature twice
     assert "the channel 'temperature' twice" in capsys.readouterr().err
     path.write_text("[noise]\nN = 0.02\n")
     assert (
-        call("simulate", path, "-o", again, "--like", out, "--seed", "3", "--quiet-progress") == 0
+        call("simulate", path, "-o", second_log, "--like", out, "--seed", "3", "--quiet-progress")
+        == 0
     )
-    assert (open_log(again).time.values == log.time.values).all()
+    assert (open_log(second_log).time.values == log.time.values).all()
 
 
 def test_command_explains_a_wrong_model(tmp_path, capsys):
@@ -157,9 +159,9 @@ def test_command_explains_a_wrong_model(tmp_path, capsys):
     assert (
         call("simulate", path, "-o", tmp_path / "log.nc", "--duration", "1min", "--rate", "10") == 2
     )
-    said = capsys.readouterr().err
-    assert "lacks the parameter 'sensitivity'" in said
-    assert "Traceback" not in said
+    message = capsys.readouterr().err
+    assert "lacks the parameter 'sensitivity'" in message
+    assert "Traceback" not in message
     assert not (tmp_path / "log.nc").exists()
 
 

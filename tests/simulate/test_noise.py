@@ -61,10 +61,10 @@ def ensembles() -> dict[str, np.ndarray]:
 def test_ensemble_allan_variance_matches_the_law_at_every_tau(term, ensembles):
     """From one sample to a tenth of the record, within 2 % (the ensemble scatters by 0.7 %)."""
     ensembles[term] = made = records(term)
-    found = np.array([allan(made, int(k)) for k in TAUS])
+    variance = np.array([allan(made, int(k)) for k in TAUS])
     expected = laws(term, TAUS / RATE)
     np.testing.assert_allclose(
-        found, expected, rtol=0.02, atol=2e-4 * expected.max() if term == "sinusoid" else 0.0
+        variance, expected, rtol=0.02, atol=2e-4 * expected.max() if term == "sinusoid" else 0.0
     )
 
 
@@ -85,8 +85,8 @@ def test_ensemble_spectrum_integrates_to_the_law(term, ensembles):
     for k in (1, 2, 5, 10, 20):
         transfer = 2 * np.sin(np.pi * f * k / RATE) ** 4 / (k * np.sin(np.pi * f / RATE)) ** 2
         weight = np.where(f == RATE / 2, 1.0, 2.0)
-        found = float((weight * density[1:] * transfer).sum() * RATE / 4000)
-        assert found == pytest.approx(float(laws(term, np.array(k / RATE))), rel=0.02), k
+        variance = float((weight * density[1:] * transfer).sum() * RATE / 4000)
+        assert variance == pytest.approx(float(laws(term, np.array(k / RATE))), rel=0.02), k
 
 
 @pytest.mark.parametrize("tau", [0.02, 0.3, 5.0])
@@ -126,10 +126,10 @@ def test_flicker_is_flat_from_one_sample_to_twenty_hours(rate):
     times = flicker_times(rate, low=FLICKER_LOW)
     tau = np.geomspace(1 / rate, 72000.0, 300)
     share = np.log(RATIO) / np.pi
-    found = sum(share * markov_avar(tau, 1.0, time) for time in times)
+    variance = sum(share * markov_avar(tau, 1.0, time) for time in times)
     faster = times[-1] / RATIO ** np.arange(1, 40)
-    found = found + share * 2 * faster.sum() / tau
-    np.testing.assert_allclose(found, LAWS["B"].avar(tau), rtol=0.004)
+    variance = variance + share * 2 * faster.sum() / tau
+    np.testing.assert_allclose(variance, LAWS["B"].avar(tau), rtol=0.004)
     assert times[-1] <= 1 / rate / 12
 
 

@@ -87,9 +87,10 @@ def test_noise_reaches_the_analysis_at_its_level():
     chunk=st.integers(150, 2500), seed=st.integers(0, 2**32), oversampling=st.sampled_from([1, 3])
 )
 def test_the_same_seed_gives_the_same_bits_whatever_the_chunks(chunk, seed, oversampling):
-    one = model(log=LOG | {"oversampling": oversampling})
+    tables = model(log=LOG | {"oversampling": oversampling})
     np.testing.assert_array_equal(
-        simulate(one, seed=seed, chunk=chunk).rate.values, simulate(one, seed=seed).rate.values
+        simulate(tables, seed=seed, chunk=chunk).rate.values,
+        simulate(tables, seed=seed).rate.values,
     )
 
 
@@ -97,9 +98,9 @@ def test_every_effect_gives_the_same_bits_whatever_the_chunks():
     world = every_channel(90.0)
     for name, kind in effects().items():
         plain = read_model(model(environment=[WORLD[5]], effect=[]))
-        one = replace(plain, effects=(kind.example(),))
+        single = replace(plain, effects=(kind.example(),))
         whole, cut = (
-            simulate(one, environment=world, chunk=chunk).rate.values for chunk in (1800, 331)
+            simulate(single, environment=world, chunk=chunk).rate.values for chunk in (1800, 331)
         )
         np.testing.assert_array_equal(cut, whole, err_msg=name)
 
@@ -121,8 +122,8 @@ def test_oversampling_keeps_the_noise_of_the_log():
     size = {"duration": "30min", "rate": 20.0}
     for factor in (1, 4):
         log = simulate({"noise": {"N": 0.02, "K": 3.0}, "log": {"oversampling": factor}}, **size)
-        found = davar(log, window="30min", taus=["0.05s"]).avar.values.mean()
-        assert found == pytest.approx(0.02**2 * 3600 / 0.05 + 9 * 0.05 / 3600 / 3, rel=0.02)
+        variance = davar(log, window="30min", taus=["0.05s"]).avar.values.mean()
+        assert variance == pytest.approx(0.02**2 * 3600 / 0.05 + 9 * 0.05 / 3600 / 3, rel=0.02)
 
 
 # --------------------------------------------------------------------------------
@@ -131,13 +132,15 @@ def test_oversampling_keeps_the_noise_of_the_log():
 
 def test_an_effect_alone_is_the_difference_of_two_runs():
     with_effects, without = simulate(model(), seed=5), simulate(model(effect=[]), seed=5)
-    alone = (with_effects.rate - without.rate).values
+    difference = (with_effects.rate - without.rate).values
     t = np.arange(1800) / 20
     bias = 0.02 * (np.interp(t, [0, 89], [20, 20 + 89 * 0.5]) - 25.0)
-    present = ~np.isnan(alone[0])
-    np.testing.assert_allclose(alone[0, present], bias[present], rtol=0, atol=1e-9)
+    present = ~np.isnan(difference[0])
+    np.testing.assert_allclose(difference[0, present], bias[present], rtol=0, atol=1e-9)
     accel = np.interp(t, np.arange(2250) / 25, with_effects.accel_x.values)
-    np.testing.assert_allclose(alone[1, present], (bias + 0.5 * accel)[present], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        difference[1, present], (bias + 0.5 * accel)[present], rtol=0, atol=1e-9
+    )
 
 
 def test_zero_size_changes_nothing_whatever_the_effect():
@@ -228,10 +231,10 @@ def test_effects_follow_the_course_of_a_recorded_channel(monkeypatch, effect, no
     if long:
         monkeypatch.setattr(drivers, "SHORT", 1000)
     follow = {"effect": [effect], "log": {"axes": ["x"]}}
-    found = simulate(follow, like=recorded).rate.values
-    error = found - truth.rate.values
+    rates = simulate(follow, like=recorded).rate.values
+    error = rates - truth.rate.values
     assert np.sqrt(np.mean(error**2)) < largest * np.std(truth.rate.values)
-    np.testing.assert_array_equal(simulate(follow, like=recorded, chunk=257).rate.values, found)
+    np.testing.assert_array_equal(simulate(follow, like=recorded, chunk=257).rate.values, rates)
 
 
 def test_noise_of_a_light_power_below_zero_is_not_followed():
@@ -242,8 +245,8 @@ def test_noise_of_a_light_power_below_zero_is_not_followed():
     assert recorded["light_power"].min() < 0.0
     noisy = {"name": "light_power_noise", "thermal": 0.5, "nominal": 1e-5}
     model = {"noise": {"N": 0.01}, "effect": [noisy], "log": {"axes": ["x"]}}
-    found, right = (simulate(model, like=one).rate.values for one in (recorded, truth))
-    assert np.std(found - right) < 0.1 * np.std(right)
+    rates, right = (simulate(model, like=recording).rate.values for recording in (recorded, truth))
+    assert np.std(rates - right) < 0.1 * np.std(right)
     dark = recorded.assign(light_power=recorded["light_power"] * 0.0)
     dark["light_power"][:100] = 1e-5
     with pytest.warns(UserWarning, match="light_power"):
@@ -262,19 +265,19 @@ def test_rotation_is_true_rate_on_its_axis():
 
 
 def test_chain_takes_each_step_once_and_resumes_from_a_state():
-    taken: list[int] = []
+    steps_taken: list[int] = []
 
     def step(number: int, state: int) -> tuple[int, int]:
-        taken.append(number)
+        steps_taken.append(number)
         return 10 * state, state + number
 
     chain = Chain(step, 1, 2000)
     whole = [chain(number) for number in range(2000)]
-    assert taken == list(range(2000))
-    taken.clear()
+    assert steps_taken == list(range(2000))
+    steps_taken.clear()
     assert chain(1001) == whole[1001]
-    assert len(taken) <= 4  # 2000 steps, 512 states
-    taken.clear()
+    assert len(steps_taken) <= 4  # 2000 steps, 512 states
+    steps_taken.clear()
     assert [pickle.loads(pickle.dumps(Chain(_count, 1, 50)))(number) for number in (30, 7)] == [
         10 * (1 + 435),
         10 * (1 + 21),
@@ -287,8 +290,8 @@ def _count(number: int, state: int) -> tuple[int, int]:
 
 def test_blocks_in_any_order_from_any_thread_are_those_of_the_whole():
     whole = simulate(model(), seed=2, chunk=100)
-    again = simulate(model(), seed=2, chunk=100)
-    backwards = [again.rate.data.blocks[0, k] for k in reversed(range(18))]
+    second_run = simulate(model(), seed=2, chunk=100)
+    backwards = [second_run.rate.data.blocks[0, k] for k in reversed(range(18))]
     parts = dask.compute(*backwards, scheduler="threads", num_workers=4)
     np.testing.assert_array_equal(np.concatenate(parts[::-1], axis=1), whole.rate.values)
 

@@ -33,8 +33,10 @@ def write_foreign(path: Path, zarr_format: int) -> None:
 
 def chunk_files(path: Path, name: str) -> list[Path]:
     """The files of the chunks of an array."""
-    found = [one for one in (path / name).rglob("*") if one.is_file()]
-    return sorted(one for one in found if not one.name.startswith(".z") and one.suffix != ".json")
+    files = [file for file in (path / name).rglob("*") if file.is_file()]
+    return sorted(
+        file for file in files if not file.name.startswith(".z") and file.suffix != ".json"
+    )
 
 
 @pytest.mark.parametrize("zarr_format", [2, 3])

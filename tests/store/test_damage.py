@@ -56,15 +56,15 @@ def test_the_graph_is_small_and_travels(tmp_path, form):
 def test_a_damaged_chunk_becomes_a_gap_with_one_warning(tmp_path, form, how):
     path = WRITERS[form](counts_log(), tmp_path / f"log.{form}")
     spoil(path, 1, 1, how=how)
-    wanted = counts_log().rate.copy()
-    wanted[1, CHUNK : 2 * CHUNK] = np.nan
-    with open_log(path) as log, warnings.catch_warnings(record=True) as seen:
+    expected = counts_log().rate.copy()
+    expected[1, CHUNK : 2 * CHUNK] = np.nan
+    with open_log(path) as log, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         with dask.config.set(scheduler="threads", num_workers=2):
-            assert same_bits(log.rate, wanted)
+            assert same_bits(log.rate, expected)
             assert np.isnan(log.rate[1, CHUNK + 3 :: 1000]).sum() == 120
     (message,) = [
-        str(warning.message) for warning in seen if issubclass(warning.category, UserWarning)
+        str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)
     ]
     assert str(path) in message
     assert (
@@ -78,7 +78,7 @@ def test_a_damaged_chunk_becomes_a_gap_with_one_warning(tmp_path, form, how):
     ):
         log.rate.compute()
     with open_log(path, strict=True) as log:
-        assert same_bits(log.rate[0], wanted[0])  # strict or not, what is sound is read
+        assert same_bits(log.rate[0], expected[0])  # strict or not, what is sound is read
 
 
 @pytest.mark.parametrize(
@@ -204,9 +204,9 @@ def test_a_worker_of_a_cluster_tells_the_client(tmp_path):
     }
 
     def compute(client):
-        found = client.compute(log.rate.data).result()
+        rates = client.compute(log.rate.data).result()
         time.sleep(1.0)  # the message takes its own way
-        return found
+        return rates
 
     with (
         distributed.LocalCluster(**settings) as cluster,
@@ -216,10 +216,10 @@ def test_a_worker_of_a_cluster_tells_the_client(tmp_path):
         with pytest.warns(
             UserWarning, match=r"axis y: the chunk from .* is missing: no file rate/1\.1"
         ):
-            found = compute(client)
+            rates = compute(client)
         assert client.scheduler_info(n_workers=-1)["workers"]
-    assert np.isnan(found[1, CHUNK:]).all()
-    assert not np.isnan(found[1, :CHUNK]).any()
+    assert np.isnan(rates[1, CHUNK:]).all()
+    assert not np.isnan(rates[1, :CHUNK]).any()
 
 
 def test_what_stands_behind_a_chunk_that_is_cut_short_is_not_read():

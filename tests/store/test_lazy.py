@@ -69,9 +69,9 @@ def test_joined_samples_are_those_of_dask(made, data):
     assert can_read_directly(joined)
     begin = data.draw(st.integers(0, size))
     for row, expected in enumerate(joined.compute(scheduler="synchronous")):
-        found = np.full(data.draw(st.integers(0, size - begin)), 7.0)
-        read_into(joined, row, begin, found)
-        np.testing.assert_array_equal(found, expected[begin : begin + found.size])
+        target = np.full(data.draw(st.integers(0, size - begin)), 7.0)
+        read_into(joined, row, begin, target)
+        np.testing.assert_array_equal(target, expected[begin : begin + target.size])
 
 
 def test_runs_that_follow_each_other_are_read_with_one_slice():
@@ -86,10 +86,10 @@ def test_runs_that_follow_each_other_are_read_with_one_slice():
     array = make_dask(Counting(values), 300)
     runs = np.array([[4 * number, 3 * number, 3] for number in range(100)])
     joined = place_on_grid([[(array, None, runs)]], 400, 400)
-    found = np.empty(400)
-    read_into(joined, 0, 0, found)
-    assert np.isnan(found[3::4]).all()
-    np.testing.assert_array_equal(found[np.isfinite(found)], values)
+    target = np.empty(400)
+    read_into(joined, 0, 0, target)
+    assert np.isnan(target[3::4]).all()
+    np.testing.assert_array_equal(target[np.isfinite(target)], values)
     assert reads == [(0, 300)]
 
 
@@ -98,9 +98,9 @@ def test_what_is_derived_from_an_array_is_not_read_past_dask():
     doubled = 2.0 * joined
     assert not can_read_directly(doubled)
     assert not can_read_directly(joined[:, 1:])
-    found = np.empty(3)
-    read_into(doubled, 0, 4, found)
-    np.testing.assert_array_equal(found, [8.0, 10.0, 12.0])
+    target = np.empty(3)
+    read_into(doubled, 0, 4, target)
+    np.testing.assert_array_equal(target, [8.0, 10.0, 12.0])
 
 
 def stored_logs(folder, form):
@@ -144,9 +144,9 @@ def test_stored_samples_are_those_of_dask(tmp_path, form):
         whole = np.atleast_2d(data.compute())
         for begin, end in np.sort(rng.integers(0, data.shape[-1] + 1, (20, 2)), axis=1).tolist():
             for row, expected in enumerate(whole):
-                found = np.full(end - begin, 7.0)
-                read_into(data, row, begin, found)
-                np.testing.assert_array_equal(found, expected[begin:end])
+                target = np.full(end - begin, 7.0)
+                read_into(data, row, begin, target)
+                np.testing.assert_array_equal(target, expected[begin:end])
 
 
 @pytest.mark.parametrize("form", ["nc", "zarr"])
@@ -166,17 +166,17 @@ def test_a_joined_log_is_written_as_dask_would_give_it(tmp_path, monkeypatch, fo
     slow.rate.encoding = log.rate.encoding
     assert not can_read_directly(slow.rate.data)
     store = {"nc": to_netcdf, "zarr": to_zarr}[form]
-    found = []
+    stored = []
     with warnings.catch_warnings():
         warnings.simplefilter(
             "error" if unit == 0.02 else "ignore"
         )  # of the other unit not every value is a multiple
-        for name, one in (("quick", log), ("slow", slow)):
-            found.append(open_log(store(one, tmp_path / f"{name}.{form}")))
-    assert found[0].rate.encoding == found[1].rate.encoding
-    assert ("scale_factor" in found[0].rate.encoding) == (unit == 0.02)
-    xr.testing.assert_equal(found[0].compute(), found[1].compute())
-    np.testing.assert_array_equal(found[0].rate.values, log.rate.values)
+        for name, source in (("quick", log), ("slow", slow)):
+            stored.append(open_log(store(source, tmp_path / f"{name}.{form}")))
+    assert stored[0].rate.encoding == stored[1].rate.encoding
+    assert ("scale_factor" in stored[0].rate.encoding) == (unit == 0.02)
+    xr.testing.assert_equal(stored[0].compute(), stored[1].compute())
+    np.testing.assert_array_equal(stored[0].rate.values, log.rate.values)
 
 
 def test_a_large_product_is_that_of_the_small_way(tmp_path, monkeypatch):
@@ -278,9 +278,9 @@ def test_logs_in_memory_join_as_before():
         for n in range(2)
     ]
     joined = concatenate_logs(parts, ["a.nc", "b.nc"]).rate.data
-    found = np.empty(7)
-    read_into(joined, 0, 0, found)
-    np.testing.assert_array_equal(found, joined.compute()[0])
+    target = np.empty(7)
+    read_into(joined, 0, 0, target)
+    np.testing.assert_array_equal(target, joined.compute()[0])
 
 
 def placed_by_hand(runs, size, rows):
@@ -292,9 +292,9 @@ def placed_by_hand(runs, size, rows):
     return out
 
 
-@pytest.mark.parametrize("kept", ["memory", "disk", "both"])
+@pytest.mark.parametrize("storage", ["memory", "disk", "both"])
 @pytest.mark.parametrize(("scale", "unit"), [(1.0, None), (3.0, None), (2.0, 0.1)])
-def test_rows_are_put_on_the_grid_directly_as_by_dask(kept, scale, unit, monkeypatch):
+def test_rows_are_put_on_the_grid_directly_as_by_dask(storage, scale, unit, monkeypatch):
     monkeypatch.setattr(fill, "MAX_PLAIN_NUMBERS", 10)
     rng = np.random.default_rng(8)
     rows = 0.1 * rng.integers(-50, 50, (2, 3000)).astype(float)
@@ -305,8 +305,10 @@ def test_rows_are_put_on_the_grid_directly_as_by_dask(kept, scale, unit, monkeyp
         "memory": [rows],
         "disk": [rows[:, :cut], rows[:, cut:]],
         "both": [rows[:, :cut], rows[:, cut:]],
-    }[kept]
-    on_disk = [kept == "disk" or (kept == "both" and number > 0) for number in range(len(pieces))]
+    }[storage]
+    on_disk = [
+        storage == "disk" or (storage == "both" and number > 0) for number in range(len(pieces))
+    ]
     columns = [
         [
             as_lazy(spool.store(piece[row])) if spooled else piece[row]
@@ -316,7 +318,7 @@ def test_rows_are_put_on_the_grid_directly_as_by_dask(kept, scale, unit, monkeyp
     ]
     raw = (
         rows
-        if kept == "memory"
+        if storage == "memory"
         else stack_rows([concatenate_columns(column, 500) for column in columns])
     )
     placed = fill.rows_on_grid(

@@ -145,10 +145,10 @@ def test_a_small_archive(tmp_path, form):
     files = make_archive.main([str(tmp_path / "a"), *given])
     make_archive.main([str(tmp_path / "b"), *given])
     assert len(files) == 4
-    log, again = (
+    log, second_log = (
         gyrostab.regularise(gyrostab.read_log(sorted((tmp_path / name).iterdir()))) for name in "ab"
     )
-    assert same_bits(log.rate, again.rate)
+    assert same_bits(log.rate, second_log.rate)
     assert log.attrs["sampling_rate_hz"] == 50.0
     assert 0.95 * 18_000 < log.sizes["time"] <= 18_000
     present = log.rate.values[~np.isnan(log.rate.values)]

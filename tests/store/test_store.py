@@ -124,15 +124,15 @@ def test_layout_and_round_trip(tmp_path, form, lazy):
         assert back.rate.chunks == ((1, 1), (CHUNK, CHUNK, 1000))
         assert isinstance(back.xindexes["time"], TimeGridIndex)
         np.testing.assert_array_equal(back.time[-3:], log.time[-3:])
-        again = WRITERS[form](back, tmp_path / f"again.{form}", stamps=False)
-        assert stored_kinds(again) == kinds
+        copy = WRITERS[form](back, tmp_path / f"again.{form}", stamps=False)
+        assert stored_kinds(copy) == kinds
 
 
 def test_compression_and_checksums(tmp_path):
     with netCDF4.Dataset(to_netcdf(counts_log(), tmp_path / "log.nc", compression="zstd")) as file:
-        found = file["rate"].filters()
-        assert found["fletcher32"]
-        assert found["zstd"]
+        filters = file["rate"].filters()
+        assert filters["fletcher32"]
+        assert filters["zstd"]
     with netCDF4.Dataset(to_netcdf(counts_log(), tmp_path / "plain.nc")) as file:
         assert file["rate"].filters()["zlib"]
         assert not file["rate"].filters()["zstd"]

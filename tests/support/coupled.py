@@ -99,10 +99,10 @@ def product(
         kind = "flicker" if noises == "flicker" else "white"
         level = 0.01 * np.stack([1 + 0.1 * pair(noise(kind, cells, rng)) for _ in axes])
         made[term] = (("axis", "time"), level, attributes(term))
-    seen = np.zeros((*shape, len(TERMS)), np.int8)
+    flags = np.zeros((*shape, len(TERMS)), np.int8)
     if terms:
-        seen[..., [1, 2]] = 2
-    made["observable"] = (("axis", "time", "term"), seen, attributes("observable"))
+        flags[..., [1, 2]] = 2
+    made["observable"] = (("axis", "time", "term"), flags, attributes("observable"))
     made["temperature"] = (
         "time",
         pair(cold),

@@ -57,7 +57,7 @@ def forked(action: Callable[[], object], *, after: float | None = None) -> int:
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
-def armed(number: int, found: Path) -> Callable[[], None]:
+def armed(number: int, count_file: Path) -> Callable[[], None]:
     """Kill this process before its call `number` that changes the disk; write the count."""
     count = 0
 
@@ -71,7 +71,7 @@ def armed(number: int, found: Path) -> Callable[[], None]:
             if count == number:
                 os.kill(os.getpid(), signal.SIGKILL)
             count += 1
-            found.write_text(str(count))
+            count_file.write_text(str(count))
             return function(*arguments, **options)
 
         return call
@@ -88,17 +88,17 @@ def main(folder: Path, log: Path, seed: int, points: int, kills: int) -> dict[st
     whole = (folder / "whole.nc").read_bytes()
     wrong: list[str] = []
 
-    def outcome(output: Path, what: str) -> None:
+    def outcome(output: Path, case: str) -> None:
         status = forked(lambda: make(log, output, resume=True))
         if status or output.read_bytes() != whole:
             wrong.append(
-                f"{what}: exit {status}, {'another product' if output.exists() else 'no product'}"
+                f"{case}: exit {status}, {'another product' if output.exists() else 'no product'}"
             )
         left = [
             path.name for path in folder.iterdir() if output.name in path.name and path != output
         ]
         if left:
-            wrong.append(f"{what}: left {left}")
+            wrong.append(f"{case}: left {left}")
 
     def killed_before(number: int, output: Path) -> bool:
         def doomed() -> None:
@@ -118,11 +118,14 @@ def main(folder: Path, log: Path, seed: int, points: int, kills: int) -> dict[st
     for kill in range(kills):
         output = folder / f"kill{kill % 3}.nc"  # the same output is killed again and again
         moment = draw.uniform(0.0, 1.05 * seconds)
-        again = output.with_name(f".{output.name}.job").exists()
+        is_begun = output.with_name(f".{output.name}.job").exists()
         if output.exists():
             output.unlink()
         landed += (
-            forked(lambda output=output, again=again: make(log, output, resume=again), after=moment)
+            forked(
+                lambda output=output, is_begun=is_begun: make(log, output, resume=is_begun),
+                after=moment,
+            )
             == -signal.SIGKILL
         )
         if kill % 3 != 1:

@@ -94,12 +94,12 @@ def content() -> dict[str, Any]:
         "estimate": 0.08,
         "p_value": 1e-9,
     }
-    kept = ("view", "axes", "tau_min_s", "tau_max_s", "ratio", "p_value")
+    keys = ("view", "axes", "tau_min_s", "tau_max_s", "ratio", "p_value")
     mismatches = [
-        {"id": number, **{key: one[key] for key in kept}, "start": when(one["begin"]),
-        "end": when(one["end"]), "explained_by": [name],
-         "statement": mismatch_statement(one, 3600.0)}
-        for number, (one, name) in enumerate(
+        {"id": number, **{key: mismatch[key] for key in keys}, "start": when(mismatch["begin"]),
+        "end": when(mismatch["end"]), "explained_by": [name],
+         "statement": mismatch_statement(mismatch, 3600.0)}
+        for number, (mismatch, name) in enumerate(
             [(shift, "vibration_rectification"), (region, "vibration_noise")], start=1
         )
     ]  # fmt: skip
@@ -108,7 +108,7 @@ def content() -> dict[str, Any]:
         ("vibration_noise", "white", 0.00045, "deg/sqrt(h)/g", []),
         ("vibration_rectification", "sensitivity", 0.0022, "deg/h/g^2", ["g_sensitivity"]),
     ):
-        said = make_effect({"name": name, parameter: value, "axes": ["x"]}).say(
+        sentence = make_effect({"name": name, parameter: value, "axes": ["x"]}).say(
             {parameter: 0.05 * value}
         )
         effects.append(
@@ -122,7 +122,7 @@ def content() -> dict[str, Any]:
                 "held_out_gain": {"nats": 31.0, "stderr": 6.0, "threshold": 5.7},
                 "alternatives": others,
                 "probability": 0.62,
-                "statement": effect_statement(said, alternatives=others),
+                "statement": effect_statement(sentence, alternatives=others),
             }
         )  # fmt: skip
     noise = {

@@ -59,14 +59,14 @@ def run(
     parts = []
     edges = [0, *cuts, size]
     for first, end in itertools.pairwise(edges):
-        here = slice(first, end)
+        span = slice(first, end)
         chunk = Chunk(
             setup=frame,
             first=first,
             size=end - first,
-            drivers={name: values[here] for name, values in given.items()},
-            true={axis: values[here] for axis, values in motion.items()},
-            signal=before[:, here].copy(),
+            drivers={name: values[span] for name, values in given.items()},
+            true={axis: values[span] for axis, values in motion.items()},
+            signal=before[:, span].copy(),
             level={
                 symbol: np.repeat(value[:, None] ** 2, end - first, axis=1)
                 for symbol, value in coefficients.items()

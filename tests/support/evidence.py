@@ -116,7 +116,7 @@ def mean_evidence(
     xarray.DataArray
         ``gain(candidate, record)`` [nats].
     """
-    designs = [design for several in candidates.values() for design in several]
+    designs = [design for shapes in candidates.values() for design in shapes]
     return _label_evidence(
         mean_factors(data, baseline, designs, axis=axis, tier=tier, **more), candidates
     )
@@ -132,7 +132,7 @@ def power_evidence(
     **more: Any,
 ) -> xr.DataArray:
     """Compute the held-out evidence of candidates in the band powers, as `mean_evidence`."""
-    designs = [design for several in candidates.values() for design in several]
+    designs = [design for shapes in candidates.values() for design in shapes]
     return _label_evidence(
         power_factors(data, baseline, designs, axis=axis, tier=tier, **more), candidates
     )

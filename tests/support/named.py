@@ -78,8 +78,8 @@ def record(
     drop: tuple[str, ...] = (),
 ) -> xr.Dataset:
     """Return cached block statistics of three axes for these arguments."""
-    found = _make_record(json.dumps(effects), json.dumps(list(environment)), seed)
-    return found.drop_vars([f"channel_{name}" for name in drop])
+    blocks = _make_record(json.dumps(effects), json.dumps(list(environment)), seed)
+    return blocks.drop_vars([f"channel_{name}" for name in drop])
 
 
 @cache

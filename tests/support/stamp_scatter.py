@@ -18,11 +18,11 @@ def lose_samples(kind: str, rows: int, random: np.random.Generator) -> NDArray[n
     if kind == "single":
         samples = np.flatnonzero(random.random(int(rows * 1.01)) >= 0.01)
     elif kind == "bursts":
-        kept = np.ones(int(rows / 0.7), dtype=bool)
-        while kept.mean() > 0.7:
-            begin = random.integers(0, len(kept))
-            kept[begin : begin + random.integers(5, 100)] = False
-        samples = np.flatnonzero(kept)
+        is_kept = np.ones(int(rows / 0.7), dtype=bool)
+        while is_kept.mean() > 0.7:
+            begin = random.integers(0, len(is_kept))
+            is_kept[begin : begin + random.integers(5, 100)] = False
+        samples = np.flatnonzero(is_kept)
     else:
         samples = np.arange(rows)
         samples[rows // 2 :] += 123_457 * (kind == "gap")

@@ -93,8 +93,8 @@ class TestIndex:
             log.sel(time=off, method="ffill")
 
     def test_it_survives_pickling_copying_alignment_and_arithmetic(self, log):
-        again = pickle.loads(pickle.dumps(log))
-        xr.testing.assert_identical(again, log)
+        restored = pickle.loads(pickle.dumps(log))
+        xr.testing.assert_identical(restored, log)
         xr.testing.assert_identical((log + log.copy()) / 2, log)
         assert (log.isel(time=slice(0, 10)).x + log.isel(time=slice(0, 10)).x).sizes["time"] == 10
         renamed = log.rename(time="t")

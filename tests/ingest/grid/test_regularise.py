@@ -26,12 +26,12 @@ RATES = [99.3, 300.0, 1 / 7, 248.7, 100.0021]
 
 def slow_placement(stamps, rate):
     """Place every row at the nearest sample by exact fractions; first rows count."""
-    taken, found = set(), []
+    filled, placement = set(), []
     for stamp in stamps.tolist():
         sample = round((stamp - START) * Fraction(rate) / 10**9)
-        found.append(-1 if sample in taken else sample)
-        taken.add(sample)
-    return found
+        placement.append(-1 if sample in filled else sample)
+        filled.add(sample)
+    return placement
 
 
 @st.composite
@@ -78,14 +78,14 @@ def test_doubled_and_swapped_rows(pattern, doubled, swapped):
     order = np.arange(len(stamps))
     for at in places[:swapped]:
         order[at], order[at + 1] = order[at + 1], order[at]
-    again = places[swapped : swapped + doubled]
-    order = np.insert(order, again + 1, order[again])
+    repeated = places[swapped : swapped + doubled]
+    order = np.insert(order, repeated + 1, order[repeated])
     log = regularise(raw_log(stamps[order]))
     truth = samples[order]
-    truth[np.sort(again) + 1 + np.arange(len(again))] = -1
+    truth[np.sort(repeated) + 1 + np.arange(len(repeated))] = -1
     np.testing.assert_array_equal(log.rate.values[0], expected(truth))
     table = gap_table(log)
-    assert table[table.cause == "duplicate"].rows.sum() == len(again)
+    assert table[table.cause == "duplicate"].rows.sum() == len(repeated)
     assert table[table.cause == "out_of_order"].rows.sum() == len(places[:swapped])
     assert slow_placement(stamps[order], rate) == truth.tolist()
 
@@ -179,11 +179,11 @@ def test_unreadable_cells_infinite_values_and_lost_stamps():
     truth = np.where(np.isinf(values), np.nan, values)
     np.testing.assert_array_equal(log.rate.values, truth)
     table = gap_table(log).set_index("start")
-    seen = [
+    gaps = [
         (round((when.value - START) / 1e7), row.samples, row.cause)
         for when, row in table.iterrows()
     ]
-    assert seen == [(50, 3, "unreadable"), (80, 1, "unreadable"), (120, 1, "outside_range")]
+    assert gaps == [(50, 3, "unreadable"), (80, 1, "unreadable"), (120, 1, "outside_range")]
     assert log.attrs["notes"][0] == "read"
     assert any("infinite" in note for note in log.attrs["notes"])
 
@@ -303,7 +303,7 @@ def test_rows_of_a_single_run_are_returned_unchanged():
 
 def test_channel_of_another_day_is_noted():
     raw = raw_log(stamps_of(np.arange(100), 10.0))
-    for day, told in ((0, False), (3, True)):
+    for day, is_noted in ((0, False), (3, True)):
         stamps = raw.time.values[:5] + np.timedelta64(day, "D")
         other = raw.assign_coords(time_temperature=("time_temperature", stamps)).assign(
             temperature=("time_temperature", np.full(5, 20.0), {"units": "degree_Celsius"})
@@ -313,7 +313,7 @@ def test_channel_of_another_day_is_noted():
                 "channel temperature: none of its 5 values" in note
                 for note in regularise(other).attrs["notes"]
             )
-            is told
+            is is_noted
         )
 
 

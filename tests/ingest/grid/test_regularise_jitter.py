@@ -133,9 +133,9 @@ def test_the_true_rate_is_accepted_whatever_the_jitter(scatter):
     random = np.random.default_rng(0)
     samples = np.arange(20_000)
     stamps = round_stamps(scatter_stamps(samples, "normal", scatter, random), 100.0, "us")
-    told = regularise(raw_log(stamps), rate=100.0)
-    assert told.attrs["sampling_rate_hz"] == 100.0
-    assert np.isfinite(told.rate.values).sum() >= 0.999 * len(samples)
+    log = regularise(raw_log(stamps), rate=100.0)
+    assert log.attrs["sampling_rate_hz"] == 100.0
+    assert np.isfinite(log.rate.values).sum() >= 0.999 * len(samples)
 
 
 def test_given_rate_overrules_a_pattern_of_losses_and_is_noted():

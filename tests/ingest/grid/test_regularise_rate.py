@@ -205,5 +205,5 @@ def test_even_stamps_and_then_shared_ones(
     even = round(rows * (1 - share))
     shared = even - 1 + group * (1 + np.arange(rows - even) // group)
     stamps = np.concatenate([np.arange(even), shared]) * period_ms * 1_000_000
-    found = estimate_rate(lambda: iter([(np.arange(rows), stamps)]), where="tool.csv")
-    assert found.rate == pytest.approx(1000 / period_ms, rel=2e-3)
+    estimate = estimate_rate(lambda: iter([(np.arange(rows), stamps)]), where="tool.csv")
+    assert estimate.rate == pytest.approx(1000 / period_ms, rel=2e-3)

@@ -226,15 +226,15 @@ def test_epoch_shifts_numeric_time_and_is_noted_once(tmp_path: Path) -> None:
 def test_integers_convert_exactly_or_not_at_all(value: int, unit: str, epoch: int) -> None:
     parsed = parse_time_unit(unit)
     exact = value * int(parsed.ns) + epoch
-    found = int(integers_to_ns(np.array([value]), parsed, epoch)[0])
-    assert found == exact or (found == NAT and abs(value * int(parsed.ns)) > 2**63 - 2 - 10**18)
+    stamp = int(integers_to_ns(np.array([value]), parsed, epoch)[0])
+    assert stamp == exact or (stamp == NAT and abs(value * int(parsed.ns)) > 2**63 - 2 - 10**18)
 
 
 @given(st.floats(-1e9, 1e9), st.sampled_from(["s", "ms"]))
 def test_binary_floats_convert_to_the_nearest_nanosecond(value: float, unit: str) -> None:
     parsed = parse_time_unit(unit)
-    found = int(floats_to_ns(np.array([value]), parsed, 0)[0])
-    assert abs(found - Fraction(value) * parsed.ns) <= Fraction(1, 2) + Fraction(1, 10**6)
+    stamp = int(floats_to_ns(np.array([value]), parsed, 0)[0])
+    assert abs(stamp - Fraction(value) * parsed.ns) <= Fraction(1, 2) + Fraction(1, 10**6)
 
 
 def test_cell_parser_refuses_text_that_is_not_a_number() -> None:

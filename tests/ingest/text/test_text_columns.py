@@ -124,9 +124,9 @@ def test_angles_are_never_guessed(tmp_path: Path) -> None:
 
 def test_a_mapped_unit_overrules_the_header_and_an_option_does_not(tmp_path: Path) -> None:
     path = write(tmp_path, "time [s],gyro_x [deg/h]\n0,1\n1,2\n")
-    kept = read_log(path, unit={"gyro": "deg/s"})
-    assert float(kept.rate[0, 0]) == 1
-    assert any("--unit gyro=deg/s is not applied" in note for note in kept.attrs["notes"])
+    log = read_log(path, unit={"gyro": "deg/s"})
+    assert float(log.rate[0, 0]) == 1
+    assert any("--unit gyro=deg/s is not applied" in note for note in log.attrs["notes"])
     assert float(read_log(path, map={"gyro_x": "gyro_x [deg/s]"}).rate[0, 0]) == 3600
 
 
@@ -300,12 +300,12 @@ def _named_on_the_page() -> list[tuple[str, str]]:
             [group.split(", ") for group in cells[2].split(";")],
         )
         if cells[2] != "any, or none" and names != ["rotation_rate"]:
-            several = (
+            units_by_name = (
                 zip(names, groups, strict=True)
                 if len(groups) > 1
                 else [(name, groups[0]) for name in names]
             )
-            pairs += [(name, unit.strip()) for name, units in several for unit in units]
+            pairs += [(name, unit.strip()) for name, units in units_by_name for unit in units]
     assert {
         ("angle_x", "arcsec"),
         ("gyro_z", "rpm"),

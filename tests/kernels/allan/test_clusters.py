@@ -23,11 +23,11 @@ def regular(length: int, lost: int) -> np.ndarray:
 
 
 def blocks(mean: float, share: float) -> np.ndarray:
-    rng, here = np.random.default_rng(3), np.ones(N, dtype=bool)
-    while here.mean() > 1 - share:
+    rng, present = np.random.default_rng(3), np.ones(N, dtype=bool)
+    while present.mean() > 1 - share:
         start = int(rng.integers(0, N))
-        here[start : start + int(rng.geometric(1 / mean))] = False
-    return here
+        present[start : start + int(rng.geometric(1 / mean))] = False
+    return present
 
 
 PATTERNS = {
@@ -172,10 +172,10 @@ def test_scatter_of_many_records_agrees_with_the_degrees_of_freedom(pattern):
     made = surface(x.ravel(), ks).isel(axis=0, tau=slice(3, None))
     scattered = 2 * made.avar.mean("time") ** 2 / made.avar.var("time")
     claimed = made.edf.median("time")
-    seen = claimed.notnull().values
-    assert seen.sum() >= 10
+    has_edf = claimed.notnull().values
+    assert has_edf.sum() >= 10
     error = np.sqrt((2 + 12 / scattered) / records)
-    assert (abs(np.log(claimed / scattered)) < 3.5 * error + 0.1).values[seen].all()
+    assert (abs(np.log(claimed / scattered)) < 3.5 * error + 0.1).values[has_edf].all()
 
 
 def test_cell_near_zero_by_chance_has_few_degrees_of_freedom():
@@ -189,6 +189,6 @@ def test_cell_near_zero_by_chance_has_few_degrees_of_freedom():
     )
     assert (made["count"] == 1001 - 2 * made.tau).all()
     assert ((made.avar * made.tau / made.white_response) < 1e-5).mean() < 0.01
-    alone = [cluster_cell(x[0], int(k))["edf"] for k in made.tau]
-    assert (made.edf < 2 * np.array(alone)).mean() > 0.95
+    single = [cluster_cell(x[0], int(k))["edf"] for k in made.tau]
+    assert (made.edf < 2 * np.array(single)).mean() > 0.95
     assert (made.edf < made["count"]).all()

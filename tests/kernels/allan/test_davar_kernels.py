@@ -42,9 +42,9 @@ class TestKernels:
         for i, (k, split, size) in enumerate(zip(used, splits, sizes, strict=True)):
             m = first + np.arange(size)
             squares = (theta[m + 2 * k] - 2 * theta[m + k] + theta[m]) ** 2
-            found = [heads[place + i] - 7.0, tails[place + i] - 7.0]
+            sums = [heads[place + i] - 7.0, tails[place + i] - 7.0]
             np.testing.assert_allclose(
-                found, [squares[:split].sum(), squares[split:].sum()], rtol=1e-12, atol=1e-13
+                sums, [squares[:split].sum(), squares[split:].sum()], rtol=1e-12, atol=1e-13
             )
         others = np.r_[:place, place + count : count + 4]
         assert np.all(heads[others] == 7.0)

@@ -217,11 +217,11 @@ def test_numeric_times_are_exact_and_halves_round_to_even(count, decimals, digit
         else str(count)
     )
     _, stamps, stop = rows_of(f"{text}\n", [NUMERIC_TIME], digits=digits)
-    wanted = round(Fraction(count, 10**decimals) * 10**digits)
+    expected = round(Fraction(count, 10**decimals) * 10**digits)
     if stop:
-        assert stamps[0] == wanted
+        assert stamps[0] == expected
     else:
-        assert abs(wanted) >= 10**18 or digits == 0 or len(text.strip("-").replace(".", "")) > 19
+        assert abs(expected) >= 10**18 or digits == 0 or len(text.strip("-").replace(".", "")) > 19
 
 
 @given(
@@ -291,8 +291,8 @@ def test_dates_of_any_order_and_mark(stamp, mark, between, order):
     parts = {YEAR_FIRST: "%Y|%m|%d", DAY_FIRST: "%d|%m|%Y", MONTH_FIRST: "%m|%d|%Y"}[order]
     text = f"{stamp:{parts.replace('|', mark)}{between}%H:%M:%S.%f}"
     stamps = rows_of(f"{text},1\n", [order, NUMBER], between=between)[1]
-    wanted = (stamp.replace(tzinfo=UTC) - EPOCH) // timedelta(microseconds=1) * 1000
-    assert stamps.tolist() == [wanted]
+    expected = (stamp.replace(tzinfo=UTC) - EPOCH) // timedelta(microseconds=1) * 1000
+    assert stamps.tolist() == [expected]
     if between == ",":  # two cells only where the caller says so
         assert rows_of(f"{text},1\n", [order, NUMBER])[2] == 0
 

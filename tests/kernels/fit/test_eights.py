@@ -66,7 +66,7 @@ def test_elimination_of_positive_definite_matrices_equals_numpy(n):
     assert ok[0].tolist() == [1, 1, 1, 1, 1, 0, 1, 1]
     for place in np.flatnonzero(ok[0]):
         factor = np.linalg.cholesky(matrices[place])
-        first, second = (one.reshape(n, n + 6, 8)[:, :, place] for one in (whitened, solved))
+        first, second = (system.reshape(n, n + 6, 8)[:, :, place] for system in (whitened, solved))
         np.testing.assert_allclose(np.triu(first[:, :n]), factor.T, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(
             first[:, n:], np.linalg.solve(factor, columns[place]), rtol=1e-7, atol=1e-8

@@ -29,10 +29,10 @@ def place(samples, *, max_gap=1e9, hold=0.75, pieces=None):
         runs.append(run)
         events.append(event)
     runs.append(state[kernel.OPEN_RUN][None])
-    found = np.full(len(rows), -1)
+    placed = np.full(len(rows), -1)
     for sample, row, length in np.concatenate(runs):
-        found[row : row + length] = np.arange(sample, sample + length)
-    return found.tolist(), np.concatenate(events)
+        placed[row : row + length] = np.arange(sample, sample + length)
+    return placed.tolist(), np.concatenate(events)
 
 
 def test_unbroken_rows_are_one_run():
@@ -45,20 +45,20 @@ def test_missing_samples_are_left_out():
 
 
 def test_first_of_two_rows_of_one_sample_is_kept():
-    found, events = place([0, 1, 2, 2, 3, 4])
-    assert found == [0, 1, 2, -1, 3, 4]
+    placed, events = place([0, 1, 2, 2, 3, 4])
+    assert placed == [0, 1, 2, -1, 3, 4]
     assert events[:, [0, 1, 2]].tolist() == [[DUPLICATE, 2, 3]]
 
 
 def test_out_of_order_row_takes_its_free_sample():
-    found, events = place([0, 1, 2, 4, 3, 5, 6])
-    assert found == [0, 1, 2, 4, 3, 5, 6]
+    placed, events = place([0, 1, 2, 4, 3, 5, 6])
+    assert placed == [0, 1, 2, 4, 3, 5, 6]
     assert events[:, [0, 1, 2]].tolist() == [[OUT_OF_ORDER, 3, 4]]
 
 
 def test_out_of_order_row_without_a_free_sample_is_dropped():
-    found, events = place([0, 1, 2, 3, 1, 4, 5])
-    assert found == [0, 1, 2, 3, -1, 4, 5]
+    placed, events = place([0, 1, 2, 3, 1, 4, 5])
+    assert placed == [0, 1, 2, 3, -1, 4, 5]
     assert events[:, [0, 2]].tolist() == [[OUT_OF_ORDER, 4]]
 
 
@@ -77,16 +77,16 @@ def test_rows_without_stamp_are_kept_where_they_fit_exactly():
     assert place([None, 0, 1, 2, None])[0] == [-1, 0, 1, 2, -1]
 
 
-@pytest.mark.parametrize(("again", "cause"), [(0, RESTART), (30, RESTART), (75, STEP)])
-def test_time_set_back_appends_after_one_missing_sample(again, cause):
-    found, events = place([*range(100), *range(again, again + 50)], hold=0.75)
-    assert found == [*range(100), *range(101, 151)]
-    assert events.tolist() == [[cause, 100, 100, round(99 * PERIOD), round(again * PERIOD)]]
+@pytest.mark.parametrize(("restart", "cause"), [(0, RESTART), (30, RESTART), (75, STEP)])
+def test_time_set_back_appends_after_one_missing_sample(restart, cause):
+    placed, events = place([*range(100), *range(restart, restart + 50)], hold=0.75)
+    assert placed == [*range(100), *range(101, 151)]
+    assert events.tolist() == [[cause, 100, 100, round(99 * PERIOD), round(restart * PERIOD)]]
 
 
 def test_long_step_ahead_is_a_step_of_the_clock():
-    found, events = place([0, 1, 2, 1000, 1001, 1002], max_gap=500.0)
-    assert found == [0, 1, 2, 4, 5, 6]
+    placed, events = place([0, 1, 2, 1000, 1001, 1002], max_gap=500.0)
+    assert placed == [0, 1, 2, 4, 5, 6]
     assert events[0, 0] == STEP
     assert place([0, 1, 2, 1000, 1001, 1002], max_gap=2000.0)[0] == [0, 1, 2, 1000, 1001, 1002]
 
@@ -110,8 +110,8 @@ def test_result_does_not_depend_on_blocks():
     values = [*values, *(s for s in values[:500])]
     whole, events = place(values)
     for cuts in ([1], [700, 701, 702, 1500], list(range(13, 3500, 13))):
-        found, happened = place(values, pieces=cuts)
-        assert found == whole
+        placed, happened = place(values, pieces=cuts)
+        assert placed == whole
         assert happened.tolist() == events.tolist()
 
 
@@ -145,9 +145,9 @@ def test_samples_between_stamps_are_rounded_counts():
             count.append(0 if new else count[-1] + k)
             piece.append(piece[-1] + new)
             phase = 0.0 if new else (1.0 - gain) * (step + phase - k * 10.0)
-        found = kernel.track(stamps, 10.0, gain, 300.0)
-        assert found[0].tolist() == count
-        assert found[1].tolist() == piece
+        result = kernel.track(stamps, 10.0, gain, 300.0)
+        assert result[0].tolist() == count
+        assert result[1].tolist() == piece
 
 
 def test_sample_count_tolerates_jitter_and_a_wrong_period():
@@ -165,13 +165,13 @@ def test_drifting_clock_skips_or_drops_single_samples(off):
     random = np.random.default_rng(5)
     n = 20_000
     stamps = np.arange(n) * (1 + off) + random.uniform(-0.2, 0.2, n)
-    found, events = place(stamps.tolist())
-    kept = np.flatnonzero(np.array(found) >= 0)
-    assert np.abs(np.array(found)[kept] - stamps[kept]).max() < 1.05
+    placed, events = place(stamps.tolist())
+    rows = np.flatnonzero(np.array(placed) >= 0)
+    assert np.abs(np.array(placed)[rows] - stamps[rows]).max() < 1.05
     if off > 0:
         assert len(events) == 0
-        assert np.sum(np.diff(found) == 2) == pytest.approx(n * off, abs=1)
+        assert np.sum(np.diff(placed) == 2) == pytest.approx(n * off, abs=1)
     else:
         assert set(events[:, 0]) == {DUPLICATE}
         assert len(events) == pytest.approx(-n * off, abs=1)
-        assert np.all(np.diff(np.array(found)[kept]) == 1)
+        assert np.all(np.diff(np.array(placed)[rows]) == 1)

@@ -41,10 +41,10 @@ def test_result_is_the_sum_over_all_level_sequences(parts: int) -> None:
     log, share, square, up = levels_smooth(like, *level_tables(low, high, parts), start)
     for record in range(2):
         expected = enumerated(like[record], low[record], high[record])
-        for found, known in zip(
+        for computed, known in zip(
             (log[record], share[record], square[record], up[record]), expected, strict=True
         ):
-            np.testing.assert_allclose(found, known, rtol=1e-10)
+            np.testing.assert_allclose(computed, known, rtol=1e-10)
 
 
 @given(low=st.floats(0.3, 300.0), high=st.floats(0.3, 300.0), parts=st.integers(1, 8))

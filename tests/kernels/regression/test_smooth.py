@@ -25,8 +25,8 @@ def test_curves_without_noise_are_almost_unchanged():
 def test_noise_is_reduced(noise):
     rng = np.random.default_rng(7)
     true = 5.0 * np.sin(np.arange(2000) / 60.0)
-    found = smooth_curve(true + noise * rng.standard_normal(true.size), longest=40.0)
-    assert np.std(found - true) < 0.5 * noise
+    curve = smooth_curve(true + noise * rng.standard_normal(true.size), longest=40.0)
+    assert np.std(curve - true) < 0.5 * noise
 
 
 def test_penalty_is_the_sum_of_squared_differences():

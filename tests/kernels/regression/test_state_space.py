@@ -37,9 +37,9 @@ def dense(columns, variance, step, present, K2, ou_variance, ou_time):
     )  # it walks by its own clock
     for v, time in zip(ou_variance, ou_time, strict=True):
         V = V + v * relaxation_covariance(edges, time)
-    V, X, one = V[np.ix_(present, present)], columns[present], np.ones(present.sum())
+    V, X, constant = V[np.ix_(present, present)], columns[present], np.ones(present.sum())
     L = np.linalg.cholesky(V)
-    A, u = np.linalg.solve(L, X), np.linalg.solve(L, one)
+    A, u = np.linalg.solve(L, X), np.linalg.solve(L, constant)
     products = A.T @ A - np.outer(A.T @ u, A.T @ u) / (u @ u)
     return products, 2.0 * np.log(np.diag(L)).sum() + np.log(u @ u)
 
@@ -148,5 +148,5 @@ def test_sum_of_processes_approximates_flicker_noise():
         v * relaxation_covariance(edges, t)[0] for v, t in zip(variance, time, strict=True)
     )
     lag = np.arange(1, n)
-    found = 2.0 * (covariance[0] + white - covariance[1:])
-    np.testing.assert_allclose(found, flicker_variogram(lag), rtol=0.05)
+    variogram = 2.0 * (covariance[0] + white - covariance[1:])
+    np.testing.assert_allclose(variogram, flicker_variogram(lag), rtol=0.05)

@@ -10,8 +10,8 @@ from gyrostab.kernels.regression.trend import window_trend
 
 def plain(values, seconds):
     """Mean and least-squares slope of finite values, in extended precision."""
-    here = np.isfinite(values)
-    y, t = values[here].astype(np.longdouble), seconds[here].astype(np.longdouble)
+    present = np.isfinite(values)
+    y, t = values[present].astype(np.longdouble), seconds[present].astype(np.longdouble)
     mean, centre = y.sum() / y.size, t.sum() / t.size
     return float(mean), float(((t - centre) * (y - mean)).sum() / ((t - centre) ** 2).sum())
 

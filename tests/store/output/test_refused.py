@@ -439,18 +439,18 @@ def test_what_another_process_has_made_meanwhile_is_not_replaced(tmp_path, suffi
     write = to_netcdf if suffix == "nc" else to_zarr
     target = tmp_path / f"log.{suffix}"
     options = {"find_foreign": find_foreign_item} if suffix == "zarr" else {}
-    kept: dict[str, object] = {}
+    tree: dict[str, object] = {}
 
     def write_late() -> None:
         with new_output(target, **options) as temporary:
             with pytest.warns(UserWarning, match="is being written now"):
                 write(log, target)
-            kept.update(read_tree(tmp_path))
+            tree.update(read_tree(tmp_path))
             (temporary / "x" if suffix == "zarr" else temporary).write_text("late")
 
     with pytest.raises(OutputError, match="exists already"):
         write_late()
-    assert {name: value for name, value in kept.items() if ".part" not in name} == read_tree(
+    assert {name: value for name, value in tree.items() if ".part" not in name} == read_tree(
         tmp_path
     )
 
