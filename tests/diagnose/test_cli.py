@@ -78,12 +78,12 @@ def recording(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def folder(recording, tmp_path_factory) -> Path:
-    found = tmp_path_factory.mktemp("found") / "diagnosis"
+    output = tmp_path_factory.mktemp("found") / "diagnosis"
     assert (
-        call("diagnose", recording, "-o", found, "--nulls", 100, "--seed", 1, "--quiet-progress")
+        call("diagnose", recording, "-o", output, "--nulls", 100, "--seed", 1, "--quiet-progress")
         == 0
     )
-    return found
+    return output
 
 
 def test_command_writes_four_files(folder: Path):
@@ -114,15 +114,21 @@ def test_simulated_effect_is_identified(
 
 
 def test_model_reproduces_the_recording(folder: Path, recording: Path, tmp_path: Path):
-    again = tmp_path / "again.nc"
+    second_log = tmp_path / "again.nc"
     assert (
         call(
-            "simulate", folder / "model.toml", "--like", recording, "-o", again, "--quiet-progress"
+            "simulate",
+            folder / "model.toml",
+            "--like",
+            recording,
+            "-o",
+            second_log,
+            "--quiet-progress",
         )
         == 0
     )
     now, before = (
-        gyrostab.open_log(again).rate.values[0],
+        gyrostab.open_log(second_log).rate.values[0],
         gyrostab.open_log(recording).rate.values[0],
     )
     loud = slice(8100, 12700)
@@ -131,10 +137,10 @@ def test_model_reproduces_the_recording(folder: Path, recording: Path, tmp_path:
 
 
 def test_python_opens_the_output_folder(folder: Path):
-    found = gyrostab.open_diagnosis(folder)
-    assert found.effects
-    assert list(found.surfaces["case"].values) == ["recording", "before", "after"]
-    assert set(found.surfaces.data_vars) >= {
+    diagnosis = gyrostab.open_diagnosis(folder)
+    assert diagnosis.effects
+    assert list(diagnosis.surfaces["case"].values) == ["recording", "before", "after"]
+    assert set(diagnosis.surfaces.data_vars) >= {
         "avar",
         "mean",
         "block_mean",
@@ -142,27 +148,27 @@ def test_python_opens_the_output_folder(folder: Path):
         "line_density",
         "channel_vibration",
     }
-    assert found.model["noise"].keys() == {"x"}
+    assert diagnosis.model["noise"].keys() == {"x"}
     assert (
         tomllib.loads((folder / "model.toml").read_text())["effect"][0]["name"]
-        == found.effects[0]["name"]
+        == diagnosis.effects[0]["name"]
     )
 
 
 def test_noise_without_channels_has_no_mismatch():
-    told: list[str] = []
-    found = diagnose(
+    labels: list[str] = []
+    diagnosis = diagnose(
         white(seconds=600.0, seed=2),
         nulls=100,
         block="20s",
-        progress=lambda label, *rest, **more: told.append(label),
+        progress=lambda label, *rest, **more: labels.append(label),
     )
-    check_diagnosis(found.content)
-    assert found.verdict == "no mismatch"
-    assert found.effects == []
-    assert found.content["recording"]["channels"] == []
-    assert found.content["not_found"]["shupe"]["upper_limit"] is None
-    assert list(dict.fromkeys(told)) == [
+    check_diagnosis(diagnosis.content)
+    assert diagnosis.verdict == "no mismatch"
+    assert diagnosis.effects == []
+    assert diagnosis.content["recording"]["channels"] == []
+    assert diagnosis.content["not_found"]["shupe"]["upper_limit"] is None
+    assert list(dict.fromkeys(labels)) == [
         "reducing",
         "calibrating",
         "comparing",
@@ -179,9 +185,13 @@ def test_constant_axis_is_left_out():
     log = white(2)
     log["rate"][1] = 3.0
     with pytest.warns(UserWarning, match="the same on axis y: left out"):
-        found = diagnose(log, nulls=100, seed=1)
-    assert found.verdict == "no mismatch"
-    assert found.content["recording"]["axes"] == list(found.content["baseline"]["noise"]) == ["x"]
+        diagnosis = diagnose(log, nulls=100, seed=1)
+    assert diagnosis.verdict == "no mismatch"
+    assert (
+        diagnosis.content["recording"]["axes"]
+        == list(diagnosis.content["baseline"]["noise"])
+        == ["x"]
+    )
     with pytest.raises(SchemaError, match="the same on axis y: without noise"):
         diagnose(log.isel(axis=[1]), nulls=100)
 
@@ -199,9 +209,9 @@ def test_short_recording_is_refused_with_the_required_length(
 ):
     to_netcdf(white(seconds=60.0), tmp_path / "short.nc")
     assert call("diagnose", tmp_path / "short.nc", "-o", tmp_path / "found") == 2
-    said = capfd.readouterr().err
-    assert "too short to diagnose" in said
-    assert "240 s at least" in said
+    message = capfd.readouterr().err
+    assert "too short to diagnose" in message
+    assert "240 s at least" in message
     assert not (tmp_path / "found").exists()
 
 
@@ -282,11 +292,11 @@ def test_unreadable_quiescent_stretches_are_refused(text: str):
 
 def test_intervals_are_few_or_the_whole_record():
     begin = np.arange(200.0)
-    there = np.zeros(200, bool)
-    there[50:80] = there[82:90] = True
-    assert join_blocks(there, begin, begin + 1.0) == [(50.0, 90.0)]
-    there[150:170] = True
-    assert join_blocks(there, begin, begin + 1.0) == [(50.0, 90.0), (150.0, 170.0)]
+    is_active = np.zeros(200, bool)
+    is_active[50:80] = is_active[82:90] = True
+    assert join_blocks(is_active, begin, begin + 1.0) == [(50.0, 90.0)]
+    is_active[150:170] = True
+    assert join_blocks(is_active, begin, begin + 1.0) == [(50.0, 90.0), (150.0, 170.0)]
     assert join_blocks(np.arange(200) % 12 < 3, begin, begin + 1.0) == [(0.0, 200.0)]
 
 

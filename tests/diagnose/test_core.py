@@ -13,7 +13,7 @@ N = 0.003  # deg/sqrt(h)
 
 
 @pytest.fixture(scope="module")
-def found() -> Diagnosis:
+def diagnosis() -> Diagnosis:
     """Half an hour with constant vibration that raises the noise of x, and with spikes on y."""
     model = {
         "noise": {"N": N, "B": 0.004, "K": 0.02},
@@ -32,26 +32,26 @@ def found() -> Diagnosis:
     return diagnose(simulate(model, duration="30min", rate=10.0, seed=5).compute(), nulls=100)
 
 
-def test_both_effects_are_identified(found: Diagnosis) -> None:
-    assert {one["name"]: one["axes"] for one in found.effects} == {
+def test_both_effects_are_identified(diagnosis: Diagnosis) -> None:
+    assert {effect["name"]: effect["axes"] for effect in diagnosis.effects} == {
         "vibration_noise": ["x"],
         "spikes": ["y"],
     }
 
 
-def test_model_has_the_recalibrated_noise(found: Diagnosis) -> None:
+def test_model_has_the_recalibrated_noise(diagnosis: Diagnosis) -> None:
     assert (
-        found.content["baseline"]["noise"]["x"]["N"]["value"] > 1.5 * N
+        diagnosis.content["baseline"]["noise"]["x"]["N"]["value"] > 1.5 * N
     )  # that of the first calibration, which knows of none
-    assert found.model["noise"]["x"]["N"] == pytest.approx(
+    assert diagnosis.model["noise"]["x"]["N"] == pytest.approx(
         N, rel=0.3
     )  # three other records give 0.95 to 1.07 of it
-    assert found.model["noise"]["y"]["N"] == pytest.approx(N, rel=0.1)
+    assert diagnosis.model["noise"]["y"]["N"] == pytest.approx(N, rel=0.1)
 
 
-def test_surface_with_effects_matches_the_recording(found: Diagnosis) -> None:
+def test_surface_with_effects_matches_the_recording(diagnosis: Diagnosis) -> None:
     """White noise that vibration raises, on x; on y noise and spikes."""
-    short = found.surfaces["avar"].isel(tau=0)
+    short = diagnosis.surfaces["avar"].isel(tau=0)
     recorded, after = (short.sel(case=case) for case in ("recording", "after"))
     np.testing.assert_allclose((recorded / after).sel(axis="x").mean(), 1.0, atol=0.05)
     np.testing.assert_allclose(
@@ -59,5 +59,5 @@ def test_surface_with_effects_matches_the_recording(found: Diagnosis) -> None:
     )
 
 
-def test_held_out_misfit_excludes_blocks_with_spikes(found: Diagnosis) -> None:
-    assert found.content["held_out"]["misfit_after"] == pytest.approx(1.0, abs=0.15)
+def test_held_out_misfit_excludes_blocks_with_spikes(diagnosis: Diagnosis) -> None:
+    assert diagnosis.content["held_out"]["misfit_after"] == pytest.approx(1.0, abs=0.15)

@@ -18,11 +18,11 @@ def test_filter_is_identified_with_its_cutoff_and_the_noise_without_it() -> None
     fine = np.random.default_rng(2).standard_normal((2, 9000 * OVERSAMPLING))
     pole = np.exp(-2.0 * np.pi * CUTOFF / RATE / OVERSAMPLING)
     rates = lfilter([1.0 - pole], [1.0, -pole], fine, axis=1)[:, ::OVERSAMPLING]
-    found = diagnose(make_log(rates, rate=RATE, unit="deg/h"), nulls=100)
-    (effect,) = found.effects
+    diagnosis = diagnose(make_log(rates, rate=RATE, unit="deg/h"), nulls=100)
+    (effect,) = diagnosis.effects
     assert (effect["name"], effect["axes"]) == ("logger_filter", ["x", "y"])
     cutoff = effect["parameters"]["cutoff"]
     assert cutoff["low"] <= CUTOFF <= cutoff["high"] < 1.3 * cutoff["low"]
     for axis in "xy":
         white = 1.0 / np.sqrt(RATE * OVERSAMPLING * 3600.0)  # of the samples before the filter
-        assert found.model["noise"][axis]["N"] == pytest.approx(white, rel=0.1)
+        assert diagnosis.model["noise"][axis]["N"] == pytest.approx(white, rel=0.1)

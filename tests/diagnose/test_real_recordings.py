@@ -34,27 +34,29 @@ def open_recording(
     return read
 
 
-def named_effects(found: Any) -> list[str]:
-    return [one["name"] for one in found.effects]
+def named_effects(diagnosis: Any) -> list[str]:
+    return [effect["name"] for effect in diagnosis.effects]
 
 
 @pytest.mark.slow
 def test_ramp_resets_are_named_before_their_lines(open_recording: Callable[..., Any]) -> None:
-    found = gyrostab.diagnose(open_recording("fog-blueseis-ramp", end=180.0), nulls=100)
-    first = found.effects[0]
+    diagnosis = gyrostab.diagnose(open_recording("fog-blueseis-ramp", end=180.0), nulls=100)
+    first = diagnosis.effects[0]
     assert (first["name"], first["axes"], first["driver"]) == ("feedback_reset", ["z"], "ramp")
     kicked = first["parameters"]["kick"]["value"] + first["parameters"]["tail"]["value"]
     assert 25.0 < kicked < 34.0  # 29.5 nrad in the catalogue
-    model = next(one for one in found.model["effect"] if one["name"] == "feedback_reset")
+    model = next(table for table in diagnosis.model["effect"] if table["name"] == "feedback_reset")
     assert model["phase"] == "channel"
     assert model["full"] < 0  # the ramp falls while the rate is positive
     lines = [
-        region for region in found.content["mismatches"] if "line at 4 Hz" in region["statement"]
+        region
+        for region in diagnosis.content["mismatches"]
+        if "line at 4 Hz" in region["statement"]
     ]
     assert lines
     assert all("feedback_reset" in region["explained_by"] for region in lines)
     assert "spectral_line" not in lines[0]["explained_by"]
-    held = found.content["held_out"]
+    held = diagnosis.content["held_out"]
     assert held["coverage95_before"] < 0.6
     assert held["coverage95_after"] > 0.85  # with the resets in the powers
     assert held["misfit_after"] < 0.2 * held["misfit_before"]
@@ -67,34 +69,34 @@ def test_turns_of_the_ramp_are_counted(open_recording: Callable[..., Any]) -> No
 
 @pytest.mark.slow
 def test_no_resets_without_the_ramp_channel(open_recording: Callable[..., Any]) -> None:
-    found = gyrostab.diagnose(open_recording("fog-blueseis-without-ramp", end=180.0), nulls=100)
-    assert found.verdict != "no mismatch"
-    assert "feedback_reset" not in named_effects(found)
-    assert "no channel ramp" in found.content["not_found"]["feedback_reset"]["reason"]
+    diagnosis = gyrostab.diagnose(open_recording("fog-blueseis-without-ramp", end=180.0), nulls=100)
+    assert diagnosis.verdict != "no mismatch"
+    assert "feedback_reset" not in named_effects(diagnosis)
+    assert "no channel ramp" in diagnosis.content["not_found"]["feedback_reset"]["reason"]
 
 
 def test_coarse_quantization_grid_is_not_a_dead_zone(open_recording: Callable[..., Any]) -> None:
     blocks = reduce_log(open_recording("rlg-static-30min"))
     assert has_coarse_grid(blocks).all()
     level = calibrate_noise(blocks)["coefficient"]
-    found, reasons = effect_candidates(blocks, level)
+    candidates, reasons = effect_candidates(blocks, level)
     for name in ("dead_zone", "held_samples", "clipping"):
         assert "quantization grid" in reasons[name]
-        assert name not in {one.effect for one in found}
+        assert name not in {candidate.effect for candidate in candidates}
     assert "rate_quantization" in {
-        one.effect for one in found if one.statistic.name == "sample_counts"
+        candidate.effect for candidate in candidates if candidate.statistic.name == "sample_counts"
     }
 
 
 @pytest.mark.slow
 def test_platform_sway_is_real_motion(open_recording: Callable[..., Any]) -> None:
-    found = gyrostab.diagnose(open_recording("rlg-static-30min", end=180.0), nulls=100)
-    assert "real_motion" in named_effects(found)
-    assert not {"dead_zone", "held_samples", "clipping"} & set(named_effects(found))
+    diagnosis = gyrostab.diagnose(open_recording("rlg-static-30min", end=180.0), nulls=100)
+    assert "real_motion" in named_effects(diagnosis)
+    assert not {"dead_zone", "held_samples", "clipping"} & set(named_effects(diagnosis))
 
 
 @pytest.mark.slow
 def test_fibre_optic_axis_does_not_follow_temperature(open_recording: Callable[..., Any]) -> None:
-    found = gyrostab.diagnose(open_recording("fog-hybrid-warmup"), nulls=100)
-    thermal = [one for one in found.effects if "temperature" in (one["driver"] or "")]
-    assert not any("z" in one["axes"] for one in thermal)
+    diagnosis = gyrostab.diagnose(open_recording("fog-hybrid-warmup"), nulls=100)
+    thermal = [effect for effect in diagnosis.effects if "temperature" in (effect["driver"] or "")]
+    assert not any("z" in effect["axes"] for effect in thermal)

@@ -24,20 +24,20 @@ def simulate_log(seed: int, *sizes: float):
 
 
 def test_same_model_has_no_mismatch():
-    found = gyrostab.diagnose(simulate_log(2), simulation=simulate_log(1), nulls=100)
-    assert found.verdict == "no mismatch"
-    assert found.effects == []
-    assert found.content["baseline"]["source"] == "simulation"
+    diagnosis = gyrostab.diagnose(simulate_log(2), simulation=simulate_log(1), nulls=100)
+    assert diagnosis.verdict == "no mismatch"
+    assert diagnosis.effects == []
+    assert diagnosis.content["baseline"]["source"] == "simulation"
 
 
 @pytest.mark.slow
 def test_effect_missing_in_the_simulation_is_identified():
-    found = gyrostab.diagnose(simulate_log(2, 0.0006), simulation=simulate_log(1), nulls=100)
-    assert found.verdict == "explained"
-    (effect,) = found.effects
+    diagnosis = gyrostab.diagnose(simulate_log(2, 0.0006), simulation=simulate_log(1), nulls=100)
+    assert diagnosis.verdict == "explained"
+    (effect,) = diagnosis.effects
     assert effect["name"] == "vibration_noise"
     assert effect["parameters"]["white"]["low"] < 0.0006 < effect["parameters"]["white"]["high"]
-    assert found.model["noise"]["x"]["N"] == pytest.approx(0.003, rel=0.1)
+    assert diagnosis.model["noise"]["x"]["N"] == pytest.approx(0.003, rel=0.1)
 
 
 SHARED = {"name": "shared_source", "N": 0.0015, "axes": ["x", "y"]}
@@ -60,17 +60,17 @@ def simulate_axes(seed: int, *names: str):
 @pytest.mark.parametrize("seed", [11, 12])
 def test_steady_effects_of_the_simulation_are_not_mismatches(seed):
     names = ("shared_source", "line", "bump")
-    found = gyrostab.diagnose(
+    diagnosis = gyrostab.diagnose(
         simulate_axes(seed, *names), simulation=simulate_axes(seed + 100, *names), nulls=100
     )
-    assert found.verdict == "no mismatch"
+    assert diagnosis.verdict == "no mismatch"
 
 
 @pytest.mark.parametrize("lacking", ["shared_source", pytest.param("line", marks=pytest.mark.slow)])
 def test_effect_in_addition_to_the_simulation_is_identified(lacking):
     names = ("shared_source", "line", "bump")
     simulation = simulate_axes(111, *(name for name in names if name != lacking))
-    found = gyrostab.diagnose(simulate_axes(11, *names), simulation=simulation, nulls=100)
-    assert [effect["name"] for effect in found.effects] == [
+    diagnosis = gyrostab.diagnose(simulate_axes(11, *names), simulation=simulation, nulls=100)
+    assert [effect["name"] for effect in diagnosis.effects] == [
         {"line": "spectral_line"}.get(lacking, lacking)
     ]

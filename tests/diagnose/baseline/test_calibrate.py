@@ -356,7 +356,8 @@ def test_strong_lines_do_not_raise_the_noise_of_means():
     plain = log({"N": 0.003}, rate=100.0, duration="30min")
     comb = {4.17 * order: 2.0 for order in range(1, 8)}
     without, given = (
-        calibrate_noise(reduce_log(one)).sel(axis="x") for one in (plain, with_sines(plain, comb))
+        calibrate_noise(reduce_log(recording)).sel(axis="x")
+        for recording in (plain, with_sines(plain, comb))
     )
     ratio = given["mean_variance"].mean() / without["mean_variance"].mean()
     assert abs(ratio - 1.0) < 0.05

@@ -80,12 +80,16 @@ def test_null_records_have_the_peaks_of_the_model():
     baseline = baseline_from_model(blocks, made)
     nulls = next(iter(null_records(blocks, baseline, count=25, rng=np.random.default_rng(1))))
     drawn = nulls["line_power"].isel(axis=0).mean(["record", "part"])
-    seen = blocks["line_power"].isel(axis=0).mean("part")
-    near = np.abs(blocks["line_frequency"].values - PLACE) < 0.1
-    assert float(seen[near].sum()) == pytest.approx(float(drawn[near].sum()), rel=0.25)
-    assert float(drawn[near].max()) > 5.0 * float(drawn[~near].median())
-    far = np.abs(blocks["line_frequency"].values - PLACE) > 0.3
-    assert float((seen[far] / drawn[far]).mean()) == pytest.approx(1.0, abs=0.05)
+    recorded = blocks["line_power"].isel(axis=0).mean("part")
+    is_near_line = np.abs(blocks["line_frequency"].values - PLACE) < 0.1
+    assert float(recorded[is_near_line].sum()) == pytest.approx(
+        float(drawn[is_near_line].sum()), rel=0.25
+    )
+    assert float(drawn[is_near_line].max()) > 5.0 * float(drawn[~is_near_line].median())
+    is_elsewhere = np.abs(blocks["line_frequency"].values - PLACE) > 0.3
+    assert float((recorded[is_elsewhere] / drawn[is_elsewhere]).mean()) == pytest.approx(
+        1.0, abs=0.05
+    )
 
 
 @pytest.mark.slow
@@ -98,16 +102,18 @@ def test_null_records_have_the_peaks_of_the_model():
     ],
 )
 def test_power_beyond_the_model_is_named(seed, inside, known, left):
-    found = gyrostab.diagnose(log_of(seed, inside), simulation=model(known), nulls=100)
+    diagnosis = gyrostab.diagnose(log_of(seed, inside), simulation=model(known), nulls=100)
     if not left:
-        assert found.verdict == "no mismatch", found.content["mismatches"]
+        assert diagnosis.verdict == "no mismatch", diagnosis.content["mismatches"]
         return
-    assert [effect["name"] for effect in found.effects] == ["spectral_line"]
+    assert [effect["name"] for effect in diagnosis.effects] == ["spectral_line"]
     for axis in "xy":
-        assert found.effects[0]["parameters"][f"amplitude.{axis}"]["value"] == pytest.approx(
+        assert diagnosis.effects[0]["parameters"][f"amplitude.{axis}"]["value"] == pytest.approx(
             left, rel=0.1
         )
-    assert found.effects[0]["parameters"]["frequency"]["value"] == pytest.approx(PLACE, abs=0.03)
+    assert diagnosis.effects[0]["parameters"]["frequency"]["value"] == pytest.approx(
+        PLACE, abs=0.03
+    )
 
 
 @pytest.mark.parametrize("amplitude", [0.07, 0.3])
@@ -123,7 +129,7 @@ def test_a_known_sine_is_no_sine_of_the_recording(amplitude, frequency):
     too_small = remove_known_lines(blocks, baseline_from_model(blocks, weaker))
     assert float(too_small["sine_nats"].max()) > 10.0
     place = int(too_small["sine_nats"].values[0].argmax())
-    left, all_of_it = (float(one["sine_square"][0, place]) for one in (too_small, blocks))
+    left, all_of_it = (float(reduced["sine_square"][0, place]) for reduced in (too_small, blocks))
     assert all_of_it - left == pytest.approx((amplitude / 4.0) ** 2, rel=0.1)
 
 

@@ -48,12 +48,15 @@ def test_a_named_filter_of_a_fast_instrument_simulates_the_recording():
     log = simulate(
         made(cutoff=6.0, order=4.0, oversampling=16), duration="30min", rate=10.0, seed=5
     ).compute()
-    found = gyrostab.diagnose(log, nulls=100)
-    (effect,) = found.effects
+    diagnosis = gyrostab.diagnose(log, nulls=100)
+    (effect,) = diagnosis.effects
     assert effect["name"] == "logger_filter"
-    assert found.model["log"] == {"oversampling": 16}
-    again = simulate(
-        found.model, like=log, seed=6
+    assert diagnosis.model["log"] == {"oversampling": 16}
+    second_log = simulate(
+        diagnosis.model, like=log, seed=6
     ).compute()  # whose cutoff lies above half of the log's rate
-    was, now = (reduce_log(one)["power"].mean(["axis", "block"]).values for one in (log, again))
+    was, now = (
+        reduce_log(recording)["power"].mean(["axis", "block"]).values
+        for recording in (log, second_log)
+    )
     np.testing.assert_allclose(now, was, rtol=0.15)

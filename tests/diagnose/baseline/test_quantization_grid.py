@@ -72,11 +72,11 @@ def test_a_filtered_angle_counter_is_not_a_rounded_rate() -> None:
 def test_axes_together_decide_what_one_axis_cannot() -> None:
     blocks = quantized_record("rate", 0.7)
     baseline = calibrate_noise(blocks)
-    alone = [
+    single_axes = [
         rounded_rates(blocks.isel(axis=[number]), baseline.isel(axis=[number]))
         for number in range(2)
     ]
-    assert not np.concatenate(alone).any()
+    assert not np.concatenate(single_axes).any()
     assert rounded_rates(blocks, baseline).all()
 
 
@@ -112,9 +112,11 @@ def test_angle_share_is_that_of_simulated_counters(mean: float, scatter: float) 
 def test_only_a_rounded_rate_is_named(kind: str, names: list[str]) -> None:
     blocks = quantized_record(kind, 2.0, size=9_000)
     baseline, records = nulls(blocks, 40)
-    found = name_effects(blocks, baseline, records)
-    assert [identification.effect for identification in found.identified] == names
-    assert ("quantization grid" in found.reasons.get("rate_quantization", "")) == (kind == "angle")
+    identifications = name_effects(blocks, baseline, records)
+    assert [identification.effect for identification in identifications.identified] == names
+    assert ("quantization grid" in identifications.reasons.get("rate_quantization", "")) == (
+        kind == "angle"
+    )
 
 
 def cut_record(
@@ -165,13 +167,15 @@ def test_samples_stuck_at_zero_are_missing_in_neighbouring_bins(zone: float) -> 
 def test_truncation_and_dead_zone_are_distinguished(how, zone: float, names: list[str]) -> None:
     blocks = cut_record(how, zone=zone, size=15_000)
     baseline, records = nulls(blocks, 40)
-    found = name_effects(blocks, baseline, records)
-    assert [identification.effect for identification in found.identified] == names
-    assert all(identification.alternatives == () for identification in found.identified)
+    identifications = name_effects(blocks, baseline, records)
+    assert [identification.effect for identification in identifications.identified] == names
+    assert all(identification.alternatives == () for identification in identifications.identified)
     if names == ["rate_quantization"]:
-        assert {one.effect.mode for one in fit_identifications(found, baseline) if one.effect} == {
-            "zero"
-        }
+        assert {
+            fitted.effect.mode
+            for fitted in fit_identifications(identifications, baseline)
+            if fitted.effect
+        } == {"zero"}
 
 
 def test_both_names_are_given_if_the_bins_do_not_decide() -> None:
@@ -188,7 +192,7 @@ def test_both_names_are_given_if_the_bins_do_not_decide() -> None:
     )
     state = initial_state(blocks, calibrate_noise(blocks))
     assert "rate_quantization" in find_equivalent_effects("dead_zone", [component], state)
-    told = cut_record(np.rint, zone=1.0, size=15_000)
+    cut_blocks = cut_record(np.rint, zone=1.0, size=15_000)
     assert "rate_quantization" not in find_equivalent_effects(
-        "dead_zone", [component], initial_state(told, calibrate_noise(told))
+        "dead_zone", [component], initial_state(cut_blocks, calibrate_noise(cut_blocks))
     )

@@ -109,13 +109,13 @@ def test_a_simulated_log_is_scaled_to_quiet_time():
 def test_a_simulation_and_quiet_time_can_be_combined():
     recording = log({"N": 0.003}, duration="15min")
     with pytest.warns(UserWarning, match=r"simulation is multiplied by 1\.[45]\d* on axis x"):
-        found = gyrostab.diagnose(
+        diagnosis = gyrostab.diagnose(
             recording, simulation={"noise": {"N": 0.002}}, quiet=(0.0, 200.0), nulls=100
         )
-    assert found.verdict == "no mismatch"
-    assert found.content["baseline"]["source"] == "model"
-    assert found.content["baseline"]["calibrated_on"]
-    assert found.model["noise"]["x"]["N"] == pytest.approx(0.003, rel=0.1)
+    assert diagnosis.verdict == "no mismatch"
+    assert diagnosis.content["baseline"]["source"] == "model"
+    assert diagnosis.content["baseline"]["calibrated_on"]
+    assert diagnosis.model["noise"]["x"]["N"] == pytest.approx(0.003, rel=0.1)
 
 
 @pytest.mark.parametrize("simulation", [None, "model", "log"])
@@ -130,10 +130,10 @@ def test_a_quiet_time_too_short_to_use_is_ignored_with_a_note(simulation):
             reduce_log(log({"N": 0.002}, duration="15min", seed=5)),
         ),
     }[simulation]
-    alone = make(blocks, *given)
+    without_quiet = make(blocks, *given)
     with pytest.warns(UserWarning, match=r"holds 0 whole blocks of 10 s: 0 samples.*is ignored"):
-        found = make(blocks, *given, quiet=(3.0, 9.0))
-    xr.testing.assert_identical(found, alone)
+        with_quiet = make(blocks, *given, quiet=(3.0, 9.0))
+    xr.testing.assert_identical(with_quiet, without_quiet)
 
 
 def test_a_quiet_time_that_is_lost_is_ignored_with_a_note():

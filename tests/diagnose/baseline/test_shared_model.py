@@ -51,7 +51,7 @@ def test_null_records_have_the_common_noise_of_the_model(lost):
         pieces, "record", data_vars="minimal", coords="minimal", compat="override", join="override"
     )
     raw = xr.concat(
-        [one[["cross", "power", "mean"]] for one in records],
+        [record[["cross", "power", "mean"]] for record in records],
         "record",
         coords="minimal",
         compat="override",
@@ -60,7 +60,7 @@ def test_null_records_have_the_common_noise_of_the_model(lost):
     expected = baseline["cross"].mean("block")
     assert np.sign(expected.real.values[:, 3]).tolist() == [1.0, -1.0, -1.0]
     bands = slice(4, None)
-    found = {}
+    correlations = {}
     for name, sample in (("raw", raw), ("drawn", nulls)):
         ratio = (sample["cross"].real.mean(["record", "block"]) / expected.real).isel(band=bands)
         assert float(np.abs(ratio - 1.0).max()) < 0.12, name
@@ -69,16 +69,16 @@ def test_null_records_have_the_common_noise_of_the_model(lost):
         ).isel(band=bands)
         assert float(np.abs(level - 1.0).max()) < 0.08, name
         steps = sample["mean"].diff("block")
-        found[name] = float(
+        correlations[name] = float(
             (steps[:, 0] * steps[:, 2]).sum()
             / np.sqrt((steps[:, 0] ** 2).sum() * (steps[:, 2] ** 2).sum())
         )
-    assert found["raw"] == pytest.approx(found["drawn"], abs=0.07)
-    assert found["drawn"] == pytest.approx(-0.41 * (1.0 - lost), abs=0.05)
+    assert correlations["raw"] == pytest.approx(correlations["drawn"], abs=0.07)
+    assert correlations["drawn"] == pytest.approx(-0.41 * (1.0 - lost), abs=0.05)
     for component in (
-        lambda one: one["cross"].real,
-        lambda one: one["cross"].imag,
-        lambda one: one["power"],
+        lambda sample: sample["cross"].real,
+        lambda sample: sample["cross"].imag,
+        lambda sample: sample["power"],
     ):
         scatter = component(nulls).isel(band=bands).std(["record", "block"]) / component(raw).isel(
             band=bands
@@ -87,10 +87,10 @@ def test_null_records_have_the_common_noise_of_the_model(lost):
     other = (nulls["power"][:, 0] * nulls["power"][:, 1]).mean(["record", "block"]) / expected[
         0
     ].real ** 2
-    seen = (raw["power"][:, 0] * raw["power"][:, 1]).mean(["record", "block"]) / expected[
-        0
-    ].real ** 2
-    np.testing.assert_allclose(other[bands], seen[bands], rtol=0.12)
+    product_of_powers = (raw["power"][:, 0] * raw["power"][:, 1]).mean(
+        ["record", "block"]
+    ) / expected[0].real ** 2
+    np.testing.assert_allclose(other[bands], product_of_powers[bands], rtol=0.12)
 
 
 def test_phases_and_signs_of_axes_are_in_the_cross_spectra():
@@ -108,47 +108,48 @@ def test_phases_and_signs_of_axes_are_in_the_cross_spectra():
         band = int(
             np.flatnonzero((blocks["band_low"] <= frequency) & (frequency < blocks["band_high"]))[0]
         )
-        seen, expected = (
-            one["cross"].isel(band=band).mean("block").values for one in (blocks, baseline)
+        recorded, expected = (
+            statistics["cross"].isel(band=band).mean("block").values
+            for statistics in (blocks, baseline)
         )
         scale = float(np.sqrt(baseline["spectrum"].isel(band=band).mean("block").max()) ** 2)
-        assert np.abs(seen - expected).max() < 0.15 * scale
+        assert np.abs(recorded - expected).max() < 0.15 * scale
     assert baseline["cross"].isel(band=band).mean("block").values[0].real < 0.0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_common_noise_of_the_model_is_not_a_mismatch(seed):
-    found = gyrostab.diagnose(
+    diagnosis = gyrostab.diagnose(
         log_of(seed, 0.0015), simulation={"noise": NOISE, "effect": [shared(0.0015)]}, nulls=100
     )
-    assert found.verdict == "no mismatch", found.content["mismatches"]
+    assert diagnosis.verdict == "no mismatch", diagnosis.content["mismatches"]
 
 
 @pytest.mark.slow
 def test_common_noise_beyond_the_model_is_named_with_its_size():
-    found = gyrostab.diagnose(
+    diagnosis = gyrostab.diagnose(
         log_of(3, 0.0015, 0.0012),
         simulation={"noise": NOISE, "effect": [shared(0.0015)]},
         nulls=100,
     )
-    assert [effect["name"] for effect in found.effects] == ["shared_source"]
+    assert [effect["name"] for effect in diagnosis.effects] == ["shared_source"]
     for axis, sign in zip("xyz", (1, 1, -1), strict=True):
-        assert found.effects[0]["parameters"][f"N.{axis}"]["value"] == pytest.approx(
+        assert diagnosis.effects[0]["parameters"][f"N.{axis}"]["value"] == pytest.approx(
             sign * 0.0012, rel=0.2
         )
 
 
 @pytest.mark.slow
 def test_an_effect_missing_in_the_model_is_named_and_explains_the_powers():
-    found = gyrostab.diagnose(log_of(4, 0.0015), simulation={"noise": NOISE}, nulls=100)
-    assert [effect["name"] for effect in found.effects] == ["shared_source"]
-    assert found.verdict == "explained", found.content["mismatches"]
+    diagnosis = gyrostab.diagnose(log_of(4, 0.0015), simulation={"noise": NOISE}, nulls=100)
+    assert [effect["name"] for effect in diagnosis.effects] == ["shared_source"]
+    assert diagnosis.verdict == "explained", diagnosis.content["mismatches"]
     for axis, sign in zip("xyz", (1, 1, -1), strict=True):
-        assert found.effects[0]["parameters"][f"N.{axis}"]["value"] == pytest.approx(
+        assert diagnosis.effects[0]["parameters"][f"N.{axis}"]["value"] == pytest.approx(
             sign * 0.0015, rel=0.15
         )
-    held = found.content["held_out"]
+    held = diagnosis.content["held_out"]
     assert abs(held["misfit_after"] - 1.0) < 0.5 * abs(held["misfit_before"] - 1.0)
 
 
@@ -156,8 +157,8 @@ def test_an_effect_missing_in_the_model_is_named_and_explains_the_powers():
 def test_low_pass_common_noise_is_not_a_filter():
     slow = {"name": "shared_source", "N": [0.0, 0.004, 0.004], "bandwidth": 0.8}
     model = {"noise": NOISE, "effect": [slow], "log": {"axes": ["x", "y", "z"]}}
-    found = gyrostab.diagnose(
+    diagnosis = gyrostab.diagnose(
         simulate(model, duration="30min", rate=10.0, seed=5).compute(), nulls=100
     )
-    assert [effect["name"] for effect in found.effects] == ["shared_source"]
-    assert found.verdict == "explained", found.content["mismatches"]
+    assert [effect["name"] for effect in diagnosis.effects] == ["shared_source"]
+    assert diagnosis.verdict == "explained", diagnosis.content["mismatches"]

@@ -46,15 +46,15 @@ def jumped():
 
 @pytest.mark.slow
 def test_a_jump_within_a_block_explains_its_power(jumped):
-    found = _diagnose_log(jumped)
-    assert found.verdict == "explained"
-    assert [effect["name"] for effect in found.effects] == ["bias_jump"]
+    diagnosis = _diagnose_log(jumped)
+    assert diagnosis.verdict == "explained"
+    assert [effect["name"] for effect in diagnosis.effects] == ["bias_jump"]
     assert {"davar", "spectrum", "mean"} <= {
-        region["view"] for region in found.content["mismatches"]
+        region["view"] for region in diagnosis.content["mismatches"]
     }
-    assert {name for region in found.content["mismatches"] for name in region["explained_by"]} == {
-        "bias_jump"
-    }
+    assert {
+        name for region in diagnosis.content["mismatches"] for name in region["explained_by"]
+    } == {"bias_jump"}
 
 
 @pytest.mark.slow
@@ -63,10 +63,10 @@ def test_a_jump_does_not_explain_noise_in_other_blocks(jumped):
     rate = jumped["rate"].transpose("axis", "time").values.copy()
     louder = rate[:, (seconds >= 1200) & (seconds < 1300)]
     rate[:, (seconds >= 1200) & (seconds < 1300)] += 0.4 * (louder - louder.mean())
-    found = _diagnose_log(jumped.assign(rate=(("axis", "time"), rate, jumped["rate"].attrs)))
-    left = [region for region in found.content["mismatches"] if not region["explained_by"]]
-    assert found.verdict == "partly explained"
-    start = np.datetime64(found.content["recording"]["start"].removesuffix("Z"))
+    diagnosis = _diagnose_log(jumped.assign(rate=(("axis", "time"), rate, jumped["rate"].attrs)))
+    left = [region for region in diagnosis.content["mismatches"] if not region["explained_by"]]
+    assert diagnosis.verdict == "partly explained"
+    start = np.datetime64(diagnosis.content["recording"]["start"].removesuffix("Z"))
     spans = [
         [
             (np.datetime64(region[end].removesuffix("Z")) - start) / np.timedelta64(1, "s")
@@ -80,9 +80,9 @@ def test_a_jump_does_not_explain_noise_in_other_blocks(jumped):
 @pytest.mark.slow
 def test_a_telegraph_leaves_no_line_against_its_own_model():
     hops = {"name": "telegraph", "step": [1.0], "low": 200.0, "high": 200.0}
-    found = _diagnose_log(_make_log([hops], 7), [hops])
-    assert (found.verdict, found.content["mismatches"]) == ("no mismatch", [])
-    assert {one["name"] for one in found.content["baseline"]["expected"]} == {"telegraph"}
+    diagnosis = _diagnose_log(_make_log([hops], 7), [hops])
+    assert (diagnosis.verdict, diagnosis.content["mismatches"]) == ("no mismatch", [])
+    assert {effect["name"] for effect in diagnosis.content["baseline"]["expected"]} == {"telegraph"}
 
 
 def test_a_part_of_moving_blocks_has_no_lines(jumped):
@@ -93,11 +93,11 @@ def test_a_part_of_moving_blocks_has_no_lines(jumped):
     course = np.zeros((1, blocks.sizes["block"]))
     course[:, :12:2] = 5.0  # the first part has the blocks 0 to 11
     known = baseline.assign(known_mean=(("axis", "block"), course))
-    found = lines_without_motion(task, blocks, known)
-    assert found["line_weight"].values[0, 0] == 0.0
-    np.testing.assert_allclose(found["line_power"][:, 2:], blocks["line_power"][:, 2:])
+    reread = lines_without_motion(task, blocks, known)
+    assert reread["line_weight"].values[0, 0] == 0.0
+    np.testing.assert_allclose(reread["line_power"][:, 2:], blocks["line_power"][:, 2:])
     xr.testing.assert_identical(
-        found.drop_vars(["line_power", "line_weight"]),
+        reread.drop_vars(["line_power", "line_weight"]),
         blocks.drop_vars(["line_power", "line_weight"]),
     )
     assert lines_without_motion(task, blocks, baseline) is blocks

@@ -67,14 +67,16 @@ def named(table: dict, *, axes: str = "xyz", mean: float = 0.0, seed: int = 1) -
     ids=lambda value: "-".join(map(str, value.values())),
 )
 def test_stuck_samples_are_identified(table, options):
-    found = named(table, **options)
-    (identification,) = found.identified
+    identifications = named(table, **options)
+    (identification,) = identifications.identified
     assert identification.effect == table["name"]
     assert identification.axes == tuple(table.get("axes", options.get("axes", "xyz")))
-    alone = table["name"] == "dead_zone" and options
-    assert identification.alternatives == (("held_samples",) if alone else ())
+    is_exclusive = table["name"] == "dead_zone" and options
+    assert identification.alternatives == (("held_samples",) if is_exclusive else ())
     if table["name"] == "held_samples":
-        (fitted,) = fit_identifications(found, calibrate_noise(found.state.blocks))[:1]
+        (fitted,) = fit_identifications(
+            identifications, calibrate_noise(identifications.state.blocks)
+        )[:1]
         assert fitted.effect is not None
         assert fitted.effect.fill == table.get("fill", "repeat")
 
@@ -86,12 +88,12 @@ def test_periodic_pulse_is_lines_and_not_spikes():
     noise[1, np.random.default_rng(7).choice(15_000, 40, replace=False)] += 12.0 * SCATTER
     blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x", "y"]))
     baseline, records = nulls(blocks, 40)
-    found = {
+    axes_by_effect = {
         identification.effect: identification.axes
         for identification in name_effects(blocks, baseline, records).identified
     }
-    assert found["spectral_line"] == ("x",)
-    assert found["spikes"] == ("y",)
+    assert axes_by_effect["spectral_line"] == ("x",)
+    assert axes_by_effect["spikes"] == ("y",)
 
 
 def on_quantization_grid(held: int, *, seed: int = 21, size: int = 15_000) -> xr.Dataset:
@@ -118,8 +120,8 @@ def test_zeros_of_a_quantization_grid_coincide_when_an_axis_is_lost():
     assert (zeros / samples > 0.04).all()
     lost = blocks["begin"].values > 800.0
     baseline, records = nulls(blocks, 40)
-    found = name_effects(blocks, baseline, records)
-    assert found.identified == ()
+    identifications = name_effects(blocks, baseline, records)
+    assert identifications.identified == ()
     drawn = records[0]["filled"].mean("record").values[:, lost].mean(axis=1)
     np.testing.assert_allclose(drawn[:2], blocks["filled"].values[:2, lost].mean(axis=1), atol=0.12)
 
@@ -166,16 +168,16 @@ def test_number_and_length_of_held_samples_are_estimated(fill):
         noise[:, first : first + length] = noise[:, first - 1 : first] if fill == "repeat" else 0.0
     blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
     baseline, records = nulls(blocks, 40)
-    found = fit_identifications(name_effects(blocks, baseline, records), baseline)
-    assert [one.axes for one in found] == [("x",), ("y",), ("z",)]
+    fitted_effects = fit_identifications(name_effects(blocks, baseline, records), baseline)
+    assert [fitted.axes for fitted in fitted_effects] == [("x",), ("y",), ("z",)]
     hours = float(blocks["samples"].sel(axis="x").sum()) / 36_000.0
-    for one in found:
-        assert one.parameters["per_hour"].value == pytest.approx(60 / hours, rel=0.06)
-        assert one.parameters["length"].value == pytest.approx(
+    for fitted in fitted_effects:
+        assert fitted.parameters["per_hour"].value == pytest.approx(60 / hours, rel=0.06)
+        assert fitted.parameters["length"].value == pytest.approx(
             (40 * 6 + 20 * 2) / 60 / 10.0, rel=0.06
         )
         for name, true in (("per_hour", 60 / hours), ("length", 0.467)):
-            assert one.parameters[name].low < true < one.parameters[name].high
+            assert fitted.parameters[name].low < true < fitted.parameters[name].high
 
 
 @pytest.mark.parametrize("number", [2, pytest.param(20, marks=pytest.mark.slow)])
@@ -185,13 +187,13 @@ def test_frames_that_are_sent_twice_are_held_samples(number: int) -> None:
         noise[:, first : first + 4] = noise[:, first - 4 : first]
     blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
     baseline, records = nulls(blocks, 40)
-    found = fit_identifications(name_effects(blocks, baseline, records), baseline)
-    assert {one.identification.effect for one in found} == {"held_samples"}
+    fitted_effects = fit_identifications(name_effects(blocks, baseline, records), baseline)
+    assert {fitted.identification.effect for fitted in fitted_effects} == {"held_samples"}
     hours = float(blocks["samples"].sel(axis="x").sum()) / 36_000.0
-    often = found[0].parameters["per_hour"]
+    often = fitted_effects[0].parameters["per_hour"]
     assert 0.0 < often.low < number / hours < often.high
-    assert found[0].parameters["length"].value == pytest.approx(0.4)
-    assert {one.effect.fill for one in found if one.effect} == {"frame"}
+    assert fitted_effects[0].parameters["length"].value == pytest.approx(0.4)
+    assert {fitted.effect.fill for fitted in fitted_effects if fitted.effect} == {"frame"}
 
 
 @pytest.mark.parametrize(
@@ -230,17 +232,17 @@ def test_intervals_of_outliers_exclude_zero_and_contain_the_truth(number: int, k
         for name, (_, _, low, high) in sizes.items():
             assert low > 0.0
             held[name].append(low < truth[name] < high)
-    assert min(len(one) for one in held.values()) > 10
+    assert min(len(intervals) for intervals in held.values()) > 10
     assert np.mean(held["size"]) > 0.9
     assert np.mean(held["per_hour"]) > (0.9 if kind == "normal" else 0.7)
 
 
-@pytest.mark.parametrize("both", [False, True])
-def test_limits_of_a_rate_that_moves_are_the_ends_of_the_record(both):
+@pytest.mark.parametrize("is_two_sided", [False, True])
+def test_limits_of_a_rate_that_moves_are_the_ends_of_the_record(is_two_sided):
     """The range is that of the record, not that of the noise about a moving mean."""
     motion = 5.0 * np.sin(2.0 * np.pi * np.arange(15_000) / 7_000.0)
     noise = SCATTER * np.random.default_rng(9).standard_normal(15_000)
-    least = -5.5 if both else -np.inf
+    least = -5.5 if is_two_sided else -np.inf
     rate = np.clip(motion + noise, least, 5.5)
     blocks = reduce_log(make_log(rate[None], rate=10.0, unit="deg/h", axis=["x"]))
     estimated = estimate_from_counts(
@@ -249,8 +251,12 @@ def test_limits_of_a_rate_that_moves_are_the_ends_of_the_record(both):
     limit, error, low, high = estimated["limit"]
     centre = centre_of_range(blocks.sel(axis="x"))
     assert centre + limit == pytest.approx(5.5)
-    assert centre - limit == pytest.approx(-5.5) if both else centre - limit < rate.min() - 10.0
-    assert (error == 0.0) is both
+    assert (
+        centre - limit == pytest.approx(-5.5)
+        if is_two_sided
+        else centre - limit < rate.min() - 10.0
+    )
+    assert (error == 0.0) is is_two_sided
     assert low <= limit <= high
     assert blocks["range_end_samples"].values[0].tolist() == [
         int((rate == rate.min()).sum()),
@@ -297,9 +303,9 @@ def test_burst_of_bit_errors_has_the_size_of_its_power():
     noise[1, places] += flips
     blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
     baseline, records = nulls(blocks, 40)
-    (identification,) = (found := name_effects(blocks, baseline, records)).identified
+    (identification,) = (identifications := name_effects(blocks, baseline, records)).identified
     assert (identification.effect, identification.axes) == ("spikes", ("y",))
-    (fitted,) = fit_identifications(found, baseline)
+    (fitted,) = fit_identifications(identifications, baseline)
     assert 0.5 < fitted.parameters["size"].value / np.sqrt(np.mean(flips**2)) < 2.0
 
 
@@ -349,9 +355,9 @@ def test_spikes_of_six_sigma_are_identified_and_counted():
     noise[1, rng.choice(15_000, 20, replace=False)] += 6.0 * SCATTER * rng.choice([-1.0, 1.0], 20)
     blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
     baseline, records = nulls(blocks, 40)
-    (identification,) = (found := name_effects(blocks, baseline, records)).identified
+    (identification,) = (identifications := name_effects(blocks, baseline, records)).identified
     assert (identification.effect, identification.axes) == ("spikes", ("y",))
-    (fitted,) = fit_identifications(found, baseline)
+    (fitted,) = fit_identifications(identifications, baseline)
     number = fitted.parameters["per_hour"].value * 15_000 / 36_000
     assert 10 < number < 40
     assert 0.5 < fitted.parameters["size"].value / (6.0 * SCATTER) < 2.0
@@ -366,11 +372,13 @@ def test_spikes_in_most_blocks_keep_their_size_and_power():
     blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x"]))
     assert (blocks["peaks"] > 0).mean() > 0.6
     baseline, records = nulls(blocks, 40)
-    (fitted,) = fit_identifications(found := name_effects(blocks, baseline, records), baseline)
+    (fitted,) = fit_identifications(
+        identifications := name_effects(blocks, baseline, records), baseline
+    )
     size, number = fitted.parameters["size"], fitted.parameters["per_hour"]
     assert size.low < 70.0 * SCATTER < size.high
     assert number.low < 0.009 * 36_000 < number.high
-    clean = predict_baseline(found, recalibrate(found, baseline, [fitted]))
+    clean = predict_baseline(identifications, recalibrate(identifications, baseline, [fitted]))
     whole = add_outlier_power(clean, blocks, [fitted])["spectrum"].mean()
     assert float(whole) == pytest.approx(float(blocks["power"].mean()), rel=0.4)
     assert float(clean["spectrum"].mean()) < 0.1 * float(whole)
@@ -379,7 +387,7 @@ def test_spikes_in_most_blocks_keep_their_size_and_power():
         ([], [fitted]),
     ):  # effects of the recording alone, or of the simulation too
         surfaces = conclude._make_surfaces_with_outliers(
-            blocks, conclude.Fit(found, clean, lacking, known), clean, clean
+            blocks, conclude.Fit(identifications, clean, lacking, known), clean, clean
         )
         short = surfaces["avar"].isel(tau=0).mean(["axis", "window"])
         before, after = (

@@ -31,9 +31,9 @@ def test_constant_rate_is_the_mean_without_the_effects():
         {"name": "misalignment", "x": 20.0, "axes": ["z"], "motion": "recorded"},
     ]
     blocks = reduce_simulation(effects[0])
-    found = constant_rates(blocks, [make_effect(table) for table in effects])
+    rates = constant_rates(blocks, [make_effect(table) for table in effects])
     leak = 0.02 * float(blocks["mean"].sel(axis="x").mean())
-    assert found == pytest.approx({"x": -3.0, "y": 0.4, "z": -leak}, abs=0.03)
+    assert rates == pytest.approx({"x": -3.0, "y": 0.4, "z": -leak}, abs=0.03)
 
 
 @pytest.mark.parametrize(("mode", "noise"), [("zero", 0.003), ("zero", 0.01), ("round", 0.003)])

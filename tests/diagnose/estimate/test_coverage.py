@@ -61,12 +61,16 @@ def fit_records(
     return out
 
 
-def covered_share(found: list[dict[str, Any]], name: str, truth: float) -> float:
-    return float(np.mean([one[name].low <= truth <= one[name].high for one in found]))
+def covered_share(estimates: list[dict[str, Any]], name: str, truth: float) -> float:
+    return float(
+        np.mean([estimate[name].low <= truth <= estimate[name].high for estimate in estimates])
+    )
 
 
-def median_half_width(found: list[dict[str, Any]], name: str) -> float:
-    return float(np.median([0.5 * (one[name].high - one[name].low) for one in found]))
+def median_half_width(estimates: list[dict[str, Any]], name: str) -> float:
+    return float(
+        np.median([0.5 * (estimate[name].high - estimate[name].low) for estimate in estimates])
+    )
 
 
 @pytest.mark.slow
@@ -83,22 +87,22 @@ def test_intervals_of_a_slow_curved_supply_response():
         *WORLD["usual"],
         {"profile": "steps", "channel": "supply_voltage", "unit": "V", "points": VOLTS},
     )
-    found = fit_records(environment, "supply_bias", "voltage", size * filter_slowly(bent, time))
-    assert 0.9 <= covered_share(found, "voltage", at_rest) <= 1.0
-    assert 0.9 <= covered_share(found, "lag", time) <= 1.0
-    assert median_half_width(found, "voltage") < 0.25 * at_rest
-    assert median_half_width(found, "lag") < 0.5 * time
+    estimates = fit_records(environment, "supply_bias", "voltage", size * filter_slowly(bent, time))
+    assert 0.9 <= covered_share(estimates, "voltage", at_rest) <= 1.0
+    assert 0.9 <= covered_share(estimates, "lag", time) <= 1.0
+    assert median_half_width(estimates, "voltage") < 0.25 * at_rest
+    assert median_half_width(estimates, "lag") < 0.5 * time
 
 
 @pytest.mark.slow
 def test_intervals_of_a_warm_up_faster_than_the_grid():
     time, size = 25.0, 1.0
-    found = fit_records(
+    estimates = fit_records(
         WORLD["usual"], "warm_up", "amplitude", size * np.exp(-(np.arange(SECONDS) + 0.5) / time)
     )
-    assert 0.9 <= covered_share(found, "amplitude", size) <= 1.0
-    assert 0.9 <= covered_share(found, "time", time) <= 1.0
-    assert median_half_width(found, "time") < 0.6 * time
+    assert 0.9 <= covered_share(estimates, "amplitude", size) <= 1.0
+    assert 0.9 <= covered_share(estimates, "time", time) <= 1.0
+    assert median_half_width(estimates, "time") < 0.6 * time
 
 
 @pytest.mark.slow
@@ -113,10 +117,12 @@ def test_intervals_of_a_dead_band_between_grid_values():
         {"profile": "ramps", "channel": "temperature", "unit": "degC", "points": HEAT},
         WORLD["usual"][1],
     )
-    found = fit_records(environment, "thermal_hysteresis", "sensitivity", size * (heat - slider))
-    assert 0.9 <= covered_share(found, "sensitivity", size) <= 1.0
-    assert 0.9 <= covered_share(found, "width", width) <= 1.0
-    assert median_half_width(found, "sensitivity") < 0.4 * size
+    estimates = fit_records(
+        environment, "thermal_hysteresis", "sensitivity", size * (heat - slider)
+    )
+    assert 0.9 <= covered_share(estimates, "sensitivity", size) <= 1.0
+    assert 0.9 <= covered_share(estimates, "width", width) <= 1.0
+    assert median_half_width(estimates, "sensitivity") < 0.4 * size
 
 
 @pytest.mark.slow
@@ -133,7 +139,9 @@ def test_limit_of_an_effect_slower_than_the_grid():
     frame = replace(
         frame,
         identified=(),
-        candidates=tuple(one for one in frame.candidates if one.effect == "shupe"),
+        candidates=tuple(
+            candidate for candidate in frame.candidates if candidate.effect == "shupe"
+        ),
     )
     drawn = next(
         iter(
@@ -142,16 +150,16 @@ def test_limit_of_an_effect_slower_than_the_grid():
             )
         )
     )
-    there = average_blocks(size * filter_slowly(60.0 * np.gradient(heat), time))
-    found = []
+    means = average_blocks(size * filter_slowly(60.0 * np.gradient(heat), time))
+    limits = []
     for number in range(RECORDS):
-        seen = blocks.assign(
-            mean=drawn["mean"].isel(record=number).transpose("axis", "block") + there
+        changed = blocks.assign(
+            mean=drawn["mean"].isel(record=number).transpose("axis", "block") + means
         )
-        found.append(
-            find_upper_limits(replace(frame, state=initial_state(seen, baseline)))[
+        limits.append(
+            find_upper_limits(replace(frame, state=initial_state(changed, baseline)))[
                 "shupe"
             ].upper_limit
         )
-    assert np.mean(np.array(found) >= size) >= 0.9
-    assert np.median(found) < 4.0 * size
+    assert np.mean(np.array(limits) >= size) >= 0.9
+    assert np.median(limits) < 4.0 * size

@@ -59,23 +59,23 @@ def diagnose_against_model(effects, *, environment=(), more=(), axes="xyz", seed
     ids=["spikes, memory, walk", "held samples", "sway", "turning"],
 )
 def test_effects_of_the_model_are_not_mismatches(effects, environment, axes):
-    found = diagnose_against_model(effects, environment=environment, axes=axes)
-    assert found.verdict == "no mismatch", (found.effects, found.content["mismatches"])
+    diagnosis = diagnose_against_model(effects, environment=environment, axes=axes)
+    assert diagnosis.verdict == "no mismatch", (diagnosis.effects, diagnosis.content["mismatches"])
 
 
 @pytest.mark.slow
 def test_effect_in_addition_to_expected_ones_is_identified():
-    found = diagnose_against_model([SPIKES, MEMORY], more=[JUMP], axes="xy")
-    assert [effect["name"] for effect in found.effects] == ["bias_jump"]
+    diagnosis = diagnose_against_model([SPIKES, MEMORY], more=[JUMP], axes="xy")
+    assert [effect["name"] for effect in diagnosis.effects] == ["bias_jump"]
     assert (
-        found.effects[0]["parameters"]["step"]["low"]
+        diagnosis.effects[0]["parameters"]["step"]["low"]
         < 1.0
-        < found.effects[0]["parameters"]["step"]["high"]
+        < diagnosis.effects[0]["parameters"]["step"]["high"]
     )
-    (expected,) = found.content["baseline"]["expected"]  # with the size that it has here
+    (expected,) = diagnosis.content["baseline"]["expected"]  # with the size that it has here
     assert (expected["name"], expected["axes"]) == ("spikes", ["x"])
     assert "per hour" in expected["statement"], expected["statement"]
-    assert "spikes" not in found.content["not_found"]
+    assert "spikes" not in diagnosis.content["not_found"]
 
 
 @pytest.fixture(scope="module")
@@ -91,8 +91,8 @@ def test_null_means_wander_like_the_model(blocks, memory, rms):
     baseline = baseline_from_model(blocks, {"noise": {"N": 1e-5}, "effect": [effect]})
     drawn = np.concatenate(
         [
-            one["mean"].values[:, 0]
-            for one in null_records(blocks, baseline, count=600, rng=np.random.default_rng(2))
+            record["mean"].values[:, 0]
+            for record in null_records(blocks, baseline, count=600, rng=np.random.default_rng(2))
         ]
     )
     a = float(blocks.attrs["block_s"]) / memory
@@ -109,8 +109,8 @@ def test_null_means_walk_during_vibration(blocks):
     baseline = baseline_from_model(blocks, {"noise": {"N": 0.003}, "effect": [effect]})
     nulls = np.concatenate(
         [
-            one["mean"].values[:, 0]
-            for one in null_records(blocks, baseline, count=400, rng=np.random.default_rng(3))
+            record["mean"].values[:, 0]
+            for record in null_records(blocks, baseline, count=400, rng=np.random.default_rng(3))
         ]
     )
     begin, end = blocks["begin"].values, blocks["end"].values
@@ -155,16 +155,19 @@ def test_narrow_resonance_is_expected_with_the_leakage_of_the_taper(frequency, q
     log = gyrostab.make_log(means[None], rate=rate, unit="deg/h")
     blocks = reduce_log(log, block="20s")
     baseline = baseline_from_model(blocks, {"noise": {"N": 1e-4}, "effect": [effect]})
-    seen, expected = (
+    recorded, expected = (
         blocks["power"].values[0].mean(axis=0),
         baseline["spectrum"].values[0].mean(axis=0),
     )
-    near = expected > 0.02 * expected.max()
-    assert near.sum() >= 2
-    np.testing.assert_allclose(seen[near], expected[near], rtol=0.25)
-    scatter = blocks["power"].values[0, :, near].var(axis=1) / seen[near] ** 2
-    assert (scatter / (1.0 / baseline["shape_alone"].values[0, 0, near]) > 0.4).all()
+    is_near_line = expected > 0.02 * expected.max()
+    assert is_near_line.sum() >= 2
+    np.testing.assert_allclose(recorded[is_near_line], expected[is_near_line], rtol=0.25)
+    scatter = blocks["power"].values[0, :, is_near_line].var(axis=1) / recorded[is_near_line] ** 2
+    assert (scatter / (1.0 / baseline["shape_alone"].values[0, 0, is_near_line]) > 0.4).all()
     assert (
-        scatter[np.argmax(seen[near])]
-        < 2.5 / baseline["shape_alone"].values[0, 0, np.flatnonzero(near)[np.argmax(seen[near])]]
+        scatter[np.argmax(recorded[is_near_line])]
+        < 2.5
+        / baseline["shape_alone"].values[
+            0, 0, np.flatnonzero(is_near_line)[np.argmax(recorded[is_near_line])]
+        ]
     )

@@ -47,12 +47,14 @@ def identify_by_hand(
 ) -> Identifications:
     """Return the identification of one effect on one axis."""
     candidates, reasons = effect_candidates(blocks, COEFFICIENT)
-    one = next(
-        one for one in candidates if one.effect == effect and one.statistic.name == statistic
+    candidate = next(
+        candidate
+        for candidate in candidates
+        if candidate.effect == effect and candidate.statistic.name == statistic
     )
-    variant = next(variant for variant in one.variants if variant.columns == columns)
-    component = Component(one, variant, (axis,), 50.0)
-    identification = Identification(effect, one.driver, (axis,), (component,), 50.0, 8.0)
+    variant = next(variant for variant in candidate.variants if variant.columns == columns)
+    component = Component(candidate, variant, (axis,), 50.0)
+    identification = Identification(effect, candidate.driver, (axis,), (component,), 50.0, 8.0)
     state = condition_on(initial_state(blocks, baseline), [component])
     return Identifications(
         (identification,),
@@ -79,12 +81,12 @@ def fit_records(noise_only, change, effect, statistic, columns):
     out = []
     frame = identify_by_hand(blocks, baseline, effect, statistic, columns)
     for number in range(RECORDS):
-        one = blocks.assign(
+        record = blocks.assign(
             mean=drawn["mean"].isel(record=number).transpose("axis", "block"),
             power=drawn["power"].isel(record=number).transpose("axis", "block", "band"),
         )
         state = condition_on(
-            initial_state(change(one), baseline), list(frame.identified[0].components)
+            initial_state(change(record), baseline), list(frame.identified[0].components)
         )
         (fitted,) = fit_identifications(replace(frame, state=state), baseline)
         out.append(fitted.parameters[columns[0]])
@@ -92,7 +94,7 @@ def fit_records(noise_only, change, effect, statistic, columns):
 
 
 def coverage(estimates, truth: float) -> float:
-    return float(np.mean([one.low <= truth <= one.high for one in estimates]))
+    return float(np.mean([estimate.low <= truth <= estimate.high for estimate in estimates]))
 
 
 @pytest.mark.parametrize(
@@ -107,12 +109,14 @@ def test_intervals_of_rectification_hold_the_true_value(noise_only, size, power)
     g = noise_only[0]["channel_vibration"].values
     truth = size / 36.0
 
-    def change(one):
-        return one.assign(mean=one["mean"] + xr.DataArray(size * (g / 6.0) ** power, dims="block"))
+    def change(blocks):
+        return blocks.assign(
+            mean=blocks["mean"] + xr.DataArray(size * (g / 6.0) ** power, dims="block")
+        )
 
-    found = fit_records(noise_only, change, "vibration_rectification", "mean", ("sensitivity",))
-    assert 0.90 <= coverage(found, truth) <= 1.0
-    assert np.mean([one.value for one in found]) == pytest.approx(
+    estimates = fit_records(noise_only, change, "vibration_rectification", "mean", ("sensitivity",))
+    assert 0.90 <= coverage(estimates, truth) <= 1.0
+    assert np.mean([estimate.value for estimate in estimates]) == pytest.approx(
         truth, rel=DEFAULTS.size_error_share
     )
 
@@ -122,18 +126,18 @@ def test_intervals_of_vibration_noise_hold_the_true_value(noise_only, share):
     g = noise_only[0]["channel_vibration"].values
     truth = 0.003 * np.sqrt(share) / 6.0
 
-    def change(one):
-        return one.assign(
-            power=one["power"] * xr.DataArray(1.0 + share * (g / 6.0) ** 2, dims="block")
+    def change(blocks):
+        return blocks.assign(
+            power=blocks["power"] * xr.DataArray(1.0 + share * (g / 6.0) ** 2, dims="block")
         )
 
-    found = fit_records(noise_only, change, "vibration_noise", "power", ("white",))
-    assert 0.88 <= coverage(found, truth) <= 1.0
-    assert np.mean([one.value for one in found]) == pytest.approx(truth, rel=0.06)
+    estimates = fit_records(noise_only, change, "vibration_noise", "power", ("white",))
+    assert 0.88 <= coverage(estimates, truth) <= 1.0
+    assert np.mean([estimate.value for estimate in estimates]) == pytest.approx(truth, rel=0.06)
 
 
-@pytest.mark.parametrize(("levels", "both"), [((5.0, 5.0), False), ((3.0, 8.0), True)])
-def test_terms_not_separated_by_one_level_become_one(noise_only, levels, both):
+@pytest.mark.parametrize(("levels", "has_both_terms"), [((5.0, 5.0), False), ((3.0, 8.0), True)])
+def test_terms_not_separated_by_one_level_become_one(noise_only, levels, has_both_terms):
     blocks, baseline = noise_only
     place = np.linspace(0.0, 1.0, blocks.sizes["block"])
     g = np.where(
@@ -142,19 +146,21 @@ def test_terms_not_separated_by_one_level_become_one(noise_only, levels, both):
         np.where((place > 0.6) & (place < 0.8), levels[1], 0.0),
     )
     g = g + 0.05 * np.random.default_rng(3).random(g.size)
-    sensitivity, quartic = (0.05, -5e-4) if both else (0.005, 0.0)
+    sensitivity, quartic = (0.05, -5e-4) if has_both_terms else (0.005, 0.0)
     shape = xr.DataArray(sensitivity * g**2 + quartic * g**4, dims="block")
     drawn = next(
         iter(null_records(blocks, baseline, count=1, rng=np.random.default_rng(4), chunk=1))
     )
-    one = blocks.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + shape)
-    one["channel_vibration"] = blocks["channel_vibration"].copy(data=g)
+    changed = blocks.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + shape)
+    changed["channel_vibration"] = blocks["channel_vibration"].copy(data=g)
     frame = identify_by_hand(
-        one, baseline, "vibration_rectification", "mean", ("sensitivity", "quartic")
+        changed, baseline, "vibration_rectification", "mean", ("sensitivity", "quartic")
     )
     (fitted,) = fit_identifications(settle_forms(frame, baseline), baseline)
-    assert set(fitted.parameters) == ({"sensitivity", "quartic"} if both else {"sensitivity"})
-    assert ("does not separate" in fitted.say()) is not both
+    assert set(fitted.parameters) == (
+        {"sensitivity", "quartic"} if has_both_terms else {"sensitivity"}
+    )
+    assert ("does not separate" in fitted.say()) is not has_both_terms
     for name, truth in (("sensitivity", sensitivity), ("quartic", quartic)):
         if name in fitted.parameters:
             assert fitted.parameters[name].low < truth < fitted.parameters[name].high
@@ -174,13 +180,13 @@ def test_single_term_is_the_plainest_of_equivalent_ones(noise_only, levels, colu
         iter(null_records(blocks, baseline, count=1, rng=np.random.default_rng(4), chunk=1))
     )
     shape = xr.DataArray(0.005 * g**2 if column == "sensitivity" else 1e-4 * g**4, dims="block")
-    one = blocks.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + shape)
-    one["channel_vibration"] = blocks["channel_vibration"].copy(data=g)
-    frame = identify_by_hand(one, baseline, "vibration_rectification", "mean", (column,))
+    changed = blocks.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + shape)
+    changed["channel_vibration"] = blocks["channel_vibration"].copy(data=g)
+    frame = identify_by_hand(changed, baseline, "vibration_rectification", "mean", (column,))
     (fitted,) = fit_identifications(settle_forms(frame, baseline), baseline)
-    alike = levels[0] == levels[1]
-    assert set(fitted.parameters) == ({"sensitivity"} if alike else {column})
-    assert ("does not separate" in fitted.say()) is alike
+    is_one_level = levels[0] == levels[1]
+    assert set(fitted.parameters) == ({"sensitivity"} if is_one_level else {column})
+    assert ("does not separate" in fitted.say()) is is_one_level
 
 
 def test_axes_of_one_effect_have_one_choice_of_a_text():
@@ -191,12 +197,12 @@ def test_axes_of_one_effect_have_one_choice_of_a_text():
     frame = identify_by_hand(blocks, baseline, "aliased_vibration", "power", ("sensitivity",))
     (identification,) = frame.identified
     (first,) = identification.components
-    ways = {one.values["sampling"]: one for one in first.candidate.variants}
+    ways = {variant.values["sampling"]: variant for variant in first.candidate.variants}
     assert set(ways) == {"point", "average"}
     components = (first, replace(first, row=("y",), variant=ways["average"]))
-    both = replace(identification, axes=("x", "y"), components=components)
-    settled = settle_forms(replace(frame, identified=(both,)), baseline)
-    texts = [one.variant.texts for one in settled.identified[0].components]
+    merged = replace(identification, axes=("x", "y"), components=components)
+    settled = settle_forms(replace(frame, identified=(merged,)), baseline)
+    texts = [variant.variant.texts for variant in settled.identified[0].components]
     assert texts == [{"sampling": "point"}] * 2
     (fitted,) = fit_identifications(settled, baseline)
     assert fitted.effect is not None
@@ -215,9 +221,9 @@ def shaken():
 def test_model_contains_the_effect(shaken):
     identifications, baseline = shaken
     (fitted,) = fit_identifications(identifications, baseline)
-    one = fitted.parameters["sensitivity"]
-    assert one.low < 0.005 < one.high
-    assert one.unit == "deg/h/g^2"
+    estimate = fitted.parameters["sensitivity"]
+    assert estimate.low < 0.005 < estimate.high
+    assert estimate.unit == "deg/h/g^2"
     assert fitted.effect is not None
     assert fitted.effect.axes == ("y",)
     assert "rectified" in fitted.say()
@@ -226,11 +232,11 @@ def test_model_contains_the_effect(shaken):
         "sensitivity": fitted.effect.sensitivity,
         "axes": list(fitted.effect.axes),
     }
-    again = record([table])["mean"].sel(axis="y") - record([])["mean"].sel(axis="y")
+    simulated = record([table])["mean"].sel(axis="y") - record([])["mean"].sel(axis="y")
     truth = record([{"name": "vibration_rectification", "sensitivity": 0.005, "axes": ["y"]}])[
         "mean"
     ].sel(axis="y") - record([])["mean"].sel(axis="y")
-    np.testing.assert_allclose(again, truth, atol=0.25 * float(np.abs(truth).max()))
+    np.testing.assert_allclose(simulated, truth, atol=0.25 * float(np.abs(truth).max()))
 
 
 def test_prediction_is_fitted_to_known_blocks_only(shaken):
@@ -252,14 +258,14 @@ def test_prediction_is_fitted_to_known_blocks_only(shaken):
 
 def test_effects_not_found_have_a_limit_or_a_reason(shaken):
     identifications, _ = shaken
-    found = find_upper_limits(identifications)
-    assert "vibration_rectification" not in found
-    assert found["shupe"].reason == "below limit"
-    assert 0.0 < found["shupe"].upper_limit < 5.0
-    assert found["shupe"].unit == "deg/h/(degC/min)"
-    assert 0.0 < found["vibration_noise"].upper_limit < 1e-3
-    assert np.isnan(found["feedback_reset"].upper_limit)
-    assert found["feedback_reset"].reason.startswith("not identifiable")
+    limits = find_upper_limits(identifications)
+    assert "vibration_rectification" not in limits
+    assert limits["shupe"].reason == "below limit"
+    assert 0.0 < limits["shupe"].upper_limit < 5.0
+    assert limits["shupe"].unit == "deg/h/(degC/min)"
+    assert 0.0 < limits["vibration_noise"].upper_limit < 1e-3
+    assert np.isnan(limits["feedback_reset"].upper_limit)
+    assert limits["feedback_reset"].reason.startswith("not identifiable")
 
 
 def test_size_of_a_line():
@@ -276,15 +282,15 @@ def test_size_of_a_line():
 def test_quality_of_a_line_follows_from_the_scatter_of_its_power():
     """A resonance narrower than a line of the spectrum looks steady, but its power scatters."""
     line = {"name": "spectral_line", "amplitude": 0.8, "frequency": 2.345, "axes": ["x"]}
-    found = {}
+    qualities = {}
     for quality in (np.inf, 150.0, 60.0):
         given = {} if np.isinf(quality) else {"quality": quality}
         blocks = record([line | given])
         place = int(blocks["line_power"].sel(axis="x").mean("part").values.argmax())
-        found[quality] = line_quality(blocks, calibrate_noise(record([])), "x", place)
-    assert np.isinf(found[np.inf])
-    assert 75.0 < found[150.0] < 300.0
-    assert 30.0 < found[60.0] < 120.0
+        qualities[quality] = line_quality(blocks, calibrate_noise(record([])), "x", place)
+    assert np.isinf(qualities[np.inf])
+    assert 75.0 < qualities[150.0] < 300.0
+    assert 30.0 < qualities[60.0] < 120.0
 
 
 def test_line_has_its_frequency_to_one_bin_and_the_amplitude_of_the_rate():
@@ -304,10 +310,10 @@ def test_line_has_its_frequency_to_one_bin_and_the_amplitude_of_the_rate():
         ),
         baseline,
     )
-    found = fitted.parameters["frequency"]
+    frequency = fitted.parameters["frequency"]
     step = float(np.diff(blocks["line_frequency"].values[:2])[0])
-    assert found.low < true < found.high
-    assert found.high - found.low < 2.0 * step
+    assert frequency.low < true < frequency.high
+    assert frequency.high - frequency.low < 2.0 * step
     assert fitted.parameters["amplitude"].value == pytest.approx(0.4, rel=0.06)
 
 
@@ -345,9 +351,9 @@ def test_axes_missing_in_the_strongest_statistic_get_sizes_from_the_next():
     candidates, reasons = effect_candidates(blocks, baseline["coefficient"])
     power, cross = (
         next(
-            one
-            for one in candidates
-            if (one.effect, one.statistic.name) == (effect["name"], statistic)
+            candidate
+            for candidate in candidates
+            if (candidate.effect, candidate.statistic.name) == (effect["name"], statistic)
         )
         for statistic in ("power", "cross_spectrum")
     )
@@ -376,14 +382,14 @@ def test_axes_missing_in_the_strongest_statistic_get_sizes_from_the_next():
         tuple(fitted.parameters[f"sensitivity.{axis}"].value for axis in truth)
     )
     for axis, size in truth.items():
-        one = fitted.parameters[f"sensitivity.{axis}"]
-        assert one.low - one.stderr < size < one.high + one.stderr
+        estimate = fitted.parameters[f"sensitivity.{axis}"]
+        assert estimate.low - estimate.stderr < size < estimate.high + estimate.stderr
 
 
 @given(st.floats(-5.0, 5.0), st.floats(0.01, 10.0))
 def test_an_interval_of_a_positive_size_contains_it(mean: float, sd: float) -> None:
-    one = _make_estimate(mean, sd, "1", positive=True, form=0.0)
-    assert 0.0 <= one.low <= one.value < one.high
+    estimate = _make_estimate(mean, sd, "1", positive=True, form=0.0)
+    assert 0.0 <= estimate.low <= estimate.value < estimate.high
 
 
 def test_an_interval_cut_off_at_zero_holds_its_share() -> None:
@@ -394,6 +400,6 @@ def test_an_interval_cut_off_at_zero_holds_its_share() -> None:
 
 
 def test_a_standard_error_is_no_wider_than_its_interval() -> None:
-    one = _make_estimate(-0.5, 49.0, "1", positive=False, form=0.0, ends=(-0.93, -0.09))
-    assert one.stderr == pytest.approx(0.5 * 0.84 / 1.96, rel=1e-3)
-    assert (one.low, one.high) == pytest.approx((-0.93, -0.09))
+    estimate = _make_estimate(-0.5, 49.0, "1", positive=False, form=0.0, ends=(-0.93, -0.09))
+    assert estimate.stderr == pytest.approx(0.5 * 0.84 / 1.96, rel=1e-3)
+    assert (estimate.low, estimate.high) == pytest.approx((-0.93, -0.09))

@@ -26,16 +26,17 @@ def noise_only():
 
 def _variant(identifications, component, values):
     candidate = next(
-        one
-        for one in identifications.candidates
-        if one.key == component.candidate.key and one.statistic == component.candidate.statistic
+        candidate
+        for candidate in identifications.candidates
+        if candidate.key == component.candidate.key
+        and candidate.statistic == component.candidate.statistic
     )
     return next(
-        one
-        for one in candidate.variants
-        if one.columns == component.variant.columns
+        variant
+        for variant in candidate.variants
+        if variant.columns == component.variant.columns
         and all(
-            one.values[name] == pytest.approx(value, rel=0.01) for name, value in values.items()
+            variant.values[name] == pytest.approx(value, rel=0.01) for name, value in values.items()
         )
     )
 
@@ -47,27 +48,27 @@ def fit_effect(noise_only, effect, statistic, column, *, true, size, named):
     component = identifications.identified[0].components[0]
     design = _variant(identifications, component, true).design
     if statistic == "mean":
-        seen = blocks.assign(
+        changed = blocks.assign(
             mean=blocks["mean"]
             + size * np.stack([design[0, 0], 0 * design[0, 0], 0 * design[0, 0]])
         )
     else:
-        seen = blocks.assign(
+        changed = blocks.assign(
             power=blocks["power"]
             + size**2 * np.stack([design[0, 0], 0 * design[0, 0], 0 * design[0, 0]])
         )
     component = replace(component, variant=_variant(identifications, component, named))
     identification = replace(identifications.identified[0], components=(component,))
-    state = condition_on(initial_state(seen, baseline), [component])
-    (found,) = fit_identifications(
+    state = condition_on(initial_state(changed, baseline), [component])
+    (fitted,) = fit_identifications(
         replace(identifications, identified=(identification,), state=state), baseline
     )
-    return found
+    return fitted
 
 
 def test_undetermined_lag_is_zero_and_widens_the_size(noise_only):
     truth = 0.01
-    found = fit_effect(
+    fitted = fit_effect(
         noise_only,
         "shupe",
         "mean",
@@ -76,16 +77,16 @@ def test_undetermined_lag_is_zero_and_widens_the_size(noise_only):
         size=truth,
         named={"lag": 75.4, "sensor_lag": 60.0},
     )
-    lag, size = found.parameters["lag"], found.parameters["sensitivity"]
-    assert (lag.value, lag.low, found.parameters["sensor_lag"].value) == (0.0, 0.0, 0.0)
+    lag, size = fitted.parameters["lag"], fitted.parameters["sensitivity"]
+    assert (lag.value, lag.low, fitted.parameters["sensor_lag"].value) == (0.0, 0.0, 0.0)
     assert 20.0 < lag.high < 3000.0
     assert size.low < truth < size.high
-    assert (found.effect.lag, found.effect.sensor_lag) == (1e-3, 0.0)
-    assert " s at most" in found.say()
+    assert (fitted.effect.lag, fitted.effect.sensor_lag) == (1e-3, 0.0)
+    assert " s at most" in fitted.say()
 
 
 def test_determined_lag_is_estimated(noise_only):
-    found = fit_effect(
+    fitted = fit_effect(
         noise_only,
         "shupe",
         "mean",
@@ -94,14 +95,14 @@ def test_determined_lag_is_estimated(noise_only):
         size=0.3,
         named={"lag": 475.5, "sensor_lag": 0.0},
     )
-    assert found.parameters["lag"].low > 100.0
-    assert found.parameters["lag"].value == pytest.approx(475.5, rel=0.2)
-    assert found.parameters["sensitivity"].value == pytest.approx(0.3, rel=0.1)
+    assert fitted.parameters["lag"].low > 100.0
+    assert fitted.parameters["lag"].value == pytest.approx(475.5, rel=0.2)
+    assert fitted.parameters["sensitivity"].value == pytest.approx(0.3, rel=0.1)
 
 
 def test_values_of_the_model_belong_together(noise_only):
     """Averages over two lags are not the effect with the average lag."""
-    found = fit_effect(
+    fitted = fit_effect(
         noise_only,
         "shupe",
         "mean",
@@ -110,21 +111,21 @@ def test_values_of_the_model_belong_together(noise_only):
         size=0.06,
         named={"lag": 475.5, "sensor_lag": 0.0},
     )
-    effect, lag = found.effect, found.parameters["lag"]
+    effect, lag = fitted.effect, fitted.parameters["lag"]
     assert effect.lag != pytest.approx(lag.value, rel=0.01)
     assert lag.low < effect.lag < lag.high
-    assert f"a lag of {format_value(lag.value, lag.stderr)} ± " in found.say()
+    assert f"a lag of {format_value(lag.value, lag.stderr)} ± " in fitted.say()
     blocks, _ = noise_only
     windows = make_windows(blocks, {"temperature": "temperature"})
     made, true = (
-        one.sensitivity * one.explain(windows).mean["sensitivity"]
-        for one in (effect, replace(effect, sensitivity=0.06, lag=475.5, sensor_lag=0.0))
+        version.sensitivity * version.explain(windows).mean["sensitivity"]
+        for version in (effect, replace(effect, sensitivity=0.06, lag=475.5, sensor_lag=0.0))
     )
     assert np.std(made - true) < 0.3 * np.std(true)
 
 
 def test_exponent_of_the_model_is_that_of_the_size(noise_only):
-    found = fit_effect(
+    fitted = fit_effect(
         noise_only,
         "vibration_noise",
         "power",
@@ -133,8 +134,8 @@ def test_exponent_of_the_model_is_that_of_the_size(noise_only):
         size=1e-4,
         named={"exponent": 2.0},
     )
-    assert found.effect.exponent == 1.0
-    assert "exponent" not in found.parameters
+    assert fitted.effect.exponent == 1.0
+    assert "exponent" not in fitted.parameters
 
 
 def test_effect_without_lags_has_no_lag_places():

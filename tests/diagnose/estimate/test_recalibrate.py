@@ -41,25 +41,33 @@ def reduce_simulation(*effects, axes=("x", "y"), environment=(), lost=0.0):
         "log": {"axes": list(axes)},
     }
     log = simulate(model, duration="30min", rate=10.0, seed=5).compute()
-    there = xr.DataArray(np.random.default_rng(3).random(log.sizes["time"]) >= lost, dims="time")
-    return reduce_log(log.assign(rate=log["rate"].where(there).assign_attrs(log["rate"].attrs)))
+    is_present = xr.DataArray(
+        np.random.default_rng(3).random(log.sizes["time"]) >= lost, dims="time"
+    )
+    return reduce_log(
+        log.assign(rate=log["rate"].where(is_present).assign_attrs(log["rate"].attrs))
+    )
 
 
 def identify_by_hand(blocks, baseline, effect, statistic, columns, **values):
     """Return the identification of one effect on x, or on both axes if it belongs to the pair."""
     known, reasons = effect_candidates(blocks, baseline["coefficient"])
-    one = next(one for one in known if one.effect == effect and one.statistic.name == statistic)
-    fits = [each for each in one.variants if each.columns == columns]
+    candidate = next(
+        candidate
+        for candidate in known
+        if candidate.effect == effect and candidate.statistic.name == statistic
+    )
+    fits = [variant for variant in candidate.variants if variant.columns == columns]
     variant = min(
         fits,
-        key=lambda each: sum(
-            abs(1.0 / (1.0 + each.values[name]) - 1.0 / (1.0 + size))
+        key=lambda variant: sum(
+            abs(1.0 / (1.0 + variant.values[name]) - 1.0 / (1.0 + size))
             for name, size in values.items()
         ),
     )
     rows = [("x", "y")] if statistic == "cross_spectrum" else [("x",)]
-    components = tuple(Component(one, variant, row, 500.0) for row in rows)
-    identification = Identification(effect, one.driver, rows[0], components, 500.0, 8.0)
+    components = tuple(Component(candidate, variant, row, 500.0) for row in rows)
+    identification = Identification(effect, candidate.driver, rows[0], components, 500.0, 8.0)
     state = condition_on(initial_state(blocks, baseline), list(components))
     return Identifications(
         (identification,), (), 8.0, np.zeros(1), reasons, tuple(known), state, fold_blocks(blocks)
@@ -172,8 +180,8 @@ def test_noise_that_changes_far_from_its_reference_has_the_level_of_the_record()
     assert "x" not in fit.noise.attrs.get("recalibrated", ())
     effect, level = fit.fitted[0].effect, noise_coefficient(fit.noise, "N")[0] ** 2
     for degrees in (58.0, 62.0, 66.0):
-        found = level * (1.0 + effect.linear * (degrees - effect.reference))
-        assert found == pytest.approx(0.003**2 * (1.0 + 0.12 * (degrees - 62.0)), rel=0.12)
+        squared_noise = level * (1.0 + effect.linear * (degrees - effect.reference))
+        assert squared_noise == pytest.approx(0.003**2 * (1.0 + 0.12 * (degrees - 62.0)), rel=0.12)
     assert "around 58 degC" in fit.fitted[0].say()
 
 
@@ -181,7 +189,7 @@ def test_axis_without_an_effect_keeps_its_noise(shaken):
     _, baseline, after = shaken
     for name in ("coefficient", "spectrum", "square", "grid_K", "mean_variance"):
         np.testing.assert_array_equal(after[name].sel(axis="y"), baseline[name].sel(axis="y"))
-    before, now = (np.exp(one["grid_calibrated"].sel(axis="y")) for one in (baseline, after))
+    before, now = (np.exp(noise["grid_calibrated"].sel(axis="y")) for noise in (baseline, after))
     np.testing.assert_allclose(now, before, atol=1e-9)
 
 
@@ -259,10 +267,16 @@ def test_phase_locked_power_is_counted_once():
     )
     baseline = calibrate_noise(blocks)
     known, reasons = effect_candidates(blocks, baseline["coefficient"])
-    statistics = {one.statistic.name: one for one in known if one.effect == "aliased_vibration"}
+    statistics = {
+        candidate.statistic.name: candidate
+        for candidate in known
+        if candidate.effect == "aliased_vibration"
+    }
     variants = {
-        statistic: next(each for each in one.variants if each.values["sampling"] == "point")
-        for statistic, one in statistics.items()
+        statistic: next(
+            variant for variant in candidate.variants if variant.values["sampling"] == "point"
+        )
+        for statistic, candidate in statistics.items()
     }
     places = [("power", ("x",)), ("power", ("y",)), ("cross_spectrum", ("x", "y"))]
     components = tuple(
@@ -280,8 +294,8 @@ def test_phase_locked_power_is_counted_once():
     noise = recalibrate(identifications, baseline, first)
     for fitted in (first, fit_identifications(with_noise(identifications, noise), noise)):
         sizes = [
-            one.value
-            for name, one in fitted[0].parameters.items()
+            estimate.value
+            for name, estimate in fitted[0].parameters.items()
             if name.startswith("sensitivity")
         ]
         assert sizes
@@ -289,13 +303,15 @@ def test_phase_locked_power_is_counted_once():
     for axis in "xy":
         value, error = noise_coefficient(noise, "N", axis)
         assert abs(value - 0.003) < 3.0 * error
-    again = {
+    second_effect = {
         "name": "aliased_vibration",
         "sensitivity": 0.3,
         "low": first[0].effect.low,
         "high": first[0].effect.high,
     }
-    model = reduce_simulation(again, environment=[shaken])  # 17.5 to 20 Hz fold onto 0 to 2.5 Hz
+    model = reduce_simulation(
+        second_effect, environment=[shaken]
+    )  # 17.5 to 20 Hz fold onto 0 to 2.5 Hz
     band, loud = model["frequency"].values, model["channel_vibration"].values > 3.0
     power = model["power"].mean("axis").values
     above = power[loud].mean(axis=0) / power[~loud].mean(axis=0) - 1.0
@@ -314,9 +330,9 @@ def test_anomalous_samples_do_not_raise_the_noise(size):
     )
     (fitted,) = fit_identifications(identifications, baseline)
     for name, true in (("per_hour", 60.0), ("size", size)):
-        one = fitted.parameters[name]
-        assert one.low <= true <= one.high
-        assert one.stderr < 0.3 * one.value
+        estimate = fitted.parameters[name]
+        assert estimate.low <= true <= estimate.high
+        assert estimate.stderr < 0.3 * estimate.value
     value, error = noise_coefficient(recalibrate(identifications, baseline, [fitted]), "N")
     assert abs(value - 0.003) < 3.0 * error
     assert error < 0.05 * value
@@ -339,9 +355,9 @@ def test_noise_before_a_filter_is_recovered(table, grid, lost):
     identifications = identify_by_hand(blocks, baseline, "logger_filter", "power", (), **grid)
     (fitted,) = fit_identifications(identifications, baseline)
     name = "cutoff" if "cutoff" in table else "length"
-    one = fitted.parameters[name]
-    assert one.low <= table[name] <= one.high
-    assert one.value == pytest.approx(table[name], rel=0.04 if lost == 0.0 else 0.15)
+    estimate = fitted.parameters[name]
+    assert estimate.low <= table[name] <= estimate.high
+    assert estimate.value == pytest.approx(table[name], rel=0.04 if lost == 0.0 else 0.15)
     after = recalibrate(identifications, baseline, [fitted])
     assert noise_coefficient(baseline, "N")[0] < 0.8 * 0.003
     value, error = noise_coefficient(after, "N")

@@ -26,7 +26,7 @@ def noise_only():
     return (
         blocks,
         calibrate_noise(blocks),
-        next(one for one in candidates if one.effect == "shared_source"),
+        next(candidate for candidate in candidates if candidate.effect == "shared_source"),
     )
 
 
@@ -65,15 +65,19 @@ def test_intervals_hold_the_true_factors(noise_only, bandwidth):
     truth = (0.0014, 0.0011, -0.0016)
     held = []
     for number in range(RECORDS):
-        found = estimate_sizes(noise_only, truth, number, bandwidth=bandwidth)
+        estimates = estimate_sizes(noise_only, truth, number, bandwidth=bandwidth)
         sign = np.sign(
-            sum(found[f"N.{axis}"][0] * one for axis, one in zip(AXES, truth, strict=True))
+            sum(
+                estimates[f"N.{axis}"][0] * factor for axis, factor in zip(AXES, truth, strict=True)
+            )
         )
         held += [
             sorted((sign * low, sign * high))
-            for _, _, low, high in (found[f"N.{axis}"] for axis in AXES)
+            for _, _, low, high in (estimates[f"N.{axis}"] for axis in AXES)
         ]
-    inside = [low <= one <= high for (low, high), one in zip(held, truth * RECORDS, strict=True)]
+    inside = [
+        low <= factor <= high for (low, high), factor in zip(held, truth * RECORDS, strict=True)
+    ]
     assert np.mean(inside) >= 0.8
 
 
@@ -87,8 +91,8 @@ def test_bandwidth_is_given_only_if_it_shows(noise_only):
 def test_one_pair_determines_only_the_product(noise_only):
     """The factors range between the most that the axis has and what the other axis leaves."""
     truth = (0.0024, 0.0009, 0.0)
-    found = estimate_sizes(noise_only, truth, 3, axes=("x", "y"))
-    (x, _, x_low, x_high), (y, _, y_low, y_high) = found["N.x"], found["N.y"]
+    estimates = estimate_sizes(noise_only, truth, 3, axes=("x", "y"))
+    (x, _, x_low, x_high), (y, _, y_low, y_high) = estimates["N.x"], estimates["N.y"]
     assert x * y == pytest.approx(truth[0] * truth[1], rel=0.15)
     assert x_low < truth[0] < x_high < 0.0032
     assert y_low < truth[1] < y_high
@@ -96,13 +100,13 @@ def test_one_pair_determines_only_the_product(noise_only):
 
 
 def test_common_noise_does_not_exceed_the_noise(noise_only):
-    found = estimate_sizes(noise_only, (0.0004, 0.0004, 0.0004), 5)
-    assert all(abs(found[f"N.{axis}"][3]) < 0.0033 for axis in AXES)
+    estimates = estimate_sizes(noise_only, (0.0004, 0.0004, 0.0004), 5)
+    assert all(abs(estimates[f"N.{axis}"][3]) < 0.0033 for axis in AXES)
 
 
 def test_other_pairs_do_not_matter(noise_only):
-    one, other = (
+    without_z, with_z = (
         estimate_sizes(noise_only, (0.002, 0.0015, 0.0), 7, axes=("x", "y")),
         estimate_sizes(noise_only, (0.002, 0.0015, 0.003), 7, axes=("x", "y")),
     )
-    assert one == other
+    assert without_z == with_z

@@ -52,7 +52,10 @@ def frame(pieces: np.ndarray) -> tuple[xr.Dataset, xr.Dataset]:
         {
             "known_mean": (("axis", "block"), np.zeros((1, BLOCKS))),
             "mean_variance": (("axis", "block"), np.full((1, BLOCKS), WHITE / PIECES)),
-            **{f"grid_{name}": (("axis", "grid"), one) for name, one in grid.items()},
+            **{
+                f"grid_{name}": (("axis", "grid"), grid_values)
+                for name, grid_values in grid.items()
+            },
         },
         {"axis": ["x"]},
     )
@@ -61,9 +64,9 @@ def frame(pieces: np.ndarray) -> tuple[xr.Dataset, xr.Dataset]:
 
 def found_in(course: np.ndarray, rng: np.random.Generator) -> SwitchingEvidence:
     noise = np.sqrt(WHITE) * rng.standard_normal((BLOCKS, PIECES))
-    found = switching_evidence(*frame(course.reshape(BLOCKS, PIECES) + noise), axis="x")
-    assert found is not None
-    return found
+    evidence = switching_evidence(*frame(course.reshape(BLOCKS, PIECES) + noise), axis="x")
+    assert evidence is not None
+    return evidence
 
 
 @pytest.mark.parametrize(
@@ -74,11 +77,11 @@ def test_finds_switching_within_blocks_and_its_parameters(
 ) -> None:
     rng = np.random.default_rng(1)
     course = course_of(rng, low, high, BLOCKS * STEP, PIECES / STEP)
-    found = found_in(step * course, rng)
-    assert found.evidence_nats > 20.0
-    np.testing.assert_allclose(found.times, [low, high], rtol=0.4)
-    assert np.sqrt(np.mean((found.share.ravel() - course) ** 2)) < 0.15
-    slope = np.polyfit(found.share.ravel(), step * course, 1)[0]
+    evidence = found_in(step * course, rng)
+    assert evidence.evidence_nats > 20.0
+    np.testing.assert_allclose(evidence.times, [low, high], rtol=0.4)
+    assert np.sqrt(np.mean((evidence.share.ravel() - course) ** 2)) < 0.15
+    slope = np.polyfit(evidence.share.ravel(), step * course, 1)[0]
     assert slope == pytest.approx(step, rel=0.1)
 
 
@@ -141,14 +144,16 @@ def test_switching_powers_match_those_of_the_samples() -> None:
     log = make_log(course[None], rate=10.0, unit="deg/h")
     blocks = reduce_log(log, block="20s")
     size = int(blocks.attrs["block_samples"])
-    seen = blocks["power"].values[0]
-    told = switching_powers(blocks["sub_block_mean"].values[0], 15.0, 6.0, size, 10.0)
+    recorded = blocks["power"].values[0]
+    predicted = switching_powers(blocks["sub_block_mean"].values[0], 15.0, 6.0, size, 10.0)
     slow = blocks["frequency"].values < 0.3
-    np.testing.assert_allclose(told[:, slow].mean(axis=0), seen[:, slow].mean(axis=0), rtol=0.05)
     np.testing.assert_allclose(
-        told.mean(axis=0), seen.mean(axis=0), rtol=0.25
+        predicted[:, slow].mean(axis=0), recorded[:, slow].mean(axis=0), rtol=0.05
+    )
+    np.testing.assert_allclose(
+        predicted.mean(axis=0), recorded.mean(axis=0), rtol=0.25
     )  # the number of switches is random
-    assert np.corrcoef(np.log(told[:, 1] + 1e-3), np.log(seen[:, 1] + 1e-3))[0, 1] > 0.99
+    assert np.corrcoef(np.log(predicted[:, 1] + 1e-3), np.log(recorded[:, 1] + 1e-3))[0, 1] > 0.99
 
 
 @pytest.mark.slow
@@ -166,11 +171,11 @@ def test_diagnosis_names_the_telegraph_with_its_parameters(
         rate=5.0,
         unit="deg/h",
     )
-    found = diagnose(log, nulls=100, seed=1)
-    assert [one["name"] for one in found.effects] == ["telegraph"]
-    assert found.verdict in ("explained", "partly explained")
-    numbers = found.effects[0]["parameters"]
+    diagnosis = diagnose(log, nulls=100, seed=1)
+    assert [effect["name"] for effect in diagnosis.effects] == ["telegraph"]
+    assert diagnosis.verdict in ("explained", "partly explained")
+    numbers = diagnosis.effects[0]["parameters"]
     assert numbers["step"]["value"] == pytest.approx(0.5 * deviations, rel=0.1)
     for name, true in (("low", low), ("high", high)):
         assert abs(numbers[name]["value"] - true) < 3.0 * numbers[name]["stderr"]
-    assert found.effects[0]["alternatives"] == []
+    assert diagnosis.effects[0]["alternatives"] == []

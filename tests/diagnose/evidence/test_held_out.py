@@ -104,10 +104,10 @@ def density(y: np.ndarray, V: np.ndarray, constant: bool) -> float:
     """Return the log density of y, up to a number that depends only on its size."""
     if not y.size:
         return 0.0
-    one, inverse = np.ones(y.size), np.linalg.inv(V)
+    ones, inverse = np.ones(y.size), np.linalg.inv(V)
     value = y @ inverse @ y + np.linalg.slogdet(V)[1]
     if constant:
-        value += np.log(one @ inverse @ one) - (y @ inverse @ one) ** 2 / (one @ inverse @ one)
+        value += np.log(ones @ inverse @ ones) - (y @ inverse @ ones) ** 2 / (ones @ inverse @ ones)
     return float(-0.5 * value)
 
 
@@ -222,11 +222,11 @@ def test_factors_of_powers_are_those_of_dense_marginal_likelihoods(tier):
             for place, design in enumerate(designs, start=1):
                 X = design.reshape(n * bands, -1)
                 limit = 1.0 / np.einsum("ij,ik,kj->j", X[cells], middle, X[cells])
-                each = [
+                densities = [
                     density(y[use], V + (X[use] * limit * width**2) @ X[use].T, False)
                     for width in WIDTHS
                 ]
-                expected = np.logaddexp.reduce(each) - np.log(len(WIDTHS)) - base
+                expected = np.logaddexp.reduce(densities) - np.log(len(WIDTHS)) - base
                 assert factors[number, place, record] == pytest.approx(expected, abs=1e-6)
 
 
@@ -260,10 +260,10 @@ def test_only_a_present_effect_has_evidence():
         power=power["power"] * (1.0 + 0.1 * xr.DataArray(trend, dims=("block", "band")))
     )
     quiet_means, loud_means = (
-        mean_evidence(one, baseline, candidates, axis="x") for one in (data, loud)
+        mean_evidence(means, baseline, candidates, axis="x") for means in (data, loud)
     )
     quiet, risen = (
-        power_evidence(one, level, {"trend": [trend]}, axis="x") for one in (power, spoken)
+        power_evidence(powers, level, {"trend": [trend]}, axis="x") for powers in (power, spoken)
     )
     assert quiet_means.dims == ("candidate", "record")
     assert float(loud_means.sel(candidate="step").min()) > 8.0
@@ -296,11 +296,11 @@ def test_units_of_a_design_do_not_matter():
     n = 80
     data, baseline = mean_case(n, records=4)
     design = np.random.default_rng(3).standard_normal((n, 2))
-    one, other = (
+    plain, scaled = (
         mean_evidence(data, baseline, {"c": [design * unit]}, axis="x")
         for unit in (1.0, np.array([1e-9, 1e6]))
     )
-    np.testing.assert_allclose(one, other, atol=1e-7)
+    np.testing.assert_allclose(plain, scaled, atol=1e-7)
 
 
 def test_folds_are_interleaved_and_scale_with_the_record():
@@ -350,10 +350,10 @@ def test_a_falling_spectrum_is_not_negative_quantization_noise():
     design = [
         np.tile(np.sin(np.pi * blocks["frequency"].values / 10.0) ** 2, (blocks.sizes["block"], 1))
     ]
-    found = power_factors(blocks, baseline, design, axis="x")[0, 1, 0]
+    gain = power_factors(blocks, baseline, design, axis="x")[0, 1, 0]
     beside_any = power_factors(blocks, baseline.drop_vars("posterior"), design, axis="x")[0, 1, 0]
-    assert found > 20.0
-    assert found > 1.3 * beside_any
+    assert gain > 20.0
+    assert gain > 1.3 * beside_any
     assert (
         np.diagonal(noise_columns(baseline, axis="x")[1])[0]
         > 2.0 / baseline["square_stderr"].sel(noise="Q").item() ** 2
@@ -369,15 +369,15 @@ def test_evidence_of_a_weak_filter_exceeds_that_of_noise(share, least, most):
     )
     baseline = calibrate_noise(blocks)
     filters = [
-        one
-        for one in effect_candidates(blocks, baseline["coefficient"])[0]
-        if one.effect == "logger_filter"
+        candidate
+        for candidate in effect_candidates(blocks, baseline["coefficient"])[0]
+        if candidate.effect == "logger_filter"
     ]
     (noise,) = null_records(blocks, baseline, count=200, rng=np.random.default_rng(3), chunk=200)
     start, folds = initial_state(blocks, baseline), fold_blocks(blocks)
-    (found,) = evidence_by_effect(compute_evidence(filters, blocks, start, folds)).values()
+    (gains,) = evidence_by_effect(compute_evidence(filters, blocks, start, folds)).values()
     (drawn,) = evidence_by_effect(
         compute_evidence(filters, noise, start, folds, rng=np.random.default_rng(1))
     ).values()
-    assert least < found[0] < most
+    assert least < gains[0] < most
     assert np.quantile(drawn, 0.99) < 5.0

@@ -24,16 +24,16 @@ def test_evidence_does_not_need_products_of_unrelated_columns():
     }
     numbers = [np.array(chosen) for chosen in ([0], [1, 2], [3], [4, 5])]
     whole = mean_products(values, columns, **frame_of)
-    some = mean_products(values, columns, **frame_of, pairs=column_pairs(7, numbers, 1))
-    assert some.gram[0, 0, 1] == 0.0 != whole.gram[0, 0, 1]
-    wanted, got = (
+    selected = mean_products(values, columns, **frame_of, pairs=column_pairs(7, numbers, 1))
+    assert selected.gram[0, 0, 1] == 0.0 != whole.gram[0, 0, 1]
+    expected, got = (
         log_evidence(
-            marginalise(one, 1, np.eye(1)), numbers, np.full(6, 0.2), np.array([-1.0, -2.0])
+            marginalise(products, 1, np.eye(1)), numbers, np.full(6, 0.2), np.array([-1.0, -2.0])
         )
-        for one in (whole, some)
+        for products in (whole, selected)
     )
-    np.testing.assert_allclose(got, wanted, rtol=1e-12)
-    alone = log_evidence(
+    np.testing.assert_allclose(got, expected, rtol=1e-12)
+    separate = log_evidence(
         marginalise(whole, 1, np.eye(1)), numbers[3:], np.full(6, 0.2), np.array([-1.0, -2.0])
     )
-    np.testing.assert_allclose(alone[1], got[4], rtol=1e-12)
+    np.testing.assert_allclose(separate[1], got[4], rtol=1e-12)

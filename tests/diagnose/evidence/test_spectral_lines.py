@@ -54,9 +54,9 @@ def test_an_intermittent_line_is_not_steady() -> None:
 def test_a_steady_line_is_found_under_a_changing_noise_level() -> None:
     level = np.array([1, 1, 1, 50, 50, 1, 1, 1.0])[:, None] * np.ones(400)
     level[:, 200] += 2.0
-    found = line_evidence(spectra(level), WEIGHT)[:, 0]
-    assert (found.argmax(axis=-1) == 200).all()
-    assert found.max(axis=-1).min() > 20.0
+    gains = line_evidence(spectra(level), WEIGHT)[:, 0]
+    assert (gains.argmax(axis=-1) == 200).all()
+    assert gains.max(axis=-1).min() > 20.0
 
 
 def sines(
@@ -120,18 +120,22 @@ def test_a_line_does_not_change_the_evidence_of_means() -> None:
     blocks = sines({0.7: 0.4}, size=9_000, axes=1)
     state, folds = initial_state(blocks, calibrate_noise(blocks)), fold_blocks(blocks)
     candidates, _ = effect_candidates(blocks, state.baseline["coefficient"])
-    found = compute_evidence(candidates, blocks, state, folds)
-    line, jump = (group_components(found)[effect][0] for effect in ("spectral_line", "bias_jump"))
+    evidence = compute_evidence(candidates, blocks, state, folds)
+    line, jump = (
+        group_components(evidence)[effect][0] for effect in ("spectral_line", "bias_jump")
+    )
     assert line.evidence_nats > 10.0
     named = condition_on(state, [line])
-    kept = reusable_evidence(found, state, named)
-    assert {one.candidate.statistic.name for one in kept} == {"mean", "telegraph"}
-    again = compute_evidence([one.candidate for one in kept], named.blocks, named, folds)
-    for one, other in zip(kept, again, strict=True):
-        np.testing.assert_array_equal(one.evidence_nats, other.evidence_nats)
-    assert not reusable_evidence(found, state, condition_on(state, [jump]))
+    reusable = reusable_evidence(evidence, state, named)
+    assert {result.candidate.statistic.name for result in reusable} == {"mean", "telegraph"}
+    recomputed = compute_evidence(
+        [result.candidate for result in reusable], named.blocks, named, folds
+    )
+    for reused, other in zip(reusable, recomputed, strict=True):
+        np.testing.assert_array_equal(reused.evidence_nats, other.evidence_nats)
+    assert not reusable_evidence(evidence, state, condition_on(state, [jump]))
     lost = replace(state, blocks=blocks.assign(mean=blocks["mean"].where(blocks["begin"] > 0.0)))
-    assert not reusable_evidence(found, state, lost)
+    assert not reusable_evidence(evidence, state, lost)
 
 
 def test_another_line_in_a_free_band_changes_the_evidence_of_lines_only() -> None:
@@ -141,24 +145,33 @@ def test_another_line_in_a_free_band_changes_the_evidence_of_lines_only() -> Non
     line = group_components(compute_evidence(candidates, blocks, state, folds))["spectral_line"][0]
     first = condition_on(state, [line])
     second = condition_on(first, [replace(line, place=line.place + 1)])
-    found = compute_evidence(candidates, blocks, first, folds)
-    kept = reusable_evidence(found, first, second)
-    assert {one.candidate.statistic.name for one in found} - {
-        one.candidate.statistic.name for one in kept
+    evidence = compute_evidence(candidates, blocks, first, folds)
+    reusable = reusable_evidence(evidence, first, second)
+    assert {result.candidate.statistic.name for result in evidence} - {
+        result.candidate.statistic.name for result in reusable
     } == {"spectral_line"}
-    again = compute_evidence([one.candidate for one in kept], second.blocks, second, folds)
-    for one, other in zip(kept, again, strict=True):
-        np.testing.assert_array_equal(one.evidence_nats, other.evidence_nats)
+    recomputed = compute_evidence(
+        [result.candidate for result in reusable], second.blocks, second, folds
+    )
+    for reused, other in zip(reusable, recomputed, strict=True):
+        np.testing.assert_array_equal(reused.evidence_nats, other.evidence_nats)
 
 
 def test_more_lines_than_are_named_do_not_end_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(selection, "MAX_LINES", 1)
     blocks = sines({0.7: 0.3, 2.03: 0.25}, size=12_000, jump=0.25)
     baseline, records = nulls(blocks, 40)
-    found = name_effects(blocks, baseline, records).identified
-    assert sorted(one.effect for one in found) == ["bias_jump", "spectral_line"]
-    line = next(one for one in found if one.effect == "spectral_line")
-    jump = next(one for one in found if one.effect == "bias_jump")
+    identified = name_effects(blocks, baseline, records).identified
+    assert sorted(identification.effect for identification in identified) == [
+        "bias_jump",
+        "spectral_line",
+    ]
+    line = next(
+        identification for identification in identified if identification.effect == "spectral_line"
+    )
+    jump = next(
+        identification for identification in identified if identification.effect == "bias_jump"
+    )
     assert line.evidence_nats > jump.evidence_nats
 
 
@@ -177,12 +190,14 @@ def component(effect: str, statistic: str, evidence_nats: float, place: int = -1
     )
 
 
-def identification(one: Component) -> Identification:
-    return Identification(one.candidate.effect, (), one.row, (one,), one.evidence_nats, 7.0)
+def identification(component: Component) -> Identification:
+    return Identification(
+        component.candidate.effect, (), component.row, (component,), component.evidence_nats, 7.0
+    )
 
 
 def test_a_line_counts_only_for_the_simplest_effect() -> None:
-    found = {
+    groups = {
         "spectral_line": [component("spectral_line", "spectral_line", 50.0)],
         "supply_bias(supply)": [
             component("supply_bias", "spectral_line", 50.0),
@@ -190,10 +205,10 @@ def test_a_line_counts_only_for_the_simplest_effect() -> None:
         ],
         "real_motion": [component("real_motion", "spectral_line", 50.0)],
     }
-    kept = merge_lines(found)
-    assert kept["spectral_line"] == found["spectral_line"]
-    assert [one.statistic.name for one in kept["supply_bias(supply)"]] == ["mean"]
-    assert "real_motion" not in kept
+    merged = merge_lines(groups)
+    assert merged["spectral_line"] == groups["spectral_line"]
+    assert [component.statistic.name for component in merged["supply_bias(supply)"]] == ["mean"]
+    assert "real_motion" not in merged
 
 
 def test_identifications_of_one_effect_merge_except_lines_of_other_frequencies() -> None:
@@ -206,11 +221,11 @@ def test_identifications_of_one_effect_merge_except_lines_of_other_frequencies()
         )
         == 2
     )
-    (both,) = add_identification(
+    (merged,) = add_identification(
         [first],
         replace(identification(component("spectral_line", "spectral_line", 20.0, 3)), axes=("y",)),
     )
-    assert (both.axes, both.evidence_nats) == (("x", "y"), 70.0)
+    assert (merged.axes, merged.evidence_nats) == (("x", "y"), 70.0)
     assert (
         len(
             add_identification(
@@ -257,17 +272,17 @@ def test_a_filter_is_undone_at_its_estimated_size(weight: float) -> None:
     )
     lines = record["line_frequency"].values
     mean_of_two = {"cutoff": 0.0, "order": 2.0, "length": 0.2, "pick": 0.0, "instrument": 1.0}
-    found, stopped = undo_filter(record, "x", "logger_filter", mean_of_two, np.ones(lines.size))
-    power = found["line_power"].mean("part").values[0] * 10.0
-    near = np.abs(lines - 4.0) < 0.2
-    kept = ~near & ~stopped
-    slope, level = np.polyfit(lines[kept], power[kept], 1)
+    undone, stopped = undo_filter(record, "x", "logger_filter", mean_of_two, np.ones(lines.size))
+    power = undone["line_power"].mean("part").values[0] * 10.0
+    is_near_line = np.abs(lines - 4.0) < 0.2
+    is_fitted = ~is_near_line & ~stopped
+    slope, level = np.polyfit(lines[is_fitted], power[is_fitted], 1)
     assert level == pytest.approx(1.0, abs=0.05)
     assert slope * 5.0 == pytest.approx(0.0, abs=0.13)
     assert stopped.any() == (weight == 0.5)
-    gains = line_evidence(found["line_power"].values[None], found["line_weight"].values)[0, 0]
+    gains = line_evidence(undone["line_power"].values[None], undone["line_weight"].values)[0, 0]
     assert lines[gains.argmax()] == pytest.approx(4.0, abs=0.1)
     assert gains.max() > 20.0
-    assert np.where(near | stopped, -np.inf, gains).max() < 5.0
-    again, _ = undo_filter(found, "x", "logger_filter", mean_of_two, np.ones(lines.size))
-    xr.testing.assert_identical(again, found)
+    assert np.where(is_near_line | stopped, -np.inf, gains).max() < 5.0
+    second_pass, _ = undo_filter(undone, "x", "logger_filter", mean_of_two, np.ones(lines.size))
+    xr.testing.assert_identical(second_pass, undone)

@@ -44,14 +44,14 @@ def frame(mean: np.ndarray) -> tuple[xr.Dataset, xr.Dataset]:
         {"axis": ["x"]},
         {"block_s": STEP},
     )
-    K, B = (one.ravel() for one in np.meshgrid(WALKS, FLICKERS, indexing="ij"))
+    K, B = (values.ravel() for values in np.meshgrid(WALKS, FLICKERS, indexing="ij"))
     baseline = xr.Dataset(
         {
             "known_mean": (("axis", "block"), np.zeros((1, mean.shape[1]))),
             "mean_variance": (("axis", "block"), np.full((1, mean.shape[1]), WHITE)),
             **{
-                f"grid_{name}": (("axis", "grid"), one[None])
-                for name, one in (("K", K), ("B", B), ("prior", 0.0 * K))
+                f"grid_{name}": (("axis", "grid"), values[None])
+                for name, values in (("K", K), ("B", B), ("prior", 0.0 * K))
             },
         },
         {"axis": ["x"]},
@@ -78,13 +78,13 @@ def white(rng: np.random.Generator, records: int) -> np.ndarray:
 def test_finds_switches_and_their_parameters() -> None:
     rng = np.random.default_rng(1)
     course = np.stack([telegraph_share(rng, 120.0, 240.0) for _ in range(20)])
-    evidence_nats, found = telegraph_evidence(*frame(0.6 * course + white(rng, 20)), axis="x")
+    evidence_nats, telegraph = telegraph_evidence(*frame(0.6 * course + white(rng, 20)), axis="x")
     assert np.median(evidence_nats) > 20.0
     assert (evidence_nats > 5.0).mean() >= 0.9
-    assert np.median(found.step) == pytest.approx(0.6, rel=0.05)
-    np.testing.assert_allclose(np.median(found.times, axis=0) * STEP, [120.0, 240.0], rtol=0.3)
+    assert np.median(telegraph.step) == pytest.approx(0.6, rel=0.05)
+    np.testing.assert_allclose(np.median(telegraph.times, axis=0) * STEP, [120.0, 240.0], rtol=0.3)
     assert (
-        np.sqrt(np.mean((found.share[evidence_nats > 5.0] - course[evidence_nats > 5.0]) ** 2))
+        np.sqrt(np.mean((telegraph.share[evidence_nats > 5.0] - course[evidence_nats > 5.0]) ** 2))
         < 0.12
     )
 
@@ -93,11 +93,11 @@ def test_finds_switches_in_a_random_walk() -> None:
     rng = np.random.default_rng(2)
     walk = np.cumsum(0.07 * rng.standard_normal((20, BLOCKS)), axis=1)
     course = np.stack([telegraph_share(rng, 150.0, 150.0) for _ in range(20)])
-    evidence_nats, found = telegraph_evidence(
+    evidence_nats, telegraph = telegraph_evidence(
         *frame(1.5 * course + walk + white(rng, 20)), axis="x"
     )
     assert np.median(evidence_nats) > 10.0
-    assert np.median(found.step[evidence_nats > 10.0]) == pytest.approx(1.5, rel=0.1)
+    assert np.median(telegraph.step[evidence_nats > 10.0]) == pytest.approx(1.5, rel=0.1)
 
 
 def test_evidence_is_a_lower_bound_of_a_bayes_factor() -> None:
@@ -127,11 +127,11 @@ def test_a_gauss_markov_bias_is_not_two_levels(time: float, size: float) -> None
 
 def test_one_jump_and_its_return_are_not_two_levels() -> None:
     mean = np.zeros((1, BLOCKS)) + np.repeat([0.0, 2.0, 0.0], [30, 40, 30])
-    evidence_nats, found = telegraph_evidence(
+    evidence_nats, telegraph = telegraph_evidence(
         *frame(mean + white(np.random.default_rng(5), 1)), axis="x"
     )
-    assert found.switch_count[0] == pytest.approx(2.0, abs=0.2)
-    assert found.switch_count[0] < DEFAULTS.min_switches
+    assert telegraph.switch_count[0] == pytest.approx(2.0, abs=0.2)
+    assert telegraph.switch_count[0] < DEFAULTS.min_switches
     assert evidence_nats[0] == -np.inf
 
 
@@ -141,11 +141,13 @@ def test_given_columns_are_not_found_again_and_blocks_may_be_missing() -> None:
     ramp = np.linspace(0.0, 20.0, BLOCKS)
     data, baseline = frame((0.8 * course + ramp)[None] + white(rng, 1))
     data["mean"][:, :, 20:35] = np.nan
-    with_ramp, found = telegraph_evidence(data, baseline, axis="x", given=ramp[:, None])
+    with_ramp, telegraph = telegraph_evidence(data, baseline, axis="x", given=ramp[:, None])
     assert with_ramp[0] > 10.0
-    assert found.step[0] == pytest.approx(0.8, abs=0.1)
-    again, _ = telegraph_evidence(data, baseline, axis="x", given=np.stack([ramp, course], axis=1))
-    assert again[0] < 1.0
+    assert telegraph.step[0] == pytest.approx(0.8, abs=0.1)
+    with_course, _ = telegraph_evidence(
+        data, baseline, axis="x", given=np.stack([ramp, course], axis=1)
+    )
+    assert with_course[0] < 1.0
 
 
 def test_the_sign_of_the_bias_does_not_matter() -> None:
@@ -156,12 +158,12 @@ def test_the_sign_of_the_bias_does_not_matter() -> None:
         np.ones(BLOCKS, bool),
         np.ones((BLOCKS, 1)),
     )
-    one, other = (
+    rising, falling = (
         telegraph_courses(sign * values, variance, all_there, constant) for sign in (1.0, -1.0)
     )
-    np.testing.assert_allclose(one.share, 1.0 - other.share, atol=0.02)
-    np.testing.assert_allclose(one.times, other.times[:, ::-1], rtol=0.02)
-    np.testing.assert_allclose(one.step, other.step, rtol=0.01)
+    np.testing.assert_allclose(rising.share, 1.0 - falling.share, atol=0.02)
+    np.testing.assert_allclose(rising.times, falling.times[:, ::-1], rtol=0.02)
+    np.testing.assert_allclose(rising.step, falling.step, rtol=0.01)
 
 
 def component(
@@ -268,12 +270,12 @@ REAL, HOP = 41, -1  # blocks: a jump of another size than the switches; and the 
 
 
 @pytest.mark.parametrize(
-    ("size", "places", "kept"),
+    ("size", "places", "remaining"),
     [(0.0, (0, HOP), ()), (3.0, (REAL,), (REAL,)), (3.0, (REAL, HOP), (REAL,))],
     ids=["none", "one", "one of two"],
 )
 def test_switches_are_not_also_jumps(
-    size: float, places: tuple[int, ...], kept: tuple[int, ...]
+    size: float, places: tuple[int, ...], remaining: tuple[int, ...]
 ) -> None:
     """First and last switch were named as jumps; a jump four times as large is a jump."""
     rng = np.random.default_rng(12)
@@ -284,7 +286,7 @@ def test_switches_are_not_also_jumps(
 
     def gains(_: object, state: State) -> list[CandidateEvidence]:
         columns = state.given.get(("mean", "x"), [])
-        evidence_nats, found = telegraph_evidence(
+        evidence_nats, telegraph = telegraph_evidence(
             state.blocks,
             state.baseline,
             axis="x",
@@ -295,34 +297,41 @@ def test_switches_are_not_also_jumps(
                 candidate,
                 [("x",)],
                 evidence_nats[:, None],
-                (Variant({}, ("step",), found.share[0][None, None]),),
+                (Variant({}, ("step",), telegraph.share[0][None, None]),),
             )
         ]
 
-    def state_with(some: Sequence[Identification]) -> State:
+    def state_with(identifications: Sequence[Identification]) -> State:
         return condition_on_components(
-            start, [one for identification in some for one in identification.components]
+            start,
+            [
+                component
+                for identification in identifications
+                for component in identification.components
+            ],
         )
 
     jumps = [jump(place if place == REAL else int(moves[place]), 20.0) for place in places]
     first = Identification("bias_jump", (), ("x",), tuple(jumps), 20.0 * len(jumps), 8.0)
-    (beside,) = gains((), state_with([first]))
-    evidence_nats = float(beside.evidence_nats[0, 0])
+    (evidence,) = gains((), state_with([first]))
+    evidence_nats = float(evidence.evidence_nats[0, 0])
     hopping = Identification(
         "telegraph",
         (),
         ("x",),
-        (Component(candidate, beside.best[0], ("x",), evidence_nats),),
+        (Component(candidate, evidence.best[0], ("x",), evidence_nats),),
         evidence_nats,
         8.0,
     )
     left = drop_explained_jumps([first, hopping], state_with, gains, 8.0)
-    assert [one.effect for one in left] == ["bias_jump"] * bool(kept) + ["telegraph"]
+    assert [identification.effect for identification in left] == ["bias_jump"] * bool(remaining) + [
+        "telegraph"
+    ]
     assert [
-        one.variant.values["at"]
-        for one in left[0].components
-        if one.candidate.effect == "bias_jump"
-    ] == [place * STEP for place in kept]
+        component.variant.values["at"]
+        for component in left[0].components
+        if component.candidate.effect == "bias_jump"
+    ] == [place * STEP for place in remaining]
     assert np.abs(np.corrcoef(left[-1].components[0].variant.design[0, 0], course)[0, 1]) > 0.98
 
 
@@ -361,7 +370,7 @@ def test_search_names_a_switching_channel_before_a_telegraph(one_thread) -> None
 
 
 @pytest.fixture(scope="module")
-def found():
+def diagnosis():
     model = {
         "log": {"axes": ["x", "y"]},
         "noise": {"N": 0.003, "B": 0.002, "K": 0.01},
@@ -371,26 +380,28 @@ def found():
 
 
 @pytest.mark.slow
-def test_diagnosis_names_the_telegraph_with_its_parameters(found) -> None:
-    assert [(one["name"], one["axes"]) for one in found.effects] == [("telegraph", ["y"])]
-    numbers = found.effects[0]["parameters"]
+def test_diagnosis_names_the_telegraph_with_its_parameters(diagnosis) -> None:
+    assert [(effect["name"], effect["axes"]) for effect in diagnosis.effects] == [
+        ("telegraph", ["y"])
+    ]
+    numbers = diagnosis.effects[0]["parameters"]
     assert abs(numbers["step"]["value"] - 0.4) < 3.0 * numbers["step"]["stderr"]
     for name, true in (("low", 120.0), ("high", 90.0)):
         assert abs(numbers[name]["value"] - true) < 3.0 * numbers[name]["stderr"]
-    assert found.effects[0]["alternatives"] == []
-    assert found.content["held_out"]["log_likelihood_gain"] > 10.0
+    assert diagnosis.effects[0]["alternatives"] == []
+    assert diagnosis.content["held_out"]["log_likelihood_gain"] > 10.0
 
 
 @pytest.mark.slow
-def test_switching_is_in_the_model_but_not_in_its_noise(found) -> None:
-    effect = next(one for one in found.model["effect"] if one["name"] == "telegraph")
+def test_switching_is_in_the_model_but_not_in_its_noise(diagnosis) -> None:
+    effect = next(effect for effect in diagnosis.model["effect"] if effect["name"] == "telegraph")
     assert float(np.atleast_1d(effect["step"])[0]) == pytest.approx(0.4, rel=0.15)
-    assert found.model["noise"]["y"]["K"] < 0.3  # above 1 if the switches count as noise
-    again = (
-        simulate(found.model, duration="30min", rate=5.0, seed=12)["rate"]
+    assert diagnosis.model["noise"]["y"]["K"] < 0.3  # above 1 if the switches count as noise
+    simulated = (
+        simulate(diagnosis.model, duration="30min", rate=5.0, seed=12)["rate"]
         .coarsen(time=100)
         .mean()
         .std("time")
     )
-    assert 0.1 < float(again.sel(axis="y")) < 0.3
-    assert float(again.sel(axis="x")) < 0.08
+    assert 0.1 < float(simulated.sel(axis="y")) < 0.3
+    assert float(simulated.sel(axis="x")) < 0.08

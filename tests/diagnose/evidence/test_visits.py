@@ -50,9 +50,9 @@ def test_evidence_of_unequal_visits_is_a_bayes_factor() -> None:
     """Over records of equal visits, the mean Bayes factor of unequal ones is one at most."""
     rng = np.random.default_rng(2)
     course, share = bursts(EQUAL)
-    found = [nats(course + noise, share) for noise in white(rng, 200)]
-    assert np.exp(found).mean() < 1.2
-    assert max(found) < 5.0
+    gains = [nats(course + noise, share) for noise in white(rng, 200)]
+    assert np.exp(gains).mean() < 1.2
+    assert max(gains) < 5.0
 
 
 def test_parts_of_blocks_belong_to_the_nearest_visit() -> None:
@@ -66,9 +66,9 @@ def test_parts_of_blocks_belong_to_the_nearest_visit() -> None:
 def test_switches_within_blocks_are_counted_by_parts() -> None:
     share = np.tile([0.0, 0.0, 1.0, 1.0], (BLOCKS, 1))
     _, baseline = frame(np.zeros((1, BLOCKS)))
-    found = compare_visits(np.zeros(BLOCKS), baseline, share, axis="x", block_s=STEP)
-    assert found.switch_count == 2 * BLOCKS - 1
-    assert np.isneginf(found.unequal_nats)
+    comparison = compare_visits(np.zeros(BLOCKS), baseline, share, axis="x", block_s=STEP)
+    assert comparison.switch_count == 2 * BLOCKS - 1
+    assert np.isneginf(comparison.unequal_nats)
 
 
 @pytest.mark.parametrize(
@@ -100,5 +100,5 @@ def test_the_course_of_a_telegraph_has_equal_visits() -> None:
     rng = np.random.default_rng(5)
     course = np.stack([telegraph_share(rng, 120.0, 160.0) for _ in range(20)])
     mean = 0.8 * course + white(rng, 20)
-    _, found = telegraph_evidence(*frame(mean), axis="x")
-    assert (np.array([nats(*pair) for pair in zip(mean, found.share, strict=True)]) < -3).all()
+    _, telegraph = telegraph_evidence(*frame(mean), axis="x")
+    assert (np.array([nats(*pair) for pair in zip(mean, telegraph.share, strict=True)]) < -3).all()

@@ -41,7 +41,7 @@ def fluctuation_left(blocks: xr.Dataset, *columns: np.ndarray) -> float:
     """Return the variance fluctuation with columns (block,) of added white power in the model."""
     state: State = initial_state(blocks, calibrate_noise(blocks))
     spread = [
-        np.broadcast_to(one[:, None], state.weight.shape[1:]).astype(float) for one in columns
+        np.broadcast_to(column[:, None], state.weight.shape[1:]).astype(float) for column in columns
     ]
     return variance_fluctuation(
         refit_weights(state.with_columns("power", "x", spread)) if columns else state, "x"
@@ -50,9 +50,11 @@ def fluctuation_left(blocks: xr.Dataset, *columns: np.ndarray) -> float:
 
 @pytest.mark.parametrize("gaps", [False, True])
 def test_steady_noise_does_not_fluctuate(gaps: bool) -> None:
-    found = [fluctuation_left(record(np.ones(BLOCKS), seed=seed, gaps=gaps)) for seed in range(12)]
-    assert max(found) < 2.0
-    assert np.median(found) < 0.0
+    fluctuations = [
+        fluctuation_left(record(np.ones(BLOCKS), seed=seed, gaps=gaps)) for seed in range(12)
+    ]
+    assert max(fluctuations) < 2.0
+    assert np.median(fluctuations) < 0.0
 
 
 def test_bursts_fluctuate_until_they_are_in_the_model() -> None:
@@ -65,9 +67,9 @@ def test_bursts_fluctuate_until_they_are_in_the_model() -> None:
 
 
 def test_single_noisy_block_is_not_a_fluctuation() -> None:
-    one = np.ones(BLOCKS)
-    one[40] = 30.0
-    assert fluctuation_left(record(one)) < 8.0
+    level = np.ones(BLOCKS)
+    level[40] = 30.0
+    assert fluctuation_left(record(level)) < 8.0
 
 
 def test_masked_blocks_do_not_count() -> None:
@@ -88,13 +90,13 @@ def test_smooth_effect_that_stands_for_bursts_is_withdrawn() -> None:
     )  # later is noisier on average, and not at all steadily
     blocks = record(level)
     baseline, records = nulls(blocks, 40)
-    found = name_effects(blocks, baseline, records)
+    identifications = name_effects(blocks, baseline, records)
     assert not [
         identification
-        for identification in found.identified
+        for identification in identifications.identified
         if identification.effect == "ageing_noise"
     ]
-    assert found.verdict == "unknown"
+    assert identifications.verdict == "unknown"
     steady = record(np.linspace(0.9, 1.15, BLOCKS))
     baseline, records = nulls(steady, 40)
     assert [
@@ -117,9 +119,11 @@ def test_noisy_axes_are_not_correlated() -> None:
     state = initial_state(blocks, calibrate_noise(blocks))
     search = Search(nuisance_alternatives(blocks), fold_blocks(blocks), CountEvidence({}), 7.0)
 
-    def common(found: list[CandidateEvidence]) -> float:
+    def common(evidence: list[CandidateEvidence]) -> float:
         return max(
-            float(one.evidence_nats.max()) for one in found if one.candidate.effect == "~cov"
+            float(result.evidence_nats.max())
+            for result in evidence
+            if result.candidate.effect == "~cov"
         )
 
     assert common(compute_evidence(search.candidates, blocks, state, search.folds)) > 100.0
@@ -132,7 +136,7 @@ def test_jump_and_ageing_are_withdrawn_in_a_stronger_drift():
     noise = 0.5 * np.random.default_rng(1).standard_normal((1, 4500))
     noise += np.interp(np.arange(4500) / 10.0, np.linspace(0.0, 320.0, 13), turned)
     blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["y"]))
-    found = name_effects(blocks, *nulls(blocks, 40))
-    assert not found.identified
-    assert {one.generic for one in found.unknown} == {"~bias(t)"}
-    assert {one.axes for one in found.unknown} == {("y",)}
+    identifications = name_effects(blocks, *nulls(blocks, 40))
+    assert not identifications.identified
+    assert {unidentified.generic for unidentified in identifications.unknown} == {"~bias(t)"}
+    assert {unidentified.axes for unidentified in identifications.unknown} == {("y",)}

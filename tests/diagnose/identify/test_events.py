@@ -49,20 +49,22 @@ def state_of_rates(rate: np.ndarray) -> State:
     return initial_state(
         blocks,
         baseline_from_model(
-            blocks, {**MODEL, "log": {"axes": [str(one) for one in blocks["axis"].values]}}
+            blocks, {**MODEL, "log": {"axes": [str(axis) for axis in blocks["axis"].values]}}
         ),
     )
 
 
 def candidate(state: State, effect: str, statistic: str) -> Candidate:
     known, _ = effect_candidates(state.blocks, state.baseline["coefficient"])
-    return next(one for one in known if (one.effect, one.statistic.name) == (effect, statistic))
+    return next(
+        tried for tried in known if (tried.effect, tried.statistic.name) == (effect, statistic)
+    )
 
 
-def components_of(state: State, one: Candidate) -> list[Component]:
+def components_of(state: State, tried: Candidate) -> list[Component]:
     return group_components(
-        compute_evidence([one], state.blocks, state, fold_blocks(state.blocks))
-    )[one.key]
+        compute_evidence([tried], state.blocks, state, fold_blocks(state.blocks))
+    )[tried.key]
 
 
 @pytest.mark.slow
@@ -71,9 +73,9 @@ def test_temporary_noise_is_not_ageing(inside: slice) -> None:
     factor = np.ones(BLOCKS)
     factor[inside] = 3.0
     blocks = reduce_rates(noise_with_levels(factor))
-    found = name_effects(blocks, *nulls(blocks, 40))
-    assert not found.identified
-    first = found.unknown[0]
+    identifications = name_effects(blocks, *nulls(blocks, 40))
+    assert not identifications.identified
+    first = identifications.unknown[0]
     assert first.generic == "~burst"
     begin, end = (first.components[0].variant.values[name] / 20.0 for name in ("begin", "end"))
     assert abs(begin - range(BLOCKS)[inside][0]) <= 1
@@ -87,14 +89,14 @@ def test_temporary_noise_is_not_ageing(inside: slice) -> None:
 )
 def test_ageing_noise_only_grows(first: float, last: float, named: list[str]) -> None:
     blocks = reduce_rates(noise_with_levels(np.sqrt(np.linspace(first**2, last**2, BLOCKS))))
-    found = name_effects(blocks, *nulls(blocks, 40))
-    assert [identification.effect for identification in found.identified] == named
-    assert found.verdict == ("explained" if named else "unknown")
+    identifications = name_effects(blocks, *nulls(blocks, 40))
+    assert [identification.effect for identification in identifications.identified] == named
+    assert identifications.verdict == ("explained" if named else "unknown")
 
 
 def test_stretches_of_all_lengths_reach_both_ends() -> None:
     for block_count in (5, 92, 540, 4320):
-        tried = {tuple(one) for one in burst_intervals(block_count).tolist()}
+        tried = {tuple(interval) for interval in burst_intervals(block_count).tolist()}
         assert len(tried) <= 240
         assert {
             (0, 1),
@@ -121,9 +123,9 @@ def test_waves_slower_than_a_block_are_not_jumps(size: float, jump: bool) -> Non
         + waves
         + size * (SECOND >= 1000.0)
     )
-    found = components_of(state, candidate(state, "bias_jump", "mean"))
-    assert sum_evidence(found) > 20.0
-    assert bool(is_physical(found, state)) == jump
+    components = components_of(state, candidate(state, "bias_jump", "mean"))
+    assert sum_evidence(components) > 20.0
+    assert bool(is_physical(components, state)) == jump
 
 
 @pytest.mark.parametrize(("back", "jump"), [(2.0, False), (1.2, True)])
@@ -132,9 +134,9 @@ def test_return_to_the_old_level_is_not_a_jump(back: float, jump: bool) -> None:
     state = state_of_rates(
         WHITE * np.random.default_rng(4).standard_normal((1, SECOND.size)) + course
     )
-    found = components_of(state, candidate(state, "bias_jump", "mean"))
-    assert sum_evidence(found) > 8.0
-    assert bool(is_physical(found, state)) == jump
+    components = components_of(state, candidate(state, "bias_jump", "mean"))
+    assert sum_evidence(components) > 8.0
+    assert bool(is_physical(components, state)) == jump
 
 
 @pytest.mark.parametrize(("back", "jump"), [(1.0, False), (0.0, True)])
@@ -145,9 +147,9 @@ def test_long_weak_event_is_not_a_jump(back: float, jump: bool) -> None:
     state = state_of_rates(
         WHITE * np.random.default_rng(5).standard_normal((1, second.size)) + course
     )
-    found = components_of(state, candidate(state, "bias_jump", "mean"))
-    assert sum_evidence(found) > 8.0
-    assert bool(is_physical(found, state)) == jump
+    components = components_of(state, candidate(state, "bias_jump", "mean"))
+    assert sum_evidence(components) > 8.0
+    assert bool(is_physical(components, state)) == jump
 
 
 @pytest.mark.parametrize("moves", [False, True])
@@ -162,13 +164,13 @@ def test_only_motion_is_a_misalignment(moves: bool) -> None:
     rate += 30.0 * WHITE * np.array([[0.015], [1.0]]) * sway * moves
     state = state_of_rates(rate)
     leaks = [
-        one
-        for one in effect_candidates(state.blocks, state.baseline["coefficient"])[0]
-        if one.key == "misalignment(y)"
+        leak
+        for leak in effect_candidates(state.blocks, state.baseline["coefficient"])[0]
+        if leak.key == "misalignment(y)"
     ]
-    (found,) = compute_evidence(leaks, state.blocks, state, fold_blocks(state.blocks))
-    assert (float(found.evidence_nats[0, 0]) > 20.0) == moves
-    assert moves or float(found.evidence_nats.max()) < 3.0
+    (evidence,) = compute_evidence(leaks, state.blocks, state, fold_blocks(state.blocks))
+    assert (float(evidence.evidence_nats[0, 0]) > 20.0) == moves
+    assert moves or float(evidence.evidence_nats.max()) < 3.0
 
 
 @pytest.mark.parametrize("sway", [0.0, 3.0])
@@ -178,12 +180,12 @@ def test_axis_at_rest_cannot_leak(sway: float) -> None:
     rate = WHITE * rng.standard_normal((2, SECOND.size))
     rate[1] += sway * WHITE * np.sin(2.0 * np.pi * 1.7 * SECOND)
     state = state_of_rates(rate)
-    one = next(
-        each
-        for each in effect_candidates(state.blocks, state.baseline["coefficient"])[0]
-        if each.key == "misalignment(y)"
+    leak = next(
+        known
+        for known in effect_candidates(state.blocks, state.baseline["coefficient"])[0]
+        if known.key == "misalignment(y)"
     )
-    component = Component(one, one.variants[0], ("x",), 20.0)
+    component = Component(leak, leak.variants[0], ("x",), 20.0)
     assert is_physical([component], state) == ([component] if sway else [])
 
 
@@ -194,10 +196,10 @@ def test_leak_must_exceed_time_shifted_surrogates(leak: float) -> None:
     state = state_of_rates(
         WHITE * rng.standard_normal((2, SECOND.size)) + np.array([[leak], [1.0]]) * turning
     )
-    one = candidate(state, "misalignment", "mean")
-    variant = next(each for each in one.variants if each.columns == ("y",))
+    misalignment = candidate(state, "misalignment", "mean")
+    variant = next(choice for choice in misalignment.variants if choice.columns == ("y",))
     beats, p_value, _ = passes_time_shift_test(
-        [Component(one, variant, ("x",), 20.0)], state, fold_blocks(state.blocks)
+        [Component(misalignment, variant, ("x",), 20.0)], state, fold_blocks(state.blocks)
     )
     assert np.isfinite(p_value)
     assert beats == bool(leak)
@@ -217,8 +219,8 @@ def test_channel_that_fails_the_time_shift_test_is_not_named(late: float, named:
     blocks = reduce_log(
         make_log(rate, rate=RATE, unit="deg/h", channels={"vibration": (shaking, "g")}), block="20s"
     )
-    found = name_effects(blocks, *nulls(blocks, 40))
-    assert [identification.effect for identification in found.identified] == named
+    identifications = name_effects(blocks, *nulls(blocks, 40))
+    assert [identification.effect for identification in identifications.identified] == named
 
 
 def make_swell(size: float) -> State:
@@ -251,8 +253,8 @@ def state_of_rotation(rate: np.ndarray, turns: np.ndarray) -> State:
 @pytest.mark.parametrize("size", [0.0, 6.0])
 def test_waves_not_locked_to_the_rotation_are_not_rotation_lines(size: float) -> None:
     state = make_swell(size)
-    found = components_of(state, candidate(state, "rotation_line", "rotation_order"))
-    assert (sum_evidence(found) > 15.0) == (size > 0.0)
+    components = components_of(state, candidate(state, "rotation_line", "rotation_order"))
+    assert (sum_evidence(components) > 15.0) == (size > 0.0)
 
 
 def test_rotation_lines_do_not_change_the_noise_around_them() -> None:
@@ -279,7 +281,8 @@ def test_scores_at_orders_scatter_like_null_records() -> None:
         state.blocks, state.baseline, count=40, rng=np.random.default_rng(1), chunk=40
     )
     real, noise = (
-        find_statistic("ramp_phase").score(one, state.baseline) for one in (state.blocks, drawn)
+        find_statistic("ramp_phase").score(blocks, state.baseline)
+        for blocks in (state.blocks, drawn)
     )
     assert real is not None
     assert noise is not None

@@ -42,11 +42,11 @@ def shaken():
 
 @pytest.mark.slow
 def test_noise_has_no_identification():
-    found = identify([], seed=2)
-    assert found.verdict == "no mismatch"
-    assert found.identified == found.unknown == ()
-    assert 3.0 < found.threshold < 15.0
-    assert found.null_best.size == 40
+    identifications = identify([], seed=2)
+    assert identifications.verdict == "no mismatch"
+    assert identifications.identified == identifications.unknown == ()
+    assert 3.0 < identifications.threshold < 15.0
+    assert identifications.null_best.size == 40
 
 
 def test_vibration_noise_is_identified_on_its_axis(shaken):
@@ -61,7 +61,7 @@ def test_vibration_noise_is_identified_on_its_axis(shaken):
 
 
 def test_every_other_effect_is_rejected_for_a_competitor(shaken):
-    rejected = {one.effect: one for one in shaken.rejected}
+    rejected = {rejection.effect: rejection for rejection in shaken.rejected}
     assert "vibration_noise" not in rejected
     noise = rejected["temperature_bias"]
     assert noise.beaten_by == "noise"
@@ -75,7 +75,9 @@ def test_chance_on_another_axis_does_not_veto_an_effect(shaken, monkeypatch):
     """Only the component of negative size, on an axis without the effect, is dropped."""
     state, (identification,) = shaken.state, shaken.identified
     (component,) = (
-        one for one in identification.components if one.candidate.statistic.name == "power"
+        component
+        for component in identification.components
+        if component.candidate.statistic.name == "power"
     )
     elsewhere = [replace(component, row=(axis,)) for axis in "yz"]
     sizes = {"x": 1.0, "y": -0.1, "z": 0.1}
@@ -90,11 +92,11 @@ def test_chance_on_another_axis_does_not_veto_an_effect(shaken, monkeypatch):
 def test_sizes_outside_the_registry_are_rejected(shaken):
     """15 deg/h for some 40 degC is that of a broken instrument, or not an effect of temperature."""
     bias = next(
-        one
-        for one in shaken.candidates
-        if one.effect == "temperature_bias" and one.statistic.name == "mean"
+        candidate
+        for candidate in shaken.candidates
+        if candidate.effect == "temperature_bias" and candidate.statistic.name == "mean"
     )
-    variant = next(one for one in bias.variants if one.columns == ("sensitivity",))
+    variant = next(variant for variant in bias.variants if variant.columns == ("sensitivity",))
     component = Component(bias, variant, ("y",), 50.0)
     for size, answer in ((5.0, [component]), (15.0, [])):
         state = shaken.state
@@ -135,29 +137,36 @@ def test_sizes_outside_the_registry_are_rejected(shaken):
     ids=lambda value: value["name"] if isinstance(value, dict) else None,
 )
 def test_single_effects_are_identified(table, environment, others):
-    found = identify([table], environment=WORLD[environment])
-    assert [identification.effect for identification in found.identified] == [table["name"]]
-    (identification,) = found.identified
+    identifications = identify([table], environment=WORLD[environment])
+    assert [identification.effect for identification in identifications.identified] == [
+        table["name"]
+    ]
+    (identification,) = identifications.identified
     assert identification.axes == tuple(table["axes"])
     assert set(identification.alternatives) <= others
 
 
 @pytest.mark.slow
 def test_effect_without_its_channel_is_not_identified():
-    found = identify(VIBRATION, drop=("vibration",))
-    assert not found.identified
-    assert found.verdict == "unknown"
-    assert {one.generic for one in found.unknown} <= {"~N(t)", "~S(f)", "~burst"}
-    assert all(one.axes == ("x",) for one in found.unknown)
+    identifications = identify(VIBRATION, drop=("vibration",))
+    assert not identifications.identified
+    assert identifications.verdict == "unknown"
+    assert {unidentified.generic for unidentified in identifications.unknown} <= {
+        "~N(t)",
+        "~S(f)",
+        "~burst",
+    }
+    assert all(unidentified.axes == ("x",) for unidentified in identifications.unknown)
 
 
 @pytest.mark.slow
 def test_two_effects_are_both_identified():
-    found = identify(
+    identifications = identify(
         [*VIBRATION, {"name": "vibration_rectification", "sensitivity": 0.006, "axes": ["y"]}]
     )
     assert {
-        (identification.effect, identification.axes) for identification in found.identified
+        (identification.effect, identification.axes)
+        for identification in identifications.identified
     } == {
         ("vibration_noise", ("x",)),
         ("vibration_rectification", ("y",)),
@@ -180,8 +189,8 @@ def test_identified_effect_is_in_the_model_of_the_next(shaken):
     vibration = shaken.state.blocks["channel_vibration"].values
     assert loud[vibration > 4].mean() > 1.2
     assert loud[vibration < 1].mean() == pytest.approx(1.0, abs=0.05)
-    again = condition_on(shaken.state, list(identification.components))
-    np.testing.assert_allclose(again.weight, shaken.state.weight, rtol=1e-3)
+    conditioned = condition_on(shaken.state, list(identification.components))
+    np.testing.assert_allclose(conditioned.weight, shaken.state.weight, rtol=1e-3)
 
 
 def test_identifications_are_frozen_data(shaken):
@@ -224,15 +233,19 @@ def test_lost_blocks_are_expected_to_have_no_counts():
     """With half of the blocks lost, the usual count in the others is not raised, and three times as
     many are."""
     rng = np.random.default_rng(5)
-    there = np.arange(120) < 60
-    usual = rng.poisson(1.0 * there, (400, 1, 120))
+    is_present = np.arange(120) < 60
+    usual = rng.poisson(1.0 * is_present, (400, 1, 120))
     mean, spread = expected_counts(usual)
     np.testing.assert_allclose(
-        [mean[0, there].mean(), mean[0, ~there].mean()], [1.0, 0.0], atol=0.02
+        [mean[0, is_present].mean(), mean[0, ~is_present].mean()], [1.0, 0.0], atol=0.02
     )
     assert (mean > 0.0).all()
-    few = sample_count_evidence(rng.poisson(0.5 * there, (50, 1, 120)), mean, spread, subsets(120))
-    many = sample_count_evidence(rng.poisson(3.0 * there, (50, 1, 120)), mean, spread, subsets(120))
+    few = sample_count_evidence(
+        rng.poisson(0.5 * is_present, (50, 1, 120)), mean, spread, subsets(120)
+    )
+    many = sample_count_evidence(
+        rng.poisson(3.0 * is_present, (50, 1, 120)), mean, spread, subsets(120)
+    )
     assert few.max() < 3.0
     assert many.min() > 40.0
 
@@ -251,14 +264,15 @@ def test_every_line_of_a_comb_is_identified():
         line_power=(quiet["line_power"] * shape).transpose(*quiet["line_power"].dims)
     )
     baseline, chance = nulls(quiet, 40)
-    found = name_effects(blocks, baseline, chance)
+    identifications = name_effects(blocks, baseline, chance)
     assert {
-        (identification.effect, identification.axes) for identification in found.identified
+        (identification.effect, identification.axes)
+        for identification in identifications.identified
     } == {("spectral_line", ("x",))}
     assert (
         sorted(
             component.place
-            for identification in found.identified
+            for identification in identifications.identified
             for component in identification.components
         )
         == comb.tolist()
@@ -272,10 +286,10 @@ def test_line_has_evidence_only_at_its_frequency():
     power = rng.gamma(22.0, 1 / 22.0, (40, 1, 8, 500))
     null = line_evidence(power, weight).max(axis=-1)
     power[:, :, :, 123] *= 2.0
-    found = line_evidence(power, weight)
+    gains = line_evidence(power, weight)
     assert np.quantile(null, 0.95) < 4.0
-    assert (found.argmax(axis=-1) == 123).all()
-    assert found.max(axis=-1).min() > 10.0
+    assert (gains.argmax(axis=-1) == 123).all()
+    assert gains.max(axis=-1).min() > 10.0
 
 
 def test_folds_of_all_lengths_are_used():

@@ -68,8 +68,10 @@ def test_fit_of_the_paper_shows_growth_in_every_term() -> None:
 
 @pytest.mark.slow
 def test_growing_coefficients_are_traced_to_their_causes(small) -> None:
-    _, found = small
-    named = {name for effect in found.effects for name in (effect["name"], *effect["alternatives"])}
+    _, diagnosis = small
+    named = {
+        name for effect in diagnosis.effects for name in (effect["name"], *effect["alternatives"])
+    }
     assert {"aliased_vibration", "vibration_rectification"} <= named
     assert named <= {
         "aliased_vibration",
@@ -77,24 +79,24 @@ def test_growing_coefficients_are_traced_to_their_causes(small) -> None:
         "vibration_rectification",
         "g_sensitivity",
     }
-    for effect in found.effects:
+    for effect in diagnosis.effects:
         if effect["name"] == "aliased_vibration":
             for axis in effect["axes"]:
                 entry = effect["parameters"].get(
                     f"sensitivity.{axis}", effect["parameters"].get("sensitivity")
                 )
                 assert entry["low"] < 0.37 < entry["high"]
-    held = found.content["held_out"]
+    held = diagnosis.content["held_out"]
     assert held["misfit_before"] > 10.0
     assert held["misfit_after"] == pytest.approx(1.0, abs=0.25)
 
 
 @pytest.mark.slow
 def test_every_effect_explains_a_mismatch(small) -> None:
-    _, found = small
-    assert found.verdict == "explained", str(found)
-    explained = {name for region in found.mismatches for name in region["explained_by"]}
-    assert explained == {effect["name"] for effect in found.effects}
+    _, diagnosis = small
+    assert diagnosis.verdict == "explained", str(diagnosis)
+    explained = {name for region in diagnosis.mismatches for name in region["explained_by"]}
+    assert explained == {effect["name"] for effect in diagnosis.effects}
 
 
 def test_docs_contain_the_tables_of_the_script() -> None:
@@ -114,9 +116,9 @@ def test_docs_contain_the_tables_of_the_script() -> None:
 def identifications(
     statistic: str, *, place: int = -1, evidence_nats: float = 40.0
 ) -> Identifications:
-    there = np.zeros((1, 1, 40))
-    there[..., 10:20] = 1.0
-    variant = Variant({}, ("sensitivity",), there if statistic == "mean" else there[..., None])
+    shape = np.zeros((1, 1, 40))
+    shape[..., 10:20] = 1.0
+    variant = Variant({}, ("sensitivity",), shape if statistic == "mean" else shape[..., None])
     component = Component(
         Candidate("shupe", find_statistic(statistic), ("temperature",), (variant,)),
         variant,
@@ -150,7 +152,7 @@ def blocks() -> xr.Dataset:
 
 
 @pytest.mark.parametrize(
-    ("statistic", "told", "taus"),
+    ("statistic", "view", "taus"),
     [
         ("mean", "mean", (20.0, 400.0)),
         ("power", "davar", (0.1, 20.0)),
@@ -158,12 +160,12 @@ def blocks() -> xr.Dataset:
     ],
 )
 def test_effect_without_a_mismatch_gets_one_where_it_acts(
-    statistic: str, told: str, taus: tuple[float, float]
+    statistic: str, view: str, taus: tuple[float, float]
 ) -> None:
     (region,) = identified_mismatches(
         identifications(statistic, place=9 if statistic == "spectral_line" else -1), blocks(), []
     )
-    assert (region["view"], region["axes"], region["explained_by"]) == (told, ["y"], ["shupe"])
+    assert (region["view"], region["axes"], region["explained_by"]) == (view, ["y"], ["shupe"])
     assert (region["tau_min_s"], region["tau_max_s"]) == pytest.approx(taus)
     whole = statistic == "spectral_line"  # a steady line is there all the time
     start, end = ("00:00", "13:20") if whole else ("03:20", "06:40")
@@ -218,8 +220,8 @@ def test_two_levels_in_a_block_make_no_tails(noisy_log) -> None:
     base = flatten_levels(noisy_log, 1.0 + share * 899.0)
     calm = drop_changed_tails(noisy_log, base["spectrum"].values)
     before, after = (
-        find_statistic("sample_counts").score(one, base).isel(tau=-1)["ratio"].max()
-        for one in (noisy_log, calm)
+        find_statistic("sample_counts").score(reduced, base).isel(tau=-1)["ratio"].max()
+        for reduced in (noisy_log, calm)
     )
     assert before > 4.0
     assert after < 1.4  # of 324 samples: five standard deviations
@@ -234,8 +236,8 @@ def test_common_noise_of_the_model_is_not_a_mismatch(noisy_log) -> None:
         cross=(("pair", "block", "band"), np.full(shared["cross"].shape, 1.0 / 50.0, complex))
     )
     before, after = (
-        np.nanmax(np.abs(find_statistic("cross_spectrum").score(shared, one)["z"].values))
-        for one in (base, model)
+        np.nanmax(np.abs(find_statistic("cross_spectrum").score(shared, expected)["z"].values))
+        for expected in (base, model)
     )
     assert before > 30.0
     assert after < 8.0
@@ -248,10 +250,10 @@ def test_anomalous_samples_count_in_the_held_out_evidence() -> None:
         "noise": {"N": 0.003},
         "effect": [{"name": "spikes", "axes": ["x"], "per_hour": 300.0}],
     }
-    found = gyrostab.diagnose(
+    diagnosis = gyrostab.diagnose(
         gyrostab.simulate(model, duration="10min", rate=20.0, seed=2).compute(), nulls=100
     )
-    (effect,) = found.effects
+    (effect,) = diagnosis.effects
     assert effect["name"] == "spikes"
-    held = found.content["held_out"]
+    held = diagnosis.content["held_out"]
     assert held["log_likelihood_gain"] > 0.5 * effect["held_out_gain"]["nats"] > 20.0

@@ -34,9 +34,9 @@ def test_gradual_change_is_not_a_jump(way: float, size: float, jump: bool) -> No
     blocks = reduce_log(make_log(noise + size * course * [[1.0], [-0.8]], rate=10.0, unit="deg/h"))
     baseline = baseline_from_model(blocks, MODEL)
     (jumps,) = (
-        one
-        for one in effect_candidates(blocks, baseline["coefficient"])[0]
-        if (one.effect, one.statistic.name) == ("bias_jump", "mean")
+        candidate
+        for candidate in effect_candidates(blocks, baseline["coefficient"])[0]
+        if (candidate.effect, candidate.statistic.name) == ("bias_jump", "mean")
     )
     state = initial_state(blocks, baseline)
     components = group_components(compute_evidence([jumps], blocks, state, fold_blocks(blocks)))[
@@ -58,12 +58,12 @@ def test_jump_at_a_restart_may_settle() -> None:
     blocks = reduce_log(make_log(rate, rate=10.0, unit="deg/h"))
     baseline = baseline_from_model(blocks, MODEL)
     (jumps,) = (
-        one
-        for one in effect_candidates(blocks, baseline["coefficient"])[0]
-        if (one.effect, one.statistic.name) == ("bias_jump", "mean")
+        candidate
+        for candidate in effect_candidates(blocks, baseline["coefficient"])[0]
+        if (candidate.effect, candidate.statistic.name) == ("bias_jump", "mean")
     )
     state = initial_state(blocks, baseline)
-    at = np.array([one.values["at"] for one in jumps.variants])
+    at = np.array([variant.values["at"] for variant in jumps.variants])
     components = {
         instant: Component(jumps, jumps.variants[int(np.abs(at - instant).argmin())], ("x",), 20.0)
         for instant in (960.0, 1010.0)

@@ -38,9 +38,9 @@ def test_filter_must_fit_all_axes(late, one_filter):
     )
     baseline = calibrate_noise(blocks)
     filters = [
-        one
-        for one in effect_candidates(blocks, baseline["coefficient"])[0]
-        if one.effect == "logger_filter"
+        candidate
+        for candidate in effect_candidates(blocks, baseline["coefficient"])[0]
+        if candidate.effect == "logger_filter"
     ]
     state = initial_state(blocks, baseline)
     components = group_components(compute_evidence(filters, blocks, state, fold_blocks(blocks)))[
@@ -81,11 +81,13 @@ def _cutoff_interval(log: xr.Dataset) -> tuple[float, float]:
     blocks = reduce_log(log)
     baseline = calibrate_noise(blocks)
     candidate = next(
-        one
-        for one in effect_candidates(blocks, baseline["coefficient"])[0]
-        if one.effect == "logger_filter"
+        candidate
+        for candidate in effect_candidates(blocks, baseline["coefficient"])[0]
+        if candidate.effect == "logger_filter"
     )
-    variant = next(one for one in candidate.variants if candidate.statistic.is_filter(one))
+    variant = next(
+        variant for variant in candidate.variants if candidate.statistic.is_filter(variant)
+    )
     components = [
         Component(candidate, variant, (str(axis),), 50.0) for axis in blocks["axis"].values
     ]

@@ -180,10 +180,10 @@ def test_rest_is_found_in_less_than_half_of_the_time(at_rest):
 def test_motion_is_one_mismatch_with_the_axes_that_sense_it(reduced):
     whole, rest = reduced
     assert motion_mismatches([], whole) == []
-    (alone,) = motion_mismatches([], rest)
-    assert (alone["axes"], alone["explained_by"]) == (["z"], [])
-    assert "scale-factor" in alone["statement"]
-    assert "40" in alone["statement"] or "39" in alone["statement"]
+    (region,) = motion_mismatches([], rest)
+    assert (region["axes"], region["explained_by"]) == (["z"], [])
+    assert "scale-factor" in region["statement"]
+    assert "40" in region["statement"] or "39" in region["statement"]
     (witnessed,) = motion_mismatches([identification("misalignment", "mean", "x")], rest)
     assert "Axis x senses part of it" in witnessed["statement"]
     assert "real rotation" in witnessed["statement"]
@@ -212,5 +212,5 @@ def test_too_few_samples_at_rest_cannot_be_calibrated(sparse_at_rest):
 @pytest.mark.slow
 def test_diagnosis_includes_motion_when_the_rest_cannot_be_calibrated(sparse_at_rest):
     with pytest.warns(UserWarning, match="includes unexplained motion.*axis z"):
-        found = diagnose(sparse_at_rest, nulls=100)
-    assert found.verdict != "no mismatch"
+        diagnosis = diagnose(sparse_at_rest, nulls=100)
+    assert diagnosis.verdict != "no mismatch"

@@ -38,7 +38,9 @@ def test_repeated_rows_form_new_layers():
         component(6.0, reference="seismometer"),
         component(5.0),
     ]
-    assert [[one.evidence_nats for one in layer] for layer in split_layers(components)] == [
+    assert [
+        [component.evidence_nats for component in layer] for layer in split_layers(components)
+    ] == [
         [9.0, 8.0, 6.0],
         [7.0],
         [5.0],
@@ -84,13 +86,16 @@ def test_two_opposite_jumps_have_evidence_only_together():
     nulls = list(null_records(blocks, baseline, count=40, rng=np.random.default_rng(1), chunk=40))
     (identification,) = name_effects(blocks, baseline, nulls).identified
     assert identification.effect == "bias_jump"
-    assert sorted(one.variant.values["at"] for one in identification.components) == [600.0, 1300.0]
+    assert sorted(component.variant.values["at"] for component in identification.components) == [
+        600.0,
+        1300.0,
+    ]
     assert identification.evidence_nats == pytest.approx(
-        sum(one.evidence_nats for one in identification.components)
+        sum(component.evidence_nats for component in identification.components)
     )
     assert (
         identification.evidence_nats
-        > max(one.evidence_nats for one in identification.components) + 5.0
+        > max(component.evidence_nats for component in identification.components) + 5.0
     )
 
 
@@ -109,6 +114,9 @@ def test_a_pair_is_found_where_any_course_explains_more_than_each():
         {"name": "light_power_noise", "shot": 0.4, "thermal": 0.0},
     ]
     blocks = named.record(effects, environment=(heat, light))
-    found = name_effects(blocks, *named.nulls(blocks))
-    assert {one.effect for one in found.identified} == {"temperature_noise", "light_power_noise"}
-    assert not found.unknown
+    identifications = name_effects(blocks, *named.nulls(blocks))
+    assert {identification.effect for identification in identifications.identified} == {
+        "temperature_noise",
+        "light_power_noise",
+    }
+    assert not identifications.unknown

@@ -33,7 +33,12 @@ def component(statistic: str, evidence_nats: float) -> Component:
 
 def identification(*components: Component) -> Identification:
     return Identification(
-        "rotation_line", (), ("x",), components, sum(one.evidence_nats for one in components), 6.0
+        "rotation_line",
+        (),
+        ("x",),
+        components,
+        sum(component.evidence_nats for component in components),
+        6.0,
     )
 
 
@@ -55,7 +60,7 @@ def test_only_phase_locked_components_are_removed() -> None:
     )  # type: ignore[arg-type]
     left, evidence_nats = remove_phase_locked(identifications, xr.Dataset())
     assert evidence_nats == 27.0
-    assert [one.components for one in left.identified] == [(mean,), (mean,)]
+    assert [identification.components for identification in left.identified] == [(mean,), (mean,)]
     assert left.identified[1] is identifications.identified[2]
 
 
@@ -74,12 +79,12 @@ def line_model(size: float, seconds: float) -> dict[str, Any]:
 @pytest.mark.slow
 def test_evidence_of_a_rotation_line_follows_the_normal_law() -> None:
     size, seconds = 0.07, 1200.0
-    found = diagnose(
+    diagnosis = diagnose(
         simulate(line_model(size, seconds), duration=seconds, rate=10.0, seed=4).compute(),
         nulls=100,
     )
-    assert [one["name"] for one in found.effects] == ["rotation_line"]
-    assert found.content["held_out"]["log_likelihood_gain"] == pytest.approx(
+    assert [effect["name"] for effect in diagnosis.effects] == ["rotation_line"]
+    assert diagnosis.content["held_out"]["log_likelihood_gain"] == pytest.approx(
         size**2 * seconds / (4.0 * 3600.0 * N**2), rel=0.5
     )
 
@@ -90,8 +95,8 @@ def test_allan_variance_is_compared_with_the_complete_model() -> None:
     before."""
     table = line_model(0.3, 600.0)
     log = simulate(table, duration=600.0, rate=10.0, seed=4).compute()
-    found = diagnose(log, simulation={"noise": table["noise"]}, nulls=100)
-    assert [one["name"] for one in found.effects] == ["rotation_line"]
-    held = found.content["held_out"]
+    diagnosis = diagnose(log, simulation={"noise": table["noise"]}, nulls=100)
+    assert [effect["name"] for effect in diagnosis.effects] == ["rotation_line"]
+    held = diagnosis.content["held_out"]
     assert held["misfit_before"] > 1.5
     assert held["misfit_after"] == pytest.approx(1.0, abs=0.2)

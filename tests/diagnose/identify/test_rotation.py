@@ -47,20 +47,20 @@ def _reduce_share(share: float) -> xr.Dataset:
 def _find_components(blocks: xr.Dataset):
     baseline = calibrate_noise(blocks)
     known = [
-        one
-        for one in effect_candidates(blocks, baseline["coefficient"])[0]
-        if one.effect in ("scale_factor", "real_motion")
+        candidate
+        for candidate in effect_candidates(blocks, baseline["coefficient"])[0]
+        if candidate.effect in ("scale_factor", "real_motion")
     ]
     state = initial_state(blocks, baseline)
     components = group_components(
         compute_evidence(
-            [one for one in known if one.statistic.name == "mean"],
+            [candidate for candidate in known if candidate.statistic.name == "mean"],
             blocks,
             state,
             fold_blocks(blocks),
         )
     )
-    return {several[0].candidate.effect: several for several in components.values()}, state
+    return {group[0].candidate.effect: group for group in components.values()}, state
 
 
 @pytest.mark.parametrize(
@@ -81,8 +81,8 @@ def test_share_of_the_rotation_selects_the_effect(share, plainer, allowed):
 def test_tiny_share_of_the_rotation_is_a_scale_factor_error():
     blocks = _reduce_share(1e-6)
     baseline, records = nulls(blocks, 40)
-    found = name_effects(blocks, baseline, records)
-    (identification,) = found.identified
+    identifications = name_effects(blocks, baseline, records)
+    (identification,) = identifications.identified
     assert identification.effect == "scale_factor"
     assert identification.axes == ("z",)
     assert "real_motion" not in identification.alternatives

@@ -10,9 +10,9 @@ RATE = 10.0
 FREQUENCY = (np.arange(400) + 0.5) / 400 * RATE / 2.0
 
 
-def common_share(one: np.ndarray, other: np.ndarray) -> float:
+def common_share(first: np.ndarray, second: np.ndarray) -> float:
     """Return the share of the evidence of a cross-spectrum that another form of it has."""
-    return float((one @ other) ** 2 / (one @ one) / (other @ other))
+    return float((first @ second) ** 2 / (first @ first) / (second @ second))
 
 
 @pytest.mark.parametrize("corner", [0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.76, 0.8, 0.9, 1.0])

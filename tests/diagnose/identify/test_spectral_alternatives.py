@@ -40,10 +40,12 @@ def shaken_record(kind: str, *, seed: int = 5) -> xr.Dataset:
 def test_vibration_noise_is_alone_only_if_its_spectrum_fits(kind: str, is_separated: bool) -> None:
     blocks = shaken_record(kind)
     baseline, records = nulls(blocks, 30)
-    found = name_effects(blocks, baseline, records).identified
-    (one,) = found
+    identified = name_effects(blocks, baseline, records).identified
+    (identification,) = identified
     names = {"vibration_noise", "aliased_vibration"}
-    assert one.effect in names
-    assert set(one.alternatives) == (set() if is_separated else names - {one.effect})
+    assert identification.effect in names
+    assert set(identification.alternatives) == (
+        set() if is_separated else names - {identification.effect}
+    )
     share = 1.0 if is_separated else 0.5
-    assert name_probability(one) == pytest.approx(share * DEFAULTS.set_probability)
+    assert name_probability(identification) == pytest.approx(share * DEFAULTS.set_probability)

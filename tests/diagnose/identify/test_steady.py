@@ -33,9 +33,9 @@ def _simulate_wander(size: float, share: float, seed: int) -> tuple[list[Compone
     )
     baseline = baseline_from_model(blocks, MODEL)
     biases = [
-        one
-        for one in effect_candidates(blocks, baseline["coefficient"])[0]
-        if one.key == "gauss_markov" and one.statistic.name == "power"
+        candidate
+        for candidate in effect_candidates(blocks, baseline["coefficient"])[0]
+        if candidate.key == "gauss_markov" and candidate.statistic.name == "power"
     ]
     state = initial_state(blocks, baseline)
     return group_components(compute_evidence(biases, blocks, state, fold_blocks(blocks)))[

@@ -36,12 +36,14 @@ def _run_time_shift_test(sensitivity: float, period: float) -> tuple[bool, float
     blocks = reduce_log(simulate(model, duration="30min", rate=10.0, seed=5).compute())
     baseline = calibrate_noise(blocks)
     known, _ = effect_candidates(blocks, baseline["coefficient"])
-    one = next(
-        one for one in known if one.effect == "temperature_bias" and one.statistic.name == "mean"
+    candidate = next(
+        candidate
+        for candidate in known
+        if candidate.effect == "temperature_bias" and candidate.statistic.name == "mean"
     )
-    variant = next(each for each in one.variants if each.columns == ("sensitivity",))
+    variant = next(variant for variant in candidate.variants if variant.columns == ("sensitivity",))
     return passes_time_shift_test(
-        [Component(one, variant, ("x",), 50.0)],
+        [Component(candidate, variant, ("x",), 50.0)],
         initial_state(blocks, baseline),
         fold_blocks(blocks),
     )

@@ -23,7 +23,7 @@ def _simulate_rotation(*effects, points=((0, 108.0), (1200, 108.0))):
         "log": {"axes": ["x", "y"]},
         "noise": {"N": 0.003},
         "effect": list(effects),
-        "environment": [{"profile": "rotation", "points": [list(one) for one in points]}],
+        "environment": [{"profile": "rotation", "points": [list(point) for point in points]}],
     }
     return simulate(model, duration="20min", rate=10.0, seed=5).compute()
 
@@ -50,7 +50,7 @@ def test_earth_rate_is_recovered(around):
     blocks = reduce_log(log)
     baseline = calibrate_noise(blocks)
     known, reasons = effect_candidates(blocks, baseline["coefficient"])
-    orders = [one for one in known if one.statistic.name == "rotation_order"]
+    orders = [candidate for candidate in known if candidate.statistic.name == "rotation_order"]
     start, folds = initial_state(blocks, baseline), fold_blocks(blocks)
     components = group_components(compute_evidence(orders, blocks, start, folds))[
         "earth_rate(rotation_rate)"
@@ -59,8 +59,8 @@ def test_earth_rate_is_recovered(around):
     state = condition_on(start, components)
     assert (
         max(
-            sum_evidence(one)
-            for one in group_components(compute_evidence(orders, blocks, state, folds)).values()
+            sum_evidence(group)
+            for group in group_components(compute_evidence(orders, blocks, state, folds)).values()
         )
         < 5.0
     )
@@ -71,10 +71,10 @@ def test_earth_rate_is_recovered(around):
         (identification,), (), 8.0, np.zeros(1), reasons, tuple(known), state, folds
     )
     (fitted,) = fit_identifications(identifications, baseline)
-    again = _simulate_rotation(
+    simulated = _simulate_rotation(
         _some_parameters(fitted.effect, "latitude", "toolface", "off", "around")
     )
-    assert float(np.abs(again["rate"] - log["rate"]).max()) < 0.01 * float(log["rate"].std())
+    assert float(np.abs(simulated["rate"] - log["rate"]).max()) < 0.01 * float(log["rate"].std())
 
 
 @pytest.mark.parametrize(("latitude", "most"), [(60.0, 4.5), (89.8, 0.3)])
@@ -95,7 +95,10 @@ def test_angles_have_the_relative_error_of_the_size(latitude, most):
     start, folds = initial_state(blocks, baseline), fold_blocks(blocks)
     components = group_components(
         compute_evidence(
-            [one for one in known if one.statistic.name == "rotation_order"], blocks, start, folds
+            [candidate for candidate in known if candidate.statistic.name == "rotation_order"],
+            blocks,
+            start,
+            folds,
         )
     )["earth_rate(rotation_rate)"]
     identification = Identification(
@@ -111,18 +114,18 @@ def test_angles_have_the_relative_error_of_the_size(latitude, most):
         condition_on(start, components),
         folds,
     )
-    found = fit_identifications(identifications, baseline)[0].parameters
-    assert found["latitude"].low < latitude < found["latitude"].high
+    estimates = fit_identifications(identifications, baseline)[0].parameters
+    assert estimates["latitude"].low < latitude < estimates["latitude"].high
     by_size = np.degrees(1.96 * 0.04 / np.tan(np.radians(latitude)))
-    assert 0.9 * by_size < (found["latitude"].high - found["latitude"].low) / 2.0 < most
-    assert np.degrees(0.04) - 1e-9 < found["toolface"].stderr < 7.0
-    assert found["toolface"].low < 150.0 < found["toolface"].high
+    assert 0.9 * by_size < (estimates["latitude"].high - estimates["latitude"].low) / 2.0 < most
+    assert np.degrees(0.04) - 1e-9 < estimates["toolface"].stderr < 7.0
+    assert estimates["toolface"].low < 150.0 < estimates["toolface"].high
 
 
 def test_all_harmonics_of_the_rotation_are_recovered():
     """The second line is the strongest, the third half of it; x has all, y only the first."""
     points = ((0, 108.0), (600, 108.0), (610, 66.0), (1200, 66.0))
-    both = {
+    first_order = {
         "name": "rotation_line",
         "amplitude": [0.5, 0.4],
         "phase": [40.0, -60.0],
@@ -130,7 +133,7 @@ def test_all_harmonics_of_the_rotation_are_recovered():
     }
     x = {"name": "rotation_line", "axes": ["x"]}
     log = _simulate_rotation(
-        both,
+        first_order,
         {**x, "order": 2.0, "amplitude": [0.8], "phase": [100.0]},
         {**x, "order": 3.0, "amplitude": [0.4]},
         points=points,
@@ -139,9 +142,9 @@ def test_all_harmonics_of_the_rotation_are_recovered():
     baseline = calibrate_noise(blocks)
     known, reasons = effect_candidates(blocks, baseline["coefficient"])
     orders = [
-        one
-        for one in known
-        if one.statistic.name == "rotation_order" and one.effect == "rotation_line"
+        candidate
+        for candidate in known
+        if candidate.statistic.name == "rotation_order" and candidate.effect == "rotation_line"
     ]
     start, folds = initial_state(blocks, baseline), fold_blocks(blocks)
     components = group_components(compute_evidence(orders, blocks, start, folds))[
@@ -166,20 +169,23 @@ def test_all_harmonics_of_the_rotation_are_recovered():
         folds,
     )
     fitted = fit_identifications(identifications, baseline)
-    assert [(one.effect.order, one.axes) for one in fitted] == [
+    assert [(fitted_effect.effect.order, fitted_effect.axes) for fitted_effect in fitted] == [
         (1.0, ("x", "y")),
         (2.0, ("x",)),
         (3.0, ("x",)),
     ]
-    again = _simulate_rotation(
+    simulated = _simulate_rotation(
         *(
-            {**_some_parameters(one.effect, "amplitude", "phase", "order"), "axes": list(one.axes)}
-            for one in fitted
+            {
+                **_some_parameters(fitted_effect.effect, "amplitude", "phase", "order"),
+                "axes": list(fitted_effect.axes),
+            }
+            for fitted_effect in fitted
         ),
         points=points,
     )
     left, whole = (
-        (one["rate"] - log["rate"]).std("time").values
-        for one in (again, _simulate_rotation(points=points))
+        (recording["rate"] - log["rate"]).std("time").values
+        for recording in (simulated, _simulate_rotation(points=points))
     )
     assert (left < 0.05 * whole).all()

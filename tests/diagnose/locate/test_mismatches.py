@@ -31,9 +31,9 @@ def null(base):
     return null_scores(base, chunks(base, 200, np.random.default_rng(21)))
 
 
-def _overlap_share(found, begin, end):
-    shared = min(float(found["end"]), end) - max(float(found["begin"]), begin)
-    return max(shared, 0.0) / (max(float(found["end"]), end) - min(float(found["begin"]), begin))
+def _overlap_share(region, begin, end):
+    shared = min(float(region["end"]), end) - max(float(region["begin"]), begin)
+    return max(shared, 0.0) / (max(float(region["end"]), end) - min(float(region["begin"]), begin))
 
 
 @pytest.mark.slow
@@ -56,15 +56,15 @@ def test_false_alarm_rate_is_that_of_the_level(base, null):
 
 
 def test_level_sets_the_threshold(base, null):
-    found = records(base, 1, np.random.default_rng(40)).isel(record=0)
-    found["power"][0, 75:90] *= 1.06
-    p = float(smallest_p(found, base, null))
+    blocks = records(base, 1, np.random.default_rng(40)).isel(record=0)
+    blocks["power"][0, 75:90] *= 1.06
+    p = float(smallest_p(blocks, base, null))
     assert 1e-6 < p < 0.2
-    assert locate_mismatches(found, base, null, level=1.5 * p).sizes["mismatch"] >= 1
-    assert locate_mismatches(found, base, null, level=0.7 * p).sizes["mismatch"] == 0
+    assert locate_mismatches(blocks, base, null, level=1.5 * p).sizes["mismatch"] >= 1
+    assert locate_mismatches(blocks, base, null, level=0.7 * p).sizes["mismatch"] == 0
     for level in (0.0, 0.7, -1.0):
         with pytest.raises(OptionError, match="false-alarm probability"):
-            locate_mismatches(found, base, null, level=level)
+            locate_mismatches(blocks, base, null, level=level)
 
 
 @cache
@@ -79,9 +79,9 @@ def test_burst_of_noise_has_a_region(share, missing):
     base, null = _baseline_and_null(missing)
     overlaps = []
     for seed in range(9):
-        found = records(base, 1, np.random.default_rng(seed), missing=missing).isel(record=0)
-        found["power"][1, 75:90] *= 1.0 + share**2
-        regions = locate_mismatches(found, base, null)
+        blocks = records(base, 1, np.random.default_rng(seed), missing=missing).isel(record=0)
+        blocks["power"][1, 75:90] *= 1.0 + share**2
+        regions = locate_mismatches(blocks, base, null)
         regions = regions.sel(mismatch=(regions["view"] == "davar") & (regions["axes"] == "y"))
         overlaps.append(
             _overlap_share(regions.isel(mismatch=0), 1500.0, 1800.0)
@@ -100,10 +100,10 @@ def test_burst_of_noise_has_a_region(share, missing):
 def test_step_of_the_mean_has_a_region(base, null):
     overlaps = []
     for seed in range(9):
-        found = records(base, 1, np.random.default_rng(seed)).isel(record=0)
-        found["mean"][0, 30:45] += 0.1
-        found["mean"][0, 120:140] -= 0.1
-        regions = locate_mismatches(found, base, null)
+        blocks = records(base, 1, np.random.default_rng(seed)).isel(record=0)
+        blocks["mean"][0, 30:45] += 0.1
+        blocks["mean"][0, 120:140] -= 0.1
+        regions = locate_mismatches(blocks, base, null)
         regions = regions.sel(mismatch=regions["view"] == "mean")
         assert regions.sizes["mismatch"] == 2
         assert set(regions["axes"].values) == {"x"}
@@ -111,18 +111,18 @@ def test_step_of_the_mean_has_a_region(base, null):
             (regions["sign"] > 0, 600.0, 900.0),
             (regions["sign"] < 0, 2400.0, 2800.0),
         ):
-            one = regions.sel(mismatch=region).isel(mismatch=0)
-            overlaps.append(_overlap_share(one, begin, end))
-            assert abs(float(one["estimate"])) == pytest.approx(0.1, abs=0.045)
+            step = regions.sel(mismatch=region).isel(mismatch=0)
+            overlaps.append(_overlap_share(step, begin, end))
+            assert abs(float(step["estimate"])) == pytest.approx(0.1, abs=0.045)
     assert np.median(overlaps) >= 0.7
 
 
 def test_band_of_noise_has_its_averaging_times(base, null):
     """Noise between 3 and 12 Hz only is a region around tau = 0.37 / f, and no wider than that."""
-    found = records(base, 1, np.random.default_rng(5)).isel(record=0)
-    inside = (found["frequency"].values > 3.0) & (found["frequency"].values < 12.0)
-    found["power"][0, 60:120] *= 1.0 + 3.0 * xr.DataArray(inside.astype(float), dims="band")
-    region = locate_mismatches(found, base, null).isel(mismatch=0)
+    blocks = records(base, 1, np.random.default_rng(5)).isel(record=0)
+    inside = (blocks["frequency"].values > 3.0) & (blocks["frequency"].values < 12.0)
+    blocks["power"][0, 60:120] *= 1.0 + 3.0 * xr.DataArray(inside.astype(float), dims="band")
+    region = locate_mismatches(blocks, base, null).isel(mismatch=0)
     assert str(region["view"].values) == "davar"
     assert float(region["tau_min_s"]) in (0.02, 0.04)
     assert float(region["tau_min_s"]) < 0.37 / 7.0 < float(region["tau_max_s"])
@@ -131,9 +131,9 @@ def test_band_of_noise_has_its_averaging_times(base, null):
 
 
 def test_less_noise_than_simulated_has_negative_sign(base, null):
-    found = records(base, 1, np.random.default_rng(5)).isel(record=0)
-    found["power"] *= 0.9
-    regions = locate_mismatches(found, base, null)
+    blocks = records(base, 1, np.random.default_rng(5)).isel(record=0)
+    blocks["power"] *= 0.9
+    regions = locate_mismatches(blocks, base, null)
     assert regions.sizes["mismatch"] == 1  # of all axes together
     assert sorted(str(regions["axes"].values[0]).split()) == ["x", "y", "z"]
     assert (float(regions["begin"][0]), float(regions["end"][0])) == (0.0, 3600.0)
@@ -142,10 +142,10 @@ def test_less_noise_than_simulated_has_negative_sign(base, null):
 
 
 def test_two_bursts_are_two_regions(base, null):
-    found = records(base, 1, np.random.default_rng(5)).isel(record=0)
-    found["power"][0, 30:45] *= 1.3
-    found["power"][0, 100:115] *= 1.3
-    regions = locate_mismatches(found, base, null)
+    blocks = records(base, 1, np.random.default_rng(5)).isel(record=0)
+    blocks["power"][0, 30:45] *= 1.3
+    blocks["power"][0, 100:115] *= 1.3
+    regions = locate_mismatches(blocks, base, null)
     begins = sorted(regions["begin"].values)
     assert regions.sizes["mismatch"] == 2
     assert begins[0] == pytest.approx(600.0, abs=2 * BLOCK_S)
@@ -153,9 +153,9 @@ def test_two_bursts_are_two_regions(base, null):
 
 
 def test_wandering_mean_is_one_mismatch(base, null):
-    found = records(base, 1, np.random.default_rng(5)).isel(record=0)
-    found["mean"][1] += 0.5 * np.sin(2.0 * np.pi * np.arange(180) / 30.0)
-    regions = locate_mismatches(found, base, null)
+    blocks = records(base, 1, np.random.default_rng(5)).isel(record=0)
+    blocks["mean"][1] += 0.5 * np.sin(2.0 * np.pi * np.arange(180) / 30.0)
+    regions = locate_mismatches(blocks, base, null)
     regions = regions.sel(mismatch=regions["view"] == "mean")
     assert regions["sign"].values.tolist() == [0]
     assert float(regions["end"][0] - regions["begin"][0]) > 3000.0
@@ -174,11 +174,13 @@ def test_pieces_of_one_region_are_merged_and_others_are_not():
         "tau_max_s": 0.1,
     }
     region |= {"frequency": np.nan, "sign": 1, "z": 9.0, "p_value": 1e-6}
-    near, far = (
+    adjacent, separate = (
         region | {"begin": 120.0, "end": 160.0, "z": 6.0},
         region | {"begin": 400.0, "end": 460.0, "z": 6.0},
     )
-    assert [(one["begin"], one["end"]) for one in merge_regions([far, near, region])] == [
+    assert [
+        (merged["begin"], merged["end"]) for merged in merge_regions([separate, adjacent, region])
+    ] == [
         (0.0, 160.0),
         (400.0, 460.0),
     ]

@@ -56,7 +56,7 @@ def both(lost: float) -> tuple[xr.Dataset, xr.Dataset]:
     )
     names = [name for name in nulls.data_vars if "record" in nulls[name].dims]
     return xr.concat(
-        [one[names] for one in records],
+        [record[names] for record in records],
         "record",
         coords="minimal",
         compat="override",
@@ -64,43 +64,43 @@ def both(lost: float) -> tuple[xr.Dataset, xr.Dataset]:
     ), nulls
 
 
-def close(one: xr.DataArray, other: xr.DataArray, *, rel: float) -> None:
+def close(expected: xr.DataArray, drawn: xr.DataArray, *, rel: float) -> None:
     """Check that means and standard deviations agree within `rel` standard deviations."""
-    scale = float(other.std())
-    assert abs(float(one.mean() - other.mean())) < rel * scale
-    assert float(one.std()) == pytest.approx(scale, rel=rel)
+    scale = float(drawn.std())
+    assert abs(float(expected.mean() - drawn.mean())) < rel * scale
+    assert float(expected.std()) == pytest.approx(scale, rel=rel)
 
 
 @pytest.mark.parametrize("lost", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
 def test_statistics_match_those_of_raw_logs(lost):
-    found, nulls = both(lost)
+    raw_records, nulls = both(lost)
     for name in ("power", "mean", "cross", "line_power", "kurtosis"):
         np.testing.assert_array_equal(
-            np.isnan(found[name].isel(record=0)), np.isnan(nulls[name].isel(record=0))
+            np.isnan(raw_records[name].isel(record=0)), np.isnan(nulls[name].isel(record=0))
         )
     for band in (0, 4, -1):
-        close(found["power"].isel(band=band), nulls["power"].isel(band=band), rel=0.06)
+        close(raw_records["power"].isel(band=band), nulls["power"].isel(band=band), rel=0.06)
         close(
-            np.abs(found["cross"].isel(band=band)) ** 2,
+            np.abs(raw_records["cross"].isel(band=band)) ** 2,
             np.abs(nulls["cross"].isel(band=band)) ** 2,
             rel=0.12,
         )
-    share = found["power"] / nulls["power"].mean(["record", "axis", "block"])
+    share = raw_records["power"] / nulls["power"].mean(["record", "axis", "block"])
     other = nulls["power"] / nulls["power"].mean(["record", "axis", "block"])
     close(
         share.isel(band=slice(-4, None)).mean("band"),
         other.isel(band=slice(-4, None)).mean("band"),
         rel=0.06,
     )
-    close(found["mean"].diff("block"), nulls["mean"].diff("block"), rel=0.05)
+    close(raw_records["mean"].diff("block"), nulls["mean"].diff("block"), rel=0.05)
     drift = [
-        one["mean"].isel(block=slice(60, 90)).mean("block")
-        - one["mean"].isel(block=slice(0, 20)).mean("block")
-        for one in (found, nulls)
+        sample["mean"].isel(block=slice(60, 90)).mean("block")
+        - sample["mean"].isel(block=slice(0, 20)).mean("block")
+        for sample in (raw_records, nulls)
     ]
     close(*drift, rel=0.35)
-    close(found["kurtosis"], nulls["kurtosis"], rel=0.1)
-    close(found["line_power"].max("line"), nulls["line_power"].max("line"), rel=0.15)
+    close(raw_records["kurtosis"], nulls["kurtosis"], rel=0.1)
+    close(raw_records["line_power"].max("line"), nulls["line_power"].max("line"), rel=0.15)
     assert set(np.unique(nulls["extremes"].sum("block"))) == {2}
     assert (
         0.0
@@ -120,9 +120,11 @@ def test_covariance_of_neighbouring_bands_matches_raw_logs(lost):
         )
         left = left[:, np.isfinite(left).all(axis=0)]
         shares.append(np.corrcoef(left[:10]))
-    beside = [np.mean([np.diagonal(share, apart).mean() for apart in (1, 2)]) for share in shares]
-    assert beside[1] == pytest.approx(beside[0], abs=0.006)
-    assert beside[0] > 0.01
+    neighbours = [
+        np.mean([np.diagonal(share, apart).mean() for apart in (1, 2)]) for share in shares
+    ]
+    assert neighbours[1] == pytest.approx(neighbours[0], abs=0.006)
+    assert neighbours[0] > 0.01
 
 
 @pytest.mark.slow
@@ -153,10 +155,10 @@ def test_tails_of_the_kurtosis_match_samples():
     size = int(record.attrs["block_samples"])
     samples = np.random.default_rng(3).standard_normal((50_000, size))
     square = (samples - samples.mean(axis=1, keepdims=True)) ** 2
-    found = (square**2).mean(axis=1) / square.mean(axis=1) ** 2 - 3.0
+    kurtosis = (square**2).mean(axis=1) / square.mean(axis=1) ** 2 - 3.0
     for share, tolerance in ((1e-3, 0.025), (1e-2, 0.02), (0.5, 0.02), (0.99, 0.06), (0.999, 0.2)):
         assert float(nulls["kurtosis"].quantile(share)) == pytest.approx(
-            np.quantile(found, share), abs=tolerance
+            np.quantile(kurtosis, share), abs=tolerance
         )
 
 
@@ -188,9 +190,9 @@ def test_blocks_with_few_samples_may_have_repeats():
     baseline = calibrate_noise(record)
     nulls = joined(list(null_records(record, baseline, count=100, rng=np.random.default_rng(2))))
     many = float(nulls["repeats"].values[:, 0, sparse].sum(axis=1).mean())
-    found = float(record["repeats"].values[0, sparse].sum())
+    repeats = float(record["repeats"].values[0, sparse].sum())
     assert many > 100
-    assert found == pytest.approx(many, abs=4.0 * np.sqrt(many))
+    assert repeats == pytest.approx(many, abs=4.0 * np.sqrt(many))
     assert ((nulls["repeats"] > nulls["adjacent"]).sum()) == 0
     zeros = nulls["zeros"].values[:, 0, sparse].sum(axis=1)
     assert float(record["zeros"].values[0, sparse].sum()) <= zeros.mean() + 5.0 * np.sqrt(
@@ -223,25 +225,27 @@ def test_orders_profiles_and_reference_channels_have_the_scatter_of_noise():
         )
     )
     for name, rel in (("order", 0.08), ("profile", 0.05), ("reference_cross", 0.1)):
-        found = np.concatenate([np.abs(one[name].values.ravel()) ** 2 for one in records])
+        squares = np.concatenate([np.abs(record[name].values.ravel()) ** 2 for record in records])
         other = np.abs(nulls[name].values) ** 2
-        assert np.nanmean(found) == pytest.approx(np.nanmean(other), rel=rel), name
+        assert np.nanmean(squares) == pytest.approx(np.nanmean(other), rel=rel), name
 
 
 def test_the_same_generator_gives_the_same_records():
     record = raw(1, 0.3)
     baseline = calibrate_noise(record)
-    one, other = (
+    first, second = (
         next(null_records(record, baseline, count=2, rng=np.random.default_rng(5)))
         for _ in range(2)
     )
-    xr.testing.assert_identical(one, other)
+    xr.testing.assert_identical(first, second)
 
 
 def candidates(record: xr.Dataset) -> tuple[dict, dict]:
     n, bands = record.sizes["block"], record.sizes["band"]
     t, x = np.arange(n) / n, np.linspace(0.0, 1.0, bands)
-    knots = np.stack([np.interp(t, np.linspace(0, 1, 9), one) for one in np.eye(9)], axis=1)
+    knots = np.stack(
+        [np.interp(t, np.linspace(0, 1, 9), unit_vector) for unit_vector in np.eye(9)], axis=1
+    )
     event = ((t > 0.4) & (t < 0.5)).astype(float)
     means = {
         "step": [(t > edge).astype(float) for edge in np.arange(0.1, 0.95, 0.1)],
@@ -283,8 +287,8 @@ def test_largest_evidence_of_raw_logs_matches_null_records(lost):
             ranks[statistic].append(
                 int((gains(nulls, baseline, tried, axis="x").max("candidate") >= own).sum())
             )
-    for statistic, found in ranks.items():
-        share = (np.array(found) + 0.5) / (count + 1)
+    for statistic, places in ranks.items():
+        share = (np.array(places) + 0.5) / (count + 1)
         assert share.mean() == pytest.approx(0.5, abs=3.5 * np.sqrt(1.0 / 12.0 / records)), (
             statistic
         )

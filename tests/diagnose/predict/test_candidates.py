@@ -40,16 +40,16 @@ def plain():
 
 
 @pytest.fixture(scope="module")
-def found(rich):
+def tried_effects(rich):
     return effect_candidates(rich, COEFFICIENT)
 
 
-def test_every_effect_is_tried_or_has_a_reason(found):
-    candidates, reasons = found
-    tried = {one.effect for one in candidates}
+def test_every_effect_is_tried_or_has_a_reason(tried_effects):
+    candidates, reasons = tried_effects
+    tried = {candidate.effect for candidate in candidates}
     assert tried.isdisjoint(reasons)
     assert tried | set(reasons) | {"fringe_hop"} == set(effects())
-    assert {one.statistic.name for one in candidates} <= {
+    assert {candidate.statistic.name for candidate in candidates} <= {
         statistic.name for statistic in STATISTICS
     }
     for reason in reasons.values():
@@ -72,8 +72,10 @@ def test_every_effect_is_tried_or_has_a_reason(found):
         ("gauss_markov", {"power", "random_process"}),
     ],
 )
-def test_effects_show_in_the_expected_statistics(found, effect, statistics):
-    assert {one.statistic.name for one in found[0] if one.effect == effect} == statistics
+def test_effects_show_in_the_expected_statistics(tried_effects, effect, statistics):
+    assert {
+        candidate.statistic.name for candidate in tried_effects[0] if candidate.effect == effect
+    } == statistics
 
 
 def test_reason_names_the_missing_channel(plain):
@@ -83,10 +85,10 @@ def test_reason_names_the_missing_channel(plain):
 
 
 @pytest.mark.parametrize(
-    ("told", "tried"),
+    ("band", "tried"),
     [([120.0, 160.0], (120.0, 160.0)), (None, (700.0, 800.0)), ("wide", (700.0, 800.0))],
 )
-def test_vibration_aliases_from_the_band_of_its_channel(told, tried):
+def test_vibration_aliases_from_the_band_of_its_channel(band, tried):
     shaking = np.random.default_rng(2).uniform(0.0, 5.0, 60_000)
     log = make_log(
         np.random.default_rng(1).standard_normal((1, 60_000)),
@@ -94,14 +96,19 @@ def test_vibration_aliases_from_the_band_of_its_channel(told, tried):
         unit="deg/h",
         channels={"vibration": (shaking, "g")},
     )
-    if told is not None:
-        log["vibration"].attrs["band_hz"] = told
+    if band is not None:
+        log["vibration"].attrs["band_hz"] = band
     known, _ = effect_candidates(reduce_log(log), COEFFICIENT)
     variants = [
-        variant for one in known if one.effect == "aliased_vibration" for variant in one.variants
+        variant
+        for candidate in known
+        if candidate.effect == "aliased_vibration"
+        for variant in candidate.variants
     ]
     assert variants
-    assert {(one.values["low"], one.values["high"]) for one in variants} == {tried}
+    assert {(candidate.values["low"], candidate.values["high"]) for candidate in variants} == {
+        tried
+    }
 
 
 def test_a_constant_channel_has_no_effect(plain):
@@ -109,38 +116,40 @@ def test_a_constant_channel_has_no_effect(plain):
         {name: plain[name] * 0.0 + 20.0 for name in ("channel_temperature", "fine_temperature")}
     )
     candidates, reasons = effect_candidates(still, COEFFICIENT)
-    assert not [one for one in candidates if one.effect == "shupe"]
+    assert not [candidate for candidate in candidates if candidate.effect == "shupe"]
     assert reasons["shupe"] == "not identifiable: temperature does not change"
 
 
-def test_an_axis_does_not_explain_itself(plain, found):
+def test_an_axis_does_not_explain_itself(plain, tried_effects):
     turning = 500.0 * np.sin(np.linspace(0.0, 6.0, plain.sizes["block"]))
     moving = plain.assign(mean=plain["mean"] + turning)
     leak = next(
-        one
-        for one in effect_candidates(moving, COEFFICIENT)[0]
-        if one.effect == "misalignment" and one.statistic.name == "mean"
+        candidate
+        for candidate in effect_candidates(moving, COEFFICIENT)[0]
+        if candidate.effect == "misalignment" and candidate.statistic.name == "mean"
     )
     for variant in leak.variants:
         for name, design in zip(variant.columns, variant.design, strict=True):
             assert not design["xyz".index(name)].any()
     assert not [
-        one
-        for one in found[0]
-        if one.effect in ("dead_zone", "clock_error") and one.statistic.name == "mean"
+        candidate
+        for candidate in tried_effects[0]
+        if candidate.effect in ("dead_zone", "clock_error") and candidate.statistic.name == "mean"
     ]
 
 
-def test_axes_at_rest_do_not_leak(plain, found):
+def test_axes_at_rest_do_not_leak(plain, tried_effects):
     assert not [
-        one for one in found[0] if one.effect == "misalignment" and one.statistic.name == "mean"
+        candidate
+        for candidate in tried_effects[0]
+        if candidate.effect == "misalignment" and candidate.statistic.name == "mean"
     ]
     course = xr.DataArray(np.linspace(0.0, 500.0, plain.sizes["block"]), dims="block")
     turning = plain.assign(mean=plain["mean"] + course.where(plain["axis"] == "z", 0.0))
     leak = next(
-        one
-        for one in effect_candidates(turning, COEFFICIENT)[0]
-        if one.effect == "misalignment" and one.statistic.name == "mean"
+        candidate
+        for candidate in effect_candidates(turning, COEFFICIENT)[0]
+        if candidate.effect == "misalignment" and candidate.statistic.name == "mean"
     )
     assert [variant.columns for variant in leak.variants] == [("z",)]
 
@@ -149,26 +158,28 @@ def test_mean_designs_match_the_simulator(plain):
     candidates, _ = effect_candidates(plain, COEFFICIENT)
     table = {"name": "vibration_rectification", "sensitivity": 0.01}
     added = (record([table])["mean"] - record([])["mean"]).values
-    one = next(one for one in candidates if one.effect == table["name"])
-    design = next(variant.design for variant in one.variants if variant.columns == ("sensitivity",))
+    candidate = next(candidate for candidate in candidates if candidate.effect == table["name"])
+    design = next(
+        variant.design for variant in candidate.variants if variant.columns == ("sensitivity",)
+    )
     np.testing.assert_allclose(0.01 * design[0], added, rtol=0.02, atol=2e-4)
 
 
 def test_earth_rate_is_in_quadrature_between_the_cross_axes(rich):
     candidates, _ = effect_candidates(rich, COEFFICIENT)
-    one = next(
-        one
-        for one in candidates
-        if one.effect == "earth_rate" and one.statistic.name == "rotation_order"
+    candidate = next(
+        candidate
+        for candidate in candidates
+        if candidate.effect == "earth_rate" and candidate.statistic.name == "rotation_order"
     )
-    pattern = one.variants[0].design[0, :, 0]
+    pattern = candidate.variants[0].design[0, :, 0]
     turning = [*WORLD["turning"]]
     table = {"name": "earth_rate", "latitude": 60.0}
-    seen = (
+    recorded = (
         record([table], environment=turning)["order"] - record([], environment=turning)["order"]
     ).isel(harmonic=0)
-    good = np.isfinite(seen.values).all(axis=0)
-    x, y, z = seen.values[:, good]
+    good = np.isfinite(recorded.values).all(axis=0)
+    x, y, z = recorded.values[:, good]
     assert (
         np.median(np.abs(y / x - pattern[1] / pattern[0])) < 0.01
     )  # except in blocks with a fractional number of turns
@@ -201,11 +212,11 @@ def test_gaps_mix_a_density_with_its_mean(plain):
 def test_gaps_in_channels_are_interpolated(plain):
     values = plain["channel_temperature"].values.copy()
     values[10:14] = np.nan
-    seen = make_windows(
+    temperatures = make_windows(
         plain.assign(channel_temperature=("block", values)), {"temperature": "temperature"}
     ).drivers["temperature"]
     np.testing.assert_allclose(
-        seen[10:14], np.interp(np.arange(10, 14), [9, 14], [values[9], values[14]])
+        temperatures[10:14], np.interp(np.arange(10, 14), [9, 14], [values[9], values[14]])
     )
 
 
@@ -224,13 +235,15 @@ def test_linear_model_of_powers_gives_the_evidence_of_powers(plain, common):
     baseline = calibrate_noise(plain)
     baseline = baseline.assign(common=baseline["common"] + common)
     folds = fold_blocks(plain)
-    generic = [one for one in nuisance_alternatives(plain) if one.effect == "~N(t)"]
+    generic = [
+        alternative for alternative in nuisance_alternatives(plain) if alternative.effect == "~N(t)"
+    ]
     state = initial_state(plain, baseline)
     cells = generic[0].statistic.model(generic, 0, plain, state)
     mine = linear_model_factors(cells, folds)[:, 1:]
     designs = [
-        power_column(one, 0, state) / baseline["spectrum"].values[0]
-        for one in generic[0].variants[0].design
+        power_column(column, 0, state) / baseline["spectrum"].values[0]
+        for column in generic[0].variants[0].design
     ]
     theirs = power_factors(plain, baseline, [np.stack(designs, axis=-1)], axis="x", folds=folds)[
         :, 1:
@@ -242,29 +255,33 @@ def test_linear_model_of_powers_gives_the_evidence_of_powers(plain, common):
 def test_simulated_noise_has_the_variance_of_the_weights(rich, statistic):
     baseline = calibrate_noise(rich)
     candidates = [
-        one
-        for one in effect_candidates(rich, COEFFICIENT)[0]
-        if one.statistic.name == statistic and one.each
+        candidate
+        for candidate in effect_candidates(rich, COEFFICIENT)[0]
+        if candidate.statistic.name == statistic and candidate.each
     ][:1]
     cells = candidates[0].statistic.model(candidates, 0, rich, initial_state(rich, baseline))
     z = (cells.values[..., 0] * np.sqrt(cells.weight))[
         (cells.weight > 0) & np.isfinite(cells.values[..., 0])
     ]
     assert np.mean(z**2) == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / z.size) + 0.03)
-    some = simulate_noise(cells, np.random.default_rng(1), 3)
-    assert some.values.shape[2] == 3
-    assert not some.values[cells.weight == 0].any()
+    drawn = simulate_noise(cells, np.random.default_rng(1), 3)
+    assert drawn.values.shape[2] == 3
+    assert not drawn.values[cells.weight == 0].any()
 
 
-def test_a_filter_is_a_candidate_only_if_it_changes_the_shape(found):
-    one = next(one for one in found[0] if one.effect == "logger_filter")
-    assert all(variant.columns == () for variant in one.variants)
+def test_a_filter_is_a_candidate_only_if_it_changes_the_shape(tried_effects):
+    candidate = next(
+        candidate for candidate in tried_effects[0] if candidate.effect == "logger_filter"
+    )
+    assert all(variant.columns == () for variant in candidate.variants)
     assert all(
-        (variant.design <= 1e-9).all() for variant in one.variants if not variant.values["pick"]
+        (variant.design <= 1e-9).all()
+        for variant in candidate.variants
+        if not variant.values["pick"]
     )
     assert all(
         (variant.design[..., 0] > variant.design[..., -1]).all()
-        for variant in one.variants
+        for variant in candidate.variants
         if variant.values["pick"]
     )
 
@@ -285,13 +302,15 @@ def test_simulated_wander_has_the_predicted_variance():
 
 
 def test_nuisance_alternatives_have_the_axes_of_the_record(plain):
-    assert {one.statistic.name for one in nuisance_alternatives(plain)} == {
+    assert {alternative.statistic.name for alternative in nuisance_alternatives(plain)} == {
         "mean",
         "power",
         "telegraph",
         "cross_spectrum",
         "sample_counts",
     }
-    alone = plain.isel(axis=[0]).drop_dims("pair") if "pair" in plain.dims else plain
-    assert isinstance(alone, xr.Dataset)
-    assert "cross_spectrum" not in {one.statistic.name for one in nuisance_alternatives(alone)}
+    single_axis = plain.isel(axis=[0]).drop_dims("pair") if "pair" in plain.dims else plain
+    assert isinstance(single_axis, xr.Dataset)
+    assert "cross_spectrum" not in {
+        alternative.statistic.name for alternative in nuisance_alternatives(single_axis)
+    }

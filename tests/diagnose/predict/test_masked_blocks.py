@@ -20,12 +20,12 @@ PAIRS = [("x", "y"), ("x", "z"), ("y", "z")]
 @pytest.fixture
 def blocks() -> xr.Dataset:
     """Noise on x, y and z; an outlier on y in blocks 5 and 9, and one on z in block 9."""
-    found = records(
+    statistics = records(
         baseline(block_count=BLOCKS), 1, np.random.default_rng(1), block_count=BLOCKS
     ).isel(record=0)
     outliers = np.zeros((3, BLOCKS), np.int64)
     outliers[1, [5, 9]] = outliers[2, 9] = 1
-    return found.assign(outliers=(("axis", "block"), outliers))
+    return statistics.assign(outliers=(("axis", "block"), outliers))
 
 
 def spikes(axis: str) -> Component:
@@ -35,9 +35,9 @@ def spikes(axis: str) -> Component:
     )
 
 
-def lost(found: xr.DataArray, before: xr.DataArray) -> set[tuple[str, int]]:
+def lost(after: xr.DataArray, before: xr.DataArray) -> set[tuple[str, int]]:
     """Return rows and blocks without data; the bands of a block are lost together."""
-    gone = (found.isnull() & before.notnull()).transpose(
+    gone = (after.isnull() & before.notnull()).transpose(
         ..., "block", *(["band"] if "band" in before.dims else [])
     )
     if "band" in gone.dims:
@@ -51,9 +51,9 @@ def test_cross_spectrum_is_left_out_with_either_axis(blocks: xr.Dataset) -> None
     left_out = np.zeros((3, BLOCKS), np.bool_)
     left_out[0, 3] = left_out[1, 7] = left_out[2, 7] = True
     assert list(zip(blocks["first"].values, blocks["second"].values, strict=True)) == PAIRS
-    found = cross_without(blocks, left_out)
-    assert lost(found, blocks["cross"]) == {("xy", 3), ("xz", 3), ("xy", 7), ("xz", 7), ("yz", 7)}
-    assert found.dims == blocks["cross"].dims
+    cross = cross_without(blocks, left_out)
+    assert lost(cross, blocks["cross"]) == {("xy", 3), ("xz", 3), ("xy", 7), ("xz", 7), ("yz", 7)}
+    assert cross.dims == blocks["cross"].dims
     assert cross_without(blocks, np.zeros((3, BLOCKS), np.bool_)).identical(blocks["cross"])
 
 
@@ -80,7 +80,7 @@ def test_blocks_with_named_spikes_are_left_out_of_all_statistics(
 
 def test_blocks_with_spikes_are_left_out_in_the_next_search(blocks: xr.Dataset) -> None:
     state = initial_state(blocks, baseline(block_count=BLOCKS))
-    found = condition_on_components(state, [spikes("y")]).blocks
+    masked = condition_on_components(state, [spikes("y")]).blocks
     for name in ("mean", "power"):
-        assert lost(found[name], blocks[name]) == {("y", 5), ("y", 9)}
-    assert lost(found["cross"], blocks["cross"]) == {("xy", 5), ("yz", 5), ("xy", 9), ("yz", 9)}
+        assert lost(masked[name], blocks[name]) == {("y", 5), ("y", 9)}
+    assert lost(masked["cross"], blocks["cross"]) == {("xy", 5), ("yz", 5), ("xy", 9), ("yz", 9)}

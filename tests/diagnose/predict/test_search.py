@@ -19,15 +19,17 @@ AXES = [("x",), ("y",)]
 
 def evidence_of_peaks(peaks: Sequence[tuple[int, float]]) -> tuple[NDArray[np.float64], list[int]]:
     """Evidence on each axis, and best variants; one variant of an axis has this log factor."""
-    variants = tuple(Variant({"at": float(one)}, ("step",), np.empty(0)) for one in range(VARIANTS))
+    variants = tuple(
+        Variant({"at": float(instant)}, ("step",), np.empty(0)) for instant in range(VARIANTS)
+    )
     candidate = Candidate("bias_jump", find_statistic("mean"), (), variants)
     factors = []
     for variant, nats in peaks:
         row = np.full((1 + FOLDS, VARIANTS, 1), -2.0)
         row[:, variant] = nats
         factors.append(row)
-    (found,) = collect_evidence([candidate], AXES, factors)
-    return found.evidence_nats[0], [int(one.values["at"]) for one in found.best]
+    (evidence,) = collect_evidence([candidate], AXES, factors)
+    return evidence.evidence_nats[0], [int(variant.values["at"]) for variant in evidence.best]
 
 
 def test_axes_with_one_instant_pay_for_its_search_once():
@@ -45,5 +47,5 @@ def test_another_instant_of_an_axis_is_still_found():
 
 
 def test_noise_on_one_axis_gains_nothing_from_the_others():
-    (_, alone), _ = evidence_of_peaks([(40, 2.0), (70, -2.0)])
-    assert alone <= 0.0
+    (_, single), _ = evidence_of_peaks([(40, 2.0), (70, -2.0)])
+    assert single <= 0.0

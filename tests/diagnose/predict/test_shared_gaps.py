@@ -29,19 +29,19 @@ def log():
 @pytest.mark.parametrize("rows", [1, 2])
 def test_random_gaps_do_not_bias_a_shared_band(log, rows):
     lost = np.random.default_rng(3).random((rows, log.sizes["time"])) < 0.4
-    there = xr.DataArray(np.broadcast_to(~lost, (2, lost.shape[1])), dims=("axis", "time"))
+    is_present = xr.DataArray(np.broadcast_to(~lost, (2, lost.shape[1])), dims=("axis", "time"))
     rate = log["rate"].transpose("axis", "time")
-    blocks = reduce_log(log.assign(rate=rate.where(there).assign_attrs(rate.attrs)))
+    blocks = reduce_log(log.assign(rate=rate.where(is_present).assign_attrs(rate.attrs)))
     baseline = calibrate_noise(blocks)
     known, _ = effect_candidates(blocks, baseline["coefficient"])
-    one = next(
-        one
-        for one in known
-        if one.effect == "shared_source" and one.statistic.name == "cross_spectrum"
+    candidate = next(
+        candidate
+        for candidate in known
+        if candidate.effect == "shared_source" and candidate.statistic.name == "cross_spectrum"
     )
-    variant = next(each for each in one.variants if each.values["bandwidth"] == 0.5)
+    variant = next(variant for variant in candidate.variants if variant.values["bandwidth"] == 0.5)
     mean, covariance = component_mixture(
-        Component(one, variant, ("x", "y"), 1.0), initial_state(blocks, baseline)
+        Component(candidate, variant, ("x", "y"), 1.0), initial_state(blocks, baseline)
     ).moments()
     error = float(np.sqrt(covariance[0, 0]))
     assert abs(mean[0] - 9e-6) < 3.0 * error

@@ -30,26 +30,30 @@ def restarted():
 
 def _jump_candidates(blocks):
     return next(
-        one
-        for one in effect_candidates(blocks, COEFFICIENT)[0]
-        if one.effect == "bias_jump" and one.statistic.name == "mean"
+        candidate
+        for candidate in effect_candidates(blocks, COEFFICIENT)[0]
+        if candidate.effect == "bias_jump" and candidate.statistic.name == "mean"
     )
 
 
 def test_a_restart_is_as_probable_as_all_other_times(restarted):
     variants = _jump_candidates(restarted).variants
-    weight = np.array([one.weight for one in variants])
-    known = np.array([one.values["at"] == _BACK for one in variants])
+    weight = np.array([variant.weight for variant in variants])
+    known = np.array([variant.values["at"] == _BACK for variant in variants])
     assert known.sum() == 1
     assert weight[known].sum() == pytest.approx(weight[~known].sum())
     assert weight[~known].sum() == pytest.approx((~known).sum())
 
 
 def test_each_time_has_the_probability_of_its_interval():
-    variants = sorted(_jump_candidates(record([])).variants, key=lambda one: one.values["at"])
+    variants = sorted(
+        _jump_candidates(record([])).variants, key=lambda variant: variant.values["at"]
+    )
     at, weight = (
-        np.array(several)
-        for several in zip(*((one.values["at"], one.weight) for one in variants), strict=True)
+        np.array(values)
+        for values in zip(
+            *((variant.values["at"], variant.weight) for variant in variants), strict=True
+        )
     )
     np.testing.assert_allclose(
         weight[1:-1] / weight[1], (at[2:] - at[:-2]) / (at[2] - at[0]), rtol=1e-9
@@ -77,8 +81,8 @@ def test_two_restarts_share_their_probability(restarted):
         restart_begin=("restart", [900.0, _BACK]), restart_end=("restart", [905.0, _BACK + 7.0])
     )
     variants = _jump_candidates(twice).variants
-    weight = np.array([one.weight for one in variants])
-    known = np.array([one.values["at"] in (905.0, _BACK + 7.0) for one in variants])
+    weight = np.array([variant.weight for variant in variants])
+    known = np.array([variant.values["at"] in (905.0, _BACK + 7.0) for variant in variants])
     assert known.sum() == 2
     assert weight[known].sum() == pytest.approx(weight[~known].sum())
 
@@ -88,9 +92,12 @@ def test_a_jump_at_a_restart_needs_less_evidence(restarted):
     moved = restarted.assign(mean=restarted["mean"] + 0.08 * (middle > _BACK))
     state = initial_state(moved, calibrate_noise(moved))
     weighed = _jump_candidates(moved)
-    alike = replace(weighed, variants=tuple(replace(one, weight=1.0) for one in weighed.variants))
-    found = [
-        compute_evidence([one], moved, state, fold_blocks(moved))[0] for one in (weighed, alike)
+    equal = replace(
+        weighed, variants=tuple(replace(variant, weight=1.0) for variant in weighed.variants)
+    )
+    evidence = [
+        compute_evidence([candidate], moved, state, fold_blocks(moved))[0]
+        for candidate in (weighed, equal)
     ]
-    assert (found[0].evidence_nats > found[1].evidence_nats + 0.5).any()
-    assert {one.values["at"] for one in found[0].best} == {_BACK}
+    assert (evidence[0].evidence_nats > evidence[1].evidence_nats + 0.5).any()
+    assert {variant.values["at"] for variant in evidence[0].best} == {_BACK}

@@ -78,11 +78,11 @@ def test_a_slower_channel_is_interpolated_but_not_across_gaps():
     seconds = np.delete(np.arange(0.0, 30.0, 0.03), slice(100, 110))
     aligned = align_channels(with_channel(log_of(), "accel_x", seconds, 2.0 * seconds, "g"))
     at = np.arange(SIZE) / RATE
-    found = aligned.log["accel_x"].values
+    values = aligned.log["accel_x"].values
     gap = (at > 2.97 + 1e-6) & (at < 3.30 - 1e-6)
     inside = ~gap & (at <= seconds[-1])
-    np.testing.assert_allclose(found[inside], 2.0 * at[inside], atol=1e-9)
-    assert np.isnan(found[gap]).all()
+    np.testing.assert_allclose(values[inside], 2.0 * at[inside], atol=1e-9)
+    assert np.isnan(values[gap]).all()
     assert "interpolated from 33.33 Hz" in aligned.notes[0]
     held = align_channels(
         with_channel(log_of(), "accel_x", seconds, seconds, "g", interpolation="previous")
@@ -122,7 +122,7 @@ def test_a_fast_toolface_is_not_reported_as_slow():
     blocks, _, _ = candidates_of(
         with_channel(log_of(60_000), "toolface", seconds, np.mod(70.0 * seconds, 360.0), "degree")
     )
-    assert [one["reason"] for one in unused_channels(blocks, ())] == [
+    assert [channel["reason"] for channel in unused_channels(blocks, ())] == [
         "no effect follows a channel of this name; "
         "lines at the rotation are found with the channel rotation_rate"
     ]
@@ -160,15 +160,16 @@ def test_a_lazy_log_gives_the_same_as_a_log_in_memory(
     values = np.random.default_rng(2).standard_normal(count)
     values[[place for place in lost if place < count]] = np.nan
     seconds = (np.arange(count) * ratio + skew) / RATE
-    one = with_channel(log, "accel_x", seconds, values, "g")
+    log_with_channel = with_channel(log, "accel_x", seconds, values, "g")
     if grid:
         start = int((START + np.timedelta64(round(skew / RATE * 1e9), "ns")).view(np.int64))
-        one = one.drop_vars("time_accel_x").assign_coords(
+        log_with_channel = log_with_channel.drop_vars("time_accel_x").assign_coords(
             time_coordinate(start, RATE / ratio, count, name="time_accel_x")
         )
-    whole = align_channels(one).log["accel_x"]
-    lazy = one.assign(
-        rate=one["rate"].chunk(time=chunk), accel_x=one["accel_x"].chunk(time_accel_x=31)
+    whole = align_channels(log_with_channel).log["accel_x"]
+    lazy = log_with_channel.assign(
+        rate=log_with_channel["rate"].chunk(time=chunk),
+        accel_x=log_with_channel["accel_x"].chunk(time_accel_x=31),
     )
     pieces = align_channels(lazy).log["accel_x"]
     assert isinstance(pieces.data, da.Array)
@@ -186,8 +187,8 @@ def test_a_lazy_channel_is_read_chunk_by_chunk():
 
     log = log_of(size).chunk(time=10_000)
     channel = da.map_blocks(values, chunks=((1000,) * 100,), dtype=np.float64, meta=np.empty(0))
-    one = with_channel(log, "accel_x", (np.arange(size) + 0.3) / RATE, channel, "g")
-    aligned = align_channels(one).log["accel_x"]
+    log_with_channel = with_channel(log, "accel_x", (np.arange(size) + 0.3) / RATE, channel, "g")
+    aligned = align_channels(log_with_channel).log["accel_x"]
     read.clear()
     aligned.data.blocks[4].compute(scheduler="synchronous")
     assert sum(high - low for low, high in read) <= 12_000
@@ -215,9 +216,11 @@ def candidates_of(log: xr.Dataset) -> tuple[xr.Dataset, list[Any], dict[str, str
 
 
 def test_a_ramp_from_another_file_is_used():
-    blocks, found, reasons = candidates_of(kicked(1 / 3))
+    blocks, candidates, reasons = candidates_of(kicked(1 / 3))
     assert "feedback_reset" not in reasons
-    assert {one.statistic.name for one in found if one.effect == "feedback_reset"} >= {"ramp_phase"}
+    assert {
+        candidate.statistic.name for candidate in candidates if candidate.effect == "feedback_reset"
+    } >= {"ramp_phase"}
     profile = blocks["profile"].mean("block").values[0]
     late = 4.17 / RATE / 3.0  # turns between a sample and its ramp value
     assert profile[-2:].mean() - profile[2:36].mean() == pytest.approx(
@@ -230,13 +233,14 @@ def test_reason_of_an_effect_names_the_unused_channel():
     slow = with_channel(
         log.drop_vars(["ramp", "time_ramp"]), "ramp", np.arange(0.0, 600.0, 0.5), np.zeros(1200)
     )
-    blocks, found, reasons = candidates_of(slow)
+    blocks, candidates, reasons = candidates_of(slow)
     assert "the channel ramp is not used: it is sampled at 2 Hz" in reasons["feedback_reset"]
     assert "no channel temperature" in reasons["shupe"]
-    (one,) = unused_channels(
-        blocks, {name for each in found for name in (*each.driver, *each.reference)}
+    (channel,) = unused_channels(
+        blocks,
+        {name for candidate in candidates for name in (*candidate.driver, *candidate.reference)},
     )
-    assert one["name"] == "ramp"
+    assert channel["name"] == "ramp"
 
 
 @pytest.mark.parametrize(
@@ -265,12 +269,17 @@ def test_reason_of_an_effect_names_the_unused_channel():
 )
 def test_every_unused_channel_is_listed(name: str, unit: str, values: Any, reason: str):
     log = with_channel(log_of(60_000), name, np.arange(600.0), values, unit)
-    blocks, found, reasons = candidates_of(log)
-    (one,) = unused_channels(
-        blocks, {each for candidate in found for each in (*candidate.driver, *candidate.reference)}
+    blocks, candidates, reasons = candidates_of(log)
+    (channel,) = unused_channels(
+        blocks,
+        {
+            channel_name
+            for candidate in candidates
+            for channel_name in (*candidate.driver, *candidate.reference)
+        },
     )
-    assert one["name"] == name
-    assert reason in one["reason"]
+    assert channel["name"] == name
+    assert reason in channel["reason"]
     if name == "temperature" and "change" not in reason:
         assert reason in reasons["temperature_bias"]
 
@@ -280,11 +289,13 @@ def test_a_seismometer_with_its_own_stamps_is_compared_sample_by_sample():
     ground = np.random.default_rng(4).standard_normal(60_000)
     log["rate"] = log["rate"] + ground
     log["rate"].attrs["units"] = "degree hour-1"
-    blocks, found, _ = candidates_of(
+    blocks, candidates, _ = candidates_of(
         with_channel(log, "seismometer_z", (np.arange(60_000) + 0.37) / RATE, ground)
     )
     assert ("real_motion", ("seismometer_z",)) in {
-        (one.effect, one.reference) for one in found if one.statistic.name == "transfer"
+        (candidate.effect, candidate.reference)
+        for candidate in candidates
+        if candidate.statistic.name == "transfer"
     }
     assert unused_channels(blocks, {"seismometer_z"}) == []
 
@@ -295,10 +306,10 @@ def test_diagnosis_lists_the_channels_it_used(recwarn: pytest.WarningsRecorder):
     with pytest.warns(
         UserWarning, match=r"channel ramp: its stamps are 3\.33 ms after those of the gyro"
     ):
-        found = gyrostab.diagnose(log, nulls=100)
-    assert found.effects[0]["name"] == "feedback_reset"
-    assert [one["name"] for one in found.content["unused_channels"]] == ["humidity"]
-    assert "- channel humidity is not used: no effect follows" in str(found)
+        diagnosis = gyrostab.diagnose(log, nulls=100)
+    assert diagnosis.effects[0]["name"] == "feedback_reset"
+    assert [channel["name"] for channel in diagnosis.content["unused_channels"]] == ["humidity"]
+    assert "- channel humidity is not used: no effect follows" in str(diagnosis)
 
 
 def test_separate_files_are_diagnosed_like_one_file(recordings: Callable[[str], Path]):

@@ -63,33 +63,38 @@ def test_powers_match_their_definition(seed: int, size: int, lost: float, offset
     component = x[:, number * size : (number + 1) * size]
     angle = np.exp(-2j * np.pi * np.outer(np.arange(ordinates(size) + 1), np.arange(size)) / size)
     for row in range(2):
-        there = ~np.isnan(component[row])
-        if there.mean() < 0.25:
+        is_present = ~np.isnan(component[row])
+        if is_present.mean() < 0.25:
             assert np.isnan(blocks.power.values[row, number]).all()
             continue
-        mean = component[row][there].mean()
+        mean = component[row][is_present].mean()
         # Every Fourier coefficient is a sum c . y over the samples; c subtracts the mean.
         c = (
-            angle[:, there] * weights[there]
-            - (angle[:, there] @ weights[there])[:, None] / there.sum()
+            angle[:, is_present] * weights[is_present]
+            - (angle[:, is_present] @ weights[is_present])[:, None] / is_present.sum()
         )
-        ordinate, expected = c @ (component[row][there] - mean), (np.abs(c) ** 2).sum(axis=1)
+        ordinate, expected = c @ (component[row][is_present] - mean), (np.abs(c) ** 2).sum(axis=1)
         for band in range(edges.size - 1):
             k = slice(edges[band], edges[band + 1])
             assert blocks.power.values[row, number, band] == pytest.approx(
                 (np.abs(ordinate[k]) ** 2).sum() / expected[k].sum() / RATE, rel=1e-6
             )
         assert blocks["mean"].values[row, number] == pytest.approx(mean, rel=1e-12, abs=1e-9)
-    both = ~np.isnan(component).any(axis=0)
-    if both.mean() >= 0.25:
-        y = component[:, both] - component[:, both].mean(axis=1, keepdims=True)
-        c = angle[:, both] * weights[both] - (angle[:, both] @ weights[both])[:, None] / both.sum()
-        one, other = c @ y[0], c @ y[1]
+    in_both = ~np.isnan(component).any(axis=0)
+    if in_both.mean() >= 0.25:
+        y = component[:, in_both] - component[:, in_both].mean(axis=1, keepdims=True)
+        c = (
+            angle[:, in_both] * weights[in_both]
+            - (angle[:, in_both] @ weights[in_both])[:, None] / in_both.sum()
+        )
+        first, second = c @ y[0], c @ y[1]
         k = slice(edges[3], edges[4])
-        joint = (np.abs(one[k]) ** 2).sum() * (np.abs(other[k]) ** 2).sum()
-        coherency = (one[k] * other[k].conj()).sum() / np.sqrt(joint)
-        wanted = coherency * np.sqrt(blocks.power.values[:, number, 3].prod())
-        assert blocks.cross.values[0, number, 3] == pytest.approx(wanted, rel=1e-6, abs=1e-12)
+        joint = (np.abs(first[k]) ** 2).sum() * (np.abs(second[k]) ** 2).sum()
+        coherency = (first[k] * second[k].conj()).sum() / np.sqrt(joint)
+        expected_power = coherency * np.sqrt(blocks.power.values[:, number, 3].prod())
+        assert blocks.cross.values[0, number, 3] == pytest.approx(
+            expected_power, rel=1e-6, abs=1e-12
+        )
 
 
 @pytest.mark.parametrize(
@@ -100,8 +105,8 @@ def test_powers_of_white_noise_are_gamma_distributed(gaps: str):
     x = with_gaps(3.0 * rng.standard_normal(3000 * 400), gaps, rng)
     blocks = reduce_log(log_of(x), block="400samples")
     power, shape = blocks.power.values[0] / (9.0 / RATE), blocks["shape"].values[0]
-    there = np.isfinite(power[:, 0])
-    power, shape = power[there], shape[there]
+    is_present = np.isfinite(power[:, 0])
+    power, shape = power[is_present], shape[is_present]
     error = np.sqrt(1.0 / shape.mean(axis=0) / power.shape[0])
     assert np.all(np.abs(power.mean(axis=0) - 1.0) < 4.5 * error)
     spread = ((power - 1.0) ** 2 * shape).mean(axis=0)  # 1 for a gamma distribution of this shape
@@ -122,11 +127,11 @@ def test_covariance_of_bands_is_that_of_the_taper():
         :, 1 : ordinates(size) + 1
     ]
     power = np.add.reduceat(np.abs(spectrum) ** 2, band_edges(size)[:-1] - 1, axis=1)
-    found = np.cov((power / power.mean(axis=0)).T)
-    scatter = np.sqrt(np.outer(np.diag(found), np.diag(found)) / block_count)
-    np.fill_diagonal(found, 0.0)
-    assert np.abs((found - band_covariance(size)) / scatter).max() < 4.5
-    assert np.abs(found / scatter).max() > 6.0  # the test can fail
+    covariance = np.cov((power / power.mean(axis=0)).T)
+    scatter = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)) / block_count)
+    np.fill_diagonal(covariance, 0.0)
+    assert np.abs((covariance - band_covariance(size)) / scatter).max() < 4.5
+    assert np.abs(covariance / scatter).max() > 6.0  # the test can fail
 
 
 def test_full_blocks_lose_little_to_the_taper():
@@ -161,13 +166,13 @@ def test_random_gaps_mix_densities_by_the_share_of_neighbours(
     else:
         white, walk = (noise["N"] * 60.0) ** 2, (noise["K"] / 60.0) ** 2
         density += white + walk / omega**2
-        seen = fine[fine >= 0.05]  # block means are subtracted
-        mean = white + np.sum(walk / (2 * np.pi * seen) ** 2) * (fine[1] - fine[0]) / 25.0
+        frequencies = fine[fine >= 0.05]  # block means are subtracted
+        mean = white + np.sum(walk / (2 * np.pi * frequencies) ** 2) * (fine[1] - fine[0]) / 25.0
     share = float(blocks.neighbours.mean())
     assert share == pytest.approx(0.6, abs=0.01)
-    wanted = share * density + (1.0 - share) * mean
-    found = blocks.power.mean("block").values[0]
-    assert found[4:] == pytest.approx(wanted[4:], rel=tolerance)
+    expected_power = share * density + (1.0 - share) * mean
+    power = blocks.power.mean("block").values[0]
+    assert power[4:] == pytest.approx(expected_power[4:], rel=tolerance)
 
 
 def test_a_sine_is_in_its_band_and_line():
@@ -325,12 +330,12 @@ def test_temperatures_are_smoothed_within_blocks(own):
     t = np.arange(180_000) / RATE
     true = 20.0 + np.clip(t - 801.0, 0.0, 400.0) / 30.0
     every = 100 if own else 1
-    seen = true[::every] + (0.1 if own else 1.0) * rng.standard_normal(t[::every].size)
+    readings = true[::every] + (0.1 if own else 1.0) * rng.standard_normal(t[::every].size)
     if own:
-        log["temperature"] = ("time_temperature", seen, {"units": "degree_Celsius"})
+        log["temperature"] = ("time_temperature", readings, {"units": "degree_Celsius"})
         log = log.assign_coords(time_temperature=log.time.values[::every])
     else:
-        log["temperature"] = ("time", seen, {"units": "degree_Celsius"})
+        log["temperature"] = ("time", readings, {"units": "degree_Celsius"})
     log["supply_voltage"] = ("time", true, {"units": "V"})
     log["temperature_2"] = ("time_temperature_2", true[::900], {"units": "degree_Celsius"})
     log = log.assign_coords(time_temperature_2=log.time.values[::900])
@@ -354,9 +359,9 @@ def test_a_channel_is_missing_in_its_long_gaps():
     keep = np.r_[0:200, 400:600]
     log["temperature"] = ("time_temperature", np.full(400, 50.0), {"units": "degree_Celsius"})
     log = log.assign_coords(time_temperature=stamps[keep])
-    found = reduce_log(log, block="5s").channel_temperature.values
-    assert np.isnan(found[41:79]).all()
-    assert np.all(found[np.r_[0:39, 81:119]] == 50.0)
+    temperature = reduce_log(log, block="5s").channel_temperature.values
+    assert np.isnan(temperature[41:79]).all()
+    assert np.all(temperature[np.r_[0:39, 81:119]] == 50.0)
 
 
 def test_long_gaps_and_restarts_are_listed_in_seconds():
@@ -411,9 +416,9 @@ def test_an_angle_log_gives_the_statistics_of_its_rates():
     rates = np.random.default_rng(5).standard_normal((1, 30_000)) + 10.0
     angle = np.concatenate([[[0.0]], np.cumsum(rates, axis=1) / 3600.0 / RATE], axis=1)
     log = make_log(angle, rate=RATE, unit="deg", kind="angle")
-    one, other = reduce_log(log_of(rates)), reduce_log(log.chunk(time=7001))
-    assert other.power.values == pytest.approx(one.power.values, rel=1e-4)
-    assert other["mean"].values == pytest.approx(one["mean"].values, abs=1e-6)
+    from_rates, from_angles = reduce_log(log_of(rates)), reduce_log(log.chunk(time=7001))
+    assert from_angles.power.values == pytest.approx(from_rates.power.values, rel=1e-4)
+    assert from_angles["mean"].values == pytest.approx(from_rates["mean"].values, abs=1e-6)
 
 
 # --------------------------------------------------------------------------------
@@ -454,9 +459,9 @@ def test_an_invalid_log_is_refused():
 
 
 def test_progress_reaches_its_end():
-    told = []
+    calls = []
     reduce_log(
         log_of(np.random.default_rng(0).standard_normal((3, 50_000))),
-        progress=lambda *given: told.append(given),
+        progress=lambda *given: calls.append(given),
     )
-    assert told[-1][2] == told[-1][1] > 0.98 * 3 * 50_000
+    assert calls[-1][2] == calls[-1][1] > 0.98 * 3 * 50_000

@@ -58,12 +58,12 @@ def test_departures_are_from_the_median_of_surrounding_pairs(seed: int, lost: fl
     checked = 0
     for b, i in np.ndindex(*x.shape):
         pairs = [(x[b, i - k], x[b, i + k]) for k in range(1, 5) if i - k >= 0 and i + k < 60]
-        both = [pair for pair in pairs if not np.isnan(pair).any()]
+        complete = [pair for pair in pairs if not np.isnan(pair).any()]
         if np.isnan(x[b, i]):
             assert np.isnan(away[b, i])
-        elif len(both) > 1:
-            share = np.sqrt((1.0 + smaller[4]) / (1.0 + smaller[len(both)]))
-            assert away[b, i] == pytest.approx((x[b, i] - np.median(both)) * share, abs=1e-12)
+        elif len(complete) > 1:
+            share = np.sqrt((1.0 + smaller[4]) / (1.0 + smaller[len(complete)]))
+            assert away[b, i] == pytest.approx((x[b, i] - np.median(complete)) * share, abs=1e-12)
             checked += 1
     assert checked > 5
     assert histogram.sum() == np.isfinite(away).sum()
@@ -102,8 +102,8 @@ def test_gaussian_noise_has_the_expected_false_outliers():
 
 @pytest.mark.parametrize(("size", "least"), [(5.0, 0.2), (6.0, 0.5), (8.0, 0.9)])
 def test_spikes_are_detected_from_five_deviations(size, least):
-    seen = total(lambda rng: spiked(rng, size, 15), 10)
-    assert least * 150 <= seen <= 150
+    detected = total(lambda rng: spiked(rng, size, 15), 10)
+    assert least * 150 <= detected <= 150
 
 
 def test_a_large_outlier_counts_three_times_anywhere_in_a_block():

@@ -102,8 +102,8 @@ def test_chance_is_no_frame_that_was_sent_twice(values: str):
     blocks = reduce_log(log_of(x), block="10s")
     assert (int(blocks.repeats.sum()) == 0) == (values != "quantized")
     within = x.reshape(60, 1000)
-    again = (np.diff(within) == 0.0) & (within[:, 1:] != 0.0)
-    assert int(blocks.repeats.sum()) == int(again.sum())
+    is_repeat = (np.diff(within) == 0.0) & (within[:, 1:] != 0.0)
+    assert int(blocks.repeats.sum()) == int(is_repeat.sum())
 
 
 def test_held_samples_do_not_make_outliers_of_the_others():

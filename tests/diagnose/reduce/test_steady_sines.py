@@ -21,10 +21,10 @@ LINES = RATE / LENGTH * np.arange(1, LENGTH // 2)
 
 
 def search(values, *, batch=LENGTH):
-    found = SineSearch(len(values), values.shape[1] // LENGTH, LENGTH, RATE)
+    sine_search = SineSearch(len(values), values.shape[1] // LENGTH, LENGTH, RATE)
     for begin in range(0, values.shape[1], batch):
-        found.add(values[:, begin : begin + batch])
-    return found.strongest(LINES)
+        sine_search.add(values[:, begin : begin + batch])
+    return sine_search.strongest(LINES)
 
 
 def wave(frequency, amplitude, size=SIZE, phase=0.7):
@@ -66,9 +66,9 @@ def test_constant_axis_has_no_sine():
     noise = np.random.default_rng(4).standard_normal((3, SIZE))
     expected = search(noise[:2])["sine_nats"]
     noise[2] = 5.0
-    found = search(noise)["sine_nats"]
-    assert np.isneginf(found[2]).all()
-    np.testing.assert_allclose(found[:2], expected, atol=1e-6)
+    sines = search(noise)["sine_nats"]
+    assert np.isneginf(sines[2]).all()
+    np.testing.assert_allclose(sines[:2], expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("frequency", [0.0721, 0.1043, 0.70713, 1.3, 4.61])
@@ -82,10 +82,10 @@ def test_finds_a_sine_that_blocks_do_not_show(frequency):
     place = int(np.argmin(np.abs(blocks["line_frequency"].values - frequency)))
     by_blocks = line_evidence(blocks["line_power"].values[None], blocks["line_weight"].values)[0]
     assert by_blocks[:, place].max() < 10.0
-    found = blocks.isel(line=place)
-    assert (found["sine_nats"][:2].values > 12.0).all()
-    assert found["sine_nats"][2] < 0.0
-    assert abs(found["sine_frequency"] - frequency) < 0.3 * RATE / SIZE
+    line = blocks.isel(line=place)
+    assert (line["sine_nats"][:2].values > 12.0).all()
+    assert line["sine_nats"][2] < 0.0
+    assert abs(line["sine_frequency"] - frequency) < 0.3 * RATE / SIZE
     assert blocks["sine_nats"].drop_isel(line=[place - 1, place, place + 1]).max() < 2.0
 
 
@@ -95,11 +95,11 @@ def test_finds_a_line_whose_phase_wanders():
     amplitude = np.sqrt(4.0 * 120.0 / SIZE)
     phase = 2.0 * np.pi * 1.303 * np.arange(SIZE) / RATE + drift
     noise = rng.standard_normal((1, SIZE)) + amplitude * np.sin(phase)
-    found = search(noise)
-    place = int(found["sine_nats"][0].argmax())
-    assert found["sine_nats"][0, place] > 10.0
-    assert abs(found["sine_frequency"][place] - 1.303) < 2.0 * found["sine_resolution"][place]
-    assert found["sine_resolution"][place] > 2.0 * RATE / SIZE  # seen in the parts of the record
+    sines = search(noise)
+    place = int(sines["sine_nats"][0].argmax())
+    assert sines["sine_nats"][0, place] > 10.0
+    assert abs(sines["sine_frequency"][place] - 1.303) < 2.0 * sines["sine_resolution"][place]
+    assert sines["sine_resolution"][place] > 2.0 * RATE / SIZE  # seen in the parts of the record
 
 
 def test_amplitude_has_the_error_it_states():
@@ -110,9 +110,9 @@ def test_amplitude_has_the_error_it_states():
         noise = rng.standard_normal((1, SIZE)) + wave(
             frequency, amplitude, phase=rng.uniform(0.0, 6.0)
         )
-        found = search(noise)
-        place = int(found["sine_nats"][0].argmax())
-        square, stderr = found["sine_square"][0, place], found["sine_square_stderr"][0, place]
+        sines = search(noise)
+        place = int(sines["sine_nats"][0].argmax())
+        square, stderr = sines["sine_square"][0, place], sines["sine_square_stderr"][0, place]
         errors.append((square - amplitude**2) / stderr)
     assert abs(np.mean(errors)) < 0.35
     assert 0.7 < np.std(errors) < 1.3
@@ -135,9 +135,9 @@ def test_short_records_and_silent_axes_have_no_search():
     assert np.isneginf(search(np.zeros((1, 24 * LENGTH // 20)))["sine_nats"]).all()
     noise = np.random.default_rng(6).standard_normal((2, SIZE))
     noise[1] = np.nan
-    found = search(noise)["sine_nats"]
-    assert np.isneginf(found[1]).all()
-    assert np.isfinite(found[0]).any()
+    sines = search(noise)["sine_nats"]
+    assert np.isneginf(sines[1]).all()
+    assert np.isfinite(sines[0]).any()
 
 
 def test_weak_sine_is_named_with_frequency_and_amplitude():
@@ -145,9 +145,9 @@ def test_weak_sine_is_named_with_frequency_and_amplitude():
     amplitude = np.sqrt(4.0 * 60.0 / SIZE)
     noise = rng.standard_normal((1, SIZE)) + wave(1.7321, amplitude)
     blocks = reduce_log(make_log(noise, rate=RATE, unit="deg/h"))
-    found = name_effects(blocks, *nulls(blocks, 40)).identified
-    assert [one.effect for one in found] == ["spectral_line"]
-    place = found[0].components[0].place
+    identified = name_effects(blocks, *nulls(blocks, 40)).identified
+    assert [identification.effect for identification in identified] == ["spectral_line"]
+    place = identified[0].components[0].place
     (size, stderr), (frequency, error) = estimate_line(blocks, "x", place)
     assert abs(size - amplitude) < 3.0 * stderr < 0.5 * amplitude
     assert abs(frequency - 1.7321) < 2.0 * error < 0.002
@@ -162,7 +162,7 @@ def test_a_slow_sine_counts_by_its_phase(frequency, slow):
     place = int(blocks["sine_nats"].values[0].argmax())
     line = find_statistic("spectral_line")
     variant = Variant({}, ("amplitude",), np.empty(0), squared=True)
-    found = Component(
+    component = Component(
         Candidate("spectral_line", line, (), (variant,)), variant, ("x",), 50.0, place
     )
-    assert line.is_only_in_phase(found, blocks) is slow
+    assert line.is_only_in_phase(component, blocks) is slow

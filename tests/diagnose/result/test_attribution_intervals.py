@@ -26,29 +26,35 @@ def turning():
 
 def identification(blocks, effect, statistic):
     candidates, _ = effect_candidates(blocks, COEFFICIENT)
-    one = next(
-        one for one in candidates if one.effect == effect and one.statistic.name == statistic
+    candidate = next(
+        candidate
+        for candidate in candidates
+        if candidate.effect == effect and candidate.statistic.name == statistic
     )
-    component = Component(one, one.variants[0], ("x",), 50.0, place=0)
-    return Identification(effect, one.driver, ("x",), (component,), 50.0, 8.0)
+    component = Component(candidate, candidate.variants[0], ("x",), 50.0, place=0)
+    return Identification(effect, candidate.driver, ("x",), (component,), 50.0, 8.0)
 
 
 def test_rotation_line_acts_while_the_tool_rotates(turning):
-    found = join_blocks(
+    intervals = join_blocks(
         active_blocks(identification(turning, "rotation_line", "rotation_order"), turning),
         turning["begin"].values,
         turning["end"].values,
     )
-    assert found == [(1200.0, 3600.0)]
+    assert intervals == [(1200.0, 3600.0)]
 
 
 def test_effect_present_at_rest_acts_at_rest(turning):
-    one = identification(turning, "earth_rate", "rotation_order")
-    both = replace(
-        one, components=(*one.components, *identification(turning, "earth_rate", "mean").components)
+    rotation = identification(turning, "earth_rate", "rotation_order")
+    combined = replace(
+        rotation,
+        components=(
+            *rotation.components,
+            *identification(turning, "earth_rate", "mean").components,
+        ),
     )
     assert join_blocks(
-        active_blocks(both, turning), turning["begin"].values, turning["end"].values
+        active_blocks(combined, turning), turning["begin"].values, turning["end"].values
     ) == [(0.0, 3600.0)]
 
 
@@ -63,13 +69,13 @@ def test_effect_of_a_mostly_active_channel_acts_while_it_is_active(
     assert span == (1200.0, 3600.0)
 
 
-@pytest.mark.parametrize(("level", "there"), [(0.5, True), (0.2, False)])
-def test_a_tenth_of_the_largest_counts_as_acting(level, there):
+@pytest.mark.parametrize(("level", "is_active"), [(0.5, True), (0.2, False)])
+def test_a_tenth_of_the_largest_counts_as_acting(level, is_active):
     blocks = record([])
     g = np.zeros(blocks.sizes["block"])
     g[40:60], g[100:120] = 5.0, 5.0 * level
     shaken = blocks.assign(channel_vibration=blocks["channel_vibration"].copy(data=g))
-    found = active_blocks(identification(shaken, "vibration_rectification", "mean"), shaken)
+    active = active_blocks(identification(shaken, "vibration_rectification", "mean"), shaken)
     np.testing.assert_array_equal(
-        np.flatnonzero(found), [*range(40, 60), *(range(100, 120) if there else ())]
+        np.flatnonzero(active), [*range(40, 60), *(range(100, 120) if is_active else ())]
     )

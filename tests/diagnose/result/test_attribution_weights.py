@@ -32,14 +32,18 @@ NAMES = (
 
 
 def _make_identification(candidates, effect, statistic, column):
-    one = next(one for one in candidates if (one.effect, one.statistic.name) == (effect, statistic))
+    candidate = next(
+        candidate
+        for candidate in candidates
+        if (candidate.effect, candidate.statistic.name) == (effect, statistic)
+    )
     variant = next(
-        one
-        for one in one.variants
-        if one.columns == (column,) and one.values.get("exponent", 1.0) == 1.0
+        variant
+        for variant in candidate.variants
+        if variant.columns == (column,) and variant.values.get("exponent", 1.0) == 1.0
     )
     return Identification(
-        effect, one.driver, ("x",), (Component(one, variant, ("x",), 50.0),), 50.0, 8.0
+        effect, candidate.driver, ("x",), (Component(candidate, variant, ("x",), 50.0),), 50.0, 8.0
     )
 
 
@@ -91,16 +95,16 @@ def test_leaving_out_an_effect_keeps_the_sizes_of_the_others(shaken):
 
 def test_mismatch_lists_the_effects_that_it_needs(shaken):
     blocks, baseline, identifications, null = shaken
-    found = locate_mismatches(blocks, baseline, null)
+    regions = locate_mismatches(blocks, baseline, null)
     after = predict_baseline(identifications, baseline)
 
     def attributed(statistic, **options):
         lists = attribute_mismatches(
-            found, identifications.identified, blocks, after, null, level=0.005, **options
+            regions, identifications.identified, blocks, after, null, level=0.005, **options
         )
         return {
             frozenset(names)
-            for region, names in zip(found["view"].values, lists, strict=True)
+            for region, names in zip(regions["view"].values, lists, strict=True)
             if region == statistic
         }
 
@@ -118,14 +122,16 @@ def test_blocks_with_anomalous_samples_are_attributed_to_them(shaken):
     blocks, baseline, identifications, null = shaken
     loud, _, spikes = identifications.identified
     assert find_anomalous_blocks(spikes.components[0], blocks).sum() == 2
-    found = locate_mismatches(blocks, baseline, null)
+    regions = locate_mismatches(blocks, baseline, null)
     after = predict_baseline(identifications, baseline)
-    one = attribute_mismatches(
-        found, [loud], blocks, after, null, level=0.005
+    by_noise = attribute_mismatches(
+        regions, [loud], blocks, after, null, level=0.005
     )  # the noisiest two blocks are still there
-    both = attribute_mismatches(found, identifications.identified, blocks, after, null, level=0.005)
-    davar = found["view"].values.tolist().index("davar")
-    assert (one[davar], "vibration_noise" in both[davar]) == ([], True)
+    by_all = attribute_mismatches(
+        regions, identifications.identified, blocks, after, null, level=0.005
+    )
+    davar = regions["view"].values.tolist().index("davar")
+    assert (by_noise[davar], "vibration_noise" in by_all[davar]) == ([], True)
 
 
 @pytest.mark.parametrize(("step", "attributed"), [(0.3, ["bias_jump"]), (0.0, [])])
@@ -139,12 +145,19 @@ def test_jump_explains_the_mean_on_either_side(shaken, step, attributed):
         mean=blocks["mean"] + step * np.stack([after_it, 0 * after_it, 0 * after_it])
     )
     candidates, reasons = effect_candidates(moved, COEFFICIENT)
-    one = next(
-        one for one in candidates if (one.effect, one.statistic.name) == ("bias_jump", "mean")
+    candidate = next(
+        candidate
+        for candidate in candidates
+        if (candidate.effect, candidate.statistic.name) == ("bias_jump", "mean")
     )
-    variant = next(variant for variant in one.variants if variant.values["at"] == 1800.0)
+    variant = next(variant for variant in candidate.variants if variant.values["at"] == 1800.0)
     identification = Identification(
-        "bias_jump", one.driver, ("x",), (Component(one, variant, ("x",), 50.0),), 50.0, 8.0
+        "bias_jump",
+        candidate.driver,
+        ("x",),
+        (Component(candidate, variant, ("x",), 50.0),),
+        50.0,
+        8.0,
     )
     state = condition_on(initial_state(moved, baseline), list(identification.components))
     identifications = Identifications(
@@ -207,13 +220,13 @@ def _scores_without(**sizes):
     """Scores left without some effects, where sizes add to 1; a mismatch from 6 on."""
 
     def left(out):
-        return 1.0 + sum(sizes[one.replace(" ", "_")] for one in out), 6.0
+        return 1.0 + sum(sizes[name.replace(" ", "_")] for name in out), 6.0
 
     return left
 
 
 @pytest.mark.parametrize(
-    ("sizes", "kept"),
+    ("sizes", "needed"),
     [
         ((18.0, 0.4), [0]),  # the second is not missed
         ((12.0, 6.0), [0, 1]),  # without any of the two it is a mismatch
@@ -222,10 +235,10 @@ def _scores_without(**sizes):
         ((0.0, 0.0), [0]),  # one of them does it for the two
     ],
 )
-def test_effect_is_needed_alone_or_by_a_fair_share(sizes, kept):
+def test_effect_is_needed_alone_or_by_a_fair_share(sizes, needed):
     shown = _make_shown("power", "mean")
-    found = needed_effects(BOX, shown, _scores_without(effect_0=sizes[0], effect_1=sizes[1]))
-    assert found == [f"effect {number}" for number in kept]
+    names = needed_effects(BOX, shown, _scores_without(effect_0=sizes[0], effect_1=sizes[1]))
+    assert names == [f"effect {number}" for number in needed]
 
 
 def test_effect_not_contained_in_the_statistic_stays():
@@ -283,21 +296,21 @@ def test_line_on_two_axes_explains_their_covariance(shaken, axes, attributed):
     shared = quiet.assign(cross=cross)
     place = int(np.abs(shared["line_frequency"].values - 2.0).argmin())
     candidates, _ = effect_candidates(shared, COEFFICIENT)
-    one = next(
-        one
-        for one in candidates
-        if (one.effect, one.statistic.name) == ("spectral_line", "spectral_line")
+    candidate = next(
+        candidate
+        for candidate in candidates
+        if (candidate.effect, candidate.statistic.name) == ("spectral_line", "spectral_line")
     )
     identification = Identification(
         "spectral_line",
         (),
         tuple(axes),
-        tuple(Component(one, one.variants[0], (axis,), 50.0, place) for axis in axes),
+        tuple(Component(candidate, candidate.variants[0], (axis,), 50.0, place) for axis in axes),
         50.0,
         8.0,
     )
-    found = locate_mismatches(shared, baseline, null)
-    found = found.isel(mismatch=found["view"].values == "cross_axis")
-    assert found.sizes["mismatch"] >= 1
-    lists = attribute_mismatches(found, [identification], shared, baseline, null, level=0.005)
+    regions = locate_mismatches(shared, baseline, null)
+    regions = regions.isel(mismatch=regions["view"].values == "cross_axis")
+    assert regions.sizes["mismatch"] >= 1
+    lists = attribute_mismatches(regions, [identification], shared, baseline, null, level=0.005)
     assert all(names == attributed for names in lists)

@@ -76,7 +76,7 @@ def test_docs_explain_every_key():
 
 def _places(value: Any, place: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """Every key of the content, apart from what may have any name."""
-    found = []
+    places = []
     items = (
         value.items()
         if isinstance(value, dict)
@@ -89,9 +89,9 @@ def _places(value: Any, place: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
             len(place) > 1 and place[-2] == "noise"
         )
         if isinstance(value, dict) and not free:
-            found.append((*place, key))
-        found += _places(item, (*place, key))
-    return found
+            places.append((*place, key))
+        places += _places(item, (*place, key))
+    return places
 
 
 @pytest.mark.parametrize("place", _places(content()), ids=lambda place: ".".join(map(str, place)))
@@ -224,12 +224,12 @@ def test_folder_of_four_files_round_trips(tmp_path: Path):
     assert [path.name for path in files] == list(FILES)
     assert sorted(path.name for path in (tmp_path / "found").iterdir()) == sorted(FILES)
     assert [path.name for path in tmp_path.iterdir()] == ["found"]
-    again = open_diagnosis(tmp_path / "found")
-    assert again.content == json.loads(made.to_json())
-    assert again.model == made.model
+    opened = open_diagnosis(tmp_path / "found")
+    assert opened.content == json.loads(made.to_json())
+    assert opened.model == made.model
     for name in made.surfaces.data_vars:
         np.testing.assert_array_equal(
-            again.surfaces[name].transpose(*made.surfaces[name].dims).values,
+            opened.surfaces[name].transpose(*made.surfaces[name].dims).values,
             made.surfaces[name].values,
             err_msg=str(name),
         )
@@ -371,10 +371,10 @@ def test_page_escapes_names(tmp_path: Path):
 
 @pytest.mark.parametrize("axes", ["x", pytest.param("xyz", marks=pytest.mark.slow)])
 def test_page_has_all_figures_for_any_number_of_axes(tmp_path: Path, axes: str):
-    one = content()
-    one["recording"]["axes"] = list(axes)
+    table = content()
+    table["recording"]["axes"] = list(axes)
     page = write_diagnosis_report(
-        Diagnosis(one, surfaces(axes=axes), model()), tmp_path / "report.html"
+        Diagnosis(table, surfaces(axes=axes), model()), tmp_path / "report.html"
     )
     assert page.read_text(encoding="utf-8").count("<img") == 5
 
@@ -405,7 +405,7 @@ def test_every_effect_has_a_plain_name_and_a_next_measurement():
 
 
 @pytest.mark.parametrize(
-    ("statistic", "what"),
+    ("statistic", "detail"),
     [
         ("power", "avar"),
         ("mean", "mean"),
@@ -420,9 +420,9 @@ def test_every_effect_has_a_plain_name_and_a_next_measurement():
     ],
 )
 @pytest.mark.parametrize("axes", [["x"], ["x", "y"]])
-def test_every_statistic_has_a_sentence(statistic: str, what: str, axes: list[str]):
+def test_every_statistic_has_a_sentence(statistic: str, detail: str, axes: list[str]):
     region = {
-        "statistic": statistic, "what": what, "axes": axes, "begin": 0.0, "end": 3600.0,
+        "statistic": statistic, "what": detail, "axes": axes, "begin": 0.0, "end": 3600.0,
         "tau_min_s": 0.01, "tau_max_s": 0.01, "ratio": 2.0,
         "sign": -1, "p_value": 0.002, "estimate": -0.2, "frequency": 13.0,
     }  # fmt: skip
@@ -443,14 +443,14 @@ def test_format_of_times_and_probabilities():
 
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_every_verdict_has_a_summary(verdict: str):
-    one = content() | {"verdict": verdict}
+    table = content() | {"verdict": verdict}
     if verdict in ("no mismatch", "unknown"):
-        one |= {"effects": []}
+        table |= {"effects": []}
     if verdict == "no mismatch":
-        one |= {"mismatches": []}
+        table |= {"mismatches": []}
     if verdict == "partly explained":
-        one |= {"unexplained": [1]}
-    text = summary(one)
+        table |= {"unexplained": [1]}
+    text = summary(table)
     assert text.endswith(".")
     assert ("vibration" in text) == (verdict in ("explained", "partly explained"))
 
@@ -470,16 +470,16 @@ def test_printed_diagnosis_has_verdict_and_sentences():
 @plain_pages
 def test_page_with_many_mismatches_lists_probabilities_in_a_column(tmp_path: Path):
     """The phrase on noise alone is not repeated in 24 sentences; each mismatch has its number."""
-    one = diagnosis()
-    region = one.content["mismatches"][0] | {"p_value": 1e-12, "explained_by": []}
+    made = diagnosis()
+    region = made.content["mismatches"][0] | {"p_value": 1e-12, "explained_by": []}
     region["statement"] = (
         "Axis x is noisier than the simulation "
         "(noise alone would show this in fewer than 1 in a million such records)."
     )
     regions = [region | {"id": number} for number in range(1, 25)]
     many = replace(
-        one,
-        content=one.content
+        made,
+        content=made.content
         | {"mismatches": regions, "unexplained": list(range(1, 25)), "effects": []},
     )
     text = write_diagnosis_report(many, tmp_path / "page.html").read_text(encoding="utf-8")

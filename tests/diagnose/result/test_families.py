@@ -42,8 +42,8 @@ def test_many_lines_without_a_family_are_one_finding():
     comb = [10.0, 20.0, 30.0, 40.0]
     unrelated = [7.013, 13.77, 23.31, 36.9]
     few, many = (
-        group_unrelated(find_families([*comb, *some], **SPECTRUM))
-        for some in (unrelated[:3], unrelated)
+        group_unrelated(find_families([*comb, *lines_without_family], **SPECTRUM))
+        for lines_without_family in (unrelated[:3], unrelated)
     )
     assert few[4:] == [None] * 3
     assert set(many) == {"harmonics of 10 Hz", "lines without a common spacing"}
@@ -65,11 +65,15 @@ def test_a_family_is_one_finding_in_text_and_report(
         }
         for f in (20.0, 10.0, 40.0)
     ]
-    one = replace(diagnosis(), content=diagnosis().content | {"effects": lines, "mismatches": []})
-    told = "It is the strongest of the harmonics of 10 Hz; the others are at 10 and 40 Hz."
-    page = write_diagnosis_report(one, tmp_path / "page.html").read_text(encoding="utf-8")
-    assert str(one).count("- spectral_line:") == 1
+    comb_diagnosis = replace(
+        diagnosis(), content=diagnosis().content | {"effects": lines, "mismatches": []}
+    )
+    sentence = "It is the strongest of the harmonics of 10 Hz; the others are at 10 and 40 Hz."
+    page = write_diagnosis_report(comb_diagnosis, tmp_path / "page.html").read_text(
+        encoding="utf-8"
+    )
+    assert str(comb_diagnosis).count("- spectral_line:") == 1
     assert page.count('<div class="card">') == 1
-    assert told in str(one)
-    assert told in page
-    assert "(harmonics of 10 Hz, 3 lines)" in str(one)
+    assert sentence in str(comb_diagnosis)
+    assert sentence in page
+    assert "(harmonics of 10 Hz, 3 lines)" in str(comb_diagnosis)

@@ -29,30 +29,32 @@ def _with_effects(base, *, epsilon=0.0, height=0.0):
     return after
 
 
-def _add_effects(found, *, epsilon=0.0, height=0.0):
-    found["power"][0, ON] *= 1.0 + epsilon
-    found["mean"][1, ON] += height
+def _add_effects(blocks, *, epsilon=0.0, height=0.0):
+    blocks["power"][0, ON] *= 1.0 + epsilon
+    blocks["mean"][1, ON] += height
 
 
 def test_no_gain_and_good_fit_without_effects():
-    base, found = _record()
-    result = held_out(found, base, base)
+    base, blocks = _record()
+    result = held_out(blocks, base, base)
     assert result["log_likelihood_gain"] == 0.0
     assert result["forecast_gain"] == 0.0
     assert result["misfit_before"] == result["misfit_after"]
     assert result["blocks"] == 36
-    several = [held_out(found, base, base) for _, found in map(_record, (11, 12, 13))]
-    assert np.mean([one["misfit_before"] for one in several]) == pytest.approx(1.0, abs=0.06)
-    assert 0.94 < np.mean([one["coverage95_before"] for one in several]) < 0.96
-    assert np.mean([one["mean_misfit_before"] for one in several]) == pytest.approx(1.0, abs=0.4)
+    results = [held_out(blocks, base, base) for _, blocks in map(_record, (11, 12, 13))]
+    assert np.mean([result["misfit_before"] for result in results]) == pytest.approx(1.0, abs=0.06)
+    assert 0.94 < np.mean([result["coverage95_before"] for result in results]) < 0.96
+    assert np.mean([result["mean_misfit_before"] for result in results]) == pytest.approx(
+        1.0, abs=0.4
+    )
 
 
 def test_gain_of_raised_noise_follows_the_gamma_law():
-    base, found = _record(2)
+    base, blocks = _record(2)
     epsilon = 0.2
-    _add_effects(found, epsilon=epsilon)
-    result = held_out(found, base, _with_effects(base, epsilon=epsilon))
-    shape = found["shape"].values[0, ON].sum()
+    _add_effects(blocks, epsilon=epsilon)
+    result = held_out(blocks, base, _with_effects(base, epsilon=epsilon))
+    shape = blocks["shape"].values[0, ON].sum()
     expected = shape * (epsilon - np.log1p(epsilon))
     scatter = np.sqrt(shape) * epsilon  # of sum n (P / S) epsilon / (1 + epsilon)
     assert result["log_likelihood_gain"] == pytest.approx(expected, abs=4.0 * scatter)
@@ -63,10 +65,10 @@ def test_gain_of_raised_noise_follows_the_gamma_law():
 
 
 def test_gain_of_a_mean_follows_the_normal_law():
-    base, found = _record(3)
+    base, blocks = _record(3)
     height = 0.15
-    _add_effects(found, height=height)
-    result = held_out(found, base, _with_effects(base, height=height))
+    _add_effects(blocks, height=height)
+    result = held_out(blocks, base, _with_effects(base, height=height))
     expected = 0.5 * height**2 / VARIANCE * 30 * (1.0 - 30.0 / 180.0)
     assert result["log_likelihood_gain"] == pytest.approx(expected, rel=0.35)
     assert result["mean_misfit_before"] > 3.0 * result["mean_misfit_after"]
@@ -77,25 +79,27 @@ def test_gain_of_a_mean_follows_the_normal_law():
 def test_error_of_a_gain_is_its_scatter_over_records():
     gains, errors = [], []
     for seed in range(16):
-        base, found = _record(200 + seed)
-        _add_effects(found, epsilon=0.15, height=0.1)
-        result = held_out(found, base, _with_effects(base, epsilon=0.15, height=0.1))
+        base, blocks = _record(200 + seed)
+        _add_effects(blocks, epsilon=0.15, height=0.1)
+        result = held_out(blocks, base, _with_effects(base, epsilon=0.15, height=0.1))
         gains.append(result["log_likelihood_gain"])
         errors.append(result["stderr"])
     assert 0.6 < np.std(gains, ddof=1) / np.mean(errors) < 1.6
 
 
 def test_likelihood_of_means_agrees_with_dense_algebra():
-    base, found = _record(4)
+    base, blocks = _record(4)
     known = np.ones(180, dtype=bool)
     known[40:52] = False
     known[100:110] = False  # held out by another stretch of the same fold
     twice = base.assign(mean_variance=base["mean_variance"] * 2.0)
     held = (np.arange(180) >= 40) & (np.arange(180) < 52)
-    seen = log_likelihood(found, twice, known, held) - log_likelihood(found, base, known, held)
+    difference = log_likelihood(blocks, twice, known, held) - log_likelihood(
+        blocks, base, known, held
+    )
     dense = 0.0
     for axis in range(3):
-        y, rest = found["mean"].values[axis, 40:52], found["mean"].values[axis, known]
+        y, rest = blocks["mean"].values[axis, 40:52], blocks["mean"].values[axis, known]
         for factor, sign in ((2.0, 1.0), (1.0, -1.0)):
             covariance = factor * VARIANCE * (np.eye(12) + 1.0 / rest.size)
             away = y - rest.mean()
@@ -104,45 +108,47 @@ def test_likelihood_of_means_agrees_with_dense_algebra():
                 * sign
                 * (away @ np.linalg.solve(covariance, away) + np.linalg.slogdet(covariance)[1])
             )
-    assert seen == pytest.approx(dense, rel=1e-6)
+    assert difference == pytest.approx(dense, rel=1e-6)
 
 
 def test_likelihood_of_cross_spectra_is_that_of_the_wishart_law():
     base = baseline(axes="xy")
-    found = records(base, 1, np.random.default_rng(5)).isel(record=0)
+    blocks = records(base, 1, np.random.default_rng(5)).isel(record=0)
     share = 0.3
-    found["cross"] = found["cross"] + share * LEVEL
+    blocks["cross"] = blocks["cross"] + share * LEVEL
     after = base.copy()
-    after["cross"] = (("pair", "block", "band"), np.full(found["cross"].shape, share * LEVEL + 0j))
+    after["cross"] = (("pair", "block", "band"), np.full(blocks["cross"].shape, share * LEVEL + 0j))
     known = np.ones(180, dtype=bool)
     known[20:30] = False
-    seen = log_likelihood(found, after, known, ~known) - log_likelihood(found, base, known, ~known)
+    difference = log_likelihood(blocks, after, known, ~known) - log_likelihood(
+        blocks, base, known, ~known
+    )
     model = LEVEL * np.array([[1.0, share], [share, 1.0]])
     expected = 0.0
     for block in range(20, 30):
-        for band in range(found.sizes["band"]):
-            c = complex(found["cross"].values[0, block, band])
-            powers = found["power"].values[:, block, band]
+        for band in range(blocks.sizes["band"]):
+            c = complex(blocks["cross"].values[0, block, band])
+            powers = blocks["power"].values[:, block, band]
             w = np.array([[powers[0], c], [c.conjugate(), powers[1]]])
-            n = found["shape"].values[0, block, band]
+            n = blocks["shape"].values[0, block, band]
             for s, sign in ((model, 1.0), (LEVEL * np.eye(2), -1.0)):
                 expected -= (
                     sign * n * (np.linalg.slogdet(s)[1] + np.trace(np.linalg.solve(s, w)).real)
                 )
-    assert seen == pytest.approx(expected, rel=1e-9)
-    assert seen > 0.0
+    assert difference == pytest.approx(expected, rel=1e-9)
+    assert difference > 0.0
 
 
 def test_models_are_not_fitted_to_held_out_blocks():
-    base, found = _record(6)
-    seen: list[np.ndarray] = []
+    base, blocks = _record(6)
+    fitted_blocks: list[np.ndarray] = []
 
     def train(known):
-        seen.append(known.copy())
+        fitted_blocks.append(known.copy())
         return base
 
-    held_out(found, base, train)
-    folds, forecast = seen[:4], seen[4]
+    held_out(blocks, base, train)
+    folds, forecast = fitted_blocks[:4], fitted_blocks[4]
     assert (
         np.sum([~known for known in folds], axis=0).tolist() == [1] * 180
     )  # each block is held out once
@@ -155,96 +161,96 @@ def test_effect_fitted_to_noise_loses():
     without it."""
     gains = []
     for seed in range(8):
-        base, found = _record(100 + seed)
+        base, blocks = _record(100 + seed)
         template = np.sin(np.arange(180) / 9.0)
 
-        def fit(known, base=base, found=found, template=template):
-            x, y = template[known] - template[known].mean(), found["mean"].values[0, known]
+        def fit(known, base=base, blocks=blocks, template=template):
+            x, y = template[known] - template[known].mean(), blocks["mean"].values[0, known]
             after = base.copy(deep=True)
             after["known_mean"][0] = (x @ y) / (x @ x) * template
             return after
 
-        gains.append(held_out(found, base, fit)["log_likelihood_gain"])
+        gains.append(held_out(blocks, base, fit)["log_likelihood_gain"])
     assert np.mean(gains) < 0.1
     assert max(gains) < 4.0
 
 
 @pytest.mark.parametrize(("period", "best"), [(36, 18), (180, 45)])  # blocks
 def test_slow_drift_gains_more_on_long_stretches(period, best):
-    base, found = _record(9, walk=0.1)
+    base, blocks = _record(9, walk=0.1)
     after = base.copy(deep=True)
     drift = 0.3 * np.sin(2.0 * np.pi * np.arange(180) / period)
-    found["mean"][0] += drift
+    blocks["mean"][0] += drift
     after["known_mean"][0] += drift
 
     def on(length):
         fold = np.arange(180) // length % 4
         return sum(
-            log_likelihood(found, after, fold != k, fold == k)
-            - log_likelihood(found, base, fold != k, fold == k)
+            log_likelihood(blocks, after, fold != k, fold == k)
+            - log_likelihood(blocks, base, fold != k, fold == k)
             for k in range(4)
         )
 
-    evidence_nats = held_out(found, base, after)["log_likelihood_gain"]
+    evidence_nats = held_out(blocks, base, after)["log_likelihood_gain"]
     assert evidence_nats == pytest.approx(on(best))
     assert on(best) == max(on(5), on(18), on(45))
     assert evidence_nats > on(5) + 1.0
 
 
 def test_forecast_gains_if_the_effect_continues():
-    base, found = _record(7)
+    base, blocks = _record(7)
     after = base.copy(deep=True)
     wave = 0.1 * np.sin(2.0 * np.pi * np.arange(180) / 60.0)
-    found["mean"][0] += wave
+    blocks["mean"][0] += wave
     after["known_mean"][0] += wave
-    evidence_nats = held_out(found, base, after)["forecast_gain"]
+    evidence_nats = held_out(blocks, base, after)["forecast_gain"]
     tail = wave[126:]
     assert evidence_nats == pytest.approx(0.5 * (tail**2).sum() / VARIANCE, rel=0.5)
 
 
 def test_gain_of_other_statistics_is_added():
-    base, found = _record()
-    result = held_out(found, base, base, more_gain=3.5)
+    base, blocks = _record()
+    result = held_out(blocks, base, base, more_gain=3.5)
     assert (result["log_likelihood_gain"], result["stderr"]) == (3.5, pytest.approx(np.sqrt(7.0)))
 
 
 def test_allan_variance_is_compared_with_the_shown_model():
-    base, found = _record()
-    _add_effects(found, epsilon=0.5)
+    base, blocks = _record()
+    _add_effects(blocks, epsilon=0.5)
     whole = _with_effects(base, epsilon=0.5)
-    seen, blind = (
-        held_out(found, base, base, more_gain=3.5, shown=whole),
-        held_out(found, base, base, more_gain=3.5),
+    with_model, blind = (
+        held_out(blocks, base, base, more_gain=3.5, shown=whole),
+        held_out(blocks, base, base, more_gain=3.5),
     )
-    assert seen["log_likelihood_gain"] == blind["log_likelihood_gain"] == pytest.approx(3.5)
-    assert abs(seen["misfit_after"] - 1.0) < 0.3 * abs(blind["misfit_after"] - 1.0)
+    assert with_model["log_likelihood_gain"] == blind["log_likelihood_gain"] == pytest.approx(3.5)
+    assert abs(with_model["misfit_after"] - 1.0) < 0.3 * abs(blind["misfit_after"] - 1.0)
 
 
 def test_stretches_cover_the_record_and_short_records_are_refused():
-    _, found = _record()
-    cut = cut_stretches(found)
+    _, blocks = _record()
+    cut = cut_stretches(blocks)
     assert cut.first[0] == 0
     assert cut.stop[-1] == 180
     np.testing.assert_array_equal(cut.stop[:-1], cut.first[1:])
     with pytest.raises(OptionError, match="10 blocks, and 12 are needed"):
-        cut_stretches(found.isel(block=slice(10)))
+        cut_stretches(blocks.isel(block=slice(10)))
 
 
 def test_gaps_do_not_change_the_coverage():
     base = baseline(missing=0.3)
-    found = records(base, 1, np.random.default_rng(8), missing=0.3).isel(record=0)
+    blocks = records(base, 1, np.random.default_rng(8), missing=0.3).isel(record=0)
     for name in ("mean", "power", "kurtosis"):
-        found[name][:, 30:50] = np.nan
-    found["samples"] = found["samples"].where((np.arange(180) < 30) | (np.arange(180) >= 50), 0)
-    result = held_out(found, base, base)
+        blocks[name][:, 30:50] = np.nan
+    blocks["samples"] = blocks["samples"].where((np.arange(180) < 30) | (np.arange(180) >= 50), 0)
+    result = held_out(blocks, base, base)
     assert 0.93 < result["coverage95_before"] < 0.97
     assert np.isfinite(list(result.values())).all()
 
 
 def test_surfaces_have_all_three_cases():
-    base, found = _record(9)
-    _add_effects(found, epsilon=0.5, height=0.4)
-    surfaces = make_surfaces(found, base, _with_effects(base, epsilon=0.5, height=0.4))
+    base, blocks = _record(9)
+    _add_effects(blocks, epsilon=0.5, height=0.4)
+    surfaces = make_surfaces(blocks, base, _with_effects(base, epsilon=0.5, height=0.4))
     assert surfaces["case"].values.tolist() == list(CASES)
     assert surfaces["avar"].dims == ("case", "axis", "window", "tau")
     quiet = surfaces.sel(case="before").isel(axis=2)
@@ -280,8 +286,8 @@ def test_surfaces_have_all_three_cases():
 
 def test_surfaces_of_a_long_record_stay_small():
     base = baseline(block_count=1000)
-    found = records(base, 1, np.random.default_rng(1), block_count=1000).isel(record=0)
-    surfaces = make_surfaces(found, base, base)
+    blocks = records(base, 1, np.random.default_rng(1), block_count=1000).isel(record=0)
+    surfaces = make_surfaces(blocks, base, base)
     assert surfaces.sizes["window"] <= 260
     assert surfaces["time"].dtype.kind == "M"
     assert isinstance(surfaces, xr.Dataset)

@@ -29,11 +29,13 @@ def test_an_alternative_takes_its_share():
 
 
 def test_evidence_against_an_alternative_raises_the_probability():
-    found = [probability("warm_up", warm_up=nats) for nats in (22.0, 20.0, 19.0, 17.0, 10.0)]
-    assert found == sorted(found)
-    assert found[-1] == pytest.approx(0.9, abs=1e-4)
+    probabilities = [
+        probability("warm_up", warm_up=nats) for nats in (22.0, 20.0, 19.0, 17.0, 10.0)
+    ]
+    assert probabilities == sorted(probabilities)
+    assert probabilities[-1] == pytest.approx(0.9, abs=1e-4)
     # a plainer effect may be named although another has more evidence
-    assert found[0] == pytest.approx(0.9 / (1.0 + np.exp(2.0)))
+    assert probabilities[0] == pytest.approx(0.9 / (1.0 + np.exp(2.0)))
     assert probability("rate_quantization", rate_quantization=7e5) == 0.0
 
 

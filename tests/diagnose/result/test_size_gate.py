@@ -50,10 +50,10 @@ def estimate(value: float, error: float) -> Estimate:
 def make_identification(
     effect: str, axes: str, gains: tuple[float, ...] | None = None, *, statistic: str = "mean"
 ) -> Identification:
-    one: Any = Candidate(effect, find_statistic(statistic), (), ())
+    candidate: Any = Candidate(effect, find_statistic(statistic), (), ())
     variant: Any = SimpleNamespace(values={}, columns=())
     components = tuple(
-        Component(one, variant, (axis,), evidence_nats)
+        Component(candidate, variant, (axis,), evidence_nats)
         for axis, evidence_nats in zip(axes, gains or (20.0,) * len(axes), strict=True)
     )
     return Identification(effect, (), tuple(axes), components, 20.0 * len(axes), 8.0)
@@ -93,9 +93,9 @@ def test_line_of_zero_amplitude_is_not_an_effect():
         make_identifications(identification), [[Fitted(identification, ("x",), nothing, None)]]
     )
     assert not identifications.identified
-    assert [(one.axes, one.candidates) for one in identifications.unknown] == [
-        (("x",), ("spectral_line",))
-    ]
+    assert [
+        (unidentified.axes, unidentified.candidates) for unidentified in identifications.unknown
+    ] == [(("x",), ("spectral_line",))]
 
 
 def test_effect_keeps_axes_with_a_size():
@@ -114,15 +114,20 @@ def test_effect_keeps_axes_with_a_size():
     identification = replace(identification, instead={"shupe": rival})
     before = make_identifications(identification, other)
     identifications = keep_supported(before, numbers)
-    assert [(one.effect, one.axes) for one in identifications.identified] == [
+    assert [
+        (identification.effect, identification.axes)
+        for identification in identifications.identified
+    ] == [
         ("temperature_bias", ("x",)),
         ("shupe", ("z",)),
     ]
-    kept = identifications.identified[0]
-    assert kept.components == identification.components[:1]
-    assert kept.evidence_nats < identification.evidence_nats
-    assert kept.instead == {"shupe": kept.evidence_nats - 2.0}  # on the same axes
-    assert [(one.axes, one.generic) for one in identifications.unknown] == [(("y",), "~bias(t)")]
+    supported = identifications.identified[0]
+    assert supported.components == identification.components[:1]
+    assert supported.evidence_nats < identification.evidence_nats
+    assert supported.instead == {"shupe": supported.evidence_nats - 2.0}  # on the same axes
+    assert [
+        (unidentified.axes, unidentified.generic) for unidentified in identifications.unknown
+    ] == [(("y",), "~bias(t)")]
     assert keep_supported(before, [numbers[0][:1], numbers[1]]).identified[0].axes == ("x",)
     assert keep_supported(identifications, [numbers[0][:1], numbers[1]]) is identifications
 
@@ -136,7 +141,7 @@ def test_unsupported_rest_below_the_threshold_is_dropped():
         ]
     ]
     identifications = keep_supported(make_identifications(identification), numbers)
-    assert [one.axes for one in identifications.identified] == [("x",)]
+    assert [identification.axes for identification in identifications.identified] == [("x",)]
     assert not identifications.unknown
 
 
@@ -148,8 +153,8 @@ def test_effect_of_possibly_zero_size_becomes_unidentified():
         blocks, baseline, "vibration_rectification", "mean", ("sensitivity",)
     )
     identifications = replace(identifications, null_best=np.arange(8.0))
-    kept, first, fit = conclude.fit_supported(identifications, baseline)
-    assert (kept.identified, first, fit.fitted) == ((), [], [])
+    supported, first, fit = conclude.fit_supported(identifications, baseline)
+    assert (supported.identified, first, fit.fitted) == ((), [], [])
     assert effect_tables(fit.fitted, blocks) == []
     (region,) = unidentified_mismatches(fit.identifications, blocks, [])
     assert region["explained_by"] == []
@@ -198,14 +203,14 @@ def test_held_out_data_decide_the_verdict(change: dict[str, Any], verdict: str):
 def test_a_name_with_a_better_alternative_does_not_explain(
     probability: float | None, alternatives: int, verdict: str
 ):
-    one = SHUPE | {
+    effect = SHUPE | {
         "probability": probability,
         "alternatives": ["warm_up", "bias_jump", "telegraph"],
     }
-    one["alternatives"] = one["alternatives"][:alternatives]
-    assert decide_verdict([{}], [SHUPE, one], [], GOOD) == verdict
+    effect["alternatives"] = effect["alternatives"][:alternatives]
+    assert decide_verdict([{}], [SHUPE, effect], [], GOOD) == verdict
     text = summary(
-        content() | {"verdict": verdict, "effects": [one], "unexplained": [], "held_out": GOOD}
+        content() | {"verdict": verdict, "effects": [effect], "unexplained": [], "held_out": GOOD}
     )
     assert ("An alternative is more probable than" in text) == (verdict != "explained")
 
@@ -254,7 +259,7 @@ def test_limit_of_a_mixture_lies_between_its_laws(laws):
 
 
 @pytest.mark.parametrize(
-    ("points", "told"),
+    ("points", "has_forecast"),
     [
         ([[0, 3.0], [400, 6.0], [800, 3.0], [1200, 6.0], [1800, 6.0]], True),
         ([[0, 0.02], [400, 0.02], [401, 6.0], [800, 6.0], [801, 0.02], [1800, 0.02]], False),
@@ -262,7 +267,7 @@ def test_limit_of_a_mixture_lies_between_its_laws(laws):
     ],
     ids=["all the time", "over", "at the end"],
 )
-def test_only_lasting_effects_are_forecast(points: list[list[float]], told: bool):
+def test_only_lasting_effects_are_forecast(points: list[list[float]], has_forecast: bool):
     """An event that is over does not affect later data, and the size of one near the end is unknown
     before."""
     shaken = {"profile": "vibration", "points": points}
@@ -278,9 +283,9 @@ def test_only_lasting_effects_are_forecast(points: list[list[float]], told: bool
     held = conclude.measure_evidence(
         blocks, baseline, identifications, fit_identifications(identifications, baseline)
     )
-    assert math.isfinite(held["forecast_gain"]) == told
+    assert math.isfinite(held["forecast_gain"]) == has_forecast
     assert held["log_likelihood_gain"] > 0.0
-    if told:
+    if has_forecast:
         assert held["forecast_gain"] > 0.0
 
 
@@ -297,18 +302,18 @@ def test_bench_rotation_is_not_explained_by_a_failed_forecast(
     }
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found = gyrostab.diagnose(
+        diagnosis = gyrostab.diagnose(
             gyrostab.regularise(gyrostab.read_log([path], **known)), nulls=100
         )
-    assert found.verdict == "partly explained"
-    for effect in found.effects:
+    assert diagnosis.verdict == "partly explained"
+    for effect in diagnosis.effects:
         sizes = {
-            name: one
-            for name, one in effect["parameters"].items()
+            name: entry
+            for name, entry in effect["parameters"].items()
             if name.split(".")[0] in effects()[effect["name"]].size_parameters
         }
-        assert not sizes or any(one["low"] > 0.0 or one["high"] < 0.0 for one in sizes.values()), (
-            effect
-        )
-    failed = failed_checks(found.content["held_out"])
-    assert all(text in str(found) for text in failed)
+        assert not sizes or any(
+            entry["low"] > 0.0 or entry["high"] < 0.0 for entry in sizes.values()
+        ), effect
+    failed = failed_checks(diagnosis.content["held_out"])
+    assert all(text in str(diagnosis) for text in failed)

@@ -62,9 +62,9 @@ def _quiet_records(count: int, seed: int) -> xr.Dataset:
     return _records_of_means(baseline(walk=TRUE), count, seed)
 
 
-def _with_waveform(found, shares):
-    return found.assign(
-        mean=found["mean"]
+def _with_waveform(blocks, shares):
+    return blocks.assign(
+        mean=blocks["mean"]
         + xr.DataArray(np.asarray(shares)[:, None] * _slow_waveform(), dims=("axis", "block"))
     )
 
@@ -72,9 +72,9 @@ def _with_waveform(found, shares):
 @pytest.mark.parametrize(("assumed", "true"), [(0.0, 0.0), (0.1, 0.1), (1.0, 0.02), (0.02, 1.0)])
 @pytest.mark.parametrize("missing", [0, 40])
 def test_independent_axes_have_normal_scores(assumed, true, missing):
-    found = _records_of_means(baseline(walk=true), 60, 3)
-    found["mean"][:, 1, 30 : 30 + missing] = np.nan
-    z = find_statistic("common_mode").score(found, baseline(walk=assumed))["z"].values
+    blocks = _records_of_means(baseline(walk=true), 60, 3)
+    blocks["mean"][:, 1, 30 : 30 + missing] = np.nan
+    z = find_statistic("common_mode").score(blocks, baseline(walk=assumed))["z"].values
     few = z[:, :-1, -1, :3]  # each pair over the whole record, for spans with many averages
     assert abs(few.mean()) < 4.0 / np.sqrt(180.0)
     assert 0.7 < few.std() < 1.2  # smaller if independent increments are taken as correlated
@@ -82,21 +82,21 @@ def test_independent_axes_have_normal_scores(assumed, true, missing):
 
 @pytest.mark.parametrize("shares", [(1.0, 0.8, -0.9), (-0.5, 1.0, 0.7)])
 def test_a_common_waveform_is_found_that_no_axis_shows_alone(base, null, shares):
-    found = _with_waveform(_quiet_records(30, 5), shares)
+    blocks = _with_waveform(_quiet_records(30, 5), shares)
     z = np.abs(
         np.nan_to_num(
             standardise(
-                find_statistic("common_mode").score(found, base), null.statistics["common_mode"]
+                find_statistic("common_mode").score(blocks, base), null.statistics["common_mode"]
             )
         )
     )
     assert (z.max(axis=(1, 2, 3)) > null.critical("common_mode", 0.005)).mean() >= 0.9
-    alone = np.abs(
+    scores_of_means = np.abs(
         np.nan_to_num(
-            standardise(find_statistic("mean").score(found, base), null.statistics["mean"])
+            standardise(find_statistic("mean").score(blocks, base), null.statistics["mean"])
         )
     )
-    assert (alone.max(axis=(1, 2, 3)) > null.critical("mean", 0.005)).mean() <= 0.1
+    assert (scores_of_means.max(axis=(1, 2, 3)) > null.critical("mean", 0.005)).mean() <= 0.1
 
 
 @given(
@@ -105,11 +105,13 @@ def test_a_common_waveform_is_found_that_no_axis_shows_alone(base, null, shares)
 )
 @settings(max_examples=15)
 def test_scores_do_not_depend_on_sizes_of_axes(sizes, signs):
-    noise, found = baseline(walk=WALK), _quiet_records(1, 9).isel(record=0)
-    scaled = found.assign(mean=found["mean"] * xr.DataArray(np.multiply(sizes, signs), dims="axis"))
+    noise, blocks = baseline(walk=WALK), _quiet_records(1, 9).isel(record=0)
+    scaled = blocks.assign(
+        mean=blocks["mean"] * xr.DataArray(np.multiply(sizes, signs), dims="axis")
+    )
     before, after = (
-        find_statistic("common_mode").score(one, noise)["estimate"].values
-        for one in (found, scaled)
+        find_statistic("common_mode").score(statistics, noise)["estimate"].values
+        for statistics in (blocks, scaled)
     )
     turned = np.array([signs[0] * signs[1], signs[0] * signs[2], signs[1] * signs[2], 1.0])[
         :, None, None
@@ -119,11 +121,11 @@ def test_scores_do_not_depend_on_sizes_of_axes(sizes, signs):
 
 def test_score_of_all_axes_is_that_of_the_determinant():
     noise = baseline()
-    found = _records_of_means(noise, 500, 12)
-    scores = find_statistic("common_mode").score(found, noise)
+    blocks = _records_of_means(noise, 500, 12)
+    scores = find_statistic("common_mode").score(blocks, noise)
     assert stats.kstest(stats.norm.sf(scores["z"].values[:, -1, -1, 0]), "uniform").pvalue > 1e-3
     matrix = np.corrcoef(
-        found["mean"].values[0]
+        blocks["mean"].values[0]
     )  # of white noise, except for the constant of the record
     pairs = np.array([matrix[0, 1], matrix[0, 2], matrix[1, 2]])
     np.testing.assert_allclose(scores["estimate"].values[0, :3, -1, 0], pairs, atol=0.02)
@@ -135,17 +137,17 @@ def test_score_of_all_axes_is_that_of_the_determinant():
 
 def test_known_common_white_noise_is_subtracted():
     noise = baseline()
-    found = _records_of_means(noise, 40, 8)
+    blocks = _records_of_means(noise, 40, 8)
     rng, share = np.random.default_rng(2), 0.4
     sigma = np.sqrt(noise["mean_variance"].values[0])
-    one = rng.normal(size=(40, 1, BLOCKS)) * sigma * np.sqrt(share)
-    found["mean"] = found["mean"] * np.sqrt(1.0 - share) + xr.DataArray(
-        one, dims=("record", "axis", "block")
+    shared = rng.normal(size=(40, 1, BLOCKS)) * sigma * np.sqrt(share)
+    blocks["mean"] = blocks["mean"] * np.sqrt(1.0 - share) + xr.DataArray(
+        shared, dims=("record", "axis", "block")
     ).isel(axis=0)
     known = noise.assign(cross=(("pair", "block", "band"), share * noise["spectrum"].values + 0j))
     before, after = (
-        find_statistic("common_mode").score(found, each)["estimate"].values[:, :3, -1, 0]
-        for each in (noise, known)
+        find_statistic("common_mode").score(blocks, noise_model)["estimate"].values[:, :3, -1, 0]
+        for noise_model in (noise, known)
     )
     assert before.mean() == pytest.approx(share, abs=0.03)
     assert abs(after.mean()) < 0.04
@@ -153,29 +155,31 @@ def test_known_common_white_noise_is_subtracted():
 
 def test_known_means_are_subtracted(base):
     shares = np.array([1.0, 0.8, -0.9])
-    found = _with_waveform(_quiet_records(20, 5), shares)
+    blocks = _with_waveform(_quiet_records(20, 5), shares)
     known = base.assign(known_mean=(("axis", "block"), shares[:, None] * _slow_waveform()))
     before, after = (
-        np.abs(find_statistic("common_mode").score(found, each)["z"].values[:, :3, -1, :3]).mean()
-        for each in (base, known)
+        np.abs(
+            find_statistic("common_mode").score(blocks, noise_model)["z"].values[:, :3, -1, :3]
+        ).mean()
+        for noise_model in (base, known)
     )
     assert after < 1.2 < 2.5 < before
 
 
 def test_one_axis_or_a_short_record_has_no_score():
-    alone = baseline(axes="x")
+    single = baseline(axes="x")
     assert (
-        find_statistic("common_mode").score(records(alone, 2, np.random.default_rng(1)), alone)
+        find_statistic("common_mode").score(records(single, 2, np.random.default_rng(1)), single)
         is None
     )
-    found = _records_of_means(baseline(), 2, 1)
+    blocks = _records_of_means(baseline(), 2, 1)
     assert (
         find_statistic("common_mode").score(
-            found.isel(block=slice(0, 4)), baseline().isel(block=slice(0, 4))
+            blocks.isel(block=slice(0, 4)), baseline().isel(block=slice(0, 4))
         )
         is None
     )
-    assert find_statistic("common_mode").score(found, baseline())["tau_min_s"].values.tolist() == [
+    assert find_statistic("common_mode").score(blocks, baseline())["tau_min_s"].values.tolist() == [
         BLOCK_S * span for span in (1, 2, 4, 8, 16, 32)
     ]
 
@@ -193,10 +197,10 @@ def _identification_of(statistic: str, axes: str):
 
 def test_common_motion_is_one_region_explained_by_its_effect(base, null):
     shares = np.array([1.0, 0.8, -0.9])
-    found = _with_waveform(records(baseline(walk=TRUE), 1, np.random.default_rng(5)), shares).isel(
+    blocks = _with_waveform(records(baseline(walk=TRUE), 1, np.random.default_rng(5)), shares).isel(
         record=0
     )
-    regions = locate_mismatches(found, base, null)
+    regions = locate_mismatches(blocks, base, null)
     assert regions["view"].values.tolist() == ["cross_axis"]
     assert regions["what"].values.tolist() == ["slow"]
     assert set(str(regions["axes"].values[0]).split()) == {"x", "y", "z"}
@@ -212,7 +216,7 @@ def test_common_motion_is_one_region_explained_by_its_effect(base, null):
 
     def explanation_of(statistic, axes, after):
         return attribute_mismatches(
-            regions, [_identification_of(statistic, axes)], found, after, null, level=0.005
+            regions, [_identification_of(statistic, axes)], blocks, after, null, level=0.005
         )[0]
 
     assert explanation_of("mean", "xyz", known) == ["cause"]

@@ -60,8 +60,8 @@ def test_chance_of_a_pair_in_a_bin_is_that_of_the_bivariate_normal(
     law = multivariate_normal([0.0, 0.0], [[1.0, correlation], [correlation, 1.0]])
     low, high = middle - half, middle + half
     expected = law.cdf([high, high], lower_limit=[low, low])
-    found = _chance_in_bin(np.array([middle]), half, np.ones(1), np.array([correlation]))[1]
-    assert found[0] == pytest.approx(expected, rel=1e-3)
+    chance = _chance_in_bin(np.array([middle]), half, np.ones(1), np.array([correlation]))[1]
+    assert chance[0] == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("step", [1e-1, 1e-3, 1e-4])
@@ -93,9 +93,11 @@ def test_grid_hides_repeats_only_where_noise_is_not_normal():
 @pytest.mark.slow
 @pytest.mark.parametrize("step", [1e-4, 0.5])
 def test_grid_alone_is_no_effect(step: float):
-    found = gyrostab.diagnose(log_of(np.round(noise("white") / step) * step), nulls=100)
-    assert not {"held_samples", "dead_zone", "clipping"} & {one["name"] for one in found.effects}
-    assert found.verdict == "no mismatch"
+    diagnosis = gyrostab.diagnose(log_of(np.round(noise("white") / step) * step), nulls=100)
+    assert not {"held_samples", "dead_zone", "clipping"} & {
+        effect["name"] for effect in diagnosis.effects
+    }
+    assert diagnosis.verdict == "no mismatch"
 
 
 @pytest.mark.slow
@@ -103,13 +105,13 @@ def test_held_samples_are_named_on_a_coarse_grid():
     values = np.round(noise("white") / 0.5) * 0.5
     held = np.flatnonzero(np.random.default_rng(1).random(SIZE - 1) < 0.06) + 1
     values[held] = values[held - 1]
-    found = gyrostab.diagnose(log_of(values), nulls=100)
-    assert [one["name"] for one in found.effects] == ["held_samples"]
+    diagnosis = gyrostab.diagnose(log_of(values), nulls=100)
+    assert [effect["name"] for effect in diagnosis.effects] == ["held_samples"]
 
 
 @pytest.mark.slow
 def test_dead_zone_is_named_on_a_coarse_grid():
     values = noise("white")
     values = np.round(np.where(np.abs(values) < 0.5, 0.0, values) / 0.3) * 0.3
-    found = gyrostab.diagnose(log_of(values), nulls=100)
-    assert "dead_zone" in {one["name"] for one in found.effects}
+    diagnosis = gyrostab.diagnose(log_of(values), nulls=100)
+    assert "dead_zone" in {effect["name"] for effect in diagnosis.effects}

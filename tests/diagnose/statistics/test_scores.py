@@ -51,8 +51,8 @@ def _dense_covariance(variance, present, walk, ou, decay):
     since = np.concatenate([[0.0], np.cumsum(walk[:-1])])
     dense = np.minimum.outer(since, since) + np.diag(variance)
     for i in range(p):
-        kept = np.concatenate([[0.0], np.cumsum(np.log(decay[:-1, i]))])
-        dense += ou[i] * np.exp(-np.abs(np.subtract.outer(kept, kept)))
+        decays = np.concatenate([[0.0], np.cumsum(np.log(decay[:-1, i]))])
+        dense += ou[i] * np.exp(-np.abs(np.subtract.outer(decays, decays)))
     return dense[np.ix_(present, present)]
 
 
@@ -80,21 +80,21 @@ def test_boxcar_kernels_match_dense_algebra():
     np.testing.assert_allclose(out[:, present], series[:, present] @ inverse, rtol=1e-9)
     assert not out[:, ~present].any()
     first, stop = np.array([0, 7, 30, 59]), np.array([60, 20, 31, 60])
-    found = np.empty(4)
-    boxcar_information(first, stop, innovation, gain, decay, remaining, found)
+    information = np.empty(4)
+    boxcar_information(first, stop, innovation, gain, decay, remaining, information)
     for region in range(4):
         x = ((np.arange(n) >= first[region]) & (np.arange(n) < stop[region]))[present].astype(float)
-        assert found[region] == pytest.approx(x @ inverse @ x, rel=1e-9)
+        assert information[region] == pytest.approx(x @ inverse @ x, rel=1e-9)
 
 
 @given(st.integers(1, 80), st.lists(st.integers(1, 30), min_size=1, max_size=4, unique=True))
 def test_sums_over_windows_match_their_definition(block_count, lengths):
     windows = window_set(block_count, lengths)
     values = np.random.default_rng(block_count).normal(size=(2, block_count, 3))
-    found = sum_over_windows(values, windows)
+    sums = sum_over_windows(values, windows)
     for k, (first, stop) in enumerate(zip(windows.first, windows.stop, strict=True)):
         assert 0 <= first < stop <= block_count
-        np.testing.assert_allclose(found[:, k], values[:, first:stop].sum(axis=1), atol=1e-12)
+        np.testing.assert_allclose(sums[:, k], values[:, first:stop].sum(axis=1), atol=1e-12)
     assert (windows.length == block_count).any()
 
 
@@ -115,9 +115,9 @@ def test_transfer_reproduces_the_laws_of_the_allan_variance():
 @pytest.mark.parametrize("slow", [{}, {"flicker": 0.01, "walk": 0.1}])
 def test_scores_are_normal_without_an_effect(missing, slow):
     base = baseline(missing=missing, **slow)
-    found = records(base, 40, np.random.default_rng(3), missing=missing)
+    blocks = records(base, 40, np.random.default_rng(3), missing=missing)
     for name in ("power", "mean", "cross_spectrum", "spectral_line"):
-        scores = find_statistic(name).score(found, base)
+        scores = find_statistic(name).score(blocks, base)
         z = scores["z"].values
         z = z[np.isfinite(z)]
         assert abs(z.mean()) < 0.05, name
@@ -135,16 +135,16 @@ def _shares_around_limit(make, limit, name, base, null):
     """Return the share of records detected at 3/4 and at 5/4 of the theoretical limit."""
     shares = []
     for factor in (0.75, 1.25):
-        found = records(base, 60, np.random.default_rng(17))
-        make(found, factor * limit)
-        shares.append(_detection_share(find_statistic(name).score(found, base), null, name))
+        blocks = records(base, 60, np.random.default_rng(17))
+        make(blocks, factor * limit)
+        shares.append(_detection_share(find_statistic(name).score(blocks, base), null, name))
     return shares
 
 
 @pytest.mark.slow
 def test_detection_limit_of_raised_noise(base, null):
-    def burst(found, epsilon):
-        found["power"][:, 0, EVENT] *= 1.0 + epsilon
+    def burst(blocks, epsilon):
+        blocks["power"][:, 0, EVENT] *= 1.0 + epsilon
 
     samples = 0.86 * 15 * BLOCK_S * RATE  # effective number under the taper
     nats = null.critical("power", 0.01) ** 2 / 2.0
@@ -153,8 +153,8 @@ def test_detection_limit_of_raised_noise(base, null):
 
 
 def test_detection_limit_of_a_mean_step(base, null):
-    def step(found, height):
-        found["mean"][:, 0, EVENT] += height
+    def step(blocks, height):
+        blocks["mean"][:, 0, EVENT] += height
 
     nats = null.critical("mean", 0.01) ** 2 / 2.0
     on, record = 15 * BLOCK_S, 180 * BLOCK_S
@@ -164,10 +164,10 @@ def test_detection_limit_of_a_mean_step(base, null):
 
 
 def test_detection_limit_of_shared_noise(base, null):
-    def shared(found, rho):
-        power, pairs = found["power"].values, ((0, 1), (0, 2), (1, 2))
+    def shared(blocks, rho):
+        power, pairs = blocks["power"].values, ((0, 1), (0, 2), (1, 2))
         for place, (a, b) in enumerate(pairs):
-            found["cross"].values[:, place] += rho * np.sqrt(power[:, a] * power[:, b])
+            blocks["cross"].values[:, place] += rho * np.sqrt(power[:, a] * power[:, b])
 
     nats = null.critical("cross_spectrum", 0.01) ** 2 / 2.0
     limit = np.sqrt(2.0 * nats / (0.86 * 180 * BLOCK_S * RATE) / 3.0)  # three equal pairs
@@ -176,13 +176,13 @@ def test_detection_limit_of_shared_noise(base, null):
 
 
 def test_detection_limit_of_a_line(base, null):
-    def line(found, amplitude):
+    def line(blocks, amplitude):
         signal, rng = amplitude**2 / 4.0 * 0.926 * BLOCK_S, np.random.default_rng(2)
         sine = np.sqrt(signal) * np.exp(2j * np.pi * rng.random((60, 8, 23)))
         noise = np.sqrt(LEVEL / 2.0) * (
             rng.normal(size=sine.shape) + 1j * rng.normal(size=sine.shape)
         )
-        found["line_power"][:, 1, :, 267] = (np.abs(sine + noise) ** 2).mean(axis=-1)
+        blocks["line_power"][:, 1, :, 267] = (np.abs(sine + noise) ** 2).mean(axis=-1)
 
     limit = 2.0 * np.sqrt(
         null.critical("spectral_line", 0.01) * LEVEL / (0.926 * BLOCK_S * np.sqrt(180))
@@ -192,10 +192,10 @@ def test_detection_limit_of_a_line(base, null):
 
 
 def test_the_mean_shows_a_step_between_windows_that_davar_does_not(base, null):
-    found = records(base, 40, np.random.default_rng(4))
-    found["mean"][:, 0, 60:120] += 0.06
-    assert _detection_share(find_statistic("mean").score(found, base), null, "mean") > 0.9
-    scores = find_statistic("power").score(found, base)
+    blocks = records(base, 40, np.random.default_rng(4))
+    blocks["mean"][:, 0, 60:120] += 0.06
+    assert _detection_share(find_statistic("mean").score(blocks, base), null, "mean") > 0.9
+    scores = find_statistic("power").score(blocks, base)
     scores["z"] = scores["z"].where(
         scores["stop"] - scores["first"] <= 15
     )  # the whole record shows it at its longest tau
@@ -204,10 +204,10 @@ def test_the_mean_shows_a_step_between_windows_that_davar_does_not(base, null):
 
 def test_a_step_raises_the_allan_variance_by_the_closed_form():
     base = baseline(noise=1e-6)
-    found = records(base, 1, np.random.default_rng(4)).isel(record=0)
+    blocks = records(base, 1, np.random.default_rng(4)).isel(record=0)
     height, block_count = 0.1, 180
-    found["mean"][0, 90:] += height
-    surface = davar.allan_surface(found, base)
+    blocks["mean"][0, 90:] += height
+    surface = davar.allan_surface(blocks, base)
     whole = surface["windows"].length == block_count
     for column, tau in enumerate(surface["columns"]["tau_min_s"]):
         if tau >= 4 * BLOCK_S and surface["columns"]["what"][column] == "avar":
@@ -217,15 +217,15 @@ def test_a_step_raises_the_allan_variance_by_the_closed_form():
 
 
 def test_the_mean_estimates_the_step(base):
-    found = records(base, 1, np.random.default_rng(8)).isel(record=0)
-    found["mean"][2, 60:105] += 0.5
-    scores = find_statistic("mean").score(found, base)
+    blocks = records(base, 1, np.random.default_rng(8)).isel(record=0)
+    blocks["mean"][2, 60:105] += 0.5
+    scores = find_statistic("mean").score(blocks, base)
     best = int(np.nanargmax(scores["z"].values[2, :, 0]))
     assert (int(scores["first"][best]), int(scores["stop"][best])) == (60, 105) or abs(
         int(scores["first"][best]) - 60
     ) <= 4
     inside = (np.arange(180) >= 60) & (np.arange(180) < 105)
-    assert mean.region_mean(found, base, 2, inside) == pytest.approx(0.5, abs=0.03)
+    assert mean.region_mean(blocks, base, 2, inside) == pytest.approx(0.5, abs=0.03)
 
 
 def test_a_line_estimates_its_amplitude():
@@ -247,28 +247,28 @@ def test_a_line_estimates_its_amplitude():
 
 def test_phase_locked_rates_are_detected(base):
     rng = np.random.default_rng(9)
-    found = records(base, 1, rng).isel(record=0)
-    assert find_statistic("ramp_phase").score(found, base) is None
+    blocks = records(base, 1, rng).isel(record=0)
+    assert find_statistic("ramp_phase").score(blocks, base) is None
     block_count, samples = 180, BLOCK_S * RATE
     spread = np.sqrt(2.0 * LEVEL * RATE / samples)
     order = spread * (
         rng.normal(size=(40, 3, block_count, 3)) + 1j * rng.normal(size=(40, 3, block_count, 3))
     )
     profile = np.sqrt(LEVEL * RATE / 50.0) * rng.normal(size=(40, 3, block_count, 40))
-    found["order"] = (("record", "axis", "block", "harmonic"), order)
-    found["profile"] = (("record", "axis", "block", "phase"), profile)
-    found["profile_samples"] = (("axis", "block", "phase"), np.full((3, block_count, 40), 50))
-    found["channel_rotation_rate"] = ("block", np.full(block_count, 720.0))
-    scores = find_statistic("ramp_phase").score(found, base)
+    blocks["order"] = (("record", "axis", "block", "harmonic"), order)
+    blocks["profile"] = (("record", "axis", "block", "phase"), profile)
+    blocks["profile_samples"] = (("axis", "block", "phase"), np.full((3, block_count, 40), 50))
+    blocks["channel_rotation_rate"] = ("block", np.full(block_count, 720.0))
+    scores = find_statistic("ramp_phase").score(blocks, base)
     z = scores["z"].values
     assert scores["what"].values.tolist() == ["order 1", "order 2", "order 3", "ramp phase"]
     assert np.allclose(z.std(axis=(0, 1, 2)), 1.0, atol=0.1)
     assert np.all(z.mean(axis=(0, 1, 2)) < 0.15)
-    found["order"][:, 0, :, 1] += 0.05 * np.exp(0.4j)
-    found["profile"] = found["profile"] + xr.DataArray(
+    blocks["order"][:, 0, :, 1] += 0.05 * np.exp(0.4j)
+    blocks["profile"] = blocks["profile"] + xr.DataArray(
         0.1 * np.sin(2 * np.pi * np.arange(40) / 40), dims="phase"
     )
-    scores = find_statistic("ramp_phase").score(found, base)
+    scores = find_statistic("ramp_phase").score(blocks, base)
     assert np.median(scores["estimate"].values[:, 0, -1, 1]) == pytest.approx(0.05, rel=0.1)
     assert np.median(scores["estimate"].values[:, 1, -1, 3]) == pytest.approx(
         0.1 / np.sqrt(2.0), rel=0.1
@@ -277,22 +277,22 @@ def test_phase_locked_rates_are_detected(base):
 
 
 def test_transients_and_jumps_after_restarts_are_detected(base):
-    found = records(base, 60, np.random.default_rng(10))
-    assert find_statistic("restart").score(found, base) is None
-    found["restart_begin"] = ("restart", np.array([1000.0, 2400.0]))
-    found["restart_end"] = ("restart", np.array([1010.0, 2410.0]))
-    z = find_statistic("restart").score(found, base)["z"].values
+    blocks = records(base, 60, np.random.default_rng(10))
+    assert find_statistic("restart").score(blocks, base) is None
+    blocks["restart_begin"] = ("restart", np.array([1000.0, 2400.0]))
+    blocks["restart_end"] = ("restart", np.array([1010.0, 2410.0]))
+    z = find_statistic("restart").score(blocks, base)["z"].values
     assert np.nanstd(z) == pytest.approx(1.0, abs=0.06)
     since = np.where(
         np.arange(180) >= 121,
         np.arange(180) - 121.0,
         np.where(np.arange(180) >= 51, np.arange(180) - 51.0, np.inf),
     )
-    raised = found.copy()
-    raised["mean"] = found["mean"] + xr.DataArray(0.2 * np.exp(-since / 6.0), dims="block")
+    raised = blocks.copy()
+    raised["mean"] = blocks["mean"] + xr.DataArray(0.2 * np.exp(-since / 6.0), dims="block")
     scores = find_statistic("restart").score(raised, base)
     assert float(np.nanmean(scores["estimate"].values[..., 1, 1])) == pytest.approx(0.2, rel=0.05)
-    jumped = found.copy()
+    jumped = blocks.copy()
     jumped["mean"][:, :, 121:] += 0.1
     scores = find_statistic("restart").score(jumped, base)
     jump = scores["estimate"].values[:, :, -1, -1]
@@ -301,11 +301,11 @@ def test_transients_and_jumps_after_restarts_are_detected(base):
 
 
 def test_sample_counts_and_tails_are_detected(base):
-    found = records(base, 2, np.random.default_rng(12))
-    found["outliers"][:] = 0
-    found["outliers"][1, 0, 40:43] = 2
-    found["kurtosis"][1, 2, 90:120] += 0.5
-    scores = find_statistic("sample_counts").score(found, base)
+    blocks = records(base, 2, np.random.default_rng(12))
+    blocks["outliers"][:] = 0
+    blocks["outliers"][1, 0, 40:43] = 2
+    blocks["kurtosis"][1, 2, 90:120] += 0.5
+    scores = find_statistic("sample_counts").score(blocks, base)
     of = scores["what"].values.tolist().index
     z = scores["z"].values
     short = scores["stop"].values - scores["first"].values == 5
@@ -343,8 +343,8 @@ def test_correlation_score_matches_student():
 
 def test_one_axis_has_no_pairs():
     base = baseline(axes="x")
-    found = records(base, 2, np.random.default_rng(1))
-    assert find_statistic("cross_spectrum").score(found, base) is None
+    blocks = records(base, 2, np.random.default_rng(1))
+    assert find_statistic("cross_spectrum").score(blocks, base) is None
 
 
 @pytest.mark.parametrize("loud", [(6_050, 12_000), (6_050, 6_540)])
@@ -353,13 +353,13 @@ def test_a_noise_burst_is_neither_shared_nor_a_line(loud):
     for seed in range(8):
         noise = np.random.default_rng(seed).standard_normal((2, 12_000))
         noise[:, slice(*loud)] *= 8.0
-        found = reduce_log(
+        blocks = reduce_log(
             make_log(noise, rate=10.0, unit="deg/h", axis=["x", "y"]), block="100samples"
         )
-        base = calibrate_noise(found, quiet=np.arange(120) < 60)
+        base = calibrate_noise(blocks, quiet=np.arange(120) < 60)
         for name, values in largest.items():
             values.append(
-                float(np.nanmax(np.abs(find_statistic(name).score(found, base)["z"].values)))
+                float(np.nanmax(np.abs(find_statistic(name).score(blocks, base)["z"].values)))
             )
     assert max(largest["cross_spectrum"]) < 4.8
     assert max(largest["spectral_line"]) < 4.8

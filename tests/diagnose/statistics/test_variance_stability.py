@@ -38,10 +38,10 @@ def _some_records(base, count, seed):
     return records(base, count, np.random.default_rng(seed), **SMALL)
 
 
-def _largest_score(statistic, found, base, null, row=slice(None)):
+def _largest_score(statistic, blocks, base, null, row=slice(None)):
     """Return the largest standardised score of each record."""
     name = statistic.name
-    z = np.nan_to_num(standardise(statistic.score(found, base), null.statistics[name]))
+    z = np.nan_to_num(standardise(statistic.score(blocks, base), null.statistics[name]))
     return z[:, row].reshape(z.shape[0], -1).max(axis=1)
 
 
@@ -53,10 +53,10 @@ def test_moments_of_the_scatter_match_simulated_levels(count, seed):
     drawn = rng.gamma(shape, size=(40_000, count)) / shape * rng.uniform(0.1, 10.0)
     mean = (drawn * shape).sum(axis=1, keepdims=True) / shape.sum()
     scatter = (shape * (drawn - mean) ** 2).sum(axis=1) / mean[:, 0] ** 2
-    wanted, variance = variance_stability.scatter_moments(
+    expected, variance = variance_stability.scatter_moments(
         np.array(float(count)), shape.sum(), (1.0 / shape).sum()
     )
-    assert scatter.mean() == pytest.approx(wanted, abs=5.0 * np.sqrt(variance / scatter.size))
+    assert scatter.mean() == pytest.approx(expected, abs=5.0 * np.sqrt(variance / scatter.size))
     error = np.sqrt(((scatter - scatter.mean()) ** 2).var() / scatter.size)
     assert scatter.var() == pytest.approx(variance, abs=5.0 * error)
 
@@ -78,11 +78,11 @@ def test_detection_limit_of_variance_fluctuation(base, null):
     limit = np.sqrt(critical * np.sqrt(2.0 * (BLOCKS - 1)) / (BLOCKS * shape))
     shares = []
     for factor in (0.75, 1.3):
-        found = _some_records(base, 60, 17)
-        found["power"][:, 0] *= np.exp(factor * limit * swell)[:, None]
+        blocks = _some_records(base, 60, 17)
+        blocks["power"][:, 0] *= np.exp(factor * limit * swell)[:, None]
         shares.append(
             (
-                _largest_score(find_statistic("variance_stability"), found, base, null, row=0)
+                _largest_score(find_statistic("variance_stability"), blocks, base, null, row=0)
                 > critical
             ).mean()
         )
@@ -90,92 +90,92 @@ def test_detection_limit_of_variance_fluctuation(base, null):
 
 
 def test_common_variance_fluctuation_is_detected_jointly(base, null):
-    found = _some_records(base, 30, 5)
-    found["power"] *= np.exp(0.09 * np.sin(2.0 * np.pi * np.arange(BLOCKS) / 12.0))[:, None]
-    together, alone = (
-        np.median(_largest_score(find_statistic("variance_stability"), found, base, null, row=row))
+    blocks = _some_records(base, 30, 5)
+    blocks["power"] *= np.exp(0.09 * np.sin(2.0 * np.pi * np.arange(BLOCKS) / 12.0))[:, None]
+    together, single = (
+        np.median(_largest_score(find_statistic("variance_stability"), blocks, base, null, row=row))
         for row in (3, slice(0, 3))
     )
-    assert together > null.critical("variance_stability", 0.01) > alone
+    assert together > null.critical("variance_stability", 0.01) > single
 
 
 @given(st.floats(0.01, 100.0))
 @settings(max_examples=5)
 def test_scores_do_not_depend_on_the_noise_level(factor):
     base = baseline(**SMALL)
-    found = _some_records(base, 1, 8)
-    louder = found.copy(deep=True)
+    blocks = _some_records(base, 1, 8)
+    louder = blocks.copy(deep=True)
     louder["power"][:, 1] *= factor
-    kept = [
-        find_statistic("variance_stability").score(one, base)["z"].isel(row=[0, 1, 2]).values
-        for one in (found, louder)
+    scores = [
+        find_statistic("variance_stability").score(record, base)["z"].isel(row=[0, 1, 2]).values
+        for record in (blocks, louder)
     ]
-    np.testing.assert_allclose(*kept, atol=1e-6)
+    np.testing.assert_allclose(*scores, atol=1e-6)
 
 
 def test_a_single_noisy_block_is_not_variance_fluctuation(base, null):
-    found = _some_records(base, 20, 6)
-    found["power"][:, 0, 50] *= 30.0
+    blocks = _some_records(base, 20, 6)
+    blocks["power"][:, 0, 50] *= 30.0
     assert (
-        _largest_score(find_statistic("variance_stability"), found, base, null)
+        _largest_score(find_statistic("variance_stability"), blocks, base, null)
         > null.critical("variance_stability", 0.01)
     ).mean() <= 0.1
 
 
 def test_shared_noise_is_not_variance_fluctuation(base, null):
-    found = _some_records(base, 20, 7)
-    found["power"][:, 1] = found["power"][:, 0]
-    found["power"][:, 2] = found["power"][:, 0]
-    found["cross"][:] = found["power"][:, 0].values[:, None]
+    blocks = _some_records(base, 20, 7)
+    blocks["power"][:, 1] = blocks["power"][:, 0]
+    blocks["power"][:, 2] = blocks["power"][:, 0]
+    blocks["cross"][:] = blocks["power"][:, 0].values[:, None]
     critical = null.critical("variance_stability", 0.01)
     assert (
-        _largest_score(find_statistic("variance_stability"), found, base, null, row=3) > critical
+        _largest_score(find_statistic("variance_stability"), blocks, base, null, row=3) > critical
     ).mean() <= 0.1
     assert (
         _largest_score(
-            find_statistic("variance_stability"), found.drop_vars("cross"), base, null, row=3
+            find_statistic("variance_stability"), blocks.drop_vars("cross"), base, null, row=3
         )
         > critical
     ).mean() > 0.9  # if it were not known
 
 
 def test_a_burst_with_a_region_is_not_reported_again(base, null):
-    found = _some_records(base, 1, 9).isel(record=0)
-    found["power"][0, 60:75] *= 1.7
-    regions = locate_mismatches(found, base, null)
+    blocks = _some_records(base, 1, 9).isel(record=0)
+    blocks["power"][0, 60:75] *= 1.7
+    regions = locate_mismatches(blocks, base, null)
     assert regions["what"].values.tolist() == ["level"] or set(regions["what"].values) == {"avar"}
-    found["power"][1] *= np.exp(0.5 * np.sin(2.0 * np.pi * np.arange(BLOCKS) / 9.0))[:, None]
-    regions = locate_mismatches(found, base, null)
+    blocks["power"][1] *= np.exp(0.5 * np.sin(2.0 * np.pi * np.arange(BLOCKS) / 9.0))[:, None]
+    regions = locate_mismatches(blocks, base, null)
     new = regions.sel(
-        mismatch=[str(what).startswith("variance") for what in regions["what"].values]
+        mismatch=[str(name).startswith("variance") for name in regions["what"].values]
     )
     assert "y" in {axis for axes in new["axes"].values for axis in str(axes).split()}
     assert float(new["end"].max() - new["begin"].min()) > 0.9 * BLOCKS * 20.0
 
 
 def test_scaled_powers_have_the_expected_mean(base):
-    found = _some_records(base, 1, 10).isel(record=0)
-    found["power"][0, 10:40] *= 5.0
-    flat = variance_stability.scale_to_expected(found, base, [(["x"], 200.0, 800.0)])
+    blocks = _some_records(base, 1, 10).isel(record=0)
+    blocks["power"][0, 10:40] *= 5.0
+    flat = variance_stability.scale_to_expected(blocks, base, [(["x"], 200.0, 800.0)])
     ratio = flat["power"].values / base["spectrum"].values
     np.testing.assert_allclose(ratio[0, 10:40].mean(axis=0), 1.0)
-    np.testing.assert_array_equal(flat["power"].values[1:], found["power"].values[1:])
-    np.testing.assert_array_equal(flat["power"].values[0, 40:], found["power"].values[0, 40:])
-    assert variance_stability.scale_to_expected(found, base, []) is found
+    np.testing.assert_array_equal(flat["power"].values[1:], blocks["power"].values[1:])
+    np.testing.assert_array_equal(flat["power"].values[0, 40:], blocks["power"].values[0, 40:])
+    assert variance_stability.scale_to_expected(blocks, base, []) is blocks
 
 
-def _moving_line(found, row, first, last, energy, bend=0.0):
+def _moving_line(blocks, row, first, last, energy, bend=0.0):
     """Add a line of this power over the density, moving between two lines from block to block."""
     rng = np.random.default_rng(3)
-    level = float(found["line_power"].mean())
+    level = float(blocks["line_power"].mean())
     for component in range(8):
         for block in range(BLOCKS // 8):
             t = (component + (block + 0.5) / (BLOCKS // 8)) / 8.0
             line = round(first + (last - first) * (t + bend * t * (1.0 - t)))
             beat = (
-                2.0 * np.sqrt(energy) * rng.normal(0.0, np.sqrt(0.5), found.sizes["record"])
+                2.0 * np.sqrt(energy) * rng.normal(0.0, np.sqrt(0.5), blocks.sizes["record"])
             )  # of the line with the noise
-            found["line_power"].values[:, row, component, line] += (
+            blocks["line_power"].values[:, row, component, line] += (
                 level * (energy + beat) / (BLOCKS // 8)
             )
 
@@ -184,14 +184,14 @@ def _moving_line(found, row, first, last, energy, bend=0.0):
     ("first", "last", "bend"), [(20, 60, 0.0), (75, 30, 0.0), (10, 50, 0.6), (25, 90, -0.6)]
 )
 def test_a_drifting_line_is_detected_along_its_path(base, null, first, last, bend):
-    found = _some_records(base, 12, 12)
+    blocks = _some_records(base, 12, 12)
     energy = 9.0 * np.sqrt(abs(last - first) / (8.0 * BLOCKS))  # nine standard deviations in theory
-    _moving_line(found, 1, first, last, energy, bend)
+    _moving_line(blocks, 1, first, last, energy, bend)
     critical = null.critical("drifting_line", 0.01)
     assert (
-        _largest_score(find_statistic("drifting_line"), found, base, null) > critical
+        _largest_score(find_statistic("drifting_line"), blocks, base, null) > critical
     ).mean() > 0.5
-    scores = find_statistic("drifting_line").score(found, base)
+    scores = find_statistic("drifting_line").score(blocks, base)
     best = scores["what"].values[
         np.bincount(
             standardise(scores, null.statistics["drifting_line"])[:, 1, 0].argmax(axis=1)
@@ -202,17 +202,17 @@ def test_a_drifting_line_is_detected_along_its_path(base, null, first, last, ben
     assert ends == pytest.approx(last * 0.05, abs=0.65)
     single = null.critical("spectral_line", 0.01)
     assert (
-        _largest_score(find_statistic("spectral_line"), found, base, null) > single
+        _largest_score(find_statistic("spectral_line"), blocks, base, null) > single
     ).mean() < 0.5
 
 
 def test_a_steady_line_and_a_temporary_hump_do_not_drift(base, null):
-    found = _some_records(base, 20, 13)
-    found["line_power"][:, 0, :, 37] *= 50.0
-    found["line_power"][:, 1, 3, 20:60] *= 3.0
-    found["line_power"][:, 2, 2:6] *= 4.0
+    blocks = _some_records(base, 20, 13)
+    blocks["line_power"][:, 0, :, 37] *= 50.0
+    blocks["line_power"][:, 1, 3, 20:60] *= 3.0
+    blocks["line_power"][:, 2, 2:6] *= 4.0
     assert (
-        _largest_score(find_statistic("drifting_line"), found, base, null)
+        _largest_score(find_statistic("drifting_line"), blocks, base, null)
         > null.critical("drifting_line", 0.01)
     ).mean() <= 0.1
 
@@ -238,41 +238,45 @@ def test_short_records_have_no_score(base):
         )
         is None
     )
-    found = _some_records(base, 2, 1)
-    assert find_statistic("drifting_line").score(found.drop_vars("line_power"), base) is None
-    found["line_weight"][:, 4:] = 0.0
-    assert find_statistic("drifting_line").score(found, base) is None
+    blocks = _some_records(base, 2, 1)
+    assert find_statistic("drifting_line").score(blocks.drop_vars("line_power"), base) is None
+    blocks["line_weight"][:, 4:] = 0.0
+    assert find_statistic("drifting_line").score(blocks, base) is None
 
 
 @pytest.mark.parametrize("block_count", [213, 218, 255])
 def test_windows_after_the_last_average_have_no_score(block_count):
     small = {"rate": 10.0, "block_count": block_count}
-    found = find_statistic("variance_stability").score(
+    scores = find_statistic("variance_stability").score(
         records(baseline(**small), 1, np.random.default_rng(4), **small), baseline(**small)
     )
-    behind = (found["first"] > block_count // 32 * 32).values
+    behind = (scores["first"] > block_count // 32 * 32).values
     assert behind.any()
-    long = np.char.startswith(found["what"].values.astype(str), "variance 640 s")
+    long = np.char.startswith(scores["what"].values.astype(str), "variance 640 s")
     assert long.any()
-    assert np.isnan(found["z"].values[..., behind, :][..., long]).all()
-    whole = (found["stop"] - found["first"] == block_count).values
-    assert np.isfinite(found["z"].values[..., whole, :][..., long]).all()
+    assert np.isnan(scores["z"].values[..., behind, :][..., long]).all()
+    whole = (scores["stop"] - scores["first"] == block_count).values
+    assert np.isfinite(scores["z"].values[..., whole, :][..., long]).all()
 
 
 def test_a_part_without_samples_is_skipped(base, null):
-    found = _some_records(base, 12, 16)
-    _moving_line(found, 0, 20, 60, 7.0 * np.sqrt(40.0 / (8.0 * BLOCKS)))
-    found["line_power"][:, :, 4], found["line_weight"][:, 4] = np.nan, 0.0
-    z = find_statistic("drifting_line").score(found, base)["z"].values
+    blocks = _some_records(base, 12, 16)
+    _moving_line(blocks, 0, 20, 60, 7.0 * np.sqrt(40.0 / (8.0 * BLOCKS)))
+    blocks["line_power"][:, :, 4], blocks["line_weight"][:, 4] = np.nan, 0.0
+    z = find_statistic("drifting_line").score(blocks, base)["z"].values
     assert np.isfinite(z).any()
     assert np.median(np.nanmax(z, axis=(1, 2, 3))) > 3.0
 
 
 def test_one_axis_has_no_joint_row():
-    one = baseline(axes="x", **SMALL)
-    found = records(one, 2, np.random.default_rng(1), **SMALL)
-    assert find_statistic("variance_stability").score(found, one)["axes"].values.tolist() == ["x"]
-    assert find_statistic("drifting_line").score(found, one)["axes"].values.tolist() == ["x"]
+    single_axis = baseline(axes="x", **SMALL)
+    blocks = records(single_axis, 2, np.random.default_rng(1), **SMALL)
+    assert find_statistic("variance_stability").score(blocks, single_axis)[
+        "axes"
+    ].values.tolist() == ["x"]
+    assert find_statistic("drifting_line").score(blocks, single_axis)["axes"].values.tolist() == [
+        "x"
+    ]
 
 
 def test_a_level_and_its_scatter_are_two_mismatches():
@@ -313,10 +317,10 @@ def test_statements_give_time_scale_and_frequencies():
         "tau_max_s": 2.9,
     }
     region |= {"ratio": 4.38, "estimate": 0.08, "sign": 1, "p_value": 1e-4, "frequency": np.nan}
-    told = mismatch_statement(region, 2000.0)
-    assert "axes x and y fluctuates over the whole record" in told
-    assert "one stretch of 40 s to another" in told
-    assert "8 % (rms)" in told
+    statement = mismatch_statement(region, 2000.0)
+    assert "axes x and y fluctuates over the whole record" in statement
+    assert "one stretch of 40 s to another" in statement
+    assert "8 % (rms)" in statement
     glide = region | {"statistic": "drifting_line", "what": "drifting 1.58 3.42", "axes": ["y"]}
     assert (
         "a drifting line over the whole record, from about 1.58 Hz to about 3.42 Hz"
@@ -331,13 +335,15 @@ def test_lines_of_null_records_leak_like_tapered_noise():
     )
     drawn = _correlate_lines(rng.gamma(12.0, size=(40_000, 99)) / 12.0, size)
     for wide in (4, 15, 40):  # lines in the sum along a path
-        spread = [one[:, 20 : 20 + wide].mean(axis=1).std() / one.mean() for one in (lines, drawn)]
-        alone = [one[:, 20:60].std() / one.mean() for one in (lines, drawn)]
-        seen, wanted = (
-            sums / single * np.sqrt(wide) for sums, single in zip(spread, alone, strict=True)
+        spread = [
+            power[:, 20 : 20 + wide].mean(axis=1).std() / power.mean() for power in (lines, drawn)
+        ]
+        line_scatter = [power[:, 20:60].std() / power.mean() for power in (lines, drawn)]
+        ratio, drawn_ratio = (
+            sums / single * np.sqrt(wide) for sums, single in zip(spread, line_scatter, strict=True)
         )
-        assert wanted == pytest.approx(seen, abs=0.015)
-    assert seen > 1.02
+        assert drawn_ratio == pytest.approx(ratio, abs=0.015)
+    assert ratio > 1.02
     assert drawn.min() > 0.0
     assert drawn.mean() == pytest.approx(1.0, abs=1e-3)
     assert drawn.var() == pytest.approx(1.0 / 12.0, rel=0.02)
@@ -350,7 +356,7 @@ def test_an_interval_that_ends_within_a_block_leaves_no_fluctuation():
         make_log(noise, rate=10.0, unit="deg/h", axis=["x", "y"]), block="1000samples"
     )
     base = calibrate_noise(blocks, quiet=np.arange(60) < 20)
-    told = variance_stability.scale_to_expected(blocks, base, [(("x", "y"), 2_000.0, 4_100.0)])
+    scaled = variance_stability.scale_to_expected(blocks, base, [(("x", "y"), 2_000.0, 4_100.0)])
     assert (
-        float(np.nanmax(find_statistic("variance_stability").score(told, base)["z"].values)) < 4.8
+        float(np.nanmax(find_statistic("variance_stability").score(scaled, base)["z"].values)) < 4.8
     )
