@@ -153,9 +153,9 @@ def __getattr__(name: str) -> Any:
 
         return version("gyrostab")
     if name in _HOME:
-        found = getattr(importlib.import_module(f"gyrostab.{_HOME[name]}"), name)
+        attribute = getattr(importlib.import_module(f"gyrostab.{_HOME[name]}"), name)
         _register_accessor()
-        return found
+        return attribute
     raise AttributeError(f"module 'gyrostab' has no attribute {name!r}")
 
 

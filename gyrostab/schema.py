@@ -194,9 +194,9 @@ _add_coefficients()
 
 def attributes(name: str, *, variance: str = "Allan") -> dict[str, Any]:
     """A fresh copy of the attributes of a product variable, for the variance of that name."""
-    found = dict(VARIABLES[name])
-    found["long_name"] = found["long_name"].replace("Allan variance", f"{variance} variance")
-    return found
+    attrs = dict(VARIABLES[name])
+    attrs["long_name"] = attrs["long_name"].replace("Allan variance", f"{variance} variance")
+    return attrs
 
 
 def signal_name(log: xr.Dataset) -> str:
@@ -207,14 +207,14 @@ def signal_name(log: xr.Dataset) -> str:
     SchemaError
         When it holds neither, or both.
     """
-    found = [name for name in SIGNAL_UNITS if name in log.data_vars]
-    if len(found) != 1:
-        holds = ", ".join(found or sorted(map(str, log.data_vars))) or "nothing"
+    signals = [name for name in SIGNAL_UNITS if name in log.data_vars]
+    if len(signals) != 1:
+        holds = ", ".join(signals or sorted(map(str, log.data_vars))) or "nothing"
         raise SchemaError(
             f"a log holds either 'rate' or 'angle'; this dataset holds {holds}; "
             "make one with gyrostab.make_log"
         )
-    return found[0]
+    return signals[0]
 
 
 def texts(dataset: xr.Dataset, name: str) -> list[str]:
@@ -240,22 +240,22 @@ def log_channels(log: xr.Dataset) -> list[str]:
     ]
 
 
-def _require_variables(dataset: xr.Dataset, what: str, dims: dict[str, tuple[str, ...]]) -> None:
+def _require_variables(dataset: xr.Dataset, kind: str, dims: dict[str, tuple[str, ...]]) -> None:
     if not isinstance(dataset, xr.Dataset):
         raise SchemaError(
-            f"this is a {type(dataset).__name__}, not a {what}: give the whole xarray.Dataset; "
-            f"{_MAKERS[what]} makes one, and gyrostab.from_dataframe and gyrostab.from_dataarray "
+            f"this is a {type(dataset).__name__}, not a {kind}: give the whole xarray.Dataset; "
+            f"{_MAKERS[kind]} makes one, and gyrostab.from_dataframe and gyrostab.from_dataarray "
             "make logs"
         )
     for name, expected in dims.items():
         if name not in dataset.variables:
             raise SchemaError(
-                f"this is not a {what}: it has no variable {name!r}; "
+                f"this is not a {kind}: it has no variable {name!r}; "
                 f"it has {sorted(map(str, dataset.variables))}"
             )
         if (has := dataset.variables[name].dims) != expected:
             raise SchemaError(
-                f"{what}: variable {name!r} has dimensions {has}, expected {expected}; "
+                f"{kind}: variable {name!r} has dimensions {has}, expected {expected}; "
                 "transpose or rename them"
             )
 
@@ -342,11 +342,11 @@ def _check_tau(surface: xr.Dataset) -> None:
     if rate is None or "tau" not in surface.variables:
         return
     factors = np.asarray(surface.variables["tau"].values, dtype=np.float64) * float(rate)
-    whole = np.rint(factors)
+    whole_factors = np.rint(factors)
     if (
-        np.any(whole < 1)
-        or np.any(np.abs(factors - whole) > _TAU_TOLERANCE * whole)
-        or np.any(np.diff(whole) <= 0)
+        np.any(whole_factors < 1)
+        or np.any(np.abs(factors - whole_factors) > _TAU_TOLERANCE * whole_factors)
+        or np.any(np.diff(whole_factors) <= 0)
     ):
         raise SchemaError(
             "the averaging times of the surface are not rising whole numbers of samples at "

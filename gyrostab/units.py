@@ -92,11 +92,11 @@ def _fold_spelling(text: str) -> str:
 
 
 def _add_unit(quantity: str, factor: float, *spellings: str, offset: float = 0.0) -> None:
-    known = (quantity, factor, offset)
+    definition = (quantity, factor, offset)
     for spelling in spellings:
-        _SPELLINGS[_normalize_text(spelling)] = known
+        _SPELLINGS[_normalize_text(spelling)] = definition
         key = quantity, _fold_spelling(spelling)
-        _PLAIN[key] = known if _PLAIN.get(key, known) == known else None
+        _PLAIN[key] = definition if _PLAIN.get(key, definition) == definition else None
 
 
 _add_unit("rate", 1.0, "dph")
@@ -224,13 +224,13 @@ def parse_unit(text: str, quantity: str | None = None) -> Unit:
     >>> parse_unit("DEG/HR").factor, parse_unit("G", "acceleration").quantity
     (1.0, 'acceleration')
     """
-    found = _find_unit(text, quantity)
-    if found is not None:
-        return Unit(text, *found)
+    definition = _find_unit(text, quantity)
+    if definition is not None:
+        return Unit(text, *definition)
     match = _NUMBER.match(_normalize_text(text))
-    found = _find_unit(match.group(2), quantity) if match else None
-    if match and found is not None:
-        kind, factor, offset = found
+    definition = _find_unit(match.group(2), quantity) if match else None
+    if match and definition is not None:
+        kind, factor, offset = definition
         scale = float(match.group(1))
         if scale == 0.0 or not math.isfinite(scale):
             raise UnitError(
@@ -286,8 +286,12 @@ def _parse_product(text: str) -> tuple[str, float, float] | None:
         if power < 0:
             numerator, denominator = denominator, numerator
         up, down = up * numerator ** abs(power), down * denominator ** abs(power)
-    found = _SIGNATURES.get((powers["angle"], powers["time"], powers["length"]))
-    return None if found is None else (found[0], up * found[1] / (down * found[2]), 0.0)
+    signature = _SIGNATURES.get((powers["angle"], powers["time"], powers["length"]))
+    return (
+        None
+        if signature is None
+        else (signature[0], up * signature[1] / (down * signature[2]), 0.0)
+    )
 
 
 def _find_unit(text: str, quantity: str | None) -> tuple[str, float, float] | None:
@@ -296,11 +300,11 @@ def _find_unit(text: str, quantity: str | None) -> tuple[str, float, float] | No
     if exact is not None and quantity in (None, exact[0]):
         return exact
     plain = _fold_spelling(text)
-    if quantity is not None and (found := _PLAIN.get((quantity, plain))):
-        return found
+    if quantity is not None and (definition := _PLAIN.get((quantity, plain))):
+        return definition
     if exact is not None or len(plain) < 2:  # a single letter means what its case says
         return exact
-    candidates = {known for kind in INNER if (known := _PLAIN.get((kind, plain)))}
+    candidates = {candidate for kind in INNER if (candidate := _PLAIN.get((kind, plain)))}
     return candidates.pop() if len(candidates) == 1 else None
 
 
@@ -314,11 +318,11 @@ def known_units(quantity: str) -> str:
     """
     if quantity in _LISTED:
         return _LISTED[quantity]
-    seen: dict[tuple[float, float], str] = {}
+    spellings: dict[tuple[float, float], str] = {}
     for spelling, (name, factor, offset) in _SPELLINGS.items():
         if name == quantity:
-            seen.setdefault((factor, offset), spelling)
-    return ", ".join(seen.values())
+            spellings.setdefault((factor, offset), spelling)
+    return ", ".join(spellings.values())
 
 
 def on_disk(units: str) -> str:

@@ -129,13 +129,13 @@ class GyrostabBackend(BackendEntrypoint):
     ) -> dict[str, xr.Dataset]:
         """Open the products in a folder of ``gyrostab fleet``, by the names of their runs."""
         folder = Path(filename_or_obj)
-        found = {"/": xr.Dataset()}
+        groups = {"/": xr.Dataset()}
         for path in sorted(folder.rglob("*.nc")):
             name = path.relative_to(folder).as_posix().removesuffix(".nc")
-            found[f"/{name}"] = self.open_dataset(
+            groups[f"/{name}"] = self.open_dataset(
                 path, drop_variables=drop_variables, strict=strict
             )
-        return found
+        return groups
 
     def open_datatree(  # type: ignore[override]
         self, filename_or_obj: str | os.PathLike[str], **options: Any
@@ -177,7 +177,8 @@ class _FileArray(BackendArray):
 
         single = [not isinstance(part, slice) for part in key]
         box = [
-            slice(part, part + 1) if one else part for part, one in zip(key, single, strict=True)
+            slice(part, part + 1) if is_single else part
+            for part, is_single in zip(key, single, strict=True)
         ]
         values = read_box(self.array, box)
-        return np.asarray(values[tuple(0 if one else slice(None) for one in single)])
+        return np.asarray(values[tuple(0 if is_single else slice(None) for is_single in single)])

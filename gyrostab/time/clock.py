@@ -31,12 +31,12 @@ def time_of_day() -> str:
     >>> len(time_of_day())
     20
     """
-    given = os.environ.get("SOURCE_DATE_EPOCH")
+    epoch = os.environ.get("SOURCE_DATE_EPOCH")
     try:
-        now = datetime.now(UTC) if not given else datetime.fromtimestamp(int(given), UTC)
+        now = datetime.now(UTC) if not epoch else datetime.fromtimestamp(int(epoch), UTC)
     except (ValueError, OverflowError, OSError) as error:
         raise OptionError(
-            f"SOURCE_DATE_EPOCH={given!r} in the environment is not a whole number of seconds "
+            f"SOURCE_DATE_EPOCH={epoch!r} in the environment is not a whole number of seconds "
             "since 1970; unset it"
         ) from error
     return f"{now:%Y-%m-%dT%H:%M:%SZ}"

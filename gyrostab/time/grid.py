@@ -192,8 +192,8 @@ def period_ns(rate: float) -> tuple[int, float]:
     (3333333, 0.3333333333333333)
     """
     period = NANOSECONDS / Fraction(repr(float(rate)))
-    whole = int(period)
-    return whole, float(period - whole)
+    nanoseconds = int(period)
+    return nanoseconds, float(period - nanoseconds)
 
 
 def grid_times(start: int, rate: float, index: Any) -> NDArray[np.int64]:
@@ -212,14 +212,14 @@ def grid_times(start: int, rate: float, index: Any) -> NDArray[np.int64]:
     720000000000000
     """
     index = np.asarray(index, dtype=np.int64)
-    whole, fraction = period_ns(rate)
-    return np.asarray(start + index * whole + np.rint(index * fraction).astype(np.int64))
+    nanoseconds, fraction = period_ns(rate)
+    return np.asarray(start + index * nanoseconds + np.rint(index * fraction).astype(np.int64))
 
 
 def grid_index(start: int, rate: float, stamps: Any) -> NDArray[np.float64]:
     """Compute the positions of `stamps` [ns since 1970] on the grid, in fractional samples."""
-    whole, fraction = period_ns(rate)
-    return np.asarray((np.asarray(stamps, dtype=np.int64) - start) / (whole + fraction))
+    nanoseconds, fraction = period_ns(rate)
+    return np.asarray((np.asarray(stamps, dtype=np.int64) - start) / (nanoseconds + fraction))
 
 
 def first_stamp(log: xr.Dataset) -> int:
@@ -292,8 +292,10 @@ class _GridTransform(CoordinateTransform):
     def has_ends_of(self, other: _GridTransform) -> bool:
         """Whether another grid of the same size has the same first and last stamp."""
         ends = {self.dims[0]: np.array([0, max(self.size - 1, 0)])}
-        own, others = (grid.forward(ends)[grid.coord_names[0]] for grid in (self, other))
-        return bool(np.array_equal(own, others))
+        own_stamps, other_stamps = (
+            grid.forward(ends)[grid.coord_names[0]] for grid in (self, other)
+        )
+        return bool(np.array_equal(own_stamps, other_stamps))
 
 
 def _wrap_positions(positions: dict[Any, Any]) -> Any:
@@ -326,12 +328,12 @@ class TimeGridIndex(CoordinateTransformIndex):
         """Concatenate axes; the result is computed if each begins where the previous one ends."""
         if positions is None and all(isinstance(index, cls) for index in indexes):
             grids = [index.transform for index in indexes]
-            whole, at, fits = grids[0].extended(sum(grid.size for grid in grids)), 0, True
+            full_grid, at, fits = grids[0].extended(sum(grid.size for grid in grids)), 0, True
             for grid in grids:
-                fits = fits and whole.cut(slice(at, at + grid.size)).has_ends_of(grid)
+                fits = fits and full_grid.cut(slice(at, at + grid.size)).has_ends_of(grid)
                 at += grid.size
             if fits:
-                return cls(whole)
+                return cls(full_grid)
         stamps = [index.to_pandas_index() for index in indexes]
         return xr.indexes.PandasIndex(stamps[0].append(stamps[1:]), dim)
 
@@ -375,18 +377,20 @@ class TimeGridIndex(CoordinateTransformIndex):
         def edge(bound: Any, side: str) -> int | None:
             if bound is None:
                 return None
-            whole = (
+            is_period_end = (
                 side == "right"
                 and isinstance(bound, str)
                 and not re.search(r"(Z|[+-]\d\d:?\d\d)$", bound)
             )
             # "T12:00:03" ends with that second
-            stamp = pd.Period(bound).end_time if whole else pd.Timestamp(bound)
+            stamp = pd.Period(bound).end_time if is_period_end else pd.Timestamp(bound)
             stamp = stamp.tz_convert(None) if stamp.tzinfo else stamp
             guess = int(np.floor(self.transform.reverse({name: np.datetime64(stamp)})[dim])) - 1
             while guess < self.transform.size:  # at most three steps: only rounding is missing
-                here = self.transform.forward({dim: guess})[name]
-                if here > np.datetime64(stamp) or (here == np.datetime64(stamp) and side == "left"):
+                grid_stamp = self.transform.forward({dim: guess})[name]
+                if grid_stamp > np.datetime64(stamp) or (
+                    grid_stamp == np.datetime64(stamp) and side == "left"
+                ):
                     break
                 guess += 1
             return max(0, min(guess, self.transform.size))
