@@ -78,26 +78,26 @@ def make_global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[st
         version = metadata.version("gyrostab")
     except metadata.PackageNotFoundError:
         version = "unknown"
-    given = dict(dataset.attrs)
-    history = given.get("history", "")
+    attrs = dict(dataset.attrs)
+    history = attrs.get("history", "")
     lines = [history] if isinstance(history, str) else [str(line) for line in history]
-    given["history"] = "\n".join(
+    attrs["history"] = "\n".join(
         [*filter(None, lines), f"{now} gyrostab {version}: {verb}, {kind}"]
     )
-    variance = VARIANCES.get(str(given.get("variance")), VARIANCES["avar"]).text
+    variance = VARIANCES.get(str(attrs.get("variance")), VARIANCES["avar"]).text
     titles = {name: text.replace("Allan", variance) for name, text in _TITLES.items()}
-    if given.get("title") in (None, *titles.values()):  # also a title of an earlier stage
-        given["title"] = titles[kind]
+    if attrs.get("title") in (None, *titles.values()):  # also a title of an earlier stage
+        attrs["title"] = titles[kind]
     names = texts(dataset, "source_files")
     source = "gyro log: " + ", ".join(names) if names else "gyro log"
-    given.setdefault("source", source.encode("ascii", "backslashreplace").decode())
-    given |= {
+    attrs.setdefault("source", source.encode("ascii", "backslashreplace").decode())
+    attrs |= {
         "Conventions": _CONVENTIONS,
         "date_created": now,
         "gyrostab_version": version,
         "gyrostab_content": kind,
     }
-    given.setdefault(
+    attrs.setdefault(
         "references",
         "IEEE Std 952; Wang et al., Sensors 16 (2016) 2081 "
         "(dynamic Allan variance of gyros with missing data)",
@@ -107,8 +107,8 @@ def make_global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[st
         for end, position in (("start", 0), ("end", -1)):
             # one dimension when the axis is computed
             stamp = np.asarray(times[position].values).ravel()[0]
-            given[f"time_coverage_{end}"] = f"{stamp.astype('datetime64[us]')}Z"
-    return encode_attributes(given)
+            attrs[f"time_coverage_{end}"] = f"{stamp.astype('datetime64[us]')}Z"
+    return encode_attributes(attrs)
 
 
 def decode_attributes(attrs: dict[str, Any]) -> dict[str, Any]:

@@ -73,11 +73,11 @@ def _find_blosc_arrays(folder: Path) -> Iterator[Path]:
     """
     consolidated = _read_consolidated(folder)
     for place, _, names in os.walk(folder):
-        known = [consolidated.get(Path(place).relative_to(folder).as_posix())]
-        known += [
+        metadata = [consolidated.get(Path(place).relative_to(folder).as_posix())]
+        metadata += [
             _read_json(Path(place, name)) for name in (".zarray", "zarr.json") if name in names
         ]
-        if any(map(_uses_blosc, known)):
+        if any(map(_uses_blosc, metadata)):
             yield Path(place)
 
 

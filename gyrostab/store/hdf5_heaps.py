@@ -52,8 +52,8 @@ def check_global_heaps(path: Path, *, skip: Sequence[tuple[int, int]] = ()) -> N
             return
         for begin in _find_collections(file, size, skip):
             if not _is_finite(file, begin):
-                what = f"this HDF5 file is damaged (global heap at byte {begin})"
-                raise FormatError(f"{path.name}: {what}; copy it again")
+                problem = f"this HDF5 file is damaged (global heap at byte {begin})"
+                raise FormatError(f"{path.name}: {problem}; copy it again")
 
 
 def _find_size_of_lengths(file: BinaryIO, size: int) -> int:

@@ -212,8 +212,10 @@ def _find_hdf5_codecs(plist: Any) -> tuple[tuple[int, Any], ...]:
 
 def has_known_filters(plist: Any) -> bool:
     """Whether all filters in the creation property list of an HDF5 dataset are known."""
-    known = (_DEFLATE, _SHUFFLE, _FLETCHER32, _ZSTD)
-    return all(plist.get_filter(number)[0] in known for number in range(plist.get_nfilters()))
+    known_filters = (_DEFLATE, _SHUFFLE, _FLETCHER32, _ZSTD)
+    return all(
+        plist.get_filter(number)[0] in known_filters for number in range(plist.get_nfilters())
+    )
 
 
 @dataclass(frozen=True)
@@ -227,12 +229,12 @@ class _Shuffle:
         from numcodecs import Shuffle
 
         stored = np.frombuffer(data, np.uint8)
-        whole = stored.size - stored.size % max(self.width, 1)
-        ordered = Shuffle(elementsize=self.width).decode(stored[:whole])
+        shuffled_size = stored.size - stored.size % max(self.width, 1)
+        ordered = Shuffle(elementsize=self.width).decode(stored[:shuffled_size])
         return (
             ordered
-            if whole == stored.size
-            else np.concatenate([np.frombuffer(ordered, np.uint8), stored[whole:]])
+            if shuffled_size == stored.size
+            else np.concatenate([np.frombuffer(ordered, np.uint8), stored[shuffled_size:]])
         )
 
 
@@ -311,12 +313,12 @@ def find_zarr_codecs(layout: dict[str, Any]) -> tuple[Any, ...]:
     """Find the codecs of a variable, in the order of reading."""
     import numcodecs
 
-    known = {"fletcher32": _Fletcher32, "blosc": _Blosc}
+    known_codecs = {"fletcher32": _Fletcher32, "blosc": _Blosc}
     described = [
         item for item in [layout["compressor"], *reversed(layout["filters"] or ())] if item
     ]
     return tuple(
-        known[item["id"]]() if item["id"] in known else numcodecs.get_codec(item)
+        known_codecs[item["id"]]() if item["id"] in known_codecs else numcodecs.get_codec(item)
         for item in described
     )
 

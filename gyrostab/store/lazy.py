@@ -119,26 +119,26 @@ def find_source(array: Any) -> Source | None:
 
 def _source_in_layer(graph: Any, name: str) -> Source | None:
     layer = getattr(graph, "layers", {}).get(name, {})
-    found = layer.get(name)
-    if not isinstance(found, Source):
-        found = getattr(found, "value", None)  # some versions of dask wrap data of a graph
-    return found if isinstance(found, Source) else None
+    node = layer.get(name)
+    if not isinstance(node, Source):
+        node = getattr(node, "value", None)  # some versions of dask wrap data of a graph
+    return node if isinstance(node, Source) else None
 
 
 def find_files(array: Any) -> set[Path]:
     """Find the files that an array reads through sources; empty for an array in memory."""
     source = find_source(array)
     if source is not None:
-        own = set() if source.path is None else {source.path}
-        return own.union(*map(find_files, source.parts))
+        own_files = set() if source.path is None else {source.path}
+        return own_files.union(*map(find_files, source.parts))
     return set().union(*map(find_files, _sources_of_graph(array).values()))
 
 
 def _sources_of_graph(array: Any) -> dict[str, Source]:
     graph = getattr(array, "dask", None)
     names = [name for name in getattr(graph, "layers", ()) if name.startswith(_LAYER)]
-    found = {name: _source_in_layer(graph, name) for name in names}
-    return {name: source for name, source in found.items() if source is not None}
+    sources = {name: _source_in_layer(graph, name) for name in names}
+    return {name: source for name, source in sources.items() if source is not None}
 
 
 def keep_sources(array: Any, derived: Any) -> Any:
@@ -208,9 +208,9 @@ def read_box(array: Any, box: Sequence[slice]) -> NDArray[Any]:
     """
     ends = tuple(slice(*part.indices(n)) for part, n in zip(box, array.shape, strict=True))
     source = find_source(array)
-    found = (array if source is None else source)[ends]
+    selection = (array if source is None else source)[ends]
     return np.asarray(
-        found.compute(scheduler="synchronous") if hasattr(found, "compute") else found
+        selection.compute(scheduler="synchronous") if hasattr(selection, "compute") else selection
     )
 
 
@@ -267,8 +267,8 @@ class _Joined(RowSource):
         """Read samples of one row from `begin` on into `out`."""
         done, piece = 0, bisect_right(self.edges, begin) - 1
         while done < out.size:
-            most = self.edges[piece + 1] - begin - done
-            place = out[done : done + most]
+            remaining = self.edges[piece + 1] - begin - done
+            place = out[done : done + remaining]
             read_into(self.parts[piece], row, begin + done - self.edges[piece], place)
             done, piece = done + place.size, piece + 1
 
@@ -322,8 +322,8 @@ class _Selected(RowSource):
 
     def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
         """Read samples of one row from `begin` on into `out`."""
-        own = row if self.row is None else self.row
-        read_into(self.parts[0], own, self.begin + begin, out)
+        source_row = row if self.row is None else self.row
+        read_into(self.parts[0], source_row, self.begin + begin, out)
 
 
 def select_part(array: Any, row: int | None, begin: int = 0, end: int | None = None) -> Any:
@@ -365,8 +365,8 @@ class _Transposed(Source):
         self.shape = tuple(source.shape[place] for place in order)
 
     def __getitem__(self, box: Any) -> NDArray[Any]:
-        before = [box[self.order.index(place)] for place in range(self.ndim)]
-        return np.asarray(self.parts[0][tuple(before)]).transpose(self.order)
+        source_box = [box[self.order.index(place)] for place in range(self.ndim)]
+        return np.asarray(self.parts[0][tuple(source_box)]).transpose(self.order)
 
 
 def transpose_lazy(variable: Any, dims: Sequence[Any]) -> Any:

@@ -213,11 +213,11 @@ def _find_data(values: Iterable[Any]) -> list[tuple[int, int]]:
     """Find first byte and size of the chunks of variables."""
     from h5py import h5d
 
-    found: list[tuple[int, int]] = []
+    chunks: list[tuple[int, int]] = []
     for variable in values:
         if variable.get_create_plist().get_layout() == h5d.CHUNKED:
-            variable.chunk_iter(lambda chunk: found.append(chunk[2:]))  # byte_offset and size
-    return sorted(found)
+            variable.chunk_iter(lambda chunk: chunks.append(chunk[2:]))  # byte_offset and size
+    return sorted(chunks)
 
 
 def _open_variables(values: dict[str, Any], *, brief: bool) -> dict[Any, xr.Variable]:
@@ -284,7 +284,7 @@ def _reduce_stamps(
 
     A chunk of stamps takes a tenth of the time of a summary.
     """
-    found = np.concatenate([_read_part(values, (at % stamps.size,), (1,)) for at in ends])
-    if stamps.shape != (rule["size"],) or not follows_rule(found, stamps.attrs, rule):
+    end_stamps = np.concatenate([_read_part(values, (at % stamps.size,), (1,)) for at in ends])
+    if stamps.shape != (rule["size"],) or not follows_rule(end_stamps, stamps.attrs, rule):
         raise ValueError("another program has changed the stamps")
     return xr.Variable((), 0, stamps.attrs)

@@ -117,14 +117,16 @@ def _open_dataset(
     if check is not None:
         check(path, stored.variables)
     is_log = stored.attrs.get("gyrostab_content") == "log"
-    own = {name for name in stored.data_vars if is_log and _is_sampled(stored.variables[name])}
+    sampled_names = {
+        name for name in stored.data_vars if is_log and _is_sampled(stored.variables[name])
+    }
     if path.is_dir():
-        check_blosc_chunks(path, skip=own | set(parse_time_grids(stored.variables, path)))
+        check_blosc_chunks(path, skip=sampled_names | set(parse_time_grids(stored.variables, path)))
     close = close_function(stored)
     stored = replace_stamps(stored, path)
     stored.set_close(close)
     long = _find_long_variables(stored, path, strict=strict) if is_log else {}
-    if path.is_dir() and own.difference(long):
+    if path.is_dir() and sampled_names.difference(long):
         check_blosc_chunks(path, skip=list(long))
     small = MIN_LAZY_VALUES if is_log else 0 if lazy else sys.maxsize
     opened = _make_variables_lazy(stored, long, path, small=small)
@@ -141,12 +143,14 @@ def _make_variables_lazy(
 
     A dask array takes time to make and to read.
     """
-    rest = {name: stored.variables[name] for name in stored.data_vars if name not in long}
+    short_variables = {
+        name: stored.variables[name] for name in stored.data_vars if name not in long
+    }
     ready = {  # text is always small, and dask cannot find the size of its chunks
         name: item.load()
         if item.size < small or item.dtype.kind in "OSU"
         else make_variable_lazy(item, path)
-        for name, item in rest.items()
+        for name, item in short_variables.items()
     }
     coords = xr.Coordinates(
         {name: stored.variables[name].load() for name in stored.coords}, indexes={}
@@ -260,9 +264,10 @@ class _ChunkedVariable(RowSource):
             low, high = max(begin, first), min(end, first + self.length)
             place = out[low - begin : high - begin]
             try:
-                whole = low == first and high == min(first + self.length, self.shape[-1])
+                is_whole = low == first and high == min(first + self.length, self.shape[-1])
                 self._decode_samples(
-                    self._read_chunk(row, number, whole=whole)[low - first : high - first], place
+                    self._read_chunk(row, number, is_whole=is_whole)[low - first : high - first],
+                    place,
                 )
             except ChunkDamage as damage:
                 self._handle_damage(row, number, str(damage))
@@ -276,8 +281,8 @@ class _ChunkedVariable(RowSource):
         if self.missing is not None and self.missing == self.missing:
             out[raw == self.missing] = np.nan
 
-    def _read_chunk(self, row: int, number: int, *, whole: bool) -> NDArray[Any]:
-        """Read one chunk as it is on disk; one that is not used as a `whole` is cached.
+    def _read_chunk(self, row: int, number: int, *, is_whole: bool) -> NDArray[Any]:
+        """Read one chunk as it is on disk; one that is not used as a whole is cached.
 
         The last chunk of a row is longer than the row.
         """
@@ -285,7 +290,7 @@ class _ChunkedVariable(RowSource):
         chunk = _CACHE.get((self.opened, self.name, place))
         if chunk is None:
             chunk = read_chunk(self.path, self.name, place, zarr=self.zarr, opened=self.opened)
-            if not whole:
+            if not is_whole:
                 _CACHE.put((self.opened, self.name, place), chunk)
         if chunk.size != self.length:
             raise ChunkDamage(f"is damaged: it holds {chunk.size} values in place of {self.length}")
@@ -302,13 +307,13 @@ class _ChunkedVariable(RowSource):
         when = " to ".join(
             str(stamp).rstrip("0").rstrip(".") for stamp in span.view("datetime64[ns]")
         )
-        what = f"{self.path}: {self.rows[row]}: the chunk from {when} {damage}"
+        problem = f"{self.path}: {self.rows[row]}: the chunk from {when} {damage}"
         if self.strict:
             raise FormatError(
-                f"{what}; copy it again, or leave out --strict to take these samples as missing"
+                f"{problem}; copy it again, or leave out --strict to take these samples as missing"
             )
         with _WARNING_LOCK:
-            _warn_once(self.opened, f"{what}. Its samples are taken as missing; copy it again")
+            _warn_once(self.opened, f"{problem}. Its samples are taken as missing; copy it again")
 
 
 #: Chunks in which one part of a run ends and the next one begins.

@@ -209,19 +209,19 @@ def describe_address(url: str) -> dict[str, Any]:
     The digest changes when the object is replaced: it is made from the size, time of change and
     checksum that the store knows. Both are None where nothing can be reached.
     """
-    found = []
+    infos = []
     try:
         filesystem, path = _open_filesystem(url)
         filesystem.invalidate_cache(path)
         names = [path, *(f"{path}/{name}" for name in _ROOT_METADATA)]
         for name in names[1:] if filesystem.isdir(path) else names[:1]:
             with contextlib.suppress(FileNotFoundError):
-                found.append(filesystem.info(name))
+                infos.append(filesystem.info(name))
     except Exception:  # libraries raise exceptions of many kinds; reading says what is wrong
         return {"bytes": None, "changed_ns": None}
-    states = [sorted((key, str(info[key])) for key in _CHANGES & set(info)) for info in found]
+    states = [sorted((key, str(info[key])) for key in _CHANGES & set(info)) for info in infos]
     return {
-        "bytes": sum(int(info.get("size") or 0) for info in found),
+        "bytes": sum(int(info.get("size") or 0) for info in infos),
         "changed_ns": 0,
         "listing": hashlib.sha256(repr(states).encode()).hexdigest(),
     }
@@ -257,13 +257,13 @@ _COPIES: dict[int, list[tempfile.TemporaryDirectory[str]]] = {}
 def remove_copies() -> Iterator[None]:
     """Remove the copies of files that this thread has downloaded in the block, at its end."""
     copies = _COPIES.setdefault(threading.get_ident(), [])
-    before = len(copies)
+    n_before = len(copies)
     try:
         yield
     finally:
-        if len(copies) > before:
+        if len(copies) > n_before:
             _download_file.cache_clear()
-        while len(copies) > before:
+        while len(copies) > n_before:
             copies.pop().cleanup()
 
 

@@ -123,31 +123,36 @@ class ChunkedRows:
             at: tuple[int, ...] = (number,)
             inside: Any = slice(low - first, high - first)
             if len(self.shape) == 2:
-                across, rest = divmod(self.place, self.chunks[1 - self.along])
+                across, offset = divmod(self.place, self.chunks[1 - self.along])
                 at, inside = (
-                    ((number, across), (inside, rest))
+                    ((number, across), (inside, offset))
                     if self.along == 0
-                    else ((across, number), (rest, inside))
+                    else ((across, number), (offset, inside))
                 )
-            alone = len(self.shape) == 1 or self.chunks[1 - self.along] == 1
+            is_single_column = len(self.shape) == 1 or self.chunks[1 - self.along] == 1
             part = low > first or high < min(first + length, self.shape[self.along])
-            chunk = self._read_chunk(at, alone=alone, part=part)
+            chunk = self._read_chunk(at, is_single_column=is_single_column, part=part)
             out[low - start : high - start] = self.fill if chunk is None else chunk[inside]
         return out
 
-    def _read_chunk(self, at: tuple[int, ...], *, alone: bool, part: bool) -> NDArray[Any] | None:
+    def _read_chunk(
+        self, at: tuple[int, ...], *, is_single_column: bool, part: bool
+    ) -> NDArray[Any] | None:
         """Read a chunk; cache it if another column or a later read will use it."""
         large = math.prod(self.chunks) * self.dtype.itemsize >= _LARGE_CHUNK_BYTES
-        kept, key = _EDGE_CACHE if alone and not large else _SHARED_CACHE, (*self.key, at)
-        chunk = kept.get(key)
+        cache, key = (
+            _EDGE_CACHE if is_single_column and not large else _SHARED_CACHE,
+            (*self.key, at),
+        )
+        chunk = cache.get(key)
         if chunk is not None:
             return chunk
         with _LARGE_CHUNK_LOCK if large else nullcontext():
-            chunk = kept.get(key) if large else None
+            chunk = cache.get(key) if large else None
             if chunk is None:
                 chunk = self.load(at)
-                if chunk is not None and (part or not alone):
-                    kept.put(key, chunk)
+                if chunk is not None and (part or not is_single_column):
+                    cache.put(key, chunk)
         return chunk
 
 
@@ -218,8 +223,8 @@ def _load_hdf5(
     if chunk is None:
         return None
     if chunk.size != int(np.prod(chunks)):
-        what = f"holds {chunk.size} values in place of {int(np.prod(chunks))}"
+        problem = f"holds {chunk.size} values in place of {int(np.prod(chunks))}"
         raise DamageError(
-            f"{path.name}: is damaged, a chunk of {name.strip('/')!r} {what}; copy it again"
+            f"{path.name}: is damaged, a chunk of {name.strip('/')!r} {problem}; copy it again"
         )
     return chunk.reshape(chunks)

@@ -61,33 +61,33 @@ def make_names_storable(dataset: xr.Dataset) -> xr.Dataset:
     ...     make_names_storable(xr.Dataset({"{{7*7}}": 1.0}))["channel_7_7"].attrs["long_name"]
     '{{7*7}}'
     """
-    taken = {str(name) for name in (*dataset.variables, *dataset.dims)}
+    used_names = {str(name) for name in (*dataset.variables, *dataset.dims)}
     safe: dict[str, str] = {}
     for name in (str(name) for name in dataset.variables if not is_storable(str(name))):
-        if name not in (f"time_{other}" for other in dataset.variables):
-            safe[name] = make_name_storable(name, taken)
-            taken.add(safe[name])
+        if name not in (f"time_{channel}" for channel in dataset.variables):
+            safe[name] = make_name_storable(name, used_names)
+            used_names.add(safe[name])
     if not safe:
         return dataset
     renamed = dataset.rename(
         {
             **safe,
             **{
-                f"time_{name}": f"time_{other}"
-                for name, other in safe.items()
-                if f"time_{name}" in taken
+                f"time_{name}": f"time_{safe_name}"
+                for name, safe_name in safe.items()
+                if f"time_{name}" in used_names
             },
         }
     )
-    for name, other in safe.items():
+    for name, safe_name in safe.items():
         # a name that was decoded wrongly may hold half a character
         shown = name.encode("utf-8", "backslashreplace").decode()
-        renamed[other].attrs = {
+        renamed[safe_name].attrs = {
             "long_name": shown,
-            **renamed[other].attrs,
+            **renamed[safe_name].attrs,
             ORIGINAL_NAME: json.dumps(name),
         }
-    renamings = ", ".join(f"{name!a} as {other!r}" for name, other in safe.items())
+    renamings = ", ".join(f"{name!a} as {safe_name!r}" for name, safe_name in safe.items())
     warnings.warn(
         "a file cannot hold a channel of this name, so it is stored under another one: "
         f"{renamings}",
@@ -108,8 +108,8 @@ def restore_names(dataset: xr.Dataset) -> xr.Dataset:
         {
             **originals,
             **{
-                f"time_{name}": f"time_{other}"
-                for name, other in originals.items()
+                f"time_{name}": f"time_{original}"
+                for name, original in originals.items()
                 if f"time_{name}" in dataset.dims
             },
         }

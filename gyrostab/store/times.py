@@ -70,15 +70,15 @@ def find_time_grids(dataset: xr.Dataset) -> dict[Any, Any]:
         for name, index in dataset.xindexes.items()
         if isinstance(index, TimeGridIndex)
     }
-    taken = [
-        other
+    conflicts = [
+        needed_name
         for name in grids
-        for other in (f"{name}_start", index_dim(name))
-        if other in dataset.variables
+        for needed_name in (f"{name}_start", index_dim(name))
+        if needed_name in dataset.variables
     ]
-    if taken:
+    if conflicts:
         raise SchemaError(
-            f"the name {taken[0]!r} is needed for the time axis; rename that variable"
+            f"the name {conflicts[0]!r} is needed for the time axis; rename that variable"
         )
     return grids
 
@@ -149,9 +149,9 @@ def has_whole_microseconds(
     for name, variable in dataset.variables.items():
         if name in grids:
             grid = grids[name]
-            whole, fraction = period_ns(grid.rate)
+            nanoseconds, fraction = period_ns(grid.rate)
             if int(grid_times(grid.start, grid.rate, grid.first)) % 1000 or (
-                stamps and (fraction or whole * grid.stride % 1000)
+                stamps and (fraction or nanoseconds * grid.stride % 1000)
             ):
                 return False
         elif variable.dtype.kind == "M" and np.any(to_nanoseconds(variable.values) % 1000):
@@ -264,8 +264,8 @@ def replace_stamps(stored: xr.Dataset, where: object) -> xr.Dataset:
             start = xr.Variable((), 0, stamps.attrs)
             stored = stored.drop_vars(name).assign({f"{name}_start": start})
         else:
-            rest = {key: value for key, value in stamps.attrs.items() if key != GRID}
-            changed = xr.Variable(stamps.dims, stamps.data, rest, stamps.encoding)
+            other_attrs = {key: value for key, value in stamps.attrs.items() if key != GRID}
+            changed = xr.Variable(stamps.dims, stamps.data, other_attrs, stamps.encoding)
             stored = stored.drop_vars(name).assign_coords(
                 xr.Coordinates({name: changed}, indexes={})
             )
@@ -291,12 +291,12 @@ def follows_rule(ends: NDArray[Any], attrs: dict[Any, Any], rule: dict[str, Any]
     """Whether the first and last stamps, or the last, follow the rule of a time axis."""
     samples = rule["first"] + rule["stride"] * np.array([0, rule["size"] - 1])[-ends.size :]
     step = _STEPS.get(str(attrs.get("units")))
-    found = (
+    end_stamps = (
         ends * step
         if step and ends.dtype.kind == "i"
         else to_nanoseconds(decode_stamps(xr.Variable("end", ends), attrs).values)
     )
-    return np.array_equal(found, grid_times(rule["start_ns"], rule["rate_hz"], samples))
+    return np.array_equal(end_stamps, grid_times(rule["start_ns"], rule["rate_hz"], samples))
 
 
 def decode_stamps(variable: xr.Variable, attrs: dict[Any, Any] | None = None) -> xr.Variable:
@@ -309,13 +309,13 @@ def decode_stamps(variable: xr.Variable, attrs: dict[Any, Any] | None = None) ->
         return variable
     step = _STEPS.get(attrs["units"])
     if step and variable.dtype.kind == "i":  # as `to_disk` writes them; xarray is slower
-        rest = {
+        other_attrs = {
             key: value for key, value in variable.attrs.items() if key not in ("units", "calendar")
         }
         return xr.Variable(
             variable.dims,
             (np.asarray(variable.values, dtype=np.int64) * step).view("datetime64[ns]"),
-            rest,
+            other_attrs,
         )
     timed = variable.copy(deep=False)
     timed.attrs = {

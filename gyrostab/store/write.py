@@ -240,15 +240,15 @@ def _copy_variables(
     from dask.system import CPU_COUNT
 
     direct = {name: v for name, v in long.items() if find_source(v.data) is not None}
-    others = {name: v for name, v in long.items() if name not in direct}
+    computed = {name: v for name, v in long.items() if name not in direct}
     segments = chain.from_iterable(_plan_batches(direct, lengths, 1))
     workers = min(dask.config.get("num_workers", None) or CPU_COUNT, MAX_WORKERS)
     batches = chain(
         map_in_order(partial(_read_segment, direct), segments, workers=workers),
         # dask walks a whole graph each time
         map_in_order(
-            partial(_compute_batch, others),
-            _plan_batches(others, lengths, MAX_BATCH_BYTES),
+            partial(_compute_batch, computed),
+            _plan_batches(computed, lengths, MAX_BATCH_BYTES),
             workers=1,
         ),
     )

@@ -201,20 +201,20 @@ def _find_foreign(label: str, target: Path, find_foreign: FindForeign) -> str | 
 
 def _check_inputs(label: str, target: Path, inputs: Sequence[Path], advice: str) -> None:
     """Compare by identity, which does not depend on links and other spellings of a path."""
-    own, place = _find_status(target), _find_real_path(target)
-    folder = own is not None and stat.S_ISDIR(own.st_mode)
+    target_status, place = _find_status(target), _find_real_path(target)
+    folder = target_status is not None and stat.S_ISDIR(target_status.st_mode)
     for item in inputs:
-        found = _find_status(item)
-        if found is None:
+        status = _find_status(item)
+        if status is None:
             continue
-        if own is not None and os.path.samestat(own, found):
+        if target_status is not None and os.path.samestat(target_status, status):
             raise OptionError(f"{label} is also an input and would be destroyed; {advice}")
         if folder and _find_real_path(item).startswith(os.path.join(place, "")):
             raise OptionError(
                 f"{label} is a folder around the input {str(item)!r}, "
                 f"which would be destroyed; {advice}"
             )
-        inside = stat.S_ISDIR(found.st_mode) and place.startswith(
+        inside = stat.S_ISDIR(status.st_mode) and place.startswith(
             os.path.join(_find_real_path(item), "")
         )
         if inside and is_store(item):

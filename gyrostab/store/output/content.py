@@ -62,8 +62,8 @@ def find_foreign_item(folder: Path) -> str | None:
     ...     find_foreign_item(Path(name))
     'tide.jpg'
     """
-    found = _find_in_node(str(folder))
-    return None if found is None else os.path.relpath(found, folder)
+    foreign_item = _find_in_node(str(folder))
+    return None if foreign_item is None else os.path.relpath(foreign_item, folder)
 
 
 def _find_in_node(folder: str) -> str | None:
@@ -74,9 +74,9 @@ def _find_in_node(folder: str) -> str | None:
             return entry.path
         chunk = node == "array" and _CHUNK.fullmatch(entry.name)
         if entry.is_dir():
-            found = _find_in_chunks(entry.path) if chunk else _find_in_node(entry.path)
-            if found is not None:
-                return found
+            foreign_item = _find_in_chunks(entry.path) if chunk else _find_in_node(entry.path)
+            if foreign_item is not None:
+                return foreign_item
         elif not entry.is_file() or not (chunk or entry.name in _METADATA):
             return entry.path
     return None
@@ -90,8 +90,8 @@ def _find_in_chunks(folder: str) -> str | None:
             or not (entry.is_dir() or entry.is_file())
         ):
             return entry.path
-        if entry.is_dir() and (found := _find_in_chunks(entry.path)) is not None:
-            return found
+        if entry.is_dir() and (foreign_item := _find_in_chunks(entry.path)) is not None:
+            return foreign_item
     return None
 
 

@@ -45,8 +45,8 @@ def describe_file(path: Path) -> dict[str, Any]:
         return describe_address(url)
     try:
         if not path.is_dir():
-            found = path.stat()
-            return {"bytes": found.st_size, "changed_ns": found.st_mtime_ns}
+            status = path.stat()
+            return {"bytes": status.st_size, "changed_ns": status.st_mtime_ns}
         listing = sorted(_list_files(str(path), ""))
     except OSError:
         return {"bytes": None, "changed_ns": None}
@@ -65,13 +65,13 @@ def _list_files(folder: str, inside: str) -> Iterator[tuple[str, int, int]]:
             if entry.is_dir():
                 yield from _list_files(entry.path, f"{name}/")
             else:
-                found = entry.stat()
-                yield name, found.st_size, found.st_mtime_ns
+                status = entry.stat()
+                yield name, status.st_size, status.st_mtime_ns
 
 
 def match_files(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Path]:
     """Find the files and folders that exist under names or patterns."""
-    found: dict[Path, None] = {}
+    files: dict[Path, None] = {}
     for path in [paths] if isinstance(paths, str | os.PathLike) else paths:
         item = os.fspath(path)
         names = (
@@ -79,8 +79,8 @@ def match_files(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
             if os.path.lexists(item) or not glob.has_magic(item)
             else glob.glob(item, recursive=True)
         )
-        found.update((Path(name), None) for name in names if os.path.lexists(name))
-    return list(found)
+        files.update((Path(name), None) for name in names if os.path.lexists(name))
+    return list(files)
 
 
 @contextlib.contextmanager
@@ -104,9 +104,9 @@ def protect_inputs(
     Traceback (most recent call last):
     gyrostab.errors.OptionError: output '...log.nc' is also an input and would be destroyed; give...
     """
-    before = _PROTECTED.get() or {}
-    files = {path: _describe_data(path) for path in match_files(paths) if path not in before}
-    token = _PROTECTED.set({**before, **files})
+    protected = _PROTECTED.get() or {}
+    files = {path: _describe_data(path) for path in match_files(paths) if path not in protected}
+    token = _PROTECTED.set({**protected, **files})
     try:
         yield
     finally:
@@ -137,11 +137,11 @@ def protected_inputs() -> list[Path]:
 
 def check_unchanged() -> None:
     """Raise `FormatError` when an input of the current command has changed since the start."""
-    for path, before in (_PROTECTED.get() or {}).items():
-        if before is not None and describe_file(path) != before:
-            what = "has changed" if path.exists() else "has vanished"
+    for path, description in (_PROTECTED.get() or {}).items():
+        if description is not None and describe_file(path) != description:
+            change = "has changed" if path.exists() else "has vanished"
             raise FormatError(
-                f"{path}: {what} while it was read, so nothing was written; "
+                f"{path}: {change} while it was read, so nothing was written; "
                 "start again once it is complete"
             )
 
@@ -162,5 +162,5 @@ def find_sources(dataset: Any) -> list[Path]:
     named = [variable.encoding.get("source") for variable in lazy] + [
         dataset.encoding.get("source") if lazy else None
     ]
-    found = {Path(path) for path in named if path is not None}
-    return sorted(found.union(*(find_files(v.data) for v in lazy if v.chunks is not None)))
+    files = {Path(path) for path in named if path is not None}
+    return sorted(files.union(*(find_files(v.data) for v in lazy if v.chunks is not None)))

@@ -88,9 +88,9 @@ def new_output(
             yield temporary
             check_unchanged()
         return
-    for left in _find_leftovers(target):
+    for leftover in _find_leftovers(target):
         warnings.warn(
-            f"{left} is being written now, or was left by a process that was killed: "
+            f"{leftover} is being written now, or was left by a process that was killed: "
             "then delete it",
             stacklevel=3,
         )
@@ -231,8 +231,8 @@ def is_leftover(name: str) -> bool:
 
 
 def _find_leftovers(target: Path) -> list[Path]:
-    found = glob.glob(f".{glob.escape(target.name)}.gyrostab-????????.part", root_dir=target.parent)
-    return [target.parent / name for name in sorted(found) if is_leftover(name)]
+    names = glob.glob(f".{glob.escape(target.name)}.gyrostab-????????.part", root_dir=target.parent)
+    return [target.parent / name for name in sorted(names) if is_leftover(name)]
 
 
 def remove_leftovers(output: Path) -> None:
