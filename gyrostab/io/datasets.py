@@ -124,9 +124,9 @@ def to_netcdf(
         log = _find_rate(packed) is not None
         encoding = _netcdf_encoding(packed, filters)
         long = long_variables(packed) if log else large_variables(packed, encoding)
-        rest = {name: options for name, options in encoding.items() if name not in long}
+        short_encoding = {name: options for name, options in encoding.items() if name not in long}
         with new_output(path, overwrite=overwrite, inputs=sources) as temporary:
-            _begin_netcdf(packed.drop_vars(long), temporary, rest)
+            _begin_netcdf(packed.drop_vars(long), temporary, short_encoding)
             (append_netcdf if log else append_compressed)(
                 temporary, long, encoding, progress=progress
             )
@@ -156,18 +156,18 @@ def _wants_stamps(dataset: xr.Dataset, stamps: bool | None) -> bool:
     return dataset.sizes.get("time", 0) < MAX_STAMPED_SAMPLES if stamps is None else stamps
 
 
-def _begin_netcdf(rest: xr.Dataset, path: Path, encoding: dict[Any, dict[str, Any]]) -> None:
+def _begin_netcdf(dataset: xr.Dataset, path: Path, encoding: dict[Any, dict[str, Any]]) -> None:
     """Write all but the long variables; `Dataset.to_netcdf` would load dask.distributed."""
     if any(
         variable.chunks is not None and variable.size >= CHUNK_VALUES
-        for variable in rest.variables.values()
+        for variable in dataset.variables.values()
     ):
-        rest.to_netcdf(path, engine="netcdf4", format="NETCDF4", encoding=encoding)
+        dataset.to_netcdf(path, engine="netcdf4", format="NETCDF4", encoding=encoding)
         return
     open_store: Any = xr.backends.NetCDF4DataStore.open
     store = open_store(path, mode="w", format="NETCDF4", lock=library_lock())
     try:
-        rest.load().dump_to_store(store, encoding=encoding)
+        dataset.load().dump_to_store(store, encoding=encoding)
     finally:
         store.close()
 
@@ -275,10 +275,10 @@ def to_zarr(
     def write(packed: xr.Dataset) -> None:
         long = long_variables(packed) if _find_rate(packed) is not None else {}
         encoding = plan_zarr(packed)
-        rest = {name: options for name, options in encoding.items() if name not in long}
+        short_encoding = {name: options for name, options in encoding.items() if name not in long}
         lazy = {
             name: packed[name].variable
-            for name in rest
+            for name in short_encoding
             if packed[name].chunks is not None and "chunks" in encoding[name]
         }
         aligned = {
@@ -288,13 +288,13 @@ def to_zarr(
         with new_output(
             path, overwrite=overwrite, find_foreign=find_foreign_item, inputs=sources
         ) as temporary:
-            whole = packed.drop_vars(long).assign(aligned)
-            whole.to_zarr(
+            short_variables = packed.drop_vars(long).assign(aligned)
+            short_variables.to_zarr(
                 temporary,
                 mode="w",
                 zarr_format=2,
                 consolidated=not long,
-                encoding=rest,
+                encoding=short_encoding,
                 write_empty_chunks=True,
             )
             append_zarr(temporary, long, encoding, progress=progress)
@@ -378,11 +378,11 @@ def _plan_chunks(variable: xr.Variable, rate: float | None) -> tuple[int, ...]:
             ]
         )
     )
-    most = max(1, CHUNK_VALUES // max(1, inner))
+    max_length = max(1, CHUNK_VALUES // max(1, inner))
     if rate is not None:
         on_time = variable.dims[-1] in ("time", index_dim("time")) and not _has_rule(variable)
-        most = chunk_samples(rate if on_time else 0.0)
-    last = max(1, min(variable.shape[-1], most))
+        max_length = chunk_samples(rate if on_time else 0.0)
+    last = max(1, min(variable.shape[-1], max_length))
     return tuple(
         last if dim == variable.dims[-1] else 1 if dim in ("axis", "term") else size
         for dim, size in variable.sizes.items()
@@ -561,7 +561,7 @@ def _restore_log(log: xr.Dataset, path: str | os.PathLike[str]) -> xr.Dataset:
 
 
 def _open_path(
-    path: str | os.PathLike[str], what: str, check: Any, advice: str, *, strict: bool = False
+    path: str | os.PathLike[str], content: str, check: Any, advice: str, *, strict: bool = False
 ) -> xr.Dataset:
     dataset = open_dataset(path, strict=strict)
     try:
@@ -569,5 +569,5 @@ def _open_path(
             check(dataset)
     except SchemaError as error:
         dataset.close()
-        raise FormatError(f"{path}: does not hold {what} ({error}); {advice}") from error
+        raise FormatError(f"{path}: does not hold {content} ({error}); {advice}") from error
     return dataset

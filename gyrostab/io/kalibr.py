@@ -100,12 +100,12 @@ def _convert_terms(
     product: xr.Dataset, keys: Mapping[str, tuple[str, float, str]]
 ) -> dict[str, dict[str, KalibrValue]]:
     by_symbol = {symbol: (key, factor) for key, (symbol, factor, _) in keys.items()}
-    found: dict[str, dict[str, KalibrValue]] = {}
+    values_by_axis: dict[str, dict[str, KalibrValue]] = {}
     for term in summarise_terms(product):
         if term.symbol in by_symbol:
             key, factor = by_symbol[term.symbol]
-            found.setdefault(term.axis, {})[key] = _convert_term(term, factor)
-    return {axis: {key: values[key] for key in keys} for axis, values in found.items()}
+            values_by_axis.setdefault(term.axis, {})[key] = _convert_term(term, factor)
+    return {axis: {key: values[key] for key in keys} for axis, values in values_by_axis.items()}
 
 
 def _fit_accelerometers(log: xr.Dataset, product: xr.Dataset) -> xr.Dataset:
@@ -202,10 +202,10 @@ def to_kalibr(
             worst = _find_worst([values[key] for values in noise[sensor].values()])
             lines += _format_entry(key, worst, indent="")
     lines.append("axes:")
-    for axis in dict.fromkeys(axis for found in noise.values() for axis in found):
+    for axis in dict.fromkeys(axis for values_by_axis in noise.values() for axis in values_by_axis):
         lines.append(f"  {json.dumps(axis)}:")
-        for found in noise.values():
-            for key, value in found.get(axis, {}).items():
+        for values_by_axis in noise.values():
+            for key, value in values_by_axis.get(axis, {}).items():
                 lines += _format_entry(key, value, indent="    ")
     with new_output(path, overwrite=overwrite) as temporary:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -232,19 +232,19 @@ def _describe_fit(fit: FitSummary) -> str:
 
 def _find_worst(values: list[KalibrValue]) -> KalibrValue:
     """Find the largest value or limit of any axis; an axis without one is left out."""
-    known = [value for value in values if not math.isnan(value.value)]
-    return max(known, key=lambda value: value.value) if known else values[0]
+    known_values = [value for value in values if not math.isnan(value.value)]
+    return max(known_values, key=lambda value: value.value) if known_values else values[0]
 
 
-def _format_entry(key: str, found: KalibrValue, *, indent: str) -> list[str]:
+def _format_entry(key: str, value: KalibrValue, *, indent: str) -> list[str]:
     symbol, _, unit = (KEYS | ACCELEROMETER_KEYS)[key]
-    said = {
+    comment = {
         "observed": f"{unit}; {symbol}, {LAWS[symbol].name}, "
-        f"observed in {100 * found.share:.0f} % of the windows",
+        f"observed in {100 * value.share:.0f} % of the windows",
         "upper_limit_only": f"{unit}; 95 % UPPER LIMIT of {symbol} ({LAWS[symbol].name}), "
-        f"in {100 * found.share:.0f} % of the windows",
+        f"in {100 * value.share:.0f} % of the windows",
         "not_observable": f"{unit}; not observable in any window: "
         f"a longer --window may show {symbol} ({LAWS[symbol].name})",
-    }[found.meaning]
-    number = "null" if math.isnan(found.value) else f"{found.value:.6e}"
-    return [f"{indent}{key}: {number}  # {said}", f"{indent}{key}_meaning: {found.meaning}"]
+    }[value.meaning]
+    number = "null" if math.isnan(value.value) else f"{value.value:.6e}"
+    return [f"{indent}{key}: {number}  # {comment}", f"{indent}{key}_meaning: {value.meaning}"]

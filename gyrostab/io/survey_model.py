@@ -90,9 +90,9 @@ class SurveyModel:
         for term in self.terms:
             value = f"{'< ' * (term.status == 'upper_limit_only')}{term.value:.3g}"
             spread = f"{term.low:.3g} to {term.high:.3g}"
-            known = (value, spread if term.status == "observed" else "")
+            numbers = (value, spread if term.status == "observed" else "")
             rows.append(
-                (term.code, *(known if term.value >= 0.0 else ("-", "")), term.unit, term.mode,
+                (term.code, *(numbers if term.value >= 0.0 else ("-", "")), term.unit, term.mode,
                  term.propagation, term.derivation)
             )  # fmt: skip
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]

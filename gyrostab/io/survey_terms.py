@@ -224,11 +224,11 @@ def _make_term(
     code: str, kind: str, groups: _Groups, magnitudes: Mapping[str, _Magnitude]
 ) -> SurveyTerm:
     """Take the root mean square in each group, the largest of the groups, and the worst status."""
-    known = [[name for name in group if name in magnitudes] for group in groups]
-    names = [name for group in known for name in group]
+    known_groups = [[name for name in group if name in magnitudes] for group in groups]
+    names = [name for group in known_groups for name in group]
     means = [
         np.sqrt(np.mean(np.square([magnitudes[name][:3] for name in group]), axis=0))
-        for group in known
+        for group in known_groups
         if group
     ]
     mode, propagation, unit, derivation = _KINDS[kind]
@@ -261,13 +261,13 @@ def _compute_magnitudes(
         coefficients.setdefault(summary.axis, {})[summary.symbol] = chosen
 
     def combine(formula: Callable[..., float], symbols: str) -> dict[str, _Magnitude]:
-        found = {}
-        for axis, known in coefficients.items():
-            used = [known[symbol] for symbol in symbols]
+        magnitudes = {}
+        for axis, by_symbol in coefficients.items():
+            used = [by_symbol[symbol] for symbol in symbols]
             rows = zip(*(magnitude[:3] for magnitude in used), strict=True)
             value, low, high = (formula(*row) for row in rows)
-            found[axis] = _Magnitude(value, low, high, _find_worst(used))
-        return found
+            magnitudes[axis] = _Magnitude(value, low, high, _find_worst(used))
+        return magnitudes
 
     def noise(n: float) -> float:
         return math.sqrt(LAWS["N"].avar(times["station"], n))
@@ -301,7 +301,7 @@ def _read_sensitivities(diagnosis: Mapping[str, Any]) -> dict[str, _Magnitude]:
             for gyro in diagnosis["recording"]["axes"]
             for acceleration in "xyz"
         }
-    found: dict[str, _Magnitude] = {}
+    sensitivities: dict[str, _Magnitude] = {}
     for effect in diagnosis.get("effects", []):
         if effect["name"] == "g_sensitivity":
             for name, size in effect["parameters"].items():
@@ -314,8 +314,8 @@ def _read_sensitivities(diagnosis: Mapping[str, Any]) -> dict[str, _Magnitude]:
                     low = 0.0 if ends[0] * ends[1] < 0.0 else low
                     magnitude = _Magnitude(abs(value), low, high, "observed")
                     along, _, axis = name.partition(".")  # "x", or "x.y" for the gyro y alone
-                    found |= {gyro + along: magnitude for gyro in axis or effect["axes"]}
-    return found
+                    sensitivities |= {gyro + along: magnitude for gyro in axis or effect["axes"]}
+    return sensitivities
 
 
 def _describe_origin(
@@ -372,8 +372,8 @@ def _make_notes(
     if limits and limits["upper_limit"] is None:
         notes.append(f"The diagnosis has no g-dependent terms: {limits['reason']}.")
     effects = diagnosis["effects"]
-    if others := sorted({effect["name"] for effect in effects} - {"g_sensitivity"}):
-        notes.append(f"No term covers what else the diagnosis found: {', '.join(others)}.")
+    if other_effects := sorted({effect["name"] for effect in effects} - {"g_sensitivity"}):
+        notes.append(f"No term covers what else the diagnosis found: {', '.join(other_effects)}.")
     rivals = {name for e in effects if e["name"] == "g_sensitivity" for name in e["alternatives"]}
     if rivals:
         notes.append(
