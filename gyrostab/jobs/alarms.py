@@ -147,8 +147,8 @@ def check_alarms(alarms: Sequence[Alarm], window: Mapping[str, Any]) -> None:
         if alarm.name in _UNITS:
             continue
         if alarm.name not in window["channels"]:
-            known = ", ".join([*_UNITS, *window["channels"]])
-            raise OptionError(f"--alarm {alarm.text!r}: {alarm.name} is not one of {known}")
+            known_names = ", ".join([*_UNITS, *window["channels"]])
+            raise OptionError(f"--alarm {alarm.text!r}: {alarm.name} is not one of {known_names}")
         units = window["channels"][alarm.name][1]
         if parse_unit(alarm.unit or "1", _quantity_of(units)).quantity != _quantity_of(units):
             raise OptionError(f"--alarm {alarm.text!r}: {alarm.name} is in {units}")

@@ -129,7 +129,7 @@ def find_archive(paths: Sequence[str | Path]) -> Archive:
     FormatError
         When a path does not exist, or nothing is found.
     """
-    found: dict[Path, None] = {}
+    files: dict[Path, None] = {}
     diagnoses: dict[Path, None] = {}
     visited: set[str] = set()
     bases = []
@@ -154,15 +154,15 @@ def find_archive(paths: Sequence[str | Path]) -> Archive:
             elif not (is_pattern and _is_inside_output(path)):
                 inside = [("file", path)]
             for kind, item_inside in inside:
-                (diagnoses if kind == DIAGNOSIS else found)[item_inside] = None
-        bases.append(_find_base(item, is_pattern=is_pattern, alone=len(paths) == 1))
-    if not found:
+                (diagnoses if kind == DIAGNOSIS else files)[item_inside] = None
+        bases.append(_find_base(item, is_pattern=is_pattern, is_only_path=len(paths) == 1))
+    if not files:
         raise FormatError(f"{', '.join(map(str, paths))}: there are no files")
     base = os.path.commonpath([base if is_remote else os.path.abspath(base) for base in bases])
-    return Archive(Path(base), sorted(found), sorted(diagnoses))
+    return Archive(Path(base), sorted(files), sorted(diagnoses))
 
 
-def _find_base(item: str, *, is_pattern: bool, alone: bool) -> Path:
+def _find_base(item: str, *, is_pattern: bool, is_only_path: bool) -> Path:
     """Find the folder that names are relative to: the fixed part of a pattern, or a lone folder."""
     path = Path(item)
     if is_pattern:
@@ -173,7 +173,7 @@ def _find_base(item: str, *, is_pattern: bool, alone: bool) -> Path:
         is_archive = is_folder(url) and not find_store(url)
     else:
         is_archive = path.is_dir() and not is_store(path)
-    return path if alone and is_archive else path.parent
+    return path if is_only_path and is_archive else path.parent
 
 
 def _walk_address(url: str) -> Iterator[tuple[str, Path]]:
@@ -275,20 +275,20 @@ def index_files(
     """
     options = json.dumps(dict(reading), sort_keys=True, default=str)
     records: Any = [] if known is None else known.to_dict("records")
-    before = {row["file"]: row for row in records}
+    old_rows = {row["file"]: row for row in records}
     rows: dict[str, dict[str, Any]] = {}
     changed: list[str] = []
     for path in [*archive.files, *archive.diagnoses]:
-        found = describe_file(path)
+        state = describe_file(path)
         row = {
             "file": full_name(path),
             "base": str(archive.base),
-            "bytes": found["bytes"],
-            "changed_ns": found["changed_ns"],
-            "listing": found.get("listing", ""),
+            "bytes": state["bytes"],
+            "changed_ns": state["changed_ns"],
+            "listing": state.get("listing", ""),
             "options": options,
         }
-        old = before.get(row["file"], {})
+        old = old_rows.get(row["file"], {})
         is_same = all(old.get(key) == value for key, value in row.items())
         rows[row["file"]] = old if is_same else row
         if not is_same:
@@ -313,13 +313,15 @@ def _describe_logs(names: Sequence[str], reading: Mapping[str, Any]) -> dict[str
 
 def _describe_log(name: str, reading: Mapping[str, Any]) -> dict[str, Any]:
     """Describe a file by its columns and its first and last stamps, without reading its data."""
-    kept = {key: value for key, value in reading.items() if key in ReadOptions.__annotations__}
+    read_options = {
+        key: value for key, value in reading.items() if key in ReadOptions.__annotations__
+    }
     row: dict[str, Any] = dict.fromkeys(
         ("format", "start", "end", "rate [Hz]", "axes", "channels", "rows")
     )
     try:
         with remove_copies():
-            summary = scan_file(name, ReadOptions(**kept))
+            summary = scan_file(name, ReadOptions(**read_options))
     except FormatError as error:
         return {**row, "is_log": isinstance(error, DamageError), "note": str(error)}
     except (GyrostabError, OSError) as error:
@@ -422,9 +424,9 @@ def _name_groups(groups: Mapping[Path, list[Path]], base: Path, per: str) -> dic
     }
 
 
-def _avoid_names(name: str, taken: Iterable[str]) -> str:
+def _avoid_names(name: str, used_names: Iterable[str]) -> str:
     """Return the name, or for a folder around other runs ``name/files``."""
-    while name in taken:
+    while name in used_names:
         name = f"{name}/files"
     return name
 
@@ -441,15 +443,15 @@ def read_diagnosis(folder: Path) -> Mapping[str, Any] | None:
 
 def _read_diagnosed_files(folders: Sequence[Path]) -> list[tuple[Path, set[str] | None, str]]:
     """Read files and verdict of each diagnosis; no files, at the end, for those damaged."""
-    found: list[tuple[Path, set[str] | None, str]] = []
+    diagnoses: list[tuple[Path, set[str] | None, str]] = []
     for folder in folders:
         content = read_diagnosis(folder)
         if content is None:
-            found.append((folder, None, "not readable"))
+            diagnoses.append((folder, None, "not readable"))
         else:
             names = {Path(name).name for name in content["recording"]["files"]}
-            found.append((folder, names, str(content["verdict"])))
-    return sorted(found, key=lambda item: item[1] is None)
+            diagnoses.append((folder, names, str(content["verdict"])))
+    return sorted(diagnoses, key=lambda item: item[1] is None)
 
 
 def _find_diagnosis(

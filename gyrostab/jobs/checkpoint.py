@@ -119,14 +119,14 @@ def find_blocks(folder: Path, parts: Sequence[slice], *, job: str) -> dict[int, 
 
     A block that is cut short, altered, or of another job is left out and computed again.
     """
-    found = {}
+    blocks = {}
     for number, part in enumerate(parts):
         path = block_path(folder, part)
         text = _read_verified_header(path)
         header = json.loads(text) if text else {}
         if header and header["job"] == job and header["part"] == [part.start, part.stop]:
-            found[number] = Block(path, part, header, _find_arrays_offset(len(text)))
-    return found
+            blocks[number] = Block(path, part, header, _find_arrays_offset(len(text)))
+    return blocks
 
 
 def _read_verified_header(path: Path) -> bytes:
@@ -175,8 +175,8 @@ def assemble(blocks: Sequence[Block]) -> xr.Dataset:
         name: xr.Variable(described["dims"], arrays[name], _decode_attributes(described["attrs"]))
         for name, described in first["variables"].items()
     }
-    whole = xr.Dataset(variables, attrs=_decode_attributes(first["attrs"]))
-    return whole.set_coords(first["coords"])
+    dataset = xr.Dataset(variables, attrs=_decode_attributes(first["attrs"]))
+    return dataset.set_coords(first["coords"])
 
 
 def _read_variables(block: Block, names: Iterable[str]) -> dict[str, NDArray[Any]]:

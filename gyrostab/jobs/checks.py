@@ -51,12 +51,12 @@ def check_windows(
         )
     # the duration of a number of samples depends on the rate
     half = None if "sample" in window else length / fine / 2
-    given = [tau_max] if tau_max else []
+    tau_texts = [tau_max] if tau_max else []
     if taus.strip().isdigit():
         averaging_factors(taus, rate=fine, window=2)
     elif taus.strip() not in ("octave", "all"):
-        given += taus.split(",")
-    for tau in given:
+        tau_texts += taus.split(",")
+    for tau in tau_texts:
         if duration_seconds(tau, "tau", example=TAUS) > (half or math.inf):
             raise OptionError(
                 f"tau {tau.strip()} is longer than half of the window of {window}, "

@@ -42,12 +42,12 @@ def sample_log(name: str = "mwd_sample.csv.gz") -> Path:
     >>> sample_log().name
     'mwd_sample.csv.gz'
     """
-    here = Path(__file__).resolve().parents[1]
-    for folder in (here / "data", here.parent / "data"):
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "data", package.parent / "data"):
         path = folder / name
         if path.exists():
             return path
-    raise OutputError(f"the file {name} is missing from {here / 'data'}; install gyrostab again")
+    raise OutputError(f"the file {name} is missing from {package / 'data'}; install gyrostab again")
 
 
 def summarise(product: xr.Dataset) -> pd.DataFrame:

@@ -119,7 +119,7 @@ def compute_blocks(
             held.append((numbers[done[-1].start], result))
             if (
                 time.monotonic() - last > min(_MAX_HELD_SECONDS, _MAX_HELD_CHECKS * check_seconds)
-                or sum(one.nbytes for _, one in held) > _MAX_HELD_BYTES
+                or sum(result.nbytes for _, result in held) > _MAX_HELD_BYTES
             ):
                 keep()
     except BaseException as error:
@@ -150,8 +150,8 @@ def write_blocks(
     """
     import dask
 
-    whole = assemble([blocks[number] for number in sorted(blocks)]).assign_attrs(attrs)
-    variables = sum(variable.chunks is not None for variable in whole.variables.values())
+    dataset = assemble([blocks[number] for number in sorted(blocks)]).assign_attrs(attrs)
+    variables = sum(variable.chunks is not None for variable in dataset.variables.values())
     done = 0
 
     def in_order(graph: Any, keys: Any, **options: Any) -> Any:
@@ -177,8 +177,8 @@ def write_blocks(
 
     stage("writing", variables, 0, "variables")
     with dask.config.set(scheduler=in_order):
-        (to_zarr if zarr else to_netcdf)(whole, target, overwrite=overwrite, progress=share)
-    return whole
+        (to_zarr if zarr else to_netcdf)(dataset, target, overwrite=overwrite, progress=share)
+    return dataset
 
 
 def find_constant_shares(product: xr.Dataset) -> dict[str, float]:

@@ -94,9 +94,9 @@ def _measure_work() -> Iterator[Callable[[], float]]:
 
 def _measure_part(log: Any, part: slice, windows: Any, fitting: Any) -> int:
     """Compute a part; return its size as a file [bytes]."""
-    found = compute_part(log, part, windows, fitting)
+    product = compute_part(log, part, windows, fitting)
     with tempfile.TemporaryDirectory() as folder:
-        return to_netcdf(found, Path(folder) / "part.nc").stat().st_size
+        return to_netcdf(product, Path(folder) / "part.nc").stat().st_size
 
 
 def _peak_mb() -> float:

@@ -114,22 +114,22 @@ def write_file_table(
         The table of `gyrostab.jobs.archive.index_files`.
     """
     scheduler = check_scheduler(scheduler)
-    known = read_table(Path(output), content=FILES)
+    known_table = read_table(Path(output), content=FILES)
     if url := find_url(output):
-        _check_address(url, ".parquet", is_own=known is not None)
+        _check_address(url, ".parquet", is_own=known_table is not None)
     else:
-        check_output(output, suffixes=[".parquet"], overwrite=overwrite or known is not None)
+        check_output(output, suffixes=[".parquet"], overwrite=overwrite or known_table is not None)
     archive = find_archive(paths)
     files = [path for path in archive.files[:1] if not find_url(path)]
     with _open_workers(scheduler, workers, files) as pool:
         table = index_files(
             archive,
             reading=reading or {},
-            known=None if overwrite else known,
+            known=None if overwrite else known_table,
             pool=pool,
             stage=stage,
         )
-    write_table(table, Path(output), content=FILES, overwrite=overwrite or known is not None)
+    write_table(table, Path(output), content=FILES, overwrite=overwrite or known_table is not None)
     return table
 
 
@@ -212,11 +212,11 @@ def run_fleet(
     with protect_inputs(paths), lock_job(job_folder(target)):
         try:
             _begin_output(target, reports=reports)
-            archive, known = _open_archive(paths, target)
+            archive, known_table = _open_archive(paths, target)
             files = [path for path in (target, *archive.files[:1]) if not find_url(path)]
             with _open_workers(scheduler, workers, files) as pool:
                 table = index_files(
-                    archive, reading=options["reading"], known=known, pool=pool, stage=stage
+                    archive, reading=options["reading"], known=known_table, pool=pool, stage=stage
                 )
                 write_table(table, target / "files.parquet", content=FILES, overwrite=True)
                 runs = find_runs(archive, table, per=per, tool=tool)
@@ -296,17 +296,17 @@ def _write_json(path: Path, content: Any) -> None:
 
 def _open_archive(paths: Sequence[str | Path], target: Path) -> tuple[Archive, pd.DataFrame | None]:
     """List an archive, or take the files of a table; return the latest table of its files too."""
-    known = read_table(target / "files.parquet", content=FILES)
+    known_table = read_table(target / "files.parquet", content=FILES)
     if len(paths) == 1 and Path(paths[0]).suffix.lower() == ".parquet":
-        given = read_table(Path(paths[0]), content=FILES)
-        if given is not None:
-            is_diagnosis = given["format"] == DIAGNOSIS
+        given_table = read_table(Path(paths[0]), content=FILES)
+        if given_table is not None:
+            is_diagnosis = given_table["format"] == DIAGNOSIS
             files, diagnoses = (
-                [Path(name) for name in given.loc[part, "file"]]
+                [Path(name) for name in given_table.loc[part, "file"]]
                 for part in (~is_diagnosis, is_diagnosis)
             )
-            return Archive(Path(given["base"].iloc[0]), files, diagnoses), given
-    return find_archive(paths), known
+            return Archive(Path(given_table["base"].iloc[0]), files, diagnoses), given_table
+    return find_archive(paths), known_table
 
 
 def _compute_runs(
@@ -320,11 +320,12 @@ def _compute_runs(
     stage: Stage,
 ) -> pd.DataFrame:
     """Compute the runs that are new or changed, and write the table and the page of all runs."""
-    before = read_rows(target)
+    old_rows = read_rows(target)
     with ThreadPoolExecutor(_REQUESTS if find_url(target) else 1) as threads:
         is_current = threads.map(
             lambda item: (
-                not overwrite and _is_current(before.get(item.name), target, item, options, reports)
+                not overwrite
+                and _is_current(old_rows.get(item.name), target, item, options, reports)
             ),
             runs,
         )
@@ -333,7 +334,7 @@ def _compute_runs(
     stale = {item.name for item in waiting}
     rows = {
         name: row
-        for name, row in before.items()
+        for name, row in old_rows.items()
         if name not in stale and _has_product(target, name)
     }
     work = partial(
@@ -351,9 +352,9 @@ def _compute_runs(
                     write_rows(make_table(rows, runs), target)
                     saved = time.monotonic()
     except (KeyboardInterrupt, WorkerError) as error:
-        what = str(error) or "interrupted"
+        reason = str(error) or "interrupted"
         raise type(error)(
-            f"{what}; {done} of {len(waiting)} runs are done, and the same command continues"
+            f"{reason}; {done} of {len(waiting)} runs are done, and the same command continues"
         ) from error
     finally:
         stage("writing", 0)
@@ -429,17 +430,17 @@ def process_run(
         "files": len(item["files"]),
         "report": f"reports/{name}.html" if reports else "",
     }
-    given = json.loads(options)
+    run_options = json.loads(options)
     try:
         _make_folders(Path(target), product.parent)
-        row["job"] = find_job_name(item["files"], **given)
+        row["job"] = find_job_name(item["files"], **run_options)
         if (url := find_url(product)) and (overwrite or read_job_name(product) != row["job"]):
             remove_address(url)  # a run replaces nothing at an address
         with dask.config.set(scheduler="synchronous"), remove_copies():
             run(
                 item["files"],
                 product,
-                **given,
+                **run_options,
                 workers=1,
                 resume=not overwrite,  # which does nothing if the product is complete
                 overwrite=True,
@@ -493,8 +494,8 @@ def _consolidate_metadata(target: Path, names: Sequence[str]) -> None:
         ".zgroup": {"zarr_format": 2},
     }
     with ThreadPoolExecutor(_REQUESTS if find_url(target) else 1) as threads:
-        found = list(threads.map(lambda name: read_json(target / name / ".zmetadata"), names))
-    for name, content in zip(names, found, strict=True):
+        contents = list(threads.map(lambda name: read_json(target / name / ".zmetadata"), names))
+    for name, content in zip(names, contents, strict=True):
         if content is None:
             continue
         parts = name.split("/")

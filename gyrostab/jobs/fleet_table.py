@@ -116,10 +116,10 @@ def open_fleet(folder: Path) -> xr.Dataset | None:
                 products.append(product[names].isel(tau=slice(-1, None)).load())
     if not products:
         return None
-    whole = xr.concat(
+    combined = xr.concat(
         products, "time", data_vars="all", join="outer", combine_attrs="drop_conflicts"
     )
-    return whole.assign_attrs(source_files=[f"{len(products)} runs of {folder.name}"])
+    return combined.assign_attrs(source_files=[f"{len(products)} runs of {folder.name}"])
 
 
 def summarise_run(product: xr.Dataset) -> dict[str, Any]:
@@ -179,8 +179,8 @@ def _find_worst_window(product: xr.Dataset) -> dict[str, Any]:
     Ratios are averaged over the averaging times on a logarithmic scale, with the equivalent degrees
     of freedom as weights: the variance of the logarithm of an Allan variance is about 2 / edf.
     """
-    known = product["avar"].where(product["avar"] > 0.0)
-    logs = known.copy(data=np.log(known.values))
+    avar = product["avar"].where(product["avar"] > 0.0)
+    logs = avar.copy(data=np.log(avar.values))
     change = logs - logs.median("time")
     level = change.weighted(product["edf"].fillna(0.0)).mean("tau").transpose("axis", "time")
     if not np.isfinite(level.values).any():
@@ -242,7 +242,7 @@ def list_effects(table: pd.DataFrame) -> pd.DataFrame:
     for run in table.to_dict("records"):
         content = read_diagnosis(Path(run["diagnosis"])) if run["diagnosis"] else None
         for effect in content["effects"] if content else ():
-            known = {
+            effect_row = {
                 **{name: run[name] for name in ("run", "tool", "start")},
                 "effect": effect["name"],
                 "axes": " ".join(effect["axes"]),
@@ -251,7 +251,7 @@ def list_effects(table: pd.DataFrame) -> pd.DataFrame:
             }
             for parameter, size in (effect["parameters"] or {"": {}}).items():
                 numbers = {name: size.get(name) for name in ("value", "low", "high", "unit")}
-                rows.append({**known, "parameter": parameter, **numbers})
+                rows.append({**effect_row, "parameter": parameter, **numbers})
     return pd.DataFrame(rows, columns=list(_EFFECT_COLUMNS))
 
 
@@ -298,11 +298,11 @@ def find_trends(table: pd.DataFrame, effects: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for (tool, quantity), part in points.groupby(["tool", "quantity"]):
         for driver in drivers:
-            known = part[[driver, "value"]].dropna().to_numpy(float)
-            x, y = known[:: -(-len(known) // _MAX_TREND_RUNS) or 1].T
+            pairs = part[[driver, "value"]].dropna().to_numpy(float)
+            x, y = pairs[:: -(-len(pairs) // _MAX_TREND_RUNS) or 1].T
             if len(np.unique(x)) >= _MIN_TREND_RUNS:
                 slope, _, low, high = theilslopes(y, x)
                 p_value = kendalltau(x, y).pvalue
                 rows.append((tool, quantity, driver, x.size, slope, low, high, p_value))
-    found = pd.DataFrame(rows, columns=list(TREND_COLUMNS))
-    return found.assign(p_value=(found["p_value"] * len(found)).clip(upper=1.0))
+    trends = pd.DataFrame(rows, columns=list(TREND_COLUMNS))
+    return trends.assign(p_value=(trends["p_value"] * len(trends)).clip(upper=1.0))

@@ -43,13 +43,13 @@ def list_files(source: str) -> dict[Path, FileState]:
     """
     path = Path(source)
     if path.is_dir():
-        found = list(path.iterdir())
+        paths = list(path.iterdir())
     elif path.exists() or not glob.has_magic(source):
-        found = [path]
+        paths = [path]
     else:
-        found = [Path(name) for name in glob.glob(source, recursive=True)]
+        paths = [Path(name) for name in glob.glob(source, recursive=True)]
     states = {}
-    for item in sorted(found):
+    for item in sorted(paths):
         if item.name.startswith(".") or not item.is_file():
             continue
         status = item.stat()
@@ -83,11 +83,12 @@ class FileMemory:
 
     def update(self, files: dict[Path, FileState]) -> bool:
         """Take over a new list of files; return whether an earlier file was replaced or cut."""
-        before, self.files = self.files, files
+        earlier_files, self.files = self.files, files
         for path in self._kept.keys() - files.keys():
             del self._kept[path]
         return any(
-            path not in files or files[path].size < state.size for path, state in before.items()
+            path not in files or files[path].size < state.size
+            for path, state in earlier_files.items()
         )
 
     def read(self, path: Path, options: ReadOptions) -> xr.Dataset:

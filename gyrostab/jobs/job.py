@@ -167,16 +167,18 @@ def describe_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> s
     ... )
     'run7/b.csv has changed: 100 bytes, was 120; window is 5min, was 10min'
     """
-    said = _describe_input_changes(before["inputs"], now["inputs"])
+    differences = _describe_input_changes(before["inputs"], now["inputs"])
     for kind in ("options", "versions"):
         old, new = before[kind], now[kind]
-        said += [
+        differences += [
             f"{name} is {_format_option(new.get(name))}, was {_format_option(old.get(name))}"
             for name in {**old, **new}
             if old.get(name) != new.get(name)
         ]
-    return "; ".join(said[:_MAX_DIFFERENCES]) + (
-        f"; and {len(said) - _MAX_DIFFERENCES} more" if len(said) > _MAX_DIFFERENCES else ""
+    return "; ".join(differences[:_MAX_DIFFERENCES]) + (
+        f"; and {len(differences) - _MAX_DIFFERENCES} more"
+        if len(differences) > _MAX_DIFFERENCES
+        else ""
     )
 
 
@@ -184,37 +186,37 @@ def _format_option(value: Any) -> str:
     if value is None:
         return "not given"
     if isinstance(value, dict):
-        return ", ".join(f"{left}={right}" for left, right in value.items())
+        return ", ".join(f"{key}={setting}" for key, setting in value.items())
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 def _describe_input_changes(before: list[dict[str, Any]], now: list[dict[str, Any]]) -> list[str]:
     old, new = ({item["path"]: item for item in items} for items in (before, now))
-    said = [
+    changes = [
         f"{_shorten_path(path)} is given now and was not before" for path in new if path not in old
     ]
-    said += [
+    changes += [
         f"{_shorten_path(path)} was given before and is not now" for path in old if path not in new
     ]
     for path in [path for path in new if path in old and new[path] != old[path]]:
         size, was = new[path]["bytes"], old[path]["bytes"]
         if size is None:
-            said.append(f"{_shorten_path(path)} has vanished")
+            changes.append(f"{_shorten_path(path)} has vanished")
         elif size != was:
-            said.append(
+            changes.append(
                 f"{_shorten_path(path)} has changed: {size} bytes, "
                 f"was {'missing' if was is None else was}"
             )
         elif new[path]["changed_ns"] != old[path]["changed_ns"]:
-            said.append(
+            changes.append(
                 f"{_shorten_path(path)} has changed: "
                 f"written {_format_change_time(new[path])}, was {_format_change_time(old[path])}"
             )
         else:
-            said.append(f"{_shorten_path(path)} has changed: other files are in it")
-    if not said and list(old) != list(new):
-        said.append("the logs are given in another order")
-    return said
+            changes.append(f"{_shorten_path(path)} has changed: other files are in it")
+    if not changes and list(old) != list(new):
+        changes.append("the logs are given in another order")
+    return changes
 
 
 def _shorten_path(path: str) -> str:
@@ -317,10 +319,10 @@ def remove_damage(folder: Path) -> None:
         _remove_path(folder / name)
     store, seal = folder / "log.zarr", folder / _STORE_CHECKSUM_FILE
     try:
-        whole = seal.read_text(encoding="ascii") == _hash_tree(store)
+        is_intact = seal.read_text(encoding="ascii") == _hash_tree(store)
     except (OSError, ValueError):
-        whole = False
-    if not whole:
+        is_intact = False
+    if not is_intact:
         seal.unlink(missing_ok=True)
         if store.exists():
             _remove_path(store)

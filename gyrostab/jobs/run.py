@@ -108,13 +108,13 @@ def load_log(
         log = regularise(
             log, rate=reading.get("rate"), max_gap=max_gap, limits=reading.get("limits")
         )
-        said = "; ".join(
+        options = "; ".join(
             f"{name}: {_format_option(value)}"
             for name, value in reading.items()
             if value and name not in ("on_file", "read")
         )
-        if said:
-            log.attrs["history"] += f" (read with {said})"
+        if options:
+            log.attrs["history"] += f" (read with {options})"
     elif reading.get("channel"):
         log = log.assign_attrs(notes=[*log.attrs.get("notes", []), *describe_channels(log)])
     log = cut_log(log, time_from=time_from, time_to=time_to, exclude=exclude)
@@ -126,7 +126,7 @@ def load_log(
 def _format_option(value: Any) -> str:
     """Format the value of an option in one line."""
     if isinstance(value, Mapping):
-        return ", ".join(f"{left}={right}" for left, right in value.items())
+        return ", ".join(f"{key}={setting}" for key, setting in value.items())
     return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
@@ -306,22 +306,22 @@ def _describe_job(
 
 def _inspect_job(job: _Job, *, resume: bool, overwrite: bool) -> _Progress:
     """Find the state of a job, and refuse to destroy an output or to mix two jobs."""
-    before, kept = read_job(job.folder), has_finished_work(job.folder)
+    earlier_job, has_work = read_job(job.folder), has_finished_work(job.folder)
     if resume and _is_complete(job):
         return _Progress(complete=True, fresh=False, overwrite=False)
-    if before and kept and not (resume or overwrite):
+    if earlier_job and has_work and not (resume or overwrite):
         raise ResumeError(
             _add_resume_advice(job, f"{job.target}: a run of it was begun and not finished")
             + ", --overwrite starts anew"
         )
-    changes = describe_differences(before, job.fingerprint) if before else ""
-    if resume and kept and changes and not overwrite:
+    changes = describe_differences(earlier_job, job.fingerprint) if earlier_job else ""
+    if resume and has_work and changes and not overwrite:
         raise ResumeError(
             f"{job.target}: the run that was begun cannot be continued, because {changes}; "
             "put that back, or give --overwrite in place of --resume to start anew"
         )
-    again = bool(resume and before and not changes)
-    overwrite = overwrite or bool(before and again and before["overwrite"])
+    is_continued = bool(resume and earlier_job and not changes)
+    overwrite = overwrite or bool(earlier_job and is_continued and earlier_job["overwrite"])
     if job.target.exists() and resume and not overwrite:
         raise OutputError(
             f"output {str(job.target)!r} exists already, "
@@ -329,7 +329,7 @@ def _inspect_job(job: _Job, *, resume: bool, overwrite: bool) -> _Progress:
             "give --overwrite to replace it, or another name with -o"
         )
     check_output(job.target, overwrite=overwrite, **_FORMS[job.zarr])
-    return _Progress(complete=False, fresh=not again, overwrite=overwrite)
+    return _Progress(complete=False, fresh=not is_continued, overwrite=overwrite)
 
 
 def _is_complete(job: _Job) -> bool:
@@ -352,17 +352,17 @@ def read_job_name(path: Path) -> str | None:
         return None
 
 
-def _add_resume_advice(job: _Job, what: str) -> str:
+def _add_resume_advice(job: _Job, message: str) -> str:
     """Add to a message how much is done and how to continue."""
-    kept, before = count_finished_parts(job.folder), read_job(job.folder)
-    if not before or not has_finished_work(job.folder):
+    n_finished, earlier_job = count_finished_parts(job.folder), read_job(job.folder)
+    if not earlier_job or not has_finished_work(job.folder):
         return (
-            f"{what}; nothing was written under the name of the output. "
+            f"{message}; nothing was written under the name of the output. "
             "Start the same command again."
         )
-    parts = before["parts"]
+    parts = earlier_job["parts"]
     return (
-        f"{what}; {kept} of {parts} parts ({100 * kept / parts:.0f} %) are kept, "
+        f"{message}; {n_finished} of {parts} parts ({100 * n_finished / parts:.0f} %) are kept, "
         "and the same command with --resume continues"
     )
 
@@ -455,8 +455,8 @@ def _show_file(stage: Stage, number: int, count: int, path: Path) -> None:
 
 def _check_inputs(job: _Job) -> None:
     now = {**job.fingerprint, "inputs": describe_inputs(job.files)}
-    if said := describe_differences(job.fingerprint, now):
-        raise FormatError(f"{said}; a log must not change while it is read: put it back")
+    if differences := describe_differences(job.fingerprint, now):
+        raise FormatError(f"{differences}; a log must not change while it is read: put it back")
 
 
 def _compute_part_of_log(

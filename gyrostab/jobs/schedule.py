@@ -231,29 +231,31 @@ def _identity(value: Any) -> Any:
 def _check_workers(client: Any, address: str, files: Sequence[Path]) -> None:
     """Check that every worker has the same files and the same gyrostab."""
     sizes = {full_name(path): _find_size(path) for path in files}
-    found = _reach_scheduler(address, client.run, _inspect_files, list(sizes), on_error="return")
+    answers = _reach_scheduler(address, client.run, _inspect_files, list(sizes), on_error="return")
     from gyrostab import __version__
 
-    for worker, answer in found.items():
+    for worker, answer in answers.items():
         if isinstance(answer, BaseException):
             raise WorkerError(
                 f"--scheduler {address}: worker {worker} cannot run gyrostab "
                 f"({type(answer).__name__}: {answer}); "
                 f"install gyrostab {__version__} there too"
             )
-        version, seen = answer
+        version, worker_sizes = answer
         if version != __version__:
             raise WorkerError(
                 f"--scheduler {address}: worker {worker} has gyrostab {version}, "
                 f"here it is {__version__}; install the same"
             )
         for path, size in sizes.items():
-            if seen[path] != size:
-                what = (
-                    "does not see" if seen[path] is None else "sees another file under the name of"
+            if worker_sizes[path] != size:
+                problem = (
+                    "does not see"
+                    if worker_sizes[path] is None
+                    else "sees another file under the name of"
                 )
                 raise WorkerError(
-                    f"--scheduler {address}: worker {worker} {what} {path}; "
+                    f"--scheduler {address}: worker {worker} {problem} {path}; "
                     "all workers need the same file system under the same names"
                 )
 
@@ -285,14 +287,14 @@ def run_calls(
         When the workers or the scheduler have died. Exceptions of a call are raised unchanged.
     """
     waiting: dict[Future[Any], tuple[Any, ...]] = {}
-    rest = iter(calls)
+    remaining_calls = iter(calls)
     idle_since = time.monotonic()
     try:
         while True:
-            most = 2 * pool.width() if pool.remote else pool.width() + 1
-            for call in itertools.islice(rest, max(0, most - len(waiting))):
+            max_waiting = 2 * pool.width() if pool.remote else pool.width() + 1
+            for call in itertools.islice(remaining_calls, max(0, max_waiting - len(waiting))):
                 waiting[pool.submit(*call)] = call
-            if not waiting and most:
+            if not waiting and max_waiting:
                 return
             done, _ = wait(waiting, timeout=1.0, return_when=FIRST_COMPLETED)
             if done or pool.width():
@@ -311,12 +313,12 @@ def run_calls(
 
 def _unpack_result(future: Future[Any]) -> Any:
     try:
-        found = future.result()
-        if not isinstance(found, _ResultWithWarnings):
-            return found
-        for note in found.notes:
+        outcome = future.result()
+        if not isinstance(outcome, _ResultWithWarnings):
+            return outcome
+        for note in outcome.notes:
             warnings.warn(note, stacklevel=2)
-        return found.result
+        return outcome.result
     except GyrostabError:
         raise
     except BrokenProcessPool as error:

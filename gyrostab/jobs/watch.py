@@ -211,16 +211,16 @@ def _continue_product(path: Path, options: dict[str, Any], *, overwrite: bool) -
             f"{find_url(path)}: a live view writes to a local store; copy it to the address with "
             "a tool such as aws s3 sync"
         )
-    before = None
+    old_options = None
     if path.exists() and not overwrite:
         with contextlib.suppress(GyrostabError), open_product(path) as product:
-            before = product.attrs.get(_OPTIONS)
+            old_options = product.attrs.get(_OPTIONS)
             until = product["time"].values[-1]
-    if before is None:
+    if old_options is None:
         check_output(path, suffixes=[".zarr"], overwrite=overwrite)
         return _Continued(False, None)
     check_output(path, suffixes=[".zarr"], overwrite=True)
-    if changes := describe_differences(json.loads(before), _describe_options(options)):
+    if changes := describe_differences(json.loads(old_options), _describe_options(options)):
         raise OutputError(
             f"output {str(path)!r} exists already, and {changes}; give the same options to "
             "continue it, --overwrite to replace it, or another name with -o"
@@ -410,13 +410,13 @@ def hash_samples(log: xr.Dataset, span: tuple[int, int], common: str) -> bytes:
         if isinstance(source, GridSource):
             for _, _, runs in (part for row in source.rows for part in row):
                 first = np.searchsorted(runs[:, 0] + runs[:, 2], begin, side="right")
-                near = runs[first : np.searchsorted(runs[:, 0], end)].copy()
-                if len(near):
-                    ends = near[:, 0] + near[:, 2]
-                    cut = np.maximum(begin - near[:, 0], 0)
-                    near[:, :2] += cut[:, None]
-                    near[:, 2] = np.minimum(ends, end) - near[:, 0]
-                total.update(near.tobytes())
+                overlapping_runs = runs[first : np.searchsorted(runs[:, 0], end)].copy()
+                if len(overlapping_runs):
+                    ends = overlapping_runs[:, 0] + overlapping_runs[:, 2]
+                    cut = np.maximum(begin - overlapping_runs[:, 0], 0)
+                    overlapping_runs[:, :2] += cut[:, None]
+                    overlapping_runs[:, 2] = np.minimum(ends, end) - overlapping_runs[:, 0]
+                total.update(overlapping_runs.tobytes())
         else:
             total.update(read_slice(variable.data, begin, end).tobytes())
     return total.digest()
