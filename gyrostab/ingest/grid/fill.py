@@ -108,14 +108,16 @@ def gather_channel(
         block = read_slice(channel, begin, end).astype(np.float64, copy=False)
         rows = np.flatnonzero(np.isfinite(block))
         sample = samples_of(placement, rows + begin)
-        known = sample >= 0
+        has_time = sample >= 0
         when = grid_times(placement.start, rate, sample)
-        if "time" in raw.variables and not known.all():
+        if "time" in raw.variables and not has_time.all():
             written = read_stamps(raw, begin, end)[rows]
-            own = written + moved[np.searchsorted(breaks[:, 2], rows + begin, side="right")]
-            when = np.where(known, when, own)
-            known |= written != NO_STAMP
-        stamps.append(when[known])
-        values.append(block[rows][known])
+            moved_stamps = (
+                written + moved[np.searchsorted(breaks[:, 2], rows + begin, side="right")]
+            )
+            when = np.where(has_time, when, moved_stamps)
+            has_time |= written != NO_STAMP
+        stamps.append(when[has_time])
+        values.append(block[rows][has_time])
     time, first = np.unique(np.concatenate(stamps), return_index=True)
     return time.view("datetime64[ns]"), np.concatenate(values)[first]

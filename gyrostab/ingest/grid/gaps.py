@@ -53,9 +53,11 @@ def _unusable_cells(
 ) -> NDArray[np.int64]:
     """List the placed rows in which an axis has no usable number."""
     first, last = samples_of(placement, spans[:, 0]), samples_of(placement, spans[:, 1] - 1)
-    kept = (first >= 0) & (last >= first)
-    rows = (spans[:, 1] - spans[:, 0])[kept]
-    return np.stack([first[kept], last[kept] + 1, rows, rows, np.full(len(rows), cause)], axis=1)
+    is_placed = (first >= 0) & (last >= first)
+    rows = (spans[:, 1] - spans[:, 0])[is_placed]
+    return np.stack(
+        [first[is_placed], last[is_placed] + 1, rows, rows, np.full(len(rows), cause)], axis=1
+    )
 
 
 def _dropped_rows(events: NDArray[np.int64]) -> NDArray[np.int64]:

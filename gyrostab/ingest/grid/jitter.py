@@ -91,12 +91,14 @@ class JitterModel:
 
 def observe_rows(stamps: Integers, observe: str, period: float) -> Integers:
     """Select the rows whose stamps are used; the last row of a block counts as end of its group."""
-    known = np.flatnonzero(stamps != NO_STAMP)
-    if observe == "all" or len(known) == 0:
-        return known
-    apart = np.diff(stamps[known]) > 0.5 * period
+    readable = np.flatnonzero(stamps != NO_STAMP)
+    if observe == "all" or len(readable) == 0:
+        return readable
+    apart = np.diff(stamps[readable]) > 0.5 * period
     edge = np.ones(1, dtype=bool)
-    return np.asarray(known[np.concatenate([edge, apart] if observe == "first" else [apart, edge])])
+    return np.asarray(
+        readable[np.concatenate([edge, apart] if observe == "first" else [apart, edge])]
+    )
 
 
 def fit_jitter(
@@ -120,21 +122,21 @@ def fit_jitter(
     JitterModel or None
         None if no period explains the stamps.
     """
-    seen = _observe_parts(parts, observe, guesses[0])
+    observed = _observe_parts(parts, observe, guesses[0])
     lengths = (
         (32, 16) if observe == "all" else (8,)
     )  # with lost samples, only few consecutive groups are complete
-    lines = next(filter(None, (_fit_lines(seen, length) for length in lengths)), None)
+    lines = next(filter(None, (_fit_lines(observed, length) for length in lengths)), None)
     if lines is None or not (lines[0] > 0).any():
         return None
     slope, scatter = (values[lines[0] > 0] for values in lines)
     sigma_ns = float(np.median(scatter))
-    group = _rows_per_group(seen)
+    group = _rows_per_group(observed)
     if sigma_ns > _MAX_SIGMA * float(np.median(slope)):
         return None
     sure *= max(1.0, group)
-    periods = _candidate_periods(seen, slope, group)
-    sample = _shorten_parts(seen, _SEARCH_ROWS)
+    periods = _candidate_periods(observed, slope, group)
+    sample = _shorten_parts(observed, _SEARCH_ROWS)
     best = sorted(periods, key=lambda period: _row_cost(sample, period, sigma_ns, sure))[
         :_MAX_REFINED
     ]
@@ -142,11 +144,11 @@ def fit_jitter(
         *((period, sigma_ns / period) for period in best),
         *((guess, MIN_SIGMA) for guess in guesses),
     ]
-    found = [
-        _refine_model(seen, JitterModel(period, sigma, observe, group, np.inf), sure)
+    models = [
+        _refine_model(observed, JitterModel(period, sigma, observe, group, np.inf), sure)
         for period, sigma in started
     ]
-    explained = min(filter(None, found), key=lambda jitter: jitter.code_length, default=None)
+    explained = min(filter(None, models), key=lambda jitter: jitter.code_length, default=None)
     return (
         explained if explained is not None and explained.fits else None
     )  # the best may fit stamps of doubled rows
@@ -156,40 +158,40 @@ def fit_jitter_near(
     parts: list[Integers], period: float, observe: str, *, sure: float
 ) -> JitterModel | None:
     """Fit the jitter model near a given period [ns]; None if the stamps do not fit it."""
-    seen = _observe_parts(parts, observe, period)
-    group = _rows_per_group(seen)
-    found = _refine_model(
-        seen,
+    observed = _observe_parts(parts, observe, period)
+    group = _rows_per_group(observed)
+    model = _refine_model(
+        observed,
         JitterModel(period, 0.5, observe, group, np.inf),
         sure * max(1.0, group),
         most_off=0.02,
     )
-    return found if found is not None and found.fits else None
+    return model if model is not None and model.fits else None
 
 
-def _rows_per_group(seen: list[ObservedStamps]) -> float:
+def _rows_per_group(observed: list[ObservedStamps]) -> float:
     """Return the mean number of rows for each used stamp."""
     return float(
-        sum(count[-1] - count[0] for count, _ in seen)
-        / max(1, sum(len(count) - 1 for count, _ in seen))
+        sum(count[-1] - count[0] for count, _ in observed)
+        / max(1, sum(len(count) - 1 for count, _ in observed))
     )
 
 
 def _observe_parts(parts: list[Integers], observe: str, period: float) -> list[ObservedStamps]:
-    taken = []
+    observed = []
     for part in parts:
         rows = observe_rows(part, observe, period)[1:-1]
         if len(rows) > 1:
-            taken.append((rows, part[rows]))
-    return taken
+            observed.append((rows, part[rows]))
+    return observed
 
 
 def _fit_lines(
-    seen: list[ObservedStamps], length: int
+    observed: list[ObservedStamps], length: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """Fit lines to stretches of `length` stamps: slopes [ns a row], residual sigma [ns]."""
     tables = []
-    for count, stamps in seen:
+    for count, stamps in observed:
         if len(count) >= length:
             first = np.arange(0, len(count) - length + 1, length // 2)
             at = first[:, None] + np.arange(length)
@@ -204,15 +206,15 @@ def _fit_lines(
     count -= count.mean(axis=1, keepdims=True)
     stamps -= stamps.mean(axis=1, keepdims=True)
     slope = (count * stamps).sum(axis=1) / (count**2).sum(axis=1)
-    rest = stamps - slope[:, None] * count
-    return slope, np.sqrt((rest**2).sum(axis=1) / (length - 2))
+    residuals = stamps - slope[:, None] * count
+    return slope, np.sqrt((residuals**2).sum(axis=1) / (length - 2))
 
 
 def _candidate_periods(
-    seen: list[ObservedStamps], slope: NDArray[np.float64], group: float
+    observed: list[ObservedStamps], slope: NDArray[np.float64], group: float
 ) -> list[float]:
     """Return candidate periods [ns] near the smaller slopes; losses increase slopes."""
-    longer = _fit_lines(seen, 128)
+    longer = _fit_lines(observed, 128)
     slopes = longer[0] if longer is not None and len(longer[0]) >= 16 and group < 2 else slope
     slopes = slopes[slopes > 0.2 * np.median(slope)]
     low, high = np.quantile(slopes, [0.05, 0.6])
@@ -221,43 +223,46 @@ def _candidate_periods(
     return [float(period) for period in np.geomspace(low, high, steps)]
 
 
-def _shorten_parts(seen: list[ObservedStamps], rows: int) -> list[ObservedStamps]:
-    most = max(64, rows // len(seen))
-    return [(count[:most], stamps[:most]) for count, stamps in seen]
+def _shorten_parts(observed: list[ObservedStamps], rows: int) -> list[ObservedStamps]:
+    n_rows = max(64, rows // len(observed))
+    return [(count[:n_rows], stamps[:n_rows]) for count, stamps in observed]
 
 
-def _row_cost(seen: list[ObservedStamps], period: float, sigma_ns: float, sure: float) -> float:
+def _row_cost(observed: list[ObservedStamps], period: float, sigma_ns: float, sure: float) -> float:
     """Return the mean cost of a row [nats] for a period [ns]."""
     sigma = max(sigma_ns / period, MIN_SIGMA)
     total = sum(
         follow(count, stamps, period, sigma, _SEARCH_GAIN, sure * period, TRACE_ROWS)[3]
-        for count, stamps in seen
+        for count, stamps in observed
     )
-    return float(total / sum(len(count) for count, _ in seen))
+    return float(total / sum(len(count) for count, _ in observed))
 
 
 def _refine_model(
-    seen: list[ObservedStamps], jitter: JitterModel, sure: float, *, most_off: float = 0.05
+    observed: list[ObservedStamps], jitter: JitterModel, sure: float, *, most_off: float = 0.05
 ) -> JitterModel | None:
     """Refine period and jitter along the sequence of samples; None if the fit fails."""
-    if not seen:
+    if not observed:
         return None
     period, sigma = jitter.period, jitter.sigma
     for gain in (_SEARCH_GAIN, _SEARCH_GAIN / 2, GAIN, GAIN):
         cc = ct = nats = rows = dropped = single = steps = 0.0
         offs = []
-        for count, stamps in seen:
-            known = max(sigma, MIN_SIGMA)
+        for count, stamps in observed:
+            floored_sigma = max(sigma, MIN_SIGMA)
             sample, piece, off, cost = follow(
-                count, stamps, period, known, gain, sure * period, TRACE_ROWS
+                count, stamps, period, floored_sigma, gain, sure * period, TRACE_ROWS
             )
-            near = _is_near(off, sigma)
-            sums = piece_sums(stamps[near], sample[near], piece[near], period)
+            is_near = _is_near(off, sigma)
+            sums = piece_sums(stamps[is_near], sample[is_near], piece[is_near], period)
             cc, ct = cc + sums[:, 3].sum(), ct + sums[:, 4].sum()
             nats, rows = nats + cost, rows + len(count)
-            step, whole = np.diff(sample)[np.diff(piece) == 0], np.diff(count)[np.diff(piece) == 0]
-            dropped += (np.maximum(whole - step, 0)).sum()
-            single, steps = single + (step == whole).sum(), steps + len(step)
+            sample_step, count_step = (
+                np.diff(sample)[np.diff(piece) == 0],
+                np.diff(count)[np.diff(piece) == 0],
+            )
+            dropped += (np.maximum(count_step - sample_step, 0)).sum()
+            single, steps = single + (sample_step == count_step).sum(), steps + len(sample_step)
             offs.append(off)
         if cc <= 0:
             return None
@@ -295,5 +300,5 @@ def count_samples(
         longest,
         TRACE_ROWS,
     )
-    near = _is_near(off, jitter.sigma)
-    return stamps[at][near], sample[near], piece[near]
+    is_near = _is_near(off, jitter.sigma)
+    return stamps[at][is_near], sample[is_near], piece[is_near]

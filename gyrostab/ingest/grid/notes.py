@@ -48,8 +48,8 @@ def _format_span(first: np.datetime64, last: np.datetime64) -> str:
     return " to ".join(format_stamp(int(to_nanoseconds(stamp))) for stamp in (first, last))
 
 
-def _count_of(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+def _count_of(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def describe_rate(
@@ -62,7 +62,7 @@ def describe_rate(
     """Return notes on the sampling rate."""
     where = record_name(raw)
     notes = []
-    why = (
+    reason = (
         "many rows share one stamp"
         if estimate.coarse
         else "the stamps come in bursts, as rows arrive and not as they are sampled"
@@ -74,11 +74,11 @@ def describe_rate(
             if placement.wander >= 1
             else ""
         )
-        notes.append(f"{where}: {why}: rows are placed by their count at {rate:.10g} Hz{reach}")
+        notes.append(f"{where}: {reason}: rows are placed by their count at {rate:.10g} Hz{reach}")
     jitter = estimate.jitter
     if jitter is not None and (jitter.group >= 2 or jitter.sigma < MIN_SIGMA):
         notes.append(
-            f"{where}: {why}: rows are placed in their order at {rate:.10g} Hz; samples are "
+            f"{where}: {reason}: rows are placed in their order at {rate:.10g} Hz; samples are "
             "missing where a group comes late"
         )
     elif jitter is not None:
@@ -110,11 +110,11 @@ def describe_rate(
             f"{where}: the stamps say {estimate.raw:.10g} Hz, {1e6 * off:.1f} parts per million "
             f"from {rate:.10g} Hz"
         )
-    for row, stamp, own in deviating[:_MAX_NAMED]:
+    for row, stamp, own_rate in deviating[:_MAX_NAMED]:
         file, local = file_of(raw, row)
         notes.append(
             f"{file}: from about {format_stamp(stamp)} (row {local}) the samples come at "
-            f"{own:.6g} Hz and not at {rate:.6g} Hz; "
+            f"{own_rate:.6g} Hz and not at {rate:.6g} Hz; "
             "by their stamps samples are missing or dropped there; split the log at that row and "
             "run the parts on their own"
         )
@@ -148,8 +148,8 @@ def _describe_missing(
     longest = longest[longest[:, 2] >= max(2, rate)][:_MAX_NAMED]
     ends = placement.runs[:, 0] + placement.runs[:, 2]
     for first, _end, samples, _rows, _cause in longest.tolist():
-        before = placement.runs[np.searchsorted(ends, first)]
-        row = int(before[1] + before[2] - 1)
+        last_run = placement.runs[np.searchsorted(ends, first)]
+        row = int(last_run[1] + last_run[2] - 1)
         file, local = file_of(raw, row)
         since = format_stamp(int(grid_times(placement.start, rate, first)))
         notes.append(
@@ -189,18 +189,18 @@ def describe_placement(
         )
     late = events[events[:, 0] == OUT_OF_ORDER]
     if len(late):
-        kept = int((samples_of(placement, late[:, 2]) >= 0).sum())
+        n_placed = int((samples_of(placement, late[:, 2]) >= 0).sum())
         notes.append(
             f"{where}: out of order: {_count_of(len(late), 'row')}, first "
             f"{_name_row(raw, int(late[:, 2].min()))}; "
-            f"{kept} were put in their place, {len(late) - kept} dropped"
+            f"{n_placed} were put in their place, {len(late) - n_placed} dropped"
         )
     lost = (
         scanned.rows
         - scanned.absent
         - placement.placed
         - len(twice)
-        - (len(late) - kept if len(late) else 0)
+        - (len(late) - n_placed if len(late) else 0)
     )
     if lost > 0:
         notes.append(

@@ -51,7 +51,7 @@ def fit_pieces(
 
 
 def _piece_sums(
-    found: tuple[NDArray[np.int64], NDArray[np.int64]],
+    rows_and_stamps: tuple[NDArray[np.int64], NDArray[np.int64]],
     *,
     period: float,
     counted: bool,
@@ -60,20 +60,22 @@ def _piece_sums(
     jitter: JitterModel | None,
 ) -> tuple[tuple[int, int] | None, NDArray[np.float64]]:
     """Return first stamp, reference stamp and sums of the pieces of a block."""
-    rows, block = found
+    rows, block = rows_and_stamps
     block = readable_stamps(block)
     if len(block) == 0:
         return None, np.empty((0, 6))
     first = int(block[0])
     if jitter is not None:
-        block, count, piece = count_samples(np.arange(len(found[1])), found[1], jitter, longest)
+        block, count, piece = count_samples(
+            np.arange(len(rows_and_stamps[1])), rows_and_stamps[1], jitter, longest
+        )
         return (first, int(block[0])) if len(block) else None, piece_sums(
             block, count, piece, period
         )
     if counted:
-        known = np.flatnonzero(rows != NO_STAMP)
+        readable = np.flatnonzero(rows != NO_STAMP)
         piece = np.concatenate([[0], np.cumsum(np.abs(np.diff(block)) > longest)])
-        count = known  # rows without a stamp count too
+        count = readable  # rows without a stamp count too
     else:
         count, piece = track(block, period, GAIN, longest)
     if (
@@ -87,10 +89,10 @@ def pool_pieces(
     pieces: NDArray[np.float64], period: float, counted: bool
 ) -> tuple[float, float, float]:
     """Pool the pieces: period [ns], standard error [ns], samples of the longest stretch."""
-    n, cc, ct, rest = pieces[:, 0], pieces[:, 3], pieces[:, 4], pieces[:, 5]
+    n, cc, ct, residuals = pieces[:, 0], pieces[:, 3], pieces[:, 4], pieces[:, 5]
     if cc.sum() <= 0:
         return period, period, 1.0
-    noise = np.sqrt(rest.sum() / max(1.0, n.sum() - 2 * len(n)))
+    noise = np.sqrt(residuals.sum() / max(1.0, n.sum() - 2 * len(n)))
     slope = ct / np.where(cc > 0, cc, 1.0)
     sane = (cc > 0) & (
         np.abs(slope / period - 1) < 0.02 + 5 * noise / period / np.sqrt(np.maximum(cc, 1e-9))

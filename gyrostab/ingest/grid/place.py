@@ -129,9 +129,9 @@ def append_runs(
     new = np.flatnonzero((np.diff(sample) != 1) | (np.diff(rows) != 1)) + 1
     first = np.concatenate([[0], new])
     table = np.stack([sample[first], rows[first], np.diff(np.append(first, len(rows)))], axis=1)
-    before = runs[-1][-1] if runs else None
-    if before is not None and (before[:2] + before[2] == table[0, :2]).all():
-        before[2] += table[0, 2]
+    last_run = runs[-1][-1] if runs else None
+    if last_run is not None and (last_run[:2] + last_run[2] == table[0, :2]).all():
+        last_run[2] += table[0, 2]
         table = table[1:]
     if len(table):
         runs.append(table)
@@ -165,8 +165,8 @@ def place_by_stamp(
     TimeError
         When no stamp can be read.
     """
-    whole, fraction = period_ns(rate)
-    period = whole + fraction
+    nanoseconds, fraction = period_ns(rate)
+    period = nanoseconds + fraction
     state, ring = kernel.new_state()
     runs: list[NDArray[np.int64]] = []
     events: list[NDArray[np.int64]] = []
@@ -197,42 +197,44 @@ class _Windows:
 def _make_windows(stamps: Stamps, period: float, width: int) -> tuple[_Windows, int]:
     """Make windows of `width` rows; also return the first stamp [ns]."""
     parts: list[tuple[NDArray[np.float64], ...]] = []
-    rest = np.empty(0, dtype=np.int64)
+    pending = np.empty(0, dtype=np.int64)
     first: int | None = None
     last: list[float] = []  # lead at the end of the previous window
     done = 0
 
-    def summarise(values: NDArray[np.int64], before: int, zero: int) -> None:
+    def summarise(values: NDArray[np.int64], first_row: int, zero: int) -> None:
         table = values.reshape(-1, width) if len(values) >= width else values[None]
-        ahead = (table - zero) / period - (np.arange(values.size) + before).reshape(table.shape)
+        ahead = (table - zero) / period - (np.arange(values.size) + first_row).reshape(table.shape)
         ahead[table == NO_STAMP] = np.nan
-        known = np.where(
+        filled = np.where(
             np.isnan(ahead), np.nanmedian(ahead) if np.isfinite(ahead).any() else 0.0, ahead
         )
-        step = np.diff(known.ravel(), prepend=last[0] if last else known[0, 0]).reshape(known.shape)
-        last[:] = [known[-1, -1]]
-        at = np.arange(len(table)) * width + before
-        low, high = known.min(axis=1), known.max(axis=1)
+        step = np.diff(filled.ravel(), prepend=last[0] if last else filled[0, 0]).reshape(
+            filled.shape
+        )
+        last[:] = [filled[-1, -1]]
+        at = np.arange(len(table)) * width + first_row
+        low, high = filled.min(axis=1), filled.max(axis=1)
         parts.append(
             (
                 low,
                 high,
-                np.quantile(known, 0.9, axis=1) - low,
+                np.quantile(filled, 0.9, axis=1) - low,
                 at + step.argmax(axis=1),
                 at + step.argmin(axis=1),
             )
         )
 
     for _, values in stamps():
-        rest = np.concatenate([rest, values])
-        if first is None and (rest != NO_STAMP).any():
-            first = int(rest[rest != NO_STAMP][0])
-        n = len(rest) // width * width
+        pending = np.concatenate([pending, values])
+        if first is None and (pending != NO_STAMP).any():
+            first = int(pending[pending != NO_STAMP][0])
+        n = len(pending) // width * width
         if n and first is not None:
-            summarise(rest[:n], done, first)
-            rest, done = rest[n:], done + n
-    if first is not None and (len(rest) >= width // 2 or not parts) and len(rest):
-        summarise(rest, done, first)
+            summarise(pending[:n], done, first)
+            pending, done = pending[n:], done + n
+    if first is not None and (len(pending) >= width // 2 or not parts) and len(pending):
+        summarise(pending, done, first)
     low, high, reach, up, down = (np.concatenate(column) for column in zip(*parts, strict=True))
     return _Windows(low, high, reach, up.astype(np.int64), down.astype(np.int64)), int(first or 0)
 
@@ -242,30 +244,30 @@ def _find_jumps(windows: _Windows) -> tuple[list[tuple[int, float, int, float]],
     low = windows.low
     change = np.abs(np.diff(low))
     noise = 1.4826 * float(np.median(change)) if len(change) else 0.0
-    least = max(6 * noise, float(np.median(windows.reach)), 3.0)
-    found: list[tuple[int, float, int, float]] = []
+    min_size = max(6 * noise, float(np.median(windows.reach)), 3.0)
+    jumps: list[tuple[int, float, int, float]] = []
     level, placed, wander, b = float(low[0]), float(low[0]), 0.0, 1
     while b < len(low):
-        after = low[b : b + 3]
-        size = float(np.median(after)) - level
+        next_lows = low[b : b + 3]
+        size = float(np.median(next_lows)) - level
         if (
-            abs(size) > least
-            and abs(low[b] - level) > least
-            and (after - level > least).all() | (after - level < -least).all()
+            abs(size) > min_size
+            and abs(low[b] - level) > min_size
+            and (next_lows - level > min_size).all() | (next_lows - level < -min_size).all()
         ):
             # a loss late in a window does not change the lowest point of that window
             rows = (windows.up if size > 0 else windows.down)[b - 1 : b + 1]
             tops = windows.high[b - 1] - level if size > 0 else level - low[b - 1]
             row = int(rows[0]) if size > 0 and tops > 0.7 * size else int(rows[-1])
-            found.append((row, size, b, level))
-            level = float(np.median(after))
-            placed += level - found[-1][3]
+            jumps.append((row, size, b, level))
+            level = float(np.median(next_lows))
+            placed += level - jumps[-1][3]
             b += 1
             continue
         level += 0.2 * (float(low[b]) - level)
         wander = max(wander, abs(level - placed))
         b += 1
-    return found, wander
+    return jumps, wander
 
 
 def place_by_count(
@@ -278,8 +280,8 @@ def place_by_count(
     max_gap : float
         A longer loss is taken as a step of the clock [s].
     """
-    whole, fraction = period_ns(rate)
-    period = whole + fraction
+    nanoseconds, fraction = period_ns(rate)
+    period = nanoseconds + fraction
     width = max(64, int(4 * rate))
     windows, first = _make_windows(stamps, period, width)
     jumps, wander = _find_jumps(windows)
@@ -289,7 +291,7 @@ def place_by_count(
     begun = 0.0
     for row, size, _window, level in jumps:
         extra = int(np.rint(size))
-        before = first + int((row - 1 + level) * period)
+        stamp_before = first + int((row - 1 + level) * period)
         if size < 0 or size > max_gap * rate:
             back = -size
             elapsed = row + level - begun
@@ -298,7 +300,15 @@ def place_by_count(
                 if size < 0 and (2 * back > elapsed or row + level + size < 0.1 * elapsed)
                 else STEP
             )
-            events.append((cause, row + shifts[-1], row, before, before + int((size + 1) * period)))
+            events.append(
+                (
+                    cause,
+                    row + shifts[-1],
+                    row,
+                    stamp_before,
+                    stamp_before + int((size + 1) * period),
+                )
+            )
             extra, begun = 1, row + level + size
         shifts.append(shifts[-1] + extra)
         cuts.append(row)
@@ -311,12 +321,12 @@ def place_by_count(
 
 def _rows_at(stamps: Stamps, counts: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the row numbers of the rows with the given counts."""
-    found, done = counts.copy(), 0
+    row_numbers, done = counts.copy(), 0
     for rows, _ in stamps():
-        here = (counts >= done) & (counts < done + len(rows))
-        found[here] = rows[counts[here] - done]
+        is_inside = (counts >= done) & (counts < done + len(rows))
+        row_numbers[is_inside] = rows[counts[is_inside] - done]
         done += len(rows)
-    return found
+    return row_numbers
 
 
 def _counted_runs(

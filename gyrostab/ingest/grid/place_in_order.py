@@ -71,14 +71,15 @@ class _Placer:
                     begins=number > 0,
                 )
 
-    def _add_break(self, row: int, before: int, stamp: int) -> None:
-        elapsed = before - self.origin
-        again = stamp < before and (
-            stamp <= self.origin + 0.1 * elapsed or 2 * (before - stamp) > elapsed
+    def _add_break(self, row: int, previous_stamp: int, stamp: int) -> None:
+        elapsed = previous_stamp - self.origin
+        is_restart = stamp < previous_stamp and (
+            stamp <= self.origin + 0.1 * elapsed or 2 * (previous_stamp - stamp) > elapsed
         )
         self.events.append(
             np.array(
-                [[RESTART if again else STEP, self.last + 1, row, before, stamp]], dtype=np.int64
+                [[RESTART if is_restart else STEP, self.last + 1, row, previous_stamp, stamp]],
+                dtype=np.int64,
             )
         )
 
@@ -129,8 +130,8 @@ class _Placer:
             at, np.arange(n), side="left" if self.jitter.observe == "last" else "right"
         )
         nearest -= self.jitter.observe != "last"
-        known = np.append(levels, self.level if len(at) == 0 else levels[-1])
-        level = np.where(nearest < 0, self.level, known[np.clip(nearest, 0, len(at))])
+        padded_levels = np.append(levels, self.level if len(at) == 0 else levels[-1])
+        level = np.where(nearest < 0, self.level, padded_levels[np.clip(nearest, 0, len(at))])
         done = int(np.searchsorted(at, n))
         if done:
             self.level, self.phase, self.seen = (
@@ -142,10 +143,10 @@ class _Placer:
 
     def _add_rows(self, rows: Integers, sample: Integers, stamps: Integers) -> None:
         """Add runs of rows; a row on or before the sample of the previous row is a duplicate."""
-        before = np.maximum.accumulate(np.concatenate([[self.last], sample[:-1]]))
-        kept = sample > before
-        if not kept.all():
-            lost = np.flatnonzero(~kept)
+        previous_sample = np.maximum.accumulate(np.concatenate([[self.last], sample[:-1]]))
+        is_new = sample > previous_sample
+        if not is_new.all():
+            lost = np.flatnonzero(~is_new)
             same = np.full(len(lost), DUPLICATE)
             self.events.append(
                 np.stack(
@@ -153,7 +154,7 @@ class _Placer:
                     axis=1,
                 )
             )
-            rows, sample = rows[kept], sample[kept]
+            rows, sample = rows[is_new], sample[is_new]
         if len(rows):
             self.last = int(sample[-1])
             append_runs(self.runs, sample, rows)

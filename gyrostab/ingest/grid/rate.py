@@ -113,7 +113,7 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
     steps = np.concatenate([np.diff(part) for part in parts])
     backwards = float((steps < 0).mean())
     if not (steps > 0).any() or backwards > _MAX_BACKWARD_SHARE:
-        what = (
+        problem = (
             "time runs backwards"
             if backwards > 1 - _MAX_BACKWARD_SHARE
             else "the rows are in no order of time"
@@ -121,7 +121,7 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
             else "all stamps are the same"
         )
         raise TimeError(
-            f"{where}: {what} throughout; check the time column and its unit, or leave it out "
+            f"{where}: {problem} throughout; check the time column and its unit, or leave it out "
             "(--map) and give --rate HZ"
         )
     period, counted, coarse = starting_period(parts)
@@ -159,8 +159,8 @@ def _fit_jitter(
         once = [part[np.append(np.diff(part) != 0, True)] for part in parts]
         rows, apart = sum(map(len, parts)), sum(map(len, once))
         readings = [parts, once] if (1 - SHARED_SHARE) * rows < apart < rows else [parts]
-        found = [fit_jitter(reading, [period], "all", sure=sure) for reading in readings]
-        best = min(filter(None, found), key=attrgetter("code_length"), default=None)
+        models = [fit_jitter(reading, [period], "all", sure=sure) for reading in readings]
+        best = min(filter(None, models), key=attrgetter("code_length"), default=None)
         if best is not None:
             return best
     return fit_jitter(parts, [period], "first" if coarse else "last", sure=sure)
@@ -293,34 +293,34 @@ def deviating_stretches(stamps: Stamps, period: float) -> list[tuple[int, int, f
 
     Only steps of another length count as a deviation, not missing or doubled rows.
     """
-    found: list[tuple[int, int, float]] = []
+    stretches: list[tuple[int, int, float]] = []
     inside = False
     for rows, values in recut_blocks(stamps, 64 * _STRETCH):
-        known = values != NO_STAMP
-        rows, values = rows[known], values[known]
+        is_readable = values != NO_STAMP
+        rows, values = rows[is_readable], values[is_readable]
         begins, paces = _stretch_paces(values)
-        far = np.abs(paces / period - 1) >= 0.02
-        if not far.any():
-            inside = False if len(far) else inside
+        suspects = np.abs(paces / period - 1) >= 0.02
+        if not suspects.any():
+            inside = False if len(suspects) else inside
             continue
-        for begin, look in zip(begins.tolist(), far.tolist(), strict=True):
+        for begin, is_suspect in zip(begins.tolist(), suspects.tolist(), strict=True):
             part = values[begin : begin + _STRETCH]
-            own_period = period_of_lines([part]) if look else None
+            own_period = period_of_lines([part]) if is_suspect else None
             is_deviating = own_period is not None and abs(own_period / period - 1) > 0.02
             if is_deviating and not inside and own_period is not None:
-                found.append((int(rows[begin]), int(part[0]), SECOND / own_period))
+                stretches.append((int(rows[begin]), int(part[0]), SECOND / own_period))
             inside = is_deviating
-    return found
+    return stretches
 
 
 def _stretch_paces(values: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return first row and median step [ns] of every stretch."""
-    whole = len(values) // _STRETCH
-    rest = whole * _STRETCH
-    table = np.diff(values[:rest].reshape(whole, _STRETCH)[:, ::16], axis=1)
-    paces = np.median(table, axis=1) / 16 if whole else np.empty(0)
-    begins = np.arange(whole) * _STRETCH
-    if len(values) - rest >= _STRETCH // 4:
-        last = np.median(np.diff(values[rest::16])) / 16
-        begins, paces = np.append(begins, rest), np.append(paces, last)
+    n_stretches = len(values) // _STRETCH
+    end = n_stretches * _STRETCH
+    table = np.diff(values[:end].reshape(n_stretches, _STRETCH)[:, ::16], axis=1)
+    paces = np.median(table, axis=1) / 16 if n_stretches else np.empty(0)
+    begins = np.arange(n_stretches) * _STRETCH
+    if len(values) - end >= _STRETCH // 4:
+        last = np.median(np.diff(values[end::16])) / 16
+        begins, paces = np.append(begins, end), np.append(paces, last)
     return begins, paces

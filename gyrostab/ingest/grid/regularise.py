@@ -127,14 +127,14 @@ def _place_rows(
             raise
         estimate = RateEstimate(declared, 0.0, counted=False, coarse=False, raw=declared)
     if declared is not None and abs(declared / estimate.raw - 1) > _MAX_RATE_DIFFERENCE:
-        near = estimate_near(stamps, declared)
+        near_estimate = estimate_near(stamps, declared)
         named = (
             estimate.even is not None and abs(declared / estimate.even - 1) <= _MAX_RATE_DIFFERENCE
         )  # without the recurring losses
         if (
-            near is None
-            or abs(declared / near.raw - 1) > _MAX_RATE_DIFFERENCE
-            or (not named and is_far_worse(stamps, near, estimate))
+            near_estimate is None
+            or abs(declared / near_estimate.raw - 1) > _MAX_RATE_DIFFERENCE
+            or (not named and is_far_worse(stamps, near_estimate, estimate))
         ):
             raise TimeError(
                 f"{where}: the sampling rate given is {declared:.10g} Hz, but the time stamps "
@@ -147,7 +147,7 @@ def _place_rows(
             f"{where}: the stamps alone say {estimate.raw:.6g} Hz; they fit the rate given, "
             f"{declared:.10g} Hz, which is used"
         )
-        estimate = near
+        estimate = near_estimate
     rate = estimate.rate
     if declared is not None:
         rate, estimate = (
@@ -187,11 +187,11 @@ def _place_even(
     present = replace(scanned, rows=_EVEN_ROWS, present=scanned.present[: _EVEN_ROWS // 8].copy())
     notes: list[str] = []
     placement, rate = place(head, present, notes=notes)
-    whole, fraction = period_ns(rate)
+    nanoseconds, fraction = period_ns(rate)
     if (
         notes
         or fraction
-        or whole != step
+        or nanoseconds != step
         or placement.runs.tolist() != [[0, 0, _EVEN_ROWS]]
         or len(placement.events)
     ):
@@ -250,16 +250,16 @@ def _place_stamped(
 
 def _place_once(raw: xr.Dataset, scanned: ScanPass, place: Callable[[], Placement]) -> Placement:
     """Place each sample once; repeated stretches of rows are duplicates, not clock restarts."""
-    placement, known = place(), np.empty((0, 3), dtype=np.int64)
+    placement, all_repeats = place(), np.empty((0, 3), dtype=np.int64)
     for _ in range(_MAX_ROUNDS):
         repeats = find_repeats(raw, signal_name(raw), placement)
         if not len(repeats):
             break
         for row, _source, length in repeats.tolist():
             scanned.leave_out(row, row + length)
-        known = np.concatenate([known, repeats])
+        all_repeats = np.concatenate([all_repeats, repeats])
         placement = place()
-    return with_repeats(placement, raw, known) if len(known) else placement
+    return with_repeats(placement, raw, all_repeats) if len(all_repeats) else placement
 
 
 def _place_channels(
@@ -291,7 +291,7 @@ def _place_channels(
 def _log_attributes(
     raw: xr.Dataset, kind: str, rate: float, done: str, notes: list[str]
 ) -> dict[str, Any]:
-    kept = {key: value for key, value in raw.attrs.items() if key not in _OWN_ATTRIBUTES}
+    attributes = {key: value for key, value in raw.attrs.items() if key not in _OWN_ATTRIBUTES}
     now = time_of_day()
     history = "\n".join(
         filter(None, [raw.attrs.get("history"), f"{now} gyrostab.regularise: {done}"])
@@ -299,7 +299,7 @@ def _log_attributes(
     all_notes = [*texts(raw, "notes"), *notes]
     return {
         "source_files": [],
-        **kept,
+        **attributes,
         "kind": kind,
         "sampling_rate_hz": rate,
         "history": history,
@@ -417,7 +417,7 @@ def regularise(
     attributes = {**raw[name].attrs, "units": SIGNAL_UNITS[signal]}
     unit = raw[name].encoding.get("scale_factor")
     packing = {**raw[name].encoding, "scale_factor": unit * scale} if unit else {}
-    variables, own = _place_channels(raw, scanned, placement, hertz, chunk)
+    variables, channel_times = _place_channels(raw, scanned, placement, hertz, chunk)
     variables = {
         signal: (
             ("axis", "time"),
@@ -429,7 +429,7 @@ def regularise(
         **gap_variables(table, placement.start, hertz),
     }
     coordinates = (
-        xr.Coordinates({"axis": raw["axis"].variable, **own})
+        xr.Coordinates({"axis": raw["axis"].variable, **channel_times})
         .merge(time_coordinate(placement.start, hertz, placement.size))
         .coords
     )

@@ -38,24 +38,24 @@ def find_repeats(raw: xr.Dataset, name: str, placement: Placement) -> NDArray[np
     """
     events = placement.events
     back = events[np.isin(events[:, 0], (STEP, RESTART)) & (events[:, 4] < events[:, 3])]
-    found: list[tuple[int, int, int]] = []
+    repeats: list[tuple[int, int, int]] = []
     for row, stamp in sorted(zip(back[:, 2].tolist(), back[:, 4].tolist(), strict=True)):
-        if found and row < found[-1][0] + found[-1][2]:
+        if repeats and row < repeats[-1][0] + repeats[-1][2]:
             continue
         for source in _rows_at(raw, stamp, row):
             length = _same_stamps(raw, source, row)
             if length >= _MIN_ROWS and _same_values(raw, name, source, row, length):
-                found.append((row, source, length))
+                repeats.append((row, source, length))
                 break
-    return np.array(found, dtype=np.int64).reshape(-1, 3)
+    return np.array(repeats, dtype=np.int64).reshape(-1, 3)
 
 
-def _rows_at(raw: xr.Dataset, stamp: int, before: int) -> list[int]:
+def _rows_at(raw: xr.Dataset, stamp: int, end_row: int) -> list[int]:
     """Return the first few rows with a stamp."""
     rows: list[int] = []
-    for begin in range(0, before, BLOCK_ROWS):
+    for begin in range(0, end_row, BLOCK_ROWS):
         rows += (
-            np.flatnonzero(read_stamps(raw, begin, min(begin + BLOCK_ROWS, before)) == stamp)
+            np.flatnonzero(read_stamps(raw, begin, min(begin + BLOCK_ROWS, end_row)) == stamp)
             + begin
         ).tolist()
         if len(rows) >= _MAX_CANDIDATES:
@@ -68,32 +68,32 @@ def _same_stamps(raw: xr.Dataset, source: int, row: int) -> int:
     room = min(raw.sizes["row"] - row, row - source)
     for begin in range(0, room, BLOCK_ROWS):
         end = min(begin + BLOCK_ROWS, room)
-        other = np.flatnonzero(
+        mismatches = np.flatnonzero(
             read_stamps(raw, source + begin, source + end)
             != read_stamps(raw, row + begin, row + end)
         )
-        if len(other):
-            return begin + int(other[0])
+        if len(mismatches):
+            return begin + int(mismatches[0])
     return room
 
 
 def _same_values(raw: xr.Dataset, name: str, source: int, row: int, length: int) -> bool:
     """Return whether values are equal where both are known, and not constant."""
-    compared = alike = 0
+    compared = same = 0
     changes = False
     for begin in range(0, length, BLOCK_ROWS):
         end = min(begin + BLOCK_ROWS, length)
         left, right = (
             read_slice(raw[name].data, first + begin, first + end) for first in (source, row)
         )
-        known = np.isfinite(left) & np.isfinite(right)
-        rows = known.any(axis=0)
+        is_known = np.isfinite(left) & np.isfinite(right)
+        rows = is_known.any(axis=0)
         compared += int(rows.sum())
-        alike += int(((left == right) | ~known).all(axis=0)[rows].sum())
+        same += int(((left == right) | ~is_known).all(axis=0)[rows].sum())
         changes = changes or bool(
-            ((np.diff(left, axis=1) != 0) & known[:, 1:] & known[:, :-1]).any()
+            ((np.diff(left, axis=1) != 0) & is_known[:, 1:] & is_known[:, :-1]).any()
         )
-    return changes and is_copy(compared, alike)
+    return changes and is_copy(compared, same)
 
 
 def with_repeats(placement: Placement, raw: xr.Dataset, repeats: NDArray[np.int64]) -> Placement:
@@ -103,9 +103,9 @@ def with_repeats(placement: Placement, raw: xr.Dataset, repeats: NDArray[np.int6
         rows = np.arange(length)
         sample = np.maximum.accumulate(np.maximum(samples_of(placement, rows + source), 0))
         stamps = read_stamps(raw, row, row + length)
-        known = stamps != NO_STAMP
+        is_readable = stamps != NO_STAMP
         table = np.stack([np.full(length, DUPLICATE), sample, rows + row, stamps, stamps], axis=1)
-        events.append(table[known])
+        events.append(table[is_readable])
     table = np.concatenate(events)
     return Placement(
         placement.start,

@@ -81,14 +81,18 @@ def _scan_blocks(
     """Yield the findings of each block, from the reader if it has scanned it."""
     rows = raw.sizes["row"]
     source = find_source(raw[name].data)
-    seen: Sequence[RowInspection] = ()
+    inspections: Sequence[RowInspection] = ()
     if isinstance(source, InspectedRows):
-        seen = source.inspections
-    whole = sum(inspection.rows for inspection in seen) == rows and all(
-        inspection.rows % 8 == 0 for inspection in seen[:-1]
+        inspections = source.inspections
+    is_complete = sum(inspection.rows for inspection in inspections) == rows and all(
+        inspection.rows % 8 == 0 for inspection in inspections[:-1]
     )
-    if seen and whole and all(inspection.filled.keys() == set(channels) for inspection in seen):
-        return seen
+    if (
+        inspections
+        and is_complete
+        and all(inspection.filled.keys() == set(channels) for inspection in inspections)
+    ):
+        return inspections
     return map_in_order(
         partial(_scan_block, raw, name, channels),
         ((at, min(rows, at + block)) for at in range(0, rows, block)),
@@ -127,8 +131,8 @@ def scan_rows(raw: xr.Dataset, name: str, *, block: int = BLOCK_ROWS) -> ScanPas
     axes = [str(axis) for axis in raw["axis"].values]
     still = [
         axis
-        for axis, least, most in zip(axes, low, high, strict=True)
-        if least == most and rows - absent > 1
+        for axis, lowest, highest in zip(axes, low, high, strict=True)
+        if lowest == highest and rows - absent > 1
     ]
     packed = np.concatenate(bits)
     return ScanPass(
@@ -163,10 +167,10 @@ def _source_names(raw: xr.Dataset) -> list[str]:
 
 def record_name(raw: xr.Dataset) -> str:
     """Return the source file of a record, or the first one and the number of the others."""
-    first, *others = dict.fromkeys(_source_names(raw))
-    if not others:
+    first, *other_files = dict.fromkeys(_source_names(raw))
+    if not other_files:
         return first
-    return f"{first} and {len(others)} more file{'s' * (len(others) > 1)}"
+    return f"{first} and {len(other_files)} more file{'s' * (len(other_files) > 1)}"
 
 
 def file_of(raw: xr.Dataset, row: int = 0) -> tuple[str, int]:

@@ -47,11 +47,11 @@ def recut_blocks(
         if waiting < size + ahead:
             continue
         rows, values = _concatenate_blocks(held)
-        whole = (waiting - ahead) // size * size
-        for begin in range(0, whole, size):
+        n_complete = (waiting - ahead) // size * size
+        for begin in range(0, n_complete, size):
             end = begin + size + ahead
             yield rows[begin:end], values[begin:end]
-        held, waiting = [(rows[whole:], values[whole:])], waiting - whole
+        held, waiting = [(rows[n_complete:], values[n_complete:])], waiting - n_complete
     if waiting:
         yield _concatenate_blocks(held)
 
@@ -69,8 +69,8 @@ def _concatenate_blocks(
 
 def readable_stamps(block: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the readable stamps, without a copy if all are readable."""
-    known = block != NO_STAMP
-    return block if known.all() else block[known]
+    is_readable = block != NO_STAMP
+    return block if is_readable.all() else block[is_readable]
 
 
 _STRETCH = 8192  # longest sampled stretch [stamps]
@@ -79,13 +79,13 @@ _MAX_STRETCHES = 128
 
 def sample_stretches(stamps: Stamps) -> list[NDArray[np.int64]]:
     """Return stretches of stamps from the whole log, a few hundred thousand in all."""
-    found: list[NDArray[np.int64]] = []
+    stretches: list[NDArray[np.int64]] = []
     for _, block in stamps():
         block = readable_stamps(block)
-        found += [block[i : i + _STRETCH] for i in range(0, len(block), _STRETCH)]
-        if len(found) > _MAX_STRETCHES:
-            found = found[::2]
-    return [part for part in found if len(part) > 1]
+        stretches += [block[i : i + _STRETCH] for i in range(0, len(block), _STRETCH)]
+        if len(stretches) > _MAX_STRETCHES:
+            stretches = stretches[::2]
+    return [part for part in stretches if len(part) > 1]
 
 
 _PATTERN = 8  # longest pattern of steps [steps]
@@ -97,12 +97,12 @@ _LONGEST = 5.0  # longest step of a pattern [samples]
 def cut_stretches(parts: list[NDArray[np.int64]], length: int) -> NDArray[np.float64]:
     """Return stretches of `length` stamps, relative to the first stamp of each [ns]."""
     stride = length if sum(map(len, parts)) > 200 * length else 1  # overlap in a short log
-    several = [
+    stretches = [
         np.lib.stride_tricks.sliding_window_view(part, length)[::stride]
         for part in parts
         if len(part) >= length
     ]
-    table = np.concatenate([*several, np.empty((0, length), dtype=np.int64)])
+    table = np.concatenate([*stretches, np.empty((0, length), dtype=np.int64)])
     return np.asarray(table - table[:, :1], dtype=np.float64)
 
 
@@ -110,11 +110,11 @@ def refine_period(steps: NDArray[np.float64], period: float) -> float:
     """Refine a first guess of the period [ns] of which the steps are multiples, if there is one."""
     start = period
     for _ in range(30):
-        near = np.abs(steps) < 5.5 * period
-        count = np.rint(steps[near] / period).sum()
+        is_near = np.abs(steps) < 5.5 * period
+        count = np.rint(steps[is_near] / period).sum()
         if count <= 0 or not 0.3 < period / start < 2.0:  # no common period
             return start
-        new = float(steps[near].sum() / count)
+        new = float(steps[is_near].sum() / count)
         if abs(new - period) < 1e-12 * period:
             break
         period = new
@@ -136,10 +136,12 @@ def finer_period(parts: list[NDArray[np.int64]], period: float) -> float | None:
     if single > 0.9 * period:
         return None
     counts = np.rint(table / single)
-    whole = (np.abs(table / single - counts) < _WHOLE).all(axis=1)
-    again = [(counts[:, rows:] == counts[:, :-rows]).all(axis=1) for rows in range(2, _PATTERN + 1)]
+    is_whole = (np.abs(table / single - counts) < _WHOLE).all(axis=1)
+    recurrences = [
+        (counts[:, rows:] == counts[:, :-rows]).all(axis=1) for rows in range(2, _PATTERN + 1)
+    ]
     uneven = (counts.min(axis=1) == 1) & (counts.max(axis=1) > 2) & (counts.max(axis=1) <= _LONGEST)
-    return single if (whole & np.any(again, axis=0) & uneven).mean() > 0.5 else None
+    return single if (is_whole & np.any(recurrences, axis=0) & uneven).mean() > 0.5 else None
 
 
 GAIN = 0.1
@@ -156,8 +158,8 @@ def _residual_range(
     values = cut_stretches(parts, length)
     x = np.arange(length) - (length - 1) / 2
     slope = values @ x / (x @ x)
-    rest = values - slope[:, None] * x
-    return slope, np.ptp(rest, axis=1) if len(rest) else np.empty(0)
+    residuals = values - slope[:, None] * x
+    return slope, np.ptp(residuals, axis=1) if len(residuals) else np.empty(0)
 
 
 def _has_shared_stamps(parts: list[NDArray[np.int64]], steps: NDArray[np.float64]) -> bool:
@@ -173,14 +175,14 @@ def _has_shared_stamps(parts: list[NDArray[np.int64]], steps: NDArray[np.float64
 
 def rms_misfit(steps: NDArray[np.float64], period: float) -> float:
     """Return the RMS distance of steps from whole samples [samples]; 0.29 for uniform phases."""
-    near = steps[np.abs(steps) < 5.5 * period] / period
-    return float(np.sqrt(np.mean((near - np.rint(near)) ** 2))) if len(near) else 0.5
+    inliers = steps[np.abs(steps) < 5.5 * period] / period
+    return float(np.sqrt(np.mean((inliers - np.rint(inliers)) ** 2))) if len(inliers) else 0.5
 
 
 def step_scatter(steps: NDArray[np.float64], period: float) -> float:
     """Return the robust scatter of steps about whole samples [samples]; 0.37 for uniform phases."""
-    near = steps[np.abs(steps) < 5.5 * period] / period
-    return 1.4826 * float(np.median(np.abs(near - np.rint(near)))) if len(near) else 0.5
+    inliers = steps[np.abs(steps) < 5.5 * period] / period
+    return 1.4826 * float(np.median(np.abs(inliers - np.rint(inliers)))) if len(inliers) else 0.5
 
 
 def period_of_lines(parts: list[NDArray[np.int64]]) -> float | None:
@@ -230,8 +232,8 @@ def starting_period(parts: list[NDArray[np.int64]]) -> tuple[float, bool, bool]:
 def _is_bursty(parts: list[NDArray[np.int64]], steps: NDArray[np.float64], period: float) -> bool:
     """Return whether long steps are pauses between bursts, not multiples of the short ones."""
     long = steps[(steps > 1.5 * period) & (steps < 50 * period)]
-    near = steps[np.abs(steps) < 50 * period]
-    if len(long) <= max(10, 0.02 * len(steps)) or near.sum() <= 1.2 * period * len(near):
+    inliers = steps[np.abs(steps) < 50 * period]
+    if len(long) <= max(10, 0.02 * len(steps)) or inliers.sum() <= 1.2 * period * len(inliers):
         return False
     if abs(np.exp(2j * np.pi * long / period).mean()) < 0.2:
         return True
@@ -242,7 +244,7 @@ def _is_bursty(parts: list[NDArray[np.int64]], steps: NDArray[np.float64], perio
         [(part[length:] - part[:-length])[::length] for part in parts if len(part) > length]
     ).astype(np.float64)
     scatter = 1.4826 * np.median(np.abs(spans - np.median(spans)))
-    return bool(scatter**2 < 0.2 * length * near.var())  # random losses would accumulate
+    return bool(scatter**2 < 0.2 * length * inliers.var())  # random losses would accumulate
 
 
 def _time_per_row(parts: list[NDArray[np.int64]], *, ticks: bool = False) -> float:
@@ -258,9 +260,9 @@ def _time_per_row(parts: list[NDArray[np.int64]], *, ticks: bool = False) -> flo
             times, counts = float(steps[good].sum()), int(good.sum())
         if times > 0 and counts > 0:
             rates.append((times, counts))
-    found = np.array(rates, dtype=np.float64)
-    whole = found[:, 1] >= 0.5 * found[:, 1].max()
-    return float(np.median(found[whole, 0] / found[whole, 1]))
+    totals = np.array(rates, dtype=np.float64)
+    is_long = totals[:, 1] >= 0.5 * totals[:, 1].max()
+    return float(np.median(totals[is_long, 0] / totals[is_long, 1]))
 
 
 def _tick_steps(steps: NDArray[np.float64]) -> tuple[float, int]:
