@@ -147,15 +147,15 @@ def distinct_columns(headers: Sequence[str]) -> Iterator[Header]:
     """Yield the columns, each with a unique key: name, header or numbered name."""
     split = [(header.strip(), *split_header(header)) for header in headers]
     names = Counter(name.lower() for _, name, _ in split)
-    whole = Counter(header.lower() for header, _, _ in split)
-    taken: Collection[str] = whole.keys() | names.keys()
+    header_counts = Counter(header.lower() for header, _, _ in split)
+    used_names: Collection[str] = header_counts.keys() | names.keys()
     counts: Counter[str] = Counter()
     for source, (header, name, unit) in enumerate(split):
         key = name if names[name.lower()] == 1 else header
-        if whole[key.lower()] > 1:
+        if header_counts[key.lower()] > 1:
             counts[key.lower()] += 1
             number = counts[key.lower()]
-            key = key if number == 1 else free_name(f"{name}_", taken, number)
+            key = key if number == 1 else free_name(f"{name}_", used_names, number)
         yield Header(source, header, name, unit, key=key)
 
 

@@ -266,8 +266,8 @@ class PiecewiseColumn(RowSource):
             return None
         _, _, first, step = lines[0]
         even = all(
-            start == first + row * step and (own == step or rows == 1)
-            for row, rows, start, own in lines
+            start == first + row * step and (piece_step == step or rows == 1)
+            for row, rows, start, piece_step in lines
         )
         return (first, step) if even else None
 
@@ -289,8 +289,8 @@ class PiecewiseColumn(RowSource):
 
     def take_rows(self, rows: NDArray[np.int64]) -> NDArray[Any]:
         """Return the values of a few rows."""
-        found = (self[row : row + 1] for row in rows.tolist())
-        return np.concatenate([np.empty(0, self.dtype), *found])
+        values = (self[row : row + 1] for row in rows.tolist())
+        return np.concatenate([np.empty(0, self.dtype), *values])
 
 
 class Buffers:
@@ -325,17 +325,19 @@ class Buffers:
             self._held, self._moved = 0, max(map(len, self._pieces.values()))
 
     def _as_piece(self, key: Any, values: NDArray[Any]) -> Piece:
-        whole = np.ascontiguousarray(values, dtype=self.dtypes[key])
-        if isinstance(whole.base, np.ndarray) and whole.base.nbytes > whole.nbytes:
-            whole = whole.copy()  # a view would keep its whole base in memory
-        return PlainPiece(whole.view(np.int64))
+        plain = np.ascontiguousarray(values, dtype=self.dtypes[key])
+        if isinstance(plain.base, np.ndarray) and plain.base.nbytes > plain.nbytes:
+            plain = plain.copy()  # a view would keep its whole base in memory
+        return PlainPiece(plain.view(np.int64))
 
     def finish(self) -> dict[Any, NDArray[Any] | PiecewiseColumn]:
         """Return the columns: plain arrays if they are small, otherwise piecewise columns."""
         columns = {
             key: PiecewiseColumn(self.dtypes[key], pieces) for key, pieces in self._pieces.items()
         }
-        stays = any(isinstance(piece, FilePiece) for own in self._pieces.values() for piece in own)
+        stays = any(
+            isinstance(piece, FilePiece) for pieces in self._pieces.values() for piece in pieces
+        )
         self._pieces.clear()
         if stays or self._spool is not None or self.rows * len(columns) > _MAX_PLAIN_VALUES:
             return dict(columns)
@@ -364,9 +366,11 @@ def stack_as_rows(columns: Sequence[Any], seen: Sequence[RowInspection] = ()) ->
     """Stack columns as the rows of one array, without a copy if they already share one matrix."""
     if not isinstance(columns[0], np.ndarray):
         return make_dask(InspectedRows(columns, seen), (1, CHUNK_ROWS))
-    whole = columns[0].base
-    same = whole is not None and whole.shape[:-1] == (len(columns),)
-    return whole if same and all(one.base is whole for one in columns) else np.stack(columns)
+    matrix = columns[0].base
+    same = matrix is not None and matrix.shape[:-1] == (len(columns),)
+    return (
+        matrix if same and all(column.base is matrix for column in columns) else np.stack(columns)
+    )
 
 
 def as_lazy(values: NDArray[Any] | PiecewiseColumn) -> Any:

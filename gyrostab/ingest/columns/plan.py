@@ -117,20 +117,22 @@ def plan_columns(
     )
     named = resolve_duplicates(draft, named)
     time = find_time(draft, named)
-    rest = [column for column in named if column is not time]
-    gyro = [column for column in rest if AXIS_PATTERN.match(column.low)]
+    data_columns = [column for column in named if column is not time]
+    gyro = [column for column in data_columns if AXIS_PATTERN.match(column.low)]
     signal, kind = plan_gyro(draft, gyro, headers)
-    plan_channels(draft, [column for column in rest if not AXIS_PATTERN.match(column.low)])
+    plan_channels(draft, [column for column in data_columns if not AXIS_PATTERN.match(column.low)])
     rate = preset.rate if time is None and options.rate is None else None
     if preset.name:
         source_note = f", and {rate:g} Hz by the lines above the header" if rate else ""
         draft.notes.insert(
             0, f"read as a file of {preset.name}{source_note}; --map, --unit and --rate overrule it"
         )
-    elif found := [
+    elif preset_axes := [
         f"{c.header} is {c.name}" for c in named if c.preset and AXIS_PATTERN.match(c.low)
     ]:
-        draft.notes.append(f"taken for axes: {list_some(found, MAX_HEADERS)}; --map overrules it")
+        draft.notes.append(
+            f"taken for axes: {list_some(preset_axes, MAX_HEADERS)}; --map overrules it"
+        )
     if time is None and options.rate is None and rate is None and not draft.problems:
         message = (
             f"{path.name}: there is no time column; give the sampling rate with --rate HZ "

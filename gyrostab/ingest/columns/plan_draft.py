@@ -81,8 +81,8 @@ class PlanDraft:
         prefer_given: bool = False,
     ) -> str | None:
         """Return the unit of a column: from its header if usable, otherwise from the user."""
-        given = by_lower_name(self.options.unit)
-        key = next((given[low] for low in map(str.lower, keys) if low in given), None)
+        keys_by_name = by_lower_name(self.options.unit)
+        key = next((keys_by_name[low] for low in map(str.lower, keys) if low in keys_by_name), None)
         if key is None:
             return written or column.stored
         self.used_units.add(key)
@@ -161,7 +161,7 @@ def name_columns(
     presets: Mapping[int, str],
 ) -> list[Header]:
     """Name the columns by ``--map``, then by the preset, and drop those that either drops."""
-    wanted = {key.strip().lower(): key for key in draft.options.map}
+    keys_by_name = {key.strip().lower(): key for key in draft.options.map}
     targets = {split_header(target)[0].lower() for target in draft.options.map.values()}
     named: list[Header] = []
     for column in distinct_columns(headers):
@@ -170,7 +170,7 @@ def name_columns(
         column.stamped = source in stamped
         column.date_order = orders.get(source, YEAR_FIRST)
         texts = (column.key.lower(), column.header.lower(), column.low)
-        key = next((wanted[text] for text in texts if text in wanted), None)
+        key = next((keys_by_name[text] for text in texts if text in keys_by_name), None)
         if key is not None:
             draft.used_map.add(key)
             target, target_unit = split_header(draft.options.map[key])
@@ -197,7 +197,7 @@ def resolve_duplicates(draft: PlanDraft, named: list[Header]) -> list[Header]:
         groups.setdefault(column.low if is_contract_name(column.low) else column.name, []).append(
             column
         )
-    taken, dropped = set(groups), set[int]()
+    used_names, dropped = set(groups), set[int]()
     renamed: list[str] = []
     for name, same in groups.items():
         asked = [column for column in same if column.mapped]
@@ -212,18 +212,18 @@ def resolve_duplicates(draft: PlanDraft, named: list[Header]) -> list[Header]:
                 )
             )
         elif AXIS_PATTERN.match(name):
-            others = [column for column in same if not column.mapped]
-            dropped.update(column.source for column in others)
+            unmapped = [column for column in same if not column.mapped]
+            dropped.update(column.source for column in unmapped)
             draft.notes.append(
                 f"left out, as --map names another column {name}: "
-                f"{list_some([column.header for column in others], MAX_HEADERS)}"
+                f"{list_some([column.header for column in unmapped], MAX_HEADERS)}"
             )
         else:
             for number, column in enumerate(
                 sorted(same, key=lambda column: not column.mapped)[1:], 2
             ):
-                column.name = free_name(f"{column.name}_", taken, number)
-                taken.add(column.name)
+                column.name = free_name(f"{column.name}_", used_names, number)
+                used_names.add(column.name)
                 renamed.append(f"{column.header!r} is {column.name!r}")
     if renamed:
         draft.notes.append(f"columns of one name are renamed: {list_some(renamed, 5)}")

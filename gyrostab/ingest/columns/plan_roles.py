@@ -36,40 +36,40 @@ __all__ = ["find_time", "plan_channels", "plan_gyro"]
 
 def find_time(draft: PlanDraft, named: list[Header]) -> Header | None:
     """Choose the time column and its unit; other candidates are left out with a note."""
-    found = [c for c in named if c.low == "time" and c.mapped] or [
+    time_columns = [c for c in named if c.low == "time" and c.mapped] or [
         c for c in named if c.low == "time" and c.preset
     ]
-    if not found:
-        found = [
+    if not time_columns:
+        time_columns = [
             c
             for c in named
             if not (c.mapped or c.preset) and TIME_PATTERN.match(c.low) and _may_be_time(c)
         ]
-        sure = [c for c in found if c.low != "t" or c.unit or c.stored or c.stamped]
-        found = sure or found
-    if not found:
-        found = [
+        sure = [c for c in time_columns if c.low != "t" or c.unit or c.stored or c.stamped]
+        time_columns = sure or time_columns
+    if not time_columns:
+        time_columns = [
             c for c in named if c.stamped and draft.rising(c.source) and not (c.mapped or c.preset)
         ]
-        if found:
+        if time_columns:
             draft.notes.append(
-                f"{found[0].header!r} is taken for the time column, as it holds dates"
+                f"{time_columns[0].header!r} is taken for the time column, as it holds dates"
             )
-    if not found:
+    if not time_columns:
         return None
-    found.sort(key=lambda c: not draft.rising(c.source))
-    column = found[0]
-    candidates = {id(c) for c in found}
-    others = found[1:] + [c for c in named if id(c) not in candidates and c.low == "time"]
-    if others:
-        names = " and ".join(repr(c.header) for c in [column, *others][:3])
+    time_columns.sort(key=lambda c: not draft.rising(c.source))
+    column = time_columns[0]
+    candidates = {id(c) for c in time_columns}
+    rivals = time_columns[1:] + [c for c in named if id(c) not in candidates and c.low == "time"]
+    if rivals:
+        names = " and ".join(repr(c.header) for c in [column, *rivals][:3])
         draft.notes.append(
             f"{names} look like the time; {column.header!r} is used (for another: --map "
-            f'"{others[0].key}=time")'
+            f'"{rivals[0].key}=time")'
         )
-        for other in others:
-            draft.leave_out(other)
-        dropped = {id(other) for other in others}
+        for rival in rivals:
+            draft.leave_out(rival)
+        dropped = {id(rival) for rival in rivals}
         named[:] = [c for c in named if id(c) not in dropped]
     unit = None if column.stamped else _time_unit(draft, column)
     order = _date_order(draft, column) if column.stamped else YEAR_FIRST
@@ -122,9 +122,9 @@ def _may_be_time(column: Header) -> bool:
 
 def _date_order(draft: PlanDraft, column: Header) -> str:
     """Return the order of day, month and year: from the user, the header, or the dates."""
-    given = by_lower_name(draft.options.unit)
+    keys_by_name = by_lower_name(draft.options.unit)
     keys = [column.name, column.key, column.header, "time"]
-    for key in (given[low] for low in map(str.lower, keys) if low in given):
+    for key in (keys_by_name[low] for low in map(str.lower, keys) if low in keys_by_name):
         if order := parse_order(draft.options.unit[key]):
             draft.used_units.add(key)
             return order
@@ -281,8 +281,8 @@ def plan_channels(draft: PlanDraft, rest: list[Header]) -> None:
     """Plan the channels: those with a unit are kept, others left out with a note or refused."""
     for column in rest:
         quantity = quantity_of(column.low)
-        known = bool(KNOWN_CHANNEL_PATTERN.match(column.low))
-        name = column.low if known or quantity else re.sub(r"[/\s]+", "_", column.name)
+        is_known = bool(KNOWN_CHANNEL_PATTERN.match(column.low))
+        name = column.low if is_known or quantity else re.sub(r"[/\s]+", "_", column.name)
         keys = [
             name,
             column.name,
@@ -297,7 +297,7 @@ def plan_channels(draft: PlanDraft, rest: list[Header]) -> None:
         asked = (
             column.mapped
             or any(key.lower() in by_lower_name(draft.options.unit) for key in keys)
-            or (known and draft.options.channels_only)
+            or (is_known and draft.options.channels_only)
         )
         if text is None and asked:
             message = (
@@ -309,7 +309,7 @@ def plan_channels(draft: PlanDraft, rest: list[Header]) -> None:
             )
         if (
             text is not None
-            and not (known or asked)
+            and not (is_known or asked)
             and draft.kept_channels >= limit_value("channels", draft.options.limits)
         ):
             draft.surplus.append(column.header)
@@ -319,7 +319,7 @@ def plan_channels(draft: PlanDraft, rest: list[Header]) -> None:
             draft.unitless.append((name, quantity, column.header))
             draft.leave_out(column)
             continue
-        _plan_channel(draft, column, name, quantity, text, known=known, asked=asked)
+        _plan_channel(draft, column, name, quantity, text, is_known=is_known, asked=asked)
 
 
 def _plan_channel(
@@ -329,7 +329,7 @@ def _plan_channel(
     quantity: str | None,
     text: str,
     *,
-    known: bool,
+    is_known: bool,
     asked: bool,
 ) -> None:
     factor, offset, units = 1.0, 0.0, text
@@ -341,7 +341,7 @@ def _plan_channel(
             factor, offset, units = unit.factor * scale, unit.offset, INNER[quantity]
         elif quantity == "number":
             units = INNER["number"]
-        elif known:
+        elif is_known:
             message = f"column {column.header!r}: {text!r} is not a known unit of {expected}"
             advice = (
                 f"known are {known_units(expected)}; give it with --unit "
@@ -370,7 +370,7 @@ def _no_gyro(path: Path, headers: Sequence[str]) -> FormatError:
     unit = (
         "deg/h" if re.search(r"deg_?(per_?|/)?h|dph", low) else "rad/s" if "rad" in low else "deg/s"
     )
-    given = (
+    unit_option = (
         ""
         if likely and likely.unit and is_unit_of(likely.unit, ("rate", "angle"))
         else f" --unit gyro={unit}"
@@ -381,7 +381,7 @@ def _no_gyro(path: Path, headers: Sequence[str]) -> FormatError:
     )
     advice = (
         "Say which they are, for instance: --map "
-        f'"{likely.key if likely else "NAME"}=gyro_x"{given}'
+        f'"{likely.key if likely else "NAME"}=gyro_x"{unit_option}'
     )
     return FormatError(
         f"{message}. {advice}; gyrostab scan {shlex.quote(path.name)} inspects each column"

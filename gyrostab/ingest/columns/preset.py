@@ -35,15 +35,15 @@ class PresetMatch:
 @cache
 def _load_presets() -> dict[str, dict[str, Any]]:
     """Load the presets, by file name."""
-    found = {}
+    presets = {}
     for place in sorted(
         files("gyrostab.ingest.columns").joinpath("presets").iterdir(), key=lambda place: place.name
     ):
         if place.name.endswith(".toml"):
             preset = tomllib.loads(place.read_text(encoding="utf-8"))
             assert set(preset) <= _KEYS, f"{place.name}: {set(preset) - _KEYS}"
-            found[place.name.removesuffix(".toml")] = preset
-    return found
+            presets[place.name.removesuffix(".toml")] = preset
+    return presets
 
 
 def find_preset(
@@ -110,8 +110,8 @@ def _apply_preset(
         held = [places[name.lower()] for name in names if name.lower() in places]
         columns.update(dict.fromkeys(held[:1], target))
     rates = [
-        found[1]
+        match[1]
         for line in above
-        if "rate" in preset and (found := re.search(preset["rate"], line))
+        if "rate" in preset and (match := re.search(preset["rate"], line))
     ]
     return PresetMatch(name, columns, float(rates[0]) if rates else None)

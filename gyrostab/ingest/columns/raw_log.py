@@ -121,7 +121,7 @@ class RawLogBuilder:
         if self.gyro and all(mask is not None for mask in masks):
             bad = bad | np.logical_and.reduce([mask for mask in masks if mask is not None])
         any_bad = bool(bad.any())
-        others = [mask & ~bad for mask in gyro]
+        cell_masks = [mask & ~bad for mask in gyro]
         low, high = np.iinfo(np.int64).max, NAT
         if stamps is not None and self.time is not None:
             good = stamps[~bad] if any_bad else stamps
@@ -131,8 +131,8 @@ class RawLogBuilder:
             block[self.time.source] = stamps if table is None else EvenStampsPiece(table, size)
         return ConvertedBlock(
             size, block, ranges, np.flatnonzero(bad) if any_bad else _NO_ROWS,
-            np.flatnonzero(np.logical_or.reduce(others)) if others else _NO_ROWS,
-            bad_cells, sum(int(np.count_nonzero(mask)) for mask in others), low, high,
+            np.flatnonzero(np.logical_or.reduce(cell_masks)) if cell_masks else _NO_ROWS,
+            bad_cells, sum(int(np.count_nonzero(mask)) for mask in cell_masks), low, high,
         )  # fmt: skip
 
     def add(self, converted: ConvertedBlock, locate: Locate | None = None) -> None:
@@ -148,10 +148,10 @@ class RawLogBuilder:
         first = self.buffers.rows
         locate = locate or (lambda rows: [f"row {first + row}" for row in rows])
         self.bad_cells += converted.bad_cells
-        for source, (missing, low, high, whole) in converted.ranges.items():
+        for source, (missing, low, high, is_whole) in converted.ranges.items():
             span = self.whole[source]
             if span is not None and missing < converted.rows:
-                self.whole[source] = (min(span[0], low), max(span[1], high)) if whole else None
+                self.whole[source] = (min(span[0], low), max(span[1], high)) if is_whole else None
         if converted.bad_rows.size:
             self._note_rows(converted.bad_rows, locate)
         if converted.cell_rows.size:
@@ -172,15 +172,15 @@ class RawLogBuilder:
             if grid is None:
                 break
             counts = np.empty(values.size, np.int32)
-            fits, missing, low, high, whole = pack_counts(values, *grid, counts)
+            fits, missing, low, high, is_whole = pack_counts(values, *grid, counts)
             if fits:
                 self.grids[column.source] = grid
                 piece = CountsPiece(counts, grid, column.factor, column.offset)
-                return piece, (missing, low, high, whole)
+                return piece, (missing, low, high, is_whole)
             grid = find_grid(values) if search else None
         self.grids[column.source] = None  # not on a grid: do not try later blocks
-        missing, low, high, whole = clean_column(values, column.factor, column.offset)
-        return values, (missing, low, high, whole)
+        missing, low, high, is_whole = clean_column(values, column.factor, column.offset)
+        return values, (missing, low, high, is_whole)
 
     def _packing_of(self, columns: Sequence[Column]) -> dict[str, Any]:
         """Return the encoding of columns of whole numbers with one factor; empty for others."""
@@ -224,13 +224,13 @@ class RawLogBuilder:
             )
         if self.bad_rows > MAX_UNREADABLE_SHARE * rows:
             share, first = self.bad_rows / rows, self.bad_places[0]
-            what = (
+            suspects = (
                 "the separator, the columns that --map names and the unit of time (stamps lie "
                 "in the years 1678 to 2262)"
             )
             raise FormatError(
                 f"{name}: {100 * share:.0f} % of {rows} rows are unreadable, the first is {first}; "
-                f"look at it, and check {what}"
+                f"look at it, and check {suspects}"
             )
         columns = self.buffers.finish()
         stamps = self._finish_stamps(columns)

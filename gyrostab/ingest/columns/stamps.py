@@ -126,9 +126,9 @@ def parse_time_unit(text: str, calendar: str | None = None) -> TimeUnit:
     if ns is None or (
         factor and not (len(factor) <= _MAX_DIGITS and _NUMBER.match(factor.strip()))
     ):
-        known = "s, ms, us, ns, min, h, d, week, with a factor in front if needed"
+        units = "s, ms, us, ns, min, h, d, week, with a factor in front if needed"
         raise UnitError(
-            f"time unit {text!r} is not known; known are {known}; months and years have no fixed "
+            f"time unit {text!r} is not known; known are {units}; months and years have no fixed "
             "length"
         )
     scale = Fraction(factor.strip() or "1")
@@ -144,8 +144,8 @@ def _epoch_ns(text: str, since: str, calendar: str | None) -> int:
     """Return the epoch of a unit [ns since 1970], which may exceed 64 bits."""
     import cftime
 
-    known = _CALENDARS.get((calendar or "standard").strip().lower())
-    if known is None:
+    calendar_name = _CALENDARS.get((calendar or "standard").strip().lower())
+    if calendar_name is None:
         raise UnitError(
             f"time unit {text!r}: dates of the calendar {calendar!r} are not instants of a "
             "recording; "
@@ -156,7 +156,7 @@ def _epoch_ns(text: str, since: str, calendar: str | None) -> int:
         if fields is None:
             raise ValueError
         year, month, day, nanoseconds = fields
-        days = cftime.datetime(year, month, day, calendar=known).toordinal() - _ORDINAL_1970
+        days = cftime.datetime(year, month, day, calendar=calendar_name).toordinal() - _ORDINAL_1970
     except ValueError:
         raise UnitError(
             f"time unit {text!r}: {since!r} is not a date that can be read in one way only; "
@@ -200,11 +200,13 @@ def texts_to_ns(texts: Sequence[Any] | NDArray[Any]) -> NDArray[np.int64]:
     return dates_to_ns(stamps.dt.tz_convert(None).to_numpy())
 
 
-def _all_fit(values: NDArray[np.int64], units: int, up: int, rest: int) -> bool:
+def _all_fit(values: NDArray[np.int64], units: int, up: int, remainder: int) -> bool:
     """Return whether all stamps and intermediate results fit into 64 bits."""
     ends = (int(values.min()) + units, int(values.max()) + units)
     return all(
-        abs(end) < _MAX_INT64 and abs(end * up) < _MAX_INT64 and abs(end * up + rest) < _MAX_INT64
+        abs(end) < _MAX_INT64
+        and abs(end * up) < _MAX_INT64
+        and abs(end * up + remainder) < _MAX_INT64
         for end in ends
     )
 
@@ -214,20 +216,22 @@ def integers_to_ns(values: NDArray[np.int64], unit: TimeUnit, epoch: int) -> NDA
     zero = epoch if unit.epoch is None else unit.epoch
     up, down = unit.ns.numerator, unit.ns.denominator
     # Whole units of the epoch are added to the counts, so no sum exceeds 64 bits for any epoch.
-    units, rest = divmod(zero, up) if down == 1 else (0, zero)
+    units, remainder = divmod(zero, up) if down == 1 else (0, zero)
     limit = (_MAX_INT64 - down) // up - 1
-    if max(abs(units), abs(rest)) > _MAX_INT64 // 2:
+    if max(abs(units), abs(remainder)) > _MAX_INT64 // 2:
         return np.full(np.shape(values), NAT, dtype=np.int64)
-    if down == 1 and np.size(values) and _all_fit(values, units, up, rest):
-        return values if (units, up, rest) == (0, 1, 0) else (values + units) * up + rest
+    if down == 1 and np.size(values) and _all_fit(values, units, up, remainder):
+        return values if (units, up, remainder) == (0, 1, 0) else (values + units) * up + remainder
     inside = (values <= min(limit - units, _MAX_INT64)) & (
         values >= max(-limit - units, -_MAX_INT64)
     )
     scaled = np.where(inside, values + np.where(inside, units, 0), 0) * up
     if down > 1:
         scaled = (scaled + down // 2) // down
-    inside &= (scaled <= _MAX_INT64 - max(rest, 0)) & (scaled >= -_MAX_INT64 - min(rest, 0))
-    return np.where(inside, np.where(inside, scaled, 0) + rest, NAT)
+    inside &= (scaled <= _MAX_INT64 - max(remainder, 0)) & (
+        scaled >= -_MAX_INT64 - min(remainder, 0)
+    )
+    return np.where(inside, np.where(inside, scaled, 0) + remainder, NAT)
 
 
 def signed_counts(counts: NDArray[Any]) -> NDArray[np.int64]:
@@ -246,9 +250,9 @@ def floats_to_ns(
     """Convert floats to stamps: whole units as integers, only the fraction in floating point."""
     wide = np.asarray(values, dtype=np.float64)
     usable = np.isfinite(wide) & (np.abs(wide) < 2.0**62)
-    whole = np.floor(np.where(usable, wide, 0.0))
-    stamps = integers_to_ns(whole.astype(np.int64), unit, epoch)
-    part = np.rint((np.where(usable, wide, 0.0) - whole) * float(unit.ns)).astype(np.int64)
+    whole_units = np.floor(np.where(usable, wide, 0.0))
+    stamps = integers_to_ns(whole_units.astype(np.int64), unit, epoch)
+    part = np.rint((np.where(usable, wide, 0.0) - whole_units) * float(unit.ns)).astype(np.int64)
     return np.where(usable & (stamps != NAT), stamps + part, NAT)
 
 

@@ -157,12 +157,12 @@ def _convert_span(
     if not stay:
         return converted
     begin, rows = span[0], converted.rows
-    seen = None
+    inspection = None
     if builder.gyro:
         cells = np.stack(
             [cast(NDArray[np.float64], converted.block[column.source]) for column in builder.gyro]
         )
-        seen = inspect_rows(
+        inspection = inspect_rows(
             cells,
             {
                 column.name: cast(NDArray[Any], converted.block[column.source])
@@ -179,7 +179,7 @@ def _convert_span(
         block[column.source] = (
             piece if isinstance(piece, EvenStampsPiece) else FilePiece(read, begin, rows)
         )
-    return converted._replace(block=block, seen=seen)
+    return converted._replace(block=block, seen=inspection)
 
 
 def _read_values(

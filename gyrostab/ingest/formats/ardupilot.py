@@ -80,7 +80,7 @@ def _read_messages(path: Path) -> list[Table]:
     """Return a table for each message and instance of a sensor."""
     reader = library("pymavlink.DFReader", path, extra="ardupilot")
     binary = read_head(path).startswith(_BINARY)
-    found: dict[tuple[str, int], Messages] = {}
+    by_instance: dict[tuple[str, int], Messages] = {}
     # It prints what it skips, and the streams are those of the process.
     with _LOCK, redirect_stdout(StringIO()), redirect_stderr(StringIO()):
         log = (
@@ -97,13 +97,13 @@ def _read_messages(path: Path) -> list[Table]:
                 numbers = {
                     name: value for name, value in fields.items() if isinstance(value, int | float)
                 }
-                found.setdefault((kind, instance), Messages()).add(stamp, numbers)
-    axes = "IMU" if ("IMU", 0) in found else "GYR"
+                by_instance.setdefault((kind, instance), Messages()).add(stamp, numbers)
+    axes = "IMU" if ("IMU", 0) in by_instance else "GYR"
     return [
         messages.make_table(
             [f"{kind}[{instance}].{name}" for name in messages.columns],
             time_unit="us",
             meanings=_MEANINGS[kind] if instance == 0 and kind in (axes, "MAG", "BARO") else None,
         )
-        for (kind, instance), messages in found.items()
+        for (kind, instance), messages in by_instance.items()
     ]

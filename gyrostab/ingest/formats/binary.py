@@ -56,12 +56,12 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
 
 def _make_table(path: Path, options: ReadOptions, *, needs_rate: bool) -> tuple[Table, list[str]]:
     layout = find_layout(path)
-    rows, rest = divmod(path.stat().st_size - layout.header, layout.size)
+    rows, extra_bytes = divmod(path.stat().st_size - layout.header, layout.size)
     starts = None
     if layout.sync and rows > 0:
         raw = np.memmap(path, dtype=np.uint8, mode="r", offset=layout.header)
         starts = find_messages(raw, layout.sync, layout.size)
-        rows, rest = len(starts), len(raw) - len(starts) * layout.size
+        rows, extra_bytes = len(starts), len(raw) - len(starts) * layout.size
     if rows < 1:
         raise FormatError(
             f"{path.name}: it holds no record by the layout {layout.place} "
@@ -72,10 +72,10 @@ def _make_table(path: Path, options: ReadOptions, *, needs_rate: bool) -> tuple[
     stamps, notes = _count_time(path, layout, fetch, rows, options, needs_rate=needs_rate)
     if layout.sync:
         notes.insert(0, f"read as messages of {layout.place}{layout.note and ': '}{layout.note}")
-    if rest:
-        what = "part of a message" if layout.sync else f"a whole record of {layout.size} bytes"
+    if extra_bytes:
+        expected = "part of a message" if layout.sync else f"a whole record of {layout.size} bytes"
         where = "" if layout.sync else "the last "
-        notes.append(f"{where}{rest} bytes are not {what}; is the layout right?")
+        notes.append(f"{where}{extra_bytes} bytes are not {expected}; is the layout right?")
     names = tuple(field.name for field in layout.fields)
     columns = tuple(partial(fetch, field) for field in layout.fields)
     units = (None,) * len(names)

@@ -56,17 +56,26 @@ def _read_frames(path: Path) -> list[Table]:
     """Return a table for each frame of each logical file."""
     dlis = library("dlisio.dlis", path, extra="dlis")
     with _process_settings(path), dlis.load(str(path)) as files:
-        kept = [
-            (frame, [one for one in frame.channels if one and list(one.dimension) == [1]])
+        frames = [
+            (
+                frame,
+                [
+                    channel
+                    for channel in frame.channels
+                    if channel and list(channel.dimension) == [1]
+                ],
+            )
             for logical in files
             for frame in logical.frames
         ]
         names = iter(
-            plain_names([(frame.name, one.name) for frame, channels in kept for one in channels])
+            plain_names(
+                [(frame.name, channel.name) for frame, channels in frames for channel in channels]
+            )
         )
         return [
             _make_table(frame, channels, [next(names) for _ in channels])
-            for frame, channels in kept
+            for frame, channels in frames
             if channels
         ]
 

@@ -67,10 +67,10 @@ def _find_clock(
 ) -> tuple[list[Any], NDArray[Any] | None]:
     """Return the curves of dates and times with their stamps; none where a number counts time."""
     by_name = {curve.mnemonic.upper(): curve for curve in curves}
-    found = [by_name[name] for name in ("TIME", "DATETIME") if name in by_name]
+    time_curves = [by_name[name] for name in ("TIME", "DATETIME") if name in by_name]
     mapped = {name.strip().upper() for name in options.map}
     pair = {"DATE", "TIME"} <= by_name.keys() - mapped
-    for curve in found if pair else [*found, *curves[:1]]:
+    for curve in time_curves if pair else [*time_curves, *curves[:1]]:
         if holds_dates(curve.data):
             return [curve], np.asarray(curve.data)
         cells = [_DATE_AND_TIME.match(str(cell).strip()) for cell in curve.data]
@@ -127,7 +127,7 @@ def _date_order(unit: str, days: list[str]) -> str | None:
         if re.search(r"(?i)yy", unit)
         else ""
     )
-    known = (
+    known_formats = (
         "%Y-%m-%d",
         "%Y%m%d",
         "%Y/%m/%d",
@@ -137,7 +137,7 @@ def _date_order(unit: str, days: list[str]) -> str | None:
         "%d/%b/%Y",
         "%d %b %Y",
     )
-    for order in (unit_format, *known):
+    for order in (unit_format, *known_formats):
         if order and _has_date_format(order, days):
             return order
     unclear = [

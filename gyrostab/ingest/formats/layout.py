@@ -140,21 +140,21 @@ def _parse_layout(place: str, content: Mapping[str, Any]) -> Layout:
     except (TypeError, ValueError) as error:
         raise OptionError(f'{place}: sync is written as in "FE81FF55"; correct it') from error
     items = content.get("fields", ())
-    found: list[Field] = []
+    parts: list[Field] = []
     size = len(sync)
     for number, item in enumerate(items if isinstance(items, list) else (), 1):
-        one = _parse_field(item, order, size)
-        if one is None:
+        field = _parse_field(item, order, size)
+        if field is None:
             raise OptionError(
                 f'{place}: field {number} is {{name = "...", type = "..."}}, {{counter = TURN, '
                 f'type = "..."}} or {{skip = BYTES}}, the types are {", ".join(TYPES)}; correct '
                 "the layout"
             )
-        size = one.offset + one.dtype.itemsize
-        found.append(one)
-    fields = tuple(one for one in found if one.name)
-    counters = [one for one in found if one.turn]
-    if not fields or len({one.name for one in fields}) < len(fields) or len(counters) > 1:
+        size = field.offset + field.dtype.itemsize
+        parts.append(field)
+    fields = tuple(field for field in parts if field.name)
+    counters = [field for field in parts if field.turn]
+    if not fields or len({field.name for field in fields}) < len(fields) or len(counters) > 1:
         raise OptionError(
             f"{place}: a layout needs fields with different names, and one counter at most; "
             "correct it"

@@ -63,29 +63,29 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
 
 def _plan_file(path: Path, options: ReadOptions, stack: ExitStack) -> StoredTable:
     objects: list[str] = []
-    found = [
+    sized_columns = [
         (max(array.shape), column)
         for name, array in _find_arrays(path, stack, objects)
         for column in _columns_of(path, name, array, options)
     ]
-    if not found:
-        found = list(read_matlab_tables(path, objects))
-    if not found and objects:
-        what = f"it holds {', '.join(dict.fromkeys(objects))}, which MATLAB alone can read"
-        raise FormatError(f"{path.name}: {what}; save plain arrays instead: {_PLAIN_ARRAYS}")
-    if not found:
+    if not sized_columns:
+        sized_columns = list(read_matlab_tables(path, objects))
+    if not sized_columns and objects:
+        problem = f"it holds {', '.join(dict.fromkeys(objects))}, which MATLAB alone can read"
+        raise FormatError(f"{path.name}: {problem}; save plain arrays instead: {_PLAIN_ARRAYS}")
+    if not sized_columns:
         raise FormatError(
             f"{path.name}: there is no vector or matrix of numbers in it; save plain arrays"
         )
-    rows = int(max(size for size, _ in found))
-    kept = [column for size, column in found if size == rows]
-    others = [column.header for size, column in found if size != rows]
+    rows = int(max(size for size, _ in sized_columns))
+    columns = [column for size, column in sized_columns if size == rows]
+    shorter = [column.header for size, column in sized_columns if size != rows]
     notes = (
         [
             f"left out, as they are shorter than the {rows} rows of the longest: "
-            f"{', '.join(others[:20])}"
+            f"{', '.join(shorter[:20])}"
         ]
-        if others
+        if shorter
         else []
     )
     if objects:
@@ -93,25 +93,29 @@ def _plan_file(path: Path, options: ReadOptions, stack: ExitStack) -> StoredTabl
             f"left out, as MATLAB alone can read it: {', '.join(dict.fromkeys(objects))}; to "
             f"keep it, {_PLAIN_ARRAYS}"
         )
-    coded = _known_fields([column.header for column in kept])
-    return plan_stored(path, kept, rows, options, notes=notes, coded=coded)
+    coded = _known_fields([column.header for column in columns])
+    return plan_stored(path, columns, rows, options, notes=notes, coded=coded)
 
 
 def _known_fields(headers: Sequence[str]) -> dict[int, str]:
     """Return structure fields with known unique names, ``gyro_x`` of ``S.gyro_x``."""
     names = [header.rpartition(".")[2] for header in headers]
     times = [place for place, name in enumerate(names) if TIME_PATTERN.match(name.lower())]
-    found = {
+    field_names = {
         place: name.lower()
         for place, name in enumerate(names)
         if AXIS_PATTERN.match(name.lower()) or KNOWN_CHANNEL_PATTERN.match(name.lower())
     }
-    found = {place: name for place, name in found.items() if list(found.values()).count(name) == 1}
+    field_names = {
+        place: name
+        for place, name in field_names.items()
+        if list(field_names.values()).count(name) == 1
+    }
     if len(times) == 1:
         match = TIME_PATTERN.match(names[times[0]].lower())
         suffix = next((text for text in match.groups() if text), None) if match else None
-        found[times[0]] = f"time [{suffix}]" if suffix and is_time_unit(suffix) else "time"
-    return {place: name for place, name in found.items() if "." in headers[place]}
+        field_names[times[0]] = f"time [{suffix}]" if suffix and is_time_unit(suffix) else "time"
+    return {place: name for place, name in field_names.items() if "." in headers[place]}
 
 
 def _columns_of(path: Path, name: str, array: Any, options: ReadOptions) -> Iterator[StoredColumn]:
@@ -187,7 +191,7 @@ def _find_hdf_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterat
 
     check_global_heaps(path)
     file = stack.enter_context(h5py.File(path, "r"))
-    found: list[tuple[str, Any]] = []
+    arrays: list[tuple[str, Any]] = []
 
     def visit(name: str | bytes, item: Any) -> None:
         if isinstance(name, bytes):  # h5py leaves a name that is not UTF-8 as it is
@@ -203,7 +207,7 @@ def _find_hdf_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterat
             and kind != "char"
             and not name.startswith("#")
         ):
-            found.append((name.replace("/", "."), item))
+            arrays.append((name.replace("/", "."), item))
 
     file.visititems(visit)
-    yield from found
+    yield from arrays

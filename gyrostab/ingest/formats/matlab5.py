@@ -50,8 +50,8 @@ def check_structure(path: Path) -> None:
         try:
             _check_file(file, order, path.stat().st_size)
         except (_Damage, struct.error, zlib.error) as error:
-            what = f"this MATLAB file is damaged or cut off ({error}); copy it again"
-            raise FormatError(f"{path.name}: {what}") from error
+            problem = f"this MATLAB file is damaged or cut off ({error}); copy it again"
+            raise FormatError(f"{path.name}: {problem}") from error
 
 
 def _check_file(file: BinaryIO, order: str, size: int) -> None:

@@ -43,10 +43,10 @@ def crc32_mpeg2(rows: NDArray[np.uint8]) -> NDArray[np.uint32]:
     >>> hex(crc32_mpeg2(rows)[0])
     '0x49e3c2fb'
     """
-    table, found = _crc_table(), np.full(len(rows), 0xFFFFFFFF, dtype=np.uint32)
+    table, checksums = _crc_table(), np.full(len(rows), 0xFFFFFFFF, dtype=np.uint32)
     for column in np.pad(rows, ((0, 0), (0, -rows.shape[1] % 4))).T:
-        found = found << 8 ^ table[found >> 24 ^ column]
-    return found
+        checksums = checksums << 8 ^ table[checksums >> 24 ^ column]
+    return checksums
 
 
 def find_messages(raw: NDArray[np.uint8], sync: bytes, size: int) -> NDArray[np.int64]:
@@ -61,7 +61,7 @@ def find_messages(raw: NDArray[np.uint8], sync: bytes, size: int) -> NDArray[np.
     size : int
         Bytes of a message with sync bytes and checksum.
     """
-    found = [np.empty(0, dtype=np.int64)]
+    message_starts = [np.empty(0, dtype=np.int64)]
     for begin in range(0, max(len(raw) - size + 1, 0), _BLOCK):
         part = np.asarray(raw[begin : begin + _BLOCK + size - 1])
         starts = np.flatnonzero(part[: len(part) - size + 1] == sync[0])
@@ -69,8 +69,8 @@ def find_messages(raw: NDArray[np.uint8], sync: bytes, size: int) -> NDArray[np.
             starts = starts[part[starts + place] == byte]
         rows = sliding_window_view(part, size)[starts]
         sums = np.ascontiguousarray(rows[:, -CRC_BYTES:]).view(">u4")[:, 0]
-        found.append(starts[crc32_mpeg2(rows[:, :-CRC_BYTES]) == sums] + begin)
-    return np.concatenate(found)
+        message_starts.append(starts[crc32_mpeg2(rows[:, :-CRC_BYTES]) == sums] + begin)
+    return np.concatenate(message_starts)
 
 
 def unwrap_counter(counter: NDArray[Any], modulus: int) -> NDArray[np.int64]:

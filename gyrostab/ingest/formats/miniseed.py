@@ -83,12 +83,15 @@ def _cut_note(path: Path) -> list[str]:
         first = next(iter(pymseed.MS3Record.from_buffer(head)), None)
     except pymseed.MiniSEEDError:
         return []
-    rest = (
+    cut_bytes = (
         path.stat().st_size % first.reclen if first is not None and first.formatversion == 2 else 0
     )
     return (
-        [f"cut off in its last record: {rest} bytes are left out, the complete records are read"]
-        if rest
+        [
+            f"cut off in its last record: {cut_bytes} bytes are left out, the complete records "
+            "are read"
+        ]
+        if cut_bytes
         else []
     )
 
@@ -127,15 +130,15 @@ def _group_traces(traces: list[_Trace]) -> list[Table]:
         longest = max(group, key=lambda trace: sum(trace.sizes))
         rows = sum(longest.sizes)
         values = tuple(partial(_join_values, trace.values, rows) for trace in group)
-        own = tuple(names[id(trace)] for trace in group)
+        group_names = tuple(names[id(trace)] for trace in group)
         tables.append(
             Table(
                 rows,
-                own,
+                group_names,
                 (None,) * len(group),
                 values,
                 _trace_stamps(longest),
-                coded=tuple(map(_axis_of_code, own)),
+                coded=tuple(map(_axis_of_code, group_names)),
             )
         )
     return tables

@@ -257,9 +257,9 @@ def _with_uniform_time(log: xr.Dataset) -> xr.Dataset:
     if size > CHECKED_BLOCKS * 1024 and np.isfinite(rate) and rate > 0:
         begin = int(stamps(0, 1)[0])
         for first in np.unique(np.linspace(0, size - 1024, CHECKED_BLOCKS).astype(int)):
-            found = stamps(int(first), int(first) + 1024)
+            block = stamps(int(first), int(first) + 1024)
             if np.any(
-                np.abs(found - grid_times(begin, rate, np.arange(first, first + len(found)))) > 1000
+                np.abs(block - grid_times(begin, rate, np.arange(first, first + len(block)))) > 1000
             ):
                 break
         else:
@@ -287,11 +287,13 @@ def _summarise_stored(path: Path, stored: StoredLog, options: ReadOptions) -> Fi
     if not is_plain:
         return None
     ends = rule["first"] + rule["stride"] * np.array([0, rule["size"] - 1])
-    own = {dim: {time} | {f"time_{dim}", index_dim(f"time_{dim}")} for dim in stored.data_vars}
+    time_dims = {
+        dim: {time} | {f"time_{dim}", index_dim(f"time_{dim}")} for dim in stored.data_vars
+    }
     channels = {
         name: str(decode_attributes(dict(variables[name].attrs)).get("units", ""))
         for name in stored.data_vars
-        if variables[name].ndim == 1 and variables[name].dims[0] in own[name]
+        if variables[name].ndim == 1 and variables[name].dims[0] in time_dims[name]
     }
     return _make_summary(
         path,
@@ -329,12 +331,14 @@ def _make_summary(
         ColumnSummary(str(axis), f"gyro_{axis}", "gyro", signal, SIGNAL_UNITS[signal])
         for axis in labels
     ]
-    others = [ColumnSummary(name, name, "channel", None, units) for name, units in channels.items()]
+    channel_columns = [
+        ColumnSummary(name, name, "channel", None, units) for name, units in channels.items()
+    ]
     first, last = (np.datetime64(int(stamp), "ns") for stamp in span)
     return FileSummary(
         path=path,
         format="gyrostab log",
-        columns=(*axes, *others),
+        columns=(*axes, *channel_columns),
         axes=tuple(map(str, labels)),
         channels=tuple(channels),
         first=first,
@@ -359,13 +363,15 @@ def _plan_file(
     dim = max(lines, key=lambda d: (sizes[d], lines[d]))
     columns: list[StoredColumn] = []
     notes: list[str] = []
-    left: list[str] = []
+    left_out: list[str] = []
     for variable in numeric:
-        found = _columns_of(variables, variable, dim)
-        columns += found
-        left += [] if found else [variable.name]
-    if left:
-        notes.append(f"left out, as they do not run along {dim!r} alone: {', '.join(left[:20])}")
+        variable_columns = _columns_of(variables, variable, dim)
+        columns += variable_columns
+        left_out += [] if variable_columns else [variable.name]
+    if left_out:
+        notes.append(
+            f"left out, as they do not run along {dim!r} alone: {', '.join(left_out[:20])}"
+        )
     return plan_stored(path, columns, sizes[dim], options, notes=notes)
 
 
@@ -378,12 +384,12 @@ def _columns_of(
     if dim not in variable.dimensions or len(variable.shape) != 2:
         return []
     along = variable.dimensions.index(dim)
-    other, size = variable.dimensions[1 - along], variable.shape[1 - along]
+    other_dim, size = variable.dimensions[1 - along], variable.shape[1 - along]
     if size > MAX_COLUMNS:
         return []
     labels = [str(place) for place in range(size)]
-    if other in variables and variables[other].shape == (size,):
-        labels = [str(label) for label in np.ma.getdata(variables[other].values[:])]
+    if other_dim in variables and variables[other_dim].shape == (size,):
+        labels = [str(label) for label in np.ma.getdata(variables[other_dim].values[:])]
     stem = "gyro_" if variable.name.lower() in ("gyro", "rate") else f"{variable.name}/"
     return [
         make(f"{stem}{label}", rows=variable.locate(along, place))

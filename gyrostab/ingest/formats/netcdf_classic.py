@@ -58,9 +58,9 @@ class _Header:
         self.path, self.data, self.at = path, data, 4
         self.count_bytes, self.begin_bytes = (8 if wide else 4 for wide in (wide_count, wide_begin))
 
-    def fail(self, what: str) -> FormatError:
+    def fail(self, problem: str) -> FormatError:
         return FormatError(
-            f"{self.path.name}: the header of this NetCDF file is damaged or cut off ({what}); "
+            f"{self.path.name}: the header of this NetCDF file is damaged or cut off ({problem}); "
             "copy it again"
         )
 
@@ -82,12 +82,12 @@ class _Header:
 
     def items(self, tag: int) -> range:
         """Return the range of the items of a list; each takes at least eight bytes."""
-        found, count = self.number(), self.count()
-        if (found, count) == (0, 0):
+        kind, count = self.number(), self.count()
+        if (kind, count) == (0, 0):
             return range(0)
-        if found != tag or 8 * count > len(self.data) - self.at:
+        if kind != tag or 8 * count > len(self.data) - self.at:
             raise self.fail(
-                f"it asks for a list of {count:,} items of kind {found} at byte {self.at:,}"
+                f"it asks for a list of {count:,} items of kind {kind} at byte {self.at:,}"
             )
         return range(count)
 
@@ -112,15 +112,15 @@ def read_classic_header(path: Path) -> dict[str, ClassicVariable] | None:
         When the header asks for more than the file holds.
     """
     size = path.stat().st_size
-    for most in _HEAD_BYTES:
+    for head_bytes in _HEAD_BYTES:
         with path.open("rb") as file:
-            data = file.read(min(size, most))
+            data = file.read(min(size, head_bytes))
         if data[:3] != b"CDF" or data[3:4] not in (b"\1", b"\2", b"\5"):
             return None
         try:
             return _read_header(_Header(path, data, data[3] == 5, data[3] in (2, 5)), size)
         except FormatError:
-            if size <= most or most == _HEAD_BYTES[-1]:
+            if size <= head_bytes or head_bytes == _HEAD_BYTES[-1]:
                 raise
     return None
 
@@ -132,23 +132,23 @@ def _read_header(header: _Header, size: int) -> dict[str, ClassicVariable]:
         header.name()
         lengths.append(header.count())
     header.skip_attributes()
-    found: list[tuple[str, np.dtype[np.generic], list[int], int]] = []
+    entries: list[tuple[str, np.dtype[np.generic], list[int], int]] = []
     for _ in header.items(_VARIABLE):
         name = header.name()
         places = _take_dimensions(header, len(lengths))
         header.skip_attributes()
         dtype = header.dtype(header.number())
         header.count()  # vsize, which is wrong above 4 GiB
-        found.append((name, dtype, places, header.number(header.begin_bytes)))
-    return _lay_out(header, size, records, lengths, found)
+        entries.append((name, dtype, places, header.number(header.begin_bytes)))
+    return _lay_out(header, size, records, lengths, entries)
 
 
-def _take_dimensions(header: _Header, known: int) -> list[int]:
+def _take_dimensions(header: _Header, n_dimensions: int) -> list[int]:
     count = header.count()
     if count > 1024:
         raise header.fail(f"it asks for a variable of {count:,} dimensions")
     places = [header.count() for _ in range(count)]
-    if any(place >= known for place in places):
+    if any(place >= n_dimensions for place in places):
         raise header.fail("a variable has a dimension that is not there")
     return places
 
@@ -158,24 +158,24 @@ def _lay_out(
     size: int,
     records: int,
     lengths: list[int],
-    found: list[tuple[str, np.dtype[np.generic], list[int], int]],
+    entries: list[tuple[str, np.dtype[np.generic], list[int], int]],
 ) -> dict[str, ClassicVariable]:
     """Find shapes and strides, and check the last byte of each variable against the file size."""
     spans = {}
-    for name, dtype, places, _ in found:
+    for name, dtype, places, _ in entries:
         shape = [lengths[place] for place in places]
         is_record = bool(shape) and shape[0] == 0
         spans[name] = (is_record, dtype.itemsize * math.prod(shape[1:] if is_record else shape))
     rows = [span for is_record, span in spans.values() if is_record]
     stride = rows[0] if len(rows) == 1 else sum(-(-span // 4) * 4 for span in rows)
     variables = {}
-    begins = [begin for name, _, _, begin in found if spans[name][0]]
+    begins = [begin for name, _, _, begin in entries if spans[name][0]]
     if rows and records in (
         2**32 - 1,
         2**64 - 1,
     ):  # written as a stream: the file size gives the number
         records = max(size - min(begins), 0) // max(stride, 1)
-    for name, dtype, places, begin in found:
+    for name, dtype, places, begin in entries:
         is_record, span = spans[name]
         shape = [lengths[place] for place in places]
         end = begin + (

@@ -105,7 +105,7 @@ def _find_rows(path: Path, variables: Sequence[Any]) -> dict[str, Locate]:
         }
     if not h5py.is_hdf5(path):
         return {}
-    found = {}
+    locators = {}
     with library_lock(), h5py.File(path, "r") as file:
         for variable in numeric:
             stored = file.get(variable.name)
@@ -113,8 +113,8 @@ def _find_rows(path: Path, variables: Sequence[Any]) -> dict[str, Locate]:
                 variable.shape,
                 variable.dtype,
             ):
-                found[variable.name] = hdf5_rows(path, stored)
-    return {name: locate for name, locate in found.items() if locate is not None}
+                locators[variable.name] = hdf5_rows(path, stored)
+    return {name: locate for name, locate in locators.items() if locate is not None}
 
 
 def _zarr_variables(path: Path, limits: Mapping[str, float]) -> Iterator[StoredVariable]:

@@ -52,7 +52,7 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
 def _read_messages(path: Path) -> tuple[list[Table], list[str]]:
     """Return a table for each kind of message, and a note on their time."""
     oem = library("novatel_edie.oem", path, extra="novatel")
-    found: dict[str, Messages] = {}
+    by_kind: dict[str, Messages] = {}
     for message in oem.FileParser(str(path)):
         if getattr(message, "name", None) not in _KINDS:  # or bytes between messages
             continue
@@ -62,9 +62,16 @@ def _read_messages(path: Path) -> tuple[list[Table], list[str]]:
         counts |= {f"{kind}_y": -counts[f"{kind}_y"] for kind in _SENSORS}
         usable = 0 <= week < 10_000 and 0.0 <= seconds <= _WEEK
         stamp = (_GPS_EPOCH + week * _WEEK) * 10**9 + round(seconds * 1e9) if usable else NAT
-        found.setdefault(message.name, Messages()).add(stamp, counts)
-    names = iter(plain_names([(kind, name) for kind, one in found.items() for name in one.columns]))
-    tables = [one.make_table([next(names) for _ in one.columns]) for one in found.values()]
+        by_kind.setdefault(message.name, Messages()).add(stamp, counts)
+    names = iter(
+        plain_names(
+            [(kind, name) for kind, messages in by_kind.items() for name in messages.columns]
+        )
+    )
+    tables = [
+        messages.make_table([next(names) for _ in messages.columns])
+        for messages in by_kind.values()
+    ]
     return tables, [
         "the stamps are GPS time, which has no leap seconds (18 s ahead of UTC in 2026)"
     ]

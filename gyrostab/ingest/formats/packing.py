@@ -94,13 +94,13 @@ class Packing:
         [127.0, nan, 2.0]
         """
         stored: np.dtype[Any] = np.dtype(dtype).newbyteorder("=")
-        found = {key: attributes[key] for key in _PACKING if key in attributes}
-        if stored.kind in "iu" and (text := attribute_text(found.get("_Unsigned"))):
+        declared = {key: attributes[key] for key in _PACKING if key in attributes}
+        if stored.kind in "iu" and (text := attribute_text(declared.get("_Unsigned"))):
             stored = np.dtype(f"{'u' if text.lower() == 'true' else 'i'}{stored.itemsize}")
-        wraps = "_Unsigned" in found
+        wraps = "_Unsigned" in declared
         numbers = {
             key: _attribute_numbers(where, key, value, stored, wraps=wraps)
-            for key, value in found.items()
+            for key, value in declared.items()
             if key != "_Unsigned"
         }
         scale, offset = (
@@ -202,9 +202,9 @@ def _representable_values(missing: Iterable[Any], stored: np.dtype[Any]) -> Iter
     """Yield the numbers that the type of a variable can hold, except NaN."""
     for value in missing:
         with np.errstate(all="ignore"):
-            own = stored.type(value) if stored.kind == "f" or _fits_type(value, stored) else None
-        if own is not None and own == own:
-            yield own
+            number = stored.type(value) if stored.kind == "f" or _fits_type(value, stored) else None
+        if number is not None and number == number:
+            yield number
 
 
 def _fits_type(value: Any, stored: np.dtype[Any]) -> bool:

@@ -66,18 +66,18 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
     names = file.schema_arrow.names
     check_stored(path, file.metadata.num_rows, len(plan.columns), options.limits)
     builder = RawLogBuilder(plan.check(), options)
-    wanted = [names[column.source] for column in plan.columns]
+    column_names = [names[column.source] for column in plan.columns]
 
     def convert(batch: Any) -> ConvertedBlock:
-        found = {name: batch.column(place) for place, name in enumerate(batch.schema.names)}
+        arrays = {name: batch.column(place) for place, name in enumerate(batch.schema.names)}
         return convert_batch(
             builder,
             options,
-            {column.source: _to_numpy(found[names[column.source]]) for column in plan.columns},
+            {column.source: _to_numpy(arrays[names[column.source]]) for column in plan.columns},
         )
 
     for converted in map_in_order(
-        convert, file.iter_batches(batch_size=batch_rows(len(wanted)), columns=wanted)
+        convert, file.iter_batches(batch_size=batch_rows(len(column_names)), columns=column_names)
     ):
         builder.add(converted)
     return builder.finish(float32_note(plan, file.schema_arrow.types))
@@ -95,7 +95,7 @@ def _open_parquet(path: Path, options: ReadOptions) -> tuple[Any, Plan]:
         if (text := (entry.metadata or {}).get(b"units")) is not None
     }
     samples = [] if head is None else [_to_numpy(column) for column in head.columns]
-    texts = [[one for one in values if isinstance(one, str)] for values in samples]
+    texts = [[value for value in values if isinstance(value, str)] for values in samples]
     orders = {
         index: find_order(text) for index, text in enumerate(texts) if any(map(holds_date, text))
     }

@@ -68,22 +68,24 @@ def _read_topics(path: Path) -> tuple[list[Table], list[str]]:
     """Return a table for each topic with numbers, and a note on topics that are left out."""
     highlevel = library("rosbags.highlevel", path, extra="rosbag")
     typesys = library("rosbags.typesys", path, extra="rosbag")
-    known = typesys.get_typestore(typesys.Stores.LATEST)
-    found: dict[tuple[str, str], Messages] = {}
+    typestore = typesys.get_typestore(typesys.Stores.LATEST)
+    by_topic: dict[tuple[str, str], Messages] = {}
     left_out: dict[str, None] = {}
-    with highlevel.AnyReader([path], default_typestore=known) as reader:
+    with highlevel.AnyReader([path], default_typestore=typestore) as reader:
         for connection, received, raw in reader.messages():
             if len(raw) > _LARGEST_MESSAGE:
                 left_out[connection.topic] = None
                 continue
             message = reader.deserialize(raw, connection.msgtype)
-            messages = found.setdefault((connection.topic, connection.msgtype), Messages())
+            messages = by_topic.setdefault((connection.topic, connection.msgtype), Messages())
             messages.add(_message_time(message) or received, dict(_select_numbers(message)))
-    fields = [(topic, name) for (topic, _), one in found.items() for name in one.columns]
+    fields = [
+        (topic, name) for (topic, _), messages in by_topic.items() for name in messages.columns
+    ]
     names = iter(plain_names(fields))
     tables = [
         messages.make_table([next(names) for _ in messages.columns], meanings=_MEANINGS.get(kind))
-        for (_, kind), messages in found.items()
+        for (_, kind), messages in by_topic.items()
     ]
     notes = [f"left out, as their messages are large: {', '.join(left_out)}"] if left_out else []
     return tables, notes

@@ -51,15 +51,15 @@ class StoredTable:
         """Return the raw log."""
         plan, columns = self.plan, self.columns
         check_stored(plan.path, self.rows, len(plan.columns), self.options.limits)
-        wanted = [columns[column.source].rows for column in plan.columns]
+        sources = [columns[column.source].rows for column in plan.columns]
         return read_columns(
             plan,
             self.options,
             self.rows,
             partial(_fetch_rows, columns, self.decoders),
             notes=[*self.notes, *float32_note(plan, [column.dtype for column in columns])],
-            parallel=not any(isinstance(rows, LibraryRows) for rows in wanted),
-            stay=all(isinstance(rows, EvenRows) for rows in wanted),
+            parallel=not any(isinstance(rows, LibraryRows) for rows in sources),
+            stay=all(isinstance(rows, EvenRows) for rows in sources),
         )
 
 

@@ -55,9 +55,9 @@ def plain_names(names: Sequence[tuple[str, ...]]) -> list[str]:
     >>> plain_names([("imu", "wx"), ("imu", "temp"), ("probe", "temp")])
     ['wx', 'imu.temp', 'probe.temp']
     """
-    seen = Counter(name[-1] for name in names)
+    counts = Counter(name[-1] for name in names)
     return [
-        name[-1] if seen[name[-1]] == 1 else ".".join(part for part in name if part)
+        name[-1] if counts[name[-1]] == 1 else ".".join(part for part in name if part)
         for name in names
     ]
 
@@ -79,12 +79,14 @@ class _PlannedTables:
             for column in self.plan.of("time")
             if table.stamps is not None
         ]
-        own = [
+        table_columns = [
             column
             for column in self.plan.columns
             if begin <= column.source < begin + 1 + len(table.names)
         ]
-        columns = clocks + [column for column in own if not (clocks and column.role == "time")]
+        columns = clocks + [
+            column for column in table_columns if not (clocks and column.role == "time")
+        ]
 
         def fetch(source: int, start: int, stop: int) -> Any:
             part = table.stamps if source == begin else table.columns[source - begin - 1]
@@ -95,8 +97,8 @@ class _PlannedTables:
 
 
 def _plan_tables(path: Path, tables: Sequence[Table], options: ReadOptions) -> _PlannedTables:
-    kept = [table for table in tables if table.rows and table.names]
-    if not kept:
+    filled = [table for table in tables if table.rows and table.names]
+    if not filled:
         raise FormatError(
             f"{path.name}: it holds no values; copy it again, or check what the logger wrote"
         )
@@ -104,10 +106,10 @@ def _plan_tables(path: Path, tables: Sequence[Table], options: ReadOptions) -> _
     units: dict[int, str] = {}
     coded: dict[int, str] = {}
     first = []
-    for table in kept:
+    for table in filled:
         first.append(len(headers))
         named = table.stamps is not None and not any(
-            one.stamps is not None for one in kept[: len(first) - 1]
+            earlier.stamps is not None for earlier in filled[: len(first) - 1]
         )
         if named and table.time_unit:
             units[len(headers)] = table.time_unit
@@ -124,17 +126,17 @@ def _plan_tables(path: Path, tables: Sequence[Table], options: ReadOptions) -> _
         headers += ["time" if named else "", *table.names]
     stamped = [
         begin
-        for begin, table in zip(first, kept, strict=True)
+        for begin, table in zip(first, filled, strict=True)
         if table.stamps is not None and table.time_unit is None
     ]
     plan = plan_columns(path, headers, options, units=units, stamped=stamped, coded=coded)
-    wanted = plan.of("gyro") or plan.of("channel")
+    main_columns = plan.of("gyro") or plan.of("channel")
     holders = {
         max(place for place, begin in enumerate(first) if begin <= column.source)
-        for column in wanted
+        for column in main_columns
     }
     return _PlannedTables(
-        kept, first, plan, sorted(holders) if plan.of("gyro") else [min(holders, default=0)]
+        filled, first, plan, sorted(holders) if plan.of("gyro") else [min(holders, default=0)]
     )
 
 
@@ -169,7 +171,7 @@ def read_tables(
     planned = _plan_tables(path, tables, options)
     planned.plan.check()
     main: list[xr.Dataset] = []
-    others: list[xr.Dataset] = []
+    channel_logs: list[xr.Dataset] = []
     for place, table in enumerate(planned.tables):
         plan, fetch = planned.part(place)
         if place in planned.main:
@@ -185,8 +187,8 @@ def read_tables(
             )
         elif plan.of("channel"):
             plan = replace(plan, signal=None, kind=None, notes=())
-            others.append(read_columns(plan, options, table.rows, fetch))
-    log = with_channels(concatenate(main) if len(main) > 1 else main[0], others)
+            channel_logs.append(read_columns(plan, options, table.rows, fetch))
+    log = with_channels(concatenate(main) if len(main) > 1 else main[0], channel_logs)
     return (
         log.assign_attrs(source_files=[path.name], row_start=[0])
         if "axis_rows" not in log.attrs

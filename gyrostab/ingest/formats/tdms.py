@@ -62,14 +62,15 @@ def _open_tables(path: Path) -> Iterator[list[Table]]:
             channel for group in file.groups() for channel in group.channels() if len(channel)
         ]
         names = plain_names([(channel.group_name, channel.name) for channel in channels])
-        found: dict[Any, list[tuple[str, Any]]] = {}
+        groups: dict[Any, list[tuple[str, Any]]] = {}
         for name, channel in zip(names, channels, strict=True):
             clock = _waveform_clock(path, channel)
-            found.setdefault((len(channel), clock or channel.group_name), []).append(
+            groups.setdefault((len(channel), clock or channel.group_name), []).append(
                 (name, channel)
             )
         yield [
-            _make_table(members, _waveform_clock(path, members[0][1])) for members in found.values()
+            _make_table(members, _waveform_clock(path, members[0][1]))
+            for members in groups.values()
         ]
 
 
@@ -102,20 +103,22 @@ def _waveform_clock(path: Path, channel: Any) -> tuple[float, Any] | None:
 
 
 def _make_table(members: list[tuple[str, Any]], clock: tuple[float, Any] | None) -> Table:
-    own = [(name, channel) for name, channel in members]
+    fields = [(name, channel) for name, channel in members]
     dates = None
     if clock is None:
-        dates = next((channel for _, channel in own if np.dtype(channel.dtype).kind == "M"), None)
-        own = [(name, channel) for name, channel in own if channel is not dates]
+        dates = next(
+            (channel for _, channel in fields if np.dtype(channel.dtype).kind == "M"), None
+        )
+        fields = [(name, channel) for name, channel in fields if channel is not dates]
     units = tuple(
-        str(channel.properties.get("unit_string") or "").strip() or None for _, channel in own
+        str(channel.properties.get("unit_string") or "").strip() or None for _, channel in fields
     )
     stamps = _waveform_stamps(*clock) if clock else None if dates is None else sliced(dates)
     dated = clock is None or isinstance(clock[1], np.datetime64)
-    columns = tuple(sliced(channel) for _, channel in own)
+    columns = tuple(sliced(channel) for _, channel in fields)
     return Table(
         len(members[0][1]),
-        tuple(name for name, _ in own),
+        tuple(name for name, _ in fields),
         units,
         columns,
         stamps,

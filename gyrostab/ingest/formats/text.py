@@ -136,14 +136,14 @@ def _plan_file(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
 def _duration_units(layout: Layout) -> dict[int, str]:
     """Return the units of columns whose cells contain them, such as ``0.01 sec``."""
     rows = [row for row in layout.samples if len(row) == layout.width]
-    found = (
+    units = (
         {column: unit for column, cell in enumerate(rows[0]) if (unit := unit_of_duration(cell))}
         if rows
         else {}
     )
     return {
         column: unit
-        for column, unit in found.items()
+        for column, unit in units.items()
         if all(unit_of_duration(row[column]) == unit for row in rows)
     }
 
@@ -172,9 +172,10 @@ def _sample_stamps(
 
 def _is_solid(row: list[str], layout: Layout, time: int) -> bool:
     """Return whether a row holds a number in addition to its stamp."""
-    others = (cell for at, cell in enumerate(row) if at != time)
+    other_cells = (cell for at, cell in enumerate(row) if at != time)
     return len(row) == layout.width and (
-        layout.width == 1 or any(is_number(cell, comma=layout.decimal_comma) for cell in others)
+        layout.width == 1
+        or any(is_number(cell, comma=layout.decimal_comma) for cell in other_cells)
     )
 
 
@@ -216,7 +217,7 @@ def _read_chunk(path: Path, file: IO[bytes], size: int, done: int) -> bytes:
             missing -= len(part)
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         read = done + size - missing
-        what = (
+        problem = (
             f"the gzip stream is damaged or cut off; {read:,} bytes of text could be read "
             f"before that ({error})"
         )
@@ -224,7 +225,7 @@ def _read_chunk(path: Path, file: IO[bytes], size: int, done: int) -> bytes:
             f"copy the file again, or save the readable part with: gzip -dc {path.name} > "
             "rescued.csv"
         )
-        raise FormatError(f"{path.name}: {what}. {rescue}") from error
+        raise FormatError(f"{path.name}: {problem}. {rescue}") from error
     return b"".join(parts)
 
 

@@ -61,14 +61,16 @@ def _make_tables(path: Path) -> tuple[list[Table], list[str]]:
     pyulog = library("pyulog", path, extra="ulog")
     with _PaddedFile(path.open("rb", buffering=0)) as file:
         log = pyulog.ULog(file)
-    found = []
+    messages = []
     for message in log.data_list:
         name = message.name + (f"_{message.multi_id}" if message.multi_id else "")
         fields = [(field, values) for field, values in message.data.items() if field != "timestamp"]
-        found.append((name, message.data.get("timestamp"), fields))
-    names = iter(plain_names([(name, field) for name, _, fields in found for field, _ in fields]))
+        messages.append((name, message.data.get("timestamp"), fields))
+    names = iter(
+        plain_names([(name, field) for name, _, fields in messages for field, _ in fields])
+    )
     tables = []
-    for _, stamps, fields in found:
+    for _, stamps, fields in messages:
         columns = tuple(sliced(values) for _, values in fields)
         clock = None if stamps is None else sliced(stamps)
         tables.append(

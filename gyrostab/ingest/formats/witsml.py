@@ -53,15 +53,15 @@ def _read_logs(path: Path) -> Iterator[Table]:
     FormatError
         When there is none.
     """
-    found = 0
+    n_tables = 0
     for _, log in ElementTree.iterparse(path):
         if _local_name(log) == "log":
             table = _make_table(log)
             log.clear()
             if table is not None:
-                found += 1
+                n_tables += 1
                 yield table
-    if not found:
+    if not n_tables:
         raise FormatError(
             f"{path.name}: this WITSML document has no log of version 1 with values over dates "
             "and times; export the log by time as WITSML 1.4.1.1, LAS or CSV"
@@ -93,12 +93,12 @@ def _make_table(log: Any) -> Table | None:
     index = _child_text(log, "indexCurve")
     place = names.index(index) if index in names else 0
     stamps = texts_to_ns(cells[place].astype(str).tolist()).view("datetime64[ns]")
-    kept = [number for number in range(len(names)) if number != place]
+    places = [number for number in range(len(names)) if number != place]
     return Table(
         len(cells),
-        tuple(names[number] for number in kept),
-        tuple(units.get(names[number]) or None for number in kept),
-        tuple(sliced(cells[number].to_numpy()) for number in kept),
+        tuple(names[number] for number in places),
+        tuple(units.get(names[number]) or None for number in places),
+        tuple(sliced(cells[number].to_numpy()) for number in places),
         sliced(stamps),
     )
 

@@ -66,7 +66,7 @@ class BlockParser:
         counts, starts = np.empty(lines, np.int64), np.empty(lines, np.int64)
         separator = BLANKS if self.layout.separator == BLANK else ord(self.layout.separator)
         point = ord("," if self.layout.decimal_comma else ".")
-        others: dict[int, str] = {}
+        other_lines: dict[int, str] = {}
         row = at = 0
         while True:
             row, at = read_rows(
@@ -78,13 +78,13 @@ class BlockParser:
             end = block.index(b"\n", at) + 1
             line = block[at:end].decode("latin-1").split("#")[0].strip("\r\n")
             if line.strip():
-                others[row], starts[row] = line, at
+                other_lines[row], starts[row] = line, at
                 row += 1
             at = end
         stamps = None if self.time is None else self._since_epoch(counts[:row])
-        words = self._parse_cells(others, values, stamps) if others else 0
-        found = dict(zip(self.sources, values[:, :row], strict=True))
-        return ParsedBlock(found, stamps, words, starts[:row], lines)
+        words = self._parse_cells(other_lines, values, stamps) if other_lines else 0
+        columns = dict(zip(self.sources, values[:, :row], strict=True))
+        return ParsedBlock(columns, stamps, words, starts[:row], lines)
 
     def _since_epoch(self, counts: NDArray[np.int64]) -> NDArray[np.int64]:
         """Convert counts of nanoseconds or of a non-decimal unit to stamps [ns since 1970]."""

@@ -187,13 +187,13 @@ def _decode_lines(path: Path, head: bytes, *, complete: bool) -> tuple[list[str]
 def _find_pair(rows: Sequence[Sequence[str]]) -> int | None:
     """Return the first column of dates that is followed by a column of times of day."""
     width = _commonest_width(rows)
-    whole = [row for row in rows if len(row) == width]
+    full_rows = [row for row in rows if len(row) == width]
     for column in range(width - 1):
         pairs = sum(
             holds_date(row[column]) and ":" not in row[column] and is_time_of_day(row[column + 1])
-            for row in whole
+            for row in full_rows
         )
-        if 2 * pairs > len(whole):  # damaged rows are few
+        if 2 * pairs > len(full_rows):  # damaged rows are few
             return column
     return None
 
@@ -272,9 +272,9 @@ def _find_header(
             or (separator != BLANK and len(names) + 1 in widths)
         ):
             return names, separator, index, index + 1
-    what = f"no header row or row of numbers in the first {len(lines)} lines"
+    problem = f"no header row or row of numbers in the first {len(lines)} lines"
     raise FormatError(
-        f"{path.name}: {what}; if this is a gyro log, put # before the lines above its header "
+        f"{path.name}: {problem}; if this is a gyro log, put # before the lines above its header "
         "row, or delete them"
     )
 
