@@ -81,18 +81,20 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     if len(parts) == 1:
         joined = parts[0]
     else:
-        whole = _in_order([group for part in parts for group in split_axes(part)])
-        signal = _common_signal(whole)
-        own = [_slow_channels(part) for part in whole]
+        split_parts = _in_order([group for part in parts for group in split_axes(part)])
+        signal = _common_signal(split_parts)
+        slow_channels = [_slow_channels(part) for part in split_parts]
         ordered = [
             part.drop_vars([*names, *(f"time_{name}" for name in names)])
-            for part, names in zip(whole, own, strict=True)
+            for part, names in zip(split_parts, slow_channels, strict=True)
         ]
         groups = _group_by_axes(ordered)
         if "time" in ordered[0].variables:
             groups = [drop_repeats(group) for group in groups]
         joined = _concatenate_parts([part for group in groups for part in group], signal, groups)
-        apart = [part[names] for part, names in zip(whole, own, strict=True) if names]
+        apart = [
+            part[names] for part, names in zip(split_parts, slow_channels, strict=True) if names
+        ]
         joined = with_channels(joined, apart)
     if joined.sizes["row"] < 2:
         name = joined.attrs["source_files"][0]
@@ -236,15 +238,15 @@ def _files_without(groups: list[list[xr.Dataset]], holders: set[int]) -> list[st
 def _stack_signal(parts: list[xr.Dataset], signal: str, axes: list[str]) -> Any:
     """Stack the signal of all parts, (axis, row); NaN where a part lacks an axis."""
     if all(isinstance(part[signal].data, np.ndarray) for part in parts):
-        whole = np.full((len(axes), sum(part.sizes["row"] for part in parts)), np.nan)
+        values = np.full((len(axes), sum(part.sizes["row"] for part in parts)), np.nan)
         end = 0
         for part in parts:
             end += part.sizes["row"]
             for axis in map(str, part["axis"].values):
-                whole[axes.index(axis), end - part.sizes["row"] : end] = (
+                values[axes.index(axis), end - part.sizes["row"] : end] = (
                     part[signal].sel(axis=axis).data
                 )
-        return whole
+        return values
     return stack_rows(
         [
             concatenate_columns([_read_axis(part, signal, axis) for part in parts], CHUNK_ROWS)
@@ -305,17 +307,19 @@ def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Datase
                 )
                 raise OptionError(f"channel {channel!r} of {name} is in the log too; {fix}")
             pieces.setdefault(channel, []).append((stamps, values, units))
-    for channel, found in pieces.items():
-        if len({units for _, _, units in found}) > 1:
+    for channel, channel_pieces in pieces.items():
+        if len({units for _, _, units in channel_pieces}) > 1:
             raise UnitError(
                 f"channel {channel!r} has different units in {list_some(files)}; give one with "
                 f"--unit {channel}=UNIT"
             )
-        stamps, values = (np.concatenate([piece[place] for piece in found]) for place in (0, 1))
+        stamps, values = (
+            np.concatenate([piece[place] for piece in channel_pieces]) for place in (0, 1)
+        )
         order = np.argsort(stamps, kind="stable")
         dim = f"time_{channel}"
         log = log.assign_coords({dim: (dim, stamps[order])}).assign(
-            {channel: (dim, values[order], {"units": found[0][2]})}
+            {channel: (dim, values[order], {"units": channel_pieces[0][2]})}
         )
     if files:
         notes = [note for source in sources for note in source.attrs.get("notes", [])]
@@ -326,7 +330,7 @@ def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Datase
 def _read_channels(
     source: xr.Dataset, name: str
 ) -> list[tuple[str, NDArray[Any], NDArray[Any], str]]:
-    found = []
+    channels = []
     for channel, variable in source.data_vars.items():
         dim = f"time_{channel}" if f"time_{channel}" in source.variables else "time"
         if (
@@ -342,11 +346,11 @@ def _read_channels(
             )
         stamps, values = np.asarray(source[dim].values), np.asarray(variable.values)
         filled = np.isfinite(values) & ~np.isnat(stamps)
-        found.append(
+        channels.append(
             (str(channel), stamps[filled], values[filled], str(variable.attrs.get("units", "1")))
         )
-    if not found:
+    if not channels:
         raise OptionError(
             f"--channel {name}: it holds no channel with a unit; give one with --unit NAME=UNIT"
         )
-    return found
+    return channels

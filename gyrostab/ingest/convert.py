@@ -157,8 +157,8 @@ def _read_frame(
             for header in headers
             if _is_axis_name(split_header(header)[0])
         }
-    given = {"gyro": str(units)} if isinstance(units, str) else dict(units or {})
-    options = ReadOptions(map=renamed, unit=given, kind=kind)
+    units_by_name = {"gyro": str(units)} if isinstance(units, str) else dict(units or {})
+    options = ReadOptions(map=renamed, unit=units_by_name, kind=kind)
     stamps = index.to_numpy()
 
     def fetch(source: int, begin: int, end: int) -> Any:
@@ -259,7 +259,7 @@ def from_dataarray(
     """
     log, increments = _dataset_of(da, units, kind)
     try:
-        found = as_uniform(log)
+        regular_log = as_uniform(log)
     except TimeError:
         stamps = np.asarray(log["time"].values)
         if rate is None and (np.isnat(stamps).any() or np.any(stamps[1:] < stamps[:-1])):
@@ -271,18 +271,20 @@ def from_dataarray(
             .rename_dims(time="row")
             .assign_coords(time=("row", stamps.astype("datetime64[ns]")))
         )
-        found = regularise(raw.assign_attrs(source_files=["DataArray"]), rate=rate, max_gap=max_gap)
-        _warn_notes(found)
-    if rate is not None and abs(rate / found.attrs["sampling_rate_hz"] - 1) > 1e-6:
+        regular_log = regularise(
+            raw.assign_attrs(source_files=["DataArray"]), rate=rate, max_gap=max_gap
+        )
+        _warn_notes(regular_log)
+    if rate is not None and abs(rate / regular_log.attrs["sampling_rate_hz"] - 1) > 1e-6:
         raise TimeError(
             f"rate={rate:g} Hz, but the time of the DataArray says "
-            f"{found.attrs['sampling_rate_hz']:.9g} Hz; leave rate out"
+            f"{regular_log.attrs['sampling_rate_hz']:.9g} Hz; leave rate out"
         )
     if increments:
-        found["rate"] = found["rate"].copy(
-            data=found["rate"].data * (found.attrs["sampling_rate_hz"] * HOUR)
+        regular_log["rate"] = regular_log["rate"].copy(
+            data=regular_log["rate"].data * (regular_log.attrs["sampling_rate_hz"] * HOUR)
         )
-    return found
+    return regular_log
 
 
 def _dataset_of(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[xr.Dataset, bool]:

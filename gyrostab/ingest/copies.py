@@ -15,9 +15,9 @@ MIN_ALIKE_SHARE = 0.9
 
 def count_alike(held: NDArray[np.float64], new: NDArray[np.float64]) -> tuple[Any, Any]:
     """Count the samples known in both arrays (axis, ..., sample), and the equal ones."""
-    known = np.isfinite(held) & np.isfinite(new)
-    has_values = known.any(axis=0)
-    same = (np.isclose(held, new, rtol=1e-6, atol=0.0) | ~known).all(axis=0) & has_values
+    is_known = np.isfinite(held) & np.isfinite(new)
+    has_values = is_known.any(axis=0)
+    same = (np.isclose(held, new, rtol=1e-6, atol=0.0) | ~is_known).all(axis=0) & has_values
     return has_values.sum(axis=-1), same.sum(axis=-1)
 
 

@@ -58,8 +58,10 @@ def reason_of(path: Path, error: Exception) -> str:
 def check_share(lost: Sequence[LostFile], total: int) -> None:
     """Refuse to go on when more than half of the files cannot be read."""
     if len(lost) > MAX_LOST_SHARE * total:
-        what = "that is more than damage: check the names and the reading options"
-        raise FormatError(f"{lost[0].reason}; {len(lost)} of {total} files cannot be read, {what}")
+        advice = "that is more than damage: check the names and the reading options"
+        raise FormatError(
+            f"{lost[0].reason}; {len(lost)} of {total} files cannot be read, {advice}"
+        )
 
 
 def _name_key(path: Path) -> list[tuple[int, int, str]]:
@@ -92,23 +94,25 @@ def find_lost_spans(
         First and last instant [ns since 1970].
     """
     names = sorted([*spans, *(file.path for file in lost)], key=_name_key)
-    found: dict[Path, Span] = {}
+    lost_spans: dict[Path, Span] = {}
     for path in (file.path for file in lost):
         place = names.index(path)
-        before = next((name for name in reversed(names[:place]) if name in spans), None)
-        after = next((name for name in names[place:] if name in spans), None)
-        between = _span_between(spans, before, after) if before and after else None
+        previous_path = next((name for name in reversed(names[:place]) if name in spans), None)
+        next_path = next((name for name in names[place:] if name in spans), None)
+        between = (
+            _span_between(spans, previous_path, next_path) if previous_path and next_path else None
+        )
         span = between or _span_of_stamps(path, scan)
         if span:
-            found[path] = span
-    return found
+            lost_spans[path] = span
+    return lost_spans
 
 
-def _span_between(spans: Mapping[Path, Span], before: Path, after: Path) -> Span | None:
+def _span_between(spans: Mapping[Path, Span], previous_path: Path, next_path: Path) -> Span | None:
     """Return the time between two consecutive files; None if a third lies between."""
-    (_, end), (start, _) = sorted([spans[before], spans[after]])
-    others = [span for path, span in spans.items() if path not in (before, after)]
-    free = end < start and not any(first < start and last > end for first, last in others)
+    (_, end), (start, _) = sorted([spans[previous_path], spans[next_path]])
+    other_spans = [span for path, span in spans.items() if path not in (previous_path, next_path)]
+    free = end < start and not any(first < start and last > end for first, last in other_spans)
     return (end, start) if free else None
 
 

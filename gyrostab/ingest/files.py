@@ -108,9 +108,9 @@ def _find_reader(path: Path) -> Reader:
             f"{path}: no reader takes this directory; name the files in it, for instance "
             f"{path / '*.csv'}"
         )
-    what = f"no reader takes this file with the suffix {path.suffix!r}, and it is not text"
+    problem = f"no reader takes this file with the suffix {path.suffix!r}, and it is not text"
     raise FormatError(
-        f"{path}: {what}; formats are {', '.join(readers())}: save it as one of these"
+        f"{path}: {problem}; formats are {', '.join(readers())}: save it as one of these"
     )
 
 
@@ -122,7 +122,7 @@ def expand(paths: str | Path | Iterable[str | Path]) -> list[Path]:
     FormatError
         When a pattern matches no file.
     """
-    found: dict[Path, None] = {}
+    files: dict[Path, None] = {}
     for item in [paths] if isinstance(paths, str | Path) else paths:
         text = str(item)
         url = find_url(item)
@@ -134,10 +134,10 @@ def expand(paths: str | Path | Iterable[str | Path]) -> list[Path]:
             matching = [Path(match) for match in sorted(glob.glob(text, recursive=True))]
         if not matching:
             raise FormatError(f"{url or text}: no file fits this pattern")
-        found.update(dict.fromkeys(matching))
-    if not found:
+        files.update(dict.fromkeys(matching))
+    if not files:
         raise OptionError("no file was given; name at least one log")
-    return list(found)
+    return list(files)
 
 
 def scan_file(path: str | Path, options: ReadOptions | None = None) -> FileSummary:
@@ -277,9 +277,9 @@ def read_log(
         strict=strict,
         limits=dict(limits or {}),
     )
-    found = expand(paths)
+    files = expand(paths)
     extra = expand(options.channel) if options.channel else []
-    parts, lost = _read_all(found, options, on_file, read)
+    parts, lost = _read_all(files, options, on_file, read)
     regular = [path for path, part in parts.items() if "sampling_rate_hz" in part.attrs]
     if regular and len(regular) < len(parts):
         raw = next(path for path in parts if path not in regular)

@@ -62,9 +62,9 @@ def describe_break(place: str, cause: int, before: int, after: int, samples: str
     `samples` names what the log consists of, rows or samples.
     """
     jump = (after - before) / 1e9
-    what = "time restarts" if cause == _RESTART else "the clock steps"
+    event = "time restarts" if cause == _RESTART else "the clock steps"
     return (
-        f"{what}{place}: from {format_stamp(before)} to {format_stamp(after)}, "
+        f"{event}{place}: from {format_stamp(before)} to {format_stamp(after)}, "
         f"{format_duration(abs(jump))} {'back' if jump < 0 else 'ahead'}; "
         f"the pause is of unknown length, so the {samples} that follow come after one missing "
         f"sample{'' if jump < 0 else '; if the pause is real, raise max_gap'}"
@@ -101,12 +101,12 @@ def clip_table(table: NDArray[np.int64], low: int, high: int) -> NDArray[np.int6
     """
     first, end = np.maximum(table[:, FIRST], low), np.minimum(table[:, END], high)
     event = table[:, FIRST] == table[:, END]
-    kept = np.where(event, (table[:, FIRST] >= low) & (table[:, FIRST] < high), end > first)
-    out = table[kept].copy()
-    cut = (end - first)[kept] < out[:, END] - out[:, FIRST]
+    is_inside = np.where(event, (table[:, FIRST] >= low) & (table[:, FIRST] < high), end > first)
+    out = table[is_inside].copy()
+    cut = (end - first)[is_inside] < out[:, END] - out[:, FIRST]
     out[:, FIRST], out[:, END] = (
-        np.where(event, table[:, FIRST], first)[kept],
-        np.where(event, table[:, END], end)[kept],
+        np.where(event, table[:, FIRST], first)[is_inside],
+        np.where(event, table[:, END], end)[is_inside],
     )
     out[cut, SAMPLES] = np.minimum(out[:, SAMPLES], out[:, END] - out[:, FIRST])[cut]
     return out
@@ -160,10 +160,10 @@ def gap_variables(table: NDArray[np.int64], start: int, rate: float) -> dict[str
 
 def read_gaps(log: xr.Dataset, start: int, rate: float) -> NDArray[np.int64] | None:
     """Read the table of gaps in grid samples (`COLUMNS`); None if it is inconsistent."""
-    found = read_gap_columns(log)
-    if found is None:
+    columns = read_gap_columns(log)
+    if columns is None:
         return None
-    first, end, *rest = found
+    first, end, *rest = columns
     return np.stack(
         [
             *(np.rint(grid_index(start, rate, stamps)).astype(np.int64) for stamps in (first, end)),

@@ -150,9 +150,9 @@ def guess_columns(
         warnings.append(
             "no column looks like a gyro; if one is, name it: --map NAME=gyro_x --unit gyro=deg/s"
         )
-    taken = {column.key for column in axes.values()}
+    axis_keys = {column.key for column in axes.values()}
     temperature = next(
-        (c for c in inspection.columns if c.key not in taken and _is_temperature(c)), None
+        (c for c in inspection.columns if c.key not in axis_keys and _is_temperature(c)), None
     )
     return Guess(
         axes,
@@ -194,14 +194,16 @@ def _guess_time(
         )
         if not named and (counter or _COUNTER_WORD.search(low)):
             continue
-        unit, why = _time_unit(column)
-        score = 2.0 * named + ("name" in why) - 0.1 * _rate_distance(column, unit)
+        unit, reason = _time_unit(column)
+        score = 2.0 * named + ("name" in reason) - 0.1 * _rate_distance(column, unit)
         if best is None or score > best[0]:
-            best = score, column, unit, why
+            best = score, column, unit, reason
     if best is None:
         return None, None
-    _, column, unit, why = best
-    reasons.append(f"{column.key!r} is the time, as it rises from row to row; in {unit}, by {why}")
+    _, column, unit, reason = best
+    reasons.append(
+        f"{column.key!r} is the time, as it rises from row to row; in {unit}, by {reason}"
+    )
     return column, unit
 
 
@@ -229,9 +231,11 @@ def _rate_distance(column: ColumnInspection, unit: str) -> float:
 def _guess_axes(
     inspection: FileInspection, time: ColumnInspection | None, reasons: list[str]
 ) -> dict[str, ColumnInspection]:
-    known = {column.name.lower(): column for column in inspection.columns if column.role == "gyro"}
-    if known:
-        return {AXIS_PATTERN.sub(r"\2", name): column for name, column in known.items()}
+    gyro_columns = {
+        column.name.lower(): column for column in inspection.columns if column.role == "gyro"
+    }
+    if gyro_columns:
+        return {AXIS_PATTERN.sub(r"\2", name): column for name, column in gyro_columns.items()}
     usable = [
         c
         for c in inspection.columns
@@ -242,10 +246,10 @@ def _guess_axes(
     best: tuple[float, dict[str, ColumnInspection]] | None = None
     for (template, group), steadiness in zip(groups, steady, strict=True):
         score = _gyro_score(template, list(group.values()), inspection)
-        others = [other for other in steady if other is not steadiness]
-        if others and len(group) == 3:
+        rivals = [rival for rival in steady if rival is not steadiness]
+        if rivals and len(group) == 3:
             score += (
-                0.75 if steadiness <= min(others) else -0.75 if steadiness > max(others) else 0.0
+                0.75 if steadiness <= min(rivals) else -0.75 if steadiness > max(rivals) else 0.0
             )  # gravity makes the mean of an accelerometer large
         if score >= MIN_SCORE and (best is None or score > best[0]):
             best = score, group
@@ -283,20 +287,20 @@ def _group_columns(
         for match in re.finditer(r"[xyzXYZpqrENZ]|\d+", column.key):
             template = f"{column.key[: match.start()]}*{column.key[match.end() :]}"
             templates.setdefault(template, {})[match[0]] = column
-    for template, found in templates.items():
-        letters = set(found)
+    for template, by_label in templates.items():
+        letters = set(by_label)
         for trio in ("xyz", "XYZ", "pqr", "ENZ"):
             if len(letters & set(trio)) >= 2 and (trio != "pqr" or template == "*"):
                 axes = trio.lower() if trio in ("ENZ",) else "xyz"
                 yield (
                     template,
                     {
-                        axis: found[letter]
+                        axis: by_label[letter]
                         for letter, axis in zip(trio, axes, strict=True)
-                        if letter in found
+                        if letter in by_label
                     },
                 )
-        numbered = [(int(text), column) for text, column in found.items() if _NUMBER.match(text)]
+        numbered = [(int(text), column) for text, column in by_label.items() if _NUMBER.match(text)]
         digits = sorted(
             ((number, column) for number, column in numbered if column.rising < 0.9),
             key=lambda pair: pair[0],
@@ -359,10 +363,10 @@ def _guess_kind(group: Sequence[ColumnInspection], warnings: list[str]) -> str:
     """Guess whether angles are cumulative or increments, by their steps, and add a warning."""
     cumulative = all(column.scatter < CUMULATIVE_STEP_SHARE * column.std for column in group)
     kind, meaning = ("angle", "cumulative") if cumulative else ("rate", "increments of each row")
-    other = "rate if they are increments" if cumulative else "angle if they are cumulative"
+    alternative = "rate if they are increments" if cumulative else "angle if they are cumulative"
     warnings.append(
         f"--kind {kind}, {meaning}, is a guess from the size of the steps between rows; give "
-        f"--kind {other}"
+        f"--kind {alternative}"
     )
     return kind
 

@@ -67,8 +67,8 @@ def name_unit(column: ColumnInspection, quantity: str) -> str | None:
 
 def temperature_unit(column: ColumnInspection) -> str:
     """Return the unit of a temperature column, from its header or its name."""
-    given = column.unit is not None and is_unit_of(column.unit, ("temperature",))
-    return str(column.unit if given else name_unit(column, "temperature") or "degC")
+    has_unit = column.unit is not None and is_unit_of(column.unit, ("temperature",))
+    return str(column.unit if has_unit else name_unit(column, "temperature") or "degC")
 
 
 def guess_unit(

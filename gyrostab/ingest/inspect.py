@@ -101,10 +101,10 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
         (column for column in summary.columns if column.role == "time" and column.unit is not None),
         None,
     )
-    others = [column for column in summary.columns if column is not time]
-    names = {f"column_{place}": column for place, column in enumerate(others[:MAX_COLUMNS])}
+    data_columns = [column for column in summary.columns if column is not time]
+    names = {f"column_{place}": column for place, column in enumerate(data_columns[:MAX_COLUMNS])}
     chosen = {column.key: f"{name} [1]" for name, column in names.items()}
-    chosen.update({column.key: "-" for column in others[MAX_COLUMNS:]})
+    chosen.update({column.key: "-" for column in data_columns[MAX_COLUMNS:]})
     if time is not None:
         chosen[time.key] = "time" if time.unit == "ISO 8601" else f"time [{time.unit}]"
         if (
@@ -129,8 +129,8 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
     if not any(column.rows for column in columns):
         raise FormatError(f"{path.name}: there is no number in any of its columns; is it a log?")
     notes = (
-        [f"{len(others) - MAX_COLUMNS} further columns are not inspected"]
-        if len(others) > MAX_COLUMNS
+        [f"{len(data_columns) - MAX_COLUMNS} further columns are not inspected"]
+        if len(data_columns) > MAX_COLUMNS
         else []
     )
     rows = max((log.sizes[str(log[name].dims[0])] for name in names if name in log), default=0)
@@ -180,17 +180,17 @@ def _inspect_column(column: ColumnSummary, log: xr.Dataset, name: str) -> Column
         if steps.size:  # most samples may repeat the previous one
             typical = float(np.median(np.abs(steps))) / _MEDIAN_STEP
             scatter = steps.size * (typical or float(np.sqrt(np.mean(steps**2) / 2)))
-        whole, same, up = values == np.rint(values), steps == 0, steps > 0
-        counts = values.size, steps.size, whole.sum(), same.sum(), up.sum()
+        is_whole, is_held, is_rising = values == np.rint(values), steps == 0, steps > 0
+        counts = values.size, steps.size, is_whole.sum(), is_held.sum(), is_rising.sum()
         sums = away.sum(), (away**2).sum(), scatter
         chunks.append((first, last, values.min(), values.max(), *sums, *counts))
         paces += _mean_steps(values)
     table = np.array(chunks, dtype=np.float64).reshape(-1, 12)
-    known = len(table) > 0
+    has_values = len(table) > 0
     total, squares, scatters, rows, steps_seen, wholes, held, rising = table[:, 4:].sum(axis=0)
-    ends = (table[0, 0], table[-1, 1], table[:, 2].min(), table[:, 3].max()) if known else ()
+    ends = (table[0, 0], table[-1, 1], table[:, 2].min(), table[:, 3].max()) if has_values else ()
     first, last, low, high = ends or (math.nan,) * 4
-    variance = max(0.0, squares / rows - (total / rows) ** 2) if known else math.nan
+    variance = max(0.0, squares / rows - (total / rows) ** 2) if has_values else math.nan
     dim = str(log[name].dims[0]) if name in log.data_vars else "row"
     return ColumnInspection(
         key=column.key or column.header,
@@ -201,7 +201,7 @@ def _inspect_column(column: ColumnSummary, log: xr.Dataset, name: str) -> Column
         rows=int(rows),
         low=float(low),
         high=float(high),
-        mean=float(table[0, 0] + total / rows) if known else math.nan,
+        mean=float(table[0, 0] + total / rows) if has_values else math.nan,
         std=math.sqrt(variance),
         scatter=float(scatters / steps_seen) if steps_seen else math.nan,
         held=float(held / max(1, steps_seen)),

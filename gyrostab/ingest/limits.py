@@ -105,19 +105,19 @@ def check_limits(given: Mapping[str, Any] | None) -> dict[str, float]:
     >>> check_limits({"columns": "5e4"})
     {'columns': 50000.0}
     """
-    found = {}
+    limits = {}
     for name, text in (given or {}).items():
         if name not in LIMITS:
             raise OptionError(f"--limit {name}: unknown limit; the limits are {', '.join(LIMITS)}")
         try:
-            found[name] = float(text)
+            limits[name] = float(text)
         except (TypeError, ValueError) as error:
             raise OptionError(
                 f"--limit {name}={text}: give a number of {LIMITS[name].unit}"
             ) from error
-        if not found[name] > 0:
+        if not limits[name] > 0:
             raise OptionError(f"--limit {name}={text}: give a number above 0")
-    return found
+    return limits
 
 
 def limit_value(name: str, given: Mapping[str, float] | None = None) -> float:

@@ -36,12 +36,12 @@ def drop_repeats(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
         The raw logs without repeated rows, with notes on dropped rows; a file without new rows is
         dropped as a whole, with a note in the file that contains its rows.
     """
-    kept: list[xr.Dataset] = []
+    unique_parts: list[xr.Dataset] = []
     ends: list[int] = []
     for part in parts:
         first, end = stamp_span(part)
-        for place in reversed(range(len(kept))):
-            held = kept[place]
+        for place in reversed(range(len(unique_parts))):
+            held = unique_parts[place]
             if first > ends[place]:
                 continue
             tail, head = _rows_from(held, first), _rows_until(part, ends[place])
@@ -50,21 +50,24 @@ def drop_repeats(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
             if (
                 head > held.sizes["row"] - tail and end >= ends[place]
             ):  # it contains rows that the earlier file lost
-                kept[place], part = _drop_rows(held, slice(0, tail), part)
+                unique_parts[place], part = _drop_rows(held, slice(0, tail), part)
                 ends[place] = first - 1
             else:
-                part, kept[place] = _drop_rows(part, slice(head, None), held)
+                part, unique_parts[place] = _drop_rows(part, slice(head, None), held)
                 first, end = stamp_span(part)
-        kept.append(part)
+        unique_parts.append(part)
         ends.append(end)
-        full = [place for place, one in enumerate(kept) if one.sizes["row"]]
-        kept, ends = [kept[place] for place in full], [ends[place] for place in full]
-    return kept
+        full = [place for place, part in enumerate(unique_parts) if part.sizes["row"]]
+        unique_parts, ends = (
+            [unique_parts[place] for place in full],
+            [ends[place] for place in full],
+        )
+    return unique_parts
 
 
 def _drop_rows(part: xr.Dataset, rows: slice, other: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
     """Keep the given rows of `part`; add a note on the dropped rows to `part` or `other`."""
-    name, holder = (str(one.attrs["source_files"][0]) for one in (part, other))
+    name, holder = (str(log.attrs["source_files"][0]) for log in (part, other))
     shorter = part.isel(row=rows)
     left_out = part.sizes["row"] - shorter.sizes["row"]
     if shorter.sizes["row"]:
@@ -121,20 +124,22 @@ def _rows_until(part: xr.Dataset, last: int) -> int:
 
 def _is_copy(held: xr.Dataset, part: xr.Dataset, tail: int, head: int) -> bool:
     """Return whether the first `head` rows of `part` repeat those of `held` from `tail` on."""
-    near = _count_common(held, part, (tail, tail + _COMPARED_ROWS), (0, min(head, _COMPARED_ROWS)))
+    first_counts = _count_common(
+        held, part, (tail, tail + _COMPARED_ROWS), (0, min(head, _COMPARED_ROWS))
+    )
     size = held.sizes["row"]
-    far = _count_common(
+    last_counts = _count_common(
         held, part, (max(tail, size - _COMPARED_ROWS), size), (max(0, head - _COMPARED_ROWS), head)
     )
-    common, same = (int(a + b) for a, b in zip(near, far, strict=True))
+    common, same = (int(a + b) for a, b in zip(first_counts, last_counts, strict=True))
     return is_copy(common, same)
 
 
 def _count_common(
-    held: xr.Dataset, part: xr.Dataset, rows: tuple[int, int], others: tuple[int, int]
+    held: xr.Dataset, part: xr.Dataset, held_rows: tuple[int, int], part_rows: tuple[int, int]
 ) -> tuple[int, int]:
     """Count rows with equal stamps, and those with equal values; NaN equals anything."""
-    ours, theirs = read_stamps(held, *rows), read_stamps(part, *others)
+    ours, theirs = read_stamps(held, *held_rows), read_stamps(part, *part_rows)
     stamps, a, b = np.intersect1d(ours, theirs, return_indices=True)
     a, b = a[stamps != NAT], b[stamps != NAT]
     signal = next(
@@ -145,6 +150,6 @@ def _count_common(
     axes = [axis for axis in held["axis"].values if axis in part["axis"].values]
     if not axes:
         return 0, 0
-    left = np.asarray(held[signal].sel(axis=axes)[:, rows[0] : rows[1]].values)[:, a]
-    right = np.asarray(part[signal].sel(axis=axes)[:, others[0] : others[1]].values)[:, b]
+    left = np.asarray(held[signal].sel(axis=axes)[:, held_rows[0] : held_rows[1]].values)[:, a]
+    right = np.asarray(part[signal].sel(axis=axes)[:, part_rows[0] : part_rows[1]].values)[:, b]
     return count_alike(left, right)

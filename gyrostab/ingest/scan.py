@@ -141,15 +141,17 @@ def scan_and_inspect(
             rows.append(_scan_one(path, reading))
         except GyrostabError as error:
             errors.append(error)
-            found = _inspect_once(path, reading, inspected) if inspect else None
+            inspected_file = _inspect_once(path, reading, inspected) if inspect else None
             rows.append({"file": str(path), "odd": str(error)})
-            if found is not None:
-                rows[-1].update(format=found.inspection.summary.format)
-                rows[-1].update(rows=found.inspection.rows if found.paths == [path] else None)
+            if inspected_file is not None:
+                rows[-1].update(format=inspected_file.inspection.summary.format)
+                rows[-1].update(
+                    rows=inspected_file.inspection.rows if inspected_file.paths == [path] else None
+                )
     return ScanResult(
         pd.DataFrame(rows, columns=list(COLUMNS)),
         errors,
-        [found for found in inspected.values() if found is not None],
+        [inspected_file for inspected_file in inspected.values() if inspected_file is not None],
         [row["white_noise"] for row in rows if "white_noise" in row],
     )
 
@@ -176,10 +178,10 @@ def _inspect_once(
             inspected[headers] = _try_guess(path, inside, guess, reading)
     except GyrostabError:
         return None
-    found = inspected[headers]
-    if found is not None and path not in found.paths:
-        found.paths.append(path)
-    return found
+    inspected_file = inspected[headers]
+    if inspected_file is not None and path not in inspected_file.paths:
+        inspected_file.paths.append(path)
+    return inspected_file
 
 
 def _try_guess(
@@ -226,9 +228,7 @@ def _try_guess(
             reason = str(error)
         if read and read[-1].row is not None and read[-1].row["missing_share"] < MAX_MISSING_SHARE:
             break
-    best = min(
-        read, key=lambda found: found.row["missing_share"] if found.row else 1.0, default=None
-    )
+    best = min(read, key=lambda file: file.row["missing_share"] if file.row else 1.0, default=None)
     return best or InspectedFile([path], inspection, guess, options, None, reason)
 
 
@@ -241,8 +241,8 @@ def _named_rate(path: Path) -> float | None:
     """Find a sampling rate such as ``100 Hz`` in the text at the beginning of a file."""
     from gyrostab.ingest.formats.text import read_head
 
-    found = re.search(r"(?<![\w.])(\d+(?:\.\d+)?) ?(k?)Hz\b", read_head(path), re.IGNORECASE)
-    rate = float(found[1]) * (1000.0 if found[2] else 1.0) if found else 0.0
+    match = re.search(r"(?<![\w.])(\d+(?:\.\d+)?) ?(k?)Hz\b", read_head(path), re.IGNORECASE)
+    rate = float(match[1]) * (1000.0 if match[2] else 1.0) if match else 0.0
     return rate or None
 
 
@@ -309,7 +309,7 @@ def _measure_white_noise(log: xr.Dataset) -> dict[str, float]:
     values = np.asarray(part.values, dtype=np.float64)
     if signal.name == "angle":
         values = np.diff(values) * rate * HOUR
-    found = {}
+    noise = {}
     for axis, means in zip(signal["axis"].values, values, strict=True):
         levels, factor = [], 1
         while means.size >= 100:
@@ -319,8 +319,8 @@ def _measure_white_noise(log: xr.Dataset) -> dict[str, float]:
                     levels.append(float(np.nanmean(squares)) / 2.0 * factor / rate / HOUR)
                 means = means[: means.size // 2 * 2].reshape(-1, 2).mean(axis=1)
             factor *= 2
-        found[str(axis)] = math.sqrt(min(levels, default=math.nan))
-    return found
+        noise[str(axis)] = math.sqrt(min(levels, default=math.nan))
+    return noise
 
 
 def _count_runs(missing: xr.DataArray) -> int:

@@ -128,17 +128,17 @@ def _format_span(seconds: float) -> str:
 INSPECTION_COLUMNS = ("column", "unit", "low", "high", "mean", "scatter", "rate_hz", "taken_for")
 
 
-def _inspection_rows(found: InspectedFile) -> list[tuple[str, ...]]:
+def _inspection_rows(inspected_file: InspectedFile) -> list[tuple[str, ...]]:
     """Return the columns of a file as rows of text, in the order of `INSPECTION_COLUMNS`."""
-    guess = found.guess
+    guess = inspected_file.guess
     targets = {column.key: f"gyro_{axis}" for axis, column in guess.axes.items()}
     if guess.time is not None:
         targets[guess.time.key] = "time"
     if guess.temperature is not None:
         targets.setdefault(guess.temperature.key, "temperature")
     rows: list[tuple[str, ...]] = []
-    if found.inspection.time is not None:
-        time = found.inspection.time
+    if inspected_file.inspection.time is not None:
+        time = inspected_file.inspection.time
         rows.append(
             (
                 time.header,
@@ -147,26 +147,26 @@ def _inspection_rows(found: InspectedFile) -> list[tuple[str, ...]]:
                 "",
                 "",
                 "",
-                _format_number(found.inspection.rate_hz),
+                _format_number(inspected_file.inspection.rate_hz),
                 "time",
             )
         )
-    for column in found.inspection.columns:
-        known = math.isfinite(column.rate_hz) or column.rows == 0
+    for column in inspected_file.inspection.columns:
+        has_rate = math.isfinite(column.rate_hz) or column.rows == 0
         numbers = (
             column.low,
             column.high,
             column.mean,
             column.scatter,
-            column.rate_hz if known else guess.sampling_rate_hz,
+            column.rate_hz if has_rate else guess.sampling_rate_hz,
         )
-        kept = column.name if column.role == "channel" else ""
+        channel_name = column.name if column.role == "channel" else ""
         rows.append(
             (
                 column.key,
                 column.unit or "",
                 *map(_format_number, numbers),
-                targets.get(column.key, kept) if column.rows else "no numbers",
+                targets.get(column.key, channel_name) if column.rows else "no numbers",
             )
         )
     return rows

@@ -29,11 +29,11 @@ def group_axes(axes: Sequence[Sequence[str]]) -> list[list[int]]:
     [[1, 3], [0, 2]]
     """
     groups: list[tuple[set[str], list[int]]] = []
-    for number, own in enumerate(axes):
-        near = [group for group in groups if group[0] & set(own)]
-        groups = [group for group in groups if group not in near]
-        members = sorted([number, *(other for group in near for other in group[1])])
-        groups.append((set(own).union(*(group[0] for group in near)), members))
+    for number, log_axes in enumerate(axes):
+        sharing_groups = [group for group in groups if group[0] & set(log_axes)]
+        groups = [group for group in groups if group not in sharing_groups]
+        members = sorted([number, *(member for group in sharing_groups for member in group[1])])
+        groups.append((set(log_axes).union(*(group[0] for group in sharing_groups)), members))
     return [members for _, members in sorted(groups, key=lambda group: sorted(group[0]))]
 
 
@@ -76,12 +76,12 @@ def split_axes(raw: xr.Dataset) -> list[xr.Dataset]:
         data: dict[Any, Any] = {name: (("axis", "row"), stacked, signal.attrs, signal.encoding)}
         for key, variable in raw.data_vars.items():
             if key != name and (variable.dims == ("row",) or number == 0):
-                kept = (
+                values = (
                     select_part(variable.data, None, first, end)
                     if variable.dims == ("row",)
                     else variable.data
                 )
-                data[key] = (variable.dims, kept, variable.attrs, variable.encoding)
+                data[key] = (variable.dims, values, variable.attrs, variable.encoding)
         coords = {
             str(key): raw[key].variable
             for key in raw.coords
@@ -89,11 +89,11 @@ def split_axes(raw: xr.Dataset) -> list[xr.Dataset]:
         }
         if "time" in raw.variables:
             coords["time"] = xr.Variable("row", select_part(raw["time"].data, None, first, end))
-        own = [(file, start - first) for file, start in files if first <= start < end]
+        group_files = [(file, start - first) for file, start in files if first <= start < end]
         attrs = {key: value for key, value in raw.attrs.items() if key != "axis_rows"}
         attrs |= {
-            "source_files": [file for file, _ in own],
-            "row_start": [start for _, start in own],
+            "source_files": [file for file, _ in group_files],
+            "row_start": [start for _, start in group_files],
         }
         attrs |= (
             {}

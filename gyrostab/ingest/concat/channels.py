@@ -84,8 +84,8 @@ def _on_time(piece: PlacedLog, name: str, start: int, rate: float) -> PlacedArra
     spread = dask.delayed(_scatter_values, pure=False)(
         channel.data, sample - piece.first, inside, piece.end - piece.first
     )
-    whole = da.from_delayed(spread, (piece.end - piece.first,), dtype=np.float64)
-    return whole, None, np.array([[piece.first, 0, piece.end - piece.first]], dtype=np.int64)
+    values = da.from_delayed(spread, (piece.end - piece.first,), dtype=np.float64)
+    return values, None, np.array([[piece.first, 0, piece.end - piece.first]], dtype=np.int64)
 
 
 def _scatter_values(
@@ -107,7 +107,7 @@ def _own_time(
     holders: Sequence[PlacedLog], name: str, start: int, rate: float
 ) -> tuple[NDArray[np.int64], Any]:
     """Return stamps and values in order of time; duplicates are taken from the earlier log."""
-    near = int(_SAME_STAMP_PERIODS * 1e9 / rate)
+    tolerance = int(_SAME_STAMP_PERIODS * 1e9 / rate)
     done: list[
         tuple[NDArray[np.int64], NDArray[np.int64]]
     ] = []  # stamps and positions among all values, in order of time
@@ -118,17 +118,17 @@ def _own_time(
         arrays.append(values)
         offset += len(values)
         touched: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
-        while len(stamps) and done and done[-1][0][-1] >= stamps[0] - near:
+        while len(stamps) and done and done[-1][0][-1] >= stamps[0] - tolerance:
             touched.insert(0, done.pop())
         if touched:
             held, held_places = (np.concatenate(column) for column in zip(*touched, strict=True))
-            cut = np.searchsorted(held, stamps[0] - near)
-            after = np.searchsorted(held, stamps)
-            following, before = (
-                held[np.minimum(after, len(held) - 1)],
-                held[np.maximum(after - 1, 0)],
+            cut = np.searchsorted(held, stamps[0] - tolerance)
+            positions = np.searchsorted(held, stamps)
+            following, previous = (
+                held[np.minimum(positions, len(held) - 1)],
+                held[np.maximum(positions - 1, 0)],
             )
-            new = np.minimum(np.abs(following - stamps), np.abs(stamps - before)) > near
+            new = np.minimum(np.abs(following - stamps), np.abs(stamps - previous)) > tolerance
             if cut:
                 done.append((held[:cut], held_places[:cut]))
             stamps, places = (

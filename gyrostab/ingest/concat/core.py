@@ -145,11 +145,11 @@ def _check_grid(pieces: Sequence[PlacedLog], size: int, limits: Mapping[str, flo
     widest = max(
         range(1, len(ordered)), key=lambda place: ordered[place].first - ordered[place - 1].end
     )
-    before, after = (ordered[place].source for place in (widest - 1, widest))
+    earlier, later = (ordered[place].source for place in (widest - 1, widest))
     raise TimeError(
-        f"{before.name} ends at {format_stamp(before.end)} and {after.name} begins at "
-        f"{format_stamp(after.start)}: the grid of "
-        f"{before.rate:.10g} Hz would have {size:.4g} samples. Correct the time of one of them, "
+        f"{earlier.name} ends at {format_stamp(earlier.end)} and {later.name} begins at "
+        f"{format_stamp(later.start)}: the grid of "
+        f"{earlier.rate:.10g} Hz would have {size:.4g} samples. Correct the time of one of them, "
         "or give a shorter --max-gap to take the "
         "pause for a clock step. If the pause is real: "
         f"{describe_limit('grid_samples', size, limits)}"
@@ -166,11 +166,11 @@ def _check_same(sources: Sequence[Source]) -> None:
     first = sources[0]
     kind = signal_name(first.log)
     for source in sources[1:]:
-        other = signal_name(source.log)
-        if other != kind:
+        other_kind = signal_name(source.log)
+        if other_kind != kind:
             raise UnitError(
                 f"{first.name} holds a gyro signal of kind {kind!r}, {source.name} of kind "
-                f"{other!r}; run them one by one"
+                f"{other_kind!r}; run them one by one"
             )
         if abs(source.rate / first.rate - 1) > RATE_TOLERANCE:
             raise TimeError(
@@ -181,12 +181,12 @@ def _check_same(sources: Sequence[Source]) -> None:
 
 
 def _placed_arrays(pieces: Sequence[PlacedLog], name: str, axis: str) -> list[Any]:
-    found = []
+    arrays = []
     for piece in pieces:
         rows = piece.source.axes
         if axis in rows:
-            found.append((piece.source.log.variables[name].data, rows.index(axis), piece.runs))
-    return found
+            arrays.append((piece.source.log.variables[name].data, rows.index(axis), piece.runs))
+    return arrays
 
 
 def _describe_absent(sources: Sequence[Source], axes: Sequence[str]) -> list[str]:
@@ -227,7 +227,7 @@ def _common_attributes(
     sources: Sequence[Source], size: int, notes: Sequence[str]
 ) -> dict[str, Any]:
     first = sources[0].log.attrs
-    kept = {
+    common = {
         key: value
         for key, value in first.items()
         if all(_is_equal(source.log.attrs.get(key), value) for source in sources)
@@ -246,7 +246,7 @@ def _common_attributes(
     )
     lost = [name for source in sources for name in texts(source.log, "unreadable_files")]
     return {
-        **kept,
+        **common,
         "kind": signal_name(sources[0].log),
         "sampling_rate_hz": sources[0].rate,
         "source_files": list(dict.fromkeys(name for names in files for name in names)),
@@ -256,5 +256,5 @@ def _common_attributes(
     }
 
 
-def _is_equal(one: Any, other: Any) -> bool:
-    return type(one) is type(other) and bool(np.all(one == other))
+def _is_equal(value: Any, other: Any) -> bool:
+    return type(value) is type(other) and bool(np.all(value == other))

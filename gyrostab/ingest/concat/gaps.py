@@ -42,9 +42,9 @@ def _own_gaps(piece: PlacedLog) -> Table:
 def _rate_slips(piece: PlacedLog) -> Table:
     """Return the samples left empty or dropped where a different rate has drifted by one sample."""
     end, own_end = piece.runs[:-1, 0] + piece.runs[:-1, 2], piece.runs[:-1, 1] + piece.runs[:-1, 2]
-    start, own = piece.runs[1:, 0], piece.runs[1:, 1]
+    start, own_start = piece.runs[1:, 0], piece.runs[1:, 1]
     cause = np.where(start > end, _MISSING, _DUPLICATE)
-    return np.stack([end, start, start - end, own - own_end, cause], axis=1)
+    return np.stack([end, start, start - end, own_start - own_end, cause], axis=1)
 
 
 def _missing_in_both(held: Table, new: Table) -> Table:

@@ -86,11 +86,11 @@ def read_log_slices(wanted: Iterable[LogSlice]) -> dict[LogSlice, NDArray[np.flo
 def _read_log_slice(place: LogSlice) -> NDArray[np.float64]:
     source, begin, end = place
     data = source.log.variables[signal_name(source.log)].data
-    whole = np.full((data.shape[0], end - begin), np.nan)
+    values = np.full((data.shape[0], end - begin), np.nan)
     low, high = min(max(begin, 0), source.size), max(min(end, source.size), 0)
     if high > low:
-        whole[:, low - begin : high - begin] = read_slice(data, low, high)
-    return whole
+        values[:, low - begin : high - begin] = read_slice(data, low, high)
+    return values
 
 
 def source_of(log: xr.Dataset, name: str) -> Source:
@@ -136,6 +136,6 @@ def runs_of(first: int, off: float, size: int, ratio: float) -> NDArray[np.int64
     end = np.append(begin[1:], size)
     if way < 0:
         begin[1:] += 1  # the grid sample of the dropped one is taken
-    kept = end > begin
-    begin, end = begin[kept], end[kept]
+    is_nonempty = end > begin
+    begin, end = begin[is_nonempty], end[is_nonempty]
     return np.stack([first + begin + shift(begin), begin, end - begin], axis=1)

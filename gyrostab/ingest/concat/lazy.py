@@ -61,12 +61,12 @@ class GridSource(RowSource):
 
     def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
         """Read samples of one row from `begin` on into `out`."""
-        found = [
+        runs = [
             (which, *entry)
             for which, part in enumerate(self.rows[row])
             for entry in _overlapping_runs(part, begin, begin + out.size)
         ]
-        _fill(out, found)
+        _fill(out, runs)
         if self.convert is not None:
             self.convert(out)
 
@@ -127,24 +127,24 @@ def _chunk_of_dask(
     """Make one chunk of one row from dask arrays, with the public operations of dask."""
     import dask.array as da
 
-    found = [
+    runs = [
         (which, *entry)
         for which, part in enumerate(parts)
         for entry in _overlapping_runs(part, begin, end)
     ]
-    if not found:
+    if not runs:
         return _make_blank_chunk(end - begin)
     # Neighbouring runs share a slice, because each slice of a dask array takes time.
     slices: list[tuple[int, int, int]] = []  # number of the part, first sample and end
-    plan, before = [], 0
-    for which, _, _, own, at, length in found:
+    plan, offset = [], 0
+    for which, _, _, at_source, at, length in runs:
         low, high = slices[-1][1:] if slices and slices[-1][0] == which else (0, -1)
-        if high < 0 or own < high or own + length - low > 2 * (end - begin):
-            before += slices[-1][2] - slices[-1][1] if slices else 0
-            low = own
-            slices.append((which, own, own))
-        slices[-1] = (which, low, own + length)
-        plan.append((which, None, 0, before + own - low, at, length))
+        if high < 0 or at_source < high or at_source + length - low > 2 * (end - begin):
+            offset += slices[-1][2] - slices[-1][1] if slices else 0
+            low = at_source
+            slices.append((which, at_source, at_source))
+        slices[-1] = (which, low, at_source + length)
+        plan.append((which, None, 0, offset + at_source - low, at, length))
     pieces = []
     for which, low, high in slices:
         array, row, _ = parts[which]
@@ -186,53 +186,54 @@ def _place_pieces(
 
 def _fill(
     out: NDArray[np.float64],
-    found: Sequence[tuple[int, Any, int, int, int, int]],
+    runs: Sequence[tuple[int, Any, int, int, int, int]],
 ) -> None:
     """Read runs (number of the part, array, row, first, place in `out`, length) into `out`."""
-    ends = sorted((at, at + length) for *_, at, length in found)
+    ends = sorted((at, at + length) for *_, at, length in runs)
     if any(stop > start for (_, stop), (start, _) in pairwise(ends)):
         out[:] = np.nan  # overlaps are filled where NaN
     else:
         for (_, stop), (start, _) in pairwise([(0, 0), *ends, (out.size, 0)]):
             out[stop:start] = np.nan
-    taken: dict[int, list[tuple[int, int]]] = {}  # by part: the runs of one part do not overlap
-    for number, array, own_row, own, at, length in _read_ahead(found):
-        here = out[at : at + length]
-        earlier = (run for other, runs in taken.items() if other != number for run in runs)
+    # by part: the runs of one part do not overlap
+    filled_spans: dict[int, list[tuple[int, int]]] = {}
+    for number, array, row, at_source, at, length in _read_ahead(runs):
+        place = out[at : at + length]
+        earlier = (span for part, spans in filled_spans.items() if part != number for span in spans)
         if any(at < stop and start < at + length for start, stop in earlier):
             values = np.empty(length)
-            read_into(array, own_row, own, values)
-            np.copyto(here, values, where=np.isnan(here))
+            read_into(array, row, at_source, values)
+            np.copyto(place, values, where=np.isnan(place))
         else:
-            read_into(array, own_row, own, here)
-        taken.setdefault(number, []).append((at, at + length))
+            read_into(array, row, at_source, place)
+        filled_spans.setdefault(number, []).append((at, at + length))
 
 
 def _read_ahead(
-    found: Sequence[tuple[int, Any, int, int, int, int]],
+    runs: Sequence[tuple[int, Any, int, int, int, int]],
 ) -> Iterator[tuple[int, Any, int, int, int, int]]:
     """Yield the runs; short ones that follow each other in a file come from one slice of it.
 
     Each slice of a file takes milliseconds, and a log with many gaps has many runs.
     """
     begin = 0
-    while begin < len(found):
-        number, array, row, own, *_, length = found[begin]
-        stop, end = begin + 1, own + length
+    while begin < len(runs):
+        number, array, row, source_begin, *_, length = runs[begin]
+        stop, end = begin + 1, source_begin + length
         while (
             not isinstance(array, np.ndarray)
-            and stop < len(found)
-            and (found[stop][0], found[stop][3]) == (number, end)
-            and end + found[stop][5] - own <= _READ_AHEAD_SAMPLES
+            and stop < len(runs)
+            and (runs[stop][0], runs[stop][3]) == (number, end)
+            and end + runs[stop][5] - source_begin <= _READ_AHEAD_SAMPLES
         ):
-            end += found[stop][5]
+            end += runs[stop][5]
             stop += 1
         if stop > begin + 1:
-            array, row, first = np.empty(end - own), 0, own
-            read_into(found[begin][1], found[begin][2], own, array)
+            array, row, first = np.empty(end - source_begin), 0, source_begin
+            read_into(runs[begin][1], runs[begin][2], source_begin, array)
         else:
             first = 0
-        for _, _, _, at_source, at, length in found[begin:stop]:
+        for _, _, _, at_source, at, length in runs[begin:stop]:
             yield number, array, row, at_source - first, at, length
         begin = stop
 
@@ -244,8 +245,8 @@ def _overlapping_runs(
     array, row, runs = part
     low = np.searchsorted(runs[:, 0] + runs[:, 2], begin, side="right")
     high = np.searchsorted(runs[:, 0], end, side="left")
-    found = []
-    for sample, own, length in runs[low:high].tolist():
+    overlapping = []
+    for sample, at_source, length in runs[low:high].tolist():
         a, b = max(sample, begin), min(sample + length, end)
-        found.append((array, row or 0, own + a - sample, a - begin, b - a))
-    return found
+        overlapping.append((array, row or 0, at_source + a - sample, a - begin, b - a))
+    return overlapping

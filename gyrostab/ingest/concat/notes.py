@@ -14,8 +14,8 @@ _MAX_NAMED = 5  # events of one kind that are listed one by one
 def absence_notes(absent: Mapping[str, Sequence[str]]) -> list[str]:
     """Return notes on axes and channels that some files lack, by the names of these files."""
     return [
-        f"{what} is not in {list_some(files)} and is missing there"
-        for what, files in absent.items()
+        f"{name} is not in {list_some(files)} and is missing there"
+        for name, files in absent.items()
         if files
     ]
 

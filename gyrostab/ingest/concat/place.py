@@ -58,9 +58,9 @@ class _Match:
 def _find_shift(held: NDArray[np.float64], new: NDArray[np.float64]) -> _Match:
     """Compare `new` at every shift with `held`, which has a margin of `MAX_SHIFT_SAMPLES`."""
     size = new.shape[1]
-    here = _Match(*count_alike(held[:, MAX_SHIFT_SAMPLES : MAX_SHIFT_SAMPLES + size], new), 0)
-    if here.alike or here.common < _MIN_COMMON_SAMPLES:
-        return here
+    unshifted = _Match(*count_alike(held[:, MAX_SHIFT_SAMPLES : MAX_SHIFT_SAMPLES + size], new), 0)
+    if unshifted.alike or unshifted.common < _MIN_COMMON_SAMPLES:
+        return unshifted
     probe = np.flatnonzero(np.isfinite(new).any(axis=0))[:_PROBED_SAMPLES]
     shifts = np.array(sorted(range(-MAX_SHIFT_SAMPLES, MAX_SHIFT_SAMPLES + 1), key=abs))
     common, same = count_alike(
@@ -69,15 +69,15 @@ def _find_shift(held: NDArray[np.float64], new: NDArray[np.float64]) -> _Match:
     for shift in shifts[
         (common >= _MIN_COMMON_SAMPLES) & (same >= MIN_ALIKE_SHARE * common)
     ].tolist():
-        there = _Match(
+        shifted = _Match(
             *count_alike(
                 held[:, MAX_SHIFT_SAMPLES + shift : MAX_SHIFT_SAMPLES + shift + size], new
             ),
             shift,
         )
-        if there.alike and there.common >= _MIN_COMMON_SAMPLES:
-            return there
-    return here
+        if shifted.alike and shifted.common >= _MIN_COMMON_SAMPLES:
+            return shifted
+    return unshifted
 
 
 def _lag_samples(held: Source, new: Source) -> int:
@@ -107,7 +107,7 @@ def _read_overlaps(sources: Sequence[Source]) -> _Cache:
         if held.end >= new.start
         for pair in _overlap_ends(held, new, _lag_samples(held, new))
     ]
-    return read_log_slices(one for pair in pairs for one in pair)
+    return read_log_slices(log_slice for pair in pairs for log_slice in pair)
 
 
 def _match_logs(held: Source, new: Source, lag: int, cache: _Cache) -> _Match:
@@ -117,19 +117,23 @@ def _match_logs(held: Source, new: Source, lag: int, cache: _Cache) -> _Match:
     if not axes or not pairs:
         return _Match(0, 0, 0)
     rows_held, rows_new = ([source.axes.index(axis) for axis in axes] for source in (held, new))
-    found: list[_Match] = []
-    for there, here in pairs:
+    matches: list[_Match] = []
+    for held_slice, new_slice in pairs:
         if (
-            found
-            and found[0].common >= _COMPARED_SAMPLES // 2
-            and found[0].same < 0.5 * found[0].common
+            matches
+            and matches[0].common >= _COMPARED_SAMPLES // 2
+            and matches[0].same < 0.5 * matches[0].common
         ):
             break  # not a copy, whatever its end
-        cache.update(read_log_slices(one for one in (there, here) if one not in cache))
-        found.append(_find_shift(cache[there][rows_held], cache[here][rows_new]))
-    surest = max(found, key=lambda match: (match.alike, match.same))
+        cache.update(
+            read_log_slices(
+                log_slice for log_slice in (held_slice, new_slice) if log_slice not in cache
+            )
+        )
+        matches.append(_find_shift(cache[held_slice][rows_held], cache[new_slice][rows_new]))
+    surest = max(matches, key=lambda match: (match.alike, match.same))
     return _Match(
-        sum(match.common for match in found), sum(match.same for match in found), surest.shift
+        sum(match.common for match in matches), sum(match.same for match in matches), surest.shift
     )
 
 
@@ -242,19 +246,19 @@ def _grid_notes(pieces: Sequence[PlacedLog], rate: float) -> list[str]:
     notes = []
     between = [piece for piece in pieces if abs(piece.off) > NOTED_OFFSET_SAMPLES]
     if between:
-        most = max(abs(piece.off) for piece in between)
+        largest = max(abs(piece.off) for piece in between)
         names = list_some([piece.source.name for piece in between])
         notes.append(
             f"{names}: begin between two samples of the grid of {pieces[0].source.name}; their "
             "samples were put on the nearest ones, "
-            f"at most {most:.2g} of a sample ({format_duration(most / rate)}) away"
+            f"at most {largest:.2g} of a sample ({format_duration(largest / rate)}) away"
         )
-    other = [piece for piece in pieces if piece.source.rate != rate]
-    if other:
-        most = max(abs(piece.source.rate / rate - 1) for piece in other)
+    deviating = [piece for piece in pieces if piece.source.rate != rate]
+    if deviating:
+        largest = max(abs(piece.source.rate / rate - 1) for piece in deviating)
         notes.append(
-            f"{list_some([piece.source.name for piece in other])}: the sampling rate is up to "
-            f"{1e6 * most:.3g} parts per million from the "
+            f"{list_some([piece.source.name for piece in deviating])}: the sampling rate is up to "
+            f"{1e6 * largest:.3g} parts per million from the "
             f"{rate:.10g} Hz of {pieces[0].source.name}; each sample was put on the nearest one "
             "of its grid"
         )
@@ -265,13 +269,13 @@ def _overlap_note(piece: PlacedLog, held: PlacedLog, match: _Match, rate: float)
     name, holder = piece.source.name, held.source.name
     first, end = max(piece.first, held.first), min(piece.end, held.end)
     if not match.alike:
-        what = "hold other values" if match.common else "are missing in one of them"
+        difference = "hold other values" if match.common else "are missing in one of them"
         return (
-            f"{name}: {max(end - first, 0)} samples lie on samples of {holder} and {what}; "
+            f"{name}: {max(end - first, 0)} samples lie on samples of {holder} and {difference}; "
             f"those of {holder} are kept where it has them"
         )
     begin = format_stamp(int(grid_times(*held.clock[:1], rate, first - held.clock[1])))
-    whole = (
+    extent = (
         "all of it is"
         if end >= piece.end
         else f"{format_duration((end - first) / rate)} from {begin} are"
@@ -282,12 +286,12 @@ def _overlap_note(piece: PlacedLog, held: PlacedLog, match: _Match, rate: float)
         else ""
     )
     return (
-        f"{name}: {whole} in {holder} too, and counted once{differ}; the samples of {holder} "
+        f"{name}: {extent} in {holder} too, and counted once{differ}; the samples of {holder} "
         "are kept where it has them"
     )
 
 
 def _break_note(pieces: Sequence[PlacedLog], piece: PlacedLog) -> str:
-    before = max(one.source.end for one in pieces if one.clock == pieces[-1].clock)
-    what = describe_break("", piece.cause, before, piece.source.start, "samples")
-    return f"{piece.source.name}: {what}"
+    last_end = max(earlier.source.end for earlier in pieces if earlier.clock == pieces[-1].clock)
+    description = describe_break("", piece.cause, last_end, piece.source.start, "samples")
+    return f"{piece.source.name}: {description}"

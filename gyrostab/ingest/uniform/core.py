@@ -212,15 +212,15 @@ def place_samples(log: xr.Dataset, runs: Runs, start: int, rate: float, size: in
         placed[name] = xr.Variable(turned.dims, array, variable.attrs, variable.encoding).transpose(
             *variable.dims
         )
-    whole = (
+    placed_log = (
         log.drop_vars(list(moved)).assign(placed).assign_coords(time_coordinate(start, rate, size))
     )
-    whole = whole[[name for name in log.data_vars if name in whole.data_vars]]
-    whole.set_close(close_function(log))
+    placed_log = placed_log[[name for name in log.data_vars if name in placed_log.data_vars]]
+    placed_log.set_close(close_function(log))
     if left_out:
         note = f"left out, as missing samples of it could not be marked: {', '.join(left_out)}"
-        whole = whole.assign_attrs(notes=[*texts(log, "notes"), note])
-    return whole
+        placed_log = placed_log.assign_attrs(notes=[*texts(log, "notes"), note])
+    return placed_log
 
 
 def _place_array(array: Any, runs: Runs, size: int) -> Any:

@@ -139,11 +139,11 @@ def cut_log(
             f"nothing is left between --from {time_from} and --to {time_to}; {clock.describe()}"
         )
     excluded = _merge_spans([clock.span_of(span, low, high) for span in spans])
-    kept = _kept_runs(low, high, excluded)
-    if not len(kept):
+    runs = _kept_runs(low, high, excluded)
+    if not len(runs):
         raise OptionError(f"--exclude leaves nothing of the log; {clock.describe()}")
     start, size = int(grid_times(grid.start, grid.rate, low)), high - low
-    part = _cut_samples(log, kept, start, grid, low, size)
+    part = _cut_samples(log, runs, start, grid, low, size)
     part = _cut_channels(part, grid, low, high, excluded)
     if has_gap_table(log) or len(excluded):
         part = with_table(part, _cut_table(log, grid, low, high, excluded), start, grid.rate)
@@ -223,22 +223,22 @@ def _kept_runs(low: int, high: int, excluded: NDArray[np.int64]) -> NDArray[np.i
     """Return the runs (sample of the part, sample of the log, length) between excluded spans."""
     first = np.concatenate([[low], excluded[:, 1]])
     end = np.concatenate([excluded[:, 0], [high]])
-    kept = end > first
-    return np.stack([first - low, first, end - first], axis=1)[kept]
+    is_nonempty = end > first
+    return np.stack([first - low, first, end - first], axis=1)[is_nonempty]
 
 
 def _cut_samples(
-    log: xr.Dataset, kept: NDArray[np.int64], start: int, grid: UniformGrid, low: int, size: int
+    log: xr.Dataset, runs: NDArray[np.int64], start: int, grid: UniformGrid, low: int, size: int
 ) -> xr.Dataset:
     lazy = any(
         variable.chunks is not None
         for variable in log.data_vars.values()
         if "time" in variable.dims
     )
-    whole = len(kept) == 1 and kept[0, 2] == size
-    if whole and (size == grid.size or not lazy):
+    is_contiguous = len(runs) == 1 and runs[0, 2] == size
+    if is_contiguous and (size == grid.size or not lazy):
         return log.isel(time=slice(low, low + size))
-    return place_samples(log, kept, start, grid.rate, size)
+    return place_samples(log, runs, start, grid.rate, size)
 
 
 def _cut_channels(
@@ -273,13 +273,13 @@ def _cut_table(
 def _extend_history(
     log: xr.Dataset, time_from: Any, time_to: Any, spans: Sequence[Span], size: int
 ) -> str:
-    given = [
+    options = [
         f"{name} {value}"
         for name, value in (("from", time_from), ("to", time_to))
         if value is not None
     ]
-    given += [
+    options += [
         f"without {span if isinstance(span, str) else '/'.join(map(str, span))}" for span in spans
     ]
-    done = f"{time_of_day()} gyrostab.cut_log: {', '.join(given)}: {size} samples"
+    done = f"{time_of_day()} gyrostab.cut_log: {', '.join(options)}: {size} samples"
     return "\n".join(filter(None, [str(log.attrs.get("history", "")), done]))

@@ -89,10 +89,10 @@ def find_grid(read: ReadStamps, count: int, *, nominal: float | None = None) -> 
     if nominal is not None and 0 < nominal < math.inf:
         bases.insert(0, NANOSECONDS / nominal)
     for base in bases:
-        found = _fit_period(read, count, steps.span, base)
-        if found is None:
+        fit = _fit_period(read, count, steps.span, base)
+        if fit is None:
             continue
-        period, samples = found
+        period, samples = fit
         placed = _place_stamps(read, count, start, NANOSECONDS / period)
         if placed is None:
             continue
@@ -138,15 +138,15 @@ def _measure_steps(read: ReadStamps, count: int) -> _Steps:
 
 def _describe_disorder(place: int, before: int, after: int) -> str:
     """Describe which two samples are out of order."""
-    one, other = (str(np.datetime64(stamp, "ns")) for stamp in (before, after))
+    first, second = (str(np.datetime64(stamp, "ns")) for stamp in (before, after))
     if before == after:
         return (
-            f"samples {place} and {place + 1} of the log have the same time, {one}; keep one "
+            f"samples {place} and {place + 1} of the log have the same time, {first}; keep one "
             "of each: log.drop_duplicates('time')"
         )
     return (
-        f"the time of the log runs backwards: sample {place} is at {one} and sample {place + 1} "
-        f"at {other}; sort it, "
+        f"the time of the log runs backwards: sample {place} is at {first} and sample {place + 1} "
+        f"at {second}; sort it, "
         "log.sortby('time'), or give overlapping logs to gyrostab.read_log, which joins them"
     )
 
