@@ -5,14 +5,15 @@
 It prints each finding as FILE:LINE: text, and the exit code is 1 if there is one.
 
 The script reads the comments, docstrings and messages of Python files, Markdown pages, HTML
-templates and the comments of TOML files, and the names of functions and classes. It skips code:
-text in backticks, doctest lines, code blocks, replacement fields of f-strings. Each pattern is a
-phrase that is seldom plain English, or an old name of a thing that docs/glossary.md now names
-otherwise. `ALLOWED` lists the exceptions with their reasons.
+templates and the comments of TOML files, and the names of functions, classes and variables. It
+skips code: text in backticks, doctest lines, code blocks, replacement fields of f-strings. Each
+pattern is a phrase that is seldom plain English, or an old name of a thing that docs/glossary.md
+now names otherwise. `ALLOWED` lists the exceptions with their reasons.
 """
 
 from __future__ import annotations
 
+import ast
 import io
 import re
 import sys
@@ -84,6 +85,12 @@ OLD_NAME_WORDS = {
     *("odd", "loud", "louder", "told", "twin", "slide", "slides"),
 }
 OLD_NAME_WORDS_OF_DIAGNOSIS = {"view", "views", "claim", "claims"}
+#: Variables that have a role in a sentence instead of the name of what they hold.
+ROLE_WORDS = {
+    *("one", "each", "both", "some", "several", "those", "these", "here", "there", "what", "why"),
+    *("said", "told", "seen", "found", "kept", "taken", "wanted"),
+    *("far", "near", "alike", "alone", "again", "beside"),
+}
 
 
 class Allowed(NamedTuple):
@@ -197,6 +204,19 @@ def find_names(path: Path, name: str) -> Iterator[Finding]:
             yield Finding(name, line, f"name {defined}", f"without {word!r}")
 
 
+def find_role_words(path: Path, name: str) -> Iterator[Finding]:
+    """Find variables and parameters that are not named by what they hold."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.arg):
+            variable = node.arg
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            variable = node.id
+        else:
+            continue
+        if variable in ROLE_WORDS:
+            yield Finding(name, node.lineno, f"variable {variable}", "name what it holds")
+
+
 def defined_names(path: Path, kind: str = "def|class") -> Iterator[tuple[int, str]]:
     """Names of the functions and classes of a file, each with its line."""
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
@@ -230,6 +250,7 @@ def find_all(places: list[str]) -> list[Finding]:
         findings += find_phrases(path, name)
         if path.suffix == ".py":
             findings += find_names(path, name)
+            findings += find_role_words(path, name)
         if path.suffix == ".md":
             findings += find_long_lines(path, name)
     return findings

@@ -60,6 +60,13 @@ def test_finds_old_names_and_long_lines(tmp_path):
     assert [finding.line for finding in language.find_long_lines(page, "page.md")] == [1]
 
 
+@pytest.mark.parametrize("code", ["for one in names: pass", "def fit(found): pass", "here = 2"])
+def test_finds_variables_named_by_their_role(tmp_path, code):
+    path = tmp_path / "code.py"
+    path.write_text(f"named = oneself = 1\n{code}\n", encoding="utf-8")
+    assert [finding.line for finding in language.find_role_words(path, "code.py")] == [2]
+
+
 def test_finding_has_the_line_of_the_phrase(tmp_path):
     path = tmp_path / "page.md"
     path.write_text("# Title\n\nFirst line\nof a paragraph beside it.\n", encoding="utf-8")

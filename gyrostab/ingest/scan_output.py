@@ -176,26 +176,26 @@ def _format_number(value: float) -> str:
     return f"{value:.6g}" if math.isfinite(value) else ""
 
 
-def print_inspection(found: InspectedFile) -> None:
+def print_inspection(inspected: InspectedFile) -> None:
     """Print the columns of a file and the guess; in a pipe every line begins with ``#``."""
-    rows = _inspection_rows(found)
-    guess = found.guess
+    rows = _inspection_rows(inspected)
+    guess = inspected.guess
     lines = [
         *guess.reasons,
         *(f"check: {warning}" for warning in guess.warnings),
-        *found.inspection.notes,
-        *(found.inspection.summary.notes if found.row is None else found.row["notes"]),
+        *inspected.inspection.notes,
+        *(inspected.inspection.summary.notes if inspected.row is None else inspected.row["notes"]),
     ]
-    if found.row is not None:
-        read = found.row
+    if inspected.row is not None:
+        read = inspected.row
         lines.append(
             f"read so: {_format_span(read['span_s'])} at {read['rate_hz']:.6g} Hz, axes "
             f"{read['axes']}, {100 * read['missing_share']:.2f} % missing"
         )
-    if found.error is not None and guess.axes:
-        lines.append(f"not readable by this guess: {found.error}")
+    if inspected.error is not None and guess.axes:
+        lines.append(f"not readable by this guess: {inspected.error}")
     if not sys.stdout.isatty():
-        print(f"# {found.paths[0]}: {len(rows)} columns, {found.inspection.rows} rows")
+        print(f"# {inspected.paths[0]}: {len(rows)} columns, {inspected.inspection.rows} rows")
         for row in [INSPECTION_COLUMNS, *rows]:
             print("# " + "\t".join(row))
         _print_wrapped(lines)
@@ -204,7 +204,7 @@ def print_inspection(found: InspectedFile) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    framed = Table(title=escape(f"{found.paths[0]}: {found.inspection.rows:,} rows"))
+    framed = Table(title=escape(f"{inspected.paths[0]}: {inspected.inspection.rows:,} rows"))
     for heading in INSPECTION_COLUMNS:
         framed.add_column(
             heading.replace("_", " "),

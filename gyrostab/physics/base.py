@@ -200,7 +200,7 @@ class Effect:
             )
         for definition in self.parameters():
             if definition.many and self.axes:
-                self.each(definition.name, self.axes)
+                self.expand_to_axes(definition.name, self.axes)
 
     @classmethod
     def parameters(cls) -> tuple[Parameter, ...]:
@@ -260,7 +260,7 @@ class Effect:
         """Map each channel of `channels` to its name in the log."""
         return dict(zip(self.channels, self.driver or self.channels, strict=True))
 
-    def each(self, name: str, axes: tuple[str, ...]) -> Array:
+    def expand_to_axes(self, name: str, axes: tuple[str, ...]) -> Array:
         """Expand a parameter to one number per axis; one number applies to all, none means zeros.
 
         Raises

@@ -237,7 +237,7 @@ class GaussMarkov(Effect):
                 normal, self.correlation_time * chunk.rate, position
             )
             new_state.append((child, position))
-        return self.each("rms", chunk.setup.axes)[:, None] * unit, new_state
+        return self.expand_to_axes("rms", chunk.setup.axes)[:, None] * unit, new_state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """List correlation times from ten samples to a quarter of the record."""

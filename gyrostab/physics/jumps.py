@@ -145,7 +145,9 @@ class BiasJump(Effect):
         count = len(setup.axes)
         normal = restarts.standard_normal((len(setup.restarts), count))
         places = np.append(setup.restarts[:, 1].astype(np.float64), self.at * setup.rate)
-        jumps = np.concatenate([self.restart * normal, self.each("step", setup.axes)[None]])
+        jumps = np.concatenate(
+            [self.restart * normal, self.expand_to_axes("step", setup.axes)[None]]
+        )
         order = np.argsort(places, kind="stable")
         levels = np.cumsum(np.concatenate([np.zeros((1, count)), jumps[order]]), axis=0)
         mean = HOUR * setup.rate / self.shocks_per_hour if self.shocks_per_hour else math.inf
@@ -270,7 +272,7 @@ class Telegraph(Effect):
         unit = np.stack(
             [step_means(*_run_process(row, end, switch), chunk.first, chunk.size) for row in state]
         )
-        return self.each("step", chunk.setup.axes)[:, None] * unit, state
+        return self.expand_to_axes("step", chunk.setup.axes)[:, None] * unit, state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """List mean times at both levels, from ten samples to a quarter of the record."""

@@ -87,7 +87,7 @@ class SpectralLine(Effect):
         """Draw the stationary state of the oscillator, or the phases of a steady line [radian]."""
         if math.isinf(self.quality):
             if self.phase:
-                return np.radians(self.each("phase", setup.axes))
+                return np.radians(self.expand_to_axes("phase", setup.axes))
             return np.full(len(setup.axes), rng.uniform(0.0, 2.0 * math.pi))
         from gyrostab.kernels.random.coloured import draw_state, oscillator
 
@@ -96,7 +96,7 @@ class SpectralLine(Effect):
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Compute the rate contribution [degree hour-1] of every sample."""
-        amplitude = self.each("amplitude", chunk.setup.axes)[:, None]
+        amplitude = self.expand_to_axes("amplitude", chunk.setup.axes)[:, None]
         if isinstance(state, np.ndarray):
             cycles = self.frequency / chunk.rate
             middle: Array = (
@@ -216,7 +216,7 @@ class RotationLine(Effect):
         """Compute the rate contribution [degree hour-1] of every sample."""
         rotation = chunk.drivers["rotation_rate"]
         middle, inside, state = turns_of_samples(self.order * rotation, chunk.rate, state)
-        amplitude = self.each("amplitude", chunk.setup.axes)
+        amplitude = self.expand_to_axes("amplitude", chunk.setup.axes)
         lines = self._sum_lines(middle, inside, chunk.setup.axes, amplitude)
         return lines * (np.abs(rotation) >= _LEAST_TURNING_DEG_S), state
 
@@ -225,7 +225,7 @@ class RotationLine(Effect):
     ) -> Array:
         """Sum the averaged lines of amplitude one."""
         total = np.zeros((len(axes), middle.size))
-        phase = np.radians(self.each("phase", axes))[:, None]
+        phase = np.radians(self.expand_to_axes("phase", axes))[:, None]
         for k in range(1, int(self.harmonics) + 1):
             total += k**-self.rolloff * turn_means(k * middle, k * inside, k * phase)
         return amplitude[:, None] * total

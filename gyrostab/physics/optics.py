@@ -452,7 +452,7 @@ class SharedSource(Effect):
                 rng.standard_normal((chunk.size, 2)), time * chunk.rate, position
             )
             common = common / math.sqrt(2.0 * time)
-        return 60.0 * self.each("N", chunk.setup.axes)[:, None] * common, (rng, position)
+        return 60.0 * self.expand_to_axes("N", chunk.setup.axes)[:, None] * common, (rng, position)
 
     def _time_constant(self) -> float:
         return 1.0 / (2.0 * math.pi * self.bandwidth)

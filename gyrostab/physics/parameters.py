@@ -34,7 +34,7 @@ class Parameter:
     choices : tuple of str
         Allowed words of a text parameter.
     many : bool
-        Whether it has one number per axis; see `Effect.each`.
+        Whether it has one number per axis; see `Effect.expand_to_axes`.
     source : str
         Source of the typical size: author and year, or "estimate".
     """

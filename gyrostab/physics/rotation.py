@@ -323,8 +323,8 @@ class EarthRate(Effect):
     def directions(self, axes: tuple[str, ...]) -> tuple[Array, Array]:
         """Compute the angles of the axes from the tool's axis and around it [radian]."""
         if self.off or self.around:  # across the tool by default
-            off = self.each("off", axes) if self.off else np.full(len(axes), 90.0)
-            return np.radians(off), np.radians(self.each("around", axes))
+            off = self.expand_to_axes("off", axes) if self.off else np.full(len(axes), 90.0)
+            return np.radians(off), np.radians(self.expand_to_axes("around", axes))
         angles = {"x": (90.0, 0.0), "y": (90.0, 90.0), "z": (0.0, 0.0)}
         for axis in axes:
             if axis[-1:].lower() not in angles:
@@ -502,7 +502,7 @@ class RealMotion(Effect):
                 chunk.rate * HOUR
             )
             tilt = float(angle[-1])
-        return self.each("direction", chunk.setup.axes)[:, None] * motion, (
+        return self.expand_to_axes("direction", chunk.setup.axes)[:, None] * motion, (
             reading,
             rng,
             position,
@@ -521,7 +521,7 @@ class RealMotion(Effect):
         """Predict window means of rotation and tilt, and the coherent spectrum of the sway."""
         from gyrostab.kernels.random.coloured import folded_psd, oscillator_psd
 
-        direction = self.each("direction", windows.axes)[:, None]
+        direction = self.expand_to_axes("direction", windows.axes)[:, None]
         mean = {}
         if "rotation_rate" in windows.drivers:
             mean["spin"] = direction * HOUR * windows.drivers["rotation_rate"]

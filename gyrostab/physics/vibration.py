@@ -284,7 +284,7 @@ class AliasedVibration(Effect):
             reading,
             rng,
             draw_state(reading, rng.standard_normal(reading.read.size)),
-            self.each("sensitivity", setup.axes),
+            self.expand_to_axes("sensitivity", setup.axes),
         )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:

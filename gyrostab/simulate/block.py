@@ -232,5 +232,5 @@ def check_effects(steps: Sequence[Step]) -> list[Step]:
     for step in steps:
         for item in step.effect.parameters():
             if item.many and getattr(step.effect, item.name):
-                step.effect.each(item.name, step.setup.axes)
+                step.effect.expand_to_axes(item.name, step.setup.axes)
     return list(steps)

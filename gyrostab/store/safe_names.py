@@ -35,8 +35,8 @@ def is_storable(name: str) -> bool:
     return _STORABLE.fullmatch(name) is not None and len(name.encode()) <= _MAX_NAME_BYTES
 
 
-def make_name_storable(name: str, taken: Iterable[Any], *, kind: str = "channel") -> str:
-    """Make a name that files can hold, not among those `taken`.
+def make_name_storable(name: str, used_names: Iterable[Any], *, kind: str = "channel") -> str:
+    """Make a name that files can hold, not among those `used_names`.
 
     Examples
     --------
@@ -46,7 +46,7 @@ def make_name_storable(name: str, taken: Iterable[Any], *, kind: str = "channel"
     plain = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_")[: _MAX_NAME_BYTES // 2]
     plain = plain if plain[:1].isalpha() else f"{kind}_{plain}".rstrip("_")
     safe, number = plain, 1
-    while safe in taken:
+    while safe in used_names:
         number += 1
         safe = f"{plain}_{number}"
     return safe

@@ -90,7 +90,7 @@ def split_instant(text: str) -> tuple[int, int, int, int] | None:
     return year, month, day, seconds * NANOSECONDS + int((fraction or "0")[:9].ljust(9, "0"))
 
 
-def stamp_ns(start: Any, what: str = "start") -> int:
+def stamp_ns(start: Any, name: str = "start") -> int:
     """Convert an instant, as text or as nanoseconds since 1970, to nanoseconds since 1970.
 
     Parameters
@@ -121,18 +121,18 @@ def stamp_ns(start: Any, what: str = "start") -> int:
     except (ValueError, TypeError, OverflowError, AttributeError) as error:
         example = "2026-11-20T14:00:00 (UTC)"
         raise OptionError(
-            f"{what} {start!r} is not a date and time; write for instance {example}"
+            f"{name} {start!r} is not a date and time; write for instance {example}"
         ) from error
     if abs(stamp) >= 2**63:
         raise OptionError(
-            f"{what} {start!r} is outside the years 1678 to 2262, which 64-bit nanoseconds hold; "
+            f"{name} {start!r} is outside the years 1678 to 2262, which 64-bit nanoseconds hold; "
             "give another date"
         )
     return stamp
 
 
-def check_rate(rate: float, what: str) -> None:
-    """Check that a number can be a sampling rate; `what` is its name in the message.
+def check_rate(rate: float, name: str) -> None:
+    """Check that a number can be a sampling rate; `name` begins the message.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def check_rate(rate: float, what: str) -> None:
     """
     if not 0 < rate <= MAX_RATE_HZ:  # false for nan too
         raise OptionError(
-            f"{what} {rate:g}: give the sampling rate in Hz, "
+            f"{name} {rate:g}: give the sampling rate in Hz, "
             f"a number above 0 and at most {MAX_RATE_HZ:g}"
         )
 

@@ -45,7 +45,7 @@ def sizes_by_axis(effect: Effect, name: str, axes: tuple[str, ...]) -> Array:
     """Return a parameter for each axis."""
     parameters = {parameter.name: parameter for parameter in effect.parameters()}
     return (
-        effect.each(name, axes)
+        effect.expand_to_axes(name, axes)
         if parameters[name].many
         else np.full(len(axes), float(getattr(effect, name)))
     )

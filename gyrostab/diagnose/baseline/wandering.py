@@ -26,12 +26,12 @@ class Wandering(NamedTuple):
     power: Array  # (axis, block): power of all of them in the lowest band [degree2 hour-2 Hz-1]
 
 
-def is_described_by_variance(seen: Prediction) -> bool:
+def is_described_by_variance(visible: Prediction) -> bool:
     """Return whether the variance fully describes what an effect does to the means at random.
 
     It does for a constant correlation time without steps.
     """
-    return not seen.levels and all(_is_steady(*process) for process in seen.wander.values())
+    return not visible.levels and all(_is_steady(*process) for process in visible.wander.values())
 
 
 def _is_steady(time: float, variance: Array) -> bool:

@@ -115,7 +115,7 @@ def _fit_identification(
         many
         or filtered
         or any(statistic.is_pairwise for statistic in statistics)
-        or any(not component.candidate.each for component in identification.components)
+        or any(not component.candidate.is_per_axis for component in identification.components)
     )
     if fitted_together:
         return [
@@ -158,7 +158,7 @@ def _split_harmonics(identification: Identification, state: State) -> list[list[
     turning = [
         component
         for component in identification.components
-        if component.statistic.is_rotation and component.candidate.each
+        if component.statistic.is_rotation and component.candidate.is_per_axis
     ]
     sets = harmonic_sets(state.blocks.sizes["harmonic"]) if turning else []
     harmonics = sorted({k for component in turning for k in sets[component.place]})

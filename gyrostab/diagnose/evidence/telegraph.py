@@ -262,7 +262,7 @@ def _make_courses(fit: _Fit, y: Array, weight: Array, columns_given: Array) -> T
 
 
 def simulated_courses(
-    found: TelegraphCourses,
+    courses: TelegraphCourses,
     variance: Array,
     present: NDArray[np.bool_],
     *,
@@ -274,7 +274,7 @@ def simulated_courses(
 
     Parameters
     ----------
-    found : TelegraphCourses
+    courses : TelegraphCourses
         Of one record.
     variance, present
         As in `telegraph_courses`.
@@ -287,12 +287,12 @@ def simulated_courses(
     -------
     log, share : ndarray, shapes (record,) and (record, block)
     """
-    n, (low, high) = present.size, found.times[0]
+    n, (low, high) = present.size, courses.times[0]
     share = np.stack([_simulate_course(n, low, high, rng) for _ in range(count)])
-    noise = np.sqrt(variance * found.scale[0]) * rng.standard_normal(share.shape)
-    y = np.where(present, found.step[0] * share + noise, 0.0)
-    size = np.tile([0.0, found.step[0]], (count, 1))
-    fit = _Fit(size, np.tile(found.times[0], (count, 1)), np.full(count, found.scale[0]), parts)
+    noise = np.sqrt(variance * courses.scale[0]) * rng.standard_normal(share.shape)
+    y = np.where(present, courses.step[0] * share + noise, 0.0)
+    size = np.tile([0.0, courses.step[0]], (count, 1))
+    fit = _Fit(size, np.tile(courses.times[0], (count, 1)), np.full(count, courses.scale[0]), parts)
     return _smooth_courses(
         fit, y, np.where(present, 1.0 / np.where(present, variance, 1.0), 0.0), np.ones((n, 1))
     )[:2]

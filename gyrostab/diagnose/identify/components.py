@@ -33,29 +33,31 @@ __all__ = [
 PLAIN_LINE = "spectral_line"
 
 
-def find_components(found: CandidateEvidence, *, settings: Settings = DEFAULTS) -> list[Component]:
+def find_components(
+    evidence: CandidateEvidence, *, settings: Settings = DEFAULTS
+) -> list[Component]:
     """Return the rows of a candidate with enough evidence, or the best one."""
-    evidence_nats = found.evidence_nats[0]
+    evidence_nats = evidence.evidence_nats[0]
     rows = [row for row, nats in enumerate(evidence_nats) if nats > settings.component_nats]
     rows = rows or [int(evidence_nats.argmax())]
     return [
         Component(
-            found.candidate,
-            found.best[number],
-            found.rows[number],
+            evidence.candidate,
+            evidence.best[number],
+            evidence.rows[number],
             float(evidence_nats[number]),
-            int(found.place[0, number]) if found.place.size else -1,
+            int(evidence.place[0, number]) if evidence.place.size else -1,
         )
         for number in rows
     ]
 
 
 def group_components(
-    found: Sequence[CandidateEvidence], *, settings: Settings = DEFAULTS
+    all_evidence: Sequence[CandidateEvidence], *, settings: Settings = DEFAULTS
 ) -> dict[str, list[Component]]:
     """Return the components of each effect with enough evidence, the strongest first."""
     out: dict[str, list[Component]] = {}
-    for evidence in found:
+    for evidence in all_evidence:
         out.setdefault(evidence.candidate.key, []).extend(
             find_components(evidence, settings=settings)
         )

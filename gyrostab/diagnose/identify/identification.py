@@ -234,43 +234,43 @@ def remove_phase_locked(
     return replace(identifications, identified=tuple(identified)), evidence_nats
 
 
-def add_identification(chosen: Sequence[Selection], one: Selection) -> list[Selection]:
+def add_identification(chosen: Sequence[Selection], addition: Selection) -> list[Selection]:
     """Return the list with another selection; one of the same effect and channel is merged with it.
 
     Lines of other frequencies are not merged.
     """
     for place, other in enumerate(chosen):
         if (
-            isinstance(one, Identification)
+            isinstance(addition, Identification)
             and isinstance(other, Identification)
-            and _is_same_effect(one, other)
+            and _is_same_effect(addition, other)
         ):
-            axes = tuple(sorted({*other.axes, *one.axes}))
-            alternatives = tuple(dict.fromkeys([*other.alternatives, *one.alternatives]))
+            axes = tuple(sorted({*other.axes, *addition.axes}))
+            alternatives = tuple(dict.fromkeys([*other.alternatives, *addition.alternatives]))
             merged = replace(
                 other,
                 axes=axes,
-                components=(*other.components, *one.components),
-                evidence_nats=other.evidence_nats + one.evidence_nats,
+                components=(*other.components, *addition.components),
+                evidence_nats=other.evidence_nats + addition.evidence_nats,
                 alternatives=alternatives,
             )
             return [*chosen[:place], merged, *chosen[place + 1 :]]
-    return [*chosen, one]
+    return [*chosen, addition]
 
 
 def with_axes_of(
     identification: Identification,
-    again: Mapping[str, Sequence[Component]],
+    components_by_key: Mapping[str, Sequence[Component]],
     *,
     settings: Settings = DEFAULTS,
 ) -> Identification:
     """Return an identification without the axes on which it adds no evidence.
 
-    `again` has the components that were found with all others in the model.
+    `components_by_key` has the components that were found with all others in the model.
     """
     shown_axes = {
         axis
-        for component in again.get(identification.components[0].candidate.key, [])
+        for component in components_by_key.get(identification.components[0].candidate.key, [])
         if component.evidence_nats > settings.component_nats
         for axis in component.row
     }
@@ -298,15 +298,15 @@ def _is_same_effect(first: Identification, other: Identification) -> bool:
 
 
 def find_unidentified(
-    key: str, components: Sequence[Component], threshold: float, near: Sequence[str]
+    key: str, components: Sequence[Component], threshold: float, nearest: Sequence[str]
 ) -> Unidentified:
-    """Return what a nuisance alternative explains; `near` are the effects that come nearest."""
+    """Return what a nuisance alternative explains; `nearest` are the effects that come nearest."""
     return Unidentified(
         key,
         axes_of(components, ()),
         sum_evidence(components),
         threshold,
-        tuple(dict.fromkeys(near)),
+        tuple(dict.fromkeys(nearest)),
         tuple(components),
     )
 

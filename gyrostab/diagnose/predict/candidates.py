@@ -50,7 +50,7 @@ class Prospect(NamedTuple):
     """An effect with given nuisance values, before a statistic makes variants of it."""
 
     values: dict[str, Any]
-    seen: Prediction  # from `gyrostab.physics.base.Effect.explain`
+    prediction: Prediction  # from `gyrostab.physics.base.Effect.explain`
     blocks: xr.Dataset
     coefficient: xr.DataArray  # ``(axis, term)``: noise of the baseline
 
@@ -66,7 +66,9 @@ class Candidate:
     driver: tuple[str, ...]
     variants: tuple[Variant, ...]  # over the grid of nuisance parameters
     reference: tuple[str, ...] = ()  # reference channel or axis of each column, for a transfer
-    each: bool = True  # whether every axis has its own size; otherwise one size holds for all
+    is_per_axis: bool = (
+        True  # whether every axis has its own size; otherwise one size holds for all
+    )
 
     @property
     def key(self) -> str:

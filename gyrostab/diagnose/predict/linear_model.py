@@ -121,10 +121,10 @@ def band_widths(blocks: xr.Dataset) -> Array:
     return np.asarray(blocks["band_high"].values - blocks["band_low"].values)
 
 
-def mix_with_mean(density: Array, near: Array, width: Array) -> Array:
-    """Spread a density (..., band) over all bands, except for its share `near` (...)."""
+def mix_with_mean(density: Array, unspread: Array, width: Array) -> Array:
+    """Spread a density (..., band) over all bands, except for its share `unspread` (...)."""
     level = (density * width).sum(axis=-1, keepdims=True) / width.sum()
-    return np.asarray(near[..., None] * density + (1.0 - near[..., None]) * level)
+    return np.asarray(unspread[..., None] * density + (1.0 - unspread[..., None]) * level)
 
 
 def select_row(density: Array, row: int) -> Array:

@@ -62,7 +62,7 @@ def compute_evidence(
     trial = Trial(data, state, folds, count_evidence, rng)
     groups: dict[tuple[object, ...], list[Candidate]] = {}
     for candidate in candidates:
-        kind = (candidate.statistic, candidate.reference, candidate.each)
+        kind = (candidate.statistic, candidate.reference, candidate.is_per_axis)
         groups.setdefault(kind, []).append(candidate)
     return [
         evidence
@@ -72,7 +72,7 @@ def compute_evidence(
 
 
 def reusable_evidence(
-    found: Sequence[CandidateEvidence], before: State, now: State
+    all_evidence: Sequence[CandidateEvidence], before: State, now: State
 ) -> list[CandidateEvidence]:
     """Return the evidence that is still valid in another state.
 
@@ -86,12 +86,12 @@ def reusable_evidence(
         and np.array_equal(before.masked, now.masked)
     )
     if is_same_model and before.blocks.equals(now.blocks):
-        return [evidence for evidence in found if not evidence.candidate.statistic.is_line]
+        return [evidence for evidence in all_evidence if not evidence.candidate.statistic.is_line]
     left, right = (
         state.blocks.drop_vars(_TAIL_VARIABLES, errors="ignore") for state in (before, now)
     )
     return (
-        [evidence for evidence in found if evidence.candidate.statistic.is_in_means]
+        [evidence for evidence in all_evidence if evidence.candidate.statistic.is_in_means]
         if left.equals(right)
         else []
     )
@@ -110,10 +110,10 @@ def _is_given_alike(before: State, now: State, statistics: Collection[str]) -> b
     return left == right
 
 
-def evidence_by_effect(found: Sequence[CandidateEvidence]) -> dict[str, Array]:
+def evidence_by_effect(all_evidence: Sequence[CandidateEvidence]) -> dict[str, Array]:
     """Sum up the evidence (record,) of every effect by the key of its candidates."""
     rows: dict[str, list[Array]] = {}
-    for evidence in found:
+    for evidence in all_evidence:
         rows.setdefault(evidence.candidate.key, []).append(evidence.evidence_nats)
     return {
         key: combine_rows(np.concatenate(row_evidence, axis=1))

@@ -93,7 +93,7 @@ def outlier_limit(samples: float) -> float:
 
 
 def count_outliers(
-    histogram: NDArray[np.uint32], found: Sequence[Sequence[Peaks]]
+    histogram: NDArray[np.uint32], peaks: Sequence[Sequence[Peaks]]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Count outliers, and weigh them: beyond twice the limit one counts three times.
 
@@ -110,7 +110,7 @@ def count_outliers(
     ----------
     histogram : ndarray, shape (axis, block, `HISTOGRAM`)
         Numbers of departures by size.
-    found : sequence of sequence of Peaks
+    peaks : sequence of sequence of Peaks
         Of each axis, with block indices of the record.
 
     Returns
@@ -145,7 +145,7 @@ def count_outliers(
     usual = np.maximum(np.maximum(narrow, wide), 0.1 * _deviation_from_median(sums[:, -1:]))
     scale = np.where(adjacent > _NOISIER_NEIGHBOUR_RATIO * usual, adjacent, usual)
     number, outliers = np.zeros((2, *scale.shape), np.int64)
-    for axis, batches in enumerate(found):
+    for axis, batches in enumerate(peaks):
         limit = _fluctuating_level_limit(histogram[axis], scale[axis])
         for batch_peaks in batches:
             departure = batch_peaks.size / np.maximum(

@@ -75,7 +75,9 @@ def _rotating_blocks(blocks: xr.Dataset, settings: Settings) -> NDArray[np.bool_
     return np.asarray(turn > settings.rest_share * turn.max(initial=0.0))
 
 
-def join_blocks(there: NDArray[np.bool_], begin: Array, end: Array) -> list[tuple[float, float]]:
+def join_blocks(
+    is_inside: NDArray[np.bool_], begin: Array, end: Array
+) -> list[tuple[float, float]]:
     """Join blocks to stretches of time [s], with short pauses bridged.
 
     An intermittent effect with many stretches gets the whole record.
@@ -86,14 +88,14 @@ def join_blocks(there: NDArray[np.bool_], begin: Array, end: Array) -> list[tupl
     >>> join_blocks(np.array([0, 0, 1, 1, 1, 0, 0, 0, 0, 0], bool), t, t + 1)
     [(2.0, 5.0)]
     """
-    if there.mean() > 0.9:
+    if is_inside.mean() > 0.9:
         return [(float(begin[0]), float(end[-1]))]
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int))).reshape(
-        -1, 2
-    )
+    edges = np.flatnonzero(
+        np.diff(np.concatenate([[False], is_inside, [False]]).astype(int))
+    ).reshape(-1, 2)
     joined: list[list[int]] = []
     for first, stop in edges.tolist():
-        if joined and first - joined[-1][1] <= max(1, there.size // 50):
+        if joined and first - joined[-1][1] <= max(1, is_inside.size // 50):
             joined[-1][1] = stop
         else:
             joined.append([first, stop])
@@ -103,7 +105,7 @@ def join_blocks(there: NDArray[np.bool_], begin: Array, end: Array) -> list[tupl
 
 
 def attribute_mismatches(
-    found: xr.Dataset,
+    located: xr.Dataset,
     identified: Sequence[Identification],
     blocks: xr.Dataset,
     after: xr.Dataset,
@@ -125,7 +127,7 @@ def attribute_mismatches(
 
     Parameters
     ----------
-    found : xarray.Dataset
+    located : xarray.Dataset
         Mismatches from `gyrostab.diagnose.locate.mismatches.locate_mismatches`.
     blocks, after : xarray.Dataset
         The recording, and the baseline with the effects.
@@ -136,8 +138,8 @@ def attribute_mismatches(
         Line spectra of the recording without the blocks in which an effect moves the rate.
     """
     regions = [
-        {str(name): found[name].values[number] for name in found.data_vars}
-        for number in range(found.sizes["mismatch"])
+        {str(name): located[name].values[number] for name in located.data_vars}
+        for number in range(located.sizes["mismatch"])
     ]
     score_with = partial(statistic_scores, still=still, settings=settings)
     scores = score_with(blocks, after, null, regions, identified)
@@ -213,7 +215,7 @@ def attribute_mismatches(
 
 
 def drop_expected(
-    found: xr.Dataset,
+    located: xr.Dataset,
     expected: Sequence[Identification],
     blocks: xr.Dataset,
     before: xr.Dataset,
@@ -226,7 +228,7 @@ def drop_expected(
 
     Parameters
     ----------
-    found : xarray.Dataset
+    located : xarray.Dataset
         Mismatches located with the expected anomalous samples left out. Effects with such samples
         therefore explain mismatches of the sample distribution only.
     blocks, before : xarray.Dataset
@@ -246,15 +248,15 @@ def drop_expected(
     ]
     by_count, by_all = (
         attribute_mismatches(
-            found, identified, blocks, before, null, level=level, settings=settings
+            located, identified, blocks, before, null, level=level, settings=settings
         )
         for identified in (anomalous, not_anomalous)
     )
     is_expected = [
         bool(named) or (bool(counted) and statistic == "distribution")
-        for statistic, counted, named in zip(found["view"].values, by_count, by_all, strict=True)
+        for statistic, counted, named in zip(located["view"].values, by_count, by_all, strict=True)
     ]
-    return found.isel(mismatch=~np.array(is_expected, np.bool_)) if expected else found
+    return located.isel(mismatch=~np.array(is_expected, np.bool_)) if expected else located
 
 
 def _is_caused_elsewhere(

@@ -148,7 +148,7 @@ def _mismatch(
 
 
 def mismatch_tables(
-    found: xr.Dataset,
+    located: xr.Dataset,
     explained: Sequence[Sequence[str]],
     identifications: Identifications,
     blocks: xr.Dataset,
@@ -156,7 +156,7 @@ def mismatch_tables(
     settings: Settings = DEFAULTS,
 ) -> list[dict[str, Any]]:
     """Return the mismatches that were located, identified or left out, each with its sentence."""
-    out = _located_mismatches(found, blocks, explained)
+    out = _located_mismatches(located, blocks, explained)
     out += identified_mismatches(identifications, blocks, out, settings=settings)
     out += unidentified_mismatches(identifications, blocks, out)
     out += motion_mismatches(identifications.identified, blocks)
@@ -406,11 +406,11 @@ def _families_of(fitted: Sequence[Fitted], blocks: xr.Dataset) -> list[str | Non
     return families
 
 
-def limit_tables(found: Mapping[str, UpperLimit]) -> dict[str, Any]:
+def limit_tables(limits: Mapping[str, UpperLimit]) -> dict[str, Any]:
     """Return the upper limit of each effect that was not found, and why it was not."""
     return {
         name: {"upper_limit": limit.upper_limit, "unit": limit.unit, "reason": limit.reason}
-        for name, limit in found.items()
+        for name, limit in limits.items()
     }
 
 

@@ -126,9 +126,13 @@ class CrossSpectrum(Statistic):
 
     def design(self, case: Prospect) -> Iterator[Variant]:
         """Yield cross-densities per product of the factors of both axes."""
-        if not case.seen.coherent or case.seen.line is not None or "cross" not in case.blocks:
+        if (
+            not case.prediction.coherent
+            or case.prediction.line is not None
+            or "cross" not in case.blocks
+        ):
             return
-        for name, density in case.seen.spectrum.items():
+        for name, density in case.prediction.spectrum.items():
             yield Variant(case.values, (name,), with_axis(density)[None], squared=True)
 
     def rows(self, candidate: Candidate, state: State) -> list[tuple[str, ...]]:

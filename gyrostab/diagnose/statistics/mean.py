@@ -150,7 +150,7 @@ class Mean(BlockMeanStatistic):
     def design(self, case: Prospect) -> Iterator[Variant]:
         """Yield designs of the mean that are not constant; the constant is free."""
         columns = {}
-        for name, design in case.seen.mean.items():
+        for name, design in case.prediction.mean.items():
             moved = design - design.mean(axis=-1, keepdims=True)
             if np.isfinite(moved).all() and np.abs(moved).max() > 1e-9 * np.abs(design).max(
                 initial=1e-300

@@ -132,7 +132,7 @@ class Power(Statistic):
         frequency = case.blocks["frequency"].values
         rate = float(case.blocks.attrs["sampling_rate_hz"])
         level: dict[str, Array] = {}
-        for (symbol, name), share in case.seen.level.items():
+        for (symbol, name), share in case.prediction.level.items():
             square = (
                 case.coefficient.sel(term=symbol).values ** 2
                 if symbol in case.coefficient["term"].values
@@ -145,11 +145,11 @@ class Power(Statistic):
             )
             level[name] = level.get(name, 0.0) + component
         spectrum = {}
-        if case.seen.line is None:
+        if case.prediction.line is None:
             spectrum = {
                 name: with_axis(density)
-                for name, density in case.seen.spectrum.items()
-                if _changes_over_time(density) or not case.seen.coherent
+                for name, density in case.prediction.spectrum.items()
+                if _changes_over_time(density) or not case.prediction.coherent
             }
         for columns, squared in ((level, False), (spectrum, True)):
             densities = {
@@ -164,11 +164,11 @@ class Power(Statistic):
                     np.stack([densities[name] for name in chosen]),
                     squared=squared,
                 )
-        if case.seen.response is not None:
+        if case.prediction.response is not None:
             yield Variant(
                 case.values,
                 (),
-                _filter_change(case.seen.response, case.coefficient, frequency, rate)[None],
+                _filter_change(case.prediction.response, case.coefficient, frequency, rate)[None],
             )
 
     def model(

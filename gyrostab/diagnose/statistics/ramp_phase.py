@@ -107,7 +107,7 @@ class RampPhase(Statistic):
             return
         profiles = {
             name: design
-            for name, design in case.seen.phase_locked.items()
+            for name, design in case.prediction.phase_locked.items()
             if np.isfinite(design).all() and np.ptp(design) > 0
         }
         for chosen in column_choices(list(profiles)):

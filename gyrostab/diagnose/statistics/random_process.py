@@ -42,7 +42,7 @@ class RandomProcess(BlockMeanStatistic):
     def design(self, case: Prospect) -> Iterator[Variant]:
         """Yield processes slower than half a block."""
         block = float(case.blocks.attrs["block_s"])
-        for name, (time, variance) in case.seen.wander.items():
+        for name, (time, variance) in case.prediction.wander.items():
             if time >= block / 2.0:
                 yield Variant(
                     case.values, (name,), np.asarray(variance)[None], squared=True, time=time

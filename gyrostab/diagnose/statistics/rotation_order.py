@@ -60,7 +60,7 @@ class RotationOrder(Statistic):
         if "order" not in case.blocks:
             return
         count = case.blocks.sizes["harmonic"]
-        for name, pattern in case.seen.order.items():
+        for name, pattern in case.prediction.order.items():
             yield Variant(case.values, (name,), pattern[None, :, :count])
 
     def candidates(
@@ -75,7 +75,7 @@ class RotationOrder(Statistic):
         """Return the candidates, with one size for all axes unless the effect has several."""
         many = {item.name for item in kind.parameters() if item.many}
         return [
-            replace(candidate, each=bool(many & set(candidate.variants[0].columns)))
+            replace(candidate, is_per_axis=bool(many & set(candidate.variants[0].columns)))
             for candidate in super().candidates(
                 kind, driver, predictions, windows, blocks, coefficient
             )
@@ -83,7 +83,7 @@ class RotationOrder(Statistic):
 
     def rows(self, candidate: Candidate, state: State) -> list[tuple[str, ...]]:
         """Return each axis, or all axes of one size together."""
-        if candidate.each:
+        if candidate.is_per_axis:
             return super().rows(candidate, state)
         pattern = np.abs(candidate.variants[0].design[0]).max(axis=-1)
         return [tuple(axis for axis, size in zip(state.axes, pattern, strict=True) if size > 0)]
@@ -95,7 +95,7 @@ class RotationOrder(Statistic):
         values = records_last(data["order"].values, 3)
         weight = order_weight(state)
         count = weight.shape[-1]
-        if candidates[0].each:
+        if candidates[0].is_per_axis:
             cell_weight = np.concatenate([weight[row], weight[row]], axis=1)
             designs = [
                 stack_columns(order_columns(np.ones(count, complex), chosen), cell_weight.shape)
@@ -142,7 +142,7 @@ class RotationOrder(Statistic):
         """Condition on a component in the rotation orders."""
         count = state.blocks.sizes["harmonic"]
         turn = np.abs(state.blocks["channel_rotation_rate"].values) / 360.0
-        if component.candidate.each:
+        if component.candidate.is_per_axis:
             chosen = harmonic_sets(count)[component.place]
             patterns = [(axis, np.ones(count, np.complex128)) for axis in component.row]
         else:
@@ -180,7 +180,7 @@ class RotationOrder(Statistic):
         for component in fit.components:
             size, sd, angle = fit_amplitude(component, fit.state)
             error = math.hypot(sd / max(size, 1e-300), fit.state.settings.size_error_share)
-            if not component.candidate.each:
+            if not component.candidate.is_per_axis:
                 across = size * float(np.abs(component.variant.design).max())
                 return {
                     "latitude": _latitude_from_rate(across, error * across),
@@ -203,7 +203,7 @@ def is_reversed(component: Component) -> bool:
     """Return whether the rotation is reversed: y at -90 degrees from x, or a reversed channel."""
     return (
         component.statistic.is_rotation
-        and not component.candidate.each
+        and not component.candidate.is_per_axis
         and component.place % 2 == 1
     )
 

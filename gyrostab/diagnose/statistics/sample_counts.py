@@ -135,8 +135,8 @@ class SampleCounts(Statistic):
 
     def design(self, case: Prospect) -> Iterator[Variant]:
         """Yield the counts that the effect raises."""
-        if case.seen.marks:
-            yield Variant(case.values, case.seen.marks, np.empty(0))
+        if case.prediction.marks:
+            yield Variant(case.values, case.prediction.marks, np.empty(0))
 
     def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
         """Compute the evidence in sample counts."""

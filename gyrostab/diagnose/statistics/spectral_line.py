@@ -104,13 +104,13 @@ class SpectralLine(Statistic):
     def design(self, case: Prospect) -> Iterator[Variant]:
         """Yield a line of constant frequency; the spectrum itself determines the frequency."""
         if (
-            case.seen.line is None
+            case.prediction.line is None
             or "line_power" not in case.blocks
-            or not case.seen.coherent
-            or np.ptp(case.seen.line) > 0
+            or not case.prediction.coherent
+            or np.ptp(case.prediction.line) > 0
         ):
             return
-        yield Variant({}, tuple(case.seen.spectrum), np.empty(0), squared=True)
+        yield Variant({}, tuple(case.prediction.spectrum), np.empty(0), squared=True)
 
     def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
         """Compute the evidence of one line on all axes, of any phase or of constant phase.

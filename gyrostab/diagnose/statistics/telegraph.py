@@ -47,8 +47,8 @@ class Telegraph(BlockMeanStatistic):
 
     def design(self, case: Prospect) -> Iterator[Variant]:
         """Yield two levels; the means determine the course and its times."""
-        if case.seen.levels:
-            yield Variant({}, (case.seen.levels,), np.empty(0))
+        if case.prediction.levels:
+            yield Variant({}, (case.prediction.levels,), np.empty(0))
 
     def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
         """Compute the evidence of a bias of two levels, by axis.

@@ -159,9 +159,9 @@ def distinct_columns(headers: Sequence[str]) -> Iterator[Header]:
         yield Header(source, header, name, unit, key=key)
 
 
-def free_name(stem: str, taken: Collection[str], number: int = 2) -> str:
+def free_name(stem: str, used_names: Collection[str], number: int = 2) -> str:
     """Return the first free name of the form stem plus number."""
-    while f"{stem}{number}" in taken or f"{stem}{number}".lower() in taken:
+    while f"{stem}{number}" in used_names or f"{stem}{number}".lower() in used_names:
         number += 1
     return f"{stem}{number}"
 

@@ -137,32 +137,34 @@ class Piece:
 class PlainPiece(Piece):
     """Values stored as they are, by their bits (int64)."""
 
-    kept: NDArray[Any] | _SpooledArray
+    values: NDArray[Any] | _SpooledArray
 
     @property
     def rows(self) -> int:  # type: ignore[override]
         """Number of rows."""
-        return self.kept.size
+        return self.values.size
 
     @property
     def memory_bytes(self) -> int:
         """Bytes in memory."""
-        return self.kept.nbytes
+        return self.values.nbytes
 
     def read_into(self, first: int, out: NDArray[Any]) -> None:
         """Read the values from row `first` on into `out`."""
         bits = out.view(np.int64)
-        if isinstance(self.kept, _SpooledArray) and bits.flags.c_contiguous:
-            self.kept.read_into(first, bits)
+        if isinstance(self.values, _SpooledArray) and bits.flags.c_contiguous:
+            self.values.read_into(first, bits)
         else:
-            bits[:] = self.kept[first : first + out.size]
+            bits[:] = self.values[first : first + out.size]
 
     def to_spool(self, spool: Spool) -> Piece:
         """Return the piece with its values moved to a spool."""
-        if not isinstance(self.kept, np.ndarray) or not self.kept.size:
+        if not isinstance(self.values, np.ndarray) or not self.values.size:
             return self
-        begin = spool.add(self.kept)
-        return replace(self, kept=_SpooledArray(spool, begin, self.kept.size, self.kept.dtype))
+        begin = spool.add(self.values)
+        return replace(
+            self, values=_SpooledArray(spool, begin, self.values.size, self.values.dtype)
+        )
 
 
 @dataclass(frozen=True)
@@ -177,7 +179,7 @@ class CountsPiece(PlainPiece):
         """Read the values from row `first` on into `out`."""
         from gyrostab.kernels.encoding.compact import unpack_counts
 
-        counts = self.kept[first : first + out.size]
+        counts = self.values[first : first + out.size]
         unpack_counts(counts, *self.grid, self.factor, self.offset, out)
 
 
@@ -362,10 +364,10 @@ class InspectedRows(Stacked):
         self.inspections = tuple(inspections)
 
 
-def stack_as_rows(columns: Sequence[Any], seen: Sequence[RowInspection] = ()) -> Any:
+def stack_as_rows(columns: Sequence[Any], inspections: Sequence[RowInspection] = ()) -> Any:
     """Stack columns as the rows of one array, without a copy if they already share one matrix."""
     if not isinstance(columns[0], np.ndarray):
-        return make_dask(InspectedRows(columns, seen), (1, CHUNK_ROWS))
+        return make_dask(InspectedRows(columns, inspections), (1, CHUNK_ROWS))
     matrix = columns[0].base
     same = matrix is not None and matrix.shape[:-1] == (len(columns),)
     return (

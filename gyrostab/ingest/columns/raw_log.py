@@ -54,7 +54,9 @@ class ConvertedBlock(NamedTuple):
     #: Range of the stamps of readable rows [ns since 1970]; high < low if there are none.
     low: int
     high: int
-    seen: RowInspection | None = None  # findings of the scan pass over values that stay in the file
+    inspection: RowInspection | None = (
+        None  # findings of the scan pass over values that stay in the file
+    )
 
 
 _NO_ROWS = np.empty(0, np.int64)
@@ -81,7 +83,7 @@ class RawLogBuilder:
         self.cell_places: list[str] = []
         self.bad_index: list[NDArray[np.int64]] = []
         self.low, self.high = np.iinfo(np.int64).max, NAT
-        self.seen: list[RowInspection] = []
+        self.inspections: list[RowInspection] = []
         self.whole: dict[int, tuple[float, float] | None] = {
             column.source: (0.0, 0.0) for column in [*self.gyro, *self.channels]
         }
@@ -157,7 +159,7 @@ class RawLogBuilder:
         if converted.cell_rows.size:
             self._note_cells(converted.cell_rows, converted.cells, locate)
         self.low, self.high = min(self.low, converted.low), max(self.high, converted.high)
-        self.seen += [converted.seen] if converted.seen is not None else []
+        self.inspections += [converted.inspection] if converted.inspection is not None else []
         self.buffers.add(converted.block)
 
     def _convert_column(
@@ -271,7 +273,9 @@ class RawLogBuilder:
         coords: dict[str, Any] = {}
         if self.gyro and self.plan.signal is not None:
             axes = [column.name for column in self.gyro]
-            stack = stack_as_rows([columns[column.source] for column in self.gyro], self.seen)
+            stack = stack_as_rows(
+                [columns[column.source] for column in self.gyro], self.inspections
+            )
             data[self.plan.signal] = (
                 ("axis", "row"),
                 stack,

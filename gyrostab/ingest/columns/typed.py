@@ -179,7 +179,7 @@ def _convert_span(
         block[column.source] = (
             piece if isinstance(piece, EvenStampsPiece) else FilePiece(read, begin, rows)
         )
-    return converted._replace(block=block, seen=inspection)
+    return converted._replace(block=block, inspection=inspection)
 
 
 def _read_values(

@@ -77,9 +77,9 @@ class PlacedLog:
         return np.asarray(self.runs[which, 0] + samples - self.runs[which, 1])
 
 
-def read_log_slices(wanted: Iterable[LogSlice]) -> dict[LogSlice, NDArray[np.float64]]:
+def read_log_slices(slices: Iterable[LogSlice]) -> dict[LogSlice, NDArray[np.float64]]:
     """Read the signals of slices (axis, sample) in parallel; NaN beyond the ends of a log."""
-    places = list(dict.fromkeys(wanted))
+    places = list(dict.fromkeys(slices))
     return dict(zip(places, map_in_order(_read_log_slice, places), strict=True))
 
 

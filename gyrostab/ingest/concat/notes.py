@@ -36,7 +36,7 @@ def merge_notes(notes_by_file: Iterable[tuple[str, Sequence[str]]]) -> list[str]
     return [f"{list_some(names)}: {note}" for note, names in pooled.items()]
 
 
-def first_notes(notes: Sequence[str], what: str) -> list[str]:
+def first_notes(notes: Sequence[str], subject: str) -> list[str]:
     """Return the first of many notes of one kind, and how many more there are."""
     more = len(notes) - _MAX_NAMED
-    return [*notes[:_MAX_NAMED], *([f"{more} more {what}"] if more > 0 else [])]
+    return [*notes[:_MAX_NAMED], *([f"{more} more {subject}"] if more > 0 else [])]

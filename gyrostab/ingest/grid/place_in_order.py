@@ -87,7 +87,7 @@ class _Placer:
         """Begin a piece; its first row is the next sample but one, or the first of the log."""
         ahead = find_phase(count[at], stamps[at], self.period, self.sigma)
         self.origin = int(stamps[at[0]]) + int(np.rint(ahead * self.period))
-        self.count0, self.level, self.phase, self.seen = int(count[at[0]]), 0, 0.0, 0
+        self.count0, self.level, self.phase, self.observed = int(count[at[0]]), 0, 0.0, 0
         self.base = int(count[at[0]] - count[0])
 
     def _set_first_sample(self, level: int) -> None:
@@ -120,7 +120,7 @@ class _Placer:
                 self.max_gap_ns / self.period,
                 self.level,
                 self.phase,
-                self.seen,
+                self.observed,
                 levels,
                 phases,
             )
@@ -134,10 +134,10 @@ class _Placer:
         level = np.where(nearest < 0, self.level, padded_levels[np.clip(nearest, 0, len(at))])
         done = int(np.searchsorted(at, n))
         if done:
-            self.level, self.phase, self.seen = (
+            self.level, self.phase, self.observed = (
                 int(levels[done - 1]),
                 float(phases[done - 1]),
-                self.seen + done,
+                self.observed + done,
             )
         self._add_rows(rows[:n], count[:n] - self.count0 + level + self.base, stamps[:n])
 

@@ -234,7 +234,7 @@ def estimate_near(stamps: Stamps, rate: float) -> RateEstimate | None:
     return None
 
 
-def is_far_worse(stamps: Stamps, near: RateEstimate, found: RateEstimate) -> bool:
+def is_far_worse(stamps: Stamps, given: RateEstimate, estimated: RateEstimate) -> bool:
     """Return whether a rate explains the stamps worse than the estimated rate by 0.2 nats a row.
 
     Both are compared along the most likely sequence of samples, also if single stamps give the
@@ -246,19 +246,19 @@ def is_far_worse(stamps: Stamps, near: RateEstimate, found: RateEstimate) -> boo
     >>> is_far_worse(stamps, estimate_near(stamps, 110.0), estimate_rate(stamps, where="tool.csv"))
     True
     """
-    found_jitter = found.jitter
-    if found_jitter is None and not found.counted:
+    jitter = estimated.jitter
+    if jitter is None and not estimated.counted:
         parts = sample_stretches(partial(recut_blocks, stamps, _BLOCK))
-        found_jitter = fit_jitter_near(
+        jitter = fit_jitter_near(
             parts,
-            SECOND / found.raw,
+            SECOND / estimated.raw,
             "all",
             sure=_trusted_samples(sum(len(part) - 1 for part in parts)),
         )
     return (
-        near.jitter is not None
-        and found_jitter is not None
-        and near.jitter.code_length > found_jitter.code_length + _FAR_WORSE_NATS
+        given.jitter is not None
+        and jitter is not None
+        and given.jitter.code_length > jitter.code_length + _FAR_WORSE_NATS
     )
 
 

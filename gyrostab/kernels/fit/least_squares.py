@@ -45,7 +45,7 @@ class _Cells(NamedTuple):
     """What `observe` says of eight windows."""
 
     system: NDArray[np.float64]
-    seen: NDArray[np.float64]
+    responses: NDArray[np.float64]
     inverse: NDArray[np.float64]
     avar: NDArray[np.float64]
     excess: NDArray[np.float64]
@@ -288,7 +288,7 @@ def _factor_covariance(cells, fit, room, tables):  # type: ignore[no-untyped-def
     n = inverse.shape[0]
     width = n + WIDTH
     put(state, 2, 1e-7)  # the sums over lags are good to about this; a strong ramp may need more
-    root_squares(fit.basis, cells.seen, room.units, room.roots)
+    root_squares(fit.basis, cells.responses, room.units, room.roots)
     needs_retry = True
     while needs_retry:
         covariance_rows(room.roots, inverse, tables, augmented, width)
@@ -405,7 +405,7 @@ def _reduce_windows(cells, room, tables):  # type: ignore[no-untyped-def]
     compress_products(
         room.rows,
         room.units,
-        cells.seen,
+        cells.responses,
         cells.inverse,
         tables,
         room.factors,
@@ -510,7 +510,7 @@ def fit_windows(  # type: ignore[no-untyped-def]
             trend,
             valid,
         )
-        root_units(cells.seen, room.units)
+        root_units(cells.responses, room.units)
         _fit_diagonal(cells, weight, stochastic, room.normal, room.right, fit, room.scratch)
         _refit_windows(stochastic, cells, fit, room, tables)
         _measure_misfit(cells, fit, room, chi2)

@@ -79,12 +79,12 @@ def observe(  # type: ignore[no-untyped-def]
     ``cells.system`` (row ``6 cell + column``). `trend` is the variance of the trend per squared
     coefficient (0 to 3), and 0 if the product of ramp and noise is removed from the cells, else 1
     (5). What a unit of each squared coefficient is in sample units, as the cell sees it
-    through the gaps, goes to ``cells.seen`` (``6 cell + row``), the Allan variance to
+    through the gaps, goes to ``cells.responses`` (``6 cell + row``), the Allan variance to
     ``cells.avar``, the reciprocal of `factor` to ``cells.inverse``. What the gaps add to
     quantization noise comes from the ends of many runs spread over each cluster, so it scatters
     like white noise and is counted there (row 2), the most of it in ``cells.excess``.
     """
-    system, responses = cells.system, cells.seen
+    system, responses = cells.system, cells.responses
     n = 0
     cells.excess[0, place] = 0.0
     for i in range(cells.inverse.shape[0]):
