@@ -215,12 +215,12 @@ def _judge_steadiness(product: xr.Dataset) -> str:
     if not spreads:
         return "N is observed in too few windows to judge how steady it is."
     changing = [
-        f"{ratio:.2g} times on {axis}, highest around {str(when)[:19].replace('T', ' ')}"
+        f"{ratio:.2g} on {axis} (highest around {str(when)[:19].replace('T', ' ')})"
         for axis, _, ratio, when in spreads
         if ratio > _MIN_RATIO
     ]
     if changing:
-        return f"N varies (95 % over 5 % quantile): {'; '.join(changing)}."
+        return f"N varies by a factor of {', '.join(changing)}, from its 5 % to its 95 % quantile."
     return (
         "N is steady: it varies by "
         + ", ".join(f"{100 * share:.0f} % on {axis}" for axis, share, *_ in spreads)

@@ -143,11 +143,11 @@ def describe_error(error: Exception) -> int:
         )
     if isinstance(error, MemoryError):
         return print_error(
-            f"out of memory ({error}); give fewer --taus, a longer --step, or fewer --workers",
+            f"out of memory ({error}); use fewer --taus, a longer --step, or fewer --workers",
             1,
         )
     return print_error(
         f"unexpected {type(error).__name__}: {error}. "
-        "Give --debug to see where it arose, and please report it.",
+        "Use --debug to see where it occurred, and please report it.",
         1,
     )

@@ -38,7 +38,7 @@ Flag = Annotated[bool, Parameter(negative=(), show_default=False)]
 @Parameter(name="*", group=_READING)
 @dataclass(frozen=True)
 class Reading:
-    """How to read a log, as far as it does not say so itself.
+    """How to read a log, where the log does not determine it.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ class Windows:
         Analyse this gyro axis only: x. Repeat for more.
     variance
         avar, the Allan variance. hadamard is not changed by a constant drift of the rate. modified,
-        the modified Allan variance, tells white noise from quantization noise.
+        the modified Allan variance, separates white noise from quantization noise.
     """
 
     window: Annotated[str | None, Parameter(metavar="DURATION")] = None

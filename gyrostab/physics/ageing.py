@@ -116,8 +116,8 @@ class AgeingNoise(Effect):
     Examples
     --------
     >>> print(AgeingNoise(growth=0.02).say())
-    The angle random walk ages on all axes: N^2 grows by 0.02 of itself in the first hour, with the
-    power 1 of time.
+    The angle random walk ages on all axes: N^2 grows by 0.02 of its initial value in the first
+    hour, as time to the power 1.
     """
 
     name: ClassVar[str] = "ageing_noise"
@@ -154,5 +154,6 @@ class AgeingNoise(Effect):
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Describe the effect in one sentence."""
         growth, power = self.quantity("growth", errors), self.quantity("exponent", errors)
-        first = f"grows by {growth} of itself in the first hour, with the power {power} of time"
-        return f"The angle random walk ages {self.on_axes()}: N^2 {first}."
+        grows = f"grows by {growth} of its initial value in the first hour"
+        law = f"as time to the power {power}"
+        return f"The angle random walk ages {self.on_axes()}: N^2 {grows}, {law}."

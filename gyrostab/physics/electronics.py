@@ -49,7 +49,7 @@ class SupplyBias(Effect):
     Examples
     --------
     >>> SupplyBias(voltage=0.01, axes=["x"]).say()
-    'The bias follows the supply on axis x, by 0.01 deg/h/V of the voltage.'
+    'The bias follows the supply on axis x, by 0.01 deg/h/V of voltage.'
     """
 
     name: ClassVar[str] = "supply_bias"
@@ -172,8 +172,8 @@ class SupplyBias(Effect):
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Describe the effect in one sentence."""
-        parts = [f"by {self.quantity('voltage', errors)} of the voltage"] if self.voltage else []
-        parts += [f"by {self.quantity('power', errors)} of light"] if self.power else []
+        parts = [f"by {self.quantity('voltage', errors)} of voltage"] if self.voltage else []
+        parts += [f"by {self.quantity('power', errors)} of light power"] if self.power else []
         parts += [f"with a lag of {self.quantity('lag', errors)}"] if self.lag and parts else []
         if self.ripple:
             size, frequency = self.quantity("ripple", errors), self.quantity("frequency", errors)
@@ -353,7 +353,7 @@ class ClockError(Effect):
     name: ClassVar[str] = "clock_error"
     short: ClassVar[str] = "wrong or drifting rate of time"
     plain: ClassVar[str] = "an error of the clock"
-    next_measurement: ClassVar[str] = "log a second clock, or a known line such as the mains"
+    next_measurement: ClassVar[str] = "log a second clock, or a known frequency such as the mains"
     stage: ClassVar[Stage] = "sampling"
     size_parameters: ClassVar[tuple[str, ...]] = ("error", "drift")
 
@@ -444,7 +444,7 @@ class ClockError(Effect):
         """Describe the effect in one sentence."""
         fast, size = ("slow", -self.error) if self.error < 0 else ("fast", self.error)
         number = self.quantity("error", errors).replace(f"{self.error:.4g}", f"{size:.4g}", 1)
-        more = f", more by {self.quantity('drift', errors)}" if self.drift else ""
+        more = f", growing by {self.quantity('drift', errors)}," if self.drift else ""
         return f"The clock of the samples is {fast} by {number}{more} {self.on_axes()}."
 
 

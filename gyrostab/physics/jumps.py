@@ -117,8 +117,8 @@ class BiasJump(Effect):
     short: ClassVar[str] = "bias changes at restarts, shocks"
     plain: ClassVar[str] = "a bias jump"
     next_measurement: ClassVar[str] = (
-        "switch off and on several times with nothing else changed, and compare the bias before "
-        "and after"
+        "switch the power off and on several times, with nothing else changed, and compare the "
+        "bias before and after"
     )
     stage: ClassVar[Stage] = "rate"
     size_parameters: ClassVar[tuple[str, ...]] = ("restart", "shock", "step")
@@ -229,7 +229,8 @@ class Telegraph(Effect):
     short: ClassVar[str] = "bias switches between levels"
     plain: ClassVar[str] = "a bias that switches between two levels"
     next_measurement: ClassVar[str] = (
-        "record longer, for at least ten switches: the histogram of the means then shows two levels"
+        "record until the bias has switched ten times: the histogram of the means then shows two "
+        "levels"
     )
     stage: ClassVar[Stage] = "rate"
     size_parameters: ClassVar[tuple[str, ...]] = ("step",)

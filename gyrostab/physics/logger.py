@@ -314,7 +314,8 @@ class Spikes(Effect):
     Examples
     --------
     >>> Spikes(per_hour=2, lsb=0.1, bits=16).say()
-    'Single samples are wrong on all axes: one of 16 bits of 0.1 deg/h, 2 times per hour.'
+    'Single samples are wrong on all axes: one of 16 bits flips (lowest bit: 0.1 deg/h), 2
+     times per hour.'
     """
 
     name: ClassVar[str] = "spikes"
@@ -384,7 +385,7 @@ class Spikes(Effect):
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Describe the effect in one sentence."""
-        bit = f"one of {int(self.bits)} bits of {self.quantity('lsb', errors)}"
+        bit = f"one of {int(self.bits)} bits flips (lowest bit: {self.quantity('lsb', errors)})"
         deviation = bit if self.kind == "bit" else f"by {self.quantity('size', errors)} rms"
         often = self.quantity("per_hour", errors).removesuffix(" 1/h")
         return f"Single samples are wrong {self.on_axes()}: {deviation}, {often} times per hour."

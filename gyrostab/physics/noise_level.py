@@ -64,8 +64,8 @@ class TemperatureNoise(Effect):
     Examples
     --------
     >>> print(TemperatureNoise(linear=0.002, axes=["x"]).say())
-    The angle random walk follows the temperature on axis x: N^2 changes by 0.002 1/degC of itself
-    around 25 degC.
+    The angle random walk follows the temperature on axis x: N^2 changes by 0.002 1/degC of its
+    value at 25 degC.
     """
 
     name: ClassVar[str] = "temperature_noise"
@@ -121,7 +121,7 @@ class TemperatureNoise(Effect):
         """Describe the effect in one sentence."""
         names = [name for name in self.size_parameters if getattr(self, name)] or ["linear"]
         terms = [self.quantity(name, errors) for name in names]
-        change = f"changes by {', '.join(terms)} of itself around {self.quantity('reference')}"
+        change = f"changes by {', '.join(terms)} of its value at {self.quantity('reference')}"
         return f"The angle random walk follows the temperature {self.on_axes()}: N^2 {change}."
 
 
@@ -265,9 +265,7 @@ class _FollowsVibration(Effect):
         """Describe how the sizes add up and grow."""
         if self.exponent == 1.0:
             return "added in squares"
-        return (
-            f"added in squares, with the power {self.quantity('exponent', errors)} of the vibration"
-        )
+        return f"added in squares, as vibration to the power {self.quantity('exponent', errors)}"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -43,7 +43,7 @@ class ScaleFactor(Effect):
     Examples
     --------
     >>> ScaleFactor(linear=100, axes=["z"]).say()
-    'The scale factor is wrong on axis z, linear 100 ppm.'
+    'The scale factor is wrong on axis z: linear 100 ppm.'
     """
 
     name: ClassVar[str] = "scale_factor"
@@ -129,7 +129,7 @@ class ScaleFactor(Effect):
             for name in self.size_parameters
             if getattr(self, name)
         ]
-        return f"The scale factor is wrong {self.on_axes()}, {', '.join(terms) or 'by nothing'}."
+        return f"The scale factor is wrong {self.on_axes()}: {', '.join(terms) or 'by nothing'}."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -259,15 +259,15 @@ class EarthRate(Effect):
     Examples
     --------
     >>> print(EarthRate(latitude=60).say())
-    The earth turns with 15.04 deg/h; the tool at latitude 60 deg sees 7.521 deg/h across and -13.03
-    deg/h along itself, on all axes.
+    The earth turns at 15.04 deg/h; at latitude 60 deg, the tool sees 7.521 deg/h across its axis
+    and -13.03 deg/h along it, on all axes.
     """
 
     name: ClassVar[str] = "earth_rate"
     short: ClassVar[str] = "earth rate modulated by tool rotation"
-    plain: ClassVar[str] = "earth rate, which varies with the tool face"
+    plain: ClassVar[str] = "earth rate, which varies with the toolface"
     next_measurement: ClassVar[str] = (
-        "stop the rotation at four tool faces 90 degrees apart: earth rate follows the tool face"
+        "stop the rotation at four toolfaces 90 degrees apart: earth rate follows the toolface"
     )
     stage: ClassVar[Stage] = "motion"
     channels: ClassVar[Mapping[str, str]] = {"rotation_rate": INNER["rotation_rate"]}
@@ -379,10 +379,10 @@ class EarthRate(Effect):
         along, high, right = self.components()
         across = math.hypot(high, right)
         components = (
-            f"{across:.4g} deg/h across and {along:.4g} deg/h along itself, {self.on_axes()}"
+            f"{across:.4g} deg/h across its axis and {along:.4g} deg/h along it, {self.on_axes()}"
         )
-        earth = f"The earth turns with {self.quantity('rate', errors)}"
-        return f"{earth}; the tool at latitude {self.quantity('latitude')} sees {components}."
+        earth = f"The earth turns at {self.quantity('rate', errors)}"
+        return f"{earth}; at latitude {self.quantity('latitude')}, the tool sees {components}."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -421,7 +421,7 @@ class RealMotion(Effect):
     short: ClassVar[str] = "rotation that is not an error"
     plain: ClassVar[str] = "real rotation of the tool, not a sensor error"
     next_measurement: ClassVar[str] = (
-        "log accelerometers and a second gyro on the same block: real motion shows in all of "
+        "log accelerometers and a second gyro on the same mount: real motion shows in all of "
         "them, a sensor error in one"
     )
     stage: ClassVar[Stage] = "motion"

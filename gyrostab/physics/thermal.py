@@ -124,8 +124,8 @@ class Shupe(Effect):
     Examples
     --------
     >>> print(Shupe(sensitivity=0.05, axes=["x"]).say())
-    The bias follows the change of the temperature on axis x, by 0.05 deg/h/(degC/min) with a lag of
-    265 s.
+    The bias follows the rate of change of the temperature on axis x, by 0.05 deg/h/(degC/min) with
+    a lag of 265 s.
     """
 
     name: ClassVar[str] = "shupe"
@@ -236,17 +236,19 @@ class Shupe(Effect):
             [self.quantity("sensitivity", errors)] if self.sensitivity or not self.transient else []
         )
         terms += (
-            [f"{self.quantity('transient', errors)} while heat goes through the winding"]
+            [f"{self.quantity('transient', errors)} while heat passes through the winding"]
             if self.transient
             else []
         )
         size = f"{' and '.join(terms)} {_with_lag(self, errors)}"
         size += (
-            f", seen by a sensor that is {self.quantity('sensor_lag', errors)} late"
+            f", measured by a sensor that lags by {self.quantity('sensor_lag', errors)}"
             if self.sensor_lag
             else ""
         )
-        return f"The bias follows the change of the temperature {self.on_axes()}, by {size}."
+        return (
+            f"The bias follows the rate of change of the temperature {self.on_axes()}, by {size}."
+        )
 
 
 def _with_lag(effect: Shupe | ThermalGradient, errors: Mapping[str, float] | None) -> str:

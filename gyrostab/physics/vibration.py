@@ -81,7 +81,7 @@ class GSensitivity(_Vector):
     short: ClassVar[str] = "bias follows acceleration"
     plain: ClassVar[str] = "a bias that follows acceleration"
     next_measurement: ClassVar[str] = (
-        "turn the tool over, at rest: g-sensitivity changes sign with gravity, rectification does "
+        "turn the tool over at rest: g-sensitivity changes sign with gravity, rectification does "
         "not"
     )
     stage: ClassVar[Stage] = "rate"

@@ -44,7 +44,8 @@ class WarmUp(Effect):
     Examples
     --------
     >>> WarmUp(amplitude=0.1, axes=["x"]).say()
-    'The bias starts 0.1 deg/h off on axis x after every power-on and settles with 600 s.'
+    'The bias starts 0.1 deg/h off on axis x after every power-on and settles with a time
+     constant of 600 s.'
     """
 
     name: ClassVar[str] = "warm_up"
@@ -165,12 +166,12 @@ class WarmUp(Effect):
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Describe the effect in one sentence."""
         size, time = self.quantity("amplitude", errors), self.quantity("time", errors)
-        settles = f"settles with {time}"
+        settles = f"settles with a time constant of {time}"
         if self.slow_amplitude:
             slow, slow_time = (
                 self.quantity(f"slow_{name}", errors) for name in ("amplitude", "time")
             )
-            settles += f", and {slow} with {slow_time}"
+            settles += f"; another {slow} settles with {slow_time}"
         return f"The bias starts {size} off {self.on_axes()} after every power-on and {settles}."
 
 

@@ -354,13 +354,13 @@ _FIGURE_TEXT = {
         "Right: what is left with the effects added."
     ),
     "means": (
-        "The Allan variance does not show what is constant within a window. Here each dot is the "
-        "mean rate of a short block. The simulation before predicts a constant mean. Red bars are "
-        "the numbered mismatches of the mean rate. Below: channels."
+        "The Allan variance does not show a bias that is constant within a window. Here each dot "
+        "is the mean rate of a short block. The simulation before predicts a constant mean. Red "
+        "bars are the numbered mismatches of the mean rate. Below: channels."
     ),
     "deviations": (
-        "All windows together. Dots are the recording; where they leave the dashed line, the "
-        "simulation before is wrong. Where both lines coincide, the named effects change nothing."
+        "Dots are the recording; where they depart from the dashed line, the simulation without "
+        "the effects is wrong. Where both lines coincide, the named effects change nothing."
     ),
     "spectra": (
         "Grey is the recording at full resolution, so that narrow lines show. The lines are the "

@@ -272,13 +272,13 @@ _CHANGE_TEXT = (
     "mismatches."
 )
 _MEANS_TEXT = (
-    "The Allan variance does not show what is constant within a window. Each dot is the mean rate "
-    "of a short block; lines are the simulations with their 95 % bands. Red areas are the numbered "
-    "mismatches of the mean rate. Below: channels."
+    "The Allan variance does not show a bias that is constant within a window. Each dot is the "
+    "mean rate of a short block; lines are the simulations with their 95 % bands. Red areas are "
+    "the numbered mismatches of the mean rate. Below: channels."
 )
 _DEVIATIONS_TEXT = (
-    "All windows together. Points are the recording; where they leave the dashed line, the "
-    "simulation before is wrong. Click a name to hide it, click it twice to see it alone."
+    "Points are the recording; where they depart from the dashed line, the simulation without "
+    "the effects is wrong. Click a name to hide it, click it twice to see it alone."
 )
 _SPECTRA_TEXT = (
     "Thin lines are the recording at full resolution, so that narrow lines show; the highest value "

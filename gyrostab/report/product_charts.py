@@ -382,8 +382,8 @@ def _draw_surface(product: xr.Dataset) -> go.Figure:
 _CAPTIONS = {
     "record": (
         "The mean over all windows. Points are measured, lines are the five terms fitted to them; "
-        "they leave the points where the noise changes over the record. A slope of -1/2 is angle "
-        "random walk, a level part is bias instability, a slope of +1/2 rate random walk."
+        "they depart from the points if the noise changes during the record. A slope of -1/2 is "
+        "angle random walk, a level part is bias instability, a slope of +1/2 rate random walk."
     ),
     "coefficients": (
         "Points are estimates with their standard errors, open triangles are 95 % upper limits. "

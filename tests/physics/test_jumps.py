@@ -257,6 +257,6 @@ def test_a_supply_without_lag_is_the_limit_of_short_ones():
 def test_a_slow_supply_says_its_lag():
     sentence = make_effect({"name": "supply_bias", "voltage": 0.02, "lag": 40.0}).say({"lag": 5.0})
     assert (
-        sentence == "The bias follows the supply on all axes, by 0.02 deg/h/V of the voltage, "
+        sentence == "The bias follows the supply on all axes, by 0.02 deg/h/V of voltage, "
         "with a lag of 40 ± 5 s."
     )

@@ -296,15 +296,15 @@ def test_a_simulated_log_does_not_depend_on_its_chunks():
     [
         (
             {"name": "shupe", "sensitivity": 0.1, "transient": 0.2},
-            r"0.2 deg/h/\(degC/min\) while heat goes through the winding",
+            r"0.2 deg/h/\(degC/min\) while heat passes through the winding",
         ),
         (
             {"name": "shupe", "sensitivity": 0.1, "sensor_lag": 40},
-            "with a lag of 265 s, seen by a sensor that is 40 s late",
+            "with a lag of 265 s, measured by a sensor that lags by 40 s",
         ),
         (
             {"name": "shupe", "sensitivity": 0.0, "transient": 0.2},
-            r"temperature on all axes, by 0.2 deg/h/\(degC/min\) while heat goes",
+            r"temperature on all axes, by 0.2 deg/h/\(degC/min\) while heat passes",
         ),
         (
             {"name": "temperature_bias", "sensitivity": 0.0, "cubic": 1e-6},
@@ -317,7 +317,7 @@ def test_a_simulated_log_does_not_depend_on_its_chunks():
         ({"name": "temperature_bias", "sensitivity": 0.0}, r"by 0 deg/h/degC around 25 degC"),
         (
             {"name": "temperature_noise", "linear": 0.0, "quadratic": 1e-5},
-            r"N\^2 changes by 1e-05 1/degC\^2 of itself around 25 degC",
+            r"N\^2 changes by 1e-05 1/degC\^2 of its value at 25 degC",
         ),
         (
             {"name": "vibration_rectification", "sensitivity": 0.0, "quartic": 1e-6},
@@ -333,7 +333,7 @@ def test_a_simulated_log_does_not_depend_on_its_chunks():
         ),
         (
             {"name": "warm_up", "amplitude": 0.1, "slow_amplitude": 0.2},
-            "settles with 600 s, and 0.2 deg/h with 3600 s",
+            "settles with a time constant of 600 s; another 0.2 deg/h settles with 3600 s",
         ),
         (
             {"name": "ageing_bias", "logarithmic": 0.2},
@@ -341,11 +341,11 @@ def test_a_simulated_log_does_not_depend_on_its_chunks():
         ),
         (
             {"name": "vibration_noise", "white": 1, "quantization": 2, "exponent": 0.9},
-            "of N and 2 urad/g of Q, added in squares, with the",
+            "of N and 2 urad/g of Q, added in squares, as vibration to the power 0.9",
         ),
         (
             {"name": "vibration_random_walk", "sensitivity": 1, "exponent": 2},
-            "with the power 2 of the vibration",
+            "as vibration to the power 2",
         ),
     ],
 )

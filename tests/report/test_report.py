@@ -106,7 +106,7 @@ def test_summary_names_axes_span_and_change(page):
     assert "analysed in 40 windows" in text
     n = synthetic.product().N.sel(axis="y")
 
-    change = re.search(r"N varies .*?(\S+) times on y, highest around (\S+ \S+)[.;]", text)
+    change = re.search(r"N varies .*?(\S+) on y \(highest around (\S+ \S+)\)", text)
     assert change is not None
     low, high = n.quantile([0.05, 0.95]).values
     assert float(change[1]) == pytest.approx(high / low, rel=0.05)

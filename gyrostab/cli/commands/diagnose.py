@@ -45,9 +45,9 @@ def diagnose(
         Folder to write.
     simulation
         Simulation to compare with: a model, or a simulated log with the same time stamps (default:
-        noise calibrated on quiescent intervals of the recording).
+        noise calibrated on quiescent stretches of the recording).
     quiet
-        Quiescent interval of the recording, on which the noise is calibrated:
+        Quiescent stretch of the recording, on which the noise is calibrated:
         2026-03-14T08:00/2026-03-14T08:30, or 0s/30min after the start. Repeat for more (default:
         detected automatically). With --simulation, it calibrates the level of the simulated noise
         by one factor per axis.

@@ -174,14 +174,14 @@ def named_statement(
     Examples
     --------
     >>> named_statement("mean", "shupe", ["y"], "over the whole record", 0.004)
-    'The mean rate of axis y differs from the simulation over the whole record: by no more than
-     noise at any single place, but as a whole with the pattern of a bias that follows the rate of
-     change of temperature (Shupe effect) (noise alone would show this in 1 of 250 such records).'
+    'The mean rate of axis y differs from the simulation over the whole record: no single place
+     exceeds noise, but the whole has the pattern of a bias that follows the rate of change of
+     temperature (Shupe effect) (noise alone would show this in 1 of 250 such records).'
     """
     quantity = _QUANTITIES.get(statistic, "The noise")
     return (
-        f"{quantity} of {axes_text(axes)} differs from the simulation {when}: by no more than "
-        f"noise at any single place, but as a whole with the pattern of {plain_name(effect)} "
+        f"{quantity} of {axes_text(axes)} differs from the simulation {when}: no single "
+        f"place exceeds noise, but the whole has the pattern of {plain_name(effect)} "
         f"({chance(p_value)})."
     )
 
@@ -289,11 +289,10 @@ def rejection_text(beaten_by: str, nats: float | None) -> str:
     >>> rejection_text("supply_bias", 12.34)
     'a bias that follows supply voltage or light power explains 12.3 nats more'
     >>> rejection_text("noise", 5.0), rejection_text("an impossible size", None)
-    ('5.0 nats short of the evidence that noise cannot have', 'it would need an impossible size')
+    ('its evidence is 5.0 nats below the threshold', 'it would need an impossible size')
     """
     if beaten_by == "noise":
-        short = "nats short of the evidence that noise cannot have"
-        return "" if nats is None else f"{nats:.1f} {short}"
+        return "" if nats is None else f"its evidence is {nats:.1f} nats below the threshold"
     if nats is None:
         return f"it would need {beaten_by}"
     winner = plain_name(beaten_by) if beaten_by in effects() else beaten_by
@@ -308,7 +307,7 @@ def next_measurement(name: str, alternatives: Sequence[str]) -> str:
     Examples
     --------
     >>> next_measurement("g_sensitivity", ["vibration_rectification"])
-    'To tell them apart, turn the tool over, at rest: g-sensitivity changes sign with gravity,
+    'To tell them apart, turn the tool over at rest: g-sensitivity changes sign with gravity,
      rectification does not.'
     """
     names = (name, *alternatives)
