@@ -304,7 +304,7 @@ def _describe_misfit(product: xr.Dataset) -> list[str]:
         line = f"The terms do not describe {', '.join(failing)}; no term counts as observed there"
         start = find_fit_from(product)
         remedy = (
-            f"from {start:g} s on they do: fit again with --fit-from {start:g}s"
+            f"they do from {start:g} s on: fit again with --fit-from {start:g}s"
             if start
             else (
                 "no --fit-from changes that: look for spectral lines, vibration or motion in the "
@@ -325,7 +325,7 @@ def _describe_filter(product: xr.Dataset) -> list[str]:
     if not filtered:
         return []
     return [
-        f"Averaging times are left out where a filter shapes the noise: {', '.join(filtered)}. "
+        f"Averaging times at which a filter shapes the noise are left out: {', '.join(filtered)}. "
         "N, B and K are those of the noise without the filter; Q is not observable."
     ]
 
@@ -366,7 +366,7 @@ def _describe_losses(product: xr.Dataset) -> list[str]:
     if not affected:
         return []
     return [
-        f"Noise next to gaps is higher than elsewhere: {', '.join(affected)}: samples are lost "
+        f"Noise next to gaps is higher than elsewhere: {', '.join(affected)}. Samples are lost "
         "while the noise is high, and the record underestimates it."
     ]
 
@@ -382,7 +382,8 @@ def _describe_motion(product: xr.Dataset) -> list[str]:
             moved.append(f"{axis} in {_count_windows(moving)} (up to {largest} deg/h)")
     if not moved:
         return []
-    reason = "motion or a drifting bias; leave such times out with --exclude"
     return [
-        f"Mean rate more than twice the Earth rate from its median: {', '.join(moved)}: {reason}."
+        "The mean rate departs from its median by more than twice the Earth rate: "
+        f"{', '.join(moved)}. The cause is motion or a drifting bias; leave out such times with "
+        "--exclude."
     ]

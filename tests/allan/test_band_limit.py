@@ -134,7 +134,9 @@ def test_each_axis_has_its_filter_and_gaps_and_motion_do_not_hide_it():
     assert (plain.filter_time_constant == 0).all()
     assert (plain.observable.isel(axis=0) < 2).all()
     (text,) = [line for line in describe_record(product) if "filter" in line]
-    assert text.startswith("Averaging times are left out where a filter shapes the noise: x below")
+    assert text.startswith(
+        "Averaging times at which a filter shapes the noise are left out: x below"
+    )
 
 
 def test_a_run_in_parts_finds_the_filter_of_the_whole_record(tmp_path):

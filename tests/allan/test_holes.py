@@ -58,7 +58,7 @@ def test_losses_while_the_noise_is_high_are_noticed():
     (line,) = [
         line for line in describe_record(fit_noise(surface)) if line.startswith("Noise next to")
     ]
-    assert "samples are lost while the noise is high" in line
+    assert "Samples are lost while the noise is high" in line
     plain = np.where(np.repeat(rng.random(1200) < 0.1, 10), np.nan, rng.normal(size=12_000))
     product = fit_noise(davar(make_log(plain, rate=100.0, unit="deg/h"), **options))
     np.testing.assert_allclose(product["gap_edge_ratio"], 1.0, atol=0.15)

@@ -112,7 +112,7 @@ def test_outliers_and_motion_are_named_with_the_axis():
     values[1, 20_000:30_000] += 200.0  # turns at 200 deg/h for 100 s
     text = "\n".join(describe_record(make_product(values)))
     assert re.search(r"Outliers.*: x in 2 windows \(at most 1 in one\)", text)
-    assert re.search(r"Earth rate from its median: y in [23] windows", text)
+    assert re.search(r"more than twice the Earth rate: y in [23] windows", text)
 
 
 def test_a_shorter_record_gets_a_shorter_window():

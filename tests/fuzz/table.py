@@ -63,7 +63,7 @@ Whatever a file contains, gyrostab must exit with code 0 (done) or 2 (one messag
 file), soon and in bounded memory. A run that continues from a damaged checkpoint may also exit with
 3. Exit code 1, a traceback, a signal, more than {limit_seconds:.0f} s or
 more than {limit_memory:.0f} MiB of additional memory for one of these tiny
-inputs is a failure. An exception that our own code raises is also a failure, even if it is
+inputs is a failure. An exception that the code of gyrostab raises is also a failure, even if it is
 reported as a damaged file (`gyrostab.errors.DamageError`).
 
 The inputs start from small valid files of every format. A mutator flips bits, overwrites counters

@@ -15,7 +15,7 @@ def demo(*, output: Output = Path("gyrostab-demo"), common: Common = Common()) -
     """Run the whole analysis on the log shipped with gyrostab, a simulated day.
 
     Writes the product, the log, a report and figures to a folder, and prints the noise coefficients
-    while the gyro warms up, rests, is shaken, and rests again.
+    for warm-up, rest, vibration and rest.
 
     Example: gyrostab demo -o demo-output
 

@@ -79,10 +79,10 @@ def fleet(
     scheduler: Scheduler = "processes",
     common: Common = Common(),
 ) -> None:
-    """Analyse many runs: a product for each, a table of all, reports, and a page of overview.
+    """Analyse many runs: a product for each, a table of all, reports, and an overview page.
 
-    The logs of a folder are one run. A second call computes only what is new, has changed or has
-    failed before; it also continues a call that was stopped.
+    The logs of a folder are one run. When repeated, the command computes only runs that are new,
+    have changed or have failed; it also continues a call that was stopped.
 
     Example: gyrostab fleet /archive -o fleet --window 10min
 

@@ -77,7 +77,7 @@ def correlate(
     """Correlate noise coefficients and window means with temperature or other channels.
 
     Prints which quantities follow the channel, how strongly, and with what lag. With several
-    channels, also the effect of each given the others.
+    channels, it also prints the effect of each given the others.
 
     Example: gyrostab correlate product.nc --with temperature,vibration --max-lag 2h -o coupling.nc
 
@@ -86,9 +86,9 @@ def correlate(
     product
         File written by gyrostab run or gyrostab fit.
     with_
-        Channel of the product, or of the file given by --channel (default: temperature). Several
-        are separated by commas; of these, --channel gives those that the product lacks. One channel
-        is compared together with its rate of change; of several, name the rate too
+        Channels to compare with, separated by commas (default: temperature). With --channel, a
+        single channel, or those of several that the product lacks, are read from that file. A
+        single channel is compared together with its rate of change; of several, name the rate too
         (temperature_rate).
     max_lag
         Longest lag of the gyro behind the channel (default: one tenth of the record; 0s for none).

@@ -35,8 +35,8 @@ def watch(
 ) -> None:
     """Follow logs that grow: append each window to a Zarr product, and print a line for it.
 
-    The product is that of gyrostab run on the rows so far, bit for bit. Ctrl-C writes the last
-    windows and ends; the same command continues.
+    The product is bit for bit that of gyrostab run on the rows so far. Ctrl-C writes the last
+    windows and ends; repeat the command to continue.
 
     Example: gyrostab watch /data/run7 -o run7-live.zarr --window 10min --serve 8080
 
@@ -48,17 +48,18 @@ def watch(
     output
         Zarr store to write, or to continue.
     alarm
-        Say when a limit is passed, and when no longer: "N>0.01 deg/sqrt(h)" (or Q, B, K, R),
+        Report when a limit is exceeded, and when it no longer is: "N>0.01 deg/sqrt(h)" (or Q, B,
+        K, R),
         "x:N>0.01 deg/sqrt(h)" for one axis, misfit>3 (chi2/dof), "loss>5 %" (missing samples),
         "temperature>125 degC" (a channel). Repeat for more.
     lateness
-        How long a window waits for rows that come out of order: 10s. Rows that come later than
-        that are placed too, and windows that they change are computed again.
+        How long a window waits for rows that come out of order: 10s. Rows that come even later
+        are still placed, and the windows that they change are computed again.
     idle
-        End when nothing new has come for so long: 1h.
+        End if no new rows come for this long: 1h.
     serve
-        Show the windows and alarms on a page at this port of 127.0.0.1, which updates itself; 0 for
-        any free port.
+        Show the windows and alarms on a page at this port of 127.0.0.1, which is updated every two
+        seconds; 0 for any free port.
     """
     from gyrostab.jobs.alarms import parse_alarm
     from gyrostab.jobs.live_page import LivePage
