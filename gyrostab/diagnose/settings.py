@@ -218,7 +218,7 @@ class Settings:
         6e4,
         "degree hour-1",
         "Smallest step that may be a fringe hop.",
-        "one fringe, lambda c / (L D), of 5 km of fibre on a coil of 30 cm at 1.55 um",
+        "one fringe, lambda c / (L D), of 5 km of fiber on a coil of 30 cm at 1.55 um",
     )
     min_rotation_share: float = _make_setting(
         1e-5,
@@ -342,7 +342,7 @@ class Settings:
         900.0,
         "s",
         "Time after a restart that is not quiescent, at most a tenth of the record.",
-        "choice: warm-up of a fibre-optic gyro without temperature control, some minutes",
+        "choice: warm-up of a fiber-optic gyro without temperature control, some minutes",
     )
     coherency_probability: float = _make_setting(
         1e-4,

@@ -346,7 +346,7 @@ class FringeHop(Effect):
 
     order: float = parameter("1", "signed number of fringes", default=1.0, low=-1000.0, high=1000.0)
     length: float = parameter(
-        "m", "length of the coil's fibre", default=500.0, low=1.0, high=1e5, source="Lefevre 2014"
+        "m", "length of the coil's fiber", default=500.0, low=1.0, high=1e5, source="Lefevre 2014"
     )
     diameter: float = parameter(
         "m", "diameter of the coil", default=0.04, low=1e-3, high=10.0, source="Lefevre 2014"

@@ -184,7 +184,7 @@ class FeedbackReset(Effect):
         "nm", "wavelength of the light", default=1550.0, low=100.0, high=1e4, source="Lefevre 2014"
     )
     index: float = parameter(
-        "1", "refractive index of the fibre", default=1.45, low=1.0, high=3.0, source="Lefevre 2014"
+        "1", "refractive index of the fiber", default=1.45, low=1.0, high=3.0, source="Lefevre 2014"
     )
     phase: str = parameter(
         "text",

@@ -96,7 +96,7 @@ def test_platform_sway_is_real_motion(open_recording: Callable[..., Any]) -> Non
 
 
 @pytest.mark.slow
-def test_fibre_optic_axis_does_not_follow_temperature(open_recording: Callable[..., Any]) -> None:
+def test_fiber_optic_axis_does_not_follow_temperature(open_recording: Callable[..., Any]) -> None:
     diagnosis = gyrostab.diagnose(open_recording("fog-hybrid-warmup"), nulls=100)
     thermal = [effect for effect in diagnosis.effects if "temperature" in (effect["driver"] or "")]
     assert not any("z" in effect["axes"] for effect in thermal)

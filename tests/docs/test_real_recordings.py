@@ -295,14 +295,14 @@ def test_restarts_of_the_hybrid_unit(examine, name, rows):
     assert {"temperature", "temperature_rate"} <= set(product.data_vars)
 
 
-def test_fibre_optic_axis_of_the_hybrid_unit(examine):
+def test_fiber_optic_axis_of_the_hybrid_unit(examine):
     numbers = examine("fog-hybrid-warmup-static")[2]
     assert 20 < numbers["quieter"] < 30
     assert numbers["n_z"] == pytest.approx(0.013, rel=0.2)
     assert examine("fog-hybrid-warmup-turn")[2]["turn"] == pytest.approx(123, abs=1)
 
 
-def test_fibre_optic_rotation_sensor_in_an_earthquake(examine):
+def test_fiber_optic_rotation_sensor_in_an_earthquake(examine):
     log, product, numbers = examine("fog-rotation-earthquake")
     assert log.sizes["time"] == 7400
     assert numbers["shaken"] > 20 * numbers["quiet"]

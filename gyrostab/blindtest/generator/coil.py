@@ -1,4 +1,4 @@
-"""Heat conduction in a quadrupole-wound fibre coil on an insulated spool."""
+"""Heat conduction in a quadrupole-wound fiber coil on an insulated spool."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def layer_temperatures(
     dt : float
         Step [s].
     layers : int
-        Layers of fibre, from the face to the spool.
+        Layers of fiber, from the face to the spool.
     thickness : float
         Thickness of the winding [m].
     diffusivity : float
@@ -97,9 +97,9 @@ def layer_weights(
     layers : int
         Layers, a multiple of 4.
     length : float
-        Length of the fibre [m].
+        Length of the fiber [m].
     trim : float
-        Offset between the middle of the fibre and the middle of the winding, as a share of the
+        Offset between the middle of the fiber and the middle of the winding, as a share of the
         length.
     scatter : ndarray, shape (layers,), optional
         Relative error of each layer's length.

@@ -313,7 +313,7 @@ def test_diagnosis_lists_the_channels_it_used(recwarn: pytest.WarningsRecorder):
 
 
 def test_separate_files_are_diagnosed_like_one_file(recordings: Callable[[str], Path]):
-    """The real ramp of a fibre-optic gyro, in a separate file."""
+    """The real ramp of a fiber-optic gyro, in a separate file."""
     path, ramp = (
         recordings("fog-blueseis-ramp/FOG.mseed"),
         recordings("fog-blueseis-ramp/RAMP.mseed"),
