@@ -182,7 +182,7 @@ def test_noise_that_changes_far_from_its_reference_has_the_level_of_the_record()
     for degrees in (58.0, 62.0, 66.0):
         squared_noise = level * (1.0 + effect.linear * (degrees - effect.reference))
         assert squared_noise == pytest.approx(0.003**2 * (1.0 + 0.12 * (degrees - 62.0)), rel=0.12)
-    assert "around 58 degC" in fit.fitted[0].say()
+    assert "at 58 degC" in fit.fitted[0].say()
 
 
 def test_axis_without_an_effect_keeps_its_noise(shaken):

@@ -257,7 +257,7 @@ def test_simulated_noise_has_the_variance_of_the_weights(rich, statistic):
     candidates = [
         candidate
         for candidate in effect_candidates(rich, COEFFICIENT)[0]
-        if candidate.statistic.name == statistic and candidate.each
+        if candidate.statistic.name == statistic and candidate.is_per_axis
     ][:1]
     cells = candidates[0].statistic.model(candidates, 0, rich, initial_state(rich, baseline))
     z = (cells.values[..., 0] * np.sqrt(cells.weight))[
