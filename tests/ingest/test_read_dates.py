@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gyrostab import read_log, scan
-from gyrostab.errors import UnitError
+from gyrostab.errors import FormatError, OptionError, UnitError
 from gyrostab.ingest.columns.dates import DAY_FIRST, MONTH_FIRST, YEAR_FIRST, as_iso, find_order
 from gyrostab.ingest.columns.stamps import NAT, cells_to_ns
 
@@ -92,6 +93,53 @@ def test_decimal_comma_in_seconds(tmp_path: Path) -> None:
     raw = read_log(path)
     assert stamps_of(raw)[0] == np.datetime64("2026-05-01T08:00:00.125")
     assert raw["rate"].values[0].tolist() == [0.5, 1.5]
+
+
+@pytest.mark.parametrize("form", ["%Y-%m-%d %H:%M:%S,%f", "%d.%m.%Y %H:%M:%S,%f"])
+@pytest.mark.parametrize("separator", [";", "\t", ",", " "])
+def test_comma_before_the_fraction_of_a_second(form: str, separator: str, tmp_path: Path) -> None:
+    header, form = (
+        ("time,gyro_x[deg/h]", form.replace(" ", "T")) if separator == " " else
+        ("Zeit,gyro_x [deg/h]", f'"{form}"' if separator == "," else form)
+    )  # fmt: skip
+    path = write(tmp_path / "log.csv", form, header, separator)
+    path.write_text(re.sub(r"(-?\d)$", r"\1.5", path.read_text(), flags=re.MULTILINE))
+    raw = read_log(path)
+    np.testing.assert_array_equal(stamps_of(raw), STAMPS.values)
+    assert raw["rate"].values[0, 3:6].tolist() == [0.5, 1.5, 2.5]
+    assert scan(path)["end"].iloc[0] == STAMPS[-1]
+
+
+def test_comma_in_a_second_between_commas_is_refused_with_advice(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.csv", "%Y-%m-%d %H:%M:%S,%f")
+    with pytest.raises(FormatError, match=r"line 2 .* a comma precedes the fraction .* quotes"):
+        read_log(path)
+
+
+def test_column_of_stamps_of_any_name_is_the_time(tmp_path: Path) -> None:
+    rows = [f"{n / 10},{n % 7}" for n in range(99)]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["Zeit [s],gyro_x [deg/h]", *rows]) + "\n")
+    assert stamps_of(read_log(path))[98] == np.datetime64("1970-01-01T00:00:09.8")
+    path = write(tmp_path / "log.csv", "%Y-%m-%d %H:%M:%S.%f", "Zeit,gyro_x [deg/h]")
+    lines = path.read_text().splitlines()  # the clock steps back
+    path.write_text("\n".join([*lines[:20], *lines[10:]]) + "\n")
+    assert stamps_of(read_log(path))[-1] == STAMPS[-1]
+
+
+def test_two_columns_in_units_of_time_are_not_the_time(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    rows = [f"{n / 10},{2 * n},{n % 7}" for n in range(99)]
+    path.write_text("\n".join(["on [s],lag [ms],gyro_x [deg/h]", *rows]) + "\n")
+    with pytest.raises(OptionError, match="no time column"):
+        read_log(path)
+
+
+def test_clock_without_a_date_is_the_time_unless_the_rate_is_given(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.csv", "%H:%M:%S.%f", "Uhrzeit,gyro_x [deg/h]")
+    with pytest.raises(UnitError, match=r"'Uhrzeit' holds times of day without a date"):
+        read_log(path)
+    assert read_log(path, rate=25).sizes["row"] == len(STAMPS)
 
 
 def test_date_of_two_meanings_needs_the_order(tmp_path: Path) -> None:

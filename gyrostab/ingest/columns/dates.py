@@ -113,10 +113,12 @@ def as_iso(text: str, order: str) -> str | None:
     --------
     >>> as_iso("5/1/2026 1:30:00.25 PM", "MM/DD/YYYY"), as_iso("01-May-26 08:00", "DD/MM/YYYY")
     ('2026-05-01T13:30:00.25', '2026-05-01T08:00:00')
+    >>> as_iso("2026-05-01 08:00:00,25", "YYYY/MM/DD")
+    '2026-05-01 08:00:00.25'
     """
     text = text.strip()
     if is_iso(text):
-        return text
+        return text.replace(",", ".")
     match = _DATE.match(text)
     if match is None:
         return None

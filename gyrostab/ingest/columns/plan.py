@@ -105,7 +105,7 @@ def plan_columns(
     """
     check_columns(path, len(headers), options.limits)
     preset = _known_program(path, headers, above, is_filled)
-    draft = PlanDraft(path, options, rising or (lambda source: True))
+    draft = PlanDraft(path, options, rising)
     named = name_columns(
         draft,
         headers,

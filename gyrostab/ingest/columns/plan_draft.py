@@ -58,8 +58,10 @@ class Column:
 class PlanDraft:
     """Columns, notes and problems of a plan while it is being made."""
 
-    def __init__(self, path: Path, options: ReadOptions, rising: Callable[[int], bool]):
-        self.path, self.options, self.rising = path, options, rising
+    def __init__(self, path: Path, options: ReadOptions, rising: Callable[[int], bool] | None):
+        self.path, self.options = path, options
+        self.knows_rising = rising is not None
+        self.rising = rising or (lambda source: True)
         self.columns: list[Column] = []
         self.summaries: list[ColumnSummary] = []
         self.notes: list[str] = []

@@ -49,12 +49,21 @@ def find_time(draft: PlanDraft, named: list[Header]) -> Header | None:
         time_columns = sure or time_columns
     if not time_columns:
         time_columns = [
-            c for c in named if c.stamped and draft.rising(c.source) and not (c.mapped or c.preset)
+            c
+            for c in named
+            if c.stamped
+            and draft.rising(c.source)
+            and not (c.mapped or c.preset)
+            and not (c.date_order == NO_DATE and draft.options.rate is not None)
         ]
+        reason = "it holds dates"
+        if not time_columns:
+            clocks = [c for c in named if _is_clock(draft, c)]
+            time_columns = clocks if len(clocks) == 1 else []
+            reason = "it is the only column that rises in a unit of time"
         if time_columns:
-            draft.notes.append(
-                f"{time_columns[0].header!r} is taken for the time column, as it holds dates"
-            )
+            header = time_columns[0].header
+            draft.notes.append(f"{header!r} is taken for the time column, as {reason}")
     if not time_columns:
         return None
     time_columns.sort(key=lambda c: not draft.rising(c.source))
@@ -118,6 +127,19 @@ def _may_be_time(column: Header) -> bool:
     written = column.unit or column.stored
     # An epoch that cannot be read is reported, not ignored.
     return written is None or column.stamped or names_epoch(written) or is_time_unit(written)
+
+
+def _is_clock(draft: PlanDraft, column: Header) -> bool:
+    """Return whether a column of another name has a unit of time, and values known to rise."""
+    unit = column.unit or column.stored
+    return (
+        unit is not None
+        and (is_time_unit(unit) or names_epoch(unit))
+        and not (column.mapped or column.preset)
+        and not KNOWN_CHANNEL_PATTERN.match(column.low)
+        and draft.knows_rising
+        and draft.rising(column.source)
+    )
 
 
 def _date_order(draft: PlanDraft, column: Header) -> str:

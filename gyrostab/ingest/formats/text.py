@@ -21,7 +21,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.dates import DAY_FIRST, find_order, holds_date, is_time_of_day
+from gyrostab.ingest.columns.dates import DAY_FIRST, NO_DATE, find_order, holds_date, is_time_of_day
 from gyrostab.ingest.columns.plan import Column, Plan, plan_columns
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
 from gyrostab.ingest.columns.stamps import NAT, cells_to_ns
@@ -45,6 +45,9 @@ HEAD_BYTES, MAX_HEAD_BYTES, HEAD_LINES = 2**18, 2**24, 4
 BLOCK_BYTES = 2**22
 PART_BYTES = 2**16
 COUNTED_BYTES = 2**24
+#: Rises for each fall above which a column holds stamps: a clock may step back, and noise rises as
+#: often as it falls.
+RISES_OF_STAMPS = 9
 
 
 def matches(path: Path) -> bool:
@@ -149,16 +152,19 @@ def _duration_units(layout: Layout) -> dict[int, str]:
 
 
 def _is_rising(layout: Layout, column: int) -> bool:
-    """Return whether the first filled cells of a column rise from row to row."""
+    """Return whether the first filled cells of a column rise from row to row, as stamps do."""
     cells = [
         row[column] for row in layout.samples if len(row) == layout.width and row[column].strip()
     ]
     if all(is_number(cell, comma=layout.decimal_comma) for cell in cells):
         steps = np.diff([float(cell.replace(",", ".")) for cell in cells])
     else:
-        stamps = cells_to_ns(cells, None, 0, find_order(cells) or DAY_FIRST)
+        order = find_order(cells) or DAY_FIRST
+        if order == NO_DATE:
+            cells = [f"1970-01-01 {cell}" for cell in cells]
+        stamps = cells_to_ns(cells, None, 0, order)
         steps = np.diff(stamps[stamps != NAT])
-    return bool(len(steps) and (steps >= 0).all() and steps.any())
+    return int((steps > 0).sum()) > RISES_OF_STAMPS * int((steps < 0).sum())
 
 
 def _sample_stamps(

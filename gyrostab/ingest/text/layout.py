@@ -6,7 +6,7 @@ import csv
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 
 from gyrostab.errors import FormatError
@@ -33,6 +33,9 @@ _NUMBER = re.compile(r"^[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?$")
 _HEADER_CELLS = re.compile(r"(?:[^\s\[]+(?:\[[^\]]*\])?(?:[ \t]+\[[^\]]*\])?)")
 _DURATION = re.compile(r"^\s*[+-]?\d+(?:\.\d+)? (ms|s|sec|min|h|hr|d|day|days)\s*$")
 _COMMENT = re.compile(r"^\s*[#%]")
+#: Where commas do not separate cells: in brackets, and before the fraction of a second if blanks
+#: separate the cells.
+_WITHIN_CELL = re.compile(r"\[[^\]]*\]|(?<=:\d\d),(?=\d+[ \t]+[^\s,])")
 
 
 @dataclass(frozen=True)
@@ -138,6 +141,8 @@ def find_layout(
     headers = list(header) if header is not None else [str(column) for column in range(width)]
     if width == len(headers) + 1 and all(row[-1] == "" for row in rows if len(row) == width):
         headers.append("")  # every data row ends with a separator
+    if separator == "," and width == len(headers) + 1:
+        _check_seconds(path, rows[0], first + 1)
     if separator == BLANK and width != len(headers):
         notes.append(f"the header has {len(headers)} names, the rows have {width} cells")
     skipped = [index + 1 for index in content if index < above]
@@ -198,6 +203,20 @@ def _find_pair(rows: Sequence[Sequence[str]]) -> int | None:
     return None
 
 
+def _check_seconds(path: Path, row: Sequence[str], line: int) -> None:
+    """Refuse a row with a comma before the fraction of a second if commas separate its cells."""
+    for cell, fraction in pairwise(row):
+        if holds_date(cell) and re.search(r":\d\d$", cell) and fraction.isdigit():
+            problem = (
+                f"line {line} has one cell more than the header, because a comma precedes the "
+                f"fraction of the second ({cell},{fraction}) and commas separate the cells"
+            )
+            raise FormatError(
+                f"{path.name}: {problem}; write a point in its place, put the stamps in quotes, "
+                "or separate the cells by semicolons"
+            )
+
+
 def _commonest_width(rows: Sequence[Sequence[str]]) -> int:
     """Return the number of cells that most rows have."""
     widths = [len(row) for row in rows]
@@ -220,7 +239,7 @@ def _is_utf8(line: bytes) -> bool:
 
 
 def _guess_separator(line: str) -> str:
-    bare = re.sub(r"\[[^\]]*\]", "", line)
+    bare = _WITHIN_CELL.sub("", line)
     return next((mark for mark in ("\t", ";", ",") if mark in bare), BLANK)
 
 

@@ -26,7 +26,7 @@ BLANKS = 32
 
 _NAT = np.iinfo(np.int64).min
 _TAB, _LINE, _RETURN, _BLANK, _QUOTE, _HASH, _PERCENT = b'\t\n\r "#%'
-_PLUS, _MINUS, _POINT, _ZERO, _COLON, _T, _Z, _SMALL_E, _SMALL_N, _SLASH = b"+-.0:TZen/"
+_PLUS, _MINUS, _POINT, _ZERO, _COLON, _T, _Z, _SMALL_E, _SMALL_N, _SLASH, _COMMA = b"+-.0:TZen/,"
 # words for missing values, in lower case
 _NAN, _NA, _N_A, _NULL, _NONE = (
     int.from_bytes(word, "big") for word in (b"nan", b"na", b"n/a", b"null", b"none")
@@ -279,11 +279,11 @@ def _read_zone(text, at):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _read_date_stamp(text, at, size, order, point, between):  # type: ignore[no-untyped-def]
+def _read_date_stamp(text, at, size, order, mark_of_part, between):  # type: ignore[no-untyped-def]
     """Read ``2026-01-02T03:04:05.678Z`` or a like form: nanoseconds and end.
 
     Date and time are separated by T, a blank or `between`; points or slashes may take the place of
-    the first two dashes, and other zones that of the Z.
+    the first two dashes, `mark_of_part` that of the point, and other zones that of the Z.
     """
     none = (np.int64(0), np.int64(-1))
     if at + 19 >= size:  # for the caller
@@ -314,7 +314,7 @@ def _read_date_stamp(text, at, size, order, point, between):  # type: ignore[no-
     if day > last or hour > 23 or minute > 59 or second > 59:
         return none
     end, part = at + (19 if has_seconds else 16), np.uint64(0)
-    if has_seconds and (text[end] == _POINT or text[end] == point):
+    if has_seconds and (text[end] == _POINT or text[end] == mark_of_part):
         part, stop = _read_digits(text, end + 1, size, np.uint64(0))
         length = stop - end - 1
         if not 0 < length <= 9:
@@ -409,7 +409,8 @@ def _read_cell(text, at, size, role, separator, point, digits, between, may_quot
         elif role == NUMERIC_TIME:
             stamp, end = _count_of_time(text, at, size, point, digits)
         else:
-            stamp, end = _read_date_stamp(text, at, size, role, point, between)
+            mark = _COMMA if quoted or separator != _COMMA else _POINT
+            stamp, end = _read_date_stamp(text, at, size, role, mark, between)
     if quoted and end >= 0:
         end = _past_blanks(text, end, separator)
         end = end + 1 if text[end] == _QUOTE else np.int64(-1)

@@ -300,3 +300,16 @@ def test_dates_of_any_order_and_mark(stamp, mark, between, order):
 @pytest.mark.parametrize("text", ["2026-05/01 08:00:00", "2026-13-01 08:00:00", "1/5/2026 8:00:00"])
 def test_other_dates_are_left_to_the_caller(text):
     assert rows_of(f"{text} ,1\n", [YEAR_FIRST, NUMBER])[2] == 0
+
+
+@pytest.mark.parametrize(("separator", "cell", "is_read"), [
+    (";", "2026-05-01 08:00:00,25", True), (" ", "2026-05-01T08:00:00,25", True),
+    (",", '"2026-05-01 08:00:00,25"', True), (",", "2026-05-01 08:00:00,25", False),
+])  # fmt: skip
+def test_comma_before_the_fraction_of_a_second(separator: str, cell: str, is_read: bool) -> None:
+    text = f"{cell}{separator}1.5\n"
+    values, stamps, stop = rows_of(text, [YEAR_FIRST, NUMBER], separator=separator)
+    assert stop == (len(text) if is_read else 0)
+    if is_read:
+        assert np.datetime64(int(stamps[0]), "ns") == np.datetime64("2026-05-01T08:00:00.25")
+        assert values[0, 0] == 1.5
