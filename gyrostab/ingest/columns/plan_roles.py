@@ -150,7 +150,7 @@ def _date_order(draft: PlanDraft, column: Header) -> str:
         if order := parse_order(draft.options.unit[key]):
             draft.used_units.add(key)
             return order
-    order = parse_order(column.unit or "") or column.date_order
+    order = parse_order(column.unit or column.stored or "") or column.date_order
     if order == NO_DATE:
         draft.problems.append(
             UnitError(

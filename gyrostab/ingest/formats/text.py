@@ -126,7 +126,7 @@ def _plan_file(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
         path,
         layout.headers,
         options,
-        units=_duration_units(layout),
+        units={**_duration_units(layout), **layout.units},
         stamped=orders,
         orders=orders,
         rising=partial(_is_rising, layout),

@@ -5,12 +5,13 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice, pairwise
 from pathlib import Path
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.dates import holds_date, is_time_of_day
+from gyrostab.ingest.columns.dates import holds_date, is_time_of_day, parse_order
+from gyrostab.ingest.columns.headers import is_unit
 from gyrostab.ingest.limits import check_columns
 
 __all__ = [
@@ -56,6 +57,8 @@ class Layout:
     above: tuple[str, ...] = ()  # lines above the header
     #: Column whose dates have their times of day in the next one; both are one column here.
     paired: int | None = None
+    #: Units in a row under the header, by column.
+    units: Mapping[int, str] = field(default_factory=dict)
 
     @property
     def width(self) -> int:
@@ -124,20 +127,27 @@ def find_layout(
         path, 1 + max(lines[index].count(mark) for index in content for mark in "\t;,"), limits
     )
     header, separator, above, first = _find_header(path, lines, content)
+    data = [index for index in content if index >= first]
+    units = _find_units(split_line(lines[data[0]], separator), header) if header and data else {}
+    if units:
+        first = data.pop(0) + 1
     offset = sum(len(line) for line in head.splitlines(keepends=True)[:first])
-    data = [lines[index] for index in content if index >= first]
     if not data:
         raise FormatError(
             f"{path.name}: there is a header (line {content[0] + 1}) but no data row below it; "
             "copy it again"
         )
-    rows = [tuple(split_line(re.split("[#%]", line)[0], separator)) for line in data[:HEAD_LINES]]
+    rows = [
+        tuple(split_line(re.split("[#%]", lines[index])[0], separator))
+        for index in data[:HEAD_LINES]
+    ]
     paired = _find_pair(rows)
     if paired is not None:
         rows = [tuple(_join_pair(list(row), paired)) for row in rows]
     width = _commonest_width(rows)
     if header is not None and paired is not None and len(header) > width:
         header = _join_pair(header, paired)
+        units = {column - (column > paired): unit for column, unit in reversed(units.items())}
     headers = list(header) if header is not None else [str(column) for column in range(width)]
     if width == len(headers) + 1 and all(row[-1] == "" for row in rows if len(row) == width):
         headers.append("")  # every data row ends with a separator
@@ -155,7 +165,7 @@ def find_layout(
     top = tuple(lines[:above]) if header is not None else ()
     return Layout(
         tuple(headers), separator, offset, first + 1, tuple(rows[:50]), comma, tuple(notes), top,
-        paired,
+        paired, units,
     )  # fmt: skip
 
 
@@ -296,6 +306,16 @@ def _find_header(
         f"{path.name}: {problem}; if this is a gyro log, put # before the lines above its header "
         "row, or delete them"
     )
+
+
+def _find_units(cells: Sequence[str], header: Sequence[str]) -> dict[int, str]:
+    """Return the units of a row under the header by column; empty if it is not a row of units."""
+    bare = [cell.strip("[]() ") for cell in cells]
+    units = {
+        column: cell for column, cell in enumerate(bare) if is_unit(cell) or parse_order(cell)
+    }
+    is_units = len(cells) == len(header) and 2 * len(units) >= sum(map(bool, bare))
+    return units if is_units and not _is_data(list(cells), comma=True) else {}
 
 
 def _commented_header(lines: list[str], first: int, separator: str, width: int) -> list[str] | None:

@@ -34,6 +34,12 @@ from tests.support.text_logs import PLAIN, ns, write
         "\ufefftime [s],gyro_x [deg/h]\r\n0,1.5\r\n1,2.5",
         "timestamp_seconds,gyro_x[deg/h],note\n0,1.5,a # b\n1,2.5,c\n",
         ",time [s],gyro_x [deg/h]\n0,0,1.5\n1,1,2.5\n",
+        "time,gyro_x\ns,deg/h\n0,1.5\n1,2.5\n",
+        "Logger 7\ntime;gyro_x;state\n[s];[deg/h];text\n0,0;1,5;on\n1,0;2,5;on\n",
+        "time gyro_x\n  s deg/h\n  0   1.5  \n  1   2.5\n",
+        "time [s],gyro_x,n\n(ms),(deg/h),\n0,1.5,7\n1,2.5,7\n",
+        "day,clock,gyro_x\nYYYY-MM-DD,,deg/h\n1970-01-01,00:00:00,1.5\n1970-01-01,00:00:01,2.5\n",
+        "time,gyro_x\nDD/MM/YYYY,deg/h\n01/01/1970 00:00,1.5\n01/01/1970 00:00:01,2.5\n",
     ],
 )
 def test_layouts_of_the_same_log(tmp_path: Path, text: str) -> None:
@@ -41,6 +47,19 @@ def test_layouts_of_the_same_log(tmp_path: Path, text: str) -> None:
     assert ns(raw) == [0, 10**9]
     np.testing.assert_array_equal(raw.rate[0], [1.5, 2.5])
     assert raw.attrs["unreadable_rows"] == 0
+
+
+def test_units_under_the_header_need_no_options_and_yield_to_them(tmp_path: Path) -> None:
+    text = "time,gyro_x,temperature,note\ns,deg/s,degC,\n0,1.5,20,\n1,2.5,21,\n"
+    raw = read_log(write(tmp_path, text))
+    assert raw.rate[0].values.tolist() == [5400.0, 9000.0]
+    assert raw.temperature.values.tolist() == [20, 21]
+    raw = read_log(write(tmp_path, text), unit={"gyro": "deg/h"})
+    assert raw.rate[0].values.tolist() == [1.5, 2.5]
+    raw = read_log(write(tmp_path, text.replace("s,deg/s,degC,", "x,off,on,deg/s")), unit={
+        "time": "s", "gyro": "deg/h"
+    })  # fmt: skip
+    assert raw.attrs["unreadable_rows"] == 1
 
 
 def test_numbers_without_a_header_are_mapped_by_column(tmp_path: Path) -> None:
