@@ -18,7 +18,13 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from gyrostab.ingest.columns.headers import AXIS_PATTERN, TIME_PATTERN, is_time_unit, is_unit_of
+from gyrostab.ingest.columns.headers import (
+    AXIS_PATTERN,
+    TEMPERATURE_PATTERN,
+    TIME_PATTERN,
+    is_time_unit,
+    is_unit_of,
+)
 from gyrostab.ingest.guess_unit import given_unit, guess_unit, name_unit
 from gyrostab.ingest.inspect import ColumnInspection, FileInspection
 from gyrostab.time.grid import MAX_RATE_HZ
@@ -380,7 +386,9 @@ def _mean_over_scatter(group: Sequence[ColumnInspection]) -> float:
 
 def _is_temperature(column: ColumnInspection) -> bool:
     has_unit = column.unit is not None and is_unit_of(column.unit, ("temperature",))
-    is_named = bool(re.search(r"temp", column.key.lower()))
     return (
-        is_named and column.std > 0 and (has_unit or name_unit(column, "temperature") is not None)
+        bool(TEMPERATURE_PATTERN.search(column.key.lower()))
+        and column.role != "channel"  # that has its name already
+        and column.std > 0
+        and (has_unit or name_unit(column, "temperature") is not None)
     )

@@ -205,7 +205,7 @@ def _try_guess(
         if guess.time.role != "time":
             options["map"][guess.time.key] = "time"
         options["unit"]["time"] = guess.time_unit
-    if guess.temperature is not None and guess.temperature.role != "channel":
+    if guess.temperature is not None:
         options["map"][guess.temperature.key] = (
             f"temperature [{temperature_unit(guess.temperature)}]"
         )

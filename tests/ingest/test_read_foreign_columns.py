@@ -128,6 +128,46 @@ def test_advice_of_a_message_works(tmp_path: Path, text: str, options: dict) -> 
     assert read_log(path, **options).sizes["row"] == 2
 
 
+@pytest.mark.parametrize(
+    ("header", "options"),
+    [
+        ("TMP [degC]", {}),
+        ("Temperatur [°C]", {}),
+        ("Board (K)", {}),
+        ("T", {"unit": {"T": "degF"}}),
+    ],
+)
+def test_the_only_column_in_a_unit_of_temperature_is_the_temperature(
+    tmp_path: Path, header: str, options: dict
+) -> None:
+    path = write(tmp_path, f"time [s],gyro_x [deg/h],{header},bus [V]\n0,1,2,3\n1,2,3,3\n")
+    raw = read_log(path, **options)
+    assert set(raw.data_vars) == {"rate", "temperature", "bus"}
+    assert raw.temperature.attrs["units"] == "degree_Celsius"
+    assert has_note(raw, f"{header!r} is taken for the temperature")
+    name = header.split(" ")[0]
+    kept = read_log(path, map={name: name}, **options)
+    assert name in kept
+    assert "temperature" not in kept
+
+
+def test_several_temperatures_keep_their_names_with_a_note(tmp_path: Path) -> None:
+    path = write(tmp_path, "time [s],gyro_x [deg/h],TMP [degC],Case [degC]\n0,1,2,3\n1,2,3,3\n")
+    raw = read_log(path)
+    assert {"TMP", "Case"} <= set(raw.data_vars)
+    assert has_note(raw, "TMP [degC], Case [degC]", '--map "TMP=temperature"')
+    raw = read_log(path, map={"TMP": "temperature"})
+    assert {"temperature", "Case"} <= set(raw.data_vars)
+    assert not has_note(raw, "temperature")
+
+
+@pytest.mark.parametrize("name", ["temp", "IMU_Temp", "TMP", "Temperatur"])
+def test_name_like_a_temperature_is_advised_its_unit(tmp_path: Path, name: str) -> None:
+    path = write(tmp_path, f"time [s],gyro_x [deg/h],{name}\n0,1,2\n1,2,3\n")
+    assert has_note(read_log(path), f"--unit {name}=degC")
+    assert read_log(path, unit={name: "degC"}).temperature.values.tolist() == [2, 3]
+
+
 def test_unit_option_overrules_a_header_without_a_unit(tmp_path: Path) -> None:
     path = write(tmp_path, "time [s],gyro_x [x8005],temperature [x8014]\n0,1,20\n1,2,21\n")
     raw = read_log(path, unit={"gyro": "deg/s", "temperature": "degC"})

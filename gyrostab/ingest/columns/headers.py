@@ -16,6 +16,7 @@ __all__ = [
     "AXIS_PATTERN",
     "GYRO_PATTERNS",
     "KNOWN_CHANNEL_PATTERN",
+    "TEMPERATURE_PATTERN",
     "TIME_PATTERN",
     "Header",
     "distinct_columns",
@@ -57,6 +58,8 @@ QUANTITIES = {
 KNOWN_CHANNEL_PATTERN = re.compile(
     r"^(temperature|vibration|rotation_rate|supply_voltage|light_power|pressure|ramp|accel_[xyz]|mag_[xyz])$"
 )
+#: Other names of a temperature, in lower case.
+TEMPERATURE_PATTERN = re.compile(r"temp|(^|[^a-z])tmp")
 
 
 @dataclass

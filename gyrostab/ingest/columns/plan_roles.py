@@ -14,6 +14,7 @@ from gyrostab.ingest.columns.headers import (
     AXIS_PATTERN,
     GYRO_PATTERNS,
     KNOWN_CHANNEL_PATTERN,
+    TEMPERATURE_PATTERN,
     TIME_PATTERN,
     Header,
     distinct_columns,
@@ -25,7 +26,7 @@ from gyrostab.ingest.columns.headers import (
     split_header,
     unit_quantity,
 )
-from gyrostab.ingest.columns.plan_draft import Column, PlanDraft, by_lower_name
+from gyrostab.ingest.columns.plan_draft import MAX_HEADERS, Column, PlanDraft, by_lower_name
 from gyrostab.ingest.columns.stamps import TimeUnit, names_epoch, parse_time_unit
 from gyrostab.ingest.limits import limit_value
 from gyrostab.units import HOUR, INNER, known_units, parse_unit
@@ -301,8 +302,10 @@ def _find_kind(draft: PlanDraft, signal: str, header: str, key: str, name: str) 
 
 def plan_channels(draft: PlanDraft, rest: list[Header]) -> None:
     """Plan the channels: those with a unit are kept, others left out with a note or refused."""
+    _name_temperature(draft, rest)
     for column in rest:
         quantity = quantity_of(column.low)
+        likely = quantity or ("temperature" if TEMPERATURE_PATTERN.search(column.low) else None)
         is_known = bool(KNOWN_CHANNEL_PATTERN.match(column.low))
         name = column.low if is_known or quantity else re.sub(r"[/\s]+", "_", column.name)
         keys = [
@@ -324,7 +327,7 @@ def plan_channels(draft: PlanDraft, rest: list[Header]) -> None:
         if text is None and asked:
             message = (
                 f"{draft.path.name}: column {column.header!r} carries no unit; give it "
-                f"with --unit {name}={example_unit(quantity)}"
+                f"with --unit {name}={example_unit(likely)}"
             )
             draft.problems.append(
                 MissingUnitError(f'{message}, or drop the column with --map "{column.key}=-"')
@@ -338,10 +341,35 @@ def plan_channels(draft: PlanDraft, rest: list[Header]) -> None:
             draft.leave_out(column)
             continue
         if text is None:
-            draft.unitless.append((name, quantity, column.header))
+            draft.unitless.append((name, likely, column.header))
             draft.leave_out(column)
             continue
         _plan_channel(draft, column, name, quantity, text, is_known=is_known, asked=asked)
+
+
+def _name_temperature(draft: PlanDraft, rest: list[Header]) -> None:
+    """Name the only column in a unit of temperature, unless one is called temperature."""
+    if any(quantity_of(column.low) == "temperature" for column in rest):
+        return
+    given = by_lower_name(draft.options.unit)
+    found = []
+    for column in rest:
+        keys = (column.low, column.key.lower(), column.header.lower())
+        key = next((given[low] for low in keys if low in given), None)
+        unit = column.unit or column.stored or (draft.options.unit[key] if key else "")
+        if is_unit_of(unit, ("temperature",)) and quantity_of(column.low) is None:
+            found.append(column)
+    if len(found) == 1 and not (found[0].mapped or draft.options.channels_only):
+        draft.notes.append(
+            f"{found[0].header!r} is taken for the temperature, as no other column has such a unit "
+            f'(to keep its name: --map "{found[0].key}={found[0].name}")'
+        )
+        found[0].name = "temperature"
+    elif found and not any(column.mapped for column in found):
+        draft.notes.append(
+            f"in units of temperature: {list_some([c.header for c in found], MAX_HEADERS)}; name "
+            f'the temperature of the gyro: --map "{found[0].key}=temperature"'
+        )
 
 
 def _plan_channel(

@@ -311,9 +311,7 @@ def _find_header(
 def _find_units(cells: Sequence[str], header: Sequence[str]) -> dict[int, str]:
     """Return the units of a row under the header by column; empty if it is not a row of units."""
     bare = [cell.strip("[]() ") for cell in cells]
-    units = {
-        column: cell for column, cell in enumerate(bare) if is_unit(cell) or parse_order(cell)
-    }
+    units = {column: cell for column, cell in enumerate(bare) if is_unit(cell) or parse_order(cell)}
     is_units = len(cells) == len(header) and 2 * len(units) >= sum(map(bool, bare))
     return units if is_units and not _is_data(list(cells), comma=True) else {}
 
