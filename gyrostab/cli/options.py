@@ -56,7 +56,8 @@ class Reading:
         Unit of a column that states none: gyro=deg/s for all gyro axes, gyro_x=deg/s,
         temperature=degC; for counts the size of one count, "gyro=0.1 arcsec/s". Repeat for more.
     kind
-        Whether the gyro columns hold rotation rates or angles.
+        For gyro columns in a unit of angle: angle if they are cumulative, rate if each row holds
+        the increment since the row before. Columns in a unit of rate need no --kind.
     channel
         Another file with a channel of the same recording (temperature, vibration, ...). Repeat for
         more.

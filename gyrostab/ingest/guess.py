@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 from gyrostab.ingest.columns.headers import (
     AXIS_PATTERN,
+    INCREMENT_PATTERN,
     TEMPERATURE_PATTERN,
     TIME_PATTERN,
     is_time_unit,
@@ -151,7 +152,7 @@ def guess_columns(
     unit = None
     if not all(given_unit(column, "angle" if angles else "rate") for column in group):
         unit = guess_unit(inspection, axes, sampling, reasons, warnings, angles=angles)
-    guessed_kind = _guess_kind(group, warnings) if angles and kind is None else None
+    guessed_kind = _guess_kind(group, reasons, warnings) if angles and kind is None else None
     if not axes:
         warnings.append(
             "no column looks like a gyro; if one is, name it: --map NAME=gyro_x --unit gyro=deg/s"
@@ -263,7 +264,8 @@ def _guess_axes(
         return {}
     names = ", ".join(column.key for column in best[1].values())
     named = _STRONG.search(names.lower()) or any(
-        given_unit(column) or name_unit(column, "rate") for column in best[1].values()
+        given_unit(column) or name_unit(column, "rate") or INCREMENT_PATTERN.search(column.key)
+        for column in best[1].values()
     )
     reasons.append(f"{names}: the gyro, by {'name' if named else 'name and numbers'}")
     return best[1]
@@ -330,7 +332,8 @@ def _gyro_score(
 ) -> float:
     """Return a score of how much a group of columns looks like a gyro."""
     low = template.lower()
-    if any(given_unit(column) for column in group):
+    increments = INCREMENT_PATTERN.search(low) and all(given_unit(c, "angle") for c in group)
+    if increments or any(given_unit(column) for column in group):
         score = 4.0
     else:
         score = 2.5 * any(name_unit(column, "rate") for column in group)
@@ -365,8 +368,11 @@ def _gyro_score(
     return score
 
 
-def _guess_kind(group: Sequence[ColumnInspection], warnings: list[str]) -> str:
-    """Guess whether angles are cumulative or increments, by their steps, and add a warning."""
+def _guess_kind(group: Sequence[ColumnInspection], reasons: list[str], warnings: list[str]) -> str:
+    """Guess whether angles are cumulative or increments, by their names or steps."""
+    if all(INCREMENT_PATTERN.search(column.key) for column in group):
+        reasons.append("--kind rate, as the columns are increments by name")
+        return "rate"
     cumulative = all(column.scatter < CUMULATIVE_STEP_SHARE * column.std for column in group)
     kind, meaning = ("angle", "cumulative") if cumulative else ("rate", "increments of each row")
     alternative = "rate if they are increments" if cumulative else "angle if they are cumulative"

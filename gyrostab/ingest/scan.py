@@ -131,6 +131,7 @@ def scan_and_inspect(
     ScanResult
         Errors of unreadable files are collected, not raised.
     """
+    from gyrostab.ingest.columns.plan_roles import scan_advice
     from gyrostab.ingest.files import expand
 
     rows: list[dict[str, Any]] = []
@@ -140,6 +141,7 @@ def scan_and_inspect(
         try:
             rows.append(_scan_one(path, reading))
         except GyrostabError as error:
+            error.args = (str(error).removesuffix(scan_advice(path)),)
             errors.append(error)
             inspected_file = _inspect_once(path, reading, inspected) if inspect else None
             rows.append({"file": str(path), "odd": str(error)})

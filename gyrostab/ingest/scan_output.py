@@ -178,13 +178,17 @@ def _format_number(value: float) -> str:
 
 def print_inspection(inspected: InspectedFile) -> None:
     """Print the columns of a file and the guess; in a pipe every line begins with ``#``."""
+    from gyrostab.ingest.columns.plan_roles import scan_advice
+
     rows = _inspection_rows(inspected)
     guess = inspected.guess
+    advice = scan_advice(inspected.paths[0])
+    summary_notes = [note.removesuffix(advice) for note in inspected.inspection.summary.notes]
     lines = [
         *guess.reasons,
         *(f"check: {warning}" for warning in guess.warnings),
         *inspected.inspection.notes,
-        *(inspected.inspection.summary.notes if inspected.row is None else inspected.row["notes"]),
+        *(summary_notes if inspected.row is None else inspected.row["notes"]),
     ]
     if inspected.row is not None:
         read = inspected.row

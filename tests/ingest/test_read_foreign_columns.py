@@ -108,6 +108,12 @@ def test_advice_of_the_note_on_a_dropped_channel_works(
         ("time [s],gyro_x [deg/h],T\n0,1,1\n1,2,1\n", {"map": {"T": "temperature"}}),
         ("time [s],gyro_x [deg/h],T [V]\n0,1,1\n1,2,1\n", {"map": {"T": "temperature"}}),
         ("time [s],gyro_x [deg/h]\n0,1\n1,2\n", {"kind": "angle"}),
+        ("time [s],dtheta_x [arcsec]\n0,1\n1,2\n", {}),
+        ("time [s],theta_x [arcsec]\n0,1\n1,2\n", {}),
+        (
+            "time [s],dtheta_x [arcsec]\n0,1\n1,2\n",
+            {"map": {"dtheta_x": "gyro_x"}, "kind": "angle"},
+        ),
     ],
 )
 def test_advice_of_a_message_works(tmp_path: Path, text: str, options: dict) -> None:
@@ -123,6 +129,8 @@ def test_advice_of_a_message_works(tmp_path: Path, text: str, options: dict) -> 
                 if "UNIT" not in value:
                     options[option].setdefault(key, value)
                 break  # the first advice suffices
+    if "--kind" in words and "leave" not in words:
+        options["kind"] = words[len(words) - words[::-1].index("--kind")].rstrip(",;")
     if "UNIT" in str(caught.value) and not options["unit"]:
         options["unit"] = {"temperature": "degC"}
     assert read_log(path, **options).sizes["row"] == 2

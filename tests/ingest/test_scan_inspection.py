@@ -219,6 +219,30 @@ def test_angles_get_a_kind_in_the_command_and_keep_their_unit(
     assert mean == pytest.approx(3600 * GX.mean(), abs=5 * 3600 * GX.std() / np.sqrt(ROWS))
 
 
+def test_angle_increments_are_the_gyro_by_name(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    columns = {"time [s]": TIME, "toolface [deg]": TIME % 360, "dtheta_x [arcsec]": GX * 36}
+    write(tmp_path / "log.csv", columns)
+    assert call("scan", "log.csv") == 0
+    words = next_command(capsys.readouterr().out)
+    assert {"dtheta_x=gyro_x", "rate"} <= set(words)
+    assert call(*words, "--quiet-progress") == 0
+    capsys.readouterr()
+    with open_product("product.nc") as product:
+        mean = float(product.window_mean.mean())
+    assert mean == pytest.approx(3600 * GX.mean(), abs=5 * 3600 * GX.std() / np.sqrt(ROWS))
+
+
+def test_scan_does_not_advise_itself(tmp_path: Path, capsys) -> None:
+    for name in ("log", "another"):
+        write(tmp_path / f"{name}.csv", {"time [s]": TIME, "wx": GX, "wind": AX})
+        write(tmp_path / f"{name}_rain.csv", {"time [s]": TIME, "rain": AX})
+    call("scan", tmp_path / "*.csv")
+    shown = capsys.readouterr()
+    assert "no gyro column" in shown.out
+    assert "gyrostab scan" not in shown.out + shown.err
+
+
 def test_a_header_with_an_equals_sign_can_be_mapped(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     write(

@@ -15,6 +15,7 @@ from gyrostab.units import known_units, parse_unit
 __all__ = [
     "AXIS_PATTERN",
     "GYRO_PATTERNS",
+    "INCREMENT_PATTERN",
     "KNOWN_CHANNEL_PATTERN",
     "TEMPERATURE_PATTERN",
     "TIME_PATTERN",
@@ -38,9 +39,14 @@ _TIME_SUFFIX = r"s|sec|seconds?|ms|milliseconds?|us|microseconds?|ns|nanoseconds
 TIME_PATTERN = re.compile(
     rf"^(?:(?:time|timestamp|t)(?:[_ ]({_TIME_SUFFIX}))?|(?:time|timestamp)(sec|ms|us|ns|utc))$"
 )
+#: Names of angle increments.
+INCREMENT_PATTERN = re.compile(r"(^|[^a-z])d_?(theta|ang|phi)|delta|incr", re.IGNORECASE)
 GYRO_PATTERNS = [
-    re.compile(pattern, re.IGNORECASE)
-    for pattern in (r"gyr|angular_?(rate|vel)|omega", r"^[gw]_?[xyz](_|$)|^w_rs", r"rate|rot")
+    *(
+        re.compile(pattern, re.IGNORECASE)
+        for pattern in (r"gyr|angular_?(rate|vel)|omega", r"^[gw]_?[xyz](_|$)|^w_rs", r"rate|rot")
+    ),
+    INCREMENT_PATTERN,
 ]
 
 #: Channel name, or the stem before an underscore -> quantity.

@@ -13,6 +13,7 @@ from gyrostab.ingest.columns.dates import DAY_FIRST, MONTH_FIRST, NO_DATE, YEAR_
 from gyrostab.ingest.columns.headers import (
     AXIS_PATTERN,
     GYRO_PATTERNS,
+    INCREMENT_PATTERN,
     KNOWN_CHANNEL_PATTERN,
     TEMPERATURE_PATTERN,
     TIME_PATTERN,
@@ -32,7 +33,7 @@ from gyrostab.ingest.limits import limit_value
 from gyrostab.units import HOUR, INNER, known_units, parse_unit
 from gyrostab.wording import list_some
 
-__all__ = ["find_time", "plan_channels", "plan_gyro"]
+__all__ = ["find_time", "plan_channels", "plan_gyro", "scan_advice"]
 
 
 def find_time(draft: PlanDraft, named: list[Header]) -> Header | None:
@@ -297,6 +298,13 @@ def _find_kind(draft: PlanDraft, signal: str, header: str, key: str, name: str) 
             "increment since the row before"
         )
         draft.problems.append(OptionError(f"{message}; give {advice}"))
+    if draft.options.kind == "angle" and name.startswith("gyro") and INCREMENT_PATTERN.search(key):
+        message = f"{draft.path.name}: --kind angle, but column {header!r} is named as an increment"
+        axis = name.removeprefix("gyro_")
+        advice = f'if it is the cumulative angle, name it so with --map "{key}=angle_{axis}"'
+        draft.problems.append(
+            OptionError(f"{message}; give --kind rate if each row is an increment, or {advice}")
+        )
     return "angle" if draft.options.kind == "angle" else "increment"
 
 
@@ -352,24 +360,28 @@ def _name_temperature(draft: PlanDraft, rest: list[Header]) -> None:
     if any(quantity_of(column.low) == "temperature" for column in rest):
         return
     given = by_lower_name(draft.options.unit)
-    found = []
+    temperatures = []
     for column in rest:
         keys = (column.low, column.key.lower(), column.header.lower())
         key = next((given[low] for low in keys if low in given), None)
         unit = column.unit or column.stored or (draft.options.unit[key] if key else "")
         if is_unit_of(unit, ("temperature",)) and quantity_of(column.low) is None:
-            found.append(column)
-    if len(found) == 1 and not (found[0].mapped or draft.options.channels_only):
+            temperatures.append(column)
+    if not temperatures or any(column.mapped for column in temperatures):
+        return
+    first = temperatures[0]
+    if len(temperatures) == 1 and not draft.options.channels_only:
         draft.notes.append(
-            f"{found[0].header!r} is taken for the temperature, as no other column has such a unit "
-            f'(to keep its name: --map "{found[0].key}={found[0].name}")'
+            f"{first.header!r} is taken for the temperature, as no other column has such a unit "
+            f'(to keep its name: --map "{first.key}={first.name}")'
         )
-        found[0].name = "temperature"
-    elif found and not any(column.mapped for column in found):
-        draft.notes.append(
-            f"in units of temperature: {list_some([c.header for c in found], MAX_HEADERS)}; name "
-            f'the temperature of the gyro: --map "{found[0].key}=temperature"'
-        )
+        first.name = "temperature"
+        return
+    headers = list_some([column.header for column in temperatures], MAX_HEADERS)
+    draft.notes.append(
+        f"in units of temperature: {headers}; name the temperature of the gyro: --map "
+        f'"{first.key}=temperature"'
+    )
 
 
 def _plan_channel(
@@ -420,19 +432,22 @@ def _no_gyro(path: Path, headers: Sequence[str]) -> FormatError:
     unit = (
         "deg/h" if re.search(r"deg_?(per_?|/)?h|dph", low) else "rad/s" if "rad" in low else "deg/s"
     )
-    unit_option = (
-        ""
-        if likely and likely.unit and is_unit_of(likely.unit, ("rate", "angle"))
-        else f" --unit gyro={unit}"
-    )
+    options = f" --unit gyro={unit}"
+    if likely and likely.unit and is_unit_of(likely.unit, ("rate",)):
+        options = ""
+    elif likely and likely.unit and is_unit_of(likely.unit, ("angle",)):
+        options = f" --kind {'rate' if INCREMENT_PATTERN.search(likely.name) else 'angle'}"
     message = (
         f"{path.name}: no gyro column (gyro_x, gyro_y, gyro_z or angle_x ...). Columns: "
         f"{list_some([c.name for c in columns], 100)}"
     )
     advice = (
         "Say which they are, for instance: --map "
-        f'"{likely.key if likely else "NAME"}=gyro_x"{unit_option}'
+        f'"{likely.key if likely else "NAME"}=gyro_x"{options}'
     )
-    return FormatError(
-        f"{message}. {advice}; gyrostab scan {shlex.quote(path.name)} inspects each column"
-    )
+    return FormatError(f"{message}. {advice}{scan_advice(path)}")
+
+
+def scan_advice(path: Path) -> str:
+    """Return the end of a message that advises `gyrostab scan`, which leaves it out."""
+    return f"; gyrostab scan {shlex.quote(path.name)} inspects each column"
