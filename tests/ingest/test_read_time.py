@@ -10,6 +10,7 @@ import cftime
 import h5py
 import netCDF4
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
@@ -17,6 +18,7 @@ from pyarrow import parquet
 from gyrostab.errors import FormatError, OptionError, UnitError
 from gyrostab.ingest import read_log, scan_file
 from gyrostab.ingest.columns.stamps import NAT, dates_to_ns, integers_to_ns, parse_time_unit
+from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.time.grid import stamp_ns
 
 ROWS = 40
@@ -283,3 +285,47 @@ def test_a_tdms_waveform_that_begins_after_2262_is_refused(tmp_path):
         )
     with pytest.raises(FormatError, match=r"log\.tdms: .*2262"):
         read_log(tmp_path / "log.tdms")
+
+
+@pytest.mark.parametrize("block", [2**9, 2**22])
+@pytest.mark.parametrize(("name", "days"), [("log.csv", 1), ("log.csv", 7), ("log.parquet", 1)])
+@pytest.mark.parametrize("jitter", [0.0, 0.002])
+def test_clock_that_begins_again_at_midnight_is_continued(
+    tmp_path, monkeypatch, name, days, jitter, block
+):
+    monkeypatch.setattr("gyrostab.ingest.formats.text.BLOCK_BYTES", block)
+    clock = 86400.0 * days - 100.0 + np.arange(4000) / 20
+    clock = np.round(clock + jitter * np.random.default_rng(1).standard_normal(clock.size), 4)
+    table = pd.DataFrame({"time [s]": clock % (86400 * days), "gyro_x [deg/h]": np.arange(4000.0)})
+    table.loc[7, "time [s]"] = np.nan
+    path = tmp_path / name
+    table.to_csv(path, index=False) if name.endswith("csv") else table.to_parquet(path)
+    raw = read_log(path)
+    read = raw.time.values.astype("datetime64[ns]").view(np.int64) / 1e9
+    np.testing.assert_allclose(np.delete(read, 7), np.delete(clock, 7), atol=1e-6)
+    assert sum("the clock begins again" in note for note in raw.attrs["notes"]) == 1
+    log = regularise(raw)
+    assert log.sizes["time"] == 4000
+    assert not (log.gap_samples.values > 1).any()
+
+
+@pytest.mark.parametrize("first", [0.2, 40.0])
+def test_clock_that_restarts_elsewhere_is_not_continued(tmp_path, first):
+    clock = np.concatenate([50_000 + np.arange(100) / 20, first + np.arange(100) / 20])
+    if first < 1:
+        clock[:100] += 36_390  # ends 5 s before midnight
+    path = tmp_path / "log.csv"
+    pd.DataFrame({"time [s]": clock, "gyro_x [deg/h]": 1.0}).to_csv(path, index=False)
+    raw = read_log(path)
+    assert raw.time.values.astype("datetime64[ns]").view(np.int64)[100] == round(first * 1e9)
+    assert not any("the clock begins again" in note for note in raw.attrs["notes"])
+
+
+def test_one_wrong_stamp_is_not_midnight(tmp_path):
+    clock = 86_398 + np.arange(100) / 20
+    clock[40:] += 1e-3
+    clock[39] = 0.0
+    path = tmp_path / "log.csv"
+    pd.DataFrame({"time [s]": clock, "gyro_x [deg/h]": 1.0}).to_csv(path, index=False)
+    stamps = read_log(path).time.values.astype("datetime64[ns]").view(np.int64)
+    assert stamps[40] == round(clock[40] * 1e9)

@@ -20,7 +20,7 @@ from gyrostab.ingest.columns.pieces import (
     stack_as_rows,
 )
 from gyrostab.ingest.columns.plan import Column, Plan
-from gyrostab.ingest.columns.stamps import NAT
+from gyrostab.ingest.columns.stamps import NAT, continue_clock, find_turn
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store.row_inspection import RowInspection
@@ -34,6 +34,15 @@ MAX_UNREADABLE_SHARE = 0.5
 
 Values = dict[int, NDArray[np.float64]]
 Locate = Callable[[Sequence[int]], list[str]]
+
+
+class ClockBlock(NamedTuple):
+    """Stamps of a block whose clock may begin again after a day or a week [ns]."""
+
+    first: int
+    last: int  # continued within the block
+    typical: float  # step
+    turns: list[int]  # periods that were added within the block
 
 
 class ConvertedBlock(NamedTuple):
@@ -57,6 +66,7 @@ class ConvertedBlock(NamedTuple):
     inspection: RowInspection | None = (
         None  # findings of the scan pass over values that stay in the file
     )
+    clock: ClockBlock | None = None
 
 
 _NO_ROWS = np.empty(0, np.int64)
@@ -83,6 +93,10 @@ class RawLogBuilder:
         self.cell_places: list[str] = []
         self.bad_index: list[NDArray[np.int64]] = []
         self.low, self.high = np.iinfo(np.int64).max, NAT
+        unit = None if self.time is None else self.time.time_unit
+        self.continues_clock = unit is not None and unit.epoch is None
+        self.last_stamp: int | None = None
+        self.turns: list[int] = []
         self.inspections: list[RowInspection] = []
         self.whole: dict[int, tuple[float, float] | None] = {
             column.source: (0.0, 0.0) for column in [*self.gyro, *self.channels]
@@ -103,8 +117,6 @@ class RawLogBuilder:
         words : int
             Channel cells whose text is not a number (empty cells do not count).
         """
-        from gyrostab.kernels.encoding.compact import even_steps
-
         size = (
             len(next(iter(values.values()))) if values else len(stamps) if stamps is not None else 0
         )
@@ -124,17 +136,19 @@ class RawLogBuilder:
             bad = bad | np.logical_and.reduce([mask for mask in masks if mask is not None])
         any_bad = bool(bad.any())
         cell_masks = [mask & ~bad for mask in gyro]
-        low, high = np.iinfo(np.int64).max, NAT
+        low, high, clock = np.iinfo(np.int64).max, NAT, None
         if stamps is not None and self.time is not None:
+            if self.continues_clock:
+                stamps, clock = _continue_block(stamps)
             good = stamps[~bad] if any_bad else stamps
             if len(good):
                 low, high = int(good.min()), int(good.max())
-            table = even_steps(stamps)
-            block[self.time.source] = stamps if table is None else EvenStampsPiece(table, size)
+            block[self.time.source] = _pack_stamps(stamps)
         return ConvertedBlock(
             size, block, ranges, np.flatnonzero(bad) if any_bad else _NO_ROWS,
             np.flatnonzero(np.logical_or.reduce(cell_masks)) if cell_masks else _NO_ROWS,
             bad_cells, sum(int(np.count_nonzero(mask)) for mask in cell_masks), low, high,
+            clock=clock,
         )  # fmt: skip
 
     def add(self, converted: ConvertedBlock, locate: Locate | None = None) -> None:
@@ -147,6 +161,8 @@ class RawLogBuilder:
         """
         if converted.rows == 0:
             return
+        if converted.clock is not None:
+            converted = self._continue_clock(converted, converted.clock)
         first = self.buffers.rows
         locate = locate or (lambda rows: [f"row {first + row}" for row in rows])
         self.bad_cells += converted.bad_cells
@@ -161,6 +177,27 @@ class RawLogBuilder:
         self.low, self.high = min(self.low, converted.low), max(self.high, converted.high)
         self.inspections += [converted.inspection] if converted.inspection is not None else []
         self.buffers.add(converted.block)
+
+    def _continue_clock(self, converted: ConvertedBlock, clock: ClockBlock) -> ConvertedBlock:
+        """Continue the stamps of a block where those of the blocks before it end."""
+        shift, last = sum(self.turns), self.last_stamp
+        turn = 0 if last is None else find_turn(clock.first + shift - last, clock.typical)
+        shift += turn
+        self.turns += [*([turn] if turn else []), *clock.turns]
+        self.last_stamp = clock.last + shift
+        if shift == 0 or self.time is None:
+            return converted
+        piece = converted.block[self.time.source]
+        stamps = np.empty(converted.rows, np.int64)
+        if isinstance(piece, Piece):
+            piece.read_into(0, stamps)
+        else:
+            stamps[:] = piece
+        stamps[stamps != NAT] += shift
+        block = {**converted.block, self.time.source: _pack_stamps(stamps)}
+        has_range = converted.low <= converted.high
+        low, high = converted.low + shift * has_range, converted.high + shift * has_range
+        return converted._replace(block=block, low=low, high=high)
 
     def _convert_column(
         self, column: Column, values: NDArray[np.float64]
@@ -314,9 +351,40 @@ class RawLogBuilder:
                 f"{self.cells} gyro cells hold no number in rows that are readable otherwise: "
                 f"{where}"
             )
+        if self.turns:
+            days = max(self.turns) // (86400 * 10**9)
+            times = f"{len(self.turns)} time{'s' * (len(self.turns) > 1)}"
+            notes.append(
+                f"the clock begins again after {'a day' if days == 1 else 'a week'} ({times}) "
+                "without a pause; the stamps are continued"
+            )
         if self.options.start is not None and self.time is not None:
             notes.append("--start is not used: the file has its own time column")
         return notes
+
+
+def _continue_block(
+    stamps: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], ClockBlock | None]:
+    """Continue the readable stamps of a block; the block is None without any."""
+    is_good = stamps != NAT
+    good = stamps if is_good.all() else stamps[is_good]
+    if not good.size:
+        return stamps, None
+    continued, turns, typical = continue_clock(good)
+    clock = ClockBlock(int(good[0]), int(continued[-1]), typical, turns)
+    if turns and good is not stamps:
+        stamps = stamps.copy()
+        stamps[is_good] = continued
+        return stamps, clock
+    return continued if turns else stamps, clock
+
+
+def _pack_stamps(stamps: NDArray[np.int64]) -> NDArray[np.int64] | EvenStampsPiece:
+    from gyrostab.kernels.encoding.compact import even_steps
+
+    table = even_steps(stamps)
+    return stamps if table is None else EvenStampsPiece(table, len(stamps))
 
 
 def _join_places(places: Sequence[str], total: int) -> str:

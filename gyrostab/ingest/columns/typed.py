@@ -123,6 +123,7 @@ def read_columns(
     stay = stay and 8 * rows * len(plan.columns) > builder.buffers.limit
     if stay:
         builder.grids = dict.fromkeys(builder.grids)  # nothing is packed
+        builder.continues_clock = False  # stamps are read again from the file
     step = batch_rows(len(plan.columns))
     spans = ((start, min(start + step, rows)) for start in range(0, rows, step))
     take = partial(_convert_span, builder, plan, options, fetch, stay)
