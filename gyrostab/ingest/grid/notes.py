@@ -17,9 +17,14 @@ from gyrostab.schema import GAP_CAUSES, log_channels
 from gyrostab.time.grid import grid_times
 from gyrostab.time.stamps import format_stamp, to_nanoseconds
 
-__all__ = ["describe_channels", "describe_placement", "describe_rate"]
+__all__ = ["describe_angles", "describe_channels", "describe_placement", "describe_rate"]
 
 _MAX_NAMED = 5  # events of one kind that are listed one by one
+#: Rows of which the steps of angles are taken, and the least number.
+_STEP_ROWS, _MIN_STEP_ROWS = 2**14, 100
+#: Angles are like increments if their steps, over sqrt(2), are more than this share of their
+#: standard deviation: white increments have 1, and a random walk of 100 rows or more 0.2 or less.
+_INCREMENT_STEP_SHARE = 0.5
 
 
 def describe_channels(log: xr.Dataset) -> list[str]:
@@ -42,6 +47,22 @@ def describe_channels(log: xr.Dataset) -> list[str]:
                 f"{_format_span(start, end)}; {advice}"
             )
     return notes
+
+
+def describe_angles(raw: xr.Dataset) -> list[str]:
+    """Return a note if cumulative angles have the steps of increments."""
+    values = np.asarray(raw["angle"].isel(row=slice(0, _STEP_ROWS)).values, dtype=np.float64)
+    finite = values[:, np.isfinite(values).all(axis=0)]
+    steps = np.diff(finite, axis=1)
+    if steps.shape[1] < _MIN_STEP_ROWS:
+        return []
+    shares = steps.std(axis=1) / np.sqrt(2.0) / np.maximum(finite.std(axis=1), 1e-300)
+    if not (shares > _INCREMENT_STEP_SHARE).all():
+        return []
+    return [
+        f"{record_name(raw)}: with --kind angle the angles are cumulative, but they change from "
+        "row to row like increments; if each row is an increment, give --kind rate"
+    ]
 
 
 def _format_span(first: np.datetime64, last: np.datetime64) -> str:

@@ -21,7 +21,12 @@ from gyrostab.ingest.grid.axes import regularise_axes
 from gyrostab.ingest.grid.fill import gather_channel, rows_on_grid
 from gyrostab.ingest.grid.gaps import find_gaps, gap_table
 from gyrostab.ingest.grid.jitter import JitterModel
-from gyrostab.ingest.grid.notes import describe_channels, describe_placement, describe_rate
+from gyrostab.ingest.grid.notes import (
+    describe_angles,
+    describe_channels,
+    describe_placement,
+    describe_rate,
+)
 from gyrostab.ingest.grid.place import (
     Placement,
     check_grid,
@@ -410,6 +415,8 @@ def regularise(
         find_gaps(placement, scanned), raw.attrs.get("unreadable_spans", ()), placement.start, hertz
     )
     notes += describe_placement(raw, scanned, placement, table, hertz)
+    if name == "angle" and raw.attrs.get("kind") == "angle":
+        notes += describe_angles(raw)
 
     increments = raw.attrs.get("kind") == "increment"
     signal = "rate" if increments else name

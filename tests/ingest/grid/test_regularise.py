@@ -168,6 +168,17 @@ def test_cumulative_angle_stays_an_angle():
     assert log.attrs["kind"] == "angle"
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_increments_that_are_read_as_cumulative_angles_get_a_note(seed):
+    increments = np.random.default_rng(seed).standard_normal((2, 300)) + 0.2
+    increments[0, 7] = np.nan
+    stamps = stamps_of(np.arange(300), 100.0)
+    note = "if each row is an increment, give --kind rate"
+    for values, is_noted in ((increments, True), (np.nancumsum(increments, axis=1), False)):
+        log = regularise(raw_log(stamps, values, kind="angle"))
+        assert any(note in text for text in log.attrs["notes"]) == is_noted
+
+
 def test_unreadable_cells_infinite_values_and_lost_stamps():
     values = np.arange(400.0).reshape(2, 200)
     values[0, 50:53] = np.nan  # one axis
