@@ -159,6 +159,16 @@ def test_the_only_column_in_a_unit_of_temperature_is_the_temperature(
     assert "temperature" not in kept
 
 
+def test_temperature_of_another_file_is_not_in_the_way(tmp_path: Path) -> None:
+    path = write(tmp_path, "time [s],gyro_x [deg/h],TMP [degC]\n0,1,2\n1,2,3\n")
+    probe = write(tmp_path, "time [s],temperature [degC]\n0,7\n1,8\n", "probe.csv")
+    mud = write(tmp_path, "time [s],mud [degC]\n0,7\n1,8\n", "mud.csv")
+    assert {"TMP", "temperature"} <= set(read_log(path, channel=probe).data_vars)
+    raw = read_log(path, channel=mud)
+    assert {"TMP", "mud"} <= set(raw.data_vars)
+    assert has_note(raw, '--map "TMP=temperature"')
+
+
 def test_several_temperatures_keep_their_names_with_a_note(tmp_path: Path) -> None:
     path = write(tmp_path, "time [s],gyro_x [deg/h],TMP [degC],Case [degC]\n0,1,2,3\n1,2,3,3\n")
     raw = read_log(path)

@@ -357,20 +357,21 @@ def plan_channels(draft: PlanDraft, rest: list[Header]) -> None:
 
 def _name_temperature(draft: PlanDraft, rest: list[Header]) -> None:
     """Name the only column in a unit of temperature, unless one is called temperature."""
-    if any(quantity_of(column.low) == "temperature" for column in rest):
+    options = draft.options
+    if options.channels_only or any(quantity_of(column.low) == "temperature" for column in rest):
         return
-    given = by_lower_name(draft.options.unit)
+    given = by_lower_name(options.unit)
     temperatures = []
     for column in rest:
         keys = (column.low, column.key.lower(), column.header.lower())
         key = next((given[low] for low in keys if low in given), None)
-        unit = column.unit or column.stored or (draft.options.unit[key] if key else "")
+        unit = column.unit or column.stored or (options.unit[key] if key else "")
         if is_unit_of(unit, ("temperature",)) and quantity_of(column.low) is None:
             temperatures.append(column)
     if not temperatures or any(column.mapped for column in temperatures):
         return
     first = temperatures[0]
-    if len(temperatures) == 1 and not draft.options.channels_only:
+    if len(temperatures) == 1 and not options.channel:  # one of its files may hold `temperature`
         draft.notes.append(
             f"{first.header!r} is taken for the temperature, as no other column has such a unit "
             f'(to keep its name: --map "{first.key}={first.name}")'
