@@ -297,7 +297,7 @@ def test_a_time_column_may_be_mapped_away_or_chosen(tmp_path: Path) -> None:
 
 def test_temperature_called_t_is_not_the_time(tmp_path: Path) -> None:
     raw = read_log(write(tmp_path, "time [s],gyro_x [deg/h],T [degC]\n0,1,20\n1,2,21\n"))
-    assert raw.temperature.values.tolist() == [20, 21]
+    assert raw["T"].values.tolist() == [20, 21]
     assert ns(read_log(write(tmp_path, "t [s],gyro_x [deg/h]\n0,1\n1,2\n"))) == [0, 10**9]
 
 
