@@ -113,7 +113,7 @@ def test_names_that_no_file_can_hold_come_back(tmp_path, suffix, own_time):
 def test_a_name_that_no_file_can_hold_goes_all_the_way(tmp_path, capfd):
     log = write_log(
         tmp_path / "log.csv",
-        header="time [s],gyro_x [deg/h],gyro_y [deg/h],<svg onload=x> [V]",
+        header="time [s],gyro_x [deg/h],gyro_y [deg/h],<svg onload=x> [K]",
         change=lambda rows: [f"{row},{20 + index / 1000}" for index, row in enumerate(rows)],
     )
     assert call("run", log, "-o", tmp_path / "product.nc", *WINDOW, "--quiet-progress") == 0
