@@ -145,28 +145,25 @@ def test_advice_of_a_message_works(tmp_path: Path, text: str, options: dict) -> 
         ("T", {"unit": {"T": "degF"}}),
     ],
 )
-def test_the_only_column_in_a_unit_of_temperature_is_the_temperature(
+def test_a_column_in_a_unit_of_temperature_keeps_its_name_with_a_note(
     tmp_path: Path, header: str, options: dict
 ) -> None:
     path = write(tmp_path, f"time [s],gyro_x [deg/h],{header},bus [V]\n0,1,2,3\n1,2,3,3\n")
     raw = read_log(path, **options)
-    assert set(raw.data_vars) == {"rate", "temperature", "bus"}
-    assert raw.temperature.attrs["units"] == "degree_Celsius"
-    assert has_note(raw, f"{header!r} is taken for the temperature")
     name = header.split(" ")[0]
-    kept = read_log(path, map={name: name}, **options)
-    assert name in kept
-    assert "temperature" not in kept
+    assert set(raw.data_vars) == {"rate", name, "bus"}
+    assert has_note(raw, header, f'--map "{name}=temperature"')
+    mapped = read_log(path, map={name: "temperature"}, **options)
+    assert mapped.temperature.attrs["units"] == "degree_Celsius"
+    assert not has_note(mapped, "in units of temperature")
 
 
-def test_temperature_of_another_file_is_not_in_the_way(tmp_path: Path) -> None:
+def test_temperature_of_another_file_needs_no_note(tmp_path: Path) -> None:
     path = write(tmp_path, "time [s],gyro_x [deg/h],TMP [degC]\n0,1,2\n1,2,3\n")
     probe = write(tmp_path, "time [s],temperature [degC]\n0,7\n1,8\n", "probe.csv")
-    mud = write(tmp_path, "time [s],mud [degC]\n0,7\n1,8\n", "mud.csv")
-    assert {"TMP", "temperature"} <= set(read_log(path, channel=probe).data_vars)
-    raw = read_log(path, channel=mud)
-    assert {"TMP", "mud"} <= set(raw.data_vars)
-    assert has_note(raw, '--map "TMP=temperature"')
+    raw = read_log(path, channel=probe)
+    assert {"TMP", "temperature"} <= set(raw.data_vars)
+    assert not has_note(raw, "in units of temperature")
 
 
 def test_several_temperatures_keep_their_names_with_a_note(tmp_path: Path) -> None:
@@ -183,7 +180,7 @@ def test_several_temperatures_keep_their_names_with_a_note(tmp_path: Path) -> No
 def test_name_like_a_temperature_is_advised_its_unit(tmp_path: Path, name: str) -> None:
     path = write(tmp_path, f"time [s],gyro_x [deg/h],{name}\n0,1,2\n1,2,3\n")
     assert has_note(read_log(path), f"--unit {name}=degC")
-    assert read_log(path, unit={name: "degC"}).temperature.values.tolist() == [2, 3]
+    assert read_log(path, unit={name: "degC"})[name].values.tolist() == [2, 3]
 
 
 def test_unit_option_overrules_a_header_without_a_unit(tmp_path: Path) -> None:

@@ -310,7 +310,7 @@ def _find_kind(draft: PlanDraft, signal: str, header: str, key: str, name: str) 
 
 def plan_channels(draft: PlanDraft, rest: list[Header]) -> None:
     """Plan the channels: those with a unit are kept, others left out with a note or refused."""
-    _name_temperature(draft, rest)
+    _note_temperatures(draft, rest)
     for column in rest:
         quantity = quantity_of(column.low)
         likely = quantity or ("temperature" if TEMPERATURE_PATTERN.search(column.low) else None)
@@ -355,10 +355,11 @@ def plan_channels(draft: PlanDraft, rest: list[Header]) -> None:
         _plan_channel(draft, column, name, quantity, text, is_known=is_known, asked=asked)
 
 
-def _name_temperature(draft: PlanDraft, rest: list[Header]) -> None:
-    """Name the only column in a unit of temperature, unless one is called temperature."""
+def _note_temperatures(draft: PlanDraft, rest: list[Header]) -> None:
+    """Note which columns could be the temperature of the gyro, unless one is named so."""
     options = draft.options
-    if options.channels_only or any(quantity_of(column.low) == "temperature" for column in rest):
+    is_named = any(quantity_of(column.low) == "temperature" for column in rest)
+    if is_named or options.channels_only or options.channel:  # a file of channels may hold it
         return
     given = by_lower_name(options.unit)
     temperatures = []
@@ -366,23 +367,14 @@ def _name_temperature(draft: PlanDraft, rest: list[Header]) -> None:
         keys = (column.low, column.key.lower(), column.header.lower())
         key = next((given[low] for low in keys if low in given), None)
         unit = column.unit or column.stored or (options.unit[key] if key else "")
-        if is_unit_of(unit, ("temperature",)) and quantity_of(column.low) is None:
+        if is_unit_of(unit, ("temperature",)):
             temperatures.append(column)
-    if not temperatures or any(column.mapped for column in temperatures):
-        return
-    first = temperatures[0]
-    if len(temperatures) == 1 and not options.channel:  # one of its files may hold `temperature`
+    if temperatures and not any(column.mapped for column in temperatures):
+        headers = list_some([column.header for column in temperatures], MAX_HEADERS)
         draft.notes.append(
-            f"{first.header!r} is taken for the temperature, as no other column has such a unit "
-            f'(to keep its name: --map "{first.key}={first.name}")'
+            f"in units of temperature: {headers}; name the temperature of the gyro: --map "
+            f'"{temperatures[0].key}=temperature"'
         )
-        first.name = "temperature"
-        return
-    headers = list_some([column.header for column in temperatures], MAX_HEADERS)
-    draft.notes.append(
-        f"in units of temperature: {headers}; name the temperature of the gyro: --map "
-        f'"{first.key}=temperature"'
-    )
 
 
 def _plan_channel(
