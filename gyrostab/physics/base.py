@@ -317,6 +317,10 @@ class Effect:
         """Describe the effect in one sentence with its parameters and their standard errors."""
         raise NotImplementedError
 
+    def say_in_record(self, windows: Windows, errors: Mapping[str, float] | None = None) -> str:
+        """Describe the effect as `say` does, without what the record does not determine."""
+        return self.say(errors)
+
     # --------------------------------------------------------------------------------
     # phrases
 

@@ -15,6 +15,7 @@ from gyrostab.units import INNER
 __all__ = ["AliasedVibration", "GSensitivity", "Magnetic", "VibrationRectification"]
 
 _MIN_EDGE_HZ = 0.01
+_FOLDED_POINTS = 1001  # of the spectrum of the samples, from which a sentence takes the band
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -309,17 +310,19 @@ class AliasedVibration(Effect):
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict the aliased spectrum of one process on all axes."""
+        folded = self._fold_density(windows.frequency, windows.rate)
+        power = windows.drivers["vibration"] ** 2
+        return Prediction(spectrum={"sensitivity": power[:, None] * folded}, coherent=True)
+
+    def _fold_density(self, frequency: Array, rate: float) -> Array:
+        """Return the two-sided density of the samples [Hz-1] for unit sensitivity and vibration."""
         from gyrostab.kernels.random.coloured import band_psd, folded_psd
 
         def density(f: Array) -> Array:
             return band_psd(f, self.low, self.high, resonance=self.resonance, quality=self.quality)
 
         average = self.sampling == "average"
-        folded = folded_psd(
-            density, windows.frequency, windows.rate, 3.0 * self.high, average=average
-        )
-        power = windows.drivers["vibration"] ** 2
-        return Prediction(spectrum={"sensitivity": power[:, None] * folded}, coherent=True)
+        return folded_psd(density, frequency, rate, 3.0 * self.high, average=average)
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Describe the effect in one sentence."""
@@ -333,6 +336,24 @@ class AliasedVibration(Effect):
         band = f"{self.low:.4g} to {self.high:.4g} Hz"
         folds = f"Vibration at {band} folds into the samples {self.on_axes()}"
         return f"{folds}, with a sensitivity of {size}{mount}; each sample is {sampling}."
+
+    def say_in_record(self, windows: Windows, errors: Mapping[str, float] | None = None) -> str:
+        """Describe the folded band in the record, unless the log states the band of the vibration.
+
+        Bands that fold onto the same frequencies give the same samples.
+        """
+        if "vibration" in windows.bands:
+            return self.say(errors)
+        frequency = np.linspace(0.0, windows.rate / 2.0, _FOLDED_POINTS)
+        density = self._fold_density(frequency, windows.rate)
+        rms = float(np.sqrt(density.mean() * windows.rate))
+        seen = replace(self, sensitivity=tuple(size * rms for size in self.sensitivity))
+        band = frequency[density >= density.max() / 2.0]
+        return (
+            f"Vibration above half of the sampling rate folds into the samples {self.on_axes()}, "
+            f"as noise at {band[0]:.3g} to {band[-1]:.3g} Hz of {seen.quantity('sensitivity')} "
+            "(rms) in the record, which does not determine its original frequencies."
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

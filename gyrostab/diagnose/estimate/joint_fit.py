@@ -29,6 +29,7 @@ from gyrostab.diagnose.statistics.spectral_line import line_quality
 from gyrostab.errors import GyrostabError
 from gyrostab.noise import NORMAL_95
 from gyrostab.physics.base import Effect
+from gyrostab.physics.prediction import Windows
 from gyrostab.physics.registry import effects
 from gyrostab.physics.rotation import EarthRate
 
@@ -64,13 +65,16 @@ class Fitted:
     note: str = ""  # what the sizes do not show
     shown: Effect | None = None  # the same with the sizes, if they differ
 
-    def say(self) -> str:
-        """Describe the effect with its sizes in one sentence; empty without sizes."""
+    def say(self, windows: Windows | None = None) -> str:
+        """Describe the effect with its sizes in one sentence; empty without sizes.
+
+        With the windows of the record, only by what the record determines; without, all is known.
+        """
         if self.effect is None or not self.parameters:
             return ""
-        text = (self.shown or self.effect).say(
-            {name: estimate.stderr for name, estimate in self.parameters.items()}
-        )
+        effect = self.shown or self.effect
+        errors = {name: estimate.stderr for name, estimate in self.parameters.items()}
+        text = effect.say(errors) if windows is None else effect.say_in_record(windows, errors)
         return f"{text} {self.note}" if self.note else text
 
 

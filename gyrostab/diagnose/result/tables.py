@@ -18,7 +18,7 @@ from gyrostab.diagnose.identify.components import are_lines
 from gyrostab.diagnose.identify.forward_search import MIN_P_VALUE, tail_probability
 from gyrostab.diagnose.identify.identification import Identification, Identifications, Unidentified
 from gyrostab.diagnose.identify.nuisance_alternatives import NUISANCE_ALTERNATIVES
-from gyrostab.diagnose.predict.windows import channel_units
+from gyrostab.diagnose.predict.windows import channel_units, make_windows
 from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
 from gyrostab.diagnose.result.diagnosis import effect_table
@@ -373,8 +373,7 @@ def effect_tables(
                 "probability": round(name_probability(identification, settings=settings), 3),
                 "family": family,
                 "statement": effect_statement(
-                    fitted_effect.say()
-                    or unsized_statement(identification.effect, fitted_effect.axes),
+                    _describe_fitted(fitted_effect, blocks),
                     alternatives=identification.alternatives,
                     intervals=[]
                     if when == [(float(begin[0]), record_s)]
@@ -383,6 +382,19 @@ def effect_tables(
             }
         )
     return sorted(out, key=lambda table: -table["held_out_gain"]["nats"])
+
+
+def _describe_fitted(fitted_effect: Fitted, blocks: xr.Dataset) -> str:
+    """Describe a fitted effect by what the record determines of it."""
+    text = ""
+    if fitted_effect.effect is not None:
+        drivers = {
+            role: name
+            for role, name in fitted_effect.effect.channel_names().items()
+            if f"channel_{name}" in blocks
+        }
+        text = fitted_effect.say(make_windows(blocks, drivers))
+    return text or unsized_statement(fitted_effect.identification.effect, fitted_effect.axes)
 
 
 def _families_of(fitted: Sequence[Fitted], blocks: xr.Dataset) -> list[str | None]:
