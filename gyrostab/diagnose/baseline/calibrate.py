@@ -20,6 +20,7 @@ from gyrostab.diagnose.baseline.expected_statistics import (
     noise_powers,
     white_variance,
 )
+from gyrostab.diagnose.baseline.filtered_noise import fit_filter_response
 from gyrostab.diagnose.baseline.posterior import (
     Fit,
     Posterior,
@@ -176,22 +177,11 @@ def calibrate_axes(
     blocks: xr.Dataset, chosen: NDArray[np.bool_], settings: Settings
 ) -> list[Posterior]:
     """Compute the noise of every axis from the chosen blocks (axis, block)."""
-    columns = noise_powers(blocks)
-    common, shape_alone = common_variance(blocks)
-    power, shape = blocks["power"].values, blocks["shape"].values
     mean = blocks["mean"].values
     step = float(blocks.attrs["block_s"])
     posteriors = []
-    for row, axis in enumerate(blocks["axis"].values):
+    for row, fit in enumerate(_fit_quiescent_powers(blocks, chosen, settings)):
         use = chosen[row]
-        fit = average_blocks(power[row][use], shape[row][use], columns[row][use])
-        if fit.power.size < 4:
-            raise SchemaError(
-                f"axis {axis}: the quiet blocks hold spectra in {fit.power.size} bands, "
-                "too few to calibrate on; "
-                "name other quiet time, or diagnose a part of the record with fewer gaps"
-            )
-        fit = _reduce_weights(fit, shape[row][use], shape_alone[row][use], common[row][use])
         explained = _keep_explained_bands(fit, settings)
         square = np.maximum(fit_squares(explained)[0], [0.0, floor_square(explained), 0.0, 0.0])
         variance = white_variance(blocks, np.tile(square, (len(mean), 1)))[row]
@@ -211,6 +201,52 @@ def calibrate_axes(
     return posteriors
 
 
+def _fit_quiescent_powers(
+    blocks: xr.Dataset, chosen: NDArray[np.bool_], settings: Settings
+) -> list[Fit]:
+    """Return the powers of every axis as a sum of noise terms, behind a filter if it takes one.
+
+    It does where some bands are foreign to the noise terms alone, and none behind the filter.
+    """
+    fits = _average_quiescent(blocks, chosen, noise_powers(blocks))
+    if (
+        not any(_has_foreign_bands(fit, settings) for fit in fits)
+        or min(fit.power.size for fit in fits) < blocks.sizes["band"]
+    ):
+        return fits
+    filtered = _average_quiescent(
+        blocks, chosen, noise_powers(blocks, fit_filter_response(blocks, fits))
+    )
+    return fits if any(_has_foreign_bands(fit, settings) for fit in filtered) else filtered
+
+
+def _average_quiescent(
+    blocks: xr.Dataset, chosen: NDArray[np.bool_], columns: Array
+) -> list[Fit]:
+    """Average the powers of the chosen blocks of every axis; columns (axis, block, band, term)."""
+    common, shape_alone = common_variance(blocks)
+    power, shape = blocks["power"].values, blocks["shape"].values
+    fits = []
+    for row, axis in enumerate(blocks["axis"].values):
+        use = chosen[row]
+        fit = average_blocks(power[row][use], shape[row][use], columns[row][use])
+        if fit.power.size < 4:
+            raise SchemaError(
+                f"axis {axis}: the quiet blocks hold spectra in {fit.power.size} bands, "
+                "too few to calibrate on; "
+                "name other quiet time, or diagnose a part of the record with fewer gaps"
+            )
+        fits.append(
+            _reduce_weights(fit, shape[row][use], shape_alone[row][use], common[row][use])
+        )
+    return fits
+
+
+def _has_foreign_bands(fit: Fit, settings: Settings) -> bool:
+    """Return whether the noise terms miss the larger part of the power of a band."""
+    return bool(_is_foreign(_power_ratio(fit), fit.weight, settings).any())
+
+
 def _is_foreign(ratio: Array, weight: Array, settings: Settings) -> NDArray[np.bool_]:
     """Return whether the larger part of a power, or of its expected value, is not in the other.
 
@@ -228,7 +264,7 @@ def _keep_explained_bands(fit: Fit, settings: Settings) -> Fit:
     Lines and humps would raise the noise of block means, to which they add nothing. A spectrum
     that the terms describe to a factor of two keeps all bands.
     """
-    if not _is_foreign(_power_ratio(fit), fit.weight, settings).any():
+    if not _has_foreign_bands(fit, settings):
         return fit
     while fit.power.size > MIN_BANDS:
         off = np.abs(_power_ratio(fit) - 1.0) * np.sqrt(fit.weight)
