@@ -220,9 +220,7 @@ def _fit_quiescent_powers(
     return fits if any(_has_foreign_bands(fit, settings) for fit in filtered) else filtered
 
 
-def _average_quiescent(
-    blocks: xr.Dataset, chosen: NDArray[np.bool_], columns: Array
-) -> list[Fit]:
+def _average_quiescent(blocks: xr.Dataset, chosen: NDArray[np.bool_], columns: Array) -> list[Fit]:
     """Average the powers of the chosen blocks of every axis; columns (axis, block, band, term)."""
     common, shape_alone = common_variance(blocks)
     power, shape = blocks["power"].values, blocks["shape"].values
@@ -236,9 +234,7 @@ def _average_quiescent(
                 "too few to calibrate on; "
                 "name other quiet time, or diagnose a part of the record with fewer gaps"
             )
-        fits.append(
-            _reduce_weights(fit, shape[row][use], shape_alone[row][use], common[row][use])
-        )
+        fits.append(_reduce_weights(fit, shape[row][use], shape_alone[row][use], common[row][use]))
     return fits
 
 

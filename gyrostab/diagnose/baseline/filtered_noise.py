@@ -36,9 +36,7 @@ def fit_filter_response(blocks: xr.Dataset, fits: Sequence[Fit]) -> NDArray[np.f
         band_response(kind(**values), blocks)
         for values in kind.example().points(make_windows(blocks, {}))
     ]
-    return max(
-        responses, key=lambda response: sum(_max_likelihood(fit, response) for fit in fits)
-    )
+    return max(responses, key=lambda response: sum(_max_likelihood(fit, response) for fit in fits))
 
 
 def _max_likelihood(fit: Fit, response: NDArray[np.float64]) -> float:

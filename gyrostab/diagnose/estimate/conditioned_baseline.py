@@ -17,6 +17,7 @@ from gyrostab.diagnose.identify.identification import (
 )
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import MIN_POWER_RATIO, power_shares
+from gyrostab.diagnose.predict.filter_response import band_shape_factor
 from gyrostab.diagnose.predict.linear_model import (
     State,
     cross_column,
@@ -25,6 +26,7 @@ from gyrostab.diagnose.predict.linear_model import (
     pair_rows,
 )
 from gyrostab.diagnose.predict.sizes import component_mixture, mean_mixture
+from gyrostab.physics.registry import effects
 
 __all__ = ["predict_baseline"]
 
@@ -51,8 +53,8 @@ def predict_baseline(
     Returns
     -------
     xarray.Dataset
-        With ``spectrum`` and ``known_mean`` of the effects, and ``cross`` (pair, block, band) of
-        noise in common.
+        With ``spectrum`` and ``known_mean`` of the effects, ``cross`` (pair, block, band) of noise
+        in common, and ``shape_factor`` (band,) on the degrees of freedom behind a filter.
     """
     blocks = identifications.state.blocks
     keep = (
@@ -95,6 +97,11 @@ def predict_baseline(
         for identification in identified
         if not any(identification is other for other in left_out)
     ]
+    filters = [component for component in components_of(remaining) if component.is_filter]
+    if filters:  # one for all axes
+        kind = effects()[filters[0].candidate.effect]
+        factor = band_shape_factor(kind.example(**filters[0].variant.values), blocks)
+        predicted = predicted.assign(shape_factor=("band", factor))
     shared = [
         component for component in components_of(remaining) if component.statistic.is_pairwise
     ]

@@ -15,7 +15,7 @@ from gyrostab.kernels.spectra.line_levels import local_level
 from gyrostab.physics.base import Effect
 from gyrostab.physics.registry import effects
 
-__all__ = ["band_response", "frequencies_in_bands", "undo_filter"]
+__all__ = ["band_response", "band_shape_factor", "frequencies_in_bands", "undo_filter"]
 
 Array = NDArray[np.float64]
 _FREQUENCIES_PER_BAND = 48  # to average a response; design choice
@@ -39,10 +39,22 @@ def _estimate_size(power: Array, full: Array) -> float:
 
 def band_response(effect: Effect, blocks: xr.Dataset) -> Array:
     """Return the noise power factor of each band, averaged over its frequencies."""
-    return np.asarray(
-        _response_at(effect, blocks, frequencies_in_bands(blocks))
-        .reshape(-1, _FREQUENCIES_PER_BAND)
-        .mean(axis=1)
+    return _responses_in_bands(effect, blocks).mean(axis=1)
+
+
+def band_shape_factor(effect: Effect, blocks: xr.Dataset) -> Array:
+    """Return the factor on the gamma shape of white noise in each band.
+
+    Lines of unequal power have fewer degrees of freedom together than equal ones.
+    """
+    response = _responses_in_bands(effect, blocks)
+    return np.asarray(response.mean(axis=1) ** 2 / (response**2).mean(axis=1))
+
+
+def _responses_in_bands(effect: Effect, blocks: xr.Dataset) -> Array:
+    """Return the power response (band, frequency)."""
+    return _response_at(effect, blocks, frequencies_in_bands(blocks)).reshape(
+        -1, _FREQUENCIES_PER_BAND
     )
 
 

@@ -213,6 +213,8 @@ def _relative_levels(
     """
     power, spectrum = blocks["power"].values, baseline["spectrum"].values
     shape = blocks["shape"].values[..., used]
+    if "shape_factor" in baseline:
+        shape = shape * baseline["shape_factor"].values[used]
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = (power / spectrum)[..., used]
         present = np.isfinite(ratio) & (shape > 0)

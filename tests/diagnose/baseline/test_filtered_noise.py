@@ -1,0 +1,66 @@
+"""The noise of a record behind a logger's filter is calibrated as that of the instrument."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.signal import lfilter
+
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.estimate.joint_fit import fit_identifications
+from gyrostab.diagnose.identify.forward_search import name_effects
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.ingest.make_log import make_log
+from gyrostab.units import HOUR
+from tests.support.named import nulls
+
+RATE, N = 20.0, 0.05
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def filtered_blocks(numerator: list[float], denominator: list[float], seed: int) -> xr.Dataset:
+    """Pass white noise of two axes, N and 1.1 N, through a filter at the rate of the log."""
+    raw = np.random.default_rng(seed).standard_normal((2, 24_200))
+    white = N * np.sqrt(HOUR * RATE) * np.array([[1.0], [1.1]]) * raw
+    rates = lfilter(numerator, denominator, white, axis=1)[:, 200:]
+    return reduce_log(make_log(rates, rate=RATE, unit="deg/h"))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("taps", [1, 2, 3, 4, 8])
+def test_noise_behind_an_average_is_that_of_the_instrument(taps: int, seed: int) -> None:
+    baseline = calibrate_noise(filtered_blocks([1.0 / taps] * taps, [1.0], seed))
+    coefficient = baseline["coefficient"]
+    assert coefficient.sel(term="N").values == pytest.approx([N, 1.1 * N], rel=0.03)
+    assert (coefficient.sel(term="K").values < 1.0).all()  # 2.3 with the slope of the average in K
+    assert not baseline.attrs["slow_noise_apart"]
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_noise_behind_a_low_pass_is_that_of_the_instrument(seed: int) -> None:
+    baseline = calibrate_noise(filtered_blocks([0.4], [1.0, -0.6], seed))
+    assert baseline["coefficient"].sel(term="N").values == pytest.approx([N, 1.1 * N], rel=0.1)
+
+
+@pytest.mark.parametrize(("taps", "seed"), [(2, 4), (3, 4), (4, 4), (4, 5), (8, 4)])
+def test_average_is_named_with_its_length(taps: int, seed: int) -> None:
+    blocks = filtered_blocks([1.0 / taps] * taps, [1.0], seed)
+    baseline, records = nulls(blocks, 30)
+    identifications = name_effects(blocks, baseline, records)
+    assert not identifications.unknown
+    (fitted,) = fit_identifications(identifications, baseline)
+    assert fitted.identification.effect == "logger_filter"
+    assert fitted.identification.axes == ("x", "y")
+    assert fitted.parameters["length"].value == pytest.approx(taps / RATE)
+
+
+def test_hump_in_the_spectrum_is_not_taken_for_a_filter() -> None:
+    """A resonance of one axis has no filter in common with the other."""
+    rng = np.random.default_rng(6)
+    raw = N * np.sqrt(HOUR * RATE) * rng.standard_normal((2, 24_000))
+    hump = lfilter([1.0], [1.0, -1.2, 0.9], raw[:1], axis=1)
+    baseline = calibrate_noise(
+        reduce_log(make_log(np.concatenate([raw[1:], raw[1:] + hump]), rate=RATE, unit="deg/h"))
+    )
+    assert baseline["coefficient"].sel(axis="x", term="N").item() == pytest.approx(N, rel=0.03)
