@@ -215,7 +215,7 @@ def _fit_quiescent_powers(
     ):
         return fits
     filtered = _average_quiescent(
-        blocks, chosen, noise_powers(blocks, fit_filter_response(blocks, fits))
+        blocks, chosen, noise_powers(blocks, fit_filter_response(blocks, fits, settings=settings))
     )
     return fits if any(_has_foreign_bands(fit, settings) for fit in filtered) else filtered
 

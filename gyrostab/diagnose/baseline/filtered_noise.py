@@ -13,18 +13,25 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.baseline.posterior import Fit, expected_powers
+from gyrostab.diagnose.baseline.posterior import Fit, fit_squares
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.windows import make_windows
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.physics.logger import LoggerFilter
 
 __all__ = ["fit_filter_response"]
 
+Array = NDArray[np.float64]
 
-def fit_filter_response(blocks: xr.Dataset, fits: Sequence[Fit]) -> NDArray[np.float64]:
+
+def fit_filter_response(
+    blocks: xr.Dataset, fits: Sequence[Fit], *, settings: Settings = DEFAULTS
+) -> Array:
     """Return the response (band,) of the filter that describes the powers of all axes best.
 
-    All axes pass the one logger.
+    All axes pass the one logger. Of filters that fit about as well, the one that needs least
+    angle quantization is taken: Q rises where a low-pass falls, so that one at too low a cutoff
+    fits with much Q.
 
     Parameters
     ----------
@@ -36,10 +43,17 @@ def fit_filter_response(blocks: xr.Dataset, fits: Sequence[Fit]) -> NDArray[np.f
         band_response(kind(**values), blocks)
         for values in kind.example().points(make_windows(blocks, {}))
     ]
-    return max(responses, key=lambda response: sum(_max_likelihood(fit, response) for fit in fits))
+    likelihood, quantization = np.array(
+        [np.sum([_fit_behind(fit, response) for fit in fits], axis=0) for response in responses]
+    ).T
+    is_close = likelihood > likelihood.max() - settings.ambiguous_nats
+    return responses[int(np.where(is_close, quantization, np.inf).argmin())]
 
 
-def _max_likelihood(fit: Fit, response: NDArray[np.float64]) -> float:
-    """Return the largest gamma log likelihood of powers that a filter has passed."""
-    expected = expected_powers(fit._replace(columns=fit.columns * response[:, None]))
-    return -float((fit.weight * (np.log(expected) + fit.power / expected)).sum())
+def _fit_behind(fit: Fit, response: Array) -> tuple[float, float]:
+    """Return the largest log likelihood of powers behind a filter, and the Q^2 that it needs."""
+    filtered = fit._replace(columns=fit.columns * response[:, None])
+    square = fit_squares(filtered)[0]
+    expected = filtered.columns @ square
+    likelihood = -float((fit.weight * (np.log(expected) + fit.power / expected)).sum())
+    return likelihood, float(square[0])

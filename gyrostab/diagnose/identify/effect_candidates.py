@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.evidence.sample_counts import hidden_by_grid
 from gyrostab.diagnose.predict.candidates import Candidate
 from gyrostab.diagnose.predict.channel_use import MIN_BLOCK_SHARE, missing_channel_reason
+from gyrostab.diagnose.predict.filter_response import with_band_response
 from gyrostab.diagnose.predict.step_times import select_step_times
 from gyrostab.diagnose.predict.windows import (
     TIME_PARAMETER,
@@ -168,12 +169,11 @@ def _candidates_of_effect(
     for values in _nuisance_grid(kind, windows):
         try:
             effect = kind.example(**values)
+            prediction = with_band_response(predict_exogenous(effect, windows), effect, blocks)
             predictions.append(
                 (
                     values,
-                    _drop_hidden_means(
-                        kind.name, predict_exogenous(effect, windows), blocks, coefficient, settings
-                    ),
+                    _drop_hidden_means(kind.name, prediction, blocks, coefficient, settings),
                 )
             )
         except KeyError as error:

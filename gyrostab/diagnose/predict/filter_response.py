@@ -13,9 +13,16 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.kernels.spectra.line_levels import local_level
 from gyrostab.physics.base import Effect
+from gyrostab.physics.prediction import Prediction
 from gyrostab.physics.registry import effects
 
-__all__ = ["band_response", "band_shape_factor", "frequencies_in_bands", "undo_filter"]
+__all__ = [
+    "band_response",
+    "band_shape_factor",
+    "frequencies_in_bands",
+    "undo_filter",
+    "with_band_response",
+]
 
 Array = NDArray[np.float64]
 _FREQUENCIES_PER_BAND = 48  # to average a response; design choice
@@ -40,6 +47,13 @@ def _estimate_size(power: Array, full: Array) -> float:
 def band_response(effect: Effect, blocks: xr.Dataset) -> Array:
     """Return the noise power factor of each band, averaged over its frequencies."""
     return _responses_in_bands(effect, blocks).mean(axis=1)
+
+
+def with_band_response(prediction: Prediction, effect: Effect, blocks: xr.Dataset) -> Prediction:
+    """Return a prediction with its response averaged over each band, which may hold a zero."""
+    if prediction.response is None:
+        return prediction
+    return replace(prediction, response=band_response(effect, blocks))
 
 
 def band_shape_factor(effect: Effect, blocks: xr.Dataset) -> Array:
