@@ -214,9 +214,10 @@ def _fit_quiescent_powers(
         or min(fit.power.size for fit in fits) < blocks.sizes["band"]
     ):
         return fits
-    filtered = _average_quiescent(
-        blocks, chosen, noise_powers(blocks, fit_filter_response(blocks, fits, settings=settings))
-    )
+    response = fit_filter_response(blocks, fits, settings=settings)
+    if response is None:
+        return fits
+    filtered = _average_quiescent(blocks, chosen, noise_powers(blocks, response))
     return fits if any(_has_foreign_bands(fit, settings) for fit in filtered) else filtered
 
 

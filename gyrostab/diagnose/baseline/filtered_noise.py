@@ -26,10 +26,11 @@ Array = NDArray[np.float64]
 
 def fit_filter_response(
     blocks: xr.Dataset, fits: Sequence[Fit], *, settings: Settings = DEFAULTS
-) -> Array:
+) -> Array | None:
     """Return the response (band,) of the filter that describes the powers of all axes best.
 
-    All axes pass the one logger. Of filters that fit about as well, the one that needs least
+    All axes pass the one logger: None if the noise terms alone describe some axis better. Of
+    filters that fit about as well, the one that needs least
     angle quantization is taken: Q rises where a low-pass falls, so that one at too low a cutoff
     fits with much Q.
 
@@ -43,11 +44,19 @@ def fit_filter_response(
         band_response(kind(**values), blocks)
         for values in kind.example().points(make_windows(blocks, {}))
     ]
-    likelihood, quantization = np.array(
-        [np.sum([_fit_behind(fit, response) for fit in fits], axis=0) for response in responses]
-    ).T
-    is_close = likelihood > likelihood.max() - settings.ambiguous_nats
-    return responses[int(np.where(is_close, quantization, np.inf).argmin())]
+    # (filter, axis), the last without a filter
+    likelihood, quantization = np.moveaxis(
+        [
+            [_fit_behind(fit, response) for fit in fits]
+            for response in [*responses, np.ones(blocks.sizes["band"])]
+        ],
+        -1,
+        0,
+    )
+    total = likelihood[:-1].sum(axis=1)
+    is_close = total > total.max() - settings.ambiguous_nats
+    chosen = int(np.where(is_close, quantization[:-1].sum(axis=1), np.inf).argmin())
+    return responses[chosen] if (likelihood[chosen] > likelihood[-1]).all() else None
 
 
 def _fit_behind(fit: Fit, response: Array) -> tuple[float, float]:

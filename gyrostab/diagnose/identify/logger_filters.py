@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.expected_statistics import band_columns, common_variance
-from gyrostab.diagnose.baseline.posterior import Fit, expected_powers
+from gyrostab.diagnose.baseline.posterior import Fit, expected_powers, fit_squares
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.filter_response import band_response
@@ -37,7 +37,8 @@ def without_slopes(
 
     A line is compared with its neighbours, so that the steep slope of a filter, or the lobes of an
     average, look like one. Lines that keep half of their evidence come before the filter: many of
-    them together leave a broad form in the powers too.
+    them together leave a broad form in the powers too. All that explains less than the filter then
+    waits with it, because any other form would be named for the slope.
     """
     lines = [key for key in passing if components[key][0].candidate.statistic.is_line]
     filters = [key for key in passing if any(component.is_filter for component in components[key])]
@@ -58,9 +59,10 @@ def without_slopes(
         for key in lines
         if nats_after.get(key, 0.0) > state.settings.majority_share * nats_before[key]
     }
-    return [
-        key for key in passing if (key in real if key in lines else key not in filters or not real)
-    ]
+    if not real:
+        return [key for key in passing if key not in lines]
+    stronger = passing[: passing.index(filters[0])]
+    return [key for key in passing if key in real or (key in stronger and key not in lines)]
 
 
 def separate_axes_nats(components: Sequence[Component], state: State) -> float:
@@ -94,6 +96,9 @@ def fit_filter_sizes(
 ) -> tuple[dict[str, tuple[float, ...]], dict[str, float]]:
     """Fit the cutoff or length of a filter to the powers of all its axes, with free noise.
 
+    Of filters that fit about as well, the one that needs least angle quantization is taken: a
+    low-pass of far too low a cutoff with much of it is an average of two samples.
+
     Returns
     -------
     sizes : dict of str to (float, float) or (float, float, float, float)
@@ -105,14 +110,18 @@ def fit_filter_sizes(
     kind = effects()[components[0].candidate.effect]
     fits = [_average_powers(component.row[0], state) for component in components]
 
-    def likelihood(values: Mapping[str, Any]) -> float:
+    def fits_behind(values: Mapping[str, Any]) -> list[Fit]:
         filtered = (
             band_columns(state.blocks)
             * band_response(kind.example(**values), state.blocks)[:, None]
         )
-        return sum(
-            _max_log_likelihood(fit._replace(columns=mixing @ filtered)) for fit, mixing in fits
-        )
+        return [fit._replace(columns=mixing @ filtered) for fit, mixing in fits]
+
+    def likelihood(values: Mapping[str, Any]) -> float:
+        return sum(map(_max_log_likelihood, fits_behind(values)))
+
+    def quantization(values: Mapping[str, Any]) -> float:
+        return sum(float(fit_squares(fit)[0][0]) for fit in fits_behind(values))
 
     family = [
         variant.values
@@ -120,7 +129,12 @@ def fit_filter_sizes(
         if components[0].statistic.is_filter(variant)
     ]
     log = [likelihood(values) for values in family]
-    best = family[int(np.argmax(log))]
+    close = [
+        values
+        for values, log_likelihood in zip(family, log, strict=True)
+        if log_likelihood > max(log) - state.settings.ambiguous_nats
+    ]
+    best = min(close, key=quantization)
     name = "cutoff" if best["cutoff"] else "length"
     other_values = {key: float(value) for key, value in best.items() if key != name}
     if name == "length" and best["instrument"] == 1.0:
