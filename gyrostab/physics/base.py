@@ -337,7 +337,7 @@ class Effect:
         error = (errors or {}).get(name)
         values = value if isinstance(value, tuple) else (value,)
         text = join_words([format_value(number, error) for number in values])
-        if error is not None:
+        if error:  # a count or a choice has none
             text += f" ± {error:.2g}"
         return text if unit in ("1", "text") else f"{text} {unit}"
 

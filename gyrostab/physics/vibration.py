@@ -347,11 +347,11 @@ class AliasedVibration(Effect):
         frequency = np.linspace(0.0, windows.rate / 2.0, _FOLDED_POINTS)
         density = self._fold_density(frequency, windows.rate)
         rms = float(np.sqrt(density.mean() * windows.rate))
-        seen = replace(self, sensitivity=tuple(size * rms for size in self.sensitivity))
+        in_record = replace(self, sensitivity=tuple(size * rms for size in self.sensitivity))
         band = frequency[density >= density.max() / 2.0]
         return (
             f"Vibration above half of the sampling rate folds into the samples {self.on_axes()}, "
-            f"as noise at {band[0]:.3g} to {band[-1]:.3g} Hz of {seen.quantity('sensitivity')} "
+            f"as noise at {band[0]:.3g} to {band[-1]:.3g} Hz of {in_record.quantity('sensitivity')} "
             "(rms) in the record, which does not determine its original frequencies."
         )
 

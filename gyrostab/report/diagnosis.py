@@ -16,6 +16,7 @@ from gyrostab.diagnose.result.text import (
     chance_share,
     family_text,
     next_measurement,
+    noise_texts,
     plain_name,
     probability_text,
     rejection_text,
@@ -145,6 +146,11 @@ def _fact_rows(content: Mapping[str, Any]) -> list[tuple[str, str]]:
         *(
             [("Quiescent stretches (UTC)", spans + (f" and {more} more" if more > 0 else ""))]
             if spans
+            else []
+        ),
+        *(
+            [("Calibrated noise", "; ".join(text.strip() for text in noise[1:]))]
+            if (noise := noise_texts(content))
             else []
         ),
         ("Computing time", f"{content['seconds']:.3g} s"),

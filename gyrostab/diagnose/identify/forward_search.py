@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.quantization_grid import rounded_rates
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.evidence.sample_counts import CountEvidence, ExpectedCounts
+from gyrostab.diagnose.evidence.sample_counts import CountEvidence, ExpectedCounts, has_coarse_grid
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.equivalents import settle_forms
 from gyrostab.diagnose.identify.expected import identify_expected_effects
@@ -22,6 +22,7 @@ from gyrostab.diagnose.predict.candidates import Candidate
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.search import compute_evidence, evidence_by_effect
 from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.diagnose.statistics.wording import COARSE_ANGLE_GRID
 from gyrostab.physics.base import Effect
 from gyrostab.progress import Stage, no_stage
 
@@ -73,7 +74,9 @@ def name_effects(
     )
     if not count_evidence.rounded.any() and (blocks["quantization_step"] > 0.0).any():
         reasons["rate_quantization"] = (
-            "not identifiable: the quantization grid is that of angles, or too fine to show"
+            COARSE_ANGLE_GRID
+            if has_coarse_grid(blocks).any()
+            else "not identifiable: the quantization grid is that of angles, or too fine to show"
         )
     expected, start = identify_expected_effects(
         known,

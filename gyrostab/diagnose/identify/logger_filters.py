@@ -96,8 +96,8 @@ def fit_filter_sizes(
 ) -> tuple[dict[str, tuple[float, ...]], dict[str, float]]:
     """Fit the cutoff or length of a filter to the powers of all its axes, with free noise.
 
-    Of filters that fit about as well, the one that needs least angle quantization is taken: a
-    low-pass of far too low a cutoff with much of it is an average of two samples.
+    If several filters fit about as well, the one that needs least angle quantization is taken: a
+    low-pass at far too low a cutoff with much of it passes what an average of two samples does.
 
     Returns
     -------

@@ -15,6 +15,8 @@ __all__ = ["CALIBRATION_CHANNELS", "MIN_BLOCK_SHARE", "missing_channel_reason", 
 
 #: Least share of the blocks in which a channel must have values. Design choice.
 MIN_BLOCK_SHARE = 0.5
+#: The angle whose rate of change is the channel ``rotation_rate``.
+TOOLFACE = "toolface"
 #: Prefixes of channels that select the quiescent intervals.
 CALIBRATION_CHANNELS = ("vibration", "temperature", "rotation_rate")
 
@@ -97,6 +99,11 @@ def _is_compared(name: str, blocks: xr.Dataset) -> bool:
 
 def _describe_unused(name: str, blocks: xr.Dataset) -> str:
     """Explain why no effect uses a channel."""
+    if name == TOOLFACE:
+        return (
+            "effects that vary with the tool face, such as earth rate, take it from the channel "
+            "rotation_rate"
+        )
     if _is_compared(name, blocks) or _wanted_units(name):
         return "no effect that this record can show follows it"
     if name.startswith(ROTATION_WAVE_PREFIXES):

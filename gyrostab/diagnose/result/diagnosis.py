@@ -15,12 +15,16 @@ from gyrostab.diagnose.result.families import group_families
 from gyrostab.diagnose.result.text import (
     chance_share,
     family_text,
+    join_axes,
+    joined_statements,
     next_measurement,
+    noise_texts,
     probability_text,
     summary,
     without_chance,
 )
 from gyrostab.diagnose.settings import Settings, stored_settings
+from gyrostab.diagnose.statistics.wording import COARSE_ANGLE_GRID
 from gyrostab.physics.base import Effect
 
 __all__ = ["Diagnosis", "effect_table", "model_text", "plain"]
@@ -73,10 +77,15 @@ class Diagnosis:
     def __str__(self) -> str:
         """Return the verdict with a sentence for each effect and each unexplained mismatch."""
         lines = [f"{self.verdict}: {summary(self.content)}"]
-        for effect, *others in group_families(self.effects):
+        for effect, *others in join_axes(group_families(self.effects)):
             evidence = effect["held_out_gain"]
-            lines.append(f"- {effect['name']}: {effect['statement']}")
-            if others:
+            has_family = effect.get("family") is not None
+            if has_family:
+                lines.append(f"- {effect['name']}: {effect['statement']}")
+            else:
+                first, *more = joined_statements([effect, *others])
+                lines += [f"- {effect['name']}: {first}", *(f"  {text}" for text in more)]
+            if others and has_family:
                 lines.append(f"  {family_text(effect, others)}")
             lines.append(
                 f"  evidence: held-out data are predicted better by {evidence['nats']:.3g} nats "
@@ -90,6 +99,13 @@ class Diagnosis:
             f"- channel {channel['name']} is not used: {channel['reason']}"
             for channel in self.content.get("unused_channels", [])
         ]
+        if self.content["unexplained"] and any(
+            limit["reason"] == COARSE_ANGLE_GRID for limit in self.content["not_found"].values()
+        ):
+            lines.append(
+                "- The values lie on a coarse quantization grid, and it is that of angles: the "
+                "rounding of a counter of angles may cause what is not explained."
+            )
         unexplained = set(self.content["unexplained"])
         regions = [region for region in self.mismatches if region["id"] in unexplained]
         if len(regions) == 1:
@@ -100,7 +116,7 @@ class Diagnosis:
             lines.append(
                 f"  Noise alone would show the least certain of these in {share} such records."
             )
-        return "\n".join(lines)
+        return "\n".join([*lines, *noise_texts(self.content)])
 
 
 def plain(value: Any) -> Any:

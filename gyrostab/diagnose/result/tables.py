@@ -40,6 +40,7 @@ from gyrostab.noise import LAWS
 from gyrostab.physics.base import Effect
 from gyrostab.simulate.model import Model
 from gyrostab.units import HOUR
+from gyrostab.wording import join_words
 
 __all__ = [
     "baseline_table",
@@ -265,13 +266,19 @@ def unidentified_mismatches(
             unidentified.evidence_nats,
             settings=identifications.state.settings,
         )
-        candidates = ", ".join(plain_name(name) for name in unidentified.candidates)
-        nearest = f"; the closest candidates are {candidates}" if candidates else ""
+        nearest = unidentified.candidates
+        verb = "comes" if len(nearest) == 1 else "come"
+        explanation = (
+            f"{join_words([plain_name(name) for name in nearest])} {verb} closest, but "
+            "another form explains more"
+            if nearest
+            else "no known effect explains it"
+        )
         description = NUISANCE_ALTERNATIVES.get(unidentified.generic, "something differs")
         begin, end, when = _find_event(unidentified, blocks)
         text = (
-            f"On {axes_text(unidentified.axes)} {description}{when}; no known effect "
-            f"explains it{nearest} ({chance(p_value)})."
+            f"On {axes_text(unidentified.axes)} {description}{when}; {explanation} "
+            f"({chance(p_value)})."
         )
         taus = (block, longest) if view == "mean" else (1.0 / rate, block)
         out.append(_mismatch(blocks, view, unidentified.axes, (begin, end), taus, p_value, text))
