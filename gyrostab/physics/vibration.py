@@ -349,10 +349,11 @@ class AliasedVibration(Effect):
         rms = float(np.sqrt(density.mean() * windows.rate))
         in_record = replace(self, sensitivity=tuple(size * rms for size in self.sensitivity))
         band = frequency[density >= density.max() / 2.0]
+        size = in_record.quantity("sensitivity")
         return (
             f"Vibration above half of the sampling rate folds into the samples {self.on_axes()}, "
-            f"as noise at {band[0]:.3g} to {band[-1]:.3g} Hz of {in_record.quantity('sensitivity')} "
-            "(rms) in the record, which does not determine its original frequencies."
+            f"as noise at {band[0]:.3g} to {band[-1]:.3g} Hz of {size} (rms) in the record, which "
+            "does not determine its original frequencies."
         )
 
 

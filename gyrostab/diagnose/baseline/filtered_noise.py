@@ -29,9 +29,9 @@ def fit_filter_response(
 ) -> Array | None:
     """Return the response (band,) of the filter that describes the powers of all axes best.
 
-    All axes pass the one logger: None if the noise terms alone describe some axis better. If several
-    filters fit about as well, the one that needs least angle quantization is taken: Q rises where a
-    low-pass falls, so that one at too low a cutoff fits with much Q.
+    All axes pass the one logger: None if the noise terms alone describe some axis better. If
+    several filters fit about as well, the one that needs least angle quantization is taken: Q rises
+    where a low-pass falls, so that one at too low a cutoff fits with much Q.
 
     Parameters
     ----------
