@@ -38,20 +38,17 @@ def fit_filter_response(
     fits : sequence of Fit
         Powers of each axis in all bands.
     """
-    kind = LoggerFilter
     responses = [
-        band_response(kind(**values), blocks)
-        for values in kind.example().points(make_windows(blocks, {}))
+        band_response(LoggerFilter.example(**values), blocks)
+        for values in LoggerFilter.example().points(make_windows(blocks, {}))
     ]
-    # (filter, axis), the last without a filter
-    likelihood, quantization = np.moveaxis(
+    behind = np.array(  # (filter, axis, 2), the last without a filter
         [
             [_fit_behind(fit, response) for fit in fits]
             for response in [*responses, np.ones(blocks.sizes["band"])]
-        ],
-        -1,
-        0,
+        ]
     )
+    likelihood, quantization = behind[..., 0], behind[..., 1]
     total = likelihood[:-1].sum(axis=1)
     is_close = total > total.max() - settings.ambiguous_nats
     chosen = int(np.where(is_close, quantization[:-1].sum(axis=1), np.inf).argmin())

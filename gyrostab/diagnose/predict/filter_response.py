@@ -46,7 +46,7 @@ def _estimate_size(power: Array, full: Array) -> float:
 
 def band_response(effect: Effect, blocks: xr.Dataset) -> Array:
     """Return the noise power factor of each band, averaged over its frequencies."""
-    return _responses_in_bands(effect, blocks).mean(axis=1)
+    return np.asarray(_responses_in_bands(effect, blocks).mean(axis=1))
 
 
 def with_band_response(prediction: Prediction, effect: Effect, blocks: xr.Dataset) -> Prediction:
