@@ -33,6 +33,7 @@ _LEVEL_LOG_SCATTERS = np.linspace(0.0, 0.6, 61)  # tried scatters of log noise l
 _TAIL_RANGE_SIGMA = (2.5, 3.7)
 _MIN_STEP_ERRORS = 64.0  # rounding errors in the smallest quantization step; design choice
 _MAX_OFF_GRID_SHARE = 0.01  # of the values, off a coarse quantization grid; design choice
+_STEP_ERROR_SHARE = 1e-3  # of the step, from rounding errors of the values; design choice
 _SPIKE_SHARE = 0.1  # of the values, where spikes may be as common as grid values; design choice
 _NEIGHBOUR_BLOCKS = 2  # on either side, that enter the deviation of a block; design choice
 _NOISIER_NEIGHBOUR_RATIO = 1.5  # of deviations, from which a noisier neighbour counts
@@ -372,16 +373,20 @@ def quantization_step(values: Array) -> float:
         else (levels,)
     ):
         # as written in single and in double precision; numbers of the former repeat on any grid
-        # that is coarser than their last digit, and those of the latter are that precise
-        for resolution, min_step_share in ((2.0**-23, 0.0), (2.0**-52, 2.0**-20)):
+        # that is coarser than their last digit, and are on a finer one the closer they are to 0
+        for resolution, is_double in ((2.0**-23, False), (2.0**-52, True)):
             fine = 8.0 * resolution * size
             distances = np.diff(kept_levels)
             distances = distances[distances > fine]
-            if distances.size and (min_step_share or distances.size <= 0.8 * finite.size):
+            if distances.size and (is_double or distances.size <= 0.8 * finite.size):
                 step = _common_divisor(distances, fine)
-                if step > min_step_share * size and (
-                    kept_levels is levels
-                    or _off_grid_share(levels, times, step, fine) <= _MAX_OFF_GRID_SHARE
+                if (
+                    step > 0.0
+                    and (not is_double or _is_step_of_large_values(kept_levels, step, fine))
+                    and (
+                        kept_levels is levels
+                        or _off_grid_share(levels, times, step, fine) <= _MAX_OFF_GRID_SHARE
+                    )
                 ):
                     return step
     return 0.0
@@ -392,6 +397,13 @@ def _frequent_levels(levels: Array, times: NDArray[np.int64], rare: float) -> Ar
     order = np.argsort(times, kind="stable")
     common = np.sort(order[np.cumsum(times[order]) > rare * times.sum()])
     return levels[common] if common.size and times[common].min() > 1 else levels[:0]
+
+
+def _is_step_of_large_values(levels: Array, step: float, fine: float) -> bool:
+    """Return whether the larger half of the values has this step, as on a grid of equal steps."""
+    distances = np.diff(levels[np.abs(levels) >= np.median(np.abs(levels))])
+    large_step = _common_divisor(distances[distances > fine], fine)
+    return abs(large_step - step) <= _STEP_ERROR_SHARE * step
 
 
 def _off_grid_share(levels: Array, times: NDArray[np.int64], step: float, fine: float) -> float:
@@ -411,7 +423,7 @@ def _common_divisor(distances: Array, fine: float) -> float:
         nearby = step_count < step / (16.0 * fine)
         remainder = np.abs(distances - step_count * step)
         wrong = nearby & (remainder > 2.0 * fine * (1.0 + step_count))
-        if not nearby.any():
+        if 2 * np.count_nonzero(nearby) < distances.size:  # by chance a few have a divisor
             return 0.0
         if not wrong.any():
             return float(distances[nearby].sum() / step_count[nearby].sum())

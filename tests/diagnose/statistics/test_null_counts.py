@@ -71,11 +71,34 @@ def test_fine_step_is_found_in_a_short_record(step: float):
     assert quantization_step(3600.0 * values + 0.7) == pytest.approx(3600.0 * step, rel=1e-6)
 
 
+def turning(seed: int, *, size: int = SIZE) -> NDArray[np.float64]:
+    """Noise of an axis that turns at up to 30 deg/s, on a grid of 1e-6 deg/s [degree hour-1]."""
+    rng = np.random.default_rng(seed)
+    stops = np.repeat(rng.choice([-30.0, -10.0, 0.0, 10.0, 30.0], size // 2000), 2000)
+    sway = np.convolve(rng.standard_normal(size + 199), np.full(200, 0.05), "valid")
+    return 3600.0 * np.round(stops + sway + 3e-4 * rng.standard_normal(size), 6)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_null_records_have_the_repeats_of_an_axis_that_turns(seed: int):
+    values = np.stack([3600.0 * np.round(3e-4 * noise("white", seed=seed), 6), turning(seed)])
+    blocks = reduce_log(make_log(values, rate=50.0, unit="deg/h", start="2026-01-01"))
+    assert blocks["quantization_step"].values == pytest.approx([0.0036, 0.0036], rel=1e-6)
+    records = null_records(
+        blocks, calibrate_noise(blocks), count=60, rng=np.random.default_rng(1), chunk=60
+    )
+    drawn = next(iter(records))["repeats"].sum("block")
+    for axis in (0, 1):
+        count, expected = int(blocks["repeats"][axis].sum()), drawn[:, axis].values
+        assert abs(count - expected.mean()) < 4.5 * np.hypot(expected.std(), 1.0)
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_values_without_a_grid_have_no_step(dtype: type):
     for seed in range(30):
-        values = noise("white", seed=seed, size=2_000).astype(dtype).astype(np.float64)
-        assert quantization_step(values) == 0.0
+        white = noise("white", seed=seed, size=2_000)
+        for values in (white, np.cumsum(white)):
+            assert quantization_step(3.6 * values.astype(dtype).astype(np.float64)) == 0.0
 
 
 def test_grid_hides_repeats_only_where_noise_is_not_normal():
