@@ -21,6 +21,7 @@ from gyrostab.diagnose.baseline.known_lines import remove_known_lines
 from gyrostab.diagnose.estimate.expected_effects import expected_baseline, without_expected
 from gyrostab.diagnose.estimate.recalibrate import remove_fast_switching
 from gyrostab.diagnose.identify.forward_search import name_effects
+from gyrostab.diagnose.identify.identification import components_of
 from gyrostab.diagnose.identify.moving_axes import unexplained_motion, without_motion
 from gyrostab.diagnose.inputs import check_options, read_simulation, varying_axes
 from gyrostab.diagnose.locate.mismatches import locate_mismatches
@@ -32,7 +33,12 @@ from gyrostab.diagnose.result.attribution import drop_expected
 from gyrostab.diagnose.result.diagnosis import Diagnosis
 from gyrostab.diagnose.result.finish import finish_diagnosis
 from gyrostab.diagnose.settings import DEFAULTS, Settings
-from gyrostab.diagnose.task import Comparison, Task, lines_without_motion
+from gyrostab.diagnose.task import (
+    Comparison,
+    Task,
+    lines_without_motion,
+    take_lines_at_rest,
+)
 from gyrostab.errors import SchemaError
 from gyrostab.ingest.convert import as_log
 from gyrostab.progress import Stage, no_stage
@@ -130,7 +136,7 @@ def _run_steps(task: Task, block: Any) -> Diagnosis:
     started = time.perf_counter()
     task, blocks = _reduce_recording(task, block)
     comparison = _compare_blocks(task, *_calibrate_baseline(task, blocks))
-    for revise in (_leave_out_motion, _take_out_fast_switching):
+    for revise in (_leave_out_motion, _leave_motion_out_of_lines, _take_out_fast_switching):
         revised = revise(task, comparison)
         if revised is not None:
             comparison = _compare_blocks(task, *revised)
@@ -245,6 +251,25 @@ def _leave_out_motion(task: Task, comparison: Comparison) -> tuple[xr.Dataset, x
             stacklevel=4,
         )
         return None
+
+
+def _leave_motion_out_of_lines(
+    task: Task, comparison: Comparison
+) -> tuple[xr.Dataset, xr.Dataset] | None:
+    """Return blocks with the lines of axes at rest; None if no effect moves an axis with lines."""
+    identifications = comparison.identifications
+    with_lines = [
+        component.row[0]
+        for component in components_of(identifications.identified)
+        if component.statistic.is_line
+    ]
+    moving = (
+        identifications.state.masked
+        & np.isin(comparison.blocks["axis"].values.astype(str), with_lines)[:, None]
+    )
+    if not moving.any():
+        return None
+    return take_lines_at_rest(task, comparison.blocks, moving), comparison.baseline
 
 
 def _take_out_fast_switching(

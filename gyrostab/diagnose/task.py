@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion
 from gyrostab.diagnose.baseline.known_lines import remove_known_lines
@@ -17,7 +18,7 @@ from gyrostab.diagnose.settings import Settings
 from gyrostab.progress import Stage
 from gyrostab.simulate.model import Model
 
-__all__ = ["Comparison", "Task", "lines_without_motion"]
+__all__ = ["Comparison", "Task", "lines_without_motion", "take_lines_at_rest"]
 
 
 @dataclass(frozen=True)
@@ -48,17 +49,33 @@ class Comparison(NamedTuple):
 
 
 def lines_without_motion(task: Task, blocks: xr.Dataset, known: xr.Dataset) -> xr.Dataset:
-    """Return the blocks with line spectra from those in which no known effect moves the rate.
+    """Return the blocks with line spectra from those in which no known effect moves the rate."""
+    moving = expect_known_motion(blocks, known, settings=task.settings)
+    at_rest = take_lines_at_rest(task, blocks, moving)
+    return (
+        blocks if at_rest is blocks else remove_known_lines(at_rest, known, settings=task.settings)
+    )
+
+
+def take_lines_at_rest(task: Task, blocks: xr.Dataset, moving: NDArray[np.bool_]) -> xr.Dataset:
+    """Return the blocks with line spectra from those in which an axis does not move.
 
     A step within a block has a broad spectrum, and all blocks in a part of the record share one
-    line spectrum. The log is read again when a block has to be left out.
+    line spectrum. The log is read again when a block has to be left out. An axis that moves has no
+    sines: they are sought in the record as a whole, where its levels have harmonics.
+
+    Parameters
+    ----------
+    moving : ndarray of bool, shape (axis, block)
     """
     has_data = np.isfinite(blocks["power"].values).any(axis=-1)
-    moving = expect_known_motion(blocks, known, settings=task.settings)
     if not (moving & has_data).any():
         return blocks
     at_rest = without_motion(
         task.log, blocks, moving | ~has_data, restart_gap=task.restart_gap, progress=task.progress
     )
     lines = {name: at_rest[name] for name in ("line_power", "line_weight")}
-    return remove_known_lines(blocks.assign(lines), known, settings=task.settings)
+    if "sine_nats" in blocks:
+        stays = xr.DataArray(~moving.any(axis=1), dims="axis")
+        lines["sine_nats"] = blocks["sine_nats"].where(stays, -np.inf)
+    return blocks.assign(lines)

@@ -441,7 +441,12 @@ class RealMotion(Effect):
         "1", "frequency of the sway over its width", default=20.0, low=0.5, high=1e4
     )
     spin: float = parameter(
-        "1", "share of the rotation rate", default=0.0, typical=1.0, low=-1.0, high=1.0
+        "1",
+        "share of the rotation rate, with scale-factor errors of gyro and channel",
+        default=0.0,
+        typical=1.0,
+        low=-1.1,
+        high=1.1,
     )
     x: float = parameter(
         "mrad/g",

@@ -22,6 +22,7 @@ from gyrostab.diagnose.identify.jumps import event_nats, gradual_nats, scatter_n
 from gyrostab.diagnose.identify.logger_filters import separate_axes_nats
 from gyrostab.diagnose.identify.steady import intermittent_nats
 from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component, Variant
+from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.diagnose.reduce.zero_bin import possibly_truncated_axes
@@ -41,6 +42,7 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+_PPM = 1e6  # in one
 _JUMP_CHANGES = 2  # from block to block, in the column of a jump within a block
 #: Effect -> effects that look the same in block statistics, whatever the excitation.
 OBSERVATIONALLY_EQUIVALENT: dict[str, tuple[str, ...]] = {
@@ -147,7 +149,7 @@ def find_plainer_effect(components: Sequence[Component], state: State) -> str | 
     """Return the effect that explains the same more plainly, or None.
 
     An axis senses a real rotation by the cosine of its angle to it, which is rarely small; errors
-    of the scale factor are.
+    of the scale factor are, and physics excludes large ones.
     """
     effect = components[0].candidate.effect
     if effect == "real_motion" and all(
@@ -169,9 +171,19 @@ def _is_rotation(component: Component) -> bool:
 
 
 def _rotation_share(component: Component, state: State) -> float:
-    from gyrostab.diagnose.predict.sizes import component_size
+    """Return the share of the rotation of the tool that an axis senses, or that an error is."""
+    from gyrostab.diagnose.predict.sizes import component_mixture, component_size
 
-    return abs(component_size(component, state)[0])
+    if _is_rotation(component):
+        return abs(component_size(component, state)[0])
+    row = state.axes.index(component.row[0])
+    error = component_mixture(component, state).moments()[0] @ mean_columns(component.variant, row)
+    per_ppm = next(
+        mean_columns(variant, row)[0]
+        for variant in component.candidate.variants
+        if variant.columns == ("linear",)
+    )
+    return float(np.nanstd(error) / (_PPM * np.nanstd(per_ppm)))
 
 
 def _find_other_form(component: Component, state: State) -> tuple[str, float] | None:
@@ -199,6 +211,12 @@ def _is_possible(component: Component, state: State) -> bool:
     if (
         _is_rotation(component)
         and _rotation_share(component, state) < state.settings.min_rotation_share
+    ):
+        return False
+    if (
+        effect == "scale_factor"
+        and statistic.is_linear_in_means
+        and _rotation_share(component, state) > state.settings.max_misalignment_share
     ):
         return False
     if (

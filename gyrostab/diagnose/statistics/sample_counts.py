@@ -256,6 +256,8 @@ def _count_evidence(
     values = data[name].values.astype(np.float64)
     values = values if values.ndim == 3 else values[None]
     values = excess_extremes(values) if name == "extremes" else values
+    if name == "kurtosis":  # that of a block with a moving mean is not that of noise
+        values = np.where(state.masked, np.nan, values)
     compute = kurtosis_evidence if name == "kurtosis" else sample_count_evidence
     return compute(values, *count_evidence.of[name], subsets)
 

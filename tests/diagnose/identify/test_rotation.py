@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.evidence.sample_counts import CountEvidence
+from gyrostab.diagnose.evidence.spectral_lines import line_evidence
 from gyrostab.diagnose.identify.components import group_components
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import find_plainer_effect, is_physical
+from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.settings import DEFAULTS
+from gyrostab.diagnose.task import Task, take_lines_at_rest
+from gyrostab.ingest.make_log import make_log
+from gyrostab.progress import no_stage
 from gyrostab.simulate import simulate
 from tests.support.named import nulls
 
@@ -75,6 +85,80 @@ def test_share_of_the_rotation_selects_the_effect(share, plainer, allowed):
     assert find_plainer_effect(motion, state) == plainer
     assert bool(is_physical(motion, state)) is allowed
     assert find_plainer_effect(error, state) is None
+
+
+def _log_whole_rotation(seed: int, *, error: float, size: int = 15_000) -> xr.Dataset:
+    """Make a log with an encoder, in which axis z senses all of the rotation, and an error of it.
+
+    The table turns to and fro, so that its rotation has harmonics at all frequencies.
+    """
+    rng = np.random.default_rng(seed)
+    levels = np.array([0.0, 10.0, -10.0, 30.0, -30.0, 0.0])
+    stops = levels[np.arange(size) // 1000 % levels.size]
+    turned = np.convolve(np.concatenate([np.zeros(30), stops]), np.full(31, 1.0 / 31.0), "valid")
+    rates = 3600.0 * np.stack([np.zeros(size), (1.0 + error) * turned])
+    rates += 5.0 * rng.standard_normal(rates.shape)
+    log = make_log(rates, rate=10.0, unit="deg/h", start="2026-01-01", axis=["x", "z"])
+    encoder = turned + 5e-4 * rng.standard_normal(size)
+    return log.assign(rotation_rate=("time", encoder, {"units": "degree s-1"}))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("error", [0.0, 2e-4])
+def test_whole_rotation_is_no_scale_factor_error(seed: int, error: float):
+    components, state = _find_components(reduce_log(_log_whole_rotation(seed, error=error)))
+    assert is_physical(components["real_motion"], state)
+    assert not is_physical(components["scale_factor"], state)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_lines_of_an_axis_that_turns_are_those_at_rest(seed: int):
+    log = _log_whole_rotation(seed, error=0.0)
+    hum = 3.0 * np.sin(2.0 * np.pi * 2.3 * np.arange(log.sizes["time"]) / 10.0)
+    log["rate"][1] += hum
+    blocks = reduce_log(log)
+    turned = np.abs(np.diff(blocks["mean"].values[1], append=0.0)) > 50.0
+    moving = np.stack([np.zeros_like(turned), turned | np.roll(turned, 1)])
+    task = Task(log, None, None, 5.0, 0, 100, 0.01, no_stage, DEFAULTS)
+    at_rest = take_lines_at_rest(task, blocks, moving)
+    nats = line_evidence(at_rest["line_power"].values[None], at_rest["line_weight"].values)[0, 1]
+    frequency = at_rest["line_frequency"].values
+    assert nats[np.abs(frequency - 2.3).argmin()] > 30.0
+    assert nats[np.abs(frequency - 2.3) > 0.2].max() < 5.0
+    assert not np.isfinite(at_rest["sine_nats"].values[1]).any()
+    np.testing.assert_array_equal(at_rest["sine_nats"][0], blocks["sine_nats"][0])
+
+
+def test_tails_of_blocks_in_which_an_axis_turns_do_not_count():
+    blocks = reduce_log(_log_whole_rotation(1, error=0.0))
+    turned = np.zeros(blocks["kurtosis"].shape, np.bool_)
+    turned[1, ::3] = True
+    blocks["kurtosis"] = blocks["kurtosis"].where(~turned, 4.0).where(turned, 0.0)
+    state = initial_state(blocks, calibrate_noise(blocks))
+    folds = fold_blocks(blocks)
+    tails = [item for item in nuisance_alternatives(blocks) if item.effect == "~outliers"]
+    moments = np.zeros(2), np.full(2, 0.4)
+    evidence = [
+        compute_evidence(
+            tails,
+            blocks,
+            replace(state, masked=masked),
+            folds,
+            count_evidence=CountEvidence({"kurtosis": moments}),
+        )[0].evidence_nats[0, 1]
+        for masked in (np.zeros_like(turned), turned)
+    ]
+    assert evidence[0] > 30.0
+    assert evidence[1] < 3.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("error", [0.0, 2e-4])
+def test_whole_rotation_is_the_only_effect(error: float):
+    diagnosis = diagnose(_log_whole_rotation(2, error=error), nulls=100)
+    (effect,) = diagnosis.effects
+    assert effect["name"] == "real_motion"
+    assert effect["parameters"]["spin"]["value"] == pytest.approx(1.0 + error, abs=2e-5)
 
 
 @pytest.mark.slow
