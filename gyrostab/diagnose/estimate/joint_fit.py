@@ -24,7 +24,7 @@ from gyrostab.diagnose.reduce.zero_bin import truncated_axes
 from gyrostab.diagnose.statistics import Statistic
 from gyrostab.diagnose.statistics.base import SizeFit
 from gyrostab.diagnose.statistics.rotation_order import fit_amplitude, harmonic_sets, is_reversed
-from gyrostab.diagnose.statistics.sample_sizes import centre_of_range
+from gyrostab.diagnose.statistics.sample_sizes import centre_of_range, has_empty_zone
 from gyrostab.diagnose.statistics.spectral_line import line_quality
 from gyrostab.errors import GyrostabError
 from gyrostab.noise import NORMAL_95
@@ -331,6 +331,8 @@ def _model_settings(
         and truncated_axes(state.blocks)[state.axes.index(component.row[0])]
     ):
         return {"mode": "zero"}
+    if identification.effect == "dead_zone" and has_empty_zone(state.blocks, component.row[0]):
+        return {"edge": "jump"}
     if identification.effect == "spikes":
         return {"kind": "outlier"}
     if identification.effect == "earth_rate" and is_reversed(component):

@@ -18,7 +18,7 @@ from gyrostab.diagnose.reduce.accumulate import (
 from gyrostab.diagnose.reduce.log_blocks import channel_means, numeric_channels
 from gyrostab.diagnose.reduce.outliers import count_outliers, quantization_step, zeros_beyond_chance
 from gyrostab.diagnose.reduce.schema import COORDINATES, check_block_statistics, label_variables
-from gyrostab.diagnose.reduce.zero_bin import BINS, bin_widths
+from gyrostab.diagnose.reduce.zero_bin import BINS, bin_widths, empty_zone
 from gyrostab.kernels.regression.smooth import smooth_curve
 from gyrostab.schema import GAP_CAUSES, texts
 from gyrostab.time.grid import grid_index, grid_times
@@ -52,6 +52,7 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
     # on a quantization grid equal values are frequent by chance
     resent = np.where(steps[:, None, None] > 0.0, 0, work.resent)
     widths = np.array([bin_widths(_kept_values(work, row), step) for row, step in enumerate(steps)])
+    zones = np.array([empty_zone(_kept_values(work, row)) for row in range(work.axes)])
     line_total, line_square = np.moveaxis(work.line_counts, -1, 0)
     weight = np.divide(
         line_total**2, line_square, where=line_square > 0, out=np.zeros(line_total.shape)
@@ -89,6 +90,8 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
         "line_weight": weight,
         "bin_width": widths[:, 0],
         "bin_width_stderr": widths[:, 1],
+        "zone_width": zones[:, 0],
+        "zone_width_stderr": zones[:, 1],
     }
     arrays |= work.sines.strongest(_line_frequencies(work))
     variables = (

@@ -94,6 +94,10 @@ BLOCK_STATISTICS: dict[str, Variable] = {
         ("axis", "bin"), "1", "width of the zero bin and of its neighbours, in quantization steps"
     ),
     "bin_width_stderr": Variable(("axis", "bin"), "1", "standard error of it"),
+    "zone_width": Variable(
+        ("axis",), _RATE, "half width of a zone around zero that is empty but near zero", False
+    ),
+    "zone_width_stderr": Variable(("axis",), _RATE, "standard error of it", False),
     "sub_block_mean": Variable(_SUB_BLOCK, _RATE, "mean rate of a sub-block"),
     "sub_block_samples": Variable(_SUB_BLOCK, "1", "samples of a sub-block"),
     "cross": Variable(

@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-__all__ = ["BINS", "bin_widths", "possibly_truncated_axes", "truncated_axes"]
+__all__ = ["BINS", "bin_widths", "empty_zone", "possibly_truncated_axes", "truncated_axes"]
 
 Array = NDArray[np.float64]
 #: Bins whose widths are measured: the zero bin, and its two neighbours together.
@@ -26,6 +26,8 @@ _FIT_REACH_SCATTERS = 1.0  # range of the fit on either side of zero; design cho
 _MIN_FIT_BINS, _MAX_FIT_BINS = 4, 200  # on either side; design choice
 _OFF_GRID_SHARE = 0.01  # of the values, and of a step, that values may be off the grid
 _MAX_ITERATIONS = 50
+#: Levels in as much beyond an empty zone as it is wide; by chance 1 in 2^40 gaps leaves out 40.
+_MIN_BEYOND = 40
 
 
 def bin_widths(values: Array, step: float) -> tuple[Array, Array]:
@@ -92,6 +94,42 @@ def bin_widths(values: Array, step: float) -> tuple[Array, Array]:
             width[bin_index] * np.sqrt(slope @ covariance @ slope),
         )
     return width, error
+
+
+def empty_zone(values: Array) -> tuple[float, float]:
+    """Measure the half width of a zone around zero whose outer part is empty, and its error.
+
+    A loop that sticks near zero, and is right outside of its zone, leaves such a gap: between the
+    values at which it sticks, which may have noise of their own, and the least rate that it shows.
+    The stretch of the same width beyond has the levels that a gap leaves out: by chance they are
+    few, and on a quantization grid there is one.
+
+    Parameters
+    ----------
+    values : ndarray
+        Samples of an axis [degree hour-1]; NaN is ignored.
+
+    Returns
+    -------
+    width, error : float
+        NaN without such a zone.
+
+    Examples
+    --------
+    >>> rate = np.random.default_rng(1).normal(0.0, 1.0, 20_000)
+    >>> sticking = np.where(np.abs(rate) < 0.3, 0.01 * rate, rate)
+    >>> round(empty_zone(sticking)[0], 3), empty_zone(rate)
+    (0.3, (nan, nan))
+    """
+    levels = np.unique(np.abs(values[np.isfinite(values)]))
+    if levels.size < _MIN_BEYOND:
+        return np.nan, np.nan
+    inner, outer = levels[:-1], levels[1:]
+    beyond = np.searchsorted(levels, 2.0 * outer - inner, "right") - np.arange(1, levels.size)
+    gap = int(np.argmax(beyond >= _MIN_BEYOND))
+    if beyond[gap] < _MIN_BEYOND:
+        return np.nan, np.nan
+    return float(outer[gap]), float((outer[gap] - inner[gap]) / beyond[gap])
 
 
 def _parabola_columns(at: Array, reach: float) -> Array:

@@ -15,7 +15,7 @@ from gyrostab.diagnose.settings import INTERVAL_TAILS, Settings
 from gyrostab.noise import NORMAL_95
 from gyrostab.units import HOUR
 
-__all__ = ["centre_of_range", "estimate_from_counts"]
+__all__ = ["centre_of_range", "estimate_from_counts", "has_empty_zone"]
 
 #: Standard deviation of the difference of white noise and the median of its eight neighbours, in
 #: standard deviations of the noise.
@@ -74,6 +74,12 @@ def estimate_from_counts(
     )
     if effect == "clipping":
         return {"limit": _size_range(blocks.sel(axis=axis), spread, samples)}
+    if effect == "dead_zone" and has_empty_zone(blocks, axis):
+        width, error = (
+            float(blocks[name].sel(axis=axis)) for name in ("zone_width", "zone_width_stderr")
+        )
+        # the least of many samples beyond the zone is that far from its edge, by an exponential law
+        return {"width": (width, error, width + error * math.log(INTERVAL_TAILS[0]), width)}
     if effect == "dead_zone":
         width, narrow, wide = (
             spread * float(ndtri(0.5 + fraction / 2.0))
@@ -82,6 +88,11 @@ def estimate_from_counts(
         slope = spread / (2.0 * float(_normal_density(width / spread)))
         return {"width": (width, slope * error / samples, narrow, wide)}
     return {}
+
+
+def has_empty_zone(blocks: xr.Dataset, axis: str) -> bool:
+    """Return whether an axis shows no rates next to those at which it sticks near zero."""
+    return "zone_width" in blocks and bool(np.isfinite(blocks["zone_width"].sel(axis=axis)))
 
 
 def centre_of_range(blocks: xr.Dataset) -> float:
