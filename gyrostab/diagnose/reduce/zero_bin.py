@@ -100,9 +100,9 @@ def empty_zone(values: Array) -> tuple[float, float]:
     """Measure the half width of a zone around zero whose outer part is empty, and its error.
 
     A loop that sticks near zero, and is right outside of its zone, leaves such a gap: between the
-    values at which it sticks, which may have noise of their own, and the least rate that it shows.
-    The stretch of the same width beyond has the levels that a gap leaves out: by chance they are
-    few, and on a quantization grid there is one.
+    values at which it sticks, which may be noisy, and the least rate that it shows. The stretch of
+    the same width beyond has the levels that a gap leaves out: by chance they are few, and on a
+    quantization grid there is one.
 
     Parameters
     ----------
