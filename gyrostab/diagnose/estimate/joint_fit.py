@@ -17,9 +17,12 @@ from gyrostab.diagnose.identify.identification import (
     Selection,
     condition_on_selections,
 )
+from gyrostab.diagnose.identify.jumps import is_step
 from gyrostab.diagnose.identify.logger_filters import fit_filter_sizes
 from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.condition import condition_on_components
 from gyrostab.diagnose.predict.linear_model import State, initial_state
+from gyrostab.diagnose.predict.windows import TIME_PARAMETER
 from gyrostab.diagnose.reduce.zero_bin import truncated_axes
 from gyrostab.diagnose.statistics import Statistic
 from gyrostab.diagnose.statistics.base import SizeFit
@@ -37,6 +40,7 @@ __all__ = ["Estimate", "Fitted", "fit_identifications"]
 
 _ANGLE = "deg"
 _TAIL = float(ndtr(-NORMAL_95))  # beyond either end of an interval
+MAX_BLOCKS_OF_STEP = 2  # by which the times of a step on two axes may differ; design choice
 _PLACE = "frequency"  # of a line: where it is does not depend on what makes it
 
 
@@ -64,6 +68,7 @@ class Fitted:
     effect: Effect | None
     note: str = ""  # what the sizes do not show
     shown: Effect | None = None  # the same with the sizes, if they differ
+    components: tuple[Component, ...] = ()  # that the sizes are those of
 
     def say(self, windows: Windows | None = None) -> str:
         """Describe the effect with its sizes in one sentence; empty without sizes.
@@ -127,10 +132,11 @@ def _fit_identification(
                 identification,
                 _axes_shown(identification, components),
                 components,
-                state,
+                state_beside,
                 identifications,
             )
-            for components in _split_harmonics(identification, state)
+            for harmonic in _split_harmonics(identification, state)
+            for components, state_beside in _split_steps(harmonic, state)
         ]
     return [
         _fit_components(
@@ -186,6 +192,84 @@ def _split_harmonics(identification: Identification, state: State) -> list[list[
     ]
     rest = [component for component in identification.components if component not in turning]
     return [[*visible_harmonics[0], *rest], *visible_harmonics[1:]]
+
+
+def _split_steps(
+    components: Sequence[Component], state: State
+) -> list[tuple[list[Component], State]]:
+    """Split the components of steps at several times, each with the other steps in the model.
+
+    Steps of different axes are one if hardly any block lies between their times. The grid of times
+    of each step ends half way to the others: at their times it could not be distinguished from
+    them.
+    """
+    steps = [step for component in components for step in _single_steps(component)]
+    groups = _group_steps(steps, state)
+    if len(groups) < 2:
+        return [([*steps, *(part for part in components if not is_step(part))], state)]
+    out = []
+    for group in groups:
+        others = [step for other in groups if other is not group for step in other]
+        with_others = condition_on_components(state, others)
+        nearest = [_nearest_times(step, [_step_time(other) for other in others]) for step in group]
+        out.append((nearest, replace(state, given=with_others.given)))
+    return out
+
+
+def _group_steps(steps: Sequence[Component], state: State) -> list[list[Component]]:
+    """Group steps of different axes at the same time, in the order of time."""
+    middle = (state.blocks["begin"].values + state.blocks["end"].values) / 2.0
+    present = np.isfinite(state.blocks["mean"].values).any(axis=0)
+    groups: list[list[Component]] = []
+    for step in sorted(steps, key=_step_time):
+        if groups:
+            between = (middle > _step_time(groups[-1][0])) & (middle < _step_time(step))
+            is_other = (present & between).sum() > MAX_BLOCKS_OF_STEP
+            if not is_other and all(step.row != other.row for other in groups[-1]):
+                groups[-1].append(step)
+                continue
+        groups.append([step])
+    return groups
+
+
+def _nearest_times(step: Component, other_times: Sequence[float]) -> Component:
+    """Return a step with only those times of its grid that are nearer to it than to others."""
+    distances = {
+        id(variant): (
+            abs(float(variant.values[TIME_PARAMETER]) - _step_time(step)),
+            min(abs(float(variant.values[TIME_PARAMETER]) - other) for other in other_times),
+        )
+        for variant in step.candidate.variants
+    }
+    nearest = tuple(
+        variant
+        for variant in step.candidate.variants
+        if distances[id(variant)][0] < distances[id(variant)][1]
+    )
+    return replace(step, candidate=replace(step.candidate, variants=nearest))
+
+
+def _single_steps(component: Component) -> list[Component]:
+    """Return a component for each step of a component in the means; empty without one.
+
+    The times of steps at every restart are known.
+    """
+    variant = component.variant
+    if not is_step(component):
+        return []
+    if len(variant.columns) == 1:
+        return [component]
+    single = [other for other in component.candidate.variants if len(other.columns) == 1]
+    return [
+        replace(component, variant=other, candidate=replace(component.candidate, variants=(other,)))
+        for column in variant.design
+        for other in single
+        if np.array_equal(other.design[0], column)
+    ]
+
+
+def _step_time(component: Component) -> float:
+    return float(component.variant.values[TIME_PARAMETER])
 
 
 def _fit_components(
@@ -250,6 +334,7 @@ def _fit_components(
         averaged if effect is None else effect,
         next((component.note for component in by_statistic[statistic] if component.note), ""),
         averaged,
+        tuple(components),
     )
 
 
@@ -286,9 +371,9 @@ def _estimate_sizes(
     identifications: Identifications,
 ) -> tuple[Mapping[str, tuple[float, ...]], Mapping[str, float | str]]:
     """Return parameters with their errors from components in one statistic, and likely values."""
-    fit = SizeFit(
-        components, axes, state, identifications.candidates, identifications.count_evidence
-    )
+    # a step has its own grid of times, which ends where those of other steps begin
+    candidates = () if is_step(components[0]) else identifications.candidates
+    fit = SizeFit(components, axes, state, candidates, identifications.count_evidence)
     return components[0].statistic.estimate(fit), fit.likeliest
 
 

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import Mixture, component_mixture, mean_mixture
+from gyrostab.diagnose.predict.windows import TIME_PARAMETER
 
-__all__ = ["event_nats", "gradual_nats", "is_free_jump", "scatter_nats"]
+__all__ = ["event_nats", "gradual_nats", "is_free_jump", "is_step", "scatter_nats"]
 
 Array = NDArray[np.float64]
-_JUMP, _INSTANT = "bias_jump", "at"
+_JUMP = "bias_jump"
 _TRANSITION_BLOCKS = (4, 8)  # lengths of the gradual changes that a jump is compared with
 EVENT_LENGTHS = 48  # that are tried, from two blocks up
 MIN_EVENT_LIMIT_BLOCKS = 8.0
@@ -23,16 +24,17 @@ MIN_LEVEL_BLOCKS = 3  # before and after an event, that determine the level ther
 _VARIANCE_FACTORS = (10.0, 100.0, 1e3, 1e4, 1e5)  # over the usual variance of the means
 
 
+def is_step(component: Component) -> bool:
+    """Return whether a component is a step of the mean at a given time."""
+    return component.statistic.is_linear_in_means and TIME_PARAMETER in component.variant.values
+
+
 def is_free_jump(component: Component, state: State) -> bool:
     """Return whether a component is a jump at a free instant, not at a restart."""
-    if (
-        component.candidate.effect != _JUMP
-        or not component.statistic.is_linear_in_means
-        or _INSTANT not in component.variant.values
-    ):
+    if component.candidate.effect != _JUMP or not is_step(component):
         return False
     ends = state.blocks["restart_end"].values if "restart_end" in state.blocks else np.empty(0)
-    return not np.isclose(ends, float(component.variant.values[_INSTANT])).any()
+    return not np.isclose(ends, float(component.variant.values[TIME_PARAMETER])).any()
 
 
 def gradual_nats(components: Sequence[Component], state: State, *, error: float = 0.0) -> float:
@@ -142,7 +144,9 @@ def _possible_variances(component: Component, state: State) -> list[Array]:
     """Return white variances of the means: the usual, and larger ones for a time near the jump."""
     axis, block_count = component.row[0], state.blocks.sizes["block"]
     block = np.arange(block_count)
-    at = round(float(component.variant.values[_INSTANT]) / float(state.blocks.attrs["block_s"]))
+    at = round(
+        float(component.variant.values[TIME_PARAMETER]) / float(state.blocks.attrs["block_s"])
+    )
     lengths = [2**power for power in range(1, max(block_count, 2).bit_length())]
     spans = {
         (max(at - blocks_before, 0), min(at + blocks_after, block_count))
@@ -164,7 +168,7 @@ def _possible_variances(component: Component, state: State) -> list[Array]:
 def _event_spans(component: Component, state: State) -> list[tuple[int, int]]:
     """Return the first and last edges of events that begin or end at a jump."""
     block, block_count = float(state.blocks.attrs["block_s"]), state.blocks.sizes["block"]
-    at = round(float(component.variant.values[_INSTANT]) / block)
+    at = round(float(component.variant.values[TIME_PARAMETER]) / block)
     lengths = np.unique(
         np.geomspace(
             2.0,
@@ -209,7 +213,7 @@ def _transition_evidence(component: Component, state: State, length: int) -> flo
     if length:
         block = float(state.blocks.attrs["block_s"])
         middle = (np.arange(state.blocks.sizes["block"]) + 0.5) * block - float(
-            variant.values[_INSTANT]
+            variant.values[TIME_PARAMETER]
         )
         way = np.clip(middle / (length * block) + 0.5, 0.0, 1.0)
         variant = replace(variant, design=np.broadcast_to(way, variant.design.shape))

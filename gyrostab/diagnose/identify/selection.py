@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations_with_replacement
 
 import numpy as np
 import xarray as xr
@@ -41,6 +41,7 @@ from gyrostab.diagnose.identify.identification import (
     form_error,
     with_axes_of,
 )
+from gyrostab.diagnose.identify.jumps import is_step
 from gyrostab.diagnose.identify.naming_order import order_passing, order_rivals
 from gyrostab.diagnose.identify.rejected import find_rejections
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
@@ -306,9 +307,10 @@ class Search:
     ) -> tuple[str, list[Component], State] | None:
         """Find two effects that together explain more than the nuisance alternative.
 
-        An alternative of any form explains more than each of them while the other is not in the
-        model. The evidence of a pair is the lower one of both orders: an effect that is fitted
-        alone to both may have a form that the second one has to undo.
+        Two jumps are such a pair if the alternative is a course of levels. An alternative of any
+        form explains more than each of them while the other is not in the model. The evidence of a
+        pair is the lower one of both orders: an effect that is fitted alone to both may have a form
+        that the second one has to undo.
 
         Returns
         -------
@@ -320,10 +322,15 @@ class Search:
             With the other in the model.
         """
         alternative = components[passing[0]]
+        is_course = alternative[0].statistic.is_switching  # of levels, as jumps make it
         keys = [
             key
             for key in passing
-            if not key.startswith("~") and components[key][0].statistic is alternative[0].statistic
+            if not key.startswith("~")
+            and (
+                components[key][0].statistic is alternative[0].statistic
+                or (is_course and components[key][0].statistic.is_linear_in_means)
+            )
         ]
         companions = {
             key: self._find_beside(keys, components[key], required[key], state) for key in keys
@@ -336,8 +343,10 @@ class Search:
         }
         pairs = {
             pair: min(totals[pair], totals[pair[::-1]])
-            for pair in combinations(keys, 2)
-            if pair in totals and pair[::-1] in totals
+            for pair in combinations_with_replacement(keys, 2)
+            if pair in totals
+            and pair[::-1] in totals
+            and (pair[0] != pair[1] or (is_course and is_step(components[pair[0]][0])))
         }
         best = max(pairs, key=lambda pair: pairs[pair], default=None)
         if best is None or pairs[best] <= sum_evidence(alternative):

@@ -24,6 +24,7 @@ from gyrostab.diagnose.identify.identification import (
     components_of,
     remove_phase_locked,
 )
+from gyrostab.diagnose.identify.jumps import is_step
 from gyrostab.diagnose.identify.switching import remove_telegraph_bias
 from gyrostab.diagnose.predict.channel_use import unused_channels
 from gyrostab.diagnose.result.attribution import active_blocks, attribute_mismatches
@@ -222,14 +223,19 @@ def _can_be_forecast(
 ) -> bool:
     """Return whether an effect acts both before and after the time that a forecast begins from.
 
-    The size of an event in the last part is unknown before, and an event that is over does not
-    affect the last part. Sample counts are in neither means nor powers, which are forecast.
+    The size of an event in the last part is unknown before, also where it is one of several jumps,
+    and an event that is over does not affect the last part. Sample counts are in neither means nor
+    powers, which are forecast.
     """
     if all(component.statistic.is_count for component in identification.components):
         return False
     acts = active_blocks(identification, blocks, settings=settings)
     known = select_forecast_start(blocks)
-    return bool(acts[known].any() and acts[~known].any())
+    has_later_step = any(
+        is_step(component) and (np.ptp(component.variant.design[..., known], axis=-1) == 0.0).any()
+        for component in identification.components
+    )
+    return bool(acts[known].any() and acts[~known].any() and not has_later_step)
 
 
 def _attributed_mismatches(

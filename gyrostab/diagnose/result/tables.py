@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -359,7 +359,10 @@ def effect_tables(
     out = []
     for fitted_effect, family in zip(fitted, _families_of(fitted, blocks), strict=True):
         identification = fitted_effect.identification
-        acting = active_blocks(identification, blocks, settings=settings)
+        components = fitted_effect.components or identification.components
+        acting = active_blocks(
+            replace(identification, components=components), blocks, settings=settings
+        )
         when = join_blocks(acting, begin, end)
         record_s = float(end[-1])
         out.append(

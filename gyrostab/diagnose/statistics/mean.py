@@ -23,6 +23,8 @@ from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State, moves_within_blocks
 from gyrostab.diagnose.predict.search import Trial, collect_evidence
 from gyrostab.diagnose.predict.sizes import Mixture, mean_mixture
+from gyrostab.diagnose.predict.step_times import power_on_times
+from gyrostab.diagnose.predict.windows import TIME_PARAMETER
 from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.statistics.base import Region, Statistic, column_choices
 from gyrostab.diagnose.statistics.scores import (
@@ -41,6 +43,9 @@ from gyrostab.kernels.regression.boxcars import (
 )
 from gyrostab.kernels.regression.state_space import flicker_states
 from gyrostab.noise import HOUR
+from gyrostab.physics.base import Effect
+from gyrostab.physics.prediction import Prediction
+from gyrostab.physics.prediction import Windows as PredictionWindows
 
 __all__ = [
     "LENGTHS",
@@ -159,6 +164,23 @@ class Mean(BlockMeanStatistic):
         for chosen in column_choices(list(columns)):
             yield Variant(case.values, chosen, np.stack([columns[name] for name in chosen]))
 
+    def candidates(
+        self,
+        kind: type[Effect],
+        driver: tuple[str, ...],
+        predictions: Sequence[tuple[dict[str, Any], Prediction]],
+        windows: PredictionWindows,
+        blocks: xr.Dataset,
+        coefficient: xr.DataArray,
+    ) -> list[Candidate]:
+        """Return the candidates of an effect; a step at a given time may occur at every restart."""
+        return [
+            replace(candidate, variants=_with_steps_at_restarts(candidate.variants, windows))
+            for candidate in super().candidates(
+                kind, driver, predictions, windows, blocks, coefficient
+            )
+        ]
+
     def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
         """Compute the evidence in block means."""
         factors = []
@@ -197,6 +219,41 @@ class Mean(BlockMeanStatistic):
             f"The mean rate of {axes} is {size}{'above' if is_higher(region) else 'below'} its "
             f"expected value {when}, more than drift and noise allow"
         )
+
+
+def _with_steps_at_restarts(
+    variants: tuple[Variant, ...], windows: PredictionWindows
+) -> tuple[Variant, ...]:
+    """Add a variant in which the level changes at every restart, each time by another size.
+
+    A single step leaves the others, which free random walk explains as well as that step. With all
+    of them in one design, the parts between the restarts show how small the random walk is. The
+    design has half of the prior probability of steps at restarts.
+    """
+    if not all(TIME_PARAMETER in variant.values for variant in variants):
+        return variants
+    restarts = power_on_times(windows)
+    at_restart = [
+        bool(np.isclose(restarts, variant.values[TIME_PARAMETER]).any()) for variant in variants
+    ]
+    steps = [
+        variant
+        for variant, at_one in zip(variants, at_restart, strict=True)
+        if at_one and len(variant.columns) == 1
+    ]
+    if len(steps) < 2:
+        return variants
+    every = replace(
+        steps[0],
+        columns=tuple(name for variant in steps for name in variant.columns),
+        design=np.concatenate([variant.design for variant in steps]),
+        weight=0.5 * sum(variant.weight for variant in steps),
+    )
+    halved = [
+        replace(variant, weight=0.5 * variant.weight) if at_one else variant
+        for variant, at_one in zip(variants, at_restart, strict=True)
+    ]
+    return (*halved, every)
 
 
 def window_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, Array]:

@@ -1,0 +1,92 @@
+"""Jumps at several restarts, or several jumps of one axis, are found and fitted together."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.core import diagnose
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify.components import group_components, sum_evidence
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
+from gyrostab.diagnose.predict.linear_model import initial_state
+from gyrostab.diagnose.predict.search import compute_evidence
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.ingest.make_log import make_log
+
+RATE = 2.0
+RESTARTS = ((3000.0, 3090.0), (6200.0, 6500.0), (8500.0, 8560.0))
+
+
+def drifting_log(seed: int, steps: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> xr.Dataset:
+    """Make a log with N = 0.05, K = 0.4 and `steps` (axis, sample) [deg/h]."""
+    rng = np.random.default_rng(seed)
+    second = np.arange(steps.shape[1]) / RATE
+    rate = 0.05 * 60.0 * np.sqrt(RATE) * rng.standard_normal(steps.shape) + steps
+    rate += 0.4 * np.sqrt(1.0 / RATE / 3600.0) * rng.standard_normal(steps.shape).cumsum(axis=1)
+    for begin, end in gaps:
+        rate[:, (second >= begin) & (second < end)] = np.nan
+    return make_log(rate, rate=RATE, unit="deg/h")
+
+
+def levels(sizes: tuple[float, ...], times: tuple[float, ...], seconds: float) -> np.ndarray:
+    """Sum steps of these sizes at these times."""
+    second = np.arange(round(seconds * RATE)) / RATE
+    return sum(size * (second >= at) for size, at in zip(sizes, times, strict=True))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_jumps_at_every_restart_compete_as_one_design(seed: int) -> None:
+    """One jump alone is no larger than the random walk that would explain the others."""
+    times = tuple(end for _, end in RESTARTS)
+    steps = np.stack(
+        [levels(sizes, times, 10_800.0) for sizes in ((1.6, -1.9, 1.1), (-1.1, 1.7, -2.0))]
+    )
+    blocks = reduce_log(drifting_log(seed, steps, RESTARTS))
+    baseline = calibrate_noise(blocks)
+    (jumps,) = (
+        candidate
+        for candidate in effect_candidates(blocks, baseline["coefficient"])[0]
+        if (candidate.effect, candidate.statistic.name) == ("bias_jump", "mean")
+    )
+    state = initial_state(blocks, baseline)
+    components = group_components(compute_evidence([jumps], blocks, state, fold_blocks(blocks)))[
+        jumps.key
+    ]
+    assert {component.row for component in components} == {("x",), ("y",)}
+    assert all(len(component.variant.columns) == 3 for component in components)
+    assert sum_evidence(components) > 15.0
+
+
+@pytest.mark.parametrize("seed", [1])
+def test_jumps_at_all_restarts_are_sized(seed: int) -> None:
+    times = tuple(end for _, end in RESTARTS)
+    sizes = np.array([(1.6, -1.9, 1.1), (-1.1, 1.7, -2.0)])
+    steps = np.stack([levels(tuple(row), times, 10_800.0) for row in sizes])
+    found = diagnose(drifting_log(seed, steps, RESTARTS), nulls=100)
+    assert [effect["name"] for effect in found.effects] == ["bias_jump"] * 3
+    assert [effect["at"] for effect in found.model["effect"]] == list(times)
+    for effect, truth in zip(found.effects, sizes.T, strict=True):
+        for axis, size in zip(("x", "y"), truth, strict=True):
+            estimate = effect["parameters"][f"step.{axis}"]
+            assert abs(estimate["value"] - size) < 4.0 * estimate["stderr"]
+            assert estimate["stderr"] < 0.5
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_two_jumps_beat_a_course_of_levels(seed: int) -> None:
+    steps = levels((2.6, -2.1), (9500.0, 11_800.0), 14_400.0)[None]
+    found = diagnose(drifting_log(seed, steps, ()), nulls=100)
+    sizes = {
+        effect["parameters"]["at"]["value"]: effect["parameters"]["step"]
+        for effect in found.effects
+        if effect["name"] == "bias_jump"
+    }
+    assert len(sizes) == 2
+    for (at, estimate), truth_at, truth in zip(
+        sorted(sizes.items()), (9500.0, 11_800.0), (2.6, -2.1), strict=True
+    ):
+        assert at == pytest.approx(truth_at, abs=60.0)
+        assert abs(estimate["value"] - truth) < 4.0 * estimate["stderr"] < 4.0
