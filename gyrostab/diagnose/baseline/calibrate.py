@@ -195,10 +195,37 @@ def calibrate_axes(
                 step=step,
                 draws=DRAWS,
                 rng=np.random.default_rng(row),
+                effects=_level_columns(use, settings.min_quiescent_blocks),
                 max_disagreement_nats=settings.disagreement_nats,
             )._replace(of_means=None if explained is fit else square)
         )
     return posteriors
+
+
+def _level_columns(quiet: NDArray[np.bool_], min_blocks: int) -> Array:
+    """Return steps that give each quiescent stretch its own level, (block, step).
+
+    What moves the bias between two stretches, vibration for instance, is not noise of either. A
+    stretch that is shorter than `min_blocks` continues with the next: the level of each costs one
+    increment of the random walk in `min_blocks`.
+
+    Examples
+    --------
+    >>> _level_columns(np.array([1, 1, 0, 1, 1, 0, 0, 1], bool), 2).T
+    array([[0., 0., 0., 1., 1., 1., 1., 1.],
+           [0., 0., 0., 0., 0., 0., 0., 1.]])
+    >>> _level_columns(np.array([1, 1, 0, 1, 1, 0, 0, 1], bool), 3).T
+    array([[0., 0., 0., 0., 0., 0., 0., 1.]])
+    """
+    starts = np.flatnonzero(quiet & ~np.append(False, quiet[:-1]))
+    block = np.arange(quiet.size)
+    columns: list[Array] = []
+    last = 0
+    for first in starts.tolist():
+        if quiet[last:first].sum() >= min_blocks:
+            columns.append((block >= first).astype(np.float64))
+            last = first
+    return np.stack(columns, axis=1) if columns else np.empty((quiet.size, 0))
 
 
 def _fit_quiescent_powers(

@@ -88,7 +88,7 @@ def predict_baseline(
             )
             size, _ = mean_mixture(state_without_means, axis, columns).moments()
             mean[row] += np.tensordot(size[is_kept], np.stack(columns)[is_kept], axes=1)
-    predicted = baseline.assign(
+    predicted = state.baseline.assign(
         spectrum=baseline["spectrum"].copy(data=weight),
         known_mean=baseline["known_mean"].copy(data=mean),
     )

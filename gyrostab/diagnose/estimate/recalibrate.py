@@ -27,6 +27,7 @@ from gyrostab.diagnose.baseline.posterior import (
 )
 from gyrostab.diagnose.baseline.predicted_effects import find_drivers
 from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_identifications
+from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.identify.identification import (
     Identifications,
     components_of,
@@ -65,8 +66,9 @@ def recalibrate(
     """Calibrate the noise with the identified effects in the model, those of free size free.
 
     An axis without an effect keeps its noise; so does one on which the effects leave too little to
-    determine it. The course of an effect separates it from noise, so that the whole record is used;
-    with something unidentified on the axis, only its quiescent blocks are.
+    determine it, or with a random walk that follows a channel. The course of an effect separates it
+    from noise, so that the whole record is used; with something unidentified on the axis, only its
+    quiescent blocks are.
 
     Parameters
     ----------
@@ -95,7 +97,8 @@ def recalibrate(
     for row, axis in enumerate(state.axes):
         axis_effects = _collect_effects(identifications, baseline, fitted, axis)
         posterior = None
-        if axis_effects is not None:
+        has_walk = expected_processes(state.baseline, row).walk.any()
+        if axis_effects is not None and not has_walk:
             has_unidentified = any(axis in selection.axes for selection in identifications.unknown)
             chosen = use & ~state.masked[row] & (quiet[row] if has_unidentified else True)
             posterior = _fit_noise(state, row, axis_effects, chosen)

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-__all__ = ["RandomProcesses", "block_mean_variance", "expected_processes"]
+__all__ = ["RandomProcesses", "block_mean_variance", "expected_processes", "with_walk"]
 
 Array = NDArray[np.float64]
 
@@ -51,6 +51,24 @@ def expected_processes(baseline: xr.Dataset, axis: str | int) -> RandomProcesses
         processes["wander_time"].values[active],
         processes["wander_walk"].values,
     )
+
+
+def with_walk(baseline: xr.Dataset, axis: str, walk: Array) -> xr.Dataset:
+    """Return the baseline with another random walk in the mean of an axis.
+
+    Parameters
+    ----------
+    walk : ndarray, shape (block,)
+        Growth of its variance [degree2 hour-2 s-1].
+    """
+    axes = baseline["axis"].values.tolist()
+    total = np.stack([expected_processes(baseline, row).walk for row in range(len(axes))])
+    total[axes.index(axis)] += walk
+    values: dict[str, tuple[tuple[str, ...], Array]] = {"wander_walk": (("axis", "block"), total)}
+    if "wander_square" not in baseline:
+        values["wander_square"] = (("axis", "wander"), np.zeros((len(total), 0)))
+        values["wander_time"] = (("wander",), np.zeros(0))
+    return baseline.assign(values)
 
 
 def block_mean_variance(step: float, time: Array) -> Array:

@@ -11,6 +11,7 @@ import xarray as xr
 
 from gyrostab.diagnose.evidence.held_out import LinearModel, noise_columns, with_independent_cells
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines
+from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect, Variant
 from gyrostab.diagnose.predict.filter_response import undo_filter
 from gyrostab.diagnose.predict.linear_model import (
@@ -310,14 +311,14 @@ def _surface_of_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows
     block, block_count = float(blocks.attrs["block_s"]), blocks.sizes["block"]
     means = blocks["mean"].values - baseline["known_mean"].values
     white = baseline["mean_variance"].values
+    walk = block * np.stack([expected_processes(baseline, row).walk for row in range(len(white))])
     sizes = [k for k in (1, 2, 4, 8, 16, 32) if 4 * k <= block_count]
     surfaces: dict[str, list[Array]] = {"observed": [], "expected": [], "shape": []}
     for k in sizes:
         d2 = _mean_differences(means, k) ** 2 / 2.0
         expected = (
-            _pair_variance(white, k) / 2.0
-            + _slow_allan_variance(blocks, baseline, k * block)[:, None]
-        )
+            _pair_variance(white, k) + _walk_variance(walk, k)
+        ) / 2.0 + _slow_allan_variance(blocks, baseline, k * block)[:, None]
         present = np.isfinite(d2) & np.isfinite(expected)
         pairs = Windows(windows.first, np.maximum(windows.stop - 2 * k + 1, windows.first))
         count = sum_over_windows(present[..., None].astype(float), pairs)[..., 0]
@@ -364,6 +365,17 @@ def _pair_variance(white: Array, k: int) -> Array:
     """Return the white variance of the differences of means of k blocks."""
     total = cumulative(np.where(np.isfinite(white), white, 0.0))
     return _pad_end((total[..., 2 * k :] - total[..., : -2 * k]) / k**2, white.shape[-1])
+
+
+def _walk_variance(walk: Array, k: int) -> Array:
+    """Return what random walks add to the variance of the differences of means of k blocks.
+
+    `walk` (axis, block) is the growth of their variance in each block.
+    """
+    rising = np.diff(np.arange(k + 1.0) ** 3) / (3.0 * k**2)
+    weight = np.concatenate([rising, rising[::-1]])
+    added = np.stack([np.correlate(row, weight, mode="valid") for row in walk])
+    return _pad_end(added, walk.shape[-1])
 
 
 def _pad_end(values: Array, size: int) -> Array:

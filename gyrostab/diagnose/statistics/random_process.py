@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.baseline.posterior import visible_coefficients
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.evidence.held_out import Tier, mean_factors
+from gyrostab.diagnose.evidence.wandering import with_walk
+from gyrostab.diagnose.predict.average_sizes import plain_places
 from gyrostab.diagnose.predict.candidates import (
     Candidate,
     CandidateEvidence,
@@ -17,17 +24,24 @@ from gyrostab.diagnose.predict.candidates import (
 )
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import Trial
+from gyrostab.diagnose.settings import Settings
+from gyrostab.diagnose.statistics.base import SizeFit, Sizes
 from gyrostab.diagnose.statistics.mean import BlockMeanStatistic
+from gyrostab.noise import HOUR
 
 Array = NDArray[Any]
+#: Sizes of a walk that are tried, as multiples of the walk that the means just show; and those
+#: that its size is estimated from. Design choice: half decades, and steps of 12 %.
+_WALK_FACTORS = 10.0 ** np.arange(0.0, 3.1, 0.5)
+_FINE_FACTORS = 10.0 ** np.arange(-0.5, 3.1, 0.05)
 
 
 class RandomProcess(BlockMeanStatistic):
     """A random process in the block means, which widens their scatter.
 
-    No null record, score or evidence is its own: the flicker and random walk of the noise are free
-    in the evidence of means, so that they cannot be distinguished from a random process there. It
-    takes part in the model of the simulation, and in the explanation of mismatches.
+    No null record or score is its own. The flicker and random walk of the noise are free in the
+    evidence of means: a steady process cannot be distinguished from them there, but a random walk
+    that is present only while its channel is active can.
     """
 
     name = "random_process"
@@ -49,8 +63,55 @@ class RandomProcess(BlockMeanStatistic):
                 )
 
     def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
-        """Return nothing: free flicker and random walk explain as much."""
-        return []
+        """Compute the Bayes factor of random walks that follow a channel, of any size.
+
+        It needs no held-out data: the walk has no course that could be fitted to the record.
+        """
+        out = []
+        for candidate in group:
+            if not any(candidate.driver) or not all(map(_is_changing_walk, candidate.variants)):
+                continue
+            prior = np.array([variant.weight for variant in candidate.variants])
+            evidence_nats, best = [], []
+            for axis in trial.state.axes:
+                factors = (
+                    np.stack(
+                        [
+                            np.logaddexp.reduce(factor, axis=0) - np.log(len(factor))
+                            for factor in (
+                                _walk_factors(
+                                    variant, axis, trial.data, trial.state, _WALK_FACTORS
+                                )[1]
+                                for variant in candidate.variants
+                            )
+                        ]
+                    )
+                    + np.log(prior / prior.sum())[:, None]
+                )  # (variant, record)
+                evidence_nats.append(np.logaddexp.reduce(factors, axis=0))
+                best.append(_plain_or_best(candidate, factors[:, 0], trial.state.settings))
+            rows: list[tuple[str, ...]] = [(axis,) for axis in trial.state.axes]
+            out.append(
+                CandidateEvidence(candidate, rows, np.stack(evidence_nats, axis=-1), tuple(best))
+            )
+        return out
+
+    def condition(self, state: State, component: Component) -> State:
+        """Put a random walk that follows a channel into the noise of the means."""
+        if not _is_changing_walk(component.variant):
+            return state
+        size, _ = _walk_size(component, state, component.variant)
+        walk = size**2 * component.variant.design[0]
+        return replace(state, baseline=with_walk(state.baseline, component.row[0], walk))
+
+    def estimate(self, fit: SizeFit) -> Sizes:
+        """Estimate the size of a random walk that follows a channel, for its best exponent."""
+        out: dict[str, tuple[float, ...]] = {}
+        for component in fit.components:
+            (name,) = component.variant.columns
+            key = name if len(fit.axes) == 1 else f"{name}.{component.row[0]}"
+            out[key] = _walk_size(component, fit.state, component.variant)
+        return out
 
     def is_modelled_in(self, region: Mapping[str, Any], *, together: bool) -> bool:
         """Return whether the baseline contains it: axes that wander together are in no model."""
@@ -61,3 +122,64 @@ class RandomProcess(BlockMeanStatistic):
     ) -> tuple[Array | float, list[Array], list[Array]]:
         """Return nothing: the process is noise."""
         return 0.0, [], []
+
+
+def _is_changing_walk(variant: Variant) -> bool:
+    """Return whether a process is a random walk whose strength changes in time."""
+    return bool(np.isinf(variant.time) and np.ptp(variant.design) > 0.0)
+
+
+def _plain_or_best(candidate: Candidate, evidence_nats: Array, settings: Settings) -> Variant:
+    """Return the variant with the default exponent, unless another explains clearly more."""
+    best = int(evidence_nats.argmax())
+    plain = [
+        place
+        for place in plain_places(candidate.effect, candidate.variants)
+        if evidence_nats[place] > evidence_nats[best] - settings.ambiguous_nats
+    ]
+    return candidate.variants[plain[0] if plain else best]
+
+
+def _walk_factors(
+    variant: Variant,
+    axis: str,
+    data: xr.Dataset,
+    state: State,
+    steps: Array,
+    *,
+    tier: Tier = "free",
+) -> tuple[Array, Array]:
+    """Return sizes of a walk (size,), and the log Bayes factors of each (size, record).
+
+    Where the channel is most active, the walk is `steps` times that which the means just show.
+    """
+    baseline, folds = state.baseline, fold_blocks(data).isel(length=slice(0, 0))
+    block, count = float(data.attrs["block_s"]), data.sizes["block"]
+    density = block * float(np.nanmedian(baseline["mean_variance"].sel(axis=axis)))
+    visible, _ = visible_coefficients(density, block * count)
+    sizes = visible * steps / np.sqrt(HOUR * variant.design.max())
+
+    def log_evidence(walk: Array) -> Array:
+        factors = mean_factors(
+            data,
+            with_walk(baseline, axis, walk),
+            [],
+            axis=axis,
+            tier=tier,
+            given=state.given_to("mean", axis),
+            folds=folds,
+        )
+        return np.asarray(factors[0, 0])
+
+    without = log_evidence(np.zeros(count))
+    return sizes, np.stack([log_evidence(size**2 * variant.design[0]) - without for size in sizes])
+
+
+def _walk_size(component: Component, state: State, variant: Variant) -> tuple[float, float]:
+    """Return the size of a walk that follows a channel in calibrated noise, and its error."""
+    sizes, factors = _walk_factors(
+        variant, component.row[0], state.blocks, state, _FINE_FACTORS, tier="calibrated"
+    )
+    weight = np.exp(factors[:, 0] - np.logaddexp.reduce(factors[:, 0]))
+    mean = float(weight @ sizes)
+    return mean, float(np.sqrt(weight @ (sizes - mean) ** 2))

@@ -1,0 +1,76 @@
+"""A random walk that is present only under vibration is found in the block means."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.core import diagnose
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify.components import group_components, sum_evidence
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
+from gyrostab.diagnose.predict.linear_model import initial_state
+from gyrostab.diagnose.predict.search import compute_evidence
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.simulate import simulate
+
+SHAKE = {
+    "profile": "vibration",
+    "points": [
+        *([0, 0.02], [900, 0.02], [901, 3.0], [1700, 3.0], [1701, 0.02], [2600, 0.02]),
+        *([2601, 4.0], [3400, 4.0], [3401, 0.02], [4500, 0.02]),
+    ],
+}
+
+
+def shaken_log(seed: int, effects: tuple[dict[str, object], ...]) -> xr.Dataset:
+    model = {
+        "log": {"axes": ["x"]},
+        "noise": {"N": 0.003, "B": 0.004, "K": 0.02},
+        "environment": [SHAKE],
+        "effect": list(effects),
+    }
+    return simulate(model, duration="75min", rate=4.0, seed=seed).compute()
+
+
+WALK = {"name": "vibration_random_walk", "sensitivity": 0.15}
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_levels_between_quiescent_stretches_are_no_random_walk(seed: int) -> None:
+    baseline = calibrate_noise(reduce_log(shaken_log(seed, (WALK,))))
+    K = baseline.sel(axis="x", term="K")
+    assert float(K.coefficient) < 0.02 + 3.0 * float(K.stderr)
+    assert float(K.coefficient) + 3.0 * float(K.stderr) < 0.25
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_walk_under_vibration_has_evidence_in_the_means(seed: int) -> None:
+    evidence = []
+    for effects in ((WALK,), ()):
+        blocks = reduce_log(shaken_log(seed, effects))
+        baseline = calibrate_noise(blocks)
+        walks = [
+            candidate
+            for candidate in effect_candidates(blocks, baseline["coefficient"])[0]
+            if (candidate.effect, candidate.statistic.name)
+            == ("vibration_random_walk", "random_process")
+        ]
+        components = group_components(
+            compute_evidence(walks, blocks, initial_state(blocks, baseline), fold_blocks(blocks))
+        )
+        evidence.append(sum(map(sum_evidence, components.values())))
+    assert evidence[0] > 10.0
+    assert evidence[1] < 3.0
+
+
+def test_walk_under_vibration_is_named_and_sized() -> None:
+    found = diagnose(shaken_log(2, (WALK,)), nulls=100)
+    assert found.verdict == "explained"
+    (effect,) = found.effects
+    assert effect["name"] == "vibration_random_walk"
+    size = effect["parameters"]["sensitivity"]
+    assert abs(size["value"] - 0.15) < 3.0 * size["stderr"] < 0.15
+    assert np.isfinite(found.content["held_out"]["log_likelihood_gain"])
