@@ -101,7 +101,7 @@ def _describe_unused(name: str, blocks: xr.Dataset) -> str:
     """Explain why no effect uses a channel."""
     if name == TOOLFACE:
         return (
-            "effects that vary with the tool face, such as earth rate, take it from the channel "
+            "effects that vary with the toolface, such as earth rate, take it from the channel "
             "rotation_rate"
         )
     if _is_compared(name, blocks) or _wanted_units(name):

@@ -173,7 +173,7 @@ class RotationOrder(Statistic):
     def estimate(self, fit: SizeFit) -> Sizes:
         """Return amplitude and phase of components locked to the rotation.
 
-        For the earth rate these are latitude and tool face of a tool that points down. Angles get
+        For the earth rate these are latitude and toolface of a tool that points down. Angles get
         the error of the form of the amplitude: a share of an angle has no meaning.
         """
         out: dict[str, tuple[float, ...]] = {}

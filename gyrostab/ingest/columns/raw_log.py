@@ -20,7 +20,7 @@ from gyrostab.ingest.columns.pieces import (
     stack_as_rows,
 )
 from gyrostab.ingest.columns.plan import Column, Plan
-from gyrostab.ingest.columns.stamps import NAT, continue_clock, find_turn
+from gyrostab.ingest.columns.stamps import CLOCK_PERIODS, NAT, continue_clock, find_turn
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store.row_inspection import RowInspection
@@ -352,10 +352,10 @@ class RawLogBuilder:
                 f"{where}"
             )
         if self.turns:
-            days = max(self.turns) // (86400 * 10**9)
+            period = "a day" if max(self.turns) == CLOCK_PERIODS[0] else "a week"
             times = f"{len(self.turns)} time{'s' * (len(self.turns) > 1)}"
             notes.append(
-                f"the clock begins again after {'a day' if days == 1 else 'a week'} ({times}) "
+                f"the clock begins again after {period} ({times}) "
                 "without a pause; the stamps are continued"
             )
         if self.options.start is not None and self.time is not None:

@@ -25,6 +25,7 @@ from gyrostab.time.grid import split_instant
 from gyrostab.time.stamps import to_nanoseconds
 
 __all__ = [
+    "CLOCK_PERIODS",
     "NAT",
     "TimeUnit",
     "cells_to_ns",
@@ -44,7 +45,7 @@ __all__ = [
 NAT = np.iinfo(np.int64).min
 _MAX_INT64 = 2**63 - 1
 #: Periods after which a clock of the time of day, and one of the GPS week, begin again [ns].
-_CLOCK_PERIODS = (86400 * 10**9, 7 * 86400 * 10**9)
+CLOCK_PERIODS = (86400 * 10**9, 7 * 86400 * 10**9)
 #: Steps from which the typical one follows.
 _TYPICAL_STEPS = 4096
 #: Julian day number of 1970-01-01.
@@ -296,7 +297,7 @@ def find_turn(step: int, typical: float) -> int:
     >>> find_turn(-86_399_950_000_000, 5e7), find_turn(-86_000_000_000_000, 5e7)
     (86400000000000, 0)
     """
-    return next((turn for turn in _CLOCK_PERIODS if 0 < step + turn <= 2 * typical < turn / 2), 0)
+    return next((turn for turn in CLOCK_PERIODS if 0 < step + turn <= 2 * typical < turn / 2), 0)
 
 
 def continue_clock(stamps: NDArray[np.int64]) -> tuple[NDArray[np.int64], list[int], float]:
@@ -316,8 +317,8 @@ def continue_clock(stamps: NDArray[np.int64]) -> tuple[NDArray[np.int64], list[i
     rises = rises[rises > 0]
     typical = float(np.median(rises)) if rises.size else 0.0
     turns: list[int] = []
-    if steps.size and steps.min() < -_CLOCK_PERIODS[0] // 2:
-        for row in (np.flatnonzero(steps < -_CLOCK_PERIODS[0] // 2) + 1).tolist():
+    if steps.size and steps.min() < -CLOCK_PERIODS[0] // 2:
+        for row in (np.flatnonzero(steps < -CLOCK_PERIODS[0] // 2) + 1).tolist():
             turn = find_turn(int(steps[row - 1]), typical)
             if turn and not (row < steps.size and steps[row] > turn // 2):  # not one wrong stamp
                 stamps = stamps if turns else stamps.copy()

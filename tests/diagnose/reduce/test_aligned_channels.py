@@ -123,8 +123,8 @@ def test_a_fast_toolface_is_not_reported_as_slow():
         with_channel(log_of(60_000), "toolface", seconds, np.mod(70.0 * seconds, 360.0), "degree")
     )
     assert [channel["reason"] for channel in unused_channels(blocks, ())] == [
-        "no effect follows a channel of this name; "
-        "lines at the rotation are found with the channel rotation_rate"
+        "effects that vary with the toolface, such as earth rate, take it from the channel "
+        "rotation_rate"
     ]
 
 
