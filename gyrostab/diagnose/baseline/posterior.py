@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from gyrostab.diagnose.evidence.products import marginalise, mean_products
+from gyrostab.diagnose.evidence.products import marginalise, mean_products, scale_columns
 from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.kernels.regression.nonnegative import solve_nonnegative
 from gyrostab.noise import HOUR
@@ -326,11 +326,7 @@ def noise_posterior(
     coarse_K, coarse_B = _fine_grid(density, mean.size * step, step)
     K, B = (axis_values.ravel() for axis_values in np.meshgrid(coarse_K, coarse_B, indexing="ij"))
     values = np.where(present, mean, 0.0)[:, None]
-    columns = (
-        np.empty((mean.size, 0))
-        if effects is None
-        else effects / np.maximum(np.abs(effects).max(axis=0), 1e-300)
-    )
+    columns = scale_columns(effects, mean.size)
     products = mean_products(
         values, columns, variance=variance, step=step, K=K, B=B, present=present
     )

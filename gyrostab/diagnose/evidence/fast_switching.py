@@ -15,7 +15,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.evidence.products import WIDTHS, marginalise, mean_products
+from gyrostab.diagnose.evidence.products import (
+    WIDTHS,
+    marginalise,
+    mean_products,
+    scale_columns,
+)
 from gyrostab.diagnose.evidence.telegraph import (
     TelegraphCourses,
     course_evidence,
@@ -120,9 +125,7 @@ def switching_evidence(
     n = present.size
     flat = np.where(present, values.ravel(), 0.0)[:, None]
     variance = np.where(present, variance.ravel(), 1.0)
-    effect_columns = (
-        np.empty((n, 0)) if given is None else _merge_columns(given, merged).reshape(n, -1)
-    )
+    effect_columns = scale_columns(None if given is None else _merge_columns(given, merged), n)
     best: SwitchingEvidence | None = None
     for count in (0, 8):
         columns_given = np.concatenate([drift_waves(n, count), effect_columns], axis=1)
@@ -228,10 +231,9 @@ def _sub_block_means(data: xr.Dataset, baseline: xr.Dataset, axis: str) -> tuple
 
 
 def _merge_columns(given: Array, merged: int) -> Array:
-    """Average columns (block, sub-block, column) over merged sub-blocks; scale to at most one."""
-    out = np.nan_to_num(given).reshape(given.shape[0], -1, merged, given.shape[2]).mean(axis=2)
-    largest = np.abs(out).max(axis=(0, 1))
-    return np.asarray(out / np.where(largest > 0.0, largest, 1.0))
+    """Average columns (block, sub-block, column) over merged sub-blocks, as (mean, column)."""
+    parts = np.nan_to_num(given).reshape(given.shape[0], -1, merged, given.shape[2])
+    return np.asarray(parts.mean(axis=2).reshape(-1, given.shape[2]))
 
 
 def _course_gains(

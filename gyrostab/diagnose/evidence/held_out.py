@@ -16,7 +16,7 @@ its factor when the fold is held out.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -27,6 +27,7 @@ from gyrostab.diagnose.evidence.products import (
     WIDTHS,
     Array,
     Products,
+    axis_noise,
     column_pairs,
     factor_errors,
     held_out_evidence,
@@ -36,7 +37,6 @@ from gyrostab.diagnose.evidence.products import (
     power_products,
     remove_common_part,
 )
-from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.errors import OptionError
 
 __all__ = [
@@ -133,14 +133,15 @@ def mean_factors(
     design_width = columns.shape[1]
     columns = np.concatenate([columns, columns_given], axis=1)
     present = np.asarray(np.isfinite(values).all(axis=1))
-    setup: dict[str, Any] = {
-        "variance": np.asarray(baseline["mean_variance"].sel(axis=axis).values, dtype=np.float64),
+    setup = axis_noise(baseline, axis) | {
         "step": float(data["end"][0] - data["begin"][0]),
         "pairs": column_pairs(columns.shape[1], numbers, columns_given.shape[1]),
-        "wander": expected_processes(baseline, axis),
     }
     white = mean_products(
-        values[:, :0], columns, **setup, K=np.zeros(1), B=np.zeros(1), present=present
+        values[:, :0],
+        columns,
+        **(setup | {"K": np.zeros(1), "B": np.zeros(1)}),
+        present=present,
     )
     raw_square = (np.where(present[:, None], columns, 0.0) ** 2 / setup["variance"][:, None])[
         present
@@ -153,15 +154,11 @@ def mean_factors(
         raw_square[:design_width],
         np.diagonal(marginalise(white, columns_given.shape[1], precision).gram[0]),
     )
-    grid: dict[str, Any] = {
-        "K": baseline["grid_K"].sel(axis=axis).values,
-        "B": baseline["grid_B"].sel(axis=axis).values,
-    }
     log_weight = _log_weight(baseline, axis, tier)
     subsets = fold_subsets(fold_blocks(data) if folds is None else folds)
     out = np.empty((len(subsets), 1 + len(designs), values.shape[1]))
     for number, subset in enumerate(subsets):
-        products = mean_products(values, columns, **setup, **grid, present=present & subset)
+        products = mean_products(values, columns, **setup, present=present & subset)
         out[number] = log_evidence(
             marginalise(products, columns_given.shape[1], precision), numbers, limits, log_weight
         )
@@ -288,14 +285,7 @@ def linear_model_factors(model: LinearModel, folds: xr.DataArray) -> Array:
                 ],
                 total,
             )
-            subset_products.append(
-                Products(
-                    *[
-                        a - b
-                        for a, b in zip(_product_arrays(total), _product_arrays(held), strict=True)
-                    ]
-                )
-            )
+            subset_products.append(Products(*(a - b for a, b in zip(total, held, strict=True))))
     out = np.stack(
         [
             log_evidence(marginalise(part, count, precision), numbers, limits, np.zeros(1))
@@ -306,16 +296,11 @@ def linear_model_factors(model: LinearModel, folds: xr.DataArray) -> Array:
     return out
 
 
-def _product_arrays(products: Products) -> tuple[Array, ...]:
-    """Return the arrays of the products."""
-    return products.square, products.cross, products.gram, products.log_determinant
-
-
 def _sum_products(products: Sequence[Products], like: Products | None = None) -> Products:
     """Add products; zeros like `like` if there are none."""
     if not products and like is not None:
-        return Products(*[np.zeros_like(array) for array in _product_arrays(like)])
-    return Products(*map(_add_arrays, zip(*map(_product_arrays, products), strict=True)))
+        return Products(*map(np.zeros_like, like))
+    return Products(*map(_add_arrays, zip(*products, strict=True)))
 
 
 def _add_arrays(arrays: Sequence[Array]) -> Array:

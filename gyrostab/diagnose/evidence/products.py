@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.folds import FOLDS
-from gyrostab.diagnose.evidence.wandering import RandomProcesses
+from gyrostab.diagnose.evidence.wandering import RandomProcesses, expected_processes
 from gyrostab.kernels.regression.evidence import chosen_products, mixed_evidence
 from gyrostab.kernels.regression.state_space import flicker_states, whiten
 from gyrostab.noise import HOUR
@@ -18,6 +19,7 @@ __all__ = [
     "WIDTHS",
     "Array",
     "Products",
+    "axis_noise",
     "column_pairs",
     "factor_errors",
     "held_out_evidence",
@@ -26,6 +28,7 @@ __all__ = [
     "mean_products",
     "power_products",
     "remove_common_part",
+    "scale_columns",
 ]
 
 Array = NDArray[np.float64]
@@ -38,8 +41,7 @@ _MIN_SQUARE_SHARE = 1e-9
 _MAX_PRODUCTS_AT_ONCE = 10_000  # designs times records times grid points; limits memory
 
 
-@dataclass(frozen=True)
-class Products:
+class Products(NamedTuple):
     """Products of whitened data and columns on some blocks; without a grid, one grid point.
 
     Attributes
@@ -87,6 +89,25 @@ def factor_errors(before: Array, after: Array) -> Array:
     """
     is_visible = after > _MIN_SQUARE_SHARE * np.maximum(before, np.finfo(float).tiny)
     return np.where(is_visible, 1.0 / np.sqrt(np.where(is_visible, after, 1.0)), 0.0)
+
+
+def axis_noise(baseline: xr.Dataset, axis: str) -> dict[str, Any]:
+    """Return the noise of the means of an axis, as `mean_products` takes it."""
+    return {
+        "variance": baseline["mean_variance"].sel(axis=axis).values,
+        "K": baseline["grid_K"].sel(axis=axis).values,
+        "B": baseline["grid_B"].sel(axis=axis).values,
+        "wander": expected_processes(baseline, axis),
+    }
+
+
+def scale_columns(columns: Array | None, count: int) -> Array:
+    """Return columns (count, column) over their largest size, 0 where missing; none for None."""
+    if columns is None:
+        return np.empty((count, 0))
+    finite = np.where(np.isfinite(columns), columns, 0.0)
+    largest = np.abs(finite).max(axis=0, initial=0.0)
+    return np.asarray(finite / np.where(largest > 0.0, largest, 1.0))
 
 
 def mean_products(

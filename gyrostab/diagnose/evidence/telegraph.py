@@ -19,14 +19,16 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.evidence.held_out import values_by_record
 from gyrostab.diagnose.evidence.products import (
     WIDTHS,
     Products,
+    axis_noise,
     column_pairs,
     marginalise,
     mean_products,
+    scale_columns,
 )
-from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.regression.evidence import mixed_evidence
 from gyrostab.kernels.regression.levels import level_tables, levels_smooth
@@ -348,27 +350,13 @@ def telegraph_evidence(
         Lower bound of the log Bayes factor [nats]; -inf with fewer than `min_switches` switches.
     courses : TelegraphCourses
     """
-    mean = (data["mean"] - baseline["known_mean"]).sel(axis=axis)
-    values = (
-        (mean if "record" in mean.dims else mean.expand_dims("record"))
-        .transpose("block", "record")
-        .values
-    )
-    variance = baseline["mean_variance"].sel(axis=axis).values
+    values = values_by_record((data["mean"] - baseline["known_mean"]).sel(axis=axis), "block")
+    setup = axis_noise(baseline, axis)
+    variance = setup["variance"]
     present = np.asarray(np.isfinite(values).all(axis=1)) & np.isfinite(variance)
     n = present.size
-    scaled_given = np.empty((n, 0)) if given is None else np.where(np.isfinite(given), given, 0.0)
-    largest = np.abs(scaled_given).max(axis=0)
-    scaled_given = scaled_given / np.where(largest > 0.0, largest, 1.0)
-    setup: dict[str, Any] = {
-        "variance": variance,
-        "step": float(data["end"][0] - data["begin"][0]),
-        "present": present,
-        "wander": expected_processes(baseline, axis),
-    }
-    grid: dict[str, Any] = {
-        name: baseline[f"grid_{name}"].sel(axis=axis).values for name in ("K", "B")
-    }
+    scaled_given = scale_columns(given, n)
+    setup |= {"step": float(data["end"][0] - data["begin"][0]), "present": present}
     log_weight = baseline["grid_prior"].sel(axis=axis).values
     safe = np.where(present[:, None], values, 0.0)
     attempts = []
@@ -376,9 +364,9 @@ def telegraph_evidence(
         courses = telegraph_courses(
             safe, variance, present, np.concatenate([drift_waves(n, count), scaled_given], axis=1)
         )
-        worth = _course_evidence_by_record(
-            courses, safe, scaled_given, setup, grid, log_weight
-        ) - np.log(len(_DRIFT_WAVES))
+        worth = _course_evidence_by_record(courses, safe, scaled_given, setup, log_weight) - np.log(
+            len(_DRIFT_WAVES)
+        )
         has_switches = courses.switch_count >= settings.min_switches
         attempts.append((np.where(has_switches, worth, -np.inf), courses))
     chosen = np.argmax([evidence_nats for evidence_nats, _ in attempts], axis=0)
@@ -401,7 +389,6 @@ def _course_evidence_by_record(
     values: Array,
     given: Array,
     setup: dict[str, Any],
-    grid: dict[str, Any],
     log_weight: Array,
 ) -> Array:
     """Return the evidence of the courses minus their cost; their scatter counts as a datum."""
@@ -409,12 +396,12 @@ def _course_evidence_by_record(
     columns = np.concatenate([courses.share.T, given], axis=1)
     present, variance = setup["present"], setup["variance"]
     scatter = courses.spread @ np.where(present, 1.0 / np.where(present, variance, 1.0), 0.0)
-    white = mean_products(values[:, :0], columns, **setup, K=np.zeros(1), B=np.zeros(1))
+    white = mean_products(values[:, :0], columns, **(setup | {"K": np.zeros(1), "B": np.zeros(1)}))
     square = np.diagonal(white.gram[0])
     wide = np.where(square[records:] > 0.0, square[records:], 1.0) / WIDTHS[-1] ** 2
     pairs = column_pairs(columns.shape[1], [], columns_given)
     products = marginalise(
-        mean_products(values, columns, **setup, **grid, pairs=pairs), columns_given, np.diag(wide)
+        mean_products(values, columns, **setup, pairs=pairs), columns_given, np.diag(wide)
     )
     usual = np.diagonal(marginalise(white, columns_given, np.diag(wide)).gram[0])
     weight = log_weight - np.logaddexp.reduce(log_weight)

@@ -9,14 +9,19 @@ tell.
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.evidence.products import Products, marginalise, mean_products
-from gyrostab.diagnose.evidence.wandering import expected_processes
+from gyrostab.diagnose.evidence.products import (
+    Products,
+    axis_noise,
+    marginalise,
+    mean_products,
+    scale_columns,
+)
 
 __all__ = ["Visits", "compare_visits", "visit_columns"]
 
@@ -98,29 +103,17 @@ def compare_visits(
     course = parts.mean(axis=1)
     if switch_count > y.size:
         return Visits(-np.inf, switch_count, course[None])
-    effect_columns = (
-        np.empty((y.size, 0)) if given is None else np.where(np.isfinite(given), given, 0.0)
-    )
-    size = np.abs(effect_columns).max(axis=0, initial=0.0)
-    columns = np.column_stack(
-        [course, effect_columns / np.where(size > 0.0, size, 1.0), *(visits.T for visits in levels)]
-    )
-    grid: dict[str, Any] = {
-        name: baseline[f"grid_{name}"].sel(axis=axis).values for name in ("K", "B")
-    }
+    effect_columns = scale_columns(given, y.size)
+    columns = np.column_stack([course, effect_columns, *(visits.T for visits in levels)])
     products = mean_products(
         np.where(present, y, 0.0)[:, None],
         np.where(present[:, None], columns, 0.0),
-        variance=baseline["mean_variance"].sel(axis=axis).values,
         step=block_s,
         present=present,
-        wander=expected_processes(baseline, axis),
-        **grid,
+        **axis_noise(baseline, axis),
     )
-    base_count, log_weight = (
-        1 + effect_columns.shape[1],
-        baseline["grid_prior"].sel(axis=axis).values,
-    )
+    base_count = 1 + effect_columns.shape[1]
+    log_weight = baseline["grid_prior"].sel(axis=axis).values
     same, step = _log_evidence(products, np.arange(base_count), base_count, 0.0, log_weight)
     first = base_count + np.cumsum([0, *(len(visits) for visits in levels)])
     free = [
@@ -145,11 +138,8 @@ def _log_evidence(
     log_weight: Array,
 ) -> tuple[float, float]:
     """Return the log evidence of columns, those after `own` with a prior variance; and the step."""
-    part = Products(
-        products.square,
-        products.cross[:, chosen],
-        products.gram[:, chosen[:, None], chosen],
-        products.log_determinant,
+    part = products._replace(
+        cross=products.cross[:, chosen], gram=products.gram[:, chosen[:, None], chosen]
     )
     width = chosen.size - base_count
     if width:
