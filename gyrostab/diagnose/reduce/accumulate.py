@@ -67,12 +67,9 @@ class Accumulator:
     """
 
     def __init__(self, log: xr.Dataset, length: int, block_count: int, rate: float):
-        self.rate, self.length, self.block_count, self.start = (
-            rate,
-            length,
-            block_count,
-            first_stamp(log),
-        )
+        self.rate, self.length, self.block_count = rate, length, block_count
+        self.start = first_stamp(log)
+        self.min_samples = max(_MIN_SPECTRUM_SHARE * length, 2)  # of a block, for its spectrum
         self.axes = log.sizes["axis"]
         self.channels = numeric_channels(log)[0]
         rows = self.rows = self.axes + len(self.channels)
@@ -107,9 +104,8 @@ class Accumulator:
         self.line_expected = np.zeros_like(self.line_sum)
         self.line_counts = np.zeros((self.axes, RECORD_PARTS, 2))
         self.sines = SineSearch(self.axes, block_count, length, rate)
-        self.sub_blocks = np.zeros(
-            (2, self.axes, block_count, SUB_BLOCKS)
-        )  # sums and numbers of samples
+        # sums and numbers of samples
+        self.sub_blocks = np.zeros((2, self.axes, block_count, SUB_BLOCKS))
         self.channel_parts = {
             name: np.full((block_count, CHANNEL_PARTS), np.nan)
             for name in self.channels
@@ -169,31 +165,19 @@ class Accumulator:
             present[: self.axes, :, 1:] & present[: self.axes, :, :-1], axis=-1
         )
         self._find_gaps(block_range, present[: self.axes])
-        inner = np.arange(SUB_BLOCKS) * self.length // SUB_BLOCKS
         for row in range(self.axes):
-            self.sub_blocks[0, row, block_range] = np.add.reduceat(
-                np.where(present[row], batch.values[row], 0.0), inner, axis=1
-            )
-            self.sub_blocks[1, row, block_range] = np.add.reduceat(
-                present[row], inner, axis=1, dtype=np.float64
-            )
+            self.sub_blocks[:, row, block_range] = _sum_parts(batch.values[row], SUB_BLOCKS)
         for name, fine in self.channel_parts.items():
             row = self.axes + self.channels.index(name)
-            edges = np.arange(CHANNEL_PARTS) * self.length // CHANNEL_PARTS
-            total = np.add.reduceat(np.where(present[row], batch.values[row], 0.0), edges, axis=1)
+            total, count = _sum_parts(batch.values[row], CHANNEL_PARTS)
             with np.errstate(invalid="ignore", divide="ignore"):
-                fine[block_range] = total / np.add.reduceat(
-                    present[row].astype(np.float64), edges, axis=1
-                )
+                fine[block_range] = total / count
         every = max(1, self.block_count // _GRID_BLOCKS)
-        chosen = [
-            number for number in range(block_range.start, block_range.stop) if number % every == 0
-        ]
+        samples = slice(_GRID_SAMPLES_PER_AXIS // _GRID_BLOCKS)
         self.kept_samples += [
-            batch.values[
-                : self.axes, number - block_range.start, : _GRID_SAMPLES_PER_AXIS // _GRID_BLOCKS
-            ].copy()
-            for number in chosen
+            batch.values[: self.axes, number - block_range.start, samples].copy()
+            for number in range(block_range.start, block_range.stop)
+            if number % every == 0
         ]
         if self.order is not None:
             self._add_rotation_orders(block_range, centred[: self.axes])
@@ -236,7 +220,7 @@ class Accumulator:
                 [centred[: self.axes], _subtract_mean(centred[self.axes :], present[self.axes :])]
             )
         spectra = np.fft.rfft(centred * self.weights, axis=-1)[..., inside]
-        used = counts >= max(_MIN_SPECTRUM_SHARE * self.length, 2)
+        used = counts >= self.min_samples
         places, tables = [], []
         for row in range(self.rows):
             place, table = self._tabulate_masks(
@@ -269,7 +253,7 @@ class Accumulator:
                     joint, self.weights
                 )
             cross[~(used[a] & used[b])] = np.nan
-            cross[joint_count < max(_MIN_SPECTRUM_SHARE * self.length, 2)] = np.nan
+            cross[joint_count < self.min_samples] = np.nan
             self.cross[number, block_range] = cross
 
     def _tabulate_masks(
@@ -330,7 +314,7 @@ class Accumulator:
         """
         out = np.full((present.shape[0], self.edges.size - 1), np.nan + 0j)
         shape = np.full(out.shape, np.nan)
-        enough = present.sum(axis=-1) >= max(_MIN_SPECTRUM_SHARE * self.length, 2)
+        enough = present.sum(axis=-1) >= self.min_samples
         if enough.any():
             present, centred = present[enough], centred[:, enough]
             centred = _subtract_mean(centred, present)
@@ -385,9 +369,8 @@ class Accumulator:
         self.turns = math.fmod(float(edges[-1]), 1.0)
         turns = (edges[:-1] + inside / 2.0).reshape(centred.shape[1:])
         often = np.diff(edges).reshape(turns.shape).sum(axis=-1)
-        turned = np.abs(often) >= 1.0
         counts = self.counts[: self.axes, block_range, 0]
-        enough = turned & (counts >= max(_MIN_SPECTRUM_SHARE * self.length, 2))
+        enough = (np.abs(often) >= 1.0) & (counts >= self.min_samples)
         wheels = [np.exp(-2j * math.pi * harmonic * turns) for harmonic in HARMONICS]
         present, residual = centred != 0.0, centred  # missing samples count as zero
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -425,6 +408,13 @@ def _power_near_order(turned: NDArray[np.complex128], often: Array, harmonic: in
         return np.asarray((power * free).sum(axis=-1) / free.sum(axis=-1))
 
 
+def _sum_parts(values: Array, parts: int) -> tuple[Array, Array]:
+    """Return sums and numbers of the samples in equal parts of the blocks (block, sample)."""
+    edges, present = np.arange(parts) * values.shape[1] // parts, ~np.isnan(values)
+    total = np.add.reduceat(np.where(present, values, 0.0), edges, axis=1)
+    return total, np.add.reduceat(present, edges, axis=1, dtype=np.float64)
+
+
 def _subtract_mean(values: Array, present: NDArray[np.bool_]) -> Array:
     """Subtract the mean of the samples present from each block; 0 where none is present."""
     total = (values * present).sum(axis=-1, keepdims=True)
@@ -444,21 +434,16 @@ def _neighbour_share(present: NDArray[np.bool_], weights: Array) -> Array:
 def _find_rotation_source(log: xr.Dataset) -> tuple[Source | None, float]:
     """Return the rotation rate of the tool and its factor to degree s-1; None if not in the log."""
     name = "rotation_rate"
-    if (
-        name not in numeric_channels(log)[0] + numeric_channels(log)[1]
-        or not np.isfinite(_finite_range(log[name].data)).all()
-    ):
-        return None, 1.0
-    inner_unit = parse_unit(INNER[name])
-    try:
-        log_unit = parse_unit(str(log[name].attrs.get("units")))
-    except UnitError:
-        return None, 1.0
-    return (
-        (make_source(log, name), log_unit.factor / inner_unit.factor)
-        if log_unit.quantity == inner_unit.quantity
-        else (None, 1.0)
-    )
+    if any(name in names for names in numeric_channels(log)):
+        inner_unit = parse_unit(INNER[name])
+        try:
+            log_unit = parse_unit(str(log[name].attrs.get("units")))
+        except UnitError:
+            return None, 1.0
+        is_known = np.isfinite(_finite_range(log[name].data)).all()
+        if is_known and log_unit.quantity == inner_unit.quantity:
+            return make_source(log, name), log_unit.factor / inner_unit.factor
+    return None, 1.0
 
 
 def _finite_range(data: Any) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.reduce.accumulate import Accumulator
 from gyrostab.diagnose.reduce.label_statistics import label_statistics
-from gyrostab.diagnose.reduce.log_blocks import count_rows, count_samples, read_batches
+from gyrostab.diagnose.reduce.log_blocks import count_samples, read_batches
 from gyrostab.errors import OptionError
 from gyrostab.progress import Stage, no_stage
 from gyrostab.schema import check_log
@@ -136,19 +136,14 @@ def reduce_log(
     rate, size = float(log.attrs["sampling_rate_hz"]), count_samples(log)
     length = block_samples(size, rate, block)
     work = Accumulator(log, length, size // length, rate)
-    rows = count_rows(log)
-    progress("reducing", rows * work.block_count * length)
+    sample_count = work.rows * work.block_count * length
+    progress("reducing", sample_count)
     for batch in read_batches(log, length):
+        stop = batch.first + batch.values.shape[1]
         if left_out is not None:
-            batch.values[: work.axes][
-                left_out[:, batch.first : batch.first + batch.values.shape[1]]
-            ] = np.nan
+            batch.values[: work.axes][left_out[:, batch.first : stop]] = np.nan
         work.add(batch)
-        progress(
-            "reducing",
-            rows * work.block_count * length,
-            rows * (batch.first + batch.values.shape[1]) * length,
-        )
+        progress("reducing", sample_count, work.rows * stop * length)
     return label_statistics(work, log, restart=duration_seconds(restart_gap, "restart_gap"))
 
 

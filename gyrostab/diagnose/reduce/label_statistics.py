@@ -17,7 +17,7 @@ from gyrostab.diagnose.reduce.accumulate import (
 )
 from gyrostab.diagnose.reduce.log_blocks import channel_means, numeric_channels
 from gyrostab.diagnose.reduce.outliers import count_outliers, quantization_step, zeros_beyond_chance
-from gyrostab.diagnose.reduce.schema import COORDINATES, check_block_statistics, label_variables
+from gyrostab.diagnose.reduce.schema import COORDINATES, label_variables
 from gyrostab.diagnose.reduce.zero_bin import BINS, bin_widths, empty_zone
 from gyrostab.kernels.regression.smooth import smooth_curve
 from gyrostab.schema import GAP_CAUSES, texts
@@ -53,6 +53,7 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
     resent = np.where(steps[:, None, None] > 0.0, 0, work.resent)
     widths = np.array([bin_widths(_kept_values(work, row), step) for row, step in enumerate(steps)])
     zones = np.array([empty_zone(_kept_values(work, row)) for row in range(work.axes)])
+    at_ends = _count_at_range_ends(moments, counts[..., 3], counts[..., 4])
     line_total, line_square = np.moveaxis(work.line_counts, -1, 0)
     weight = np.divide(
         line_total**2, line_square, where=line_square > 0, out=np.zeros(line_total.shape)
@@ -75,11 +76,9 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
         "repeat_runs": counts[..., 7] + resent[..., 1],
         "resent": resent[..., 0],
         "zero_runs": counts[..., 8],
-        "extremes": _count_at_range_ends(moments, counts[..., 3], counts[..., 4]).sum(axis=-1),
+        "extremes": at_ends.sum(axis=-1),
         "range_end": np.concatenate(_record_range(moments), axis=1),
-        "range_end_samples": _count_at_range_ends(moments, counts[..., 3], counts[..., 4]).sum(
-            axis=1
-        ),
+        "range_end_samples": at_ends.sum(axis=1),
         "zeros": counts[..., 1],
         "stuck": _count_stuck(moments, counts, filled),
         "filled": filled,
@@ -93,26 +92,18 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
         "zone_width": zones[:, 0],
         "zone_width_stderr": zones[:, 1],
     }
-    arrays |= work.sines.strongest(_line_frequencies(work))
+    arrays |= work.sines.strongest(_line_frequencies(work)) | _sub_block_means(work)
+    arrays |= _phase_locked_statistics(work) | _gap_table(work, log, restart)
     variables = (
-        label_variables(
-            arrays
-            | _sub_block_means(work)
-            | _phase_locked_statistics(work)
-            | _gap_table(work, log, restart)
-        )
+        label_variables(arrays)
         | _cross_spectra(work, log)
         | _channel_means(work, log)
         | _channel_part_means(work, log)
     )
     if work.ramp_turns is not None:
         variables["ramp_turns"][2].update(zip(("low", "high"), work.ramp_range, strict=True))
-    return check_block_statistics(
-        xr.Dataset(
-            variables,
-            coords=_make_coordinates(work, log),
-            attrs=_make_attributes(work, log, present),
-        )
+    return xr.Dataset(
+        variables, coords=_make_coordinates(work, log), attrs=_make_attributes(work, log, present)
     )
 
 
@@ -126,11 +117,6 @@ def _sub_block_means(work: Accumulator) -> dict[str, Any]:
     total, count = work.sub_blocks
     with np.errstate(invalid="ignore", divide="ignore"):
         return {"sub_block_mean": total / count, "sub_block_samples": count.astype(np.int64)}
-
-
-def _make_attrs(name: str, units: str) -> dict[str, Any]:
-    """Return the attributes of a variable."""
-    return {"long_name": name, "units": units}
 
 
 def _equal_block_share(
@@ -203,14 +189,8 @@ def _cross_spectra(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
     """Return cross-spectra of the axes, and of each axis with the channels on the log's time."""
     axes = work.axes
     axis_pairs = [number for number, (_, other) in enumerate(work.pairs) if other < axes]
-    variables = label_variables(
-        {
-            "cross": work.cross[axis_pairs],
-            "cross_shape": work.cross_shape[axis_pairs],
-            "cross_neighbours": work.cross_neighbours[axis_pairs],
-            "cross_samples": work.cross_samples[axis_pairs],
-        }
-    )
+    names = ("cross", "cross_shape", "cross_neighbours", "cross_samples")
+    variables = label_variables({name: getattr(work, name)[axis_pairs] for name in names})
     if work.channels:
         shape = (axes, len(work.channels), *work.cross.shape[1:])
         with_axes = np.full(shape, np.nan + 0j)
@@ -255,13 +235,13 @@ def _channel_means(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
             values = np.sqrt(mean**2 + spread) if rms else mean
         else:
             values = channel_means(log, name, edges, rms=rms)
-        units = str(log[name].attrs.get("units", "1"))
-        band = {"band_hz": log[name].attrs["band_hz"]} if "band_hz" in log[name].attrs else {}
-        variables[f"channel_{name}"] = (
-            "block",
-            values,
-            _make_attrs(f"{'rms' if rms else 'mean'} of {name} over the block", units) | band,
-        )
+        attrs = {
+            "long_name": f"{'rms' if rms else 'mean'} of {name} over the block",
+            "units": str(log[name].attrs.get("units", "1")),
+        }
+        if "band_hz" in log[name].attrs:
+            attrs["band_hz"] = log[name].attrs["band_hz"]
+        variables[f"channel_{name}"] = ("block", values, attrs)
     return variables
 
 
@@ -286,14 +266,15 @@ def _channel_part_means(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
         if good.mean() > 1.0 / 2.0:
             place = np.arange(values.size)
             bridged = np.interp(place, place[good.ravel()], values[good])
-            units = str(log[name].attrs.get("units", "1"))
-            smooth = smooth_curve(bridged, longest=_MAX_SMOOTHING_BLOCKS * CHANNEL_PARTS).reshape(
-                values.shape
-            )
+            smooth = smooth_curve(bridged, longest=_MAX_SMOOTHING_BLOCKS * CHANNEL_PARTS)
+            attrs = {
+                "long_name": f"{name} in parts of the block, without noise",
+                "units": str(log[name].attrs.get("units", "1")),
+            }
             variables[f"fine_{name}"] = (
                 ("block", "block_part"),
-                smooth,
-                _make_attrs(f"{name} in parts of the block, without noise", units),
+                smooth.reshape(values.shape),
+                attrs,
             )
     return variables
 

@@ -19,7 +19,6 @@ __all__ = [
     "BlockBatch",
     "channel_at",
     "channel_means",
-    "count_rows",
     "count_samples",
     "numeric_channels",
     "read_batches",
@@ -53,11 +52,6 @@ def count_samples(log: xr.Dataset) -> int:
     return int(log.sizes["time"] - (signal_name(log) == "angle"))
 
 
-def count_rows(log: xr.Dataset) -> int:
-    """Count the rows of a `BlockBatch`."""
-    return int(log.sizes["axis"] + len(numeric_channels(log)[0]))
-
-
 def read_batches(log: xr.Dataset, size: int) -> Iterator[BlockBatch]:
     """Read a log in order of time, every chunk once.
 
@@ -68,7 +62,7 @@ def read_batches(log: xr.Dataset, size: int) -> Iterator[BlockBatch]:
     size : int
         Samples of a block. An incomplete block at the end is not read.
     """
-    rows = count_rows(log)
+    rows = log.sizes["axis"] + len(numeric_channels(log)[0])
     blocks_per_batch = max(1, _SAMPLES_PER_BATCH // (rows * size))
     remainder, number = np.empty((rows, 0)), 0
     for values in _read_rates(log):
@@ -106,15 +100,13 @@ def _read_rates(log: xr.Dataset) -> Iterator[Array]:
 
 def _split_at_chunks(signal: Any, rows: int) -> Iterator[tuple[int, int]]:
     """Split the log into reads that end where chunks end."""
-    chunks: Sequence[int] = signal.chunks[1] if hasattr(signal, "chunks") else (signal.shape[1],)
-    if len(chunks) == 1 and not hasattr(signal, "chunks"):
+    size = signal.shape[1]
+    if not hasattr(signal, "chunks"):
         step = max(1, _SAMPLES_PER_READ // rows)
-        yield from (
-            (low, min(low + step, signal.shape[1])) for low in range(0, signal.shape[1], step)
-        )
+        yield from ((low, min(low + step, size)) for low in range(0, size, step))
         return
     low = high = 0
-    for chunk in chunks:
+    for chunk in signal.chunks[1]:
         high += chunk
         if (high - low) * rows >= _SAMPLES_PER_READ:
             yield low, high
@@ -182,14 +174,9 @@ def channel_means(log: xr.Dataset, name: str, edges: NDArray[np.int64], *, rms: 
     with np.errstate(invalid="ignore", divide="ignore"):
         means = sums / counts
     means = np.sqrt(means) if rms else means
-    if stamps.size > 1 and stamps.size <= _CHANNEL_VALUES_PER_READ:
-        means = (
-            _interpolate_empty(
-                means, make_source(log, name), edges, 3 * float(np.median(np.diff(stamps)))
-            )
-            if (counts > 0).any()
-            else means
-        )
+    if 1 < stamps.size <= _CHANNEL_VALUES_PER_READ and counts.any():
+        longest = 3 * float(np.median(np.diff(stamps)))
+        return _interpolate_empty(means, make_source(log, name), edges, longest)
     return means
 
 

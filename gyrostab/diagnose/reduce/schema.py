@@ -1,7 +1,7 @@
 """Schema of block statistics and baseline: dimensions, unit and meaning of every variable.
 
 The order of the dimensions is fixed. Later steps may therefore compute on plain arrays, and look up
-labels only where they read and write.
+labels only where they read and write. A log without the source of a variable has none.
 """
 
 from __future__ import annotations
@@ -9,29 +9,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import xarray as xr
-
-from gyrostab.errors import SchemaError
 from gyrostab.noise import LAWS, TERMS
 from gyrostab.units import INNER
 
-__all__ = [
-    "BASELINE",
-    "BLOCK_STATISTICS",
-    "COORDINATES",
-    "Variable",
-    "check_block_statistics",
-    "label_variables",
-]
+__all__ = ["BASELINE", "BLOCK_STATISTICS", "COORDINATES", "Variable", "label_variables"]
 
 
 class Variable(NamedTuple):
-    """Dimensions, unit and meaning of a variable; `required` unless the log may lack its source."""
+    """Dimensions, unit and meaning of a variable."""
 
     dims: tuple[str, ...]
     units: str
     long_name: str
-    required: bool = True
 
 
 _RATE, _POWER = INNER["rate"], "degree2 hour-2 Hz-1"
@@ -84,20 +73,20 @@ BLOCK_STATISTICS: dict[str, Variable] = {
         ("axis", "part"), "1", "equivalent number of equal blocks in each mean"
     ),
     "sine_nats": Variable(
-        _LINE, "1", "evidence of the strongest sine nearest to a line, of constant phase", False
+        _LINE, "1", "evidence of the strongest sine nearest to a line, of constant phase"
     ),
-    "sine_frequency": Variable(("line",), "Hz", "frequency of this sine", False),
-    "sine_resolution": Variable(("line",), "Hz", "resolution of the spectrum that shows it", False),
-    "sine_square": Variable(_LINE, "degree2 hour-2", "square of its amplitude", False),
-    "sine_square_stderr": Variable(_LINE, "degree2 hour-2", "standard error of it", False),
+    "sine_frequency": Variable(("line",), "Hz", "frequency of this sine"),
+    "sine_resolution": Variable(("line",), "Hz", "resolution of the spectrum that shows it"),
+    "sine_square": Variable(_LINE, "degree2 hour-2", "square of its amplitude"),
+    "sine_square_stderr": Variable(_LINE, "degree2 hour-2", "standard error of it"),
     "bin_width": Variable(
         ("axis", "bin"), "1", "width of the zero bin and of its neighbours, in quantization steps"
     ),
     "bin_width_stderr": Variable(("axis", "bin"), "1", "standard error of it"),
     "zone_width": Variable(
-        ("axis",), _RATE, "half width of a zone around zero that is empty but near zero", False
+        ("axis",), _RATE, "half width of a zone around zero that is empty but near zero"
     ),
-    "zone_width_stderr": Variable(("axis",), _RATE, "standard error of it", False),
+    "zone_width_stderr": Variable(("axis",), _RATE, "standard error of it"),
     "sub_block_mean": Variable(_SUB_BLOCK, _RATE, "mean rate of a sub-block"),
     "sub_block_samples": Variable(_SUB_BLOCK, "1", "samples of a sub-block"),
     "cross": Variable(
@@ -118,32 +107,26 @@ BLOCK_STATISTICS: dict[str, Variable] = {
         ("reference", "block", "band"),
         "square of the channel's unit per Hz",
         "mean periodogram of a channel, two-sided density",
-        required=False,
     ),
     "reference_cross": Variable(
         ("axis", "reference", "block", "band"),
         "degree hour-1 Hz-1 times the channel's unit",
         "mean cross-periodogram of axis and channel, F_axis conj(F_channel)",
-        required=False,
     ),
     "order": Variable(
         _HARMONIC,
         _RATE,
         "complex amplitude at multiples of the rotation, NaN below one turn per block",
-        required=False,
     ),
     "order_level": Variable(
         _HARMONIC,
         _POWER,
         "density of what turns 1 to 4 times in the block more or less than that, two-sided",
-        required=False,
     ),
-    "profile": Variable(
-        _PHASE, _RATE, "mean rate less the block's mean, by phase of the ramp", required=False
-    ),
-    "profile_samples": Variable(_PHASE, "1", "samples of each mean", required=False),
+    "profile": Variable(_PHASE, _RATE, "mean rate less the block's mean, by phase of the ramp"),
+    "profile_samples": Variable(_PHASE, "1", "samples of each mean"),
     "ramp_turns": Variable(
-        ("block",), "Hz", "turns of the ramp in a second, negative where it falls", required=False
+        ("block",), "Hz", "turns of the ramp in a second, negative where it falls"
     ),
     "gap_begin": Variable(("gap",), "s", "first missing sample, since the start"),
     "gap_end": Variable(("gap",), "s", "first sample present again, since the start"),
@@ -218,23 +201,3 @@ def label_variables(
         )
         for name, array in arrays.items()
     }
-
-
-def check_block_statistics(blocks: xr.Dataset) -> xr.Dataset:
-    """Check that all variables are there with their dimensions in order, and return the blocks.
-
-    Raises
-    ------
-    SchemaError
-        When one is missing or has other dimensions.
-    """
-    for name, variable in BLOCK_STATISTICS.items():
-        if name not in blocks:
-            if variable.required:
-                raise SchemaError(f"the block statistics lack {name} {variable.dims}")
-        elif blocks[name].dims != variable.dims:
-            raise SchemaError(
-                f"the block statistic {name} has the dimensions {blocks[name].dims}; "
-                f"it must have {variable.dims}"
-            )
-    return blocks

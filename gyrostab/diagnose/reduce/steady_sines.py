@@ -45,13 +45,9 @@ class _Spectrum(NamedTuple):
     band_largest: Array  # (axis, band), level of the noisiest one
 
     def equal_count(self) -> Array:
-        """Return how many equal periodograms have a sum with the upper tail of this one.
+        """Return (axis, frequency) how many equal periodograms have a sum with this upper tail.
 
         A noisier stretch leaves fewer: with a single one, the sum is an exponential variable.
-
-        Returns
-        -------
-        ndarray, shape (axis, frequency)
         """
         lines = self.total.shape[1]
         widths = np.diff(_band_edges(lines), append=lines)
@@ -70,14 +66,8 @@ def _band_edges(lines: int) -> NDArray[np.int64]:
 def _make_spectrum(axes: int, size: int) -> _Spectrum:
     lines = ordinates(_FINER * size)
     bands = np.zeros((axes, _band_edges(lines).size))
-    return _Spectrum(
-        size,
-        taper(size),
-        np.zeros((axes, lines)),
-        np.zeros(axes, np.int64),
-        bands,
-        bands.copy(),
-    )
+    total, used = np.zeros((axes, lines)), np.zeros(axes, np.int64)
+    return _Spectrum(size, taper(size), total, used, bands, bands.copy())
 
 
 class SineSearch:

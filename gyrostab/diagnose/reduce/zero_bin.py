@@ -160,13 +160,9 @@ def _fit_log_counts(
 
 
 def truncated_axes(blocks: xr.Dataset) -> NDArray[np.bool_]:
-    """Find the axes whose rate is truncated towards zero on its quantization grid.
+    """Find the axes (axis,) whose rate is truncated towards zero on its quantization grid.
 
     The axes are judged together, because one logger writes all of them in the same way.
-
-    Returns
-    -------
-    ndarray of bool, shape (axis,)
     """
     quantized = np.asarray(blocks["quantization_step"].values > 0.0)
     width, error, is_measured = _read_widths(blocks)
