@@ -18,6 +18,7 @@ from gyrostab.diagnose.baseline.expected_statistics import (
     NOISE,
     common_variance,
     noise_powers,
+    sum_noise,
     white_variance,
 )
 from gyrostab.diagnose.baseline.filtered_noise import fit_filter_response
@@ -295,11 +296,8 @@ def _keep_explained_bands(fit: Fit, settings: Settings) -> Fit:
         worst = int(off.argmax())
         if off[worst] <= settings.excess_sigma:
             break
-        fit = fit._replace(
-            **{
-                name: np.delete(getattr(fit, name), worst, axis=0)
-                for name in ("power", "columns", "weight")
-            }
+        fit = Fit(
+            *(np.delete(part, worst, axis=0) for part in (fit.power, fit.columns, fit.weight))
         )
     return fit
 
@@ -332,9 +330,6 @@ def assemble_baseline(
 
     Parameters
     ----------
-    quiet : ndarray of bool, shape (axis, block)
-    attrs : mapping
-        ``source``, ``calibrated_on`` and other attributes.
     known_mean : ndarray, shape (axis, block), optional
         Known means of effects [degree hour-1].
     spectrum : ndarray, shape (axis, block, band), optional
@@ -342,7 +337,7 @@ def assemble_baseline(
     """
     columns = noise_powers(blocks)
     square = np.stack([posterior.square for posterior in posteriors])
-    noise = np.einsum("abfn,an->abf", columns, square)
+    noise = sum_noise(columns, square)
     expected = noise if spectrum is None else spectrum
     power, shape = blocks["power"].values, blocks["shape"].values
     floor = np.array([1e-3 * levels.min() / HOUR for levels in expected])
@@ -395,21 +390,15 @@ def assemble_baseline(
         for name in ("axis", "time", "begin", "end", "frequency", "band_low", "band_high")
         if name in blocks
     }
-    not_joined = [
-        str(axis)
-        for axis, posterior in zip(blocks["axis"].values, posteriors, strict=True)
-        if not posterior.joined
-    ]
+    of_axes = [*zip(map(str, blocks["axis"].values), posteriors, strict=True)]
     return xr.Dataset(
         label_variables(variables, BASELINE),
         coords={**coordinates, "term": list(TERMS), "noise": list(NOISE), "slow": ["B", "K"]},
         attrs={
             **attrs,
-            "slow_noise_apart": not_joined,
+            "slow_noise_apart": [axis for axis, posterior in of_axes if not posterior.joined],
             "white_noise_of_means_apart": [
-                str(axis)
-                for axis, posterior in zip(blocks["axis"].values, posteriors, strict=True)
-                if posterior.of_means is not None
+                axis for axis, posterior in of_axes if posterior.of_means is not None
             ],
         },
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -19,6 +20,7 @@ __all__ = [
     "common_variance",
     "line_columns",
     "noise_powers",
+    "sum_noise",
     "white_variance",
 ]
 
@@ -28,12 +30,9 @@ NOISE = ("Q", "N", "B", "K")
 
 
 def line_columns(blocks: xr.Dataset) -> Array:
-    """Return the expected power of every line of a full block for unit squares of Q, N, B, K.
+    """Return the expected power (line, term) of a full block for unit squares of Q, N, B, K.
 
-    Returns
-    -------
-    ndarray, shape (line, term)
-        [degree2 hour-2 Hz-1 per squared unit of the noise table].
+    In degree2 hour-2 Hz-1 per squared unit of the noise table.
     """
     size, rate = int(blocks.attrs["block_samples"]), float(blocks.attrs["sampling_rate_hz"])
     return np.asarray(
@@ -43,45 +42,31 @@ def line_columns(blocks: xr.Dataset) -> Array:
 
 
 def band_columns(blocks: xr.Dataset) -> Array:
-    """Return the expected band powers of a full block for unit squares of Q, N, B, K.
-
-    Returns
-    -------
-    ndarray, shape (band, term)
-        [degree2 hour-2 Hz-1 per squared unit of the noise table].
-    """
+    """Return the means (band, term) of `line_columns` over the bands."""
     columns = line_columns(blocks)
     edges = band_edges(int(blocks.attrs["block_samples"])) - 1
     return np.stack([columns[low:high].mean(axis=0) for low, high in pairwise(edges)])
 
 
 def noise_powers(blocks: xr.Dataset, response: Array | None = None) -> Array:
-    """Return the expected band powers for unit squares of Q, N, B, K, with the gaps of each block.
+    """Return `band_columns` with the gaps of each block, (axis, block, band, term).
 
-    Parameters
-    ----------
-    response : ndarray, shape (band,), optional
-        Power response of a filter before samples were lost.
-
-    Returns
-    -------
-    ndarray, shape (axis, block, band, term)
-        [degree2 hour-2 Hz-1 per squared unit of the noise table].
+    The response (band,) is that of a filter before samples were lost.
     """
     term_powers = band_columns(blocks).T * (1.0 if response is None else response)
     return np.stack([spread_by_gaps(power[None, None], blocks) for power in term_powers], axis=-1)
 
 
+def sum_noise(columns: Array, squares: Sequence[Array]) -> Array:
+    """Return the power (axis, block, band) of noise with these squares, from `noise_powers`."""
+    return np.asarray(np.einsum("abfn,an->abf", columns, np.stack(squares)))
+
+
 def common_variance(blocks: xr.Dataset) -> tuple[Array, Array]:
-    """Return the relative variance common to all bands of a block, and the remaining shape.
+    """Return the relative variance (axis, block) common to all bands of a block by random gaps.
 
-    Random gaps cause the common variance.
-
-    Returns
-    -------
-    common : ndarray, shape (axis, block)
-    shape : ndarray, shape (axis, block, band)
-        Of the gamma distribution of each power, given the common factor.
+    Returned with it is the shape (axis, block, band) of the gamma distribution of each power, given
+    the common factor.
     """
     shape = blocks["shape"].values
     neighbours = blocks["neighbours"].values

@@ -32,11 +32,6 @@ def fit_filter_response(
     All axes pass the one logger: None if the noise terms alone describe some axis better. If
     several filters fit about as well, the one that needs least angle quantization is taken: Q rises
     where a low-pass falls, so that one at too low a cutoff fits with much Q.
-
-    Parameters
-    ----------
-    fits : sequence of Fit
-        Powers of each axis in all bands.
     """
     responses = [
         band_response(LoggerFilter.example(**values), blocks)

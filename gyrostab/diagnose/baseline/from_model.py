@@ -14,11 +14,7 @@ from gyrostab.diagnose.baseline.known_effects import expect_known_effects
 from gyrostab.diagnose.baseline.known_lines import independent_line_share
 from gyrostab.diagnose.baseline.noise_level import quiescent_level, scale_axes
 from gyrostab.diagnose.baseline.posterior import Posterior
-from gyrostab.diagnose.baseline.quiescent import (
-    GIVEN,
-    find_quiescent_spans,
-    given_quiescent_blocks,
-)
+from gyrostab.diagnose.baseline.quiescent import given_quiescent_blocks, use_given_blocks
 from gyrostab.diagnose.baseline.wandering import with_wandering
 from gyrostab.diagnose.reduce.schema import BASELINE, label_variables
 from gyrostab.diagnose.settings import DEFAULTS, Settings
@@ -36,8 +32,6 @@ def baseline_from_model(
 
     Parameters
     ----------
-    blocks : xarray.Dataset
-        The recording, from `reduce_log`.
     quiet : array_like of bool (block,), or (start, end) or several of these, optional
         Quiescent time of the recording. One factor for each axis then fits the noise of the model
         to it; the noise terms keep their proportions, and the effects their sizes. By default, and
@@ -78,8 +72,8 @@ def baseline_from_model(
     attrs: dict[str, Any] = {"source": "model", "calibrated_on": [], "model": parsed.source}
     given_blocks = given_quiescent_blocks(blocks, quiet, settings=settings)
     if given_blocks is not None:
-        chosen, attrs["quiet_by"] = given_blocks, GIVEN
-        attrs["calibrated_on"] = find_quiescent_spans(blocks, chosen)
+        chosen = given_blocks
+        use_given_blocks(blocks, chosen, attrs)
         posteriors = _scale_to_quiescent(blocks, parsed, posteriors, chosen)
     effects = expect_known_effects(
         blocks, parsed, np.stack([posterior.square for posterior in posteriors])

@@ -8,16 +8,16 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.baseline.calibrate import assemble_baseline, calibrate_axes
-from gyrostab.diagnose.baseline.expected_statistics import noise_powers
+from gyrostab.diagnose.baseline.calibrate import MIN_BANDS, assemble_baseline, calibrate_axes
+from gyrostab.diagnose.baseline.expected_statistics import noise_powers, sum_noise
 from gyrostab.diagnose.baseline.noise_level import quiescent_level, scale_axes
 from gyrostab.diagnose.baseline.posterior import Posterior
 from gyrostab.diagnose.baseline.quiescent import (
-    GIVEN,
     find_quiescent_blocks,
     find_quiescent_spans,
     given_quiescent_blocks,
     noise_level_excess,
+    use_given_blocks,
 )
 from gyrostab.diagnose.baseline.simulated import (
     add_extra_statistics,
@@ -30,7 +30,6 @@ from gyrostab.errors import SchemaError
 __all__ = ["baseline_from_simulation"]
 
 Array = NDArray[np.float64]
-_MIN_BANDS = 6  # that the noise terms are fitted to, with any spectral shape
 
 
 def baseline_from_simulation(
@@ -44,8 +43,6 @@ def baseline_from_simulation(
 
     Parameters
     ----------
-    blocks, simulated : xarray.Dataset
-        Recording and simulation, from `reduce_log`.
     quiet : array_like of bool (block,), or (start, end) or several of these, optional
         Quiescent time of the recording: one factor for each axis fits the noise of the simulation
         to it.
@@ -55,41 +52,27 @@ def baseline_from_simulation(
     SchemaError
         If the two differ in axes, sampling rate or length.
     """
-    for name, in_recording, in_simulation in (
-        (
-            "sampling rate [Hz]",
-            blocks.attrs["sampling_rate_hz"],
-            simulated.attrs["sampling_rate_hz"],
-        ),
-        (
-            "blocks",
-            (blocks.sizes["block"], blocks.attrs["block_samples"]),
-            (simulated.sizes["block"], simulated.attrs["block_samples"]),
-        ),
-        ("axes", list(blocks["axis"].values), list(simulated["axis"].values)),
-    ):
-        if in_recording != in_simulation:
+    in_recording, in_simulation = (
+        {
+            "sampling rate [Hz]": record.attrs["sampling_rate_hz"],
+            "blocks": (record.sizes["block"], record.attrs["block_samples"]),
+            "axes": list(record["axis"].values),
+        }
+        for record in (blocks, simulated)
+    )
+    for name, value in in_recording.items():
+        if in_simulation[name] != value:
             raise SchemaError(
-                f"simulation: {name} {in_simulation}, but {in_recording} in the recording; "
+                f"simulation: {name} {in_simulation[name]}, but {value} in the recording; "
                 "simulate with --like RECORDING"
             )
     chosen, reason = find_quiescent_blocks(simulated, settings=settings)
     posteriors, level, unexplained = _calibrate_simulation(simulated, chosen, settings)
-    plain = (
-        np.einsum(
-            "abfn,an->abf",
-            noise_powers(simulated),
-            np.stack([posterior.square for posterior in posteriors]),
-        )
-        * level[..., None]
-    )
+    squares = [posterior.square for posterior in posteriors]
+    plain = sum_noise(noise_powers(simulated), squares) * level[..., None]
     shown = measure_extra_statistics(simulated, plain, unexplained, settings=settings)
-    noise = np.einsum(
-        "abfn,an->abf",
-        noise_powers(blocks),
-        np.stack([posterior.square for posterior in posteriors]),
-    )
-    attrs = {
+    noise = sum_noise(noise_powers(blocks), squares)
+    attrs: dict[str, Any] = {
         "source": "simulation",
         "calibrated_on": find_quiescent_spans(simulated, chosen),
         "quiet_by": reason,
@@ -97,18 +80,15 @@ def baseline_from_simulation(
     spectrum = noise * level[..., None] * shown.form[:, None]
     given_blocks = given_quiescent_blocks(blocks, quiet, settings=settings)
     if given_blocks is not None:
-        chosen, attrs["quiet_by"] = given_blocks, GIVEN
-        attrs["calibrated_on"] = find_quiescent_spans(blocks, chosen)
+        chosen = given_blocks
+        use_given_blocks(blocks, chosen, attrs)
         factor, error = quiescent_level(blocks, spectrum, 0.0 * spectrum, chosen)
         posteriors = scale_axes(blocks, posteriors, factor, error)
         spectrum = spectrum * factor[:, None, None]
-    return add_extra_statistics(
-        assemble_baseline(
-            blocks, posteriors, quiet=chosen, attrs=attrs, spectrum=spectrum, settings=settings
-        ),
-        shown,
-        blocks,
+    baseline = assemble_baseline(
+        blocks, posteriors, quiet=chosen, attrs=attrs, spectrum=spectrum, settings=settings
     )
+    return add_extra_statistics(baseline, shown, blocks)
 
 
 def _calibrate_simulation(
@@ -126,13 +106,11 @@ def _calibrate_simulation(
             power=simulated["power"].where(~xr.DataArray(unexplained, dims=("axis", "band")))
         )
         posteriors = calibrate_axes(explained, chosen, settings)
-        plain = np.einsum(
-            "abfn,an->abf", columns, np.stack([posterior.square for posterior in posteriors])
-        )
+        plain = sum_noise(columns, [posterior.square for posterior in posteriors])
         level = _level_over_time(explained, plain, settings)
         newly_unexplained = worst_band(
             explained, plain * level[..., None], min_sigma=settings.excess_sigma
-        ) & (unexplained.sum(axis=1, keepdims=True) < unexplained.shape[1] - _MIN_BANDS)
+        ) & (unexplained.sum(axis=1, keepdims=True) < unexplained.shape[1] - MIN_BANDS)
         if not newly_unexplained.any():
             return posteriors, level, unexplained
         unexplained |= newly_unexplained

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -26,9 +26,9 @@ from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import (
     cross_without,
     moves_within_blocks,
-    pair_rows,
     spread_by_gaps,
 )
+from gyrostab.diagnose.reduce.block_statistics import pair_indices
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.physics.base import Effect
 from gyrostab.physics.logger import LoggerFilter
@@ -64,22 +64,14 @@ class KnownEffects(NamedTuple):
 
 
 def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> KnownEffects:
-    """Predict the known effects of a model in the record.
-
-    Parameters
-    ----------
-    square : ndarray, shape (axis, 4)
-        Squared noise coefficients.
+    """Predict the known effects of a model in the record, given squares of the noise (axis, 4).
 
     Raises
     ------
     SchemaError
         If the recording lacks the channel of an effect.
     """
-    acting = [
-        _act_on_record(effect, blocks)
-        for effect in map(_effect_of_instrument(model), model.effects)
-    ]
+    acting = [_act_on_record(effect, model, blocks) for effect in model.effects]
     # Blocks with anomalous samples are found and left out.
     described = [active for active in acting if not _has_anomalous_samples(active)]
     powers = [power for active in described for power in _added_powers(active, blocks)]
@@ -142,8 +134,10 @@ class _AddedPower(NamedTuple):
         return np.asarray(np.abs(self.factor[:, None, None]) ** 2 * self.density)
 
 
-def _act_on_record(effect: Effect, blocks: xr.Dataset) -> _ActingEffect:
-    """Predict an effect on the axes that it acts on."""
+def _act_on_record(effect: Effect, model: Model, blocks: xr.Dataset) -> _ActingEffect:
+    """Predict an effect on the axes that it acts on, a filter at the rate of the instrument."""
+    if isinstance(effect, LoggerFilter):
+        effect = replace(effect, instrument=float(model.log.get("oversampling", 1)))
     axes = [str(axis) for axis in blocks["axis"].values]
     rows = [row for row, axis in enumerate(axes) if not effect.axes or axis in effect.axes]
     axis_names = tuple(axes[row] for row in rows)
@@ -158,22 +152,11 @@ def _has_anomalous_samples(active: _ActingEffect) -> bool:
 def _shows_elsewhere(active: _ActingEffect) -> bool:
     """Return whether an effect also shows outside means, powers and cross-spectra."""
     prediction = active.prediction
-    elsewhere = (
-        prediction.marks
-        or not is_described_by_variance(prediction)
-        or prediction.transfer
-        or prediction.order
-        or prediction.phase_locked
-    )
-    return bool(
-        elsewhere
-        or not (
-            prediction.mean
-            or prediction.level
-            or prediction.spectrum
-            or prediction.response is not None
-        )
-    )
+    elsewhere = prediction.marks or prediction.transfer or prediction.order
+    if elsewhere or prediction.phase_locked or not is_described_by_variance(prediction):
+        return True
+    here = prediction.mean or prediction.level or prediction.spectrum
+    return not here and prediction.response is None
 
 
 def _expected_means(acting: Sequence[_ActingEffect], blocks: xr.Dataset) -> Array:
@@ -229,8 +212,7 @@ def _shared_cross(
     """Return the cross-spectrum of coherent effects after a filter (axis, 1, band)."""
     if "cross" not in blocks:
         return None
-    axes = [str(axis) for axis in blocks["axis"].values]
-    pairs = [(axes.index(a), axes.index(b)) for a, b in pair_rows(blocks)]
+    pairs = pair_indices(blocks).T
     shared = np.zeros((len(pairs), blocks.sizes["block"], blocks.sizes["band"]), np.complex128)
     for power in (power for power in powers if power.acting.prediction.coherent):
         for number, (row, other_row) in enumerate(pairs):
@@ -277,11 +259,3 @@ def remove_known_motion(
         {name: blocks[name].where(still) for name in ("power", "kurtosis") if name in blocks}
     )
     return out.assign(cross=cross_without(blocks, moving)) if "cross" in blocks else out
-
-
-def _effect_of_instrument(model: Model) -> Callable[[Effect], Effect]:
-    """Return the filter of effects at the rate of the model's instrument."""
-    instrument = float(model.log.get("oversampling", 1))
-    return lambda effect: (
-        replace(effect, instrument=instrument) if isinstance(effect, LoggerFilter) else effect
-    )

@@ -27,8 +27,6 @@ def quiescent_level(
 
     Parameters
     ----------
-    blocks : xarray.Dataset
-        Recording, from `reduce_log`.
     noise, added : ndarray, shape (axis, block, band)
         Expected power of the noise, and power that effects of the simulation add.
     quiet : ndarray of bool, shape (axis, block)
@@ -36,10 +34,8 @@ def quiescent_level(
 
     Returns
     -------
-    factor : ndarray, shape (axis,)
-        Factor of `noise` with the largest gamma likelihood.
-    error : ndarray, shape (axis,)
-        Its standard error, relative to it.
+    factor, error : ndarray, shape (axis,)
+        Factor of `noise` with the largest gamma likelihood; its standard error, relative to it.
 
     Raises
     ------
@@ -58,19 +54,16 @@ def quiescent_level(
                 "name other quiet time, or leave --quiet out to take the simulation as it is"
             )
         separate_shape = np.where(good, shape_alone[row], 0.0).sum(axis=1)
-        reduction = 1.0 / (
-            1.0 + np.where(quiet[row], common[row], 0.0) * separate_shape
-        )  # see `common_variance`
+        # see `common_variance`
+        reduction = 1.0 / (1.0 + np.where(quiet[row], common[row], 0.0) * separate_shape)
         weight = (shape[row] * np.broadcast_to(reduction[:, None], good.shape))[good]
         factors.append(_fit_factor(power[row][good], noise[row][good], added[row][good], weight))
-    return np.array([factor for factor, _ in factors]), np.array([error for _, error in factors])
+    factor, error = np.array(factors).T
+    return factor, error
 
 
 def _fit_factor(power: Array, noise: Array, added: Array, weight: Array) -> tuple[float, float]:
-    """Fit ``factor * noise + added`` to gamma-distributed powers; return also the relative error.
-
-    By Fisher scoring.
-    """
+    """Fit ``factor * noise + added`` to gamma-distributed powers; return also the error share."""
     factor = float((weight * power / (noise + added)).sum() / weight.sum())
     information = 0.0
     for _ in range(_ROUNDS):
@@ -84,13 +77,7 @@ def _fit_factor(power: Array, noise: Array, added: Array, weight: Array) -> tupl
 def _scale_noise(
     noise: Posterior, factor: float, error: float, rng: np.random.Generator
 ) -> Posterior:
-    """Scale the noise of an axis, with the error of the scale in its draws.
-
-    Parameters
-    ----------
-    error : float
-        Standard error of `factor`, relative to it.
-    """
+    """Scale the noise of an axis, with the relative error of the factor in its draws."""
     scatter = rng.gamma(error**-2, error**2, (len(noise.draws), 1))
     return noise._replace(
         square=noise.square * factor,

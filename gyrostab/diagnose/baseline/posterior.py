@@ -17,7 +17,6 @@ __all__ = [
     "Fit",
     "Posterior",
     "average_blocks",
-    "expected_powers",
     "fit_squares",
     "floor_square",
     "noise_posterior",
@@ -50,12 +49,9 @@ class Fit(NamedTuple):
 
     def free(self) -> tuple[Array, Array]:
         """Return columns and precisions of the free sizes."""
-        free_columns = (
-            np.empty((self.power.size, 0)) if self.free_columns is None else self.free_columns
-        )
-        return free_columns, np.zeros(
-            free_columns.shape[1]
-        ) if self.precision is None else self.precision
+        columns, precision = self.free_columns, self.precision
+        columns = np.empty((self.power.size, 0)) if columns is None else columns
+        return columns, np.zeros(columns.shape[1]) if precision is None else precision
 
 
 class Posterior(NamedTuple):
@@ -88,10 +84,10 @@ def average_blocks(power: Array, shape: Array, columns: Array) -> Fit:
     return Fit(mean[has_data], mean_columns[has_data], total[has_data])
 
 
-def fit_squares(fit: Fit) -> tuple[Array, Array]:
-    """Fit non-negative squares by gamma likelihood (Whittle); return also their information.
+def fit_squares(fit: Fit) -> tuple[Array, Array, Array]:
+    """Fit non-negative squares by gamma likelihood (Whittle).
 
-    The Fisher information is that with the effects free.
+    Returned with them are their Fisher information with the effects free, and the expected powers.
 
     Examples
     --------
@@ -101,17 +97,6 @@ def fit_squares(fit: Fit) -> tuple[Array, Array]:
     >>> fit_squares(fit)[0].round(6)
     array([0.1, 2. , 0. , 3. ])
     """
-    square, normal, _ = _fit_likelihood(fit)
-    return square, normal
-
-
-def expected_powers(fit: Fit) -> Array:
-    """Return the expected powers at the largest likelihood."""
-    return _fit_likelihood(fit)[2]
-
-
-def _fit_likelihood(fit: Fit) -> tuple[Array, Array, Array]:
-    """Return squares, their information, and the expected powers."""
     width = fit.columns.shape[1]
     square, normal = np.zeros(width), np.zeros((width, width))
     square[1] = max(
@@ -304,24 +289,18 @@ def noise_posterior(
     effects: Array | None = None,
     max_disagreement_nats: float = DEFAULTS.disagreement_nats,
 ) -> Posterior:
-    """Compute the posterior of Q, N, B, K.
+    """Compute the posterior of Q, N, B, K from the band powers and means of quiescent blocks.
 
     Parameters
     ----------
-    fit : Fit
-        Band powers of the quiescent blocks; columns in the order Q, N, B, K.
     mean, variance : ndarray, shape (block,)
         Block means [degree hour-1] and their white variance.
-    present : ndarray of bool, shape (block,)
-        Quiescent blocks with a mean.
-    step : float
-        Length of a block [s].
     effects : ndarray, shape (block, column), optional
         Designs of effects in the means, of any size.
     max_disagreement_nats : float
         Of spectrum and means about B and K, up to which both together determine them.
     """
-    square, information, spectrum = _fit_likelihood(fit)
+    square, information, spectrum = fit_squares(fit)
     density = HOUR * max(float(square[1]), floor_square(fit))
     coarse_K, coarse_B = _fine_grid(density, mean.size * step, step)
     K, B = (axis_values.ravel() for axis_values in np.meshgrid(coarse_K, coarse_B, indexing="ij"))

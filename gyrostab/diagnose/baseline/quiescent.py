@@ -15,16 +15,16 @@ from gyrostab.errors import OptionError
 from gyrostab.time.grid import stamp_ns
 
 __all__ = [
-    "GIVEN",
     "LEVEL_SPANS",
     "find_quiescent_blocks",
     "find_quiescent_spans",
     "given_quiescent_blocks",
     "noise_level_excess",
+    "use_given_blocks",
 ]
 
 Array = NDArray[np.float64]
-#: Criterion of blocks that the user gave.
+# Criterion of blocks that the user gave.
 GIVEN = "the time given as quiet"
 #: Blocks over which the noise level is averaged. Design choice.
 LEVEL_SPANS = (1, 5, 15)
@@ -95,19 +95,13 @@ def noise_level_excess(
 ) -> tuple[Array, Array]:
     """Measure the noise level of every block over the smallest span in which it is significant.
 
+    The level (block,) is expected to be 1; its largest deviation above 1 over all spans is in
+    standard deviations.
+
     Parameters
     ----------
-    residual : ndarray, shape (block, band)
-        Power over expected power, minus 1; NaN where missing.
-    weight : ndarray, shape (block, band)
-        Shape of the gamma distribution.
-
-    Returns
-    -------
-    level : ndarray, shape (block,)
-        Expected to be 1.
-    deviation : ndarray, shape (block,)
-        Largest deviation above 1 over all spans [standard deviations].
+    residual, weight : ndarray, shape (block, band)
+        Power over expected power, minus 1, NaN where missing; shape of its gamma distribution.
     """
     use = np.where(np.isfinite(residual) & np.isfinite(weight), weight, 0.0)
     total = (use * np.nan_to_num(residual)).sum(axis=1, keepdims=True)
@@ -167,18 +161,12 @@ def _drop_noisy_blocks(
 def find_quiescent_blocks(
     blocks: xr.Dataset, quiet: Any = None, *, settings: Settings = DEFAULTS
 ) -> tuple[NDArray[np.bool_], str]:
-    """Find the quiescent blocks, to calibrate on.
+    """Find the quiescent blocks (axis, block), to calibrate on; describe the criterion.
 
     Parameters
     ----------
     quiet : array_like of bool (block,), or sequence of (start, end), optional
         Quiescent time given by the user; spans in seconds since the start, or ISO times.
-
-    Returns
-    -------
-    quiet : ndarray of bool, shape (axis, block)
-    reason : str
-        Description of the criterion.
     """
     n = blocks.sizes["block"]
     given_blocks = given_quiescent_blocks(blocks, quiet, settings=settings)
@@ -202,11 +190,8 @@ def given_quiescent_blocks(
 ) -> NDArray[np.bool_] | None:
     """Return the blocks (axis, block) given as quiescent by the user, if they can be used.
 
-    Returns
-    -------
-    ndarray of bool, or None
-        None without `quiet`, and, with a warning, where its whole blocks hold fewer than 100
-        samples or no spectrum: the diagnosis then continues without it.
+    None without `quiet`, and, with a warning, where its whole blocks hold fewer than 100 samples or
+    no spectrum: the diagnosis then continues without it.
 
     Raises
     ------
@@ -241,6 +226,11 @@ def given_quiescent_blocks(
     return np.broadcast_to(chosen, (blocks.sizes["axis"], n)).copy()
 
 
+def use_given_blocks(blocks: xr.Dataset, chosen: NDArray[np.bool_], attrs: dict[str, Any]) -> None:
+    """Write into the attributes of a baseline that it is calibrated on blocks given as quiet."""
+    attrs["quiet_by"], attrs["calibrated_on"] = GIVEN, find_quiescent_spans(blocks, chosen)
+
+
 def _is_usable(blocks: xr.Dataset, chosen: NDArray[np.bool_], better_count: int) -> bool:
     """Return whether given blocks hold enough to calibrate on; warn where that is little."""
     step, size = float(blocks.attrs["block_s"]), int(blocks.attrs["block_samples"])
@@ -248,8 +238,9 @@ def _is_usable(blocks: xr.Dataset, chosen: NDArray[np.bool_], better_count: int)
     spectra = np.isfinite(blocks["power"].values[:, chosen]).any(axis=1).sum(axis=1)
     enough = count * size >= _MIN_GIVEN_SAMPLES
     if enough and spectra.min() >= _MIN_GIVEN_BANDS:
+        error = math.sqrt(0.5 / (count * size))  # of N in white noise, half that of its variance
         lack = (
-            f"N is known to {100 * _white_error(count * size):.1f} % at best, and drift slower "
+            f"N is known to {100 * error:.1f} % at best, and drift slower "
             f"than {count * step:g} s not at all, so that slow mismatches may be missed; "
             f"{better_count * step:g} s or more are better"
         )
@@ -269,14 +260,6 @@ def _is_usable(blocks: xr.Dataset, chosen: NDArray[np.bool_], better_count: int)
             stacklevel=2,
         )
     return usable
-
-
-def _white_error(samples: int) -> float:
-    """Return the relative standard error of N from white noise.
-
-    The variance of n samples has the relative error sqrt(2 / n), N half of that.
-    """
-    return math.sqrt(0.5 / samples)
 
 
 def _seconds_since_start(blocks: xr.Dataset, edge: Any) -> float:

@@ -14,7 +14,8 @@ from gyrostab.diagnose.evidence.spectral_lines import (
     line_evidence,
     line_skirt,
 )
-from gyrostab.diagnose.predict.linear_model import band_widths, pair_rows, unspread_share
+from gyrostab.diagnose.predict.linear_model import band_widths, unspread_share
+from gyrostab.diagnose.reduce.block_statistics import pair_indices
 from gyrostab.diagnose.reduce.schema import BASELINE, label_variables
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.line_levels import local_level
@@ -43,20 +44,9 @@ class ExtraStatistics(NamedTuple):
 
 
 def worst_band(simulated: xr.Dataset, expected: Array, *, min_sigma: float) -> NDArray[np.bool_]:
-    """Find the band of each axis that differs most from the noise terms, if significantly.
+    """Find the band (axis, band) that differs most from the noise terms, if significantly.
 
-    Parameters
-    ----------
-    simulated : xarray.Dataset
-        From `reduce_log`; bands without powers are skipped.
-    expected : ndarray, shape (axis, block, band)
-        Power of its noise terms, with their level over time.
-    min_sigma : float
-        Least difference [standard deviations].
-
-    Returns
-    -------
-    ndarray of bool, shape (axis, band)
+    `expected` (axis, block, band) is the power of the noise terms, with their level over time.
     """
     form, shape = _spectral_form(simulated, expected)
     off = np.abs(form - 1.0) * np.sqrt(shape)
@@ -72,12 +62,7 @@ def measure_extra_statistics(
 ) -> ExtraStatistics:
     """Measure what a simulation has in addition to its noise terms.
 
-    Parameters
-    ----------
-    expected : ndarray, shape (axis, block, band)
-        Power of its noise terms, with their level over time.
-    unexplained : ndarray of bool, shape (axis, band)
-        Bands that the noise terms do not explain.
+    `expected` is as in `worst_band`, `unexplained` (axis, band) are bands that they do not explain.
     """
     form, shape = _spectral_form(simulated, expected)
     # An unexplained band reaches into others.
@@ -117,16 +102,9 @@ def _measure_coherency(
     """Return the coherency of the axes and its error, 0 if not significant."""
     if "cross" not in simulated:
         return np.zeros((0, expected.shape[2]), np.complex128), np.zeros((0, expected.shape[2]))
-    axes = [str(axis) for axis in simulated["axis"].values]
     cross, shape = (simulated[name].values for name in ("cross", "cross_shape"))
-    pairs = [
-        (axes.index(axis), axes.index(other_axis)) for axis, other_axis in pair_rows(simulated)
-    ]
-    geometric_mean = (
-        np.stack([np.sqrt(expected[row] * expected[other_row]) for row, other_row in pairs])
-        if pairs
-        else np.empty(cross.shape)
-    )
+    first, second = pair_indices(simulated)
+    geometric_mean = np.sqrt(expected[first] * expected[second])
     coherency, coherency_shape = _weighted_mean(cross / geometric_mean, shape)
     total = 2.0 * (np.abs(coherency) ** 2 * coherency_shape).sum(axis=1, keepdims=True)
     significant = (coherency_shape > 0.0) & (
@@ -208,14 +186,8 @@ def add_extra_statistics(
     """
     arrays: dict[str, Any] = {"form_shape": extra.form_shape}
     if extra.coherency.any():
-        axes = [str(axis) for axis in blocks["axis"].values]
-        spectrum = baseline["spectrum"].values
-        geometric_mean = np.stack(
-            [
-                np.sqrt(spectrum[axes.index(axis)] * spectrum[axes.index(other_axis)])
-                for axis, other_axis in pair_rows(blocks)
-            ]
-        )
+        spectrum, (first, second) = baseline["spectrum"].values, pair_indices(blocks)
+        geometric_mean = np.sqrt(spectrum[first] * spectrum[second])
         arrays["cross"] = extra.coherency[:, None] * geometric_mean
         arrays["cross_error"] = extra.coherency_error
     if extra.lines.any() or extra.peaks.any():

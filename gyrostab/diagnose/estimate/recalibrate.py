@@ -311,7 +311,7 @@ def _fit_noise(
         axis_effects,
         chosen,
     )
-    square, information = fit_squares(fit)
+    square, information, _ = fit_squares(fit)
     plain = float(
         (
             (fit.weight / (fit.start if fit.start is not None else fit.power) ** 2)

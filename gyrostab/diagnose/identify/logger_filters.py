@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.expected_statistics import band_columns, common_variance
-from gyrostab.diagnose.baseline.posterior import Fit, expected_powers, fit_squares
+from gyrostab.diagnose.baseline.posterior import Fit, fit_squares
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.filter_response import band_response
@@ -251,5 +251,5 @@ def _average_powers(axis: str, state: State) -> tuple[Fit, Array]:
 
 def _max_log_likelihood(fit: Fit) -> float:
     """Return the largest log likelihood of the powers over the noise."""
-    expected = expected_powers(fit)
+    expected = fit_squares(fit)[2]
     return float(-(fit.weight * (np.log(expected) + fit.power / expected)).sum())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.locate.regions import merge_regions, merge_wandering_regions
-from gyrostab.diagnose.nulls.scores import NullScores, null_scores, standardise
+from gyrostab.diagnose.nulls.scores import NullScores, standardise
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS, Statistic
 from gyrostab.diagnose.statistics.mean import region_mean
@@ -46,7 +45,7 @@ FIELDS = {
 def locate_mismatches(
     blocks: xr.Dataset,
     baseline: xr.Dataset,
-    nulls: Iterable[xr.Dataset] | NullScores,
+    null: NullScores,
     *,
     level: float = 0.01,
     settings: Settings = DEFAULTS,
@@ -60,8 +59,8 @@ def locate_mismatches(
 
     Parameters
     ----------
-    nulls : iterable of xarray.Dataset, or NullScores
-        Null records from `gyrostab.diagnose.nulls.records.null_records`, or their `null_scores`.
+    null : NullScores
+        Scores of null records, from `gyrostab.diagnose.nulls.scores.null_scores`.
     level : float
         Probability that a recording without missing physics has any mismatch.
 
@@ -81,8 +80,8 @@ def locate_mismatches(
 
     Examples
     --------
-    >>> nulls = null_records(blocks, baseline, count=400, rng=rng)  # doctest: +SKIP
-    >>> found = locate_mismatches(blocks, baseline, nulls)  # doctest: +SKIP
+    >>> null = null_scores(baseline, null_records(blocks, baseline, rng=rng))  # doctest: +SKIP
+    >>> found = locate_mismatches(blocks, baseline, null)  # doctest: +SKIP
     >>> found.axes.values, found.begin.values, found.end.values  # doctest: +SKIP
     (array(['x']), array([1500.]), array([1800.]))
     """
@@ -91,9 +90,6 @@ def locate_mismatches(
             f"level {level!r}: give a false-alarm probability above 0 and below 0.5, "
             "for instance 0.01"
         )
-    null = (
-        nulls if isinstance(nulls, NullScores) else null_scores(baseline, nulls, settings=settings)
-    )
     regions: list[dict[str, Any]] = []
     for statistic in STATISTICS:
         if statistic.name in null.statistics:
@@ -185,9 +181,8 @@ def _take_region(
         return None
     window, column = np.unravel_index(np.nanargmax(np.abs(remaining)), remaining.shape)
     sign = 1.0 if remaining[window, column] > 0 else -1.0
-    free = np.where(
-        np.isfinite(remaining[:, column]) | np.isnan(z[:, column]), z[:, column], 0.0
-    )  # explained windows do not count
+    # explained windows do not count
+    free = np.where(np.isfinite(remaining[:, column]) | np.isnan(z[:, column]), z[:, column], 0.0)
     begin, end, fine = _find_span(scores, free * sign, int(window), settings)
     combined, ratio = _combine_windows(scores, row, z * sign, fine, int(window))
     columns, reach = _find_columns(statistic, scores, combined, ratio, int(column), settings)
@@ -246,9 +241,7 @@ def _find_span(
             best, low, high = float(sums[place]), place, place + count
     chosen = fine[low:high]
     inside = fine[(first[fine] >= first[window]) & (stop[fine] <= stop[window])]
-    if (
-        best < settings.window_sum_share * z[window]
-    ):  # the short windows do not add up to the whole one
+    if best < settings.window_sum_share * z[window]:  # they do not add up to the whole window
         raised = inside[z[inside] > settings.visible_sigma]
         chosen = (
             inside[(inside >= raised[0]) & (inside <= raised[-1])]
@@ -316,11 +309,9 @@ def _find_columns(
     grown = np.arange(lower, upper + 1)
     excess = np.abs(ratio - 1.0) if statistic.is_ratio else np.abs(combined)
     region = grown[excess[grown] >= settings.region_excess_share * excess[column]]
-    margin = LEAK_LINES if kinds[column] == "line" else 0
     if kinds[column] == "line":
-        return np.array([column]), np.arange(
-            max(lower - margin, 0), min(upper + margin + 1, kinds.size)
-        )
+        first, last = max(lower - LEAK_LINES, 0), min(upper + LEAK_LINES + 1, kinds.size)
+        return np.array([column]), np.arange(first, last)
     overlap = (low <= high[grown].max() * 1.01) & (high >= low[grown].min() * 0.99)
     return region, np.flatnonzero(overlap)
 
@@ -329,21 +320,12 @@ def _make_table(
     regions: list[dict[str, Any]], blocks: xr.Dataset, null: NullScores, level: float
 ) -> xr.Dataset:
     variables: dict[str, Any] = {}
+    kinds = dict.fromkeys(("statistic", "view", "axes", "what"), str) | {"sign": int}
     for field, units in FIELDS.items():
-        kind = (
-            str
-            if field in ("statistic", "view", "axes", "what")
-            else int
-            if field == "sign"
-            else float
-        )
+        kind = kinds.get(field, float)
         values = np.array([region[field] for region in regions], dtype=kind)
         variables[field] = ("mismatch", values, {"units": units} if units else {})
-    start = (
-        np.datetime64(int(blocks.attrs["start_ns"]), "ns")
-        if "start_ns" in blocks.attrs
-        else np.datetime64("1970-01-01", "ns")
-    )
+    start = np.datetime64(int(blocks.attrs["start_ns"]), "ns")
     for field, edge in (("start_time", "begin"), ("end_time", "end")):
         seconds = np.array([region[edge] for region in regions], dtype=float)
         variables[field] = ("mismatch", start + np.rint(seconds * 1e9).astype("timedelta64[ns]"))

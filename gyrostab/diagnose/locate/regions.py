@@ -19,12 +19,8 @@ def merge_regions(regions: Sequence[Region], *, settings: Settings = DEFAULTS) -
     """Merge regions, the surest first; the surest gives the numbers.
 
     Regions of different axes are merged when they share most of their time. Those of the same axes
-    are also merged when they are adjacent, and then span both.
-
-    Parameters
-    ----------
-    regions : sequence of dict
-        With the fields of `gyrostab.diagnose.locate.mismatches.FIELDS`.
+    are also merged when they are adjacent, and then span both. The fields of a region are those of
+    `gyrostab.diagnose.locate.mismatches.FIELDS`.
 
     Examples
     --------
@@ -71,11 +67,7 @@ def _are_alike(region: Region, other: Region, settings: Settings) -> bool:
 
 
 def _kind_of(region: Region) -> str:
-    """Return the kind of a region; regions of different kinds are not merged.
-
-    The kinds are within blocks and between them, levels and their scatter, steady and drifting
-    lines.
-    """
+    """Return the kind of a region; regions of different kinds are not merged."""
     kind = str(region["what"]).split(" ")[0]
     return kind if kind in _SEPARATE_KINDS else ""
 
@@ -122,12 +114,7 @@ def merge_wandering_regions(
 ) -> list[Region]:
     """Merge the regions of the mean of an axis when there are many: its mean wanders.
 
-    The largest gives the numbers.
-
-    Parameters
-    ----------
-    regions : sequence of dict
-        Regions of the mean, one axis each.
+    The largest gives the numbers. A region is of one axis.
     """
     merged = []
     for axes in dict.fromkeys(region["axes"] for region in regions):

@@ -23,6 +23,7 @@ from gyrostab.diagnose.nulls.shared_noise import (
     draw_shared_white,
     find_shared_noise,
 )
+from gyrostab.diagnose.reduce.block_statistics import pair_indices
 from gyrostab.diagnose.statistics import STATISTICS
 from gyrostab.diagnose.statistics.base import NullDraw
 from gyrostab.diagnose.statistics.cross_spectrum import draw_coherency
@@ -57,7 +58,6 @@ class _NullSetup(NamedTuple):
 
     blocks: xr.Dataset
     baseline: xr.Dataset
-    shape: Array
     # Shapes of the gamma parts that each band has in common with the first, second, ... above it.
     ties: list[Array]
     columns: Array
@@ -142,37 +142,22 @@ def _prepare_nulls(
     noise = np.einsum("abfn,an->abf", columns, baseline["square"].values)
     effects = baseline["spectrum"].values / noise
     lines = line_columns(blocks)
+    rate = float(blocks.attrs["sampling_rate_hz"])
+    half_difference = 1.0 - np.cos(2.0 * np.pi * blocks["line_frequency"].values / rate)
     sd = []
     for square in baseline["square"].values:
         density = lines @ square
-        sd.append(
-            [
-                np.sqrt(level)
-                for level in (
-                    _sample_variance(blocks, density),
-                    2.0 * _sample_variance(blocks, density, difference=True),
-                )
-            ]
-        )
+        variances = density.mean() * rate, 2.0 * ((density * half_difference).mean() * rate)
+        sd.append(np.sqrt(variances))
     peaks = baseline["peaks"].values if "peaks" in baseline else np.zeros((len(sd), len(lines)))
     density = [
         np.column_stack([lines * square, peak])
         for square, peak in zip(baseline["square"].values, peaks, strict=True)
     ]
     tails = np.array([_kurtosis_excess(blocks, axis_density, rng) for axis_density in density])
-    shape = blocks["shape"].values
     ties = _common_shapes(baseline["shape_alone"].values, int(blocks.attrs["block_samples"]))
-    return _NullSetup(
-        blocks,
-        baseline,
-        shape,
-        ties,
-        columns,
-        effects,
-        np.array(sd),
-        tails,
-        find_shared_noise(blocks, baseline),
-    )
+    shared = find_shared_noise(blocks, baseline)
+    return _NullSetup(blocks, baseline, ties, columns, effects, np.array(sd), tails, shared)
 
 
 def _common_shapes(shape: Array, size: int) -> list[Array]:
@@ -230,25 +215,13 @@ def _kurtosis_excess(
     return float(kurtosis.mean() - mean), float(kurtosis.std() / np.sqrt(variance))
 
 
-def _sample_variance(blocks: xr.Dataset, density: Array, *, difference: bool = False) -> float:
-    """Return the variance of a sample, or half that of a difference, from the line density."""
-    rate = float(blocks.attrs["sampling_rate_hz"])
-    factor = (
-        1.0 - np.cos(2.0 * np.pi * blocks["line_frequency"].values / rate) if difference else 1.0
-    )
-    return float((density * factor).mean() * rate)
-
-
 def _draw_records(setup: _NullSetup, count: int, rng: np.random.Generator) -> xr.Dataset:
     """Draw some null records."""
     blocks, baseline = setup.blocks, setup.baseline
     axes, draws = blocks.sizes["axis"], baseline.sizes["draw"]
     chosen = rng.integers(0, draws, (count, axes))
-    squares = np.stack(
-        [baseline["posterior"].values[axis, chosen[:, axis]] for axis in range(axes)], axis=1
-    )
-    slow = np.stack(
-        [baseline["posterior_slow"].values[axis, chosen[:, axis]] for axis in range(axes)], axis=1
+    squares, slow = (
+        baseline[name].values[np.arange(axes), chosen] for name in ("posterior", "posterior_slow")
     )
     expected = np.einsum("abfn,ran->rabf", setup.columns, squares) * setup.effects
     if "form_shape" in baseline:  # the form of the spectrum was measured on a simulated log
@@ -421,14 +394,9 @@ def _draw_independent_cross(
     setup: _NullSetup, power: Array, rng: np.random.Generator
 ) -> NDArray[np.complex128]:
     """Draw cross-spectra of axes without anything in common."""
-    names = [str(axis) for axis in setup.blocks["axis"].values]
-    first = [names.index(str(name)) for name in setup.blocks["first"].values]
-    second = [names.index(str(name)) for name in setup.blocks["second"].values]
+    first, second = pair_indices(setup.blocks)
     size = np.sqrt(power[:, first] * power[:, second])
-    shape = np.minimum(setup.shape[first], setup.shape[second])
-    if "cross_shape" in setup.blocks:
-        shape = setup.blocks["cross_shape"].values
-    cross = size * draw_coherency(shape, size.shape, rng)
+    cross = size * draw_coherency(setup.blocks["cross_shape"].values, size.shape, rng)
     cross[..., np.isnan(setup.blocks["cross"].values)] = np.nan
     return np.asarray(cross)
 
@@ -437,8 +405,7 @@ def _scale_shared_cross(
     setup: _NullSetup, level: Array, between: NDArray[np.complex128]
 ) -> NDArray[np.complex128]:
     """Return cross-spectra of axes with common noise, from those over the levels of both."""
-    assert setup.shared is not None
-    first, second = ([pair[side] for pair in setup.shared.pairs] for side in (0, 1))
+    first, second = pair_indices(setup.blocks)
     cross = between * np.sqrt(level[:, first] * level[:, second])
     cross[..., np.isnan(setup.blocks["cross"].values)] = np.nan
     return np.asarray(cross)

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.predict.linear_model import pair_rows
+from gyrostab.diagnose.reduce.block_statistics import pair_indices
 
 __all__ = ["SharedNoise", "draw_shared_spectra", "draw_shared_white", "find_shared_noise"]
 
@@ -20,7 +20,7 @@ class SharedNoise(NamedTuple):
     """Noise that axes have in common."""
 
     root: NDArray[np.complex128]  # (block, band, axis, axis): square root of the coherency matrix
-    pairs: list[tuple[int, int]]  # indices of the axes of each pair
+    pairs: NDArray[np.int64]  # (pair, 2): indices of the axes of each pair
     axis_shape: Array  # (axis, block, band): shape of the gamma distribution of each power
     pair_shape: Array  # (pair, block, band): the same for samples that both axes of a pair have
     #: (block, axis, axis): square root of the correlation matrix of the white noise of the block
@@ -32,13 +32,12 @@ def find_shared_noise(blocks: xr.Dataset, baseline: xr.Dataset) -> SharedNoise |
     """Return the noise that axes have in common in the baseline; None without any."""
     if "cross" not in baseline:
         return None
-    axes = [str(axis) for axis in blocks["axis"].values]
-    pairs = [(axes.index(a), axes.index(b)) for a, b in pair_rows(blocks)]
+    pairs, axes = pair_indices(blocks).T, blocks.sizes["axis"]
     spectrum, axis_shape = (baseline[name].values for name in ("spectrum", "shape_alone"))
     cross = baseline["cross"].values
     samples, joint_samples = blocks["samples"].values, blocks["cross_samples"].values
-    matrix = np.zeros((*spectrum.shape[1:], len(axes), len(axes)), np.complex128)
-    matrix[..., range(len(axes)), range(len(axes))] = 1.0
+    matrix = np.zeros((*spectrum.shape[1:], axes, axes), np.complex128)
+    matrix[...] = np.eye(axes)
     white = matrix[:, 0].real.copy()
     for number, (a, b) in enumerate(pairs):
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -46,12 +45,9 @@ def find_shared_noise(blocks: xr.Dataset, baseline: xr.Dataset) -> SharedNoise |
             overlap = np.nan_to_num(joint_samples[number] / np.sqrt(samples[a] * samples[b]))
         matrix[..., a, b], matrix[..., b, a] = coherency, coherency.conj()
         white[:, a, b] = white[:, b, a] = coherency[:, 0].real * overlap
+    pair_shape = blocks["cross_shape"].values
     return SharedNoise(
-        _correlation_root(matrix),
-        pairs,
-        axis_shape,
-        blocks["cross_shape"].values,
-        _correlation_root(white),
+        _correlation_root(matrix), pairs, axis_shape, pair_shape, _correlation_root(white)
     )
 
 
@@ -69,14 +65,9 @@ def draw_shared_spectra(
 ) -> tuple[Array, NDArray[np.complex128]]:
     """Draw powers over their expectation, and cross-spectra over the root of both expectations.
 
-    They are Wishart distributed, drawn by the Bartlett decomposition: as many independent
-    frequencies as the shape of each axis. Samples of only one axis of a pair add scatter that is
-    not common.
-
-    Returns
-    -------
-    power : ndarray, shape (record, axis, block, band)
-    cross : ndarray of complex, shape (record, pair, block, band)
+    The shapes are (record, axis or pair, block, band). They are Wishart distributed, drawn by the
+    Bartlett decomposition: as many independent frequencies as the shape of each axis. Samples of
+    only one axis of a pair add scatter that is not common.
     """
     axis_shape = np.where(
         np.isfinite(shared.axis_shape) & (shared.axis_shape > 0.0), shared.axis_shape, 1.0

@@ -16,7 +16,14 @@ from gyrostab.progress import Stage, no_stage
 from gyrostab.schema import check_log
 from gyrostab.time.durations import duration_seconds, samples
 
-__all__ = ["MIN_BLOCKS", "block_samples", "measured", "noise_at_orders", "reduce_log"]
+__all__ = [
+    "MIN_BLOCKS",
+    "block_samples",
+    "measured",
+    "noise_at_orders",
+    "pair_indices",
+    "reduce_log",
+]
 
 Array = NDArray[np.float64]
 _BLOCK_S = 20.0  # default block; design choice
@@ -145,6 +152,13 @@ def reduce_log(
         work.add(batch)
         progress("reducing", sample_count, work.rows * stop * length)
     return label_statistics(work, log, restart=duration_seconds(restart_gap, "restart_gap"))
+
+
+def pair_indices(blocks: xr.Dataset) -> NDArray[np.int64]:
+    """Return the indices of the first and of the second axes of all pairs, (2, pair)."""
+    axes = blocks["axis"].values.tolist()
+    sides = [[axes.index(axis) for axis in blocks[name].values] for name in ("first", "second")]
+    return np.array(sides, np.int64)
 
 
 def measured(blocks: xr.Dataset, name: str) -> xr.DataArray:

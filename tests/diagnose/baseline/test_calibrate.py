@@ -337,7 +337,7 @@ def test_fit_maximises_the_likelihood_even_without_a_good_fit():
         minimize(worse, rng.uniform(-5, 5, 4), method="Nelder-Mead", options={"maxiter": 4000}).fun
         for _ in range(8)
     )
-    square, _ = fit_squares(fit)
+    square, *_ = fit_squares(fit)
     assert worse(np.log(np.maximum(square, 1e-12))) < best + 0.1
 
 
