@@ -69,71 +69,37 @@ class Statistic:
 
     A subclass sets the attributes and overrides the methods of the steps in which it takes part.
     The registry `gyrostab.diagnose.statistics.STATISTICS` has one instance of each.
-
-    Attributes
-    ----------
-    name : str
-        Unique name. The key ``view`` of a mismatch in diagnosis.json is the attribute of this name.
-    explains : tuple of str
-        Kinds of mismatches that an effect in this statistic can explain.
-    contained_in : tuple of str
-        Kinds of mismatches whose score against the baseline with effects contains what an
-        effect in this statistic contributes.
-    nuisance_alternative : str
-        As what the rest of an effect is reported that explains too little in this statistic.
-    error_shows_in : tuple of str
-        Names of the statistics in which an error of the form of an effect shows.
-    null_variable : str
-        Variable of the null records that the evidence uses; "" to draw the noise of the linear
-        model instead.
-    is_power_weighted : bool
-        Whether the expected powers are its weights.
-    is_phase_locked : bool
-        Whether it is locked to the rotation of the tool or to the feedback ramp.
-    is_in_baseline : bool
-        Whether the baseline with the effects contains what an effect contributes.
-    is_in_means, is_linear_in_means, is_switching : bool
-        Whether effects move the block means; by columns; by two levels of free course.
-    is_power, is_pairwise, is_rotation, is_transfer, is_line, is_count : bool
-        Whether effects add power, covariance of two axes, amplitudes at multiples of the rotation,
-        what follows a reference channel, a spectral line, anomalous samples.
-    explains_motion : bool
-        Whether an effect explains a moving mean although it has no columns in the means.
-    has_course, has_size : bool
-        Whether designs are by block; whether the size follows from a linear model.
-    uses_line_spectra : bool
-        Whether the score is of the spectrum at full resolution.
-    is_ratio : bool
-        Whether the score is of a variance over the expected one.
-    grows_in_time : bool
-        Whether adjacent regions of a mismatch are one.
     """
 
-    name: str
-    view: str
-    explains: tuple[str, ...] = ()
+    name: str  # unique
+    view: str  # the key ``view`` of its mismatches in diagnosis.json
+    explains: tuple[str, ...] = ()  # kinds of mismatches that an effect in it can explain
+    #: Kinds of mismatches whose score against the baseline with effects contains what an effect in
+    #: this statistic contributes.
     contained_in: tuple[str, ...] = ()
+    #: As what the rest of an effect is reported that explains too little in this statistic.
     nuisance_alternative = "~S(f)"
-    error_shows_in: tuple[str, ...] = ()
+    error_shows_in: tuple[str, ...] = ()  # statistics that show an error of the form of an effect
+    #: Variable of the null records that the evidence uses; "" to draw noise of the linear model.
     null_variable = ""
-    is_power_weighted = False
-    is_phase_locked = False
-    is_in_baseline = False
-    is_in_means = False
-    is_linear_in_means = False
-    is_switching = False
-    is_power = False
-    is_pairwise = False
-    is_rotation = False
-    is_transfer = False
-    is_line = False
-    is_count = False
-    has_course = False
-    explains_motion = False
-    has_size = True
-    uses_line_spectra = False
-    is_ratio = False
-    grows_in_time = True
+    is_power_weighted = False  # whether the expected powers are its weights
+    is_phase_locked = False  # whether it is locked to the rotation of the tool or to the ramp
+    is_in_baseline = False  # whether the baseline with the effects contains what an effect adds
+    is_in_means = False  # whether effects move the block means,
+    is_linear_in_means = False  # by columns,
+    is_switching = False  # by two levels of free course
+    is_power = False  # whether effects add power,
+    is_pairwise = False  # covariance of two axes,
+    is_rotation = False  # amplitudes at multiples of the rotation,
+    is_transfer = False  # what follows a reference channel,
+    is_line = False  # a spectral line,
+    is_count = False  # anomalous samples
+    has_course = False  # whether designs are by block
+    explains_motion = False  # whether an effect without columns in the means explains their motion
+    has_size = True  # whether the size follows from a linear model
+    uses_line_spectra = False  # whether the score is of the spectrum at full resolution
+    is_ratio = False  # whether the score is of a variance over the expected one
+    grows_in_time = True  # whether adjacent regions of a mismatch are one
 
     def __repr__(self) -> str:
         return f"<{self.name}>"
@@ -183,7 +149,14 @@ class Statistic:
         )
         if not variants:
             return []
-        return [Candidate(kind.name, self, driver, weigh_by_time(variants, windows))]
+        candidate = Candidate(kind.name, self, driver, weigh_by_time(variants, windows))
+        return [self.complete_candidate(candidate, kind, windows)]
+
+    def complete_candidate(
+        self, candidate: Candidate, kind: type[Effect], windows: Windows
+    ) -> Candidate:
+        """Return a candidate with what its statistic adds to it; by default nothing."""
+        return candidate
 
     def candidates_without_channel(self, kind: type[Effect], blocks: xr.Dataset) -> list[Candidate]:
         """Return the candidates of an effect none of whose channels is in the record."""
@@ -237,19 +210,8 @@ class Statistic:
     ) -> tuple[Array | float, list[Array], list[Array]]:
         """Return what a component takes from the noise of an axis.
 
-        Parameters
-        ----------
-        state : State
-            Without any effect.
-        weight : ndarray, shape (axis, block, band)
-            Powers with all effects.
-
-        Returns
-        -------
-        known : ndarray, shape (block, band)
-            Power of known size.
-        free, means : list of ndarray
-            Powers and means of free size.
+        These are a power of known size (block, band), and powers and means of free size. The state
+        is that without any effect, `weight` (axis, block, band) the powers with all effects.
         """
         columns = self.condition(state, component).given
         return 0.0, columns.get(("power", axis), []), columns.get(("mean", axis), [])
@@ -273,11 +235,7 @@ class Statistic:
     def estimate(self, fit: SizeFit) -> Sizes:
         """Estimate parameters with their standard errors; by axis if there are several.
 
-        Returns
-        -------
-        dict of str to (float, float) or (float, float, float, float)
-            Value and standard error, with the ends of an asymmetric 95 % interval. Keys are
-            ``name``, or ``name.axis``.
+        Keys are ``name`` or ``name.axis``; an asymmetric 95 % interval has its ends behind.
         """
         out: dict[str, tuple[float, ...]] = {}
         points: list[dict[str, float | str]] = []

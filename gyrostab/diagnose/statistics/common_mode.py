@@ -18,7 +18,7 @@ from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
     cube_root_score,
-    cumulative,
+    moving_sum,
     statistic_dataset,
     sum_over_windows,
     window_set,
@@ -56,12 +56,10 @@ class CommonMode(Statistic):
         the correlation, which no calibration error changes. The increments are averaged over
         several blocks, because the common motion may be slow.
 
-        Returns
-        -------
-        xarray.Dataset or None
-            None with one axis, or for too short a record. A row for each pair, whose ``ratio`` and
-            ``estimate`` are the correlation. Three axes or more have a row of all together, by the
-            determinant of their correlations; its ``estimate`` is the root of their mean square.
+        A pair of axes has a row, whose ``ratio`` and ``estimate`` are the correlation. Three axes
+        or more have a row of all together, by the determinant of their correlations; its
+        ``estimate`` is the root of their mean square. None with one axis, or for too short a
+        record.
         """
         axes = [str(axis) for axis in blocks["axis"].values]
         block_count = blocks.sizes["block"]
@@ -177,18 +175,15 @@ def _correlate_pairs(
     def products(values: Array) -> Array:
         return over(values[..., first, :] * values[..., second, :])
 
-    averages = _moving_sum(increments, span)
+    averages = moving_sum(increments, span)
     square, product = over(averages**2), products(averages)
     if shared is not None:
-        product = product - shared[1][:, None] * products(_moving_sum(shared[0], span)).mean(axis=0)
+        product = product - shared[1][:, None] * products(moving_sum(shared[0], span)).mean(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         r = np.clip(product / np.sqrt(square[..., first, :] * square[..., second, :]), -1.0, 1.0)
-    count = over((present[first] & present[second]).astype(float)) * (
-        _OVERLAP_FACTOR / span if span > 1 else 1.0
-    )
-    memory = _blocks_per_value(averages, first, second)[..., None] * (
-        _OVERLAP_FACTOR / span if span > 1 else 1.0
-    )
+    share = _OVERLAP_FACTOR / span if span > 1 else 1.0  # of an average that is independent
+    count = over((present[first] & present[second]).astype(float)) * share
+    memory = _blocks_per_value(averages, first, second)[..., None] * share
     return np.where(count >= _MIN_AVERAGES, r, np.nan), count / np.maximum(memory, 1.0)
 
 
@@ -205,14 +200,6 @@ def _blocks_per_value(averages: Array, first: list[int], second: list[int]) -> A
     return np.asarray(
         2.0 * (autocorrelation[..., first, :] * autocorrelation[..., second, :]).sum(axis=-1) - 1.0
     )
-
-
-def _moving_sum(values: Array, span: int) -> Array:
-    """Return sums over `span` blocks around each."""
-    total = cumulative(values)
-    place = np.arange(values.shape[-1])
-    low, high = np.maximum(place - span // 2, 0), np.minimum(place - span // 2 + span, place.size)
-    return np.asarray(total[..., high] - total[..., low])
 
 
 def _score_all_axes(r: Array, count: Array, pairs: list[tuple[int, int]], axes: int) -> Array:

@@ -26,6 +26,7 @@ from gyrostab.diagnose.predict.linear_model import (
     stack_designs,
     unspread_share,
 )
+from gyrostab.diagnose.reduce.block_statistics import pair_indices
 from gyrostab.diagnose.statistics.base import SizeFit, Sizes, Statistic
 from gyrostab.diagnose.statistics.power import with_axis
 from gyrostab.diagnose.statistics.scores import (
@@ -67,24 +68,18 @@ class CrossSpectrum(Statistic):
     has_course = True
 
     def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
-        """Score the coherency of every pair of axes, in bands and in total.
+        """Score the coherency of every pair of axes, in phase and in quadrature.
 
-        Returns
-        -------
-        xarray.Dataset or None
-            None with one axis. Columns ``in phase`` and ``in quadrature``; ``ratio`` and
-            ``estimate`` are the coherency. Three axes or more have a row of all pairs together,
-            over all bands in phase.
+        ``ratio`` and ``estimate`` are the coherency, in bands and in total. Three axes or more have
+        a row of all pairs together, over all bands in phase.
         """
         if "cross" not in blocks or blocks.sizes.get("pair", 0) == 0:
             return None
         axes = [str(axis) for axis in blocks["axis"].values]
-        left = [axes.index(str(axis)) for axis in blocks["first"].values]
-        right = [axes.index(str(axis)) for axis in blocks["second"].values]
+        left, right = pair_indices(blocks)
         windows = window_set(blocks.sizes["block"], LENGTHS)
         coherency, count = _pair_coherency(blocks, baseline, left, right, windows)
-        parts = [coherency.real, coherency.imag]
-        r = np.concatenate(parts, axis=-1)
+        r = real_and_imaginary(coherency)
         z = correlation_score(r, np.concatenate([2.0 * count] * 2, axis=-1))
         rows = [f"{axes[a]} {axes[b]}" for a, b in zip(left, right, strict=True)]
         bands = blocks.sizes["band"]
@@ -126,13 +121,10 @@ class CrossSpectrum(Statistic):
 
     def design(self, case: Prospect) -> Iterator[Variant]:
         """Yield cross-densities per product of the factors of both axes."""
-        if (
-            not case.prediction.coherent
-            or case.prediction.line is not None
-            or "cross" not in case.blocks
-        ):
+        prediction = case.prediction
+        if not prediction.coherent or prediction.line is not None or "cross" not in case.blocks:
             return
-        for name, density in case.prediction.spectrum.items():
+        for name, density in prediction.spectrum.items():
             yield Variant(case.values, (name,), with_axis(density)[None], squared=True)
 
     def rows(self, candidate: Candidate, state: State) -> list[tuple[str, ...]]:
@@ -178,7 +170,7 @@ class CrossSpectrum(Statistic):
         columns = []
         for density in component.variant.design:
             chosen = cross_column(density, row, state.blocks)
-            columns.append(np.concatenate([chosen.real, chosen.imag], axis=-1))
+            columns.append(real_and_imaginary(chosen))
         state = state.with_columns("cross", ",".join(component.row), columns)
         if not component.variant.squared:
             return state
@@ -228,7 +220,11 @@ class CrossSpectrum(Statistic):
 
 
 def _pair_coherency(
-    blocks: xr.Dataset, baseline: xr.Dataset, left: list[int], right: list[int], windows: Windows
+    blocks: xr.Dataset,
+    baseline: xr.Dataset,
+    left: NDArray[np.int64],
+    right: NDArray[np.int64],
+    windows: Windows,
 ) -> tuple[Complex, Array]:
     """Compute the coherency and the number of complex frequencies by (record), pair, window, band.
 

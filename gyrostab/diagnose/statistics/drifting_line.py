@@ -52,17 +52,9 @@ class DriftingLine(Statistic):
         cells of its path together exceed noise by :math:`E \sqrt{P B / L}` standard deviations.
         Paths begin anywhere, cover 4 lines or more in either direction, and accelerate or slow down
         by up to a half of their mean speed. The largest sum from one eighth of the spectrum to
-        another is the score of that column.
+        another is the score of that column, and ``ratio``. Several axes have a row of all together.
+        None without lines, or with spectra of fewer than 6 parts of the record.
 
-        Returns
-        -------
-        xarray.Dataset or None
-            None without lines, or with spectra of fewer than 6 parts of the record. ``ratio`` is
-            the power along the path over that of the noise. Several axes have a row of all
-            together.
-
-        Notes
-        -----
         Every line is relative to the lines around it in its part and to its own mean over the
         parts, and its contribution is limited: neither a steady line nor a noisier part of the
         record is a drifting line.
@@ -197,12 +189,7 @@ def _path_columns(frequency: Array) -> dict[str, Any]:
     """Return columns from the middle of one section to another, and averaging times between."""
     edges = np.linspace(frequency[0], frequency[-1], _SPECTRUM_SECTIONS + 1)
     middle = (edges[1:] + edges[:-1]) / 2.0
-    begin_section, end_section = (
-        part.ravel()
-        for part in np.meshgrid(
-            np.arange(_SPECTRUM_SECTIONS), np.arange(_SPECTRUM_SECTIONS), indexing="ij"
-        )
-    )
+    begin_section, end_section = np.divmod(np.arange(_SPECTRUM_SECTIONS**2), _SPECTRUM_SECTIONS)
     return {
         "what": [
             f"drifting {middle[a]:.3g} {middle[b]:.3g}"

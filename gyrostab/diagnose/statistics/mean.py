@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -44,7 +44,6 @@ from gyrostab.kernels.regression.boxcars import (
 from gyrostab.kernels.regression.state_space import flicker_states
 from gyrostab.noise import HOUR
 from gyrostab.physics.base import Effect
-from gyrostab.physics.prediction import Prediction
 from gyrostab.physics.prediction import Windows as PredictionWindows
 
 __all__ = [
@@ -123,13 +122,7 @@ class Mean(BlockMeanStatistic):
         The score is that of a constant added only in the window, by generalised least squares with
         the noise of the simulation and a constant of the record. For white noise it is the window's
         mean minus that of the rest, over its standard deviation; for slow noise, neighbours count
-        more.
-
-        Returns
-        -------
-        xarray.Dataset
-            See `gyrostab.diagnose.statistics.scores.statistic_dataset`; ``estimate`` is the
-            constant [degree hour-1].
+        more. ``estimate`` is the constant [degree hour-1].
         """
         windows = window_set(blocks.sizes["block"], LENGTHS, whole=False)
         amount, information = window_means(blocks, baseline, windows)
@@ -164,22 +157,11 @@ class Mean(BlockMeanStatistic):
         for chosen in column_choices(list(columns)):
             yield Variant(case.values, chosen, np.stack([columns[name] for name in chosen]))
 
-    def candidates(
-        self,
-        kind: type[Effect],
-        driver: tuple[str, ...],
-        predictions: Sequence[tuple[dict[str, Any], Prediction]],
-        windows: PredictionWindows,
-        blocks: xr.Dataset,
-        coefficient: xr.DataArray,
-    ) -> list[Candidate]:
-        """Return the candidates of an effect; a step at a given time may occur at every restart."""
-        return [
-            replace(candidate, variants=_with_steps_at_restarts(candidate.variants, windows))
-            for candidate in super().candidates(
-                kind, driver, predictions, windows, blocks, coefficient
-            )
-        ]
+    def complete_candidate(
+        self, candidate: Candidate, kind: type[Effect], windows: PredictionWindows
+    ) -> Candidate:
+        """Let a step at a given time occur at every restart."""
+        return replace(candidate, variants=_with_steps_at_restarts(candidate.variants, windows))
 
     def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
         """Compute the evidence in block means."""
@@ -206,7 +188,7 @@ class Mean(BlockMeanStatistic):
         """Put columns into the means, and mask blocks in which the effect moves much."""
         return condition_means(state, component)
 
-    def describe(self, region: Mapping[str, Any], when: str) -> str:
+    def describe(self, region: Region, when: str) -> str:
         """Describe another mean, or one that wanders."""
         axes, estimate = axes_text(region["axes"]), region.get("estimate", np.nan)
         if region.get("sign", 1) == 0:
@@ -259,15 +241,8 @@ def _with_steps_at_restarts(
 def window_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, Array]:
     """Compute matched filter and information of every window; their ratio is the constant in it.
 
-    Parameters
-    ----------
-    windows : Windows
-        Windows other than the whole record, whose constant is free.
-
-    Returns
-    -------
-    amount, information : ndarray ((record,) axis, window), (axis, window)
-        [degree-1 hour], [degree-2 hour2]; NaN if too little of the window is present.
+    By (record), axis, window [degree-1 hour], and by axis, window [degree-2 hour2]; NaN if too
+    little of the window is present. The constant of the whole record is free.
     """
     residual = blocks["mean"].values - baseline["known_mean"].values
     amount = np.full((*residual.shape[:-1], windows.first.size), np.nan)
@@ -351,8 +326,8 @@ def region_mean(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, inside: Arr
     """
     residual = blocks["mean"].values[axis] - baseline["known_mean"].values[axis]
     noise = mean_noise(blocks, baseline, axis, np.isfinite(residual))
-    rows = apply_precision(np.stack([np.ones(residual.size), inside.astype(float)]), noise)
     columns = np.stack([np.ones(residual.size), inside.astype(float)])
+    rows = apply_precision(columns, noise)
     solved = np.linalg.lstsq(rows @ columns.T, rows @ np.nan_to_num(residual), rcond=None)[0]
     return float(solved[1])
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -25,7 +25,7 @@ from gyrostab.diagnose.predict.linear_model import (
     stack_designs,
     unspread_share,
 )
-from gyrostab.diagnose.statistics.base import Statistic, column_choices
+from gyrostab.diagnose.statistics.base import Region, Statistic, column_choices
 from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
@@ -48,22 +48,11 @@ _INTEGRATION_POINTS = 256  # of the transfer function in one band, at least
 
 
 def allan_transfer(low: Array, high: Array, tau: Array, rate: float) -> Array:
-    """Return the Allan variance per unit of two-sided density in each band.
+    """Return the Allan variance (tau, band) per unit of two-sided density in each band [Hz].
 
-    Parameters
-    ----------
-    low, high : ndarray (band,)
-        Edges of the bands [Hz].
-    tau : ndarray (tau,)
-        Averaging times, whole numbers of samples [s].
-    rate : float
-        Sampling rate [Hz].
-
-    Returns
-    -------
-    ndarray (tau, band)
-        Integral of ``4 sin(pi f tau)^4 / (k sin(pi f / rate))^2``, k = tau rate, over the band
-        [Hz].
+    It is the integral of ``4 sin(pi f tau)^4 / (k sin(pi f / rate))^2``, k = tau rate, over the
+    band. Edges of the bands and sampling rate are in Hz; averaging times are whole numbers of
+    samples [s].
 
     Examples
     --------
@@ -107,11 +96,6 @@ class Power(Statistic):
         Within blocks it is computed from the band powers, at octaves of the sampling interval up to
         a quarter of a block; the column ``level`` weights all bands equally, as the likelihood
         does. From a block on it is computed from the block means.
-
-        Returns
-        -------
-        xarray.Dataset
-            See `gyrostab.diagnose.statistics.scores.statistic_dataset`.
         """
         surface = allan_surface(blocks, baseline)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -222,7 +206,7 @@ class Power(Statistic):
             [power_column(density, row, state) for density in component.variant.design],
         )
 
-    def describe(self, region: Mapping[str, Any], when: str) -> str:
+    def describe(self, region: Region, when: str) -> str:
         """Describe another Allan variance."""
         is_single = len(region["axes"]) == 1
         return (
@@ -238,19 +222,8 @@ def allan_surface(
 ) -> dict[str, Any]:
     """Compute observed and expected Allan variances, and the shape of their gamma distribution.
 
-    By (record), axis, window, tau [degree2 hour-2].
-
-    Parameters
-    ----------
-    blocks, baseline : xarray.Dataset
-        As for `score`; the known mean is subtracted.
-    windows : Windows, optional
-        By default those of `score`.
-
-    Returns
-    -------
-    dict
-        ``observed``, ``expected``, ``shape``; ``windows``; ``columns`` as for `statistic_dataset`.
+    By (record), axis, window, tau [degree2 hour-2], without the known mean: ``observed``,
+    ``expected``, ``shape``; with ``windows``, and ``columns`` as for `statistic_dataset`.
     """
     windows = window_set(blocks.sizes["block"], LENGTHS) if windows is None else windows
     surfaces = [
@@ -350,10 +323,7 @@ def _surface_of_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows
 
 
 def _mean_differences(means: Array, k: int) -> Array:
-    """Return the mean of k blocks minus that of the k before; NaN if incomplete.
-
-    As long as the record.
-    """
+    """Return the mean of k blocks minus that of the k before; NaN if incomplete."""
     total = cumulative(np.where(np.isfinite(means), means, 0.0))
     lost = cumulative(~np.isfinite(means))
     difference = (total[..., 2 * k :] - 2.0 * total[..., k:-k] + total[..., : -2 * k]) / k

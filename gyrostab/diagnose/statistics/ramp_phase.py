@@ -54,11 +54,7 @@ class RampPhase(Statistic):
     def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         """Score the harmonics that are phase-locked to the rotation, and the mean by ramp phase.
 
-        Returns
-        -------
-        xarray.Dataset or None
-            None with neither channel. ``estimate`` is the amplitude, or the rms over the phase
-            [degree hour-1].
+        ``estimate`` is the amplitude, or the rms over the phase [degree hour-1].
         """
         windows = window_set(blocks.sizes["block"], LENGTHS)
         rate, block = float(blocks.attrs["sampling_rate_hz"]), float(blocks.attrs["block_s"])
@@ -67,7 +63,8 @@ class RampPhase(Statistic):
         tau_min, tau_max = [], []
         if "order" in blocks:
             scored.append(score_orders(blocks, baseline, windows))
-            kinds += [f"order {h}" for h in range(1, blocks.sizes["harmonic"] + 1)]
+            harmonics = range(1, blocks.sizes["harmonic"] + 1)
+            kinds += [f"order {h}" for h in harmonics]
             turning = turns_per_second(blocks)
             turning_blocks = turning[turning > 0]
             low, high = (
@@ -75,10 +72,8 @@ class RampPhase(Statistic):
                 if turning_blocks.size
                 else (1.0 / block, rate / 2.0)
             )
-            tau_min += [
-                SINE_TAU_CYCLES / (h * high) for h in range(1, blocks.sizes["harmonic"] + 1)
-            ]
-            tau_max += [SINE_TAU_CYCLES / (h * low) for h in range(1, blocks.sizes["harmonic"] + 1)]
+            tau_min += [SINE_TAU_CYCLES / (h * high) for h in harmonics]
+            tau_max += [SINE_TAU_CYCLES / (h * low) for h in harmonics]
         if "profile" in blocks:
             scored.append(_score_profile(blocks, baseline, windows))
             kinds.append("ramp phase")

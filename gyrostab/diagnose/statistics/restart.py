@@ -30,12 +30,7 @@ class Restart(Statistic):
         """Score transients that begin equally at every restart, and a jump of the mean at each.
 
         Both are independent of a constant of the record, and have the noise of the simulation.
-
-        Returns
-        -------
-        xarray.Dataset or None
-            None without restarts. ``estimate`` is the transient at the restart, or the jump [degree
-            hour-1].
+        ``estimate`` is the transient at the restart, or the jump [degree hour-1].
         """
         restarts = restart_blocks(blocks)
         if restarts.size == 0:
@@ -57,11 +52,8 @@ class Restart(Statistic):
             [np.arange(len(_DECAY_BLOCKS)), np.full(restarts.size, len(_DECAY_BLOCKS))]
         )
         scores = np.full((*z.shape, len(kinds)), np.nan)
-        size = scores.copy()
-        scores[..., np.arange(column.size), column], size[..., np.arange(column.size), column] = (
-            z,
-            estimate,
-        )
+        size, place = scores.copy(), np.arange(column.size)
+        scores[..., place, column], size[..., place, column] = z, estimate
         tau = np.array([*_DECAY_BLOCKS, _SIDE_BLOCKS], dtype=float) * block
         return statistic_dataset(
             "restart",

@@ -27,7 +27,6 @@ from gyrostab.diagnose.statistics.base import NullDraw, SizeFit, Sizes, Statisti
 from gyrostab.diagnose.statistics.scores import Windows, exponential_score, sum_over_windows
 from gyrostab.noise import NORMAL_95
 from gyrostab.physics.base import Effect
-from gyrostab.physics.prediction import Prediction
 from gyrostab.physics.prediction import Windows as EffectWindows
 
 Array = NDArray[Any]
@@ -63,23 +62,12 @@ class RotationOrder(Statistic):
         for name, pattern in case.prediction.order.items():
             yield Variant(case.values, (name,), pattern[None, :, :count])
 
-    def candidates(
-        self,
-        kind: type[Effect],
-        driver: tuple[str, ...],
-        predictions: Sequence[tuple[dict[str, Any], Prediction]],
-        windows: EffectWindows,
-        blocks: xr.Dataset,
-        coefficient: xr.DataArray,
-    ) -> list[Candidate]:
-        """Return the candidates, with one size for all axes unless the effect has several."""
+    def complete_candidate(
+        self, candidate: Candidate, kind: type[Effect], windows: EffectWindows
+    ) -> Candidate:
+        """Give all axes one size unless the effect has several."""
         many = {item.name for item in kind.parameters() if item.many}
-        return [
-            replace(candidate, is_per_axis=bool(many & set(candidate.variants[0].columns)))
-            for candidate in super().candidates(
-                kind, driver, predictions, windows, blocks, coefficient
-            )
-        ]
+        return replace(candidate, is_per_axis=bool(many & set(candidate.variants[0].columns)))
 
     def rows(self, candidate: Candidate, state: State) -> list[tuple[str, ...]]:
         """Return each axis, or all axes of one size together."""
@@ -146,12 +134,9 @@ class RotationOrder(Statistic):
             chosen = harmonic_sets(count)[component.place]
             patterns = [(axis, np.ones(count, np.complex128)) for axis in component.row]
         else:
-            chosen = (0,)
-            pattern = (
-                np.conj(component.variant.design[0])
-                if is_reversed(component)
-                else component.variant.design[0]
-            )
+            chosen, pattern = (0,), component.variant.design[0]
+            if is_reversed(component):
+                pattern = np.conj(pattern)
             patterns = [(axis, pattern[state.axes.index(axis)]) for axis in component.row]
         for axis, pattern in patterns:
             state = state.with_columns("order", axis, order_columns(pattern, chosen))
@@ -188,14 +173,8 @@ class RotationOrder(Statistic):
                 }
             label = "" if len(fit.axes) == 1 else f".{component.row[0]}"
             out |= {f"amplitude{label}": (size, sd), f"phase{label}": (angle, math.degrees(error))}
-            out["order"] = (
-                float(
-                    fit.state.blocks["harmonic"].values[
-                        component.place % fit.state.blocks.sizes["harmonic"]
-                    ]
-                ),
-                0.0,
-            )
+            harmonics = fit.state.blocks["harmonic"].values
+            out["order"] = (float(harmonics[component.place % harmonics.size]), 0.0)
         return out
 
 

@@ -31,7 +31,7 @@ from gyrostab.diagnose.predict.linear_model import State, cross_without
 from gyrostab.diagnose.predict.search import Trial
 from gyrostab.diagnose.reduce.label_statistics import MIN_MEAN_SHARE
 from gyrostab.diagnose.settings import DEFAULTS, Settings
-from gyrostab.diagnose.statistics.base import NullDraw, SizeFit, Sizes, Statistic
+from gyrostab.diagnose.statistics.base import NullDraw, Region, SizeFit, Sizes, Statistic
 from gyrostab.diagnose.statistics.null_counts import null_counts
 from gyrostab.diagnose.statistics.sample_sizes import estimate_from_counts
 from gyrostab.diagnose.statistics.scores import (
@@ -83,13 +83,7 @@ class SampleCounts(Statistic):
 
         Anscombe's root makes the scatter of the counts equal; null records define their
         expectation. With a coarse quantization grid, counts that the grid alone changes are left
-        out.
-
-        Returns
-        -------
-        xarray.Dataset
-            See `gyrostab.diagnose.statistics.scores.statistic_dataset`. ``ratio`` and ``estimate``
-            are the count, or the mean kurtosis.
+        out. ``ratio`` and ``estimate`` are the count, or the mean kurtosis.
         """
         windows = window_set(blocks.sizes["block"], LENGTHS)
         samples = blocks["samples"].values.astype(float)
@@ -168,18 +162,9 @@ class SampleCounts(Statistic):
         """Leave out blocks with anomalous samples; if too many, free the shape of the spectrum."""
         if _is_everywhere(component):
             return state
-        axis = component.row[0]
-        anomalous = find_anomalous_blocks(component, state.blocks, state.settings)
-        if not anomalous.any():
-            return free_shape(state, axis)
-        keep = xr.DataArray(~anomalous, dims="block")
-        is_axis = state.blocks["axis"] == axis
-        blocks = state.blocks.copy()
-        for variable in ("mean", "power"):
-            blocks[variable] = blocks[variable].where(keep | ~is_axis)
-        if "cross" in blocks:
-            rows = np.array([name == axis for name in state.axes])
-            blocks["cross"] = cross_without(blocks, anomalous & rows[:, None])
+        blocks = mask_anomalous_blocks(state.blocks, [component], state.settings)
+        if blocks is state.blocks:
+            return free_shape(state, component.row[0])
         return replace(state, blocks=blocks)
 
     def noise_shares(
@@ -203,11 +188,11 @@ class SampleCounts(Statistic):
             fit.state.settings,
         )
 
-    def is_modelled_in(self, region: Mapping[str, Any], *, together: bool) -> bool:
+    def is_modelled_in(self, region: Region, *, together: bool) -> bool:
         """Return whether the mismatch is of several axes: anomalous blocks are left out there."""
         return bool(region["view"] == "cross_axis")
 
-    def describe(self, region: Mapping[str, Any], when: str) -> str:
+    def describe(self, region: Region, when: str) -> str:
         """Describe an unusual distribution of samples."""
         samples = _SAMPLES.get(str(region["what"]), "an unusual distribution of its samples")
         verb = "has" if len(region["axes"]) == 1 else "have"
@@ -265,11 +250,8 @@ def _count_evidence(
 def _grid_evidence(state: State, count_evidence: CountEvidence) -> Array:
     """Count samples of a rounded rate, one nat each: unrounded noise is never on the grid."""
     samples = state.blocks["samples"].values.sum(axis=1)
-    return (
-        np.where(count_evidence.rounded, samples, 0.0).astype(np.float64)
-        if count_evidence.rounded.size
-        else np.zeros(samples.size)
-    )
+    rounded = count_evidence.rounded if count_evidence.rounded.size else False
+    return np.where(rounded, samples, 0.0).astype(np.float64)
 
 
 def _is_everywhere(component: Component) -> bool:

@@ -16,6 +16,7 @@ __all__ = [
     "cube_root_score",
     "cumulative",
     "exponential_score",
+    "moving_sum",
     "statistic_dataset",
     "sum_over_windows",
     "window_set",
@@ -83,6 +84,14 @@ def cumulative(values: Array) -> Array:
     return np.pad(np.cumsum(values, axis=-1), [(0, 0)] * (values.ndim - 1) + [(1, 0)])
 
 
+def moving_sum(values: Array, span: int) -> Array:
+    """Return sums over `span` places of the last dimension around each, fewer at the ends."""
+    total = cumulative(values)
+    low = np.arange(values.shape[-1]) - span // 2
+    high = np.minimum(low + span, values.shape[-1])
+    return np.asarray(total[..., high] - total[..., np.maximum(low, 0)])
+
+
 def sum_over_windows(values: Any, windows: Windows) -> Any:
     """Sum over each window; blocks are the second last dimension, missing values must be zero.
 
@@ -142,9 +151,7 @@ def statistic_dataset(
     Parameters
     ----------
     name : str
-        Statistic, as named in diagnosis.json.
-    blocks : xarray.Dataset
-        From `gyrostab.diagnose.reduce.block_statistics.reduce_log`; defines the window edges.
+        Key ``view`` of its mismatches in diagnosis.json.
     columns : dict
         ``what`` (str), ``tau_min_s``, ``tau_max_s`` [s] and ``frequency`` [Hz] of each column, and
         ``floor``, the smallest standard deviation that null records may give a score.
@@ -154,8 +161,6 @@ def statistic_dataset(
         Axes of each row, separated by blanks; by default a row is an axis of the record.
     estimate : ndarray, optional
         Size of the mismatch, in `units`.
-    units : str
-        Unit of the estimate.
     one_sided : bool
         Whether only an excess is a mismatch.
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import xarray as xr
@@ -26,13 +25,14 @@ from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import Trial
 from gyrostab.diagnose.reduce.block_statistics import MIN_BLOCKS
 from gyrostab.diagnose.settings import DEFAULTS, Settings
-from gyrostab.diagnose.statistics.base import SizeFit, Sizes, Statistic
+from gyrostab.diagnose.statistics.base import Region, SizeFit, Sizes, Statistic
 from gyrostab.diagnose.statistics.scores import (
     SINE_TAU_CYCLES,
     Array,
     Windows,
     cube_root_score,
     cumulative,
+    moving_sum,
     statistic_dataset,
     sum_over_windows,
 )
@@ -41,7 +41,7 @@ from gyrostab.kernels.spectra.line_levels import LEAK_LINES, local_level
 
 __all__ = ["SpectralLine"]
 
-_LEAK_LINES = 2  # lines on either side that a line leaks into
+_WIDTH_LINES = 5  # of a line with its leakage
 _CERTAIN_SIGMA = 3.0  # by which the power of a line varies more than that of noise; design choice
 _MAX_COHERENCE_BLOCKS = 3.0  # longest coherence time that the scatter of block powers determines
 _SLOW_CYCLES = 2.0  # in a block, below which slow noise has the power of a sine; design choice
@@ -62,11 +62,7 @@ class SpectralLine(Statistic):
     def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         """Score every line of the spectrum, in parts of the record and in the whole.
 
-        Returns
-        -------
-        xarray.Dataset or None
-            None without lines. ``estimate`` is the amplitude of a sine with the same excess [degree
-            hour-1].
+        ``estimate`` is the amplitude of a sine with the same excess [degree hour-1].
         """
         if "line_power" not in blocks:
             return None
@@ -85,8 +81,10 @@ class SpectralLine(Statistic):
             count = count * _equal_block_share(blocks, windows)
             around = _mean_around(flat)
             ratio = flat / around
-        # A sum over lines, which only a recording needs.
-        excess = _sum_leakage(flat - around) * expected if flat.ndim == 3 else np.zeros(1)
+        # A quarter of squared amplitude times block for a sine; only a recording needs it.
+        excess = (
+            moving_sum(flat - around, _WIDTH_LINES) * expected if flat.ndim == 3 else np.zeros(1)
+        )
         z = cube_root_score(ratio, count / (1.0 + 1.0 / (2.0 * _AROUND_LINES)))
         half = SINE_TAU_CYCLES / frequency  # at which the Allan variance of a sine is largest
         return statistic_dataset(
@@ -178,9 +176,8 @@ class SpectralLine(Statistic):
         is_sway = fit.components[0].candidate.effect == "real_motion"
         name = "sway" if is_sway else fit.components[0].variant.columns[0]
         out: dict[str, tuple[float, float]] = {}
-        for component in sorted(
-            fit.components, key=lambda component: component.evidence_nats
-        ):  # the strongest of several lines of an axis is last
+        # the strongest of several lines of an axis is last
+        for component in sorted(fit.components, key=lambda component: component.evidence_nats):
             amplitude, frequency = estimate_line(
                 blocks, component.row[0], component.place, fit.state.settings
             )
@@ -193,11 +190,7 @@ class SpectralLine(Statistic):
         return out
 
     def can_explain(
-        self,
-        component: Component,
-        region: Mapping[str, Any],
-        blocks: xr.Dataset,
-        settings: Settings,
+        self, component: Component, region: Region, blocks: xr.Dataset, settings: Settings
     ) -> bool:
         """Return whether a mismatch is at the frequency of the line, or of samples."""
         if str(region["view"]) not in self.explains:
@@ -220,7 +213,7 @@ class SpectralLine(Statistic):
             <= region["tau_max_s"] * settings.line_tau_ratio
         )
 
-    def is_modelled_in(self, region: Mapping[str, Any], *, together: bool) -> bool:
+    def is_modelled_in(self, region: Region, *, together: bool) -> bool:
         """Return whether the mismatch is of several axes: the baseline has their common lines."""
         return bool(region["view"] == "cross_axis")
 
@@ -231,7 +224,7 @@ class SpectralLine(Statistic):
         tau = SINE_TAU_CYCLES / float(blocks["line_frequency"].values[component.place])
         return tau, tau
 
-    def describe(self, region: Mapping[str, Any], when: str) -> str:
+    def describe(self, region: Region, when: str) -> str:
         """Describe a line."""
         return (
             f"The spectrum of {axes_text(region['axes'])} has a line at "
@@ -268,28 +261,15 @@ def _equal_block_share(blocks: xr.Dataset, windows: Windows) -> Array:
     return np.asarray(even[..., place - 1] * (1.0 - share) + even[..., place] * share)
 
 
-def _sum_leakage(excess: Array) -> Array:
-    """Sum over a line and its leakage; for a sine, a quarter of squared amplitude times block."""
-    n = excess.shape[-1]
-    total = cumulative(excess)
-    place = np.arange(n)
-    return np.asarray(
-        total[..., np.minimum(place + _LEAK_LINES + 1, n)]
-        - total[..., np.maximum(place - _LEAK_LINES, 0)]
-    )
-
-
 def _mean_around(flat: Array) -> Array:
     """Return the mean of the lines around each, without its leakage; one-sided near the ends."""
     n = flat.shape[-1]
     total = cumulative(flat)
-    place = np.arange(n)
-    width = min(2 * _AROUND_LINES + 2 * _LEAK_LINES + 1, n)
-    low = np.clip(place - width // 2, 0, n - width)
-    near_low, near_high = np.maximum(place - _LEAK_LINES, 0), np.minimum(place + _LEAK_LINES + 1, n)
-    inner = total[..., near_high] - total[..., near_low]
+    width = min(2 * _AROUND_LINES + _WIDTH_LINES, n)
+    low = np.clip(np.arange(n) - width // 2, 0, n - width)
     outer = total[..., low + width] - total[..., low]
-    return np.asarray((outer - inner) / np.maximum(width - (near_high - near_low), 1))
+    inner, count = moving_sum(flat, _WIDTH_LINES), moving_sum(np.ones(n), _WIDTH_LINES)
+    return np.asarray((outer - inner) / np.maximum(width - count, 1.0))
 
 
 def estimate_line(

@@ -64,58 +64,33 @@ class Transfer(Statistic):
         coefficient: xr.DataArray,
     ) -> list[Candidate]:
         """Return candidates of rates that follow another channel or axis at every frequency."""
-        return [
-            replace(candidate, driver=driver)
-            for candidate in self._candidates_by_channel(kind.name, predictions, windows, blocks)
-        ]
-
-    def _candidates_by_channel(
-        self,
-        name: str,
-        predictions: Sequence[tuple[dict[str, Any], Prediction]],
-        windows: Windows,
-        blocks: xr.Dataset,
-    ) -> list[Candidate]:
-        """Build candidates of rates that follow another channel or axis at every frequency."""
-        reference_channels = (
-            {str(channel) for channel in blocks["reference"].values}
-            if "reference" in blocks.dims
-            else set()
-        )
-        axes = set(windows.axes) if "cross" in blocks else set()
+        usable = set(_reference_channels(blocks))
+        usable |= set(windows.axes) if "cross" in blocks else set()
         by_channel: dict[str, list[Variant]] = {}
         for values, prediction in predictions:
             for (parameter, channel), transfer in prediction.transfer.items():
-                if channel in reference_channels or channel in axes:
+                if channel in usable:
                     by_channel.setdefault(channel, []).append(
                         Variant(values, (parameter,), np.asarray(transfer)[None])
                     )
-        if by_channel and effects()[name].stage == "motion":
-            unknown_channels = [
-                channel for channel in sorted(reference_channels) if not _is_known_channel(channel)
-            ]
-            for channel in [*by_channel, *unknown_channels]:
+        if by_channel and kind.stage == "motion":
+            for channel in [*by_channel, *_unknown_channels(blocks)]:
                 by_channel[channel] = by_channel.get(channel, []) + _any_transfer(
                     windows.frequency.size
                 )
         return [
-            Candidate(name, self, (), distinct_variants(variants), reference=(channel,))
+            Candidate(kind.name, self, driver, distinct_variants(variants), reference=(channel,))
             for channel, variants in by_channel.items()
         ]
 
     def candidates_without_channel(self, kind: type[Effect], blocks: xr.Dataset) -> list[Candidate]:
         """Build real motion that only channels of no known effect see, such as a seismometer."""
-        if kind.name != "real_motion" or "reference" not in blocks.dims:
+        if kind.name != "real_motion":
             return []
         variants = distinct_variants(_any_transfer(blocks.sizes["band"]))
-        unknown_channels = sorted(
-            str(channel)
-            for channel in blocks["reference"].values
-            if not _is_known_channel(str(channel))
-        )
         return [
             Candidate(kind.name, self, (), variants, reference=(channel,))
-            for channel in unknown_channels
+            for channel in _unknown_channels(blocks)
         ]
 
     def model(
@@ -145,13 +120,8 @@ class Transfer(Statistic):
         axis = component.row[0]
         power = reference_channel_power(component.candidate.reference[0], state.blocks)
         power = np.where(np.isfinite(power), power, 0.0)
-        columns = np.concatenate(
-            [
-                component.variant.design.real * np.sqrt(power)[:, None],
-                component.variant.design.imag * np.sqrt(power)[:, None],
-            ],
-            axis=-1,
-        )
+        root, design = np.sqrt(power)[:, None], component.variant.design
+        columns = np.concatenate([design.real * root, design.imag * root], axis=-1)
         state = state.with_columns("transfer", axis, list(np.moveaxis(columns, 1, 0)))
         for band in range(power.shape[1]):
             column = np.zeros_like(power)
@@ -188,7 +158,7 @@ def reference_channel_of(
                     has_power, np.conj(cross[number]) if pair[0] == name else cross[number], np.nan
                 )
         return cross_power, reference_channel_power(name, blocks)
-    place = [str(channel) for channel in blocks["reference"].values].index(name)
+    place = _reference_channels(blocks).index(name)
     cross = records_last(data["reference_cross"].values, 4)
     return cross[row, place], reference_channel_power(name, blocks)
 
@@ -209,6 +179,16 @@ def _moving_share(name: str, power: Array, state: State) -> Array:
         noise = np.fmax(noise, np.nanquantile(power, state.settings.quiescent_share, axis=0))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(power > state.settings.clear_sigma**2 * noise, 1.0 - noise / power, 0.0)
+
+
+def _reference_channels(blocks: xr.Dataset) -> list[str]:
+    """Return the channels on the log's time."""
+    return list(map(str, blocks["reference"].values)) if "reference" in blocks.dims else []
+
+
+def _unknown_channels(blocks: xr.Dataset) -> list[str]:
+    """Return the channels on the log's time that may show motion, but drive no known effect."""
+    return [name for name in sorted(_reference_channels(blocks)) if not _is_known_channel(name)]
 
 
 def _is_known_channel(channel: str) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.reduce.block_statistics import pair_indices
 from gyrostab.diagnose.statistics.base import Statistic
 from gyrostab.diagnose.statistics.power import LEVEL_COLUMNS
 from gyrostab.diagnose.statistics.scores import (
@@ -61,18 +62,11 @@ class VarianceStability(Statistic):
         noise in 100 blocks of 200 samples (w = 93 each) five, if v = 9 %. Averages over k blocks
         have a variance smaller by the root of k, and lose variations faster than some 3 k blocks.
 
-        Returns
-        -------
-        xarray.Dataset or None
-            None for too short a record. A column for each span and each band, each quarter of the
-            bands, all bands, and each band against its own mean. ``ratio`` is the scatter over that
-            of steady noise, ``estimate`` the variation of the power, rms over mean. Several axes
-            have a row of all together, the mean of their levels, because axes often fluctuate
-            together.
-
-        Notes
-        -----
-        The lowest bands are left out, because a moving mean shows in them.
+        Each span has a column for each band, each quarter of the bands, all bands, and each band
+        against its own mean; the lowest bands are left out, because a moving mean shows in them.
+        ``ratio`` is the scatter over that of steady noise, ``estimate`` the variation of the power,
+        rms over mean. Several axes have a row of all together, the mean of their levels, because
+        axes often fluctuate together. None for too short a record.
         """
         block_count, block = blocks.sizes["block"], float(blocks.attrs["block_s"])
         spans = [span for span in SPANS if block_count // span >= _MIN_AVERAGES]
@@ -137,12 +131,7 @@ def scale_to_expected(
     """Scale the powers in some intervals to the expected mean, when their levels are known.
 
     The first two and the last two blocks of an interval are scaled separately, because the level
-    may change within them.
-
-    Parameters
-    ----------
-    spans : sequence of (axes, begin, end)
-        Names of axes, and times [s since the start].
+    may change within them. A span has names of axes, begin, and end [s since the start].
     """
     if not spans:
         return blocks
@@ -169,12 +158,8 @@ def scatter_moments(count: Array, total: Array, inverse: Array) -> tuple[Array, 
     """Return mean and variance of the scatter of gamma-distributed levels relative to their mean.
 
     Exact for levels of one scale: their mean is then independent of their ratios (Lukacs 1955), so
-    that the moments of Q are those of the sum of squares over those of the mean.
-
-    Parameters
-    ----------
-    count, total, inverse : ndarray
-        Number of levels, sum of their shapes, and sum of the inverse shapes.
+    that the moments of Q are those of the sum of squares over those of the mean. The arguments are
+    the number of levels, the sum of their shapes, and the sum of the inverse shapes.
 
     Examples
     --------
@@ -193,9 +178,8 @@ def scatter_moments(count: Array, total: Array, inverse: Array) -> tuple[Array, 
 
 def _band_groups(bands: int) -> list[NDArray[np.int64]]:
     """Return the bands of each column: one, a quarter of them, all."""
-    used_shape = [np.array([band]) for band in range(bands)]
     return [
-        *used_shape,
+        *(np.array([band]) for band in range(bands)),
         *(group for group in np.array_split(np.arange(bands), _BAND_GROUPS) if group.size > 1),
         np.arange(bands),
     ]
@@ -269,10 +253,7 @@ def _coherence_factor(
     """Return the variance factor (record), 1, 1, group of the mean over coherent axes."""
     if "cross" not in blocks:
         return np.ones(1)
-    axes = [str(axis) for axis in blocks["axis"].values]
-    first, second = (
-        [axes.index(str(axis)) for axis in blocks[name].values] for name in ("first", "second")
-    )
+    first, second = pair_indices(blocks)
     power = np.nan_to_num(blocks["power"].values[..., used])
     cross = np.nan_to_num(blocks["cross"].values[..., used])
     with np.errstate(divide="ignore", invalid="ignore"):
