@@ -64,28 +64,15 @@ _START_QUANTILES = (
 
 @dataclass(frozen=True)
 class SwitchingEvidence:
-    """Evidence of a bias that switches between two levels within blocks.
+    """Evidence of a bias that switches between two levels within blocks."""
 
-    Attributes
-    ----------
-    evidence_nats : float
-        Lower bound of the log Bayes factor against noise [nats]; -inf with fewer than
-        `min_switches` switches, or if normal noise of any spectrum comes within
-        `two_level_nats`.
-    share : ndarray, shape (block, sub_block)
-        Share of each sub-block on the upper level.
-    times : ndarray, shape (2,)
-        Mean times on the lower and on the upper level [s].
-    switch_count : float
-        Expected number.
-    refuted : bool
-        Two levels beat white noise with a random walk, but the sub-blocks do not have two levels.
-    """
-
+    #: Lower bound of the log Bayes factor against noise; -inf with fewer than `min_switches`
+    #: switches, or if normal noise of any spectrum comes within `two_level_nats`.
     evidence_nats: float
-    share: Array
-    times: Array
-    switch_count: float
+    share: Array  # (block, sub_block): share of each sub-block on the upper level
+    times: Array  # (2,): mean times on the lower and on the upper level [s]
+    switch_count: float  # expected number
+    #: Two levels beat white noise with a random walk, but the sub-blocks do not have two levels.
     refuted: bool = False
 
 
@@ -97,22 +84,9 @@ def switching_evidence(
     given: Array | None = None,
     settings: Settings = DEFAULTS,
 ) -> SwitchingEvidence | None:
-    """Compute the evidence of two levels in means over sub-blocks.
+    """Compute the evidence of two levels in means over sub-blocks; None without, or with too few.
 
-    Parameters
-    ----------
-    data : xarray.Dataset
-        Block statistics of one record with ``sub_block_mean`` (axis block sub_block) [degree
-        hour-1] and ``sub_block_samples``.
-    baseline : xarray.Dataset
-        As for `gyrostab.diagnose.evidence.telegraph.telegraph_evidence`.
-    given : ndarray, shape (block, sub_block, column), optional
-        Columns of effects in the model in both cases.
-
-    Returns
-    -------
-    SwitchingEvidence or None
-        None if the record has no such means, or too few.
+    The given columns (block, sub_block, column) of effects are in the model in both cases.
     """
     if "sub_block_mean" not in data or "record" in data.dims:
         return None
@@ -211,12 +185,8 @@ def _sub_block_means(data: xr.Dataset, baseline: xr.Dataset, axis: str) -> tuple
     merged = 1
     while samples.size // merged > _MAX_MEANS and merged < samples.shape[1]:
         merged *= 2
-    count = samples.reshape(len(samples), -1, merged).sum(axis=2)
-    total = (
-        np.where(samples > 0, np.nan_to_num(mean) * samples, 0.0)
-        .reshape(len(samples), -1, merged)
-        .sum(axis=2)
-    )
+    sums = np.where(samples > 0, np.nan_to_num(mean) * samples, 0.0)
+    count, total = (part.reshape(len(samples), -1, merged).sum(axis=2) for part in (samples, sums))
     enough = (count >= _MIN_SAMPLE_SHARE * max(np.median(count), 1.0)) & np.isfinite(
         axis_data["mean"].values
     )[:, None]
@@ -350,10 +320,6 @@ def switching_powers(share: Array, low: float, high: float, size: int, rate: flo
         Share of each sub-block on the upper level.
     low, high : float
         Mean times on both levels [s].
-    size : int
-        Samples of a block.
-    rate : float
-        Sampling rate [Hz].
 
     Returns
     -------
@@ -379,9 +345,8 @@ def switching_powers(share: Array, low: float, high: float, size: int, rate: flo
         ).real
     frequency = (edges[:-1] + edges[1:] - 1) / 2.0 * rate / size
     moves = np.abs(np.diff(share.ravel(), prepend=share[0, 0])).reshape(share.shape).sum(axis=1)
-    usual = (
-        low * high / (low + high) ** 2 * lorentz_density(frequency, low * high / (low + high), rate)
-    )
+    memory = low * high / (low + high)
+    usual = low * high / (low + high) ** 2 * lorentz_density(frequency, memory, rate)
     beyond = moves[:, None] / max(float(moves.mean()), 1e-300) * usual
     return np.where(
         frequency < _MAX_PERIODS_PER_SUB_BLOCK * rate * share.shape[1] / size, out, beyond

@@ -20,18 +20,9 @@ LENGTHS = ((100.0, 1.0 / 36.0), (350.0, 1.0 / 10.0), (900.0, 1.0 / 4.0))
 
 
 def fold_blocks(blocks: xr.Dataset) -> xr.DataArray:
-    """Assign every block to a fold, at every length.
+    """Assign every block to a fold, 0 to 3, at every length: ``fold(length, block)``.
 
-    Parameters
-    ----------
-    blocks : xarray.Dataset
-        From `reduce_log`, with dimension `block` and `begin` and `end` [s].
-
-    Returns
-    -------
-    xarray.DataArray
-        ``fold(length, block)``, 0 to 3; coordinate ``length`` of an interval [s], a whole number of
-        blocks.
+    The coordinate ``length`` of an interval [s] is a whole number of blocks.
 
     Raises
     ------
@@ -68,11 +59,9 @@ def fold_blocks(blocks: xr.Dataset) -> xr.DataArray:
 
 
 def fold_subsets(fold: xr.DataArray) -> NDArray[np.bool_]:
-    """Return the blocks used: all, then all but each fold, fold by fold and length by length.
+    """Return the blocks used (1 + lengths * FOLDS, block): all, then all but each fold.
 
-    Returns
-    -------
-    ndarray of bool, shape (1 + lengths * FOLDS, block)
+    The folds of a length follow each other.
     """
     values = fold.values
     subsets = [values != number for number in range(FOLDS)]

@@ -99,22 +99,12 @@ def mean_factors(
     given: Array | None = None,
     folds: xr.DataArray | None = None,
 ) -> Array:
-    """Compute factors of designs in the block means.
+    """Compute factors of designs in the block means of an axis, one record or many of equal gaps.
 
     Parameters
     ----------
-    data : xarray.Dataset
-        Block statistics, one record or many with the same gaps: ``mean`` ((record,) axis block)
-        [degree hour-1].
-    baseline : xarray.Dataset
-        ``known_mean``, ``mean_variance``, ``grid_K``, ``grid_B``, ``grid_prior``,
-        ``grid_calibrated``.
     designs : sequence of ndarray, shape (block,) or (block, column)
         Columns in any unit.
-    axis : str
-        Axis of the data.
-    tier : {"free", "calibrated"}
-        Freedom of the noise.
     given : ndarray, shape (block, column), optional
         Columns in the model with and without the design (effects already named).
 
@@ -197,25 +187,14 @@ def noise_columns(baseline: xr.Dataset, *, axis: str, tier: Tier = "free") -> tu
 
 
 class LinearModel(NamedTuple):
-    """A linear model of data that are independent from cell to cell.
+    """A linear model of data that are independent from cell to cell."""
 
-    Attributes
-    ----------
-    values : ndarray, shape (block, cell, record)
-    weight : ndarray, shape (block, cell)
-        One over the variance; 0 for no data.
-    designs : list of ndarray, shape (block, cell, column)
-    given : ndarray, shape (block, cell, column)
-        Columns in the model with and without a design.
-    precision : ndarray, shape (column, column)
-        For the given columns; negative on the diagonal for a nearly free column, whose precision is
-        taken from the data.
-    """
-
-    values: Array
-    weight: Array
-    designs: list[Array]
-    given: Array
+    values: Array  # (block, cell, record)
+    weight: Array  # (block, cell): one over the variance; 0 for no data
+    designs: list[Array]  # (block, cell, column) each
+    given: Array  # (block, cell, column): columns in the model with and without a design
+    #: (column, column): for the given columns; negative on the diagonal for a nearly free column,
+    #: whose precision is taken from the data.
     precision: Array
 
 
@@ -235,13 +214,7 @@ def with_independent_cells(
 
 
 def linear_model_factors(model: LinearModel, folds: xr.DataArray) -> Array:
-    """Compute factors of designs in independent cells.
-
-    Returns
-    -------
-    ndarray, shape (subset, 1 + design, record)
-        As in `mean_factors`.
-    """
+    """Compute factors of designs in independent cells, in the shape of `mean_factors`."""
     _, width, records = model.values.shape
     weight = np.where(
         np.isfinite(model.weight) & np.isfinite(model.values).all(axis=2), model.weight, 0.0
@@ -277,14 +250,8 @@ def linear_model_factors(model: LinearModel, folds: xr.DataArray) -> Array:
     subset_products = [total]
     for length in range(classes.shape[1]):
         for number in range(FOLDS):
-            held = _sum_products(
-                [
-                    part
-                    for part, label in zip(products, classes[:, length], strict=True)
-                    if label == number
-                ],
-                total,
-            )
+            of_fold = zip(products, classes[:, length] == number, strict=True)
+            held = _sum_products([part for part, is_held in of_fold if is_held], total)
             subset_products.append(Products(*(a - b for a, b in zip(total, held, strict=True))))
     out = np.stack(
         [

@@ -42,24 +42,12 @@ _MAX_PRODUCTS_AT_ONCE = 10_000  # designs times records times grid points; limit
 
 
 class Products(NamedTuple):
-    """Products of whitened data and columns on some blocks; without a grid, one grid point.
+    """Products of whitened data y and columns x on some blocks; without a grid, one grid point."""
 
-    Attributes
-    ----------
-    square : ndarray, shape (grid, record)
-        ``y' y``.
-    cross : ndarray, shape (grid, column, record)
-        ``x' y``.
-    gram : ndarray, shape (grid, column, column)
-        ``x' x``.
-    log_determinant : ndarray, shape (grid,)
-        Of the covariance.
-    """
-
-    square: Array
-    cross: Array
-    gram: Array
-    log_determinant: Array
+    square: Array  # (grid, record): y' y
+    cross: Array  # (grid, column, record): x' y
+    gram: Array  # (grid, column, column): x' x
+    log_determinant: Array  # (grid,): of the covariance
 
 
 def marginalise(products: Products, given: int, precision: Array) -> Products:
@@ -132,8 +120,6 @@ def mean_products(
         Designs.
     variance : ndarray, shape (block,)
         White variance of the means [degree2 hour-2].
-    step : float
-        Length of a block [s].
     K, B : ndarray, shape (grid,)
         Random walk [deg/h^1.5] and flicker [deg/h].
     present : ndarray of bool, shape (block,)
@@ -141,8 +127,6 @@ def mean_products(
     pairs : two ndarrays, optional
         Columns whose products are needed, from `column_pairs`; other products are 0. All by
         default.
-    wander : Wander, optional
-        Other random processes in the means.
     """
     n, width = columns.shape
     stacked = np.ascontiguousarray(np.concatenate([columns, values], axis=1))
@@ -187,17 +171,9 @@ def column_pairs(
 
 
 def power_products(residual: Array, weight: Array, columns: Array) -> Products:
-    """Compute products of relative band powers and columns, cells weighted by their shape.
+    """Compute products of data (cell, record) and columns (cell, column) in independent cells.
 
-    Parameters
-    ----------
-    residual : ndarray, shape (cell, record)
-        ``power / spectrum - 1``.
-    weight : ndarray, shape (cell,)
-        Shape of the gamma distribution of the power; 0 for no data, where `residual` may be any
-        finite value.
-    columns : ndarray, shape (cell, column)
-        Relative change of the spectrum for a unit of each factor.
+    The weight (cell,) is 0 for no data, where the data may have any finite value.
     """
     weighted = (columns * weight[:, None]).T
     square = weight @ (residual * residual)
@@ -247,7 +223,7 @@ def remove_common_part(
 def log_evidence(
     products: Products, designs: Sequence[NDArray[np.int64]], limits: Array, log_weight: Array
 ) -> Array:
-    """Compute the log marginal likelihood without any design, and with each.
+    """Compute the log marginal likelihood without any design, and with each, (1 + design, record).
 
     Parameters
     ----------
@@ -257,10 +233,6 @@ def log_evidence(
         Error of every factor in white noise; 0 for columns without effect.
     log_weight : ndarray, shape (grid,)
         Logarithm of the weight of every grid point; not normalised.
-
-    Returns
-    -------
-    ndarray, shape (1 + design, record)
     """
     weight = log_weight - np.logaddexp.reduce(log_weight)
     base = np.ascontiguousarray(
@@ -304,10 +276,10 @@ def held_out_evidence(
     owner: Sequence[int] | NDArray[np.int64],
     *,
     weight: Sequence[float] | Array | None = None,
-    folds: int = FOLDS,
 ) -> Array:
-    """Compute the held-out evidence of candidates, the largest over the fold lengths.
+    """Compute the held-out evidence (candidate, record), the largest over the fold lengths [nats].
 
+    It is the sum over the folds of the log Bayes factor on all blocks minus that without the fold.
     The longest interval is the whole record, predicted from nothing: its evidence is the Bayes
     factor itself. What lasts for most of the record is predicted from both sides of any shorter
     interval, also by a random walk.
@@ -321,11 +293,6 @@ def held_out_evidence(
         Index of the candidate of each design.
     weight : array_like, shape (design,) or (design, record), optional
         Prior probability of each design relative to the others of its candidate; equal by default.
-
-    Returns
-    -------
-    ndarray, shape (candidate, record)
-        Sum over the folds of the log Bayes factor on all blocks minus that without the fold [nats].
 
     Examples
     --------
@@ -344,6 +311,6 @@ def held_out_evidence(
         chosen = owner == candidate
         log_prior = chance[chosen] - np.logaddexp.reduce(chance[chosen], axis=0)
         mixed = np.logaddexp.reduce(factors[:, chosen] + log_prior, axis=1)
-        parts = (mixed[:1] - mixed[1:]).reshape(-1, folds, mixed.shape[1]).sum(axis=1)
+        parts = (mixed[:1] - mixed[1:]).reshape(-1, FOLDS, mixed.shape[1]).sum(axis=1)
         out.append(np.maximum(parts.max(axis=0), mixed[0]))
     return np.array(out).reshape(len(out), factors.shape[2])

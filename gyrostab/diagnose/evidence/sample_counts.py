@@ -45,16 +45,7 @@ _PRIOR_SHAPE, _PRIOR_RATE = 0.5, 0.05
 
 
 def has_coarse_grid(blocks: xr.Dataset) -> NDArray[np.bool_]:
-    """Find the axes with so coarse a quantization grid that it alone causes `GRID_COUNTS`.
-
-    Parameters
-    ----------
-    blocks : xarray.Dataset
-        Recording or null records.
-
-    Returns
-    -------
-    ndarray of bool, shape (axis,)
+    """Find the axes (axis,) with so coarse a quantization grid that it alone causes `GRID_COUNTS`.
 
     Examples
     --------
@@ -74,13 +65,9 @@ def has_coarse_grid(blocks: xr.Dataset) -> NDArray[np.bool_]:
 
 
 def hidden_by_grid(blocks: xr.Dataset, name: str) -> NDArray[np.bool_]:
-    """Find the axes on which a coarse quantization grid alone causes a count or the kurtosis.
+    """Find the axes (axis,) on which a coarse grid alone causes a count or the kurtosis.
 
     Repeats and zeros remain usable where noise is normal: null records then have as many.
-
-    Returns
-    -------
-    ndarray of bool, shape (axis,)
     """
     coarse = has_coarse_grid(blocks)
     if name not in _PREDICTED_COUNTS or not coarse.any():
@@ -114,16 +101,8 @@ def excess_extremes(values: NDArray[Any]) -> NDArray[Any]:
     """Count samples at the ends of the range, without the first two of the record.
 
     Every record has a smallest and a largest sample. A count of which two are certain is not
-    Poisson distributed; without a quantization grid there is never a third one by chance.
-
-    Parameters
-    ----------
-    values : ndarray, shape (..., block)
-        Samples equal to the smallest or largest of the record.
-
-    Returns
-    -------
-    ndarray, shape (..., block)
+    Poisson distributed; without a quantization grid there is never a third one by chance. Counts
+    are by (..., block).
 
     Examples
     --------
@@ -164,10 +143,6 @@ class ExpectedCounts:
                 values = nulls[name].values.astype(np.float64)
                 self.sums[name].append(excess_extremes(values) if name == "extremes" else values)
 
-    def block_count(self, name: str) -> Array:
-        """Return the counts (record, axis, block)."""
-        return np.concatenate(self.sums[name])
-
 
 def expected_counts(values: Array) -> tuple[Array, Array]:
     """Return the mean count (axis, block) and the overdispersion (axis,) of null records.
@@ -201,7 +176,7 @@ class CountEvidence:
         for name, counts in expected.sums.items():
             if not counts:
                 continue
-            values = expected.block_count(name)
+            values = np.concatenate(counts)  # (record, axis, block)
             if name == "kurtosis":
                 good = np.isfinite(values)
                 clean = np.where(good, values, np.nan)
@@ -238,19 +213,9 @@ def _best_held_out(evidence: Array, lengths: int) -> Array:
 def sample_count_evidence(
     values: Array, mean: Array, spread: Array, subsets: NDArray[np.bool_]
 ) -> Array:
-    """Compute the held-out evidence of a raised count.
+    """Compute the held-out evidence (record, axis) of a raised count (record, axis, block).
 
-    Parameters
-    ----------
-    values : ndarray, shape (record, axis, block)
-    mean, spread : ndarray, shapes (axis, block) and (axis,)
-        From `expected_counts`.
-    subsets : ndarray of bool, shape (subset, block)
-        From `fold_subsets`.
-
-    Returns
-    -------
-    ndarray, shape (record, axis)
+    Mean (axis, block) and spread (axis,) are from `expected_counts`, subsets from `fold_subsets`.
     """
     log_ratios = []
     for subset in subsets:

@@ -20,10 +20,7 @@ _MAX_SKIRT_LINES = 40  # design choice
 
 
 def expected_lines(baseline: xr.Dataset, frequency: Array) -> Array:
-    """Return the expected density at frequencies [Hz], without known steady lines.
-
-    Shape (axis, line) [degree2 hour-2 Hz-1].
-    """
+    """Return the expected density (axis, line) at frequencies [Hz], without known steady lines."""
     spectrum = baseline["spectrum"].mean("block").values
     bands = np.log(baseline["frequency"].values)
     if "line_spectrum" in baseline:
@@ -39,9 +36,9 @@ def expected_lines(baseline: xr.Dataset, frequency: Array) -> Array:
 def line_evidence(power: Array, weight: Array, expected: Array | None = None) -> Array:
     """Compute the held-out evidence of a steady line, minus the log of the number of lines.
 
-    The level is that of the surrounding lines in each part of the record, and at least that of the
-    adjacent lines on either side, so that slopes and broad humps are not lines. The lowest two
-    lines have no lines below them and never count.
+    It is by record, axis, line. The level is that of the surrounding lines in each part of the
+    record, and at least that of the adjacent lines on either side, so that slopes and broad humps
+    are not lines. The lowest two lines have no lines below them and never count.
 
     Parameters
     ----------
@@ -51,10 +48,6 @@ def line_evidence(power: Array, weight: Array, expected: Array | None = None) ->
         Independent periodograms in each mean.
     expected : ndarray, shape (axis, line), optional
         Density that defines the slope of the level; flat by default.
-
-    Returns
-    -------
-    ndarray, shape (record, axis, line)
     """
     usable = (weight > 0) & np.isfinite(power).all(axis=(0, 3))
     share = np.where(usable, weight, 0.0)[..., None]

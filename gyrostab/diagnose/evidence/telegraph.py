@@ -56,34 +56,16 @@ _DRIFT_WAVES = (0, 8)  # slow cosines in the model while the course is searched;
 
 @dataclass(frozen=True)
 class TelegraphCourses:
-    """Biases of two levels, one for every record.
+    """Biases of two levels, one for every record, which is the first dimension."""
 
-    Attributes
-    ----------
-    share, spread : ndarray, shape (record, block)
-        Share of each block on the upper level, and its variance.
-    step : ndarray, shape (record,)
-        Upper minus lower level [degree hour-1].
-    times : ndarray, shape (record, 2)
-        Mean times on the lower and on the upper level [blocks].
-    switch_count : ndarray, shape (record,)
-        Expected number of switches.
-    cost : ndarray, shape (record,)
-        Cost of specifying the course [nats].
-    log : ndarray, shape (record,)
-        Log likelihood of the means, including white noise.
-    scale : ndarray, shape (record,)
-        Scatter over the expected white variance.
-    """
-
-    share: Array
-    spread: Array
-    step: Array
-    times: Array
-    switch_count: Array
-    cost: Array
-    log: Array
-    scale: Array
+    share: Array  # (record, block): share of each block on the upper level
+    spread: Array  # (record, block): its variance
+    step: Array  # upper minus lower level [degree hour-1]
+    times: Array  # (record, 2): mean times on the lower and on the upper level [blocks]
+    switch_count: Array  # expected number of switches
+    cost: Array  # of specifying the course [nats]
+    log: Array  # log likelihood of the means, including white noise
+    scale: Array  # scatter over the expected white variance
 
 
 def telegraph_courses(
@@ -101,11 +83,9 @@ def telegraph_courses(
     Parameters
     ----------
     values : ndarray, shape (block, record)
-        Block means [degree hour-1].
+        Block means [degree hour-1], of which those `present` are used.
     variance : ndarray, shape (block,)
         White variance of the means, a lower limit of the scatter.
-    present : ndarray of bool, shape (block,)
-        Blocks that are used.
     columns_given : ndarray, shape (block, column)
         Columns of free size, the first one constant.
     starts : sequence of (float, float)
@@ -162,16 +142,12 @@ def telegraph_courses(
 
 @dataclass(frozen=True)
 class _Fit:
-    """State of the fit by record.
+    """State of the fit by record."""
 
-    Sizes of the columns and of the step (record, column), mean times (record, 2), scale of the
-    noise (record,), and parts of a block.
-    """
-
-    size: Array
-    times: Array
-    scale: Array
-    parts: int = PARTS_PER_BLOCK
+    size: Array  # (record, column): sizes of the columns and of the step
+    times: Array  # (record, 2): mean times
+    scale: Array  # (record,): scale of the noise
+    parts: int = PARTS_PER_BLOCK  # of a block
 
 
 def _select_by_record(arrays: Sequence[Array], chosen: NDArray[np.int64]) -> Array:
@@ -272,22 +248,9 @@ def simulated_courses(
     count: int,
     rng: np.random.Generator,
 ) -> tuple[Array, Array]:
-    """Simulate means of two levels with the found parameters; return log likelihoods, shares.
+    """Simulate `count` records of two levels with the parameters of one record.
 
-    Parameters
-    ----------
-    courses : TelegraphCourses
-        Of one record.
-    variance, present
-        As in `telegraph_courses`.
-    parts : int
-        Parts of a block.
-    count : int
-        Number of simulated records.
-
-    Returns
-    -------
-    log, share : ndarray, shapes (record,) and (record, block)
+    Return log likelihoods (record,) and shares (record, block).
     """
     n, (low, high) = present.size, courses.times[0]
     share = np.stack([_simulate_course(n, low, high, rng) for _ in range(count)])
@@ -332,23 +295,11 @@ def telegraph_evidence(
     given: Array | None = None,
     settings: Settings = DEFAULTS,
 ) -> tuple[Array, TelegraphCourses]:
-    """Compute the evidence of a bias of two levels on an axis.
+    """Compute the evidence of a bias of two levels on an axis, and its course.
 
-    Parameters
-    ----------
-    data : xarray.Dataset
-        Block statistics, one record or many with the same gaps: ``mean`` ((record,) axis block)
-        [degree hour-1].
-    baseline : xarray.Dataset
-        As in `gyrostab.diagnose.evidence.held_out.mean_factors`.
-    given : ndarray, shape (block, column), optional
-        Columns in the model with and without it (effects already named).
-
-    Returns
-    -------
-    evidence_nats : ndarray, shape (record,)
-        Lower bound of the log Bayes factor [nats]; -inf with fewer than `min_switches` switches.
-    courses : TelegraphCourses
+    The evidence (record,) is a lower bound of the log Bayes factor [nats], -inf with fewer than
+    `min_switches` switches. Data, baseline and given columns are as in
+    `gyrostab.diagnose.evidence.held_out.mean_factors`.
     """
     values = values_by_record((data["mean"] - baseline["known_mean"]).sel(axis=axis), "block")
     setup = axis_noise(baseline, axis)
@@ -419,10 +370,8 @@ def course_evidence(
 
     Parameters
     ----------
-    products : Products
-        Of records and courses, in the same order.
     place : int
-        Index of the record and its course.
+        Index of the record and its course in the products.
     scatter : float
         Variance of the course over the white variance.
     log_weight : ndarray, shape (grid,)

@@ -31,22 +31,13 @@ _SCATTER = 0.5
 
 
 class Visits(NamedTuple):
-    """Visits to the levels of a bias.
+    """Visits to the levels of a bias."""
 
-    Attributes
-    ----------
-    unequal_nats : float
-        Log Bayes factor of different heights over equal ones [nats]; minus infinity with more
-        visits than blocks, whose heights cannot be known.
-    switch_count : int
-        Number of switches between visits that have more than half of some block or part.
-    columns : ndarray, shape (column, block)
-        Visits to the level whose heights differ more.
-    """
-
+    #: Log Bayes factor of different heights over equal ones; minus infinity with more visits than
+    #: blocks, whose heights cannot be known.
     unequal_nats: float
-    switch_count: int
-    columns: Array
+    switch_count: int  # between visits that have more than half of some block or part
+    columns: Array  # (column, block): visits to the level whose heights differ more
 
 
 def visit_columns(share: Array) -> Array:
@@ -79,18 +70,8 @@ def compare_visits(
 ) -> Visits:
     """Compute the evidence that the visits to one of the levels have different heights.
 
-    Both levels are equally likely to be that level.
-
-    Parameters
-    ----------
-    mean : ndarray, shape (block,)
-        Means of the blocks [degree hour-1].
-    share : ndarray, shape (block,) or (block, part)
-        Share of each block, or part of it, on the upper level.
-    block_s : float
-        Length of a block [s].
-    baseline, axis, given
-        As in `gyrostab.diagnose.evidence.telegraph.telegraph_evidence`.
+    Both levels are equally likely to be that level. The share is that of each block, or (block,
+    part) of its parts, on the upper level.
     """
     y = mean - baseline["known_mean"].sel(axis=axis).values
     present = np.isfinite(y)

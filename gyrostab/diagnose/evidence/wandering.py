@@ -14,33 +14,15 @@ Array = NDArray[np.float64]
 
 
 class RandomProcesses(NamedTuple):
-    """Random processes in the means of an axis in addition to flicker and random walk noise.
+    """Random processes in the means of an axis in addition to flicker and random walk noise."""
 
-    Attributes
-    ----------
-    square, time : ndarray, shape (process,)
-        Variances [degree2 hour-2] and correlation times [s] of exponentially correlated processes.
-    walk : ndarray, shape (block,)
-        Growth of the variance of random walks [degree2 hour-2 s-1].
-    """
-
-    square: Array
-    time: Array
-    walk: Array
+    square: Array  # (process,): variances of exponentially correlated processes [degree2 hour-2]
+    time: Array  # (process,): their correlation times [s]
+    walk: Array  # (block,): growth of the variance of random walks [degree2 hour-2 s-1]
 
 
 def expected_processes(baseline: xr.Dataset, axis: str | int) -> RandomProcesses:
-    """Return the random processes expected in the mean of an axis.
-
-    Parameters
-    ----------
-    baseline : xarray.Dataset
-        From `gyrostab.diagnose.baseline.from_model.baseline_from_model`, with ``wander_square``
-        (axis, wander), ``wander_time`` (wander) and ``wander_walk`` (axis, block). Without these,
-        there are no such processes.
-    axis : str or int
-        Name or index.
-    """
+    """Return the random processes expected in the mean of an axis, by name or index."""
     if "wander_square" not in baseline:
         return RandomProcesses(np.empty(0), np.empty(0), np.zeros(baseline.sizes["block"]))
     processes = baseline[["wander_square", "wander_time", "wander_walk"]]
@@ -56,10 +38,7 @@ def expected_processes(baseline: xr.Dataset, axis: str | int) -> RandomProcesses
 def with_walk(baseline: xr.Dataset, axis: str, walk: Array) -> xr.Dataset:
     """Return the baseline with another random walk in the mean of an axis.
 
-    Parameters
-    ----------
-    walk : ndarray, shape (block,)
-        Growth of its variance [degree2 hour-2 s-1].
+    The walk (block,) is the growth of its variance [degree2 hour-2 s-1].
     """
     axes = baseline["axis"].values.tolist()
     total = np.stack([expected_processes(baseline, row).walk for row in range(len(axes))])
