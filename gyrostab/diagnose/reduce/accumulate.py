@@ -390,14 +390,9 @@ class Accumulator:
 def _power_near_order(turned: NDArray[np.complex128], often: Array, harmonic: int) -> Array:
     """Measure the mean power (axis, block) a few turns per block from a harmonic, NaN if unknown.
 
-    Lines at which the block mean or a harmonic was removed, and their mirror lines, do not count.
-
-    Parameters
-    ----------
-    turned : ndarray, shape (axis, block, sample)
-        Samples without the harmonics, demodulated by this harmonic.
-    often : ndarray, shape (block,)
-        Turns of the tool in the block, negative if it turns back.
+    The samples (axis, block, sample) have no harmonics, and are demodulated by this one; the tool
+    turns so often (block,), negative if it turns back. Lines at which the block mean or a harmonic
+    was removed, and their mirror lines, do not count.
     """
     neighbours = np.concatenate([-np.arange(*_NEIGHBOUR_TURNS)[::-1], np.arange(*_NEIGHBOUR_TURNS)])
     power = np.abs(np.fft.fft(turned, axis=-1)[..., neighbours]) ** 2

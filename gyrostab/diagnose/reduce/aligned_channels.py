@@ -105,12 +105,7 @@ def align_channels(log: xr.Dataset) -> Aligned:
     matters, keep their stamps and enter by their block means. The same holds for accelerometers and
     magnetometers in a log with the rotation rate: the rotation rate already gives the lines at the
     rotation, and the wave of gravity would explain them a second time. A toolface always keeps its
-    stamps, because wrapped angles have no mean.
-
-    Parameters
-    ----------
-    log : xarray.Dataset
-        Regular log, in memory or lazy; a lazy log stays lazy.
+    stamps, because wrapped angles have no mean. A lazy log stays lazy.
 
     Examples
     --------
@@ -140,13 +135,8 @@ def align_channels(log: xr.Dataset) -> Aligned:
                     {name: ("time", placed.values, log[name].attrs)}
                 )
                 notes += [placed.note] if placed.note else []
-    unused_names = [
-        variable
-        for name in unused
-        for variable in (name, f"time_{name}")
-        if variable in log.variables
-    ]
-    return Aligned(log.drop_vars(unused_names), unused, notes)
+    with_times = [variable for name in unused for variable in (name, f"time_{name}")]
+    return Aligned(log.drop_vars(with_times, errors="ignore"), unused, notes)
 
 
 class _Placed(NamedTuple):
@@ -195,18 +185,9 @@ def _place_channel(log: xr.Dataset, name: str) -> _Placed | str | None:
         choose = _average_around
         reach = 1.0
         method = f"each sample has the mean of its values at {1e9 / period:.4g} Hz"
-    place_chunk = partial(
-        _place_samples,
-        clock,
-        start=start,
-        rate=rate,
-        reach=max(reach * period, 0.5e9 / rate),
-        choose=choose,
-    )
-    return _Placed(
-        _place_on_grid(log, name, clock, place_chunk, size),
-        _describe_placement(name, clock, start, rate, period, method),
-    )
+    grid = _Grid(clock, start, rate, max(reach * period, 0.5e9 / rate), choose)
+    note = _describe_placement(name, clock, start, rate, period, method)
+    return _Placed(_place_on_grid(log, name, grid, size), note)
 
 
 def _is_wave_of_rotation(log: xr.Dataset, name: str) -> bool:
@@ -246,62 +227,56 @@ def _describe_placement(
 # -------------------------------------------------------------------------------- chunk by chunk
 
 
-def _place_on_grid(log: xr.Dataset, name: str, clock: _Clock, place_chunk: Any, size: int) -> Any:
+@dataclass(frozen=True)
+class _Grid:
+    """Samples of the gyro that get the values of a channel."""
+
+    clock: _Clock  # of the channel
+    start: int  # of the gyro [ns since 1970]
+    rate: float  # of the gyro [Hz]
+    reach: float  # distance of a sample from the values that it needs [ns]
+    choose: _Choose
+
+    def find_needed_values(self, low: int, high: int) -> tuple[int, int]:
+        """Return the range of values that the samples need, with one on either side."""
+        first, last = (int(edge) for edge in grid_times(self.start, self.rate, [low, high - 1]))
+        reach = int(self.reach)
+        return max(self.clock.count_before(first - reach) - 1, 0), min(
+            self.clock.count_before(last + reach) + 1, self.clock.size
+        )
+
+    def place_values(self, values: Any, offset: int, low: int, high: int) -> Array:
+        """Return the values at the samples, NaN where no value is within reach."""
+        numbers = np.asarray(values, dtype=np.float64)
+        stamps = self.clock.stamps_between(offset, offset + numbers.size)
+        good = np.isfinite(numbers)
+        numbers, stamps = numbers[good], stamps[good]
+        if not numbers.size:
+            return np.full(high - low, np.nan)
+        instants = grid_times(self.start, self.rate, np.arange(low, high))
+        return np.asarray(self.choose(instants, stamps, numbers, self.reach, 1e9 / self.rate))
+
+
+def _place_on_grid(log: xr.Dataset, name: str, grid: _Grid, size: int) -> Any:
     """Return the samples of a channel on the grid; lazy, in the gyro's chunks, if the log is."""
     signal, data = log[signal_name(log)].transpose("axis", "time").data, log[name].data
     edges = [*range(0, size, _CHUNK_SAMPLES), size]
     if hasattr(signal, "chunks"):
         edges = np.concatenate([[0], np.cumsum(signal.chunks[1])]).tolist()
-    pieces = list(pairwise(edges))
-    spans = [_find_needed_values(clock, place_chunk, low, high) for low, high in pieces]
+    pieces = [(*grid.find_needed_values(low, high), low, high) for low, high in pairwise(edges)]
     if isinstance(signal, np.ndarray) and isinstance(data, np.ndarray):
         return np.concatenate(
-            [
-                place_chunk(data[a:b], a, low, high)
-                for (low, high), (a, b) in zip(pieces, spans, strict=True)
-            ]
+            [grid.place_values(data[a:b], a, low, high) for a, b, low, high in pieces]
         )
     import dask
     import dask.array as da
 
-    delayed_place = dask.delayed(place_chunk, pure=False)
+    place_values = dask.delayed(grid.place_values, pure=False)
     chunks = [
-        da.from_delayed(delayed_place(data[a:b], a, low, high), (high - low,), dtype=np.float64)
-        for (low, high), (a, b) in zip(pieces, spans, strict=True)
+        da.from_delayed(place_values(data[a:b], a, low, high), (high - low,), dtype=np.float64)
+        for a, b, low, high in pieces
     ]
     return da.concatenate(chunks)
-
-
-def _find_needed_values(clock: _Clock, place_chunk: Any, low: int, high: int) -> tuple[int, int]:
-    """Return the range of values that the samples `low` to `high` need, with one on either side."""
-    start, rate, reach = (place_chunk.keywords[word] for word in ("start", "rate", "reach"))
-    first, last = (int(edge) for edge in grid_times(start, rate, [low, high - 1]))
-    return max(clock.count_before(first - int(reach)) - 1, 0), min(
-        clock.count_before(last + int(reach)) + 1, clock.size
-    )
-
-
-def _place_samples(
-    clock: _Clock,
-    values: Any,
-    offset: int,
-    low: int,
-    high: int,
-    *,
-    start: int,
-    rate: float,
-    reach: float,
-    choose: _Choose,
-) -> Array:
-    """Return the values at the samples `low` to `high`, NaN where no value is within reach."""
-    numbers = np.asarray(values, dtype=np.float64)
-    stamps = clock.stamps_between(offset, offset + numbers.size)
-    good = np.isfinite(numbers)
-    numbers, stamps = numbers[good], stamps[good]
-    if not numbers.size:
-        return np.full(high - low, np.nan)
-    instants = grid_times(start, rate, np.arange(low, high))
-    return np.asarray(choose(instants, stamps, numbers, reach, 1e9 / rate))
 
 
 def _take_nearest(

@@ -37,12 +37,8 @@ _MIN_NEIGHBOUR_RATIO = 2.0  # times expected density from which noise near an or
 def block_samples(size: int, rate: float, block: Any = None) -> int:
     """Choose the block length: 20 s, less in short records, more beyond 5.6 h; in samples.
 
-    The length is a product of small primes.
-
-    Parameters
-    ----------
-    block : str or timedelta, optional
-        Requested length: a duration, or a number of samples such as ``"2000samples"``.
+    The length is a product of small primes. A requested one is a duration, or a number of samples
+    such as ``"2000samples"``.
 
     Raises
     ------
@@ -67,11 +63,10 @@ def block_samples(size: int, rate: float, block: Any = None) -> int:
                 f"a block needs 16 ({16 / rate:g} s) at least"
             )
     if size < MIN_BLOCKS * length:
-        minimum = f"{MIN_BLOCKS} blocks of {length / rate:g} s"
         raise OptionError(
-            f"the record of {size / rate:.4g} s ({size} samples at {rate:g} Hz) "
-            "is too short to diagnose: "
-            f"it must hold {minimum}, {MIN_BLOCKS * length / rate:g} s at least"
+            f"the record of {size / rate:.4g} s ({size} samples at {rate:g} Hz) is too short to "
+            f"diagnose: it must hold {MIN_BLOCKS} blocks of {length / rate:g} s, "
+            f"{MIN_BLOCKS * length / rate:g} s at least"
             + ("; give a shorter block" if block is not None else "")
         )
     return length
@@ -170,12 +165,7 @@ def noise_at_orders(blocks: xr.Dataset, expected: Array) -> Array:
     """Return the noise density near the rotation orders: the expected or a higher measured one.
 
     Waves unrelated to the tool, such as those of the ground, have the same power at an order as
-    next to it.
-
-    Parameters
-    ----------
-    expected : ndarray, shape (..., axis, block, harmonic)
-        [degree2 hour-2 Hz-1]
+    next to it. Densities are by (..., axis, block, harmonic).
     """
     if "order_level" not in blocks:
         return expected

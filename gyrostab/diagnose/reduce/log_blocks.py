@@ -42,9 +42,8 @@ class BlockBatch(NamedTuple):
 def numeric_channels(log: xr.Dataset) -> tuple[list[str], list[str]]:
     """Return the channels on the log's own time, and those with their own time stamps."""
     names = [name for name in log_channels(log) if np.issubdtype(log[name].dtype, np.number)]
-    return [name for name in names if log[name].dims == ("time",)], [
-        name for name in names if log[name].dims != ("time",)
-    ]
+    on_log_time = [name for name in names if log[name].dims == ("time",)]
+    return on_log_time, [name for name in names if name not in on_log_time]
 
 
 def count_samples(log: xr.Dataset) -> int:
@@ -53,14 +52,9 @@ def count_samples(log: xr.Dataset) -> int:
 
 
 def read_batches(log: xr.Dataset, size: int) -> Iterator[BlockBatch]:
-    """Read a log in order of time, every chunk once.
+    """Read a log in order of time, every chunk once, as blocks of `size` samples.
 
-    Parameters
-    ----------
-    log : xarray.Dataset
-        Regular log; its chunks set the size of the reads.
-    size : int
-        Samples of a block. An incomplete block at the end is not read.
+    The chunks set the size of the reads. An incomplete block at the end is not read.
     """
     rows = log.sizes["axis"] + len(numeric_channels(log)[0])
     blocks_per_batch = max(1, _SAMPLES_PER_BATCH // (rows * size))
@@ -143,17 +137,8 @@ def channel_at(
 def channel_means(log: xr.Dataset, name: str, edges: NDArray[np.int64], *, rms: bool) -> Array:
     """Average a channel with its own time stamps over intervals, interpolating empty intervals.
 
-    Parameters
-    ----------
-    edges : ndarray of int64, shape (n + 1,)
-        Ends of the intervals, rising [ns since 1970].
-    rms : bool
-        Root mean square instead of the mean.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        NaN where the channel has no value for longer than three of its median intervals.
+    The ends of the intervals rise [ns since 1970]. The mean, or the root mean square, is NaN where
+    the channel has no value for longer than three of its median intervals.
     """
     stamps = to_nanoseconds(log[f"time_{name}"].values)
     data = log[name].data

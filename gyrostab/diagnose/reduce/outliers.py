@@ -49,14 +49,9 @@ class Peaks(NamedTuple):
 
 
 def find_peaks(values: Array, histogram: NDArray[np.uint32]) -> Peaks:
-    """Find the peaks of some blocks of an axis that may be outliers; count in the histogram.
+    """Find the peaks of some blocks (block, sample) of an axis that may be outliers.
 
-    Parameters
-    ----------
-    values : ndarray, shape (block, sample)
-        NaN where missing.
-    histogram : ndarray, shape (block, `HISTOGRAM`)
-        Numbers of departures by size; updated.
+    The histogram (block, `HISTOGRAM`) of departures by size is updated.
 
     Examples
     --------
@@ -68,14 +63,8 @@ def find_peaks(values: Array, histogram: NDArray[np.uint32]) -> Peaks:
     """
     departure = np.empty_like(values)
     departures(values, departure, histogram)
-    return Peaks(
-        *peaks(
-            values,
-            departure,
-            _deviation_from_median(histogram.astype(np.int64)),
-            _MIN_OUTLIER_SIGMA,
-        )
-    )
+    deviation = _deviation_from_median(histogram.astype(np.int64))
+    return Peaks(*peaks(values, departure, deviation, _MIN_OUTLIER_SIGMA))
 
 
 def outlier_limit(samples: float) -> float:
@@ -107,16 +96,8 @@ def count_outliers(
     noise, the noise level fluctuates faster than that can follow. The limit is then the one that a
     log-normal level with the same surplus exceeds `EXPECTED_FALSE_OUTLIERS` times.
 
-    Parameters
-    ----------
-    histogram : ndarray, shape (axis, block, `HISTOGRAM`)
-        Numbers of departures by size.
-    peaks : sequence of sequence of Peaks
-        Of each axis, with block indices of the record.
-
-    Returns
-    -------
-    peaks, outliers : ndarray of int64, shape (axis, block)
+    The histogram is (axis, block, `HISTOGRAM`); the peaks of each axis have block indices of the
+    record. Both counts are (axis, block).
 
     Examples
     --------
@@ -128,18 +109,10 @@ def count_outliers(
     >>> number[0, [7, 9]], outliers[0, [7, 9]], int(number.sum())
     (array([1, 1]), array([3, 1]), 2)
     """
-    sums = np.concatenate(
-        [
-            np.zeros_like(histogram[:, :1], dtype=np.int64),
-            np.cumsum(histogram, axis=1, dtype=np.int64),
-        ],
-        axis=1,
-    )
-    block_count = np.arange(histogram.shape[1])
-    nearby = (
-        sums[:, np.minimum(block_count + _NEIGHBOUR_BLOCKS + 1, block_count.size)]
-        - sums[:, np.maximum(block_count - _NEIGHBOUR_BLOCKS, 0)]
-    )
+    sums = np.pad(np.cumsum(histogram, axis=1, dtype=np.int64), ((0, 0), (1, 0), (0, 0)))
+    block = np.arange(histogram.shape[1])
+    first = np.maximum(block - _NEIGHBOUR_BLOCKS, 0)
+    nearby = sums[:, np.minimum(block + _NEIGHBOUR_BLOCKS + 1, block.size)] - sums[:, first]
     narrow, wide = _deviation_from_median(np.diff(sums, axis=1)), _deviation_from_median(nearby)
     adjacent = np.pad(narrow, ((0, 0), (1, 1)))
     adjacent = np.maximum(adjacent[:, :-2], adjacent[:, 2:])
@@ -217,15 +190,8 @@ def simultaneous_zeros(values: Array) -> NDArray[np.int64]:
     """Count exact zeros that all axes have at once; on a single axis, zeros in runs.
 
     Lost samples that were filled with zeros look like this. A loop that sticks at zero does so in
-    each axis separately, whenever its rate passes zero.
-
-    Parameters
-    ----------
-    values : ndarray, shape (axis, block, sample)
-
-    Returns
-    -------
-    ndarray of int64, shape (axis, block)
+    each axis separately, whenever its rate passes zero. The count of values (axis, block, sample)
+    is (axis, block).
 
     Examples
     --------
@@ -252,14 +218,8 @@ def simultaneous_zeros(values: Array) -> NDArray[np.int64]:
 def simultaneous_samples(present: NDArray[np.bool_]) -> dict[tuple[bool, ...], NDArray[np.int64]]:
     """Count the samples of each block that two or more axes have at once, by set of axes.
 
-    Parameters
-    ----------
-    present : ndarray of bool, shape (axis, block, sample)
-
-    Returns
-    -------
-    dict of tuple of bool to ndarray of int64, shape (block,)
-        Set of axes with a sample -> number of instants at which exactly these have one.
+    Returned for each set of axes is the number (block,) of instants at which exactly these have a
+    sample, from presence (axis, block, sample).
 
     Examples
     --------
@@ -297,18 +257,8 @@ def zeros_beyond_chance(
 ) -> NDArray[np.int64]:
     """Subtract the zeros that independent axes, or a single axis, have at once by chance.
 
-    Parameters
-    ----------
-    together, zeros, samples : ndarray of int, shape (..., axis, block)
-        Zeros of `simultaneous_zeros`, all zeros, and samples.
-    subset : ndarray of bool, shape (subset, axis)
-        Axes that have samples at once; unused with a single axis.
-    at_once : ndarray of int, shape (subset, block)
-        Number of samples that exactly these axes have at once.
-
-    Returns
-    -------
-    ndarray of int64, shape (..., axis, block)
+    Zeros of `simultaneous_zeros`, all zeros, and samples are by (..., axis, block). A subset of the
+    axes (subset, axis) has samples at once as often as `at_once` (subset, block).
 
     Examples
     --------
@@ -344,11 +294,6 @@ def probability_all_zero(share: Array, subset: NDArray[np.bool_]) -> Array:
 
 def quantization_step(values: Array) -> float:
     """Find the quantization step of values with any offset; 0 if there is none, or it is too fine.
-
-    Parameters
-    ----------
-    values : ndarray
-        A few thousand values; NaN is ignored.
 
     Examples
     --------

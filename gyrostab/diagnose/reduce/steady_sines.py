@@ -113,20 +113,17 @@ class SineSearch:
     def strongest(self, lines: Array) -> dict[str, Any]:
         """Return the strongest sine nearest to each line (frequencies [Hz], evenly spaced).
 
-        Returns
-        -------
-        dict of str to ndarray
-            ``sine_nats (axis, line)``, minus infinity without a search; ``sine_frequency`` and
-            ``sine_resolution (line,)`` [Hz]; ``sine_square`` and ``sine_square_stderr (axis,
-            line)`` [degree2 hour-2], the square of the amplitude.
+        The variables are described in `gyrostab.diagnose.reduce.schema.BLOCK_STATISTICS`; the
+        evidence is minus infinity without a search.
         """
         axes = self.segment.shape[0]
+        unknown = np.full((axes, lines.size), np.nan)
         out: dict[str, Any] = {
-            "sine_nats": np.full((axes, lines.size), -np.inf),
+            "sine_nats": np.full(unknown.shape, -np.inf),
             "sine_frequency": lines.copy(),
             "sine_resolution": np.full(lines.size, np.nan),
-            "sine_square": np.full((axes, lines.size), np.nan),
-            "sine_square_stderr": np.full((axes, lines.size), np.nan),
+            "sine_square": unknown,
+            "sine_square_stderr": unknown.copy(),
         }
         best = np.full(lines.size, -np.inf)
         for spectrum in self.spectra:
@@ -202,12 +199,8 @@ def sine_factors(ratio: Array, count: Array | float) -> Array:
     With a sine of random phase whose expected gain is E nats, each of n periodograms is 1 + E / n
     times an exponential variable, so that their mean r has the likelihood ratio
     :math:`\exp(n r x / (1 + x)) / (1 + x)^n` for x = E / n. It is averaged over strengths from 3 to
-    half a million nats, evenly spaced in log.
-
-    Parameters
-    ----------
-    ratio : ndarray
-        Mean of `count` periodograms of equal noise, over its density.
+    half a million nats, evenly spaced in log. The ratio is the mean of `count` periodograms of
+    equal noise, over its density.
 
     Examples
     --------

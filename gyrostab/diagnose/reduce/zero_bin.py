@@ -34,19 +34,8 @@ def bin_widths(values: Array, step: float) -> tuple[Array, Array]:
     """Measure the widths of the zero bin and of its neighbours, in steps, with standard errors.
 
     The logarithms of the counts of the other bins are a parabola in the rate, as in normal noise.
-    It gives the number of values per step.
-
-    Parameters
-    ----------
-    values : ndarray
-        Values on a quantization grid [degree hour-1]; NaN is ignored.
-    step : float
-        Quantization step of a grid through 0 [degree hour-1]; 0 for none.
-
-    Returns
-    -------
-    width, error : ndarray, shape (2,)
-        In the order of `BINS`; NaN where not measurable.
+    It gives the number of values per step. Both results are in the order of `BINS`, and NaN where
+    not measurable. The grid goes through 0; its step is 0 for none.
 
     Examples
     --------
@@ -104,15 +93,7 @@ def empty_zone(values: Array) -> tuple[float, float]:
     the same width beyond has the levels that a gap leaves out: by chance they are few, and on a
     quantization grid there is one.
 
-    Parameters
-    ----------
-    values : ndarray
-        Samples of an axis [degree hour-1]; NaN is ignored.
-
-    Returns
-    -------
-    width, error : float
-        NaN without such a zone.
+    NaN without such a zone.
 
     Examples
     --------
