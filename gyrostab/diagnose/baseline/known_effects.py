@@ -17,11 +17,6 @@ from gyrostab.diagnose.baseline.predicted_effects import (
     predict_effect,
     sizes_by_axis,
 )
-from gyrostab.diagnose.baseline.wandering import (
-    Wandering,
-    add_up_wandering,
-    is_described_by_variance,
-)
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import (
     cross_without,
@@ -29,6 +24,7 @@ from gyrostab.diagnose.predict.linear_model import (
     spread_by_gaps,
 )
 from gyrostab.diagnose.reduce.block_statistics import pair_indices
+from gyrostab.diagnose.reduce.schema import BASELINE, label_variables
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.physics.base import Effect
 from gyrostab.physics.logger import LoggerFilter
@@ -37,13 +33,24 @@ from gyrostab.simulate.model import Model
 
 __all__ = [
     "KnownEffects",
+    "Wandering",
     "expect_known_effects",
     "expect_known_motion",
     "remove_known_motion",
+    "with_wandering",
 ]
 
 Array = NDArray[np.float64]
 _EVERYWHERE = "lattice"  # the anomaly of every sample
+
+
+class Wandering(NamedTuple):
+    """Random means of all axes: exponentially correlated biases, and random walks."""
+
+    square: Array  # (axis, process): variances of exponentially correlated biases [degree2 hour-2]
+    time: Array  # (process,): their correlation times [s]
+    walk: Array  # (axis, block): growth of the variance of random walks [degree2 hour-2 s-1]
+    power: Array  # (axis, block): power of all of them in the lowest band [degree2 hour-2 Hz-1]
 
 
 class KnownEffects(NamedTuple):
@@ -89,11 +96,6 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
         for added_power in powers
         if added_power.acting.prediction.line is not None and added_power.factor.any()
     ]
-    sizes = {
-        "bands": blocks.sizes["band"],
-        "block_count": blocks.sizes["block"],
-        "axes": blocks.sizes["axis"],
-    }
     return KnownEffects(
         mean=_expected_means(described, blocks),
         spectrum=spread_by_gaps((noise + added) * response, blocks),
@@ -101,9 +103,7 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
         lines=expect_lines(blocks, narrow, response[:, 0])
         if narrow and "line_power" in blocks
         else {},
-        wandering=add_up_wandering(
-            [(_process_squares(active, blocks), active.prediction) for active in described], **sizes
-        ),
+        wandering=_add_up_wandering(described, blocks),
         left_out=[
             active.effect.name
             for active in acting
@@ -153,10 +153,25 @@ def _shows_elsewhere(active: _ActingEffect) -> bool:
     """Return whether an effect also shows outside means, powers and cross-spectra."""
     prediction = active.prediction
     elsewhere = prediction.marks or prediction.transfer or prediction.order
-    if elsewhere or prediction.phase_locked or not is_described_by_variance(prediction):
+    if elsewhere or prediction.phase_locked or not _is_described_by_variance(prediction):
         return True
-    here = prediction.mean or prediction.level or prediction.spectrum
-    return not here and prediction.response is None
+    is_shown = prediction.mean or prediction.level or prediction.spectrum
+    return not is_shown and prediction.response is None
+
+
+def _is_described_by_variance(prediction: Prediction) -> bool:
+    """Return whether the variance fully describes what an effect does to the means at random.
+
+    It does for a constant correlation time without steps.
+    """
+    return not prediction.levels and all(
+        _is_steady(*process) for process in prediction.wander.values()
+    )
+
+
+def _is_steady(time: float, variance: Array) -> bool:
+    """Return whether a process has a constant variance, or is a walk."""
+    return bool(np.isinf(time) or np.ptp(variance) == 0.0)
 
 
 def _expected_means(acting: Sequence[_ActingEffect], blocks: xr.Dataset) -> Array:
@@ -225,13 +240,45 @@ def _shared_cross(
     return spread_by_gaps(shared, blocks, "pair") if shared.any() else None
 
 
-def _process_squares(active: _ActingEffect, blocks: xr.Dataset) -> dict[str, Array]:
-    """Return squared sizes of random processes in the means, (axis,) each."""
-    squares = {}
-    for name in active.prediction.wander:
-        squares[name] = np.zeros(blocks.sizes["axis"])
-        squares[name][active.rows] = sizes_by_axis(active.effect, name, active.axes) ** 2
-    return squares
+def _add_up_wandering(acting: Sequence[_ActingEffect], blocks: xr.Dataset) -> Wandering:
+    """Add up the random means of several effects."""
+    axes, block_count, bands = (blocks.sizes[name] for name in ("axis", "block", "band"))
+    square, time = [], []
+    walk, power = np.zeros((axes, block_count)), np.zeros((axes, block_count))
+    for active in acting:
+        prediction = active.prediction
+        for name, (memory, variance) in prediction.wander.items():
+            if prediction.levels or not _is_steady(memory, variance):
+                continue
+            size = np.zeros(axes)
+            size[active.rows] = sizes_by_axis(active.effect, name, active.axes) ** 2
+            if np.isinf(memory):
+                walk += size[:, None] * variance
+            else:
+                square.append(size * variance[0])
+                time.append(memory)
+            if name in prediction.spectrum:
+                density = np.asarray(prediction.spectrum[name])
+                by_band = density.reshape(-1, block_count, bands, density.shape[-1] // bands)
+                power += size[:, None] * by_band[0, :, 0].mean(axis=-1)
+    return Wandering(np.array(square).reshape(-1, axes).T, np.array(time), walk, power)
+
+
+def with_wandering(baseline: xr.Dataset, known: Wandering, spectrum: Array) -> xr.Dataset:
+    """Add random processes of the means to a baseline with these powers (axis, block, band).
+
+    They are not white noise of the means, whatever they add to the lowest band.
+    """
+    if not (known.square.any() or known.walk.any()):
+        return baseline
+    white = baseline["mean_variance"] * (1.0 - known.power / spectrum[..., 0])
+    arrays = {
+        "mean_variance": white.values,
+        "wander_square": known.square,
+        "wander_time": known.time,
+        "wander_walk": known.walk,
+    }
+    return baseline.assign(label_variables(arrays, BASELINE))
 
 
 def expect_known_motion(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -51,18 +52,13 @@ def expect_lines(
         prediction = predict_effect(effect, blocks, chosen, frequency)
         band_power += (unspread * density).mean(axis=1) * response
         for name, values in prediction.spectrum.items():
-            size = np.abs(complex_factors(effect, name, chosen)[:, None]) ** 2 * values.mean(
-                axis=-2
-            )
+            square = np.abs(complex_factors(effect, name, chosen)[:, None]) ** 2
+            size = square * values.mean(axis=-2)
             places = 0 if prediction.line is None else prediction.line.size // blocks.sizes["block"]
             is_line = np.count_nonzero(values, axis=-1).max() <= places
             peak = resonance_density(effect, name, blocks, chosen)
             if peak is not None:
-                broad[rows] += (
-                    np.abs(complex_factors(effect, name, chosen)[:, None]) ** 2
-                    * peak
-                    * passed[rows]
-                )
+                broad[rows] += square * peak * passed[rows]
                 continue
             own_leak = leak[1]
             if (
@@ -101,21 +97,14 @@ def resonance_density(
     fine = frequency[0] / finer * np.arange(1, finer * frequency.size + 1)
     prediction = predict_effect(effect, blocks, axes, fine)
     density = prediction.spectrum[name].reshape(-1, fine.size)[0].copy()
-    centre = (
-        fine.size
-        if prediction.line is None
-        else int(np.argmin(np.abs(fine - prediction.line.flat[0])))
-    )
+    line = prediction.line
+    centre = fine.size if line is None else int(np.argmin(np.abs(fine - line.flat[0])))
     inside = (np.arange(_PEAK_POINTS) + 0.5) / _PEAK_POINTS - 0.5
     # The peak may be narrower than the steps of the density.
     for place in range(max(centre - 1, 0), min(centre + 2, fine.size)):
         frequencies = fine[place] + (fine[1] - fine[0]) * inside
-        density[place] = (
-            predict_effect(effect, blocks, axes, frequencies)
-            .spectrum[name]
-            .reshape(-1, inside.size)[0]
-            .mean()
-        )
+        finest = predict_effect(effect, blocks, axes, frequencies).spectrum[name]
+        density[place] = finest.reshape(-1, inside.size)[0].mean()
     window = np.abs(np.fft.fft(taper(size), size * finer)) ** 2
     reach = min(_LEAK_LINES, frequency.size // 2) * finer
     window = np.concatenate([window[-reach:], window[: reach + 1]])
@@ -125,11 +114,10 @@ def resonance_density(
     return np.asarray(tapered[fine.size + finer :: finer])
 
 
-def _sum_near(lines: Array) -> Array:
-    """Sum over each line (axis, line) and those that it leaks into."""
-    padded = np.pad(lines, ((0, 0), (LEAK_LINES, LEAK_LINES)))
-    neighbourhoods = np.lib.stride_tricks.sliding_window_view(padded, 2 * LEAK_LINES + 1, axis=-1)
-    return np.asarray(neighbourhoods.sum(axis=-1))
+def _take_leakage(lines: NDArray[Any]) -> NDArray[Any]:
+    """Return each line (..., line) and those that it leaks into, along another dimension."""
+    padded = np.pad(lines, [(0, 0)] * (lines.ndim - 1) + [(LEAK_LINES, LEAK_LINES)])
+    return np.lib.stride_tricks.sliding_window_view(padded, 2 * LEAK_LINES + 1, axis=-1)
 
 
 def average_in_bands(density: Array, blocks: xr.Dataset) -> Array:
@@ -190,11 +178,7 @@ def remove_known_lines(
         power.values - noise - largest_power
         > error * largest_power + settings.known_line_sigma * scatter
     )
-    padded_lines = np.pad(exceeds, ((0, 0), (0, 0), (LEAK_LINES, LEAK_LINES)))
-    # With the lines that it leaks into.
-    exceeds = np.lib.stride_tricks.sliding_window_view(
-        padded_lines, 2 * LEAK_LINES + 1, axis=-1
-    ).any(axis=-1)
+    exceeds = _take_leakage(exceeds).any(axis=-1)
     freed = noise + np.where(exceeds | (largest_power < error * noise), above, 0.0)
     freed = np.where(known_power > 0.0, np.maximum(freed, 0.0), power.values)
     out = {"line_power": power.copy(data=np.where(np.isfinite(power.values), freed, np.nan))}
@@ -202,10 +186,12 @@ def remove_known_lines(
         square, stderr = (blocks[f"sine_square{end}"].values for end in ("", "_stderr"))
         step = float(blocks["line_frequency"][0])
         known_square, largest_square = (
-            4.0 * step * _sum_near(lines[:, 0]) for lines in (known_power, largest_power)
+            4.0 * step * _take_leakage(lines[:, 0]).sum(axis=-1)
+            for lines in (known_power, largest_power)
         )
         exceeds = square - largest_square > error * largest_square + settings.clear_sigma * stderr
-        in_peak = _sum_near(baseline["peaks"].values) > error * noise[:, 0]
+        peaks = _take_leakage(baseline["peaks"].values).sum(axis=-1)
+        in_peak = peaks > error * noise[:, 0]
         new = (exceeds | (largest_square == 0.0)) & ~in_peak
         out["sine_nats"] = blocks["sine_nats"].where(new, -np.inf)
         out["sine_square"] = blocks["sine_square"] - known_square

@@ -31,17 +31,9 @@ _SERIES_TERMS = 40  # of the correlation series of `angle_share`
 def rounded_rates(
     blocks: xr.Dataset, baseline: xr.Dataset, *, settings: Settings = DEFAULTS
 ) -> NDArray[np.bool_]:
-    """Find the axes with a rounded or truncated rate, by the spectrum and the zero bin.
+    """Find the axes (axis,) with a rounded or truncated rate, by the spectrum and the zero bin.
 
-    Parameters
-    ----------
-    baseline : xarray.Dataset
-        From `calibrate_noise`; if it is not calibrated on this record, the record's own noise is
-        estimated.
-
-    Returns
-    -------
-    ndarray of bool, shape (axis,)
+    If the baseline is not calibrated on this record, the record's own noise is estimated.
     """
     step = blocks["quantization_step"].values
     if not (step > 0.0).any():
@@ -125,17 +117,9 @@ def _mean_angle_share(
 def angle_share(mean: NDArray[Any], scatter: float) -> NDArray[np.float64]:
     """Return the Q^2 of an angle counter over that of independent rounding errors.
 
-    Parameters
-    ----------
-    mean : ndarray
-        Mean increments of the angle [steps].
-    scatter : float
-        Their standard deviation [steps].
-
-    Notes
-    -----
     The rounding error is uniform; its correlation from one sample to the next is (6 / pi^2) sum
-    exp(-2 (pi n s)^2) cos(2 pi n m) / n^2 for normal increments of mean m and standard deviation s.
+    exp(-2 (pi n s)^2) cos(2 pi n m) / n^2 for normal increments of mean m and standard deviation s
+    [steps].
 
     Examples
     --------
