@@ -79,17 +79,8 @@ def null_records(
 ) -> Iterator[xr.Dataset]:
     """Draw block statistics with nothing but the noise (and known effects) of the baseline.
 
-    Parameters
-    ----------
-    baseline : xarray.Dataset
-        From `calibrate_noise`, `baseline_from_model` or `baseline_from_simulation`.
-    rng : numpy.random.Generator
-        Generator; the same state gives the same records for the same `chunk`.
-
-    Yields
-    ------
-    xarray.Dataset
-        As `blocks`, with a leading dimension ``record`` for random variables.
+    Random variables have a leading dimension ``record``. The same state of the generator gives the
+    same records for the same `chunk`.
 
     Examples
     --------

@@ -44,11 +44,9 @@ class MaximumDistribution:
 
     def level(self, p: float) -> float:
         """Return the value that the largest of a null record reaches with probability `p`."""
-        return (
-            float(self.start + self.scale * np.log(self.share / p))
-            if p < self.share
-            else float(np.quantile(self.sample, 1.0 - p))
-        )
+        if p < self.share:
+            return float(self.start + self.scale * np.log(self.share / p))
+        return float(np.quantile(self.sample, 1.0 - p))
 
 
 @dataclass(frozen=True)
@@ -84,13 +82,7 @@ class NullScores:
 def null_scores(
     baseline: xr.Dataset, nulls: Iterable[xr.Dataset], *, settings: Settings = DEFAULTS
 ) -> NullScores:
-    """Collect the scores of null records chunk by chunk, keeping only extreme scores.
-
-    Parameters
-    ----------
-    nulls : iterable of xarray.Dataset
-        Null records in chunks with a leading dimension ``record``.
-    """
+    """Collect the scores of null records chunk by chunk, keeping only extreme scores."""
     gathered: dict[str, _ScoreSums] = {}
     records = 0
     for chunk in nulls:

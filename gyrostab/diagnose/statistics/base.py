@@ -100,6 +100,7 @@ class Statistic:
     uses_line_spectra = False  # whether the score is of the spectrum at full resolution
     is_ratio = False  # whether the score is of a variance over the expected one
     grows_in_time = True  # whether adjacent regions of a mismatch are one
+    takes_noise = True  # whether an effect takes a share of the noise of an axis
 
     def __repr__(self) -> str:
         return f"<{self.name}>"
@@ -213,7 +214,7 @@ class Statistic:
         These are a power of known size (block, band), and powers and means of free size. The state
         is that without any effect, `weight` (axis, block, band) the powers with all effects.
         """
-        columns = self.condition(state, component).given
+        columns = self.condition(state, component).given if self.takes_noise else {}
         return 0.0, columns.get(("power", axis), []), columns.get(("mean", axis), [])
 
     def has_power_of_effect(self, component: Component, state: State) -> bool:

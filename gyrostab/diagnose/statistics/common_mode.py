@@ -142,10 +142,7 @@ def _shared_increments(
     blocks: xr.Dataset,
     baseline: xr.Dataset,
 ) -> tuple[Array, Array]:
-    """Return the increments of one white noise on all axes, and the share common to each pair.
-
-    The increments are by probe, axis, block.
-    """
+    """Return increments of one white noise (probe, axis, block), and the share of each pair."""
     series = np.random.default_rng(_PROBE_SEED).standard_normal((_PROBE_COUNT, 1, present.shape[1]))
     series = series * np.sqrt(np.nan_to_num(baseline["mean_variance"].values))
     spectrum = baseline["spectrum"].values[..., 0]
@@ -169,20 +166,19 @@ def _correlate_pairs(
     """Correlate pairs by (record), pair, window, averaged over `span` blocks; count averages."""
     first, second = ([pair[side] for pair in pairs] for side in (0, 1))
 
-    def over(values: Array) -> Array:
-        return np.asarray(sum_over_windows(values[..., None], windows)[..., 0])
-
     def products(values: Array) -> Array:
-        return over(values[..., first, :] * values[..., second, :])
+        product = values[..., first, :] * values[..., second, :]
+        return np.asarray(sum_over_windows(product, windows, axis=-1))
 
     averages = moving_sum(increments, span)
-    square, product = over(averages**2), products(averages)
+    square, product = sum_over_windows(averages**2, windows, axis=-1), products(averages)
     if shared is not None:
         product = product - shared[1][:, None] * products(moving_sum(shared[0], span)).mean(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         r = np.clip(product / np.sqrt(square[..., first, :] * square[..., second, :]), -1.0, 1.0)
     share = _OVERLAP_FACTOR / span if span > 1 else 1.0  # of an average that is independent
-    count = over((present[first] & present[second]).astype(float)) * share
+    joint = (present[first] & present[second]).astype(float)
+    count = sum_over_windows(joint, windows, axis=-1) * share
     memory = _blocks_per_value(averages, first, second)[..., None] * share
     return np.where(count >= _MIN_AVERAGES, r, np.nan), count / np.maximum(memory, 1.0)
 

@@ -66,6 +66,7 @@ class CrossSpectrum(Statistic):
     is_in_baseline = True
     is_pairwise = True
     has_course = True
+    takes_noise = False  # only the effect itself gives the power of each axis
 
     def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         """Score the coherency of every pair of axes, in phase and in quadrature.
@@ -194,12 +195,6 @@ class CrossSpectrum(Statistic):
                 ],
             )
         return state
-
-    def noise_shares(
-        self, component: Component, axis: str, state: State, weight: Array
-    ) -> tuple[Array | float, list[Array], list[Array]]:
-        """Return nothing: only the effect itself gives the power of each axis."""
-        return 0.0, [], []
 
     def has_power_of_effect(self, component: Component, state: State) -> bool:
         """Return True: the powers of the axes have no column."""

@@ -263,22 +263,13 @@ def _matched_filter(residual: Array, noise: MeanNoise, windows: Windows) -> tupl
     total = weighted_ones.sum()
     weighted = weighted - weighted_ones * (weighted.sum(axis=-1, keepdims=True) / total)
     boxcar = np.empty(windows.first.size)
-    boxcar_information(
-        windows.first,
-        windows.stop,
-        noise.innovation,
-        noise.gain,
-        noise.decay,
-        noise.remaining,
-        boxcar,
-    )
-    across = sum_over_windows(weighted_ones[:, None], windows)[:, 0]
-    count = sum_over_windows(noise.present[:, None], windows)[:, 0]
+    boxcar_information(windows.first, windows.stop, *noise[1:], boxcar)
+    across = sum_over_windows(weighted_ones, windows, axis=-1)
+    count = sum_over_windows(noise.present, windows, axis=-1)
     information = boxcar - across**2 / total
     enough = (count >= 0.25 * windows.length) & (information > 1e-3 * boxcar)
-    return sum_over_windows(weighted[..., None], windows)[..., 0], np.where(
-        enough, information, np.nan
-    )
+    amount = sum_over_windows(weighted, windows, axis=-1)
+    return amount, np.where(enough, information, np.nan)
 
 
 def slow_coefficients(baseline: xr.Dataset, axis: int) -> tuple[float, float]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
@@ -31,32 +29,14 @@ _MAX_CORRELATION = 0.9999
 _CHANCE_ERROR_SHARE = 0.03
 
 
-class _GridChance(NamedTuple):
-    """Probabilities of a sample on the quantization grid, by block."""
-
-    zero: Array
-    # Given a zero, that the sample before is zero, too.
-    zero_again: Array
-    # That a sample repeats the one before, at another value than zero.
-    repeat: Array
-
-
 def null_counts(
     blocks: xr.Dataset, sd: Array, count: int, rng: np.random.Generator
 ) -> dict[str, NDArray[np.int64]]:
     """Draw outliers, repeats, extremes and zeros of Gaussian noise on the quantization grid.
 
-    Repeats and zeros follow from the scatter of each block, and from the correlation of
-    neighbouring samples that its band powers give.
-
-    Parameters
-    ----------
-    sd : ndarray, shape (axis, 2)
-        Standard deviations of a sample and of a difference of neighbours [degree hour-1].
-
-    Returns
-    -------
-    dict of str to ndarray of int, shape (record, axis, block)
+    Repeats and zeros (record, axis, block) follow from the scatter of each block, and from the
+    correlation of neighbouring samples that its band powers give. The standard deviations (axis, 2)
+    are of a sample and of a difference of neighbours [degree hour-1].
     """
     samples = blocks["samples"].values.astype(np.int64)
     adjacent = blocks["adjacent"].values.astype(np.int64)
@@ -67,25 +47,19 @@ def null_counts(
     chances = [
         _grid_chance(mean[axis], float(step), scatter[axis], correlation[axis], truncated[axis])
         if step > 0.0
-        else _GridChance(nothing, nothing, nothing)
+        else (nothing, nothing, nothing)
         for axis, step in enumerate(blocks["quantization_step"].values)
     ]
     has_zeros = blocks["zeros"].values.any(axis=1, keepdims=True)
     zero, zero_again, repeat = (np.stack(part) for part in zip(*chances, strict=True))
     size = (count, *samples.shape)
+    outliers = EXPECTED_FALSE_OUTLIERS * samples / np.maximum(samples.sum(axis=1, keepdims=True), 1)
     # an error of the probabilities is common to all blocks of an axis
     error = 1.0 + _CHANCE_ERROR_SHARE * rng.standard_normal((count, len(samples), 1))
     zeros = rng.binomial(samples, np.clip(np.where(has_zeros, zero, 0.0) * error, 0.0, 1.0))
     filled = _filled_zeros(blocks, zeros, samples, zero_again, rng)
     return {
-        "outliers": rng.poisson(
-            np.broadcast_to(
-                EXPECTED_FALSE_OUTLIERS
-                * samples
-                / np.maximum(samples.sum(axis=1, keepdims=True), 1),
-                size,
-            )
-        ),
+        "outliers": rng.poisson(np.broadcast_to(outliers, size)),
         "repeats": rng.binomial(adjacent, np.clip(repeat * error, 0.0, 1.0)),
         "zeros": zeros,
         "stuck": zeros - filled,
@@ -97,16 +71,8 @@ def null_counts(
 def neighbour_statistics(blocks: xr.Dataset, sd: Array) -> tuple[Array, Array]:
     """Measure the scatter of the samples of each block, and the correlation of neighbours.
 
-    Parameters
-    ----------
-    sd : ndarray, shape (axis, 2)
-        Standard deviations of a sample and of a difference of neighbours [degree hour-1], for axes
-        without measured powers.
-
-    Returns
-    -------
-    scatter, correlation : ndarray, shape (axis, block)
-        Interpolated over blocks with losses or outliers.
+    Both (axis, block) are interpolated over blocks with losses or outliers. The standard deviations
+    are as in `null_counts`, for axes without measured powers.
     """
     rate = float(blocks.attrs["sampling_rate_hz"])
     low, high = blocks["band_low"].values, blocks["band_high"].values
@@ -174,14 +140,15 @@ def _interpolate_means(mean: Array) -> Array:
 
 def _grid_chance(
     mean: Array, step: float, scatter: Array, correlation: Array, truncated: bool
-) -> _GridChance:
-    """Return the probabilities of zeros and repeats of correlated normal noise on a grid.
+) -> tuple[Array, Array, Array]:
+    """Return the probabilities, by block, of correlated normal noise on a grid.
 
-    The values before rounding are normal, and so are pairs of neighbours. A pair is in one bin with
-    the integral of its normal density over the square of that bin: by Gauss-Legendre quadrature,
-    bin by bin. Fine grids have many bins; the difference of neighbours then decides, with a
-    triangular weight, P = s / (sqrt(2 pi) d) (1 - s^2 / (12 d^2)) for the step s and the standard
-    deviation d of differences.
+    They are those of zero, of zero again after a zero, and of a repeat at another value. The values
+    before rounding are normal, and so are pairs of neighbours. A pair is in one bin with the
+    integral of its normal density over the square of that bin: by Gauss-Legendre quadrature, bin by
+    bin. Fine grids have many bins; the difference of neighbours then decides, with a triangular
+    weight, P = s / (sqrt(2 pi) d) (1 - s^2 / (12 d^2)) for the step s and the standard deviation d
+    of differences.
     """
     variance = np.maximum(scatter**2 - step**2 / 12.0, (0.05 * step) ** 2)
     # rounding errors of coarse grids are independent: the correlation is that before rounding
@@ -205,7 +172,7 @@ def _grid_chance(
             place = nearest + level
             pair_chance = _chance_in_bin(place * step - centre, 0.5 * step, inner, rho)[1]
             repeat += np.where(np.abs(place * step) < half_zero, 0.0, pair_chance)
-    return _GridChance(zero, zero_again, np.clip(repeat, 0.0, 1.0))
+    return zero, zero_again, np.clip(repeat, 0.0, 1.0)
 
 
 def _chance_in_bin(
@@ -213,12 +180,7 @@ def _chance_in_bin(
 ) -> tuple[Array, Array]:
     """Return the probabilities that a sample, and a pair of neighbours, are in a bin.
 
-    Parameters
-    ----------
-    middle : ndarray
-        Middle of the bin, relative to the mean of the samples.
-    half : float
-        Half of its width.
+    The middle of the bin is relative to the mean of the samples; `half` is half of its width.
     """
     nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_NODES)
     value = middle[:, None] + half * nodes

@@ -143,18 +143,12 @@ class Power(Statistic):
                 if np.abs(density).max(initial=0.0) > 0 and not _is_white_and_constant(density)
             }
             for chosen in column_choices(list(densities)):
-                yield Variant(
-                    case.values,
-                    chosen,
-                    np.stack([densities[name] for name in chosen]),
-                    squared=squared,
-                )
-        if case.prediction.response is not None:
-            yield Variant(
-                case.values,
-                (),
-                _filter_change(case.prediction.response, case.coefficient, frequency, rate)[None],
-            )
+                design = np.stack([densities[name] for name in chosen])
+                yield Variant(case.values, chosen, design, squared=squared)
+        response = case.prediction.response
+        if response is not None:
+            change = _filter_change(response, case.coefficient, frequency, rate)
+            yield Variant(case.values, (), change[None])
 
     def model(
         self, candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
@@ -294,25 +288,20 @@ def _surface_of_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows
         ) / 2.0 + _slow_allan_variance(blocks, baseline, k * block)[:, None]
         present = np.isfinite(d2) & np.isfinite(expected)
         pairs = Windows(windows.first, np.maximum(windows.stop - 2 * k + 1, windows.first))
-        count = sum_over_windows(present[..., None].astype(float), pairs)[..., 0]
+        count = sum_over_windows(present.astype(float), pairs, axis=-1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            fits = (count >= 0.5 * pairs.length) & (pairs.length > 0) & (windows.length >= 4 * k)
-            surfaces["observed"].append(
-                sum_over_windows(np.where(present, d2, 0.0)[..., None], pairs)[..., 0] / count
-            )
-            surfaces["expected"].append(
-                sum_over_windows(np.where(present, expected, 0.0)[..., None], pairs)[..., 0] / count
-            )
-            table = _gamma_shape(np.arange(int(count.max(initial=0)) + 1), k)
-            surfaces["shape"].append(np.where(fits, table[count.astype(np.int64)], np.nan))
-    if not sizes:
-        nothing = np.empty((*means.shape[:-1], windows.first.size, 0))
-        joined: dict[str, Any] = dict.fromkeys(surfaces, nothing)
-    else:
-        joined = {
-            name: np.stack(np.broadcast_arrays(*values), axis=-1)
-            for name, values in surfaces.items()
-        }
+            for name, values in (("observed", d2), ("expected", expected)):
+                total = sum_over_windows(np.where(present, values, 0.0), pairs, axis=-1)
+                surfaces[name].append(total / count)
+        fits = (count >= 0.5 * pairs.length) & (pairs.length > 0) & (windows.length >= 4 * k)
+        table = _gamma_shape(np.arange(int(count.max(initial=0)) + 1), k)
+        surfaces["shape"].append(np.where(fits, table[count.astype(np.int64)], np.nan))
+    joined: dict[str, Any] = {
+        name: np.stack(np.broadcast_arrays(*values), axis=-1)
+        if sizes
+        else np.empty((*means.shape[:-1], windows.first.size, 0))
+        for name, values in surfaces.items()
+    }
     tau = np.array(sizes, dtype=float) * block
     joined["columns"] = {
         "what": np.array(["avar"] * tau.size, dtype="<U8"),

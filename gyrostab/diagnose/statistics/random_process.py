@@ -52,6 +52,7 @@ class RandomProcess(BlockMeanStatistic):
     explains_motion = True
     has_course = True
     has_size = False
+    takes_noise = False
 
     def design(self, case: Prospect) -> Iterator[Variant]:
         """Yield processes slower than half a block."""
@@ -74,20 +75,15 @@ class RandomProcess(BlockMeanStatistic):
             prior = np.array([variant.weight for variant in candidate.variants])
             evidence_nats, best = [], []
             for axis in trial.state.axes:
+                of_sizes = [
+                    _walk_factors(variant, axis, trial.data, trial.state, _WALK_FACTORS)[1]
+                    for variant in candidate.variants
+                ]
+                # (variant, record)
+                factors = np.stack([np.logaddexp.reduce(by_size, axis=0) for by_size in of_sizes])
                 factors = (
-                    np.stack(
-                        [
-                            np.logaddexp.reduce(factor, axis=0) - np.log(len(factor))
-                            for factor in (
-                                _walk_factors(
-                                    variant, axis, trial.data, trial.state, _WALK_FACTORS
-                                )[1]
-                                for variant in candidate.variants
-                            )
-                        ]
-                    )
-                    + np.log(prior / prior.sum())[:, None]
-                )  # (variant, record)
+                    factors - np.log(_WALK_FACTORS.size) + np.log(prior / prior.sum())[:, None]
+                )
                 evidence_nats.append(np.logaddexp.reduce(factors, axis=0))
                 best.append(_plain_or_best(candidate, factors[:, 0], trial.state.settings))
             rows: list[tuple[str, ...]] = [(axis,) for axis in trial.state.axes]
@@ -116,12 +112,6 @@ class RandomProcess(BlockMeanStatistic):
     def is_modelled_in(self, region: Mapping[str, Any], *, together: bool) -> bool:
         """Return whether the baseline contains it: axes that wander together are in no model."""
         return not together
-
-    def noise_shares(
-        self, component: Component, axis: str, state: State, weight: Array
-    ) -> tuple[Array | float, list[Array], list[Array]]:
-        """Return nothing: the process is noise."""
-        return 0.0, [], []
 
 
 def _is_changing_walk(variant: Variant) -> bool:

@@ -73,6 +73,7 @@ class SampleCounts(Statistic):
     is_count = True
     explains_motion = True
     has_size = False
+    takes_noise = False
 
     def null(self, draw: NullDraw) -> Mapping[str, NDArray[Any]]:
         """Draw outliers, repeats, extremes and zeros by chance."""
@@ -100,13 +101,12 @@ class SampleCounts(Statistic):
         tail_score = np.where(
             used > 0, usual + np.clip(tail_score - usual, -_MAX_BLOCK_SIGMA, _MAX_BLOCK_SIGMA), 0.0
         )
-        n = sum_over_windows(used[..., None], windows)
+        excess = np.where(used > 0, np.nan_to_num(blocks["kurtosis"].values), 0.0)
+        n, tail_sum, excess_sum = (
+            sum_over_windows(values[..., None], windows) for values in (used, tail_score, excess)
+        )
         with np.errstate(divide="ignore", invalid="ignore"):
-            tails = np.where(
-                n > 0, sum_over_windows(tail_score[..., None], windows) / np.sqrt(n), np.nan
-            )
-            excess = np.where(used > 0, np.nan_to_num(blocks["kurtosis"].values), 0.0)
-            mean = sum_over_windows(excess[..., None], windows) / n
+            tails, mean = np.where(n > 0, tail_sum / np.sqrt(n), np.nan), excess_sum / n
         rate = float(blocks.attrs["sampling_rate_hz"])
         number = np.concatenate([counts, np.broadcast_to(mean, tails.shape)], axis=-1)
         z = np.concatenate([2.0 * np.sqrt(counts + 0.375), tails], axis=-1)
@@ -166,12 +166,6 @@ class SampleCounts(Statistic):
         if blocks is state.blocks:
             return free_shape(state, component.row[0])
         return replace(state, blocks=blocks)
-
-    def noise_shares(
-        self, component: Component, axis: str, state: State, weight: Array
-    ) -> tuple[Array | float, list[Array], list[Array]]:
-        """Return nothing: counts have no columns."""
-        return 0.0, [], []
 
     def has_power_of_effect(self, component: Component, state: State) -> bool:
         """Return whether no block is left out: with the blocks their power may be left out too."""

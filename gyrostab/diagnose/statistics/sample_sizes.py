@@ -50,14 +50,12 @@ def estimate_from_counts(
         )
         return _size_spikes(count, hours, _estimate_outliers(blocks, axis), settings)
     if effect == "held_samples":
-        usual = (
-            usual if float(blocks["quantization_step"].sel(axis=axis)) > 0.0 else 0.0
-        )  # without a quantization grid chance repeats no sample
+        if not float(blocks["quantization_step"].sel(axis=axis)) > 0.0:
+            usual = 0.0  # without a quantization grid chance repeats no sample
         count = max(float(blocks[mark].sel(axis=axis).sum()) - usual, 1.0)
         runs = _held_runs(blocks, axis, mark, usual)
-        length = (
-            max(count / runs, 1.0) / rate
-        )  # of a geometric law, whose standard deviation is its mean
+        # of a geometric law, whose standard deviation is its mean
+        length = max(count / runs, 1.0) / rate
         low, high = _poisson_interval(runs)
         return {
             "per_hour": (runs / hours, math.sqrt(runs) / hours, low / hours, high / hours),
@@ -194,21 +192,16 @@ def _estimate_outliers(blocks: xr.Dataset, axis: str) -> tuple[float, float, flo
     if not good.any():
         return None
     many = count[good]
-    max_excess = (
-        samples[good] / (many * (1.0 - many / samples[good])) - 3.0
-    )  # without noise, after removal of the block mean
+    # without noise, after removal of the block mean
+    max_excess = samples[good] / (many * (1.0 - many / samples[good])) - 3.0
     tails = np.minimum(excess[good] + 3.0, (1.0 - 1e-4) * max_excess)
     half, margin = tails - 3.0, max_excess - tails
     share = (half + np.sqrt(half**2 + margin * half)) / margin
     variance = blocks["variance"].sel(axis=axis).values
-    clean = (count == 0.0) & (
-        variance > 0.0
-    )  # most blocks may have spikes: the median of all is not that of the noise
-    usual = float(
-        np.median(
-            variance[clean] if clean.sum() >= MIN_CLEAN_BLOCKS else variance[good] / (1.0 + share)
-        )
-    )
+    # most blocks may have spikes: the median of all is not that of the noise
+    clean = (count == 0.0) & (variance > 0.0)
+    is_enough = clean.sum() >= MIN_CLEAN_BLOCKS
+    usual = float(np.median(variance[clean] if is_enough else variance[good] / (1.0 + share)))
     share = np.where(
         many > 1.0,
         np.fmin(share, np.maximum(variance[good] / usual - 1.0, 0.0) + VARIANCE_TOLERANCE_SHARE),

@@ -43,12 +43,9 @@ class Windows(NamedTuple):
 
 
 def window_set(block_count: int, lengths: Sequence[int], *, whole: bool = True) -> Windows:
-    """Return windows of several lengths, a fifth of their length apart (two fifths if long).
+    """Return windows of several lengths [blocks], a fifth of their length apart.
 
-    Parameters
-    ----------
-    lengths : sequence of int
-        Lengths [blocks]; those above half of the record are skipped.
+    In long records it is two fifths. Lengths above half of the record are skipped.
 
     Examples
     --------
@@ -60,13 +57,8 @@ def window_set(block_count: int, lengths: Sequence[int], *, whole: bool = True) 
     for window_length in lengths:
         if window_length > max(block_count // 2, 1):
             continue
-        step = max(
-            1,
-            round(
-                window_length
-                * (_WINDOW_STEP if block_count <= _MAX_DENSE_BLOCKS else _LONG_WINDOW_STEP)
-            ),
-        )
+        share = _WINDOW_STEP if block_count <= _MAX_DENSE_BLOCKS else _LONG_WINDOW_STEP
+        step = max(1, round(window_length * share))
         start = np.arange(0, block_count - window_length + 1, step)
         if start[-1] != block_count - window_length:
             start = np.append(start, block_count - window_length)
@@ -92,14 +84,16 @@ def moving_sum(values: Array, span: int) -> Array:
     return np.asarray(total[..., high] - total[..., np.maximum(low, 0)])
 
 
-def sum_over_windows(values: Any, windows: Windows) -> Any:
-    """Sum over each window; blocks are the second last dimension, missing values must be zero.
+def sum_over_windows(values: Any, windows: Windows, *, axis: int = -2) -> Any:
+    """Sum over each window; missing values must be zero. The blocks are along `axis`, -2 or -1.
 
     Examples
     --------
     >>> sum_over_windows(np.ones((4, 1)), window_set(4, (2,), whole=False))[:, 0]
     array([2., 2., 2.])
     """
+    if axis == -1:
+        return sum_over_windows(values[..., None], windows)[..., 0]
     total = np.zeros(
         (*values.shape[:-2], values.shape[-2] + 1, values.shape[-1]), dtype=values.dtype
     )
@@ -146,7 +140,7 @@ def statistic_dataset(
     units: str = "1",
     one_sided: bool = False,
 ) -> xr.Dataset:
-    """Assemble the dataset of a statistic, which is the same for all.
+    """Assemble ``z``, ``ratio`` and ``estimate`` of a statistic by (record), row, window, tau.
 
     Parameters
     ----------
@@ -163,11 +157,6 @@ def statistic_dataset(
         Size of the mismatch, in `units`.
     one_sided : bool
         Whether only an excess is a mismatch.
-
-    Returns
-    -------
-    xarray.Dataset
-        ``z``, ``ratio`` and ``estimate`` by (record), row, window, tau.
     """
     dims = ("record", "row", "window", "tau") if z.ndim == 4 else ("row", "window", "tau")
     begin, end = blocks["begin"].values, blocks["end"].values

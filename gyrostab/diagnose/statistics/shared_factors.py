@@ -38,12 +38,8 @@ def estimate_shared_factors(
 
     The cross-spectra of all pairs weight white noise and low-passes of any bandwidth. No axis has
     more common noise than noise. A single pair determines only a product: each factor then lies
-    anywhere between the limits that the other axis and the axis itself set.
-
-    Returns
-    -------
-    dict of str to (float, float, float, float)
-        Value, standard error, low and high; ``bandwidth`` [Hz] is infinite for white noise.
+    anywhere between the limits that the other axis and the axis itself set. ``bandwidth`` [Hz] is
+    infinite for white noise.
     """
     name = components[0].variant.columns[0]
     rows = [row for row in pair_rows(state.blocks) if set(row) <= set(axes)]
@@ -147,13 +143,10 @@ def _score_bandwidth(
     """Return log likelihood, products of the pairs, their errors, and limits for one bandwidth."""
     variant = component.variant
     if "bandwidth" in variant.values:
-        changed_variant = replace(variant, values={**variant.values, "bandwidth": width})
-        variant = (
-            rebuild_variant(
-                component.candidate, changed_variant, state.blocks, state.baseline["coefficient"]
-            )
-            or variant
-        )
+        changed = replace(variant, values={**variant.values, "bandwidth": width})
+        coefficient = state.baseline["coefficient"]
+        rebuilt = rebuild_variant(component.candidate, changed, state.blocks, coefficient)
+        variant = rebuilt or variant
     moments = [
         component_mixture(replace(component, row=row), state, variant).moments() for row in rows
     ]

@@ -324,13 +324,8 @@ def line_quality(blocks: xr.Dataset, baseline: xr.Dataset, axis: str, place: int
 
     The power of a steady line is constant. That of an oscillator driven by noise, averaged over
     blocks of the length T, has the relative variance ``x - x^2 / 2 (1 - exp(-2 / x))`` for x = t /
-    T and the coherence time t = Q / (pi f).
-
-    Returns
-    -------
-    float
-        Infinite for a sine of constant phase, a line whose power varies no more than noise of the
-        band does, and one that is weaker than that noise.
+    T and the coherence time t = Q / (pi f). Infinite for a sine of constant phase, a line whose
+    power varies no more than noise of the band does, and one that is weaker than that noise.
     """
     if _has_constant_phase(blocks.sel(axis=axis), place):
         return math.inf
