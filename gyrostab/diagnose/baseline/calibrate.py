@@ -341,12 +341,10 @@ def assemble_baseline(
     expected = noise if spectrum is None else spectrum
     power, shape = blocks["power"].values, blocks["shape"].values
     floor = np.array([1e-3 * levels.min() / HOUR for levels in expected])
-    of_means = np.stack(
-        [
-            posterior.square if posterior.of_means is None else posterior.of_means
-            for posterior in posteriors
-        ]
-    )
+    of_means = square.copy()
+    for row, posterior in enumerate(posteriors):
+        if posterior.of_means is not None:
+            of_means[row] = posterior.of_means
     of_means[:, 1] = np.maximum(of_means[:, 1], floor)
     white = white_variance(blocks, of_means)
     white = white * np.maximum(expected[..., 0] / noise[..., 0], 0.1)
@@ -417,12 +415,13 @@ def _ramp_error(blocks: xr.Dataset, white: Array, value: Array, quiet: NDArray[n
     """Return the error of a ramp fitted to the quiescent means [deg/h^2]."""
     hours = (blocks["begin"].values + blocks["end"].values)[:, None] / (2.0 * HOUR)
     present = quiet & np.isfinite(blocks["mean"].values)
-    error = np.zeros(len(white))
-    for row in range(len(white)):
+    step = float(blocks.attrs["block_s"])
+    error = np.full(len(white), np.inf)
+    for row, variance in enumerate(white):
         K, B = value[row, 3:4], value[row, 2:3]
-        step = float(blocks.attrs["block_s"])
         information = mean_products(
-            hours[:, :0], hours, variance=white[row], step=step, K=K, B=B, present=present[row]
+            hours[:, :0], hours, variance=variance, step=step, K=K, B=B, present=present[row]
         ).gram[0, 0, 0]
-        error[row] = 1.0 / np.sqrt(information) if information > 0.0 else np.inf
+        if information > 0.0:
+            error[row] = 1.0 / np.sqrt(information)
     return error

@@ -205,26 +205,15 @@ def _likelihood_of_powers(
     known_power = fit.power - fit.rest()
     normal = _normal_matrix(fast_columns, weight, precision)
     without = _normal_matrix(fast_columns[:, 1:], weight, precision)
-    chunks = [
-        _likelihood_of_points(
-            fit,
-            np.outer(b**2, fit.columns[:, 2]) + np.outer(k**2, fit.columns[:, 3]),
-            fast_columns,
-            (normal, without),
-            (weight, known_power, spectrum),
-        )
-        for b, k in zip(
-            np.array_split(B, -(-B.size // _POINTS_AT_ONCE)),
-            np.array_split(K, -(-K.size // _POINTS_AT_ONCE)),
-            strict=True,
-        )
-    ]
-    inverse = np.linalg.inv(normal)[:2, :2] if free_columns.shape[1] else None
-    return (
-        np.concatenate([chunk[0] for chunk in chunks]),
-        np.concatenate([chunk[1] for chunk in chunks]),
-        normal if inverse is None else np.linalg.inv(inverse),
-    )
+    setup, count = (weight, known_power, spectrum), -(-B.size // _POINTS_AT_ONCE)
+    chunks = []
+    for b, k in zip(np.array_split(B, count), np.array_split(K, count), strict=True):
+        slow = np.outer(b**2, fit.columns[:, 2]) + np.outer(k**2, fit.columns[:, 3])
+        chunks.append(_likelihood_of_points(fit, slow, fast_columns, (normal, without), setup))
+    if free_columns.shape[1]:
+        normal = np.linalg.inv(np.linalg.inv(normal)[:2, :2])
+    likelihood, best = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
+    return likelihood, best, normal
 
 
 def _normal_matrix(fast_columns: Array, weight: Array, precision: Array) -> Array:
@@ -268,13 +257,9 @@ def _draw_near(mean: Array, covariance: Array, rng: np.random.Generator) -> Arra
     Q = np.maximum(mean[:, 0] - sd * ndtri(rng.random(len(mean)) * ndtr(-low)), 0.0)
     slope = float(covariance[0, 1] / covariance[0, 0])
     conditional_sd = float(np.sqrt(covariance[1, 1] - slope * covariance[0, 1]))
-    return np.stack(
-        [
-            Q,
-            mean[:, 1] + slope * (Q - mean[:, 0]) + conditional_sd * rng.standard_normal(len(mean)),
-        ],
-        axis=1,
-    )
+    conditional_mean = mean[:, 1] + slope * (Q - mean[:, 0])
+    N = conditional_mean + conditional_sd * rng.standard_normal(len(mean))
+    return np.stack([Q, N], axis=1)
 
 
 def noise_posterior(
@@ -309,13 +294,9 @@ def noise_posterior(
     products = mean_products(
         values, columns, variance=variance, step=step, K=K, B=B, present=present
     )
-    products = marginalise(
-        products,
-        columns.shape[1],
-        _PRIOR_PRECISION
-        * np.eye(columns.shape[1])
-        / np.maximum(variance[present].min(initial=1.0), 1e-300),
-    )
+    least_variance = np.maximum(variance[present].min(initial=1.0), 1e-300)
+    precision = _PRIOR_PRECISION * np.eye(columns.shape[1]) / least_variance
+    products = marginalise(products, columns.shape[1], precision)
     slow = -0.5 * (products.square[:, 0] + products.log_determinant)
     fast, best, normal = _likelihood_of_powers(fit, spectrum, K, B)
     joined = bool(slow.max() + fast.max() - (slow + fast).max() < max_disagreement_nats)

@@ -33,12 +33,11 @@ _MIN_GIVEN_BANDS = 4  # with a spectrum: as many as noise terms are fitted to th
 
 
 def _running_sum(values: Array, count: int) -> Array:
-    """Sum over `count` neighbouring rows, fewer at the ends."""
-    total = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
-    half = count // 2
-    n = values.shape[0]
-    place = np.arange(n)
-    return np.asarray(total[np.minimum(place + half + 1, n)] - total[np.maximum(place - half, 0)])
+    """Sum over `count` neighbouring values, fewer at the ends."""
+    total = np.append(0.0, np.cumsum(values))
+    place, half = np.arange(values.size), count // 2
+    stop = np.minimum(place + half + 1, values.size)
+    return np.asarray(total[stop] - total[np.maximum(place - half, 0)])
 
 
 def _distance_from_rest(blocks: xr.Dataset, settings: Settings) -> dict[str, Array]:
@@ -62,10 +61,7 @@ def _distance_from_rest(blocks: xr.Dataset, settings: Settings) -> dict[str, Arr
                 np.finfo(float).tiny,
             )
         elif name.startswith("channel_temperature"):
-            smooth = (
-                _running_sum(filled[:, None], 5)[:, 0]
-                / _running_sum(np.ones((values.size, 1)), 5)[:, 0]
-            )
+            smooth = _running_sum(filled, 5) / _running_sum(np.ones(values.size), 5)
             slope = np.abs(np.gradient(smooth, step))
             # Scatter of the slope by noise and digits.
             scatter = float(np.median(np.abs(np.diff(filled, 2)))) / (5.0 * step)
@@ -104,17 +100,16 @@ def noise_level_excess(
         Power over expected power, minus 1, NaN where missing; shape of its gamma distribution.
     """
     use = np.where(np.isfinite(residual) & np.isfinite(weight), weight, 0.0)
-    total = (use * np.nan_to_num(residual)).sum(axis=1, keepdims=True)
-    count = use.sum(axis=1, keepdims=True)
+    total, count = (use * np.nan_to_num(residual)).sum(axis=1), use.sum(axis=1)
     level, deviation = np.ones(len(use)), np.full(len(use), -np.inf)
     for span in LEVEL_SPANS:
-        excess, shape = _running_sum(total, span)[:, 0], _running_sum(count, span)[:, 0]
-        z = excess / np.sqrt(np.maximum(shape, 1e-9))
+        excess, shape = _running_sum(total, span), np.maximum(_running_sum(count, span), 1e-9)
+        z = excess / np.sqrt(shape)
         better = (z > deviation) & (deviation < settings.noisy_sigma)
-        level[better] = 1.0 + (excess / np.maximum(shape, 1e-9))[better]
+        level[better] = 1.0 + (excess / shape)[better]
         deviation = np.maximum(deviation, z)
-    block_level = 1.0 + total[:, 0] / np.maximum(count[:, 0], 1e-9)
-    spread = 3.0 / np.sqrt(np.maximum(count[:, 0], 1e-9))
+    block_level = 1.0 + total / np.maximum(count, 1e-9)
+    spread = 3.0 / np.sqrt(np.maximum(count, 1e-9))
     # The noise of a neighbour is not that of the block.
     level = np.clip(
         level, block_level / (1.0 + spread), np.maximum(block_level, 0.0) * (1.0 + spread) + spread

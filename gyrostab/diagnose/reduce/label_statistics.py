@@ -43,21 +43,21 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
     peaks, outliers = count_outliers(work.histogram, work.peaks)
     subset, at_once = np.array(list(work.at_once), np.bool_), np.stack(list(work.at_once.values()))
     filled = zeros_beyond_chance(work.common_zeros, counts[..., 1], present, subset, at_once)
-    steps = np.array(
-        [
-            quantization_step(_kept_values(work, row, _STEP_VALUES_PER_BLOCK))
-            for row in range(work.axes)
-        ]
-    )
+    first_values = [_kept_values(work, row, _STEP_VALUES_PER_BLOCK) for row in range(work.axes)]
+    steps = np.array([quantization_step(values) for values in first_values])
     # on a quantization grid equal values are frequent by chance
     resent = np.where(steps[:, None, None] > 0.0, 0, work.resent)
     widths = np.array([bin_widths(_kept_values(work, row), step) for row, step in enumerate(steps)])
     zones = np.array([empty_zone(_kept_values(work, row)) for row in range(work.axes)])
-    at_ends = _count_at_range_ends(moments, counts[..., 3], counts[..., 4])
+    lowest, highest = _record_range(moments)
+    at_ends = _count_at_range_ends(moments, counts[..., 3:5])
+    # held samples; those at zero or at an end of the range have another cause
+    repeats = counts[..., 2] - _count_at_range_ends(moments, counts[..., 5:7]).sum(axis=-1)
+    # zeros of one axis alone, unless zero is the end of its range
+    stuck = np.where((lowest < 0.0) & (highest > 0.0), counts[..., 1] - filled, 0)
     line_total, line_square = np.moveaxis(work.line_counts, -1, 0)
-    weight = np.divide(
-        line_total**2, line_square, where=line_square > 0, out=np.zeros(line_total.shape)
-    )
+    weight = np.zeros(line_total.shape)
+    np.divide(line_total**2, line_square, where=line_square > 0, out=weight)
     weight *= _equal_block_share(work.power[axes], work.shape, present, weight.shape[1])
     with np.errstate(invalid="ignore", divide="ignore"):
         lines = work.line_sum / (work.line_expected * work.rate)
@@ -72,15 +72,15 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
         "peaks": peaks,
         "outliers": outliers,
         "adjacent": work.adjacent,
-        "repeats": _count_repeats(moments, counts) + resent[..., 0],
+        "repeats": repeats + resent[..., 0],
         "repeat_runs": counts[..., 7] + resent[..., 1],
         "resent": resent[..., 0],
         "zero_runs": counts[..., 8],
         "extremes": at_ends.sum(axis=-1),
-        "range_end": np.concatenate(_record_range(moments), axis=1),
+        "range_end": np.concatenate([lowest, highest], axis=1),
         "range_end_samples": at_ends.sum(axis=1),
         "zeros": counts[..., 1],
-        "stuck": _count_stuck(moments, counts, filled),
+        "stuck": stuck,
         "filled": filled,
         "axes_at_once": subset,
         "at_once": at_once,
@@ -155,34 +155,15 @@ def _equal_block_share(
 
 def _record_range(moments: Array) -> tuple[Array, Array]:
     """Return the smallest and largest value of every axis, (axis, 1)."""
-    return np.fmin.reduce(moments[..., 3], axis=1, keepdims=True), np.fmax.reduce(
-        moments[..., 4], axis=1, keepdims=True
-    )
+    lowest = np.fmin.reduce(moments[..., 3], axis=1, keepdims=True)
+    return lowest, np.fmax.reduce(moments[..., 4], axis=1, keepdims=True)
 
 
-def _count_at_range_ends(
-    moments: Array, low: NDArray[np.int64], high: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """Count samples at the record's smallest and largest value in each block, (axis, block, 2)."""
+def _count_at_range_ends(moments: Array, counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Keep counts at both ends (axis, block, 2) where those of a block are those of the record."""
     lowest, highest = _record_range(moments)
     at_top = (moments[..., 4] == highest) & (lowest < highest)
-    return np.stack(
-        [np.where(moments[..., 3] == lowest, low, 0), np.where(at_top, high, 0)], axis=-1
-    )
-
-
-def _count_repeats(moments: Array, counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Count held samples; those at zero or at an end of the range have another cause."""
-    ends = _count_at_range_ends(moments, counts[..., 5], counts[..., 6])
-    return np.asarray(counts[..., 2] - ends.sum(axis=-1))
-
-
-def _count_stuck(
-    moments: Array, counts: NDArray[np.int64], filled: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """Count zeros of one axis alone, unless zero is the end of its range."""
-    lowest, highest = _record_range(moments)
-    return np.asarray(np.where((lowest < 0.0) & (highest > 0.0), counts[..., 1] - filled, 0))
+    return np.where(np.stack([moments[..., 3] == lowest, at_top], axis=-1), counts, 0)
 
 
 def _cross_spectra(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:

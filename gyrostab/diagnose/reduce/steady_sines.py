@@ -166,23 +166,17 @@ class SineSearch:
         chosen = order[last]
         gains = factor[:, chosen] - math.log(2.0)
         sharing = np.maximum((gains > 0.0).sum(axis=0), 1)
-        neighbours = np.clip(
-            chosen[:, None] + np.arange(-_FINER * LEAK_LINES, _FINER * LEAK_LINES + 1),
-            0,
-            frequency.size - 1,
-        )
-        above = power[:, neighbours] - level[:, neighbours]  # (axis, line, neighbour)
+        leak = np.arange(-_FINER * LEAK_LINES, _FINER * LEAK_LINES + 1)
+        neighbours = np.clip(chosen[:, None] + leak, 0, frequency.size - 1)
+        # (axis, line, neighbour)
+        peak, usual, shape = (part[:, neighbours] for part in (power, level, count))
+        above = peak - usual
         # Power N and a sine S have the variance N^2 + 2 N S; frequencies within a line are one.
-        variance = np.maximum(
-            2.0 * power[:, neighbours] - level[:, neighbours], level[:, neighbours]
-        )
-        noise = np.sqrt(
-            _FINER * (level[:, neighbours] * variance / count[:, neighbours]).sum(axis=-1)
-        )
+        variance = np.maximum(2.0 * peak - usual, usual)
+        noise = np.sqrt(_FINER * (usual * variance / shape).sum(axis=-1))
         weights = np.maximum(above, 0.0).sum(axis=0)
-        centre = (weights * frequency[neighbours]).sum(axis=-1) / np.maximum(
-            weights.sum(axis=-1), 1e-300
-        )
+        total_weight = np.maximum(weights.sum(axis=-1), 1e-300)
+        centre = (weights * frequency[neighbours]).sum(axis=-1) / total_weight
         arrays = {
             "sine_nats": gains - cost / sharing,
             "sine_frequency": centre,

@@ -149,10 +149,7 @@ def truncated_axes(blocks: xr.Dataset) -> NDArray[np.bool_]:
     width, error, is_measured = _read_widths(blocks)
     like_truncation = is_measured & _is_like_truncation(width, error)
     narrower = is_measured & (
-        width[:, 0]
-        < _TRUNCATED_WIDTHS_STEPS[0]
-        - _MAX_MISFIT_STDERRS
-        * np.hypot(error[:, 0], _WIDTH_MODEL_ERROR_SHARE * _TRUNCATED_WIDTHS_STEPS[0])
+        width[:, 0] < (_TRUNCATED_WIDTHS_STEPS - _allowed_misfit(error))[:, 0]
     )
     if not like_truncation.any() or narrower.any():
         return np.zeros_like(quantized)
@@ -182,11 +179,11 @@ def _read_widths(blocks: xr.Dataset) -> tuple[Array, Array, NDArray[np.bool_]]:
 
 def _is_like_truncation(width: Array, error: Array) -> NDArray[np.bool_]:
     """Return which axes have the bin widths of truncation."""
-    with np.errstate(invalid="ignore"):
-        return np.asarray(
-            (
-                np.abs(width - _TRUNCATED_WIDTHS_STEPS)
-                <= _MAX_MISFIT_STDERRS
-                * np.hypot(error, _WIDTH_MODEL_ERROR_SHARE * _TRUNCATED_WIDTHS_STEPS)
-            ).all(axis=1)
-        )
+    misfit = np.abs(width - _TRUNCATED_WIDTHS_STEPS)
+    return np.asarray((misfit <= _allowed_misfit(error)).all(axis=1))
+
+
+def _allowed_misfit(error: Array) -> Array:
+    """Return by how much widths (axis, bin) may differ from those of truncation."""
+    model_error = _WIDTH_MODEL_ERROR_SHARE * _TRUNCATED_WIDTHS_STEPS
+    return np.asarray(_MAX_MISFIT_STDERRS * np.hypot(error, model_error))
