@@ -133,17 +133,11 @@ def mean_factors(
         **(setup | {"K": np.zeros(1), "B": np.zeros(1)}),
         present=present,
     )
-    raw_square = (np.where(present[:, None], columns, 0.0) ** 2 / setup["variance"][:, None])[
-        present
-    ].sum(axis=0)
-    widest_limits = factor_errors(raw_square, np.diagonal(white.gram[0]))[design_width:]
-    precision = np.diag(
-        1.0 / np.square(np.where(widest_limits > 0.0, widest_limits, 1.0) * WIDTHS[-1])
-    )
-    limits = factor_errors(
-        raw_square[:design_width],
-        np.diagonal(marginalise(white, columns_given.shape[1], precision).gram[0]),
-    )
+    raw_square = (columns[present] ** 2 / setup["variance"][present, None]).sum(axis=0)
+    errors = factor_errors(raw_square, np.diagonal(white.gram[0]))[design_width:]
+    precision = np.diag(1.0 / np.square(np.where(errors > 0.0, errors, 1.0) * WIDTHS[-1]))
+    without_given = marginalise(white, columns_given.shape[1], precision)
+    limits = factor_errors(raw_square[:design_width], np.diagonal(without_given.gram[0]))
     log_weight = _log_weight(baseline, axis, tier)
     subsets = fold_subsets(fold_blocks(data) if folds is None else folds)
     out = np.empty((len(subsets), 1 + len(designs), values.shape[1]))
@@ -243,10 +237,8 @@ def linear_model_factors(model: LinearModel, folds: xr.DataArray) -> Array:
     design_width = columns.shape[2] - count
     raw_square = np.asarray(np.diagonal(total.gram[0]))
     precision = _fill_free_precision(model.precision, raw_square[design_width:])
-    limits = factor_errors(
-        raw_square[:design_width],
-        np.asarray(np.diagonal(marginalise(total, count, precision).gram[0])),
-    )
+    without_given = marginalise(total, count, precision)
+    limits = factor_errors(raw_square[:design_width], np.diagonal(without_given.gram[0]))
     subset_products = [total]
     for length in range(classes.shape[1]):
         for number in range(FOLDS):

@@ -87,14 +87,8 @@ def quiescent_scatter(blocks: xr.Dataset) -> NDArray[np.float64]:
     width = blocks["band_high"].values - blocks["band_low"].values
     power = blocks["power"].transpose("axis", ..., "band").values
     square = 2.0 * (power @ width).reshape(len(power), -1)
-    return np.sqrt(
-        [
-            np.quantile(row[np.isfinite(row)], _QUIESCENT_QUANTILE)
-            if np.isfinite(row).any()
-            else np.inf
-            for row in square
-        ]
-    )
+    known = [row[np.isfinite(row)] for row in square]
+    return np.sqrt([np.quantile(row, _QUIESCENT_QUANTILE) if row.size else np.inf for row in known])
 
 
 def excess_extremes(values: NDArray[Any]) -> NDArray[Any]:

@@ -58,10 +58,10 @@ def line_evidence(power: Array, weight: Array, expected: Array | None = None) ->
     above, precision = clean - level, share / level**2
     for number in range(FOLDS):
         held = np.arange(power.shape[2]) % FOLDS == number
-        train = np.maximum(precision[:, :, ~held].sum(axis=2), 1e-300)
-        square = np.maximum((above[:, :, ~held] * precision[:, :, ~held]).sum(axis=2) / train, 0.0)[
-            :, :, None
-        ]
+        trained = precision[:, :, ~held]
+        total = np.maximum(trained.sum(axis=2, keepdims=True), 1e-300)
+        square = (above[:, :, ~held] * trained).sum(axis=2, keepdims=True) / total
+        square = np.maximum(square, 0.0)
         ratio, excess = clean[:, :, held] / level[:, :, held], square / level[:, :, held]
         evidence_nats += (
             share[:, held] * (ratio * excess / (1.0 + excess) - np.log1p(excess))
@@ -81,10 +81,9 @@ def line_skirt(
     weight = blocks["line_weight"].sel(axis=axis).values
     power = blocks["line_power"].sel(axis=axis).values
     good = (weight > 0) & np.isfinite(power).all(axis=1)
-    total = (power[good] * weight[good, None]).sum(axis=0) / max(float(weight[good].sum()), 1e-300)
-    limit = local_level(total[None])[0] * (
-        1.0 + settings.clear_sigma / np.sqrt(max(float(weight[good].sum()), 1.0))
-    )
+    count = float(weight[good].sum())
+    total = (power[good] * weight[good, None]).sum(axis=0) / max(count, 1e-300)
+    limit = local_level(total[None])[0] * (1.0 + settings.clear_sigma / np.sqrt(max(count, 1.0)))
     in_skirt = np.abs(np.arange(total.size) - place) <= LEAK_LINES
     for step in (-1, 1):
         line = place + step

@@ -85,12 +85,8 @@ class CrossSpectrum(Statistic):
         rows = [f"{axes[a]} {axes[b]}" for a, b in zip(left, right, strict=True)]
         bands = blocks.sizes["band"]
         if len(rows) > 1:
-            z, r = (
-                np.concatenate(
-                    [part, np.full((*part.shape[:-3], 1, *part.shape[-2:]), np.nan)], axis=-3
-                )
-                for part in (z, r)
-            )
+            empty = np.full((*z.shape[:-3], 1, *z.shape[-2:]), np.nan)
+            z, r = (np.concatenate([part, empty], axis=-3) for part in (z, r))
             broad = z[..., :-1, :, bands]
             mean_square = (broad**2).mean(axis=-2)
             z[..., -1, :, bands] = cube_root_score(
@@ -144,15 +140,11 @@ class CrossSpectrum(Statistic):
         shape = state.blocks["cross_shape"].values[row]
         # The scatter is larger in phase with shared noise, and smaller in quadrature.
         noise_product, shared_product = state.weight[i] * state.weight[j], (shared**2).real
-        weight = np.concatenate(
-            [
-                2.0 * shape / (noise_product + shared_product),
-                2.0
-                * shape
-                / np.maximum(noise_product - shared_product, _MIN_QUADRATURE_SHARE * noise_product),
-            ],
-            axis=1,
+        in_quadrature = np.maximum(
+            noise_product - shared_product, _MIN_QUADRATURE_SHARE * noise_product
         )
+        variance = np.concatenate([noise_product + shared_product, in_quadrature], axis=1)
+        weight = np.tile(2.0 * shape, 2) / variance
         weight = np.where((state.masked[i] | state.masked[j])[:, None], 0.0, weight)
         given, precision = given_columns(state, "cross", pair, weight.shape)
         unspread, width = unspread_share(state.blocks, "pair")[row], band_widths(state.blocks)
@@ -184,16 +176,9 @@ class CrossSpectrum(Statistic):
         ]
         for axis in component.row if added else ():
             powers = [power_column(density, state.axes.index(axis), state) for density in added]
-            known_powers = state.given.get(("power", axis), [])
-            state = state.with_columns(
-                "power",
-                axis,
-                [
-                    power
-                    for power in powers
-                    if not any(np.array_equal(power, known_power) for known_power in known_powers)
-                ],
-            )
+            known = state.given.get(("power", axis), [])
+            new = [power for power in powers if not any(np.array_equal(power, k) for k in known)]
+            state = state.with_columns("power", axis, new)
         return state
 
     def has_power_of_effect(self, component: Component, state: State) -> bool:
@@ -235,19 +220,14 @@ def _pair_coherency(
         flat = power / spectrum
         cross = cross / np.sqrt(spectrum[left] * spectrum[right])
         weight = np.minimum(shape[..., left, :, :], shape[..., right, :, :])
-    present = (
-        np.isfinite(cross)
-        & np.isfinite(flat[..., left, :, :])
-        & np.isfinite(flat[..., right, :, :])
-        & (weight > 0)
-    )
+    left_power, right_power = flat[..., left, :, :], flat[..., right, :, :]
+    present = np.isfinite(cross) & np.isfinite(left_power) & np.isfinite(right_power) & (weight > 0)
     weight = np.where(present, weight, 0.0)
 
     def summed(values: Complex) -> Complex:
         sums = sum_over_windows(np.where(present, values, 0.0) * weight, windows)
         return np.concatenate([sums, sums.sum(axis=-1, keepdims=True)], axis=-1)
 
-    left_power, right_power = flat[..., left, :, :], flat[..., right, :, :]
     product = summed(left_power).real * summed(right_power).real
     with np.errstate(divide="ignore", invalid="ignore"):
         sums = summed(cross) / np.sqrt(product)

@@ -42,12 +42,12 @@ def estimate_from_counts(
     row = [str(name) for name in blocks["axis"].values].index(axis)
     usual = float(count_evidence.of[mark][0][row].sum()) if mark in count_evidence.of else 0.0
     count = max(float(blocks[mark].sel(axis=axis).sum()) - usual, 1.0)
-    spread = _sample_deviation(blocks, axis)
+    # standard deviation of the samples about their block means [degree hour-1]
+    spread = math.sqrt(float(blocks["variance"].sel(axis=axis).median()))
     error = math.sqrt(count + usual)
     if effect == "spikes":
-        count = max(
-            float(blocks["peaks"].sel(axis=axis).where(blocks[mark].sel(axis=axis) > 0).sum()), 1.0
-        )
+        peaks = blocks["peaks"].sel(axis=axis).where(blocks[mark].sel(axis=axis) > 0)
+        count = max(float(peaks.sum()), 1.0)
         return _size_spikes(count, hours, _estimate_outliers(blocks, axis), settings)
     if effect == "held_samples":
         if not float(blocks["quantization_step"].sel(axis=axis)) > 0.0:
@@ -213,8 +213,3 @@ def _estimate_outliers(blocks: xr.Dataset, axis: str) -> tuple[float, float, flo
     seen_squares = (limit / ends) ** 2 * (1.0 + ends * _normal_density(ends) / ndtr(-ends))
     size = limit / float(np.interp(square, seen_squares, ends))
     return float(2.0 * ndtr(-limit / size)), size * math.sqrt(usual), float(many.sum())
-
-
-def _sample_deviation(blocks: xr.Dataset, axis: str) -> float:
-    """Return the standard deviation of the samples about their block means [degree hour-1]."""
-    return math.sqrt(float(blocks["variance"].sel(axis=axis).median()))

@@ -82,22 +82,14 @@ class Telegraph(BlockMeanStatistic):
             if within is not None:
                 evidence_nats[0, row] = max(within.evidence_nats, evidence_nats[0, row])
             courses.append((course, within))
-        by_candidate = [
-            CandidateEvidence(
-                candidate,
-                rows,
-                evidence_nats,
-                tuple(
-                    _variant_with_course(candidate.variants[0], *pair, trial.state)
-                    for pair in courses
-                ),
-            )
-            for candidate in group
-        ]
-        return [
-            _with_free_levels(evidence, trial) if evidence.candidate.effect == _LEVELS else evidence
-            for evidence in by_candidate
-        ]
+        out = []
+        for candidate in group:
+            plain = candidate.variants[0]
+            best = tuple(_variant_with_course(plain, *pair, trial.state) for pair in courses)
+            evidence = CandidateEvidence(candidate, rows, evidence_nats, best)
+            is_free = candidate.effect == _LEVELS
+            out.append(_with_free_levels(evidence, trial) if is_free else evidence)
+        return out
 
     def condition(self, state: State, component: Component) -> State:
         """Condition on a bias of two levels.
@@ -245,15 +237,10 @@ def _variant_with_course(
 ) -> Variant:
     """Return the variant with the course of the first record, and its mean times [s]."""
     if within is not None:
-        low, high = within.times
-        values = {"low": float(low), "high": float(high), "switches": within.switch_count}
-        return replace(
-            variant,
-            values=values,
-            design=within.share.mean(axis=1)[None, None],
-            inside=within.share,
-        )
-    block = float(state.blocks.attrs["block_s"])
-    low, high = course.times[0] * block
-    values = {"low": float(low), "high": float(high), "switches": float(course.switch_count[0])}
-    return replace(variant, values=values, design=course.share[0][None, None])
+        (low, high), count = within.times, within.switch_count
+        variant, share = replace(variant, inside=within.share), within.share.mean(axis=1)
+    else:
+        low, high = course.times[0] * float(state.blocks.attrs["block_s"])
+        count, share = float(course.switch_count[0]), course.share[0]
+    values = {"low": float(low), "high": float(high), "switches": count}
+    return replace(variant, values=values, design=share[None, None])
