@@ -57,9 +57,9 @@ def noise_powers(blocks: xr.Dataset, response: Array | None = None) -> Array:
     return np.stack([spread_by_gaps(power[None, None], blocks) for power in term_powers], axis=-1)
 
 
-def sum_noise(columns: Array, squares: Sequence[Array]) -> Array:
+def sum_noise(columns: Array, squares: Array | Sequence[Array]) -> Array:
     """Return the power (axis, block, band) of noise with these squares, from `noise_powers`."""
-    return np.asarray(np.einsum("abfn,an->abf", columns, np.stack(squares)))
+    return np.asarray(np.einsum("abfn,an->abf", columns, np.asarray(squares)))
 
 
 def common_variance(blocks: xr.Dataset) -> tuple[Array, Array]:

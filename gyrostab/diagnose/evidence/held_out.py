@@ -191,14 +191,17 @@ class LinearModel(NamedTuple):
     #: whose precision is taken from the data.
     precision: Array
 
+    def usable_weight(self) -> Array:
+        """Return the weight, 0 where it is unknown or a record has no value."""
+        usable = np.isfinite(self.weight) & np.isfinite(self.values).all(axis=2)
+        return np.where(usable, self.weight, 0.0)
+
 
 def with_independent_cells(
     model: LinearModel, common: Array, unit: Array | None = None
 ) -> LinearModel:
     """Transform a model whose cells vary together to independent cells; `remove_common_part`."""
-    weight = np.where(
-        np.isfinite(model.weight) & np.isfinite(model.values).all(axis=2), model.weight, 0.0
-    )
+    weight = model.usable_weight()
     present = weight[..., None] > 0.0
     values, given, *designs = (
         remove_common_part(np.where(present & np.isfinite(array), array, 0.0), weight, common, unit)
@@ -209,10 +212,8 @@ def with_independent_cells(
 
 def linear_model_factors(model: LinearModel, folds: xr.DataArray) -> Array:
     """Compute factors of designs in independent cells, in the shape of `mean_factors`."""
-    _, width, records = model.values.shape
-    weight = np.where(
-        np.isfinite(model.weight) & np.isfinite(model.values).all(axis=2), model.weight, 0.0
-    )
+    records = model.values.shape[2]
+    weight = model.usable_weight()
     values = np.where(weight[..., None] > 0.0, model.values, 0.0)
     count = model.given.shape[2]
     flat = [np.where(np.isfinite(array), array, 0.0) for array in (*model.designs, model.given)]
@@ -225,14 +226,9 @@ def linear_model_factors(model: LinearModel, folds: xr.DataArray) -> Array:
     products = []
     for number in range(len(classes)):
         chosen = member.ravel() == number
-        size = int(chosen.sum()) * width
-        products.append(
-            power_products(
-                values[chosen].reshape(size, records),
-                weight[chosen].ravel(),
-                columns[chosen].reshape(size, -1),
-            )
-        )
+        cells = values[chosen].reshape(-1, records), weight[chosen].ravel()
+        size = cells[1].size
+        products.append(power_products(*cells, columns[chosen].reshape(size, -1)))
     total = _sum_products(products)
     design_width = columns.shape[2] - count
     raw_square = np.asarray(np.diagonal(total.gram[0]))

@@ -12,8 +12,7 @@ better than two levels do.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -54,8 +53,7 @@ _CONVERGED = 0.01  # in white noise deviations, or in the logarithm of a time
 _DRIFT_WAVES = (0, 8)  # slow cosines in the model while the course is searched; design choice
 
 
-@dataclass(frozen=True)
-class TelegraphCourses:
+class TelegraphCourses(NamedTuple):
     """Biases of two levels, one for every record, which is the first dimension."""
 
     share: Array  # (record, block): share of each block on the upper level
@@ -120,28 +118,16 @@ def telegraph_courses(
         fit = _Fit(size, np.full((len(y), 2), _START_TIME_BLOCKS), np.ones(len(y)))
         attempts.append(_maximise(fit, y, weight, columns_given, _TRIAL_ROUNDS, min_scatter))
     chosen = np.argmax([log for _, log in attempts], axis=0)
-    size, times, scale = (
-        _select_by_record([getattr(fit, name) for fit, _ in attempts], chosen)
-        for name in ("size", "times", "scale")
-    )
-    best = _Fit(size, times, scale)
+    by_attempt = zip(*((fit.size, fit.times, fit.scale) for fit, _ in attempts), strict=True)
+    best = _Fit(*(_select_by_record(arrays, chosen) for arrays in by_attempt))
     best, _ = _maximise(best, y, weight, columns_given, _ROUNDS, min_scatter)
-    courses = _make_courses(best, y, weight, columns_given)
     if parts > PARTS_PER_BLOCK:
-        finer, _ = _maximise(
-            _Fit(best.size, best.times, np.ones(len(y)), parts),
-            y,
-            weight,
-            columns_given,
-            _FINE_ROUNDS,
-            min_scatter,
-        )
-        courses = _make_courses(finer, y, weight, columns_given)
-    return courses
+        finer = best._replace(scale=np.ones(len(y)), parts=parts)
+        best, _ = _maximise(finer, y, weight, columns_given, _FINE_ROUNDS, min_scatter)
+    return _make_courses(best, y, weight, columns_given)
 
 
-@dataclass(frozen=True)
-class _Fit:
+class _Fit(NamedTuple):
     """State of the fit by record."""
 
     size: Array  # (record, column): sizes of the columns and of the step
@@ -310,24 +296,18 @@ def telegraph_evidence(
     setup |= {"step": float(data["end"][0] - data["begin"][0]), "present": present}
     log_weight = baseline["grid_prior"].sel(axis=axis).values
     safe = np.where(present[:, None], values, 0.0)
-    attempts = []
+    evidence_nats, attempts = [], []
     for count in _DRIFT_WAVES:
-        courses = telegraph_courses(
-            safe, variance, present, np.concatenate([drift_waves(n, count), scaled_given], axis=1)
-        )
-        worth = _course_evidence_by_record(courses, safe, scaled_given, setup, log_weight) - np.log(
-            len(_DRIFT_WAVES)
-        )
+        columns = np.concatenate([drift_waves(n, count), scaled_given], axis=1)
+        courses = telegraph_courses(safe, variance, present, columns)
+        worth = _course_evidence_by_record(courses, safe, scaled_given, setup, log_weight)
         has_switches = courses.switch_count >= settings.min_switches
-        attempts.append((np.where(has_switches, worth, -np.inf), courses))
-    chosen = np.argmax([evidence_nats for evidence_nats, _ in attempts], axis=0)
-    best = TelegraphCourses(
-        *(
-            _select_by_record([getattr(courses, item.name) for _, courses in attempts], chosen)
-            for item in fields(TelegraphCourses)
-        )
-    )
-    return _select_by_record([evidence_nats for evidence_nats, _ in attempts], chosen), best
+        evidence_nats.append(np.where(has_switches, worth - np.log(len(_DRIFT_WAVES)), -np.inf))
+        attempts.append(courses)
+    chosen = np.argmax(evidence_nats, axis=0)
+    by_attempt = zip(*attempts, strict=True)
+    best = TelegraphCourses(*(_select_by_record(arrays, chosen) for arrays in by_attempt))
+    return _select_by_record(evidence_nats, chosen), best
 
 
 def drift_waves(n: int, count: int) -> Array:

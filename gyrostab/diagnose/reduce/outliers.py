@@ -309,14 +309,11 @@ def quantization_step(values: Array) -> float:
         return 0.0
     levels, times = np.unique(finite, return_counts=True)
     size = float(np.abs(levels).max())
-    level_sets = [
+    frequent, without_spikes = (
         _frequent_levels(levels, times, rare) for rare in (_MAX_OFF_GRID_SHARE, _SPIKE_SHARE)
-    ]
-    for kept_levels in (
-        (level_set for level_set in level_sets if level_set.size)
-        if level_sets[0].size
-        else (levels,)
-    ):
+    )
+    level_sets = [frequent, without_spikes] if frequent.size else [levels]
+    for kept_levels in (level_set for level_set in level_sets if level_set.size):
         # as written in single and in double precision; numbers of the former repeat on any grid
         # that is coarser than their last digit, and are on a finer one the closer they are to 0
         for resolution, is_double in ((2.0**-23, False), (2.0**-52, True)):
