@@ -56,7 +56,7 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
     # zeros of one axis alone, unless zero is the end of its range
     stuck = np.where((lowest < 0.0) & (highest > 0.0), counts[..., 1] - filled, 0)
     line_total, line_square = np.moveaxis(work.line_counts, -1, 0)
-    weight = np.zeros(line_total.shape)
+    weight: Array = np.zeros(line_total.shape)
     np.divide(line_total**2, line_square, where=line_square > 0, out=weight)
     weight *= _equal_block_share(work.power[axes], work.shape, present, weight.shape[1])
     with np.errstate(invalid="ignore", divide="ignore"):
