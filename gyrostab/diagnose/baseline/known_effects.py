@@ -92,9 +92,9 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
     for power in powers:
         added += power.on_axes
     narrow = [
-        (added_power.acting.effect, added_power.acting.rows, added_power.on_axes)
-        for added_power in powers
-        if added_power.acting.prediction.line is not None and added_power.factor.any()
+        (power.acting.effect, power.acting.rows, power.on_axes)
+        for power in powers
+        if power.acting.prediction.line is not None and power.factor.any()
     ]
     return KnownEffects(
         mean=_expected_means(described, blocks),

@@ -185,6 +185,9 @@ def _take_region(
     free = np.where(np.isfinite(remaining[:, column]) | np.isnan(z[:, column]), z[:, column], 0.0)
     begin, end, fine = _find_span(scores, free * sign, int(window), settings)
     combined, ratio = _combine_windows(scores, row, z * sign, fine, int(window))
+    largest = abs(remaining[window, column])
+    if np.isfinite(combined[column]):
+        largest = max(largest, combined[column])
     columns, reach = _find_columns(statistic, scores, combined, ratio, int(column), settings)
     region = {
         "statistic": statistic.name,
@@ -197,18 +200,12 @@ def _take_region(
         "tau_max_s": float(scores["tau_max_s"].values[columns].max()),
         "frequency": float(scores["frequency"].values[column]),
         "sign": int(sign),
-        "z": float(
-            sign
-            * max(
-                abs(remaining[window, column]),
-                combined[column] if np.isfinite(combined[column]) else 0.0,
-            )
-        ),
+        "z": float(sign * largest),
         "ratio": float(ratio[column]),
-        "estimate": float(scores["estimate"].values[row, window, column])
-        if "estimate" in scores
-        else float(ratio[column]),
+        "estimate": float(ratio[column]),
     }
+    if "estimate" in scores:
+        region["estimate"] = float(scores["estimate"].values[row, window, column])
     overlap = (scores["begin"].values < end - 1e-9) & (scores["end"].values > begin + 1e-9)
     overlap[window] = True
     remaining[np.ix_(overlap, reach)] = np.nan

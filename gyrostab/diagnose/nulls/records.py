@@ -231,11 +231,9 @@ def _draw_records(setup: _NullSetup, count: int, rng: np.random.Generator) -> xr
                 error * (rng.standard_normal((count, *error.shape, 2)) @ np.array([1.0, 1j]))
             )[:, :, None]
     common = baseline["common"].values
-    swell = _draw_gamma(
-        np.where(common > 0.0, 1.0 / np.where(common > 0.0, common, 1.0), np.inf),
-        np.ones(power.shape[:3]),
-        rng,
-    )[..., None]
+    swell_shape = np.full(common.shape, np.inf)
+    np.divide(1.0, common, out=swell_shape, where=common > 0.0)
+    swell = _draw_gamma(swell_shape, np.ones(power.shape[:3]), rng)[..., None]
     power *= swell
     power[..., np.isnan(blocks["power"].values)] = np.nan
     variables: dict[str, Any] = {
@@ -362,13 +360,8 @@ def _draw_lines(setup: _NullSetup, squares: Array, rng: np.random.Generator) -> 
         out[:, axis, part] = (share * plain[:, axis] + (1.0 - share) * flat[:, axis]) * effects
         if "peaks" in setup.baseline:
             out[:, axis, part] += setup.baseline["peaks"].values[axis]
-    return (
-        _correlate_lines(
-            _draw_gamma(weight[..., None], np.ones(out.shape), rng),
-            int(blocks.attrs["block_samples"]),
-        )
-        * out
-    )
+    drawn = _draw_gamma(weight[..., None], np.ones(out.shape), rng)
+    return _correlate_lines(drawn, int(blocks.attrs["block_samples"])) * out
 
 
 def _correlate_lines(drawn: Array, size: int) -> Array:
@@ -421,12 +414,8 @@ def _draw_kurtosis(setup: _NullSetup, count: int, rng: np.random.Generator) -> A
     recorded = blocks["kurtosis"].values
     samples = np.maximum(blocks["samples"].values.astype(np.float64), 20.0)
     mean, variance, a = kurtosis_moments(samples)
-    root = (
-        1.0
-        - 2.0 / (9.0 * a)
-        - _widen_tails(rng.standard_normal((count, *recorded.shape)), samples)
-        * np.sqrt(2.0 / (9.0 * a))
-    )
+    noise = _widen_tails(rng.standard_normal((count, *recorded.shape)), samples)
+    root = 1.0 - 2.0 / (9.0 * a) - noise * np.sqrt(2.0 / (9.0 * a))
     score = ((1.0 - 2.0 / a) / np.maximum(root, 0.1) ** 3 - 1.0) / np.sqrt(2.0 / (a - 4.0))
     out = mean + setup.tails[:, :1] + np.sqrt(variance) * setup.tails[:, 1:] * score
     for axis, step in enumerate(blocks["quantization_step"].values):

@@ -207,13 +207,9 @@ def _score_all_axes(r: Array, count: Array, pairs: list[tuple[int, int]], axes: 
     sign, logarithm = np.linalg.slogdet(
         np.where(is_complete[..., None, None], matrix, np.eye(axes))
     )
+    logarithm = np.maximum(np.where(sign > 0, logarithm, -np.inf), _MIN_LOG_DETERMINANT)
     samples = np.maximum(count.min(axis=-3) - (2.0 * axes + 5.0) / 6.0, 1.0)
     freedom = len(pairs)
-    value = (
-        -samples
-        * np.where(sign > 0, np.maximum(logarithm, _MIN_LOG_DETERMINANT), _MIN_LOG_DETERMINANT)
-        / freedom
-    )
-    return np.where(
-        is_complete, cube_root_score(value, np.full(value.shape, freedom / 2.0)), np.nan
-    )
+    value = -samples * logarithm / freedom
+    z = cube_root_score(value, np.full(value.shape, freedom / 2.0))
+    return np.where(is_complete, z, np.nan)

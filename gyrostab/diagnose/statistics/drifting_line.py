@@ -85,13 +85,8 @@ class DriftingLine(Statistic):
         with np.errstate(divide="ignore", invalid="ignore"):
             # Expected number of paths of noise with this score.
             expected_count = np.exp(np.log(_INDEPENDENT_SHARE * path_count) + log_ndtr(-largest))
-            z = np.where(
-                path_count > 0,
-                exponential_score(
-                    -np.log(-np.expm1(-np.minimum(expected_count, _MAX_EXPECTED_PATHS)))
-                ),
-                np.nan,
-            )
+            p_value = -np.expm1(-np.minimum(expected_count, _MAX_EXPECTED_PATHS))
+            z = np.where(path_count > 0, exponential_score(-np.log(p_value)), np.nan)
         block_count = -(-np.arange(power.shape[-2] + 1) * blocks.sizes["block"] // power.shape[-2])
         return statistic_dataset(
             "spectrum",

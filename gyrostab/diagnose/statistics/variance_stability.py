@@ -204,13 +204,10 @@ def _relative_levels(
         present = np.isfinite(ratio) & (shape > 0)
         used_shape = np.where(present, shape, 0.0)
         ratio = ratio * _limit_noisy_blocks(np.where(present, ratio, 0.0), used_shape)
-        weight = np.stack([used_shape[..., group].sum(axis=-1) for group in members], axis=-1)
-        total = np.stack(
-            [
-                np.where(present, ratio * used_shape, 0.0)[..., group].sum(axis=-1)
-                for group in members
-            ],
-            axis=-1,
+        weighted = np.where(present, ratio * used_shape, 0.0)
+        total, weight = (
+            np.stack([values[..., group].sum(axis=-1) for group in members], axis=-1)
+            for values in (weighted, used_shape)
         )
         level = total / weight
         level = level / _robust_mean(level, weight)
@@ -234,17 +231,8 @@ def _limit_noisy_blocks(ratio: Array, shape: Array) -> Array:
     weight = shape.sum(axis=-1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         level = (ratio * shape).sum(axis=-1, keepdims=True) / weight
-        return np.asarray(
-            np.nan_to_num(
-                np.minimum(
-                    _robust_mean(level, weight)
-                    * (1.0 + _MAX_AVERAGE_SIGMA / np.sqrt(weight))
-                    / level,
-                    1.0,
-                ),
-                nan=1.0,
-            )
-        )
+        limit = _robust_mean(level, weight) * (1.0 + _MAX_AVERAGE_SIGMA / np.sqrt(weight))
+        return np.asarray(np.nan_to_num(np.minimum(limit / level, 1.0), nan=1.0))
 
 
 def _coherence_factor(
@@ -333,8 +321,5 @@ def _score_scatter(
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(enough, scatter / mean, np.nan)
         variation = np.sqrt(np.maximum(scatter - mean, 0.0) / weights)
-        return (
-            np.where(enough, cube_root_score(ratio, mean**2 / variance), np.nan),
-            ratio,
-            variation,
-        )
+        z = np.where(enough, cube_root_score(ratio, mean**2 / variance), np.nan)
+        return z, ratio, variation
