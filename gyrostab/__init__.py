@@ -95,45 +95,7 @@ _HOME = {
     "write_report": "report",
 }
 
-__all__ = [
-    "__version__",
-    "confidence_interval",
-    "correlate",
-    "correlation_rows",
-    "davar",
-    "diagnose",
-    "fit_noise",
-    "from_dataarray",
-    "from_dataframe",
-    "gap_table",
-    "make_log",
-    "make_noise",
-    "open_diagnosis",
-    "open_log",
-    "open_product",
-    "open_surface",
-    "plot_adev",
-    "plot_coefficients",
-    "plot_correlation",
-    "plot_davar",
-    "plot_davar_3d",
-    "plot_signal",
-    "prove",
-    "read_channel",
-    "read_log",
-    "read_model",
-    "regularise",
-    "save_figures",
-    "scan",
-    "simulate",
-    "survey_terms",
-    "to_iscwsa",
-    "to_kalibr",
-    "to_netcdf",
-    "to_zarr",
-    "write_diagnosis",
-    "write_report",
-]
+__all__ = ["__version__", *_HOME]
 
 
 class _Package(ModuleType):
