@@ -24,6 +24,7 @@ from gyrostab.plot.style import (
     stack_panels,
     title_figure,
     unit_symbol,
+    write_in_middle,
 )
 from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY, check_surface
 
@@ -98,14 +99,7 @@ def plot_adev(
     panel.set_xlim(tau.min() / 1.3, tau.max() * 1.3)
     if not shown.size:
         panel.set_ylim(0.1, 10.0)
-        panel.text(
-            0.5,
-            0.5,
-            "no estimate in this window",
-            transform=panel.transAxes,
-            ha="center",
-            va="center",
-        )
+        write_in_middle(panel, "no estimate in this window")
     else:
         panel.set_ylim(shown.min() / 4.0, np.nanmax(np.sqrt(high)) * 1.5)
     label_log_axis(panel.xaxis, *panel.get_xlim())

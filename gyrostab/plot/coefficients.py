@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import (
@@ -16,6 +15,7 @@ from gyrostab.plot.style import (
     axis_names,
     axis_style,
     draws_figure,
+    find_runs,
     is_narrow,
     label_log_axis,
     new_figure,
@@ -27,6 +27,7 @@ from gyrostab.plot.style import (
     unit_label,
     upper_limit_marker,
     window_text,
+    write_in_middle,
 )
 from gyrostab.plot.surface import find_time_edges
 from gyrostab.schema import NOT_OBSERVABLE, OBSERVED, UPPER_LIMIT_ONLY
@@ -76,7 +77,7 @@ def plot_coefficients(
             _draw_axis(panel, product.sel(axis=name), symbol, name, axis_style(product, name))
             hidden = product["observable"].sel(axis=name, term=symbol).values == NOT_OBSERVABLE
             if hidden.any():
-                first, last = _find_runs(hidden)
+                first, last = find_runs(hidden)
                 shade_spans(panel, edges[first], edges[last], alpha=0.6 / len(names))
         _set_scale(panel, product, symbol, names)
         panel.set_ylabel(f"{symbol} {unit_label(law.label)}")
@@ -164,14 +165,7 @@ def _set_scale(panel: Axes, product: xr.Dataset, symbol: str, names: list[str]) 
         panel.set_ylim(0.0, numbers.max() * 1.15)
     else:
         panel.set_yticks([])
-        panel.text(
-            0.5,
-            0.5,
-            "not observable in any window",
-            transform=panel.transAxes,
-            ha="center",
-            va="center",
-        )
+        write_in_middle(panel, "not observable in any window")
 
 
 def _legend_handles(product: xr.Dataset, names: list[str]) -> list[Any]:
@@ -193,9 +187,3 @@ def _legend_handles(product: xr.Dataset, names: list[str]) -> list[Any]:
     if (state == NOT_OBSERVABLE).any():
         keys.append(Patch(facecolor=GREY, alpha=0.5, label="not observable"))
     return keys
-
-
-def _find_runs(mask: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Find the first index of each run of True, and the index after its last."""
-    steps = np.diff(np.concatenate([[0], mask.astype(int), [0]]))
-    return np.flatnonzero(steps == 1), np.flatnonzero(steps == -1)

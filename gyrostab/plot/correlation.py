@@ -19,6 +19,7 @@ from gyrostab.plot.style import (
     is_narrow,
     new_figure,
     unit_label,
+    write_in_middle,
 )
 from gyrostab.schema import OBSERVED
 
@@ -28,7 +29,14 @@ if TYPE_CHECKING:
 
 __all__ = ["plot_correlation"]
 
-_UP, _DOWN = COLOURS[1], COLOURS[0]
+#: Points while the driver rises, and while it falls.
+_RISING: dict[str, Any] = {"linestyle": "none", "marker": "^", "color": COLOURS[1]}
+_FALLING: dict[str, Any] = {
+    "linestyle": "none",
+    "marker": "v",
+    "color": COLOURS[0],
+    "markerfacecolor": "none",
+}
 _MAX_POINTS = 3000
 
 
@@ -119,33 +127,14 @@ def _draw_panel(panel: Axes, part: xr.Dataset, variable: str, driver: str) -> No
     if variable in LAWS and "observable" in part:
         good &= part["observable"].sel(term=variable).values == OBSERVED
     every = max(1, int(good.sum()) // _MAX_POINTS)
-    styles: list[tuple[Any, dict[str, Any]]] = [
-        (rising, {"marker": "^", "color": _UP}),
-        (~rising, {"marker": "v", "color": _DOWN, "markerfacecolor": "none"}),
-    ]
-    for part_of, style in styles:
+    for part_of, style in ((rising, _RISING), (~rising, _FALLING)):
         chosen = np.flatnonzero(good & part_of)[::every]
-        panel.plot(
-            x[chosen],
-            y[chosen],
-            linestyle="none",
-            markersize=3.5,
-            alpha=0.75,
-            markeredgewidth=0.7,
-            **style,
-        )
+        panel.plot(x[chosen], y[chosen], markersize=3.5, alpha=0.75, markeredgewidth=0.7, **style)
     verdict = VERDICTS[int(cell["coupling_verdict"])]
     title = _verdict_text(verdict, lag, float(cell["p_value_adjusted"]))
     panel.set_title(title.replace(", ", "\n") if is_narrow(panel.figure) else title, size="small")
     if not good.any():
-        panel.text(
-            0.5,
-            0.5,
-            f"{variable.replace('_', ' ')} is not observed\nin any window",
-            ha="center",
-            va="center",
-            transform=panel.transAxes,
-        )
+        write_in_middle(panel, f"{variable.replace('_', ' ')} is not observed\nin any window")
         panel.tick_params(left=False, labelleft=False)
         return
     slope, low, high = (
@@ -194,16 +183,8 @@ def _legend_handles(driver: str, level: float) -> list[Any]:
 
     channel_name = driver.replace("_", " ")
     return [
-        Line2D([], [], linestyle="none", marker="^", color=_UP, label=f"{channel_name} rises"),
-        Line2D(
-            [],
-            [],
-            linestyle="none",
-            marker="v",
-            color=_DOWN,
-            markerfacecolor="none",
-            label=f"{channel_name} falls",
-        ),
+        Line2D([], [], **_RISING, label=f"{channel_name} rises"),
+        Line2D([], [], **_FALLING, label=f"{channel_name} falls"),
         Patch(
             facecolor="#8c8c8c",
             alpha=0.3,

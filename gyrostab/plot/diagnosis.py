@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from gyrostab.plot.style import (
     GREY,
     INCH_MM,
     PAGE_MM,
+    axis_names,
     draws_figure,
     is_narrow,
     label_log_axis,
@@ -60,10 +61,32 @@ def _window_edges(begin: Array, end: Array) -> Array:
     return np.concatenate([[begin[0]], inner, [end[-1]]])
 
 
-def _seconds_since(text: str, start: str) -> float:
-    return float(
-        (np.datetime64(text.removesuffix("Z"), "ns") - np.datetime64(start.removesuffix("Z"), "ns"))
-        / np.timedelta64(1, "s")
+def _find_span(
+    region: Mapping[str, Any], content: Mapping[str, Any], size: float
+) -> tuple[float, float]:
+    """Find begin and end of a mismatch since the start of the recording, in units of `size` [s]."""
+    start, *ends = (
+        np.datetime64(text.removesuffix("Z"), "ns")
+        for text in (content["recording"]["start"], region["start"], region["end"])
+    )
+    begin, end = (float((stamp - start) / np.timedelta64(1, "s")) / size for stamp in ends)
+    return begin, end
+
+
+def _number_mismatch(panel: Axes, region: Mapping[str, Any], place: Any, **options: Any) -> None:
+    """Write the number of a mismatch below and to the right of a place, white on red."""
+    panel.annotate(
+        str(region["id"]),
+        place,
+        (2, -2),
+        textcoords="offset points",
+        va="top",
+        ha="left",
+        fontsize="small",
+        color="white",
+        weight="bold",
+        bbox={"facecolor": _RED, "edgecolor": "none", "pad": 1.2},
+        **options,
     )
 
 
@@ -73,7 +96,6 @@ def _frame_mismatches(
     """Frame the mismatches of an axis that have averaging times."""
     from matplotlib.patches import Rectangle
 
-    start = content["recording"]["start"]
     low_edge, high_edge = log_edges(taus)[[0, -1]]
     left, right = panel.get_xlim()
     for region in content["mismatches"]:
@@ -83,10 +105,7 @@ def _frame_mismatches(
             or not region["tau_min_s"]
         ):
             continue
-        begin, end = (
-            _seconds_since(region["start"], start) / size,
-            _seconds_since(region["end"], start) / size,
-        )
+        begin, end = _find_span(region, content, size)
         min_width = MIN_FRAME_SHARE * (right - left)
         if end - begin < min_width:
             begin, end = (begin + end - min_width) / 2.0, (begin + end + min_width) / 2.0
@@ -104,18 +123,7 @@ def _frame_mismatches(
         }
         panel.add_patch(Rectangle((begin, low), end - begin, high - low, **style))  # type: ignore[arg-type]
         if not faint:
-            panel.annotate(
-                str(region["id"]),
-                (begin, high),
-                (2, -2),
-                textcoords="offset points",
-                va="top",
-                ha="left",
-                fontsize="small",
-                color="white",
-                weight="bold",
-                bbox={"facecolor": _RED, "edgecolor": "none", "pad": 1.2},
-            )
+            _number_mismatch(panel, region, (begin, high))
 
 
 def _draw_maps(
@@ -133,7 +141,7 @@ def _draw_maps(
     """
     from matplotlib.cm import ScalarMappable
 
-    names, tau = [str(name) for name in surfaces["axis"].values], surfaces["tau"].values
+    names, tau = axis_names(surfaces), surfaces["tau"].values
     begin, end = surfaces["begin"].values, surfaces["end"].values
     size, unit = unit_of_time(float(end[-1]))
     figure = new_figure(width / INCH_MM, 0.5 + 1.6 * len(names))
@@ -257,7 +265,7 @@ def plot_means(
     width : float
         Width of the figure [mm]: 180 for a page, 85 for a column.
     """
-    names = [str(name) for name in surfaces["axis"].values]
+    names = axis_names(surfaces)
     channels = select_channels(surfaces, content)
     size, unit = unit_of_time(float(surfaces["end"].values[-1]))
     time = (surfaces["begin"].values + surfaces["end"].values) / (2.0 * size)
@@ -341,60 +349,54 @@ def select_channels(surfaces: xr.Dataset, content: Mapping[str, Any]) -> list[st
 
 
 def _mark_spans(panel: Axes, axis: str, content: Mapping[str, Any], size: float) -> None:
-    start = content["recording"]["start"]
     for region in content["mismatches"]:
         if axis in region["axes"] and region["view"] in ("mean", "restart"):
-            begin, end = (
-                _seconds_since(region["start"], start) / size,
-                _seconds_since(region["end"], start) / size,
-            )
+            begin, end = _find_span(region, content, size)
             panel.axvspan(begin, end, color=_RED, alpha=0.05, lw=0)
             panel.axvspan(begin, end, ymin=0.96, color=_RED, lw=0)
-            panel.annotate(
-                str(region["id"]),
-                (begin, 1.0),
-                (2, -2),
-                xycoords=panel.get_xaxis_transform(),
-                textcoords="offset points",
-                va="top",
-                fontsize="small",
-                color="white",
-                weight="bold",
-                bbox={"facecolor": _RED, "edgecolor": "none", "pad": 1.2},
-            )
+            at_top = panel.get_xaxis_transform()
+            _number_mismatch(panel, region, (begin, 1.0), xycoords=at_top)
 
 
-def _make_row(names: list[str], width: float) -> tuple[Figure, Array]:
-    """Make a figure with one panel per axis, side by side, or in a column if it is narrow."""
-    figure = new_figure(width / INCH_MM, 2.6)
+def _draw_cases(
+    surfaces: xr.Dataset,
+    draw_axis: Callable[[Axes, str], None],
+    width: float,
+    *,
+    xlabel: str,
+    ylabel: str,
+) -> Figure:
+    """Draw one panel per axis, side by side, or in a column if the figure is narrow."""
+    figure, names = new_figure(width / INCH_MM, 2.6), axis_names(surfaces)
     shape = (len(names), 1) if is_narrow(figure) else (1, len(names))
     figure.set_figheight(0.8 + 1.8 * shape[0])
-    return figure, np.ravel(figure.subplots(*shape, sharex=True, sharey=True))
+    panels = np.ravel(figure.subplots(*shape, sharex=True, sharey=True))
+    for panel, name in zip(panels, names, strict=True):
+        draw_axis(panel, name)
+        panel.set(xscale="log", yscale="log", title=f"axis {name}")
+        panel.grid(True, which="major", alpha=0.4)
+        label_log_axis(panel.xaxis, *panel.get_xlim())
+    figure.supxlabel(xlabel)
+    figure.supylabel(ylabel)
+    panels[0].legend(frameon=False)
+    label_log_axis(panels[0].yaxis, *panels[0].get_ylim())
+    return figure
 
 
 @draws_figure
 def plot_deviations(surfaces: xr.Dataset, *, width: float = PAGE_MM) -> Figure:
     """Draw the Allan deviation of the whole record, one panel per axis."""
-    names, tau = [str(name) for name in surfaces["axis"].values], surfaces["tau"].values
-    figure, panels = _make_row(names, width)
+    tau = surfaces["tau"].values
     with np.errstate(invalid="ignore"):
         deviation = surfaces["avar"].mean("window", skipna=True) ** 0.5
-    for panel, name in zip(panels, names, strict=True):
-        for case in ("recording", "before", "after"):
-            panel.plot(
-                tau,
-                deviation.sel(axis=name, case=case).values,
-                **_STYLES[case],
-                label=_TITLES[case].lower(),
-            )
-        panel.set(xscale="log", yscale="log", title=f"axis {name}")
-        panel.grid(True, which="major", alpha=0.4)
-        label_log_axis(panel.xaxis, *panel.get_xlim())
-    figure.supxlabel("averaging time τ [s]")
-    figure.supylabel("Allan deviation σ(τ) [deg/h]")
-    panels[0].legend(frameon=False)
-    label_log_axis(panels[0].yaxis, *panels[0].get_ylim())
-    return figure
+
+    def draw_axis(panel: Axes, name: str) -> None:
+        for case, style in _STYLES.items():
+            values = deviation.sel(axis=name, case=case).values
+            panel.plot(tau, values, **style, label=_TITLES[case].lower())
+
+    labels = {"xlabel": "averaging time τ [s]", "ylabel": "Allan deviation σ(τ) [deg/h]"}
+    return _draw_cases(surfaces, draw_axis, width, **labels)
 
 
 @draws_figure
@@ -407,26 +409,14 @@ def plot_spectra(surfaces: xr.Dataset, *, width: float = PAGE_MM) -> Figure:
         ``density(case, axis, band)`` over ``frequency`` [Hz] and ``line_density(axis, line)`` over
         ``line_frequency``, two-sided [degree2 hour-2 Hz-1].
     """
-    names = [str(name) for name in surfaces["axis"].values]
-    figure, panels = _make_row(names, width)
-    for panel, name in zip(panels, names, strict=True):
-        panel.plot(
-            surfaces["line_frequency"].values,
-            surfaces["line_density"].sel(axis=name).values,
-            color=GREY,
-            lw=0.6,
-            label="recording",
-        )
+    frequency, lines = surfaces["frequency"].values, surfaces["line_density"]
+
+    def draw_axis(panel: Axes, name: str) -> None:
+        narrow = surfaces["line_frequency"].values, lines.sel(axis=name).values
+        panel.plot(*narrow, color=GREY, lw=0.6, label="recording")
         for case in ("before", "after"):
             values = surfaces["density"].sel(axis=name, case=case).values
-            panel.plot(
-                surfaces["frequency"].values, values, **_STYLES[case], label=_TITLES[case].lower()
-            )
-        panel.set(xscale="log", yscale="log", title=f"axis {name}")
-        panel.grid(True, which="major", alpha=0.4)
-        label_log_axis(panel.xaxis, *panel.get_xlim())
-    figure.supxlabel("frequency [Hz]")
-    figure.supylabel("power density [(deg/h)²/Hz]")
-    panels[0].legend(frameon=False)
-    label_log_axis(panels[0].yaxis, *panels[0].get_ylim())
-    return figure
+            panel.plot(frequency, values, **_STYLES[case], label=_TITLES[case].lower())
+
+    labels = {"xlabel": "frequency [Hz]", "ylabel": "power density [(deg/h)²/Hz]"}
+    return _draw_cases(surfaces, draw_axis, width, **labels)

@@ -14,7 +14,7 @@ from gyrostab.correlate import correlate
 from gyrostab.plot.adev import plot_adev
 from gyrostab.plot.coefficients import plot_coefficients
 from gyrostab.plot.correlation import plot_correlation
-from gyrostab.plot.style import PAGE_MM, save_png
+from gyrostab.plot.style import PAGE_MM, axis_names, save_png
 from gyrostab.plot.surface import plot_davar, plot_davar_3d
 from gyrostab.schema import check_product
 from gyrostab.store.output import check_folder, new_folder
@@ -59,7 +59,7 @@ def product_figures(
         figures["temperature"] = lambda: plot_correlation(
             product if "coupling_verdict" in product else correlate(product), width=width
         )
-    for axis in map(str, product["axis"].values):
+    for axis in axis_names(product):
         figures[f"adev_{axis}"] = lambda axis=axis: plot_adev(product, axis, width=width)  # type: ignore[misc]
         if min(product.sizes["time"], product.sizes["tau"]) > 1:
             figures[f"davar_3d_{axis}"] = lambda axis=axis: plot_davar_3d(

@@ -17,6 +17,7 @@ from gyrostab.plot.style import (
     axis_names,
     axis_style,
     draws_figure,
+    find_runs,
     new_figure,
     shade_spans,
     stack_panels,
@@ -178,6 +179,5 @@ def _find_gaps(log: xr.Dataset, columns: int) -> tuple[NDArray[Any], NDArray[Any
     for number in range(signal.sizes["axis"]):
         times, low, _ = thin(signal[number], columns=columns)
         missing.append(np.isnan(low))
-    edges = np.diff(np.concatenate([[0], np.all(missing, axis=0).astype(int), [0]]))
-    first, last = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+    first, last = find_runs(np.all(missing, axis=0))
     return times[first], np.append(times, log["time"].values[-1])[last]

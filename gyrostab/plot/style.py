@@ -33,6 +33,7 @@ __all__ = [
     "draws_figure",
     "duration",
     "embedded",
+    "find_runs",
     "is_narrow",
     "label_log_axis",
     "log_edges",
@@ -47,6 +48,7 @@ __all__ = [
     "unit_symbol",
     "upper_limit_marker",
     "window_text",
+    "write_in_middle",
 ]
 
 P = ParamSpec("P")
@@ -165,7 +167,7 @@ def window_text(product: xr.Dataset) -> str:
     )
 
 
-def axis_names(dataset: xr.Dataset, axis: str | None) -> list[str]:
+def axis_names(dataset: xr.Dataset, axis: str | None = None) -> list[str]:
     """List the axes to draw; raise `OptionError` if `axis` is not in the data."""
     names = [str(name) for name in dataset["axis"].values]
     if axis is None:
@@ -177,8 +179,7 @@ def axis_names(dataset: xr.Dataset, axis: str | None) -> list[str]:
 
 def axis_style(dataset: xr.Dataset, axis: str) -> dict[str, Any]:
     """Choose colour and marker of an axis: by its name for x, y and z, else by its place."""
-    places = [str(name) for name in dataset["axis"].values]
-    number = "xyz".index(axis) if axis in ("x", "y", "z") else places.index(axis)
+    number = "xyz".index(axis) if axis in ("x", "y", "z") else axis_names(dataset).index(axis)
     return {"color": COLOURS[number % len(COLOURS)], "marker": MARKERS[number % len(MARKERS)]}
 
 
@@ -366,6 +367,11 @@ def embedded(figure: Figure, alt: str, caption: str) -> dict[str, str]:
     }
 
 
+def write_in_middle(panel: Axes, text: str) -> None:
+    """Write in the middle of an empty panel why it is empty."""
+    panel.text(0.5, 0.5, text, transform=panel.transAxes, ha="center", va="center")
+
+
 def time_axis(ax: Axes, times: NDArray[Any]) -> None:
     """Label the time axis with dates and times, as short as is unambiguous."""
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
@@ -378,13 +384,14 @@ def time_axis(ax: Axes, times: NDArray[Any]) -> None:
         ax.set_xlim(times[0], times[-1])
 
 
+def find_runs(mask: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Find the first index of each run of True, and the index after its last."""
+    steps = np.diff(np.concatenate([[0], mask.astype(int), [0]]))
+    return np.flatnonzero(steps == 1), np.flatnonzero(steps == -1)
+
+
 def shade_spans(
-    ax: Axes,
-    starts: Any,
-    ends: Any,
-    *,
-    label: str | None = None,
-    alpha: float = 0.35,
+    ax: Axes, starts: Any, ends: Any, *, label: str | None = None, alpha: float = 0.35
 ) -> None:
     """Shade the spans from `starts` to `ends` (datetime64) over the full height of the panel."""
     from matplotlib.dates import date2num
