@@ -126,8 +126,9 @@ def _fact_rows(content: Mapping[str, Any]) -> list[tuple[str, str]]:
         for first, last in stretches[:MAX_LISTED_STRETCHES]
     )
     more = len(stretches) - MAX_LISTED_STRETCHES
+    unused = (f"{item['name']}: {item['reason']}" for item in content.get("unused_channels", ()))
     expected = " ".join(effect["statement"] for effect in baseline.get("expected", []))
-    return [
+    facts = [
         ("Recording", _recording_text(content)),
         (
             "Span (UTC)",
@@ -139,29 +140,15 @@ def _fact_rows(content: Mapping[str, Any]) -> list[tuple[str, str]]:
             f"{', '.join(recording['axes'])} at {recording['sampling_rate_hz']:g} Hz",
         ),
         ("Channels", ", ".join(recording["channels"]) or "none"),
-        *([("Channels not used", _unused_text(content))] if content.get("unused_channels") else []),
+        ("Channels not used", "; ".join(unused)),
         ("Missing samples", f"{100.0 * recording['missing_share']:.2g} %"),
         ("Compared with", _source_text(baseline)),
-        *([("Expected effects, with their size here", expected)] if expected else []),
-        *(
-            [("Quiescent stretches (UTC)", spans + (f" and {more} more" if more > 0 else ""))]
-            if spans
-            else []
-        ),
-        *(
-            [("Calibrated noise", "; ".join(text.strip() for text in noise[1:]))]
-            if (noise := noise_texts(content))
-            else []
-        ),
+        ("Expected effects, with their size here", expected),
+        ("Quiescent stretches (UTC)", spans + (f" and {more} more" if more > 0 else "")),
+        ("Calibrated noise", "; ".join(text.strip() for text in noise_texts(content)[1:])),
         ("Computing time", f"{content['seconds']:.3g} s"),
     ]
-
-
-def _unused_text(content: Mapping[str, Any]) -> str:
-    """List the unused channels, each with the reason."""
-    return "; ".join(
-        f"{channel['name']}: {channel['reason']}" for channel in content["unused_channels"]
-    )
+    return [(name, text) for name, text in facts if text]
 
 
 def _source_text(baseline: Mapping[str, Any]) -> str:
@@ -271,6 +258,7 @@ def _limit_rows(content: Mapping[str, Any]) -> list[dict[str, str]]:
     }
     for name, entry in content["not_found"].items():
         unit = unit_symbol(entry["unit"])
+        reason = _REASON_TEXT.get(entry["reason"], entry["reason"])
         limit = (
             "–"
             if entry["upper_limit"] is None
@@ -281,15 +269,7 @@ def _limit_rows(content: Mapping[str, Any]) -> list[dict[str, str]]:
                 "name": name,
                 "plain": plain_name(name),
                 "limit": limit,
-                "reason": "; ".join(
-                    filter(
-                        None,
-                        (
-                            _REASON_TEXT.get(entry["reason"], entry["reason"]),
-                            rejected.get(name, ""),
-                        ),
-                    )
-                ),
+                "reason": "; ".join(filter(None, [reason, rejected.get(name)])),
             }
         )
     return sorted(rows, key=lambda row: (row["limit"] == "–", row["name"]))
@@ -321,27 +301,14 @@ def _make_figures(diagnosis: Diagnosis) -> list[dict[str, str]]:
     )
 
     surfaces, content = diagnosis.surfaces, diagnosis.content
-    return [
-        embedded(
-            plot_surfaces(surfaces, content),
-            "Recording, simulation before and after",
-            _FIGURE_TEXT["surfaces"],
-        ),
-        embedded(plot_change(surfaces, content), "Where they differ", _FIGURE_TEXT["change"]),
-        embedded(
-            plot_means(surfaces, content),
-            "Mean rate over time, and what drives it",
-            _FIGURE_TEXT["means"],
-        ),
-        embedded(
-            plot_deviations(surfaces),
-            "Allan deviation of the whole record",
-            _FIGURE_TEXT["deviations"],
-        ),
-        embedded(
-            plot_spectra(surfaces), "Power spectrum of the whole record", _FIGURE_TEXT["spectra"]
-        ),
-    ]
+    figures = {
+        "surfaces": (plot_surfaces(surfaces, content), "Recording, simulation before and after"),
+        "change": (plot_change(surfaces, content), "Where they differ"),
+        "means": (plot_means(surfaces, content), "Mean rate over time, and what drives it"),
+        "deviations": (plot_deviations(surfaces), "Allan deviation of the whole record"),
+        "spectra": (plot_spectra(surfaces), "Power spectrum of the whole record"),
+    }
+    return [embedded(*figure, _FIGURE_TEXT[name]) for name, figure in figures.items()]
 
 
 #: How to read each figure.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gyrostab.noise import NORMAL_95
 from gyrostab.plot.diagnosis import INSIDE_BAND_OPACITY, select_channels
-from gyrostab.plot.style import COLOURS, axis_style, unit_label
+from gyrostab.plot.style import COLOURS, axis_names, axis_style, unit_label
 from gyrostab.report.charts import (
     DEVIATION_LABEL,
     SYMBOLS,
@@ -73,15 +73,11 @@ def _centre_stamps(
     return np.asarray(start / 1e6 + 1e3 * seconds)
 
 
-def _axis_names(surfaces: xr.Dataset) -> list[str]:
-    return [str(name) for name in surfaces["axis"].values]
-
-
 def _draw_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
     """Draw the recording over the simulations, by time and averaging time."""
     from plotly.subplots import make_subplots
 
-    names, tau = _axis_names(surfaces), surfaces["tau"].values
+    names, tau = axis_names(surfaces), surfaces["tau"].values
     frame = make_subplots(
         rows=len(names), cols=2, shared_xaxes="all", shared_yaxes="all",
         horizontal_spacing=0.03, vertical_spacing=0.05,
@@ -148,7 +144,7 @@ def _region_label(region: Mapping[str, Any]) -> dict[str, Any]:
 
 def _draw_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
     """Draw the mean rate of each axis with both simulations, and the channels below."""
-    names, channels = _axis_names(surfaces), select_channels(surfaces, content)
+    names, channels = axis_names(surfaces), select_channels(surfaces, content)
     figure = stacked_panels(len(names) + len(channels), height=170)
     window, block = _centre_stamps(surfaces, content), _centre_stamps(surfaces, content, "block_")
     for row, name in enumerate(names):
@@ -205,7 +201,7 @@ def _add_cases(
     figure: go.Figure, surfaces: xr.Dataset, x: NDArray[np.float64], values: xr.DataArray
 ) -> None:
     """Add lines of the simulations before (dashed) and after, in the colour of each axis."""
-    for name in _axis_names(surfaces):
+    for name in axis_names(surfaces):
         colour = axis_style(surfaces, name)["color"]
         for case, title in _CASES.items():
             figure.add_scatter(
@@ -224,7 +220,7 @@ def _draw_deviations(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Fig
         yaxis=log_axis(DEVIATION_LABEL, deviation.values),
         height=460,
     )
-    for row, name in enumerate(_axis_names(surfaces)):
+    for row, name in enumerate(axis_names(surfaces)):
         figure.add_scatter(
             x=tau, y=single(deviation.sel(axis=name, case="recording").values), mode="markers",
             name=f"axis {plain_text(name)}, recording", legendgroup=name,
@@ -244,7 +240,7 @@ def _draw_spectra(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure
         yaxis=log_axis("power density [(deg/h)²/Hz]", lines.values),
         height=460,
     )
-    for name in _axis_names(surfaces):
+    for name in axis_names(surfaces):
         colour = axis_style(surfaces, name)["color"]
         chosen = _find_highest(lines.sel(axis=name).values)
         figure.add_scatter(

@@ -12,7 +12,7 @@ import xarray as xr
 from gyrostab.allan.variance import variance_name
 from gyrostab.ingest.convert import as_log
 from gyrostab.noise import LAWS
-from gyrostab.plot.style import duration, embedded, unit_symbol
+from gyrostab.plot.style import axis_names, duration, embedded, unit_symbol
 from gyrostab.report.page import page_text
 from gyrostab.report.product_charts import product_charts, window_data
 from gyrostab.schema import GAP_CAUSES, check_product, texts
@@ -127,9 +127,7 @@ def _share_text(share: float) -> str:
 
 def _missing_shares(product: xr.Dataset) -> dict[str, float]:
     coverage = product["window_coverage"]
-    return {
-        str(name): 1.0 - float(coverage.sel(axis=name).mean()) for name in product["axis"].values
-    }
+    return {name: 1.0 - float(coverage.sel(axis=name).mean()) for name in axis_names(product)}
 
 
 def _file_names(product: xr.Dataset) -> list[str]:
@@ -138,7 +136,7 @@ def _file_names(product: xr.Dataset) -> list[str]:
 
 def _summarise_record(product: xr.Dataset) -> str:
     start, end = _record_span(product)
-    axes = [str(name) for name in product["axis"].values]
+    axes = axis_names(product)
     files = _file_names(product)
     origin = f" from {len(files)} file{'s' if len(files) != 1 else ''}" if files else ""
     rate = product.attrs.get("sampling_rate_hz")
@@ -185,20 +183,14 @@ def _list_facts(product: xr.Dataset) -> list[tuple[str, str]]:
     attrs = product.attrs
     start, end = _record_span(product)
     tau = product["tau"].values
+    shortest, longest = (duration(float(tau[end])) for end in (0, -1))
+    missing = (f"{axis}: {_share_text(share)}" for axis, share in _missing_shares(product).items())
     facts = [
         ("Files", ", ".join(_file_names(product)) or "not recorded"),
         ("Span (UTC)", f"{_stamp_text(start)} to {_stamp_text(end)}"),
-        ("Axes", ", ".join(str(name) for name in product["axis"].values)),
-        (
-            "Missing samples",
-            ", ".join(
-                f"{axis}: {_share_text(share)}" for axis, share in _missing_shares(product).items()
-            ),
-        ),
-        (
-            "Averaging times",
-            f"{tau.size}, from {duration(float(tau[0]))} to {duration(float(tau[-1]))}",
-        ),
+        ("Axes", ", ".join(axis_names(product))),
+        ("Missing samples", ", ".join(missing)),
+        ("Averaging times", f"{tau.size}, from {shortest} to {longest}"),
         ("Windows", str(product.sizes["time"])),
     ]
     timed = {"window_s": "Window", "step_s": "Step"}
@@ -291,34 +283,23 @@ def _summarise_gaps(log: xr.Dataset, gaps: list[dict[str, Any]]) -> str:
 def _make_figures(product: xr.Dataset, log: xr.Dataset | None) -> list[dict[str, str]]:
     from gyrostab.plot import plot_adev, plot_coefficients, plot_davar, plot_signal
 
-    figures, variance = [], variance_name(product)
-    captions = {name: text.replace("Allan", variance) for name, text in _CAPTIONS.items()}
-    if log is not None:
-        figures.append(embedded(plot_signal(log), "Signal as recorded", captions["signal"]))
-    figures.append(
-        embedded(
-            plot_coefficients(product), "Noise coefficients over time", captions["coefficients"]
-        )
-    )
-    figures.append(
-        embedded(plot_davar(product), f"Dynamic {variance} deviation", captions["davar"])
-    )
-    figures.append(
-        embedded(
-            plot_davar(product, relative=True),
-            f"Change of the dynamic {variance} deviation",
-            captions["change"],
-        )
-    )
-    for name in product["axis"].values:
-        figures.append(
-            embedded(
-                plot_adev(product, str(name)),
-                f"{variance} deviation of one window, axis {name}",
-                captions["adev"],
-            )
-        )
-    return figures
+    variance = variance_name(product)
+    change = f"Change of the dynamic {variance} deviation"
+    window = f"{variance} deviation of one window"
+    figures = [] if log is None else [("signal", plot_signal(log), "Signal as recorded")]
+    figures += [
+        ("coefficients", plot_coefficients(product), "Noise coefficients over time"),
+        ("davar", plot_davar(product), f"Dynamic {variance} deviation"),
+        ("change", plot_davar(product, relative=True), change),
+        *(
+            ("adev", plot_adev(product, axis), f"{window}, axis {axis}")
+            for axis in axis_names(product)
+        ),
+    ]
+    return [
+        embedded(figure, alt, _CAPTIONS[name].replace("Allan", variance))
+        for name, figure, alt in figures
+    ]
 
 
 #: How to read each figure.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gyrostab.allan.variance import surface_columns, variance_name
 from gyrostab.noise import LAWS
 from gyrostab.plot.adev import band
-from gyrostab.plot.style import axis_style, unit_label, unit_of_time, unit_symbol
+from gyrostab.plot.style import axis_names, axis_style, unit_label, unit_of_time, unit_symbol
 from gyrostab.report.charts import (
     DEVIATION_LABEL,
     SYMBOLS,
@@ -109,7 +109,7 @@ def window_data(product: xr.Dataset) -> str:
         "high": high,
         "fitted": _fitted_avar(part),
     }
-    names = [str(name) for name in part["axis"].values]
+    names = axis_names(part)
     content = {
         "axes": names,
         "colours": [axis_style(product, name)["color"] for name in names],
@@ -177,7 +177,7 @@ def _draw_record(product: xr.Dataset) -> go.Figure:
         yaxis=log_axis(_deviation_label(product), measured),
         height=460,
     )
-    for row, name in enumerate(map(str, record["axis"].values)):
+    for row, name in enumerate(axis_names(record)):
         style = axis_style(product, name)
         shared = {
             "x": record["tau"].values,
@@ -251,7 +251,7 @@ def _add_coefficient(
     """Add estimates as points with standard errors, and upper limits as open triangles."""
     state = product["observable"].sel(term=symbol).values
     figure.layout[panel.replace("y", "yaxis")].update(_scale_of(product, symbol, state))
-    for row, name in enumerate(map(str, product["axis"].values)):
+    for row, name in enumerate(axis_names(product)):
         colour = axis_style(product, name)["color"]
         shared = {"x": milliseconds(product), "yaxis": panel, "legendgroup": name}
         limits = np.where(
