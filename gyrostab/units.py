@@ -138,26 +138,18 @@ _add_unit("magnetic", 0.1, "mG", "milligauss", "mgauss")
 _add_unit("number", 1.0, "1", "-", "count", "")
 
 # Products of powers of angle, time and length: name -> (dimension, numerator, denominator), in
-# degree, s and m.
+# degree, s and m. Other words for a name are in `_WORDS`.
 _BASES: dict[str, tuple[str, float, float]] = {
-    **dict.fromkeys(
-        ("deg", "degs", "degree", "degrees", "°", "arcdeg", "angular_degree"), ("angle", 1.0, 1.0)
-    ),
-    **dict.fromkeys(("rad", "radian", "radians"), ("angle", 1.0, _DEGREE)),
+    **dict.fromkeys(("deg", "°", "arcdeg", "angular_degree"), ("angle", 1.0, 1.0)),
+    "rad": ("angle", 1.0, _DEGREE),
     **dict.fromkeys(
         ("arcmin", "arcminute", "arcminutes", "arc_minute", "arc_minutes"), ("angle", 1.0, 60.0)
     ),
-    **dict.fromkeys(
-        ("arcsec", "arcsecs", "asec", "arcsecond", "arcseconds", "arc_second", "arc_seconds", '"'),
-        ("angle", 1.0, HOUR),
-    ),
-    **dict.fromkeys(
-        ("rev", "revs", "revolution", "revolutions", "turn", "turns", "cycle", "cycles"),
-        ("angle", 360.0, 1.0),
-    ),
-    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), ("time", 1.0, 1.0)),
-    **dict.fromkeys(("min", "minute", "minutes"), ("time", 60.0, 1.0)),
-    **dict.fromkeys(("h", "hr", "hrs", "hour", "hours"), ("time", HOUR, 1.0)),
+    **dict.fromkeys(("arcsec", "arc_second", "arc_seconds", '"'), ("angle", 1.0, HOUR)),
+    **dict.fromkeys(("rev", "cycle", "cycles"), ("angle", 360.0, 1.0)),
+    "s": ("time", 1.0, 1.0),
+    "min": ("time", 60.0, 1.0),
+    "h": ("time", HOUR, 1.0),
     **dict.fromkeys(("d", "day", "days"), ("time", DAY, 1.0)),
     **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), ("length", 1.0, 1.0)),
 }
@@ -249,8 +241,8 @@ def _parse_base(name: str) -> tuple[str, float, float] | None:
     Upper and lower case are alike but for prefixes of one letter: ``MRAD`` may be milli or mega,
     and is refused.
     """
-    if name.lower() in _BASES:
-        return _BASES[name.lower()]
+    if (base_unit := _find_base(name)) is not None:
+        return base_unit
     for prefixes, head, base in (
         (_PREFIXES, name[:1], name[1:]),
         *(
@@ -261,10 +253,15 @@ def _parse_base(name: str) -> tuple[str, float, float] | None:
     ):
         if head.lower() != head and prefixes is _PREFIXES:
             continue
-        if head in prefixes and base.lower().lstrip("_") in _BASES:
-            dimension, numerator, denominator = _BASES[base.lower().lstrip("_")]
+        if head in prefixes and (base_unit := _find_base(base.lstrip("_"))) is not None:
+            dimension, numerator, denominator = base_unit
             return dimension, prefixes[head] * numerator, denominator
     return None
+
+
+def _find_base(name: str) -> tuple[str, float, float] | None:
+    word = name.lower()
+    return _BASES.get(_WORDS.get(word, word))
 
 
 def _parse_product(text: str) -> tuple[str, float, float] | None:
