@@ -73,6 +73,10 @@ def _flag_attributes(meanings: tuple[str, ...]) -> dict[str, Any]:
     }
 
 
+def _make_attrs(long_name: str, units: str = "1") -> dict[str, Any]:
+    return {"long_name": long_name, "units": units}
+
+
 #: Product variable -> attributes. CF, UDUNITS spelling; ``axis`` and ``term`` hold strings and so
 #: carry no unit.
 VARIABLES: dict[str, dict[str, Any]] = {
@@ -82,85 +86,55 @@ VARIABLES: dict[str, dict[str, Any]] = {
         "bounds": "time_bounds",
         "axis": "T",
     },
-    "tau": {"long_name": "averaging time", "units": "s"},
+    "tau": _make_attrs("averaging time", "s"),
     "axis": {"long_name": "sensor axis"},
     "term": {"long_name": "noise term, symbol of IEEE Std 952"},
-    "avar": {
-        "long_name": "dynamic overlapping Allan variance of the rotation rate",
-        "units": "degree2 hour-2",
-    },
-    "count": {"long_name": "second differences used", "units": "1"},
-    "coverage": {
-        "long_name": "second differences used, share of the gap-free number",
-        "units": "1",
-    },
-    "edf": {"long_name": "equivalent degrees of freedom of the Allan variance", "units": "1"},
+    "avar": _make_attrs(
+        "dynamic overlapping Allan variance of the rotation rate", "degree2 hour-2"
+    ),
+    "count": _make_attrs("second differences used"),
+    "coverage": _make_attrs("second differences used, share of the gap-free number"),
+    "edf": _make_attrs("equivalent degrees of freedom of the Allan variance"),
     "estimator": {"long_name": "estimator of the Allan variance", **_flag_attributes(ESTIMATORS)},
-    "gap_factor": {
-        "long_name": "degrees of freedom left by the gaps, share of the gap-free ones",
-        "units": "1",
-    },
-    "white_response": {
-        "long_name": "Allan variance of angle random walk seen through the gaps, "
-        "as a share of the gap-free law",
-        "units": "1",
-    },
-    "quantization_response": {
-        "long_name": "Allan variance of quantization noise seen through the gaps, "
-        "as a share of the gap-free law",
-        "units": "1",
-    },
-    "ramp_response": {
-        "long_name": "Allan variance of a rate ramp seen through the gaps, "
-        "as a share of the gap-free law",
-        "units": "1",
-    },
-    "difference_trend": {
-        "long_name": "slope of the rate that the second differences show through the gaps",
-        "units": "degree hour-2",
-    },
-    "window_mean": {"long_name": "mean rotation rate of the window", "units": INNER["rate"]},
-    "window_trend": {
-        "long_name": "slope of the least-squares line through the rate of the window",
-        "units": "degree hour-2",
-    },
-    "trend_response": {
-        "long_name": "variance of window_trend under white noise, as a share of that of a window "
-        "without gaps",
-        "units": "1",
-    },
-    "outlier_count": {
-        "long_name": "single samples of the window that are far from both neighbours",
-        "units": "1",
-    },
-    "gap_edge_ratio": {
-        "long_name": "scatter of the samples next to gaps over that of the others",
-        "units": "1",
-    },
-    "window_coverage": {
-        "long_name": "share of the window's samples that are present",
-        "units": "1",
-    },
+    "gap_factor": _make_attrs("degrees of freedom left by the gaps, share of the gap-free ones"),
+    "white_response": _make_attrs(
+        "Allan variance of angle random walk seen through the gaps, as a share of the gap-free law"
+    ),
+    "quantization_response": _make_attrs(
+        "Allan variance of quantization noise seen through the gaps, as a share of the gap-free law"
+    ),
+    "ramp_response": _make_attrs(
+        "Allan variance of a rate ramp seen through the gaps, as a share of the gap-free law"
+    ),
+    "difference_trend": _make_attrs(
+        "slope of the rate that the second differences show through the gaps", "degree hour-2"
+    ),
+    "window_mean": _make_attrs("mean rotation rate of the window", INNER["rate"]),
+    "window_trend": _make_attrs(
+        "slope of the least-squares line through the rate of the window", "degree hour-2"
+    ),
+    "trend_response": _make_attrs(
+        "variance of window_trend under white noise, as a share of that of a window without gaps"
+    ),
+    "outlier_count": _make_attrs("single samples of the window that are far from both neighbours"),
+    "gap_edge_ratio": _make_attrs("scatter of the samples next to gaps over that of the others"),
+    "window_coverage": _make_attrs("share of the window's samples that are present"),
     "observable": {
         "long_name": "whether the window shows the noise term",
         **_flag_attributes(OBSERVABLE),
     },
-    "fit_chi2": {
-        "long_name": "misfit of the five-term model, generalised least squares chi-square",
-        "units": "1",
-    },
-    "fit_dof": {"long_name": "degrees of freedom of the misfit", "units": "1"},
-    "fit_tau_min": {"long_name": "shortest averaging time of the fit", "units": "s"},
-    "filter_time_constant": {
-        "long_name": "time constant of the first-order low-pass with the effect of the filter of "
-        "the sensor on the averaging times of the fit, 0 without a filter",
-        "units": "s",
-    },
-    "filter_white_error": {
-        "long_name": "relative standard error of N by that of filter_time_constant, which the "
-        "standard error of N includes",
-        "units": "1",
-    },
+    "fit_chi2": _make_attrs("misfit of the five-term model, generalised least squares chi-square"),
+    "fit_dof": _make_attrs("degrees of freedom of the misfit"),
+    "fit_tau_min": _make_attrs("shortest averaging time of the fit", "s"),
+    "filter_time_constant": _make_attrs(
+        "time constant of the first-order low-pass with the effect of the filter of the sensor on "
+        "the averaging times of the fit, 0 without a filter",
+        "s",
+    ),
+    "filter_white_error": _make_attrs(
+        "relative standard error of N by that of filter_time_constant, which the standard error of "
+        "N includes"
+    ),
 }
 
 
