@@ -10,6 +10,8 @@ from __future__ import annotations
 import errno
 import json
 import os
+import threading
+from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -25,6 +27,7 @@ from gyrostab.store.blosc_chunks import is_blosc_cut
 from gyrostab.store.private import library_lock
 
 __all__ = [
+    "ChunkCache",
     "ChunkDamage",
     "decode_chunk",
     "find_zarr_codecs",
@@ -32,7 +35,7 @@ __all__ = [
     "is_readable",
     "read_chunk",
     "read_written_chunk",
-]  # fmt: skip
+]
 
 #: Variables whose layout is cached: several for each file of a long archive.
 _MAX_CACHED_LAYOUTS = 2**12
@@ -42,6 +45,36 @@ _DEFLATE, _SHUFFLE, _FLETCHER32, _ZSTD = 1, 2, 3, 32015
 
 class ChunkDamage(Exception):
     """A chunk that cannot be read; the message says why."""
+
+
+class ChunkCache:
+    """The most recently used chunks, by opening, variable and position, within a limit of bytes.
+
+    A chunk of more than `largest_bytes` is not stored.
+    """
+
+    def __init__(self, most_bytes: int, largest_bytes: int):
+        self._max_bytes, self._max_chunk_bytes = most_bytes, largest_bytes
+        self._bytes = 0
+        self._chunks: OrderedDict[tuple[Any, ...], NDArray[Any]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: tuple[Any, ...]) -> NDArray[Any] | None:
+        """Return a chunk, or None when it is not stored."""
+        with self._lock:
+            if key in self._chunks:
+                self._chunks.move_to_end(key)
+            return self._chunks.get(key)
+
+    def put(self, key: tuple[Any, ...], chunk: NDArray[Any]) -> None:
+        """Store a chunk, and drop the least recently used ones over the limit."""
+        with self._lock:
+            if key in self._chunks or chunk.nbytes > self._max_chunk_bytes:
+                return
+            self._chunks[key] = chunk
+            self._bytes += chunk.nbytes
+            while self._bytes > self._max_bytes:
+                self._bytes -= self._chunks.popitem(last=False)[1].nbytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,14 +158,12 @@ def _read_hdf5_chunk(path: Path, name: str, place: tuple[int, ...], opened: str)
         )
     begin, size, mask = layout.places[place]
     try:
-        handle = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
-        try:
+        with path.open("rb") as file:
             # before memory is allocated: a damaged index may hold any number
-            if begin + size > os.fstat(handle).st_size:
+            if begin + size > os.fstat(file.fileno()).st_size:
                 raise ChunkDamage("is missing: the file is cut short")
-            data = _read_bytes(handle, begin, size)
-        finally:
-            os.close(handle)
+            file.seek(begin)
+            data = file.read(size)
     except OSError as error:
         if error.errno != errno.EIO:
             raise FormatError(
@@ -144,14 +175,6 @@ def _read_hdf5_chunk(path: Path, name: str, place: tuple[int, ...], opened: str)
     return decode_chunk(
         data, [codec for number, codec in layout.codecs if not mask >> number & 1], layout.dtype
     )
-
-
-def _read_bytes(handle: int, begin: int, size: int) -> bytes:
-    os.lseek(handle, begin, os.SEEK_SET)
-    data = os.read(handle, size)
-    while 0 < len(data) < size and (more := os.read(handle, size - len(data))):
-        data += more
-    return data
 
 
 @lru_cache(maxsize=_MAX_CACHED_LAYOUTS)
@@ -193,20 +216,16 @@ def _find_hdf5_codecs(plist: Any) -> tuple[tuple[int, Any], ...]:
     """Find the codecs of the filters, in the order of reading, with their numbers."""
     from numcodecs import Zlib, Zstd
 
-    codecs = []
+    known_codecs = {_DEFLATE: Zlib, _FLETCHER32: _Fletcher32, _ZSTD: Zstd}
+    codecs: list[tuple[int, Any]] = []
     for number in reversed(range(plist.get_nfilters())):
         code, _, values, _ = plist.get_filter(number)
-        made = {_DEFLATE: Zlib, _FLETCHER32: _Fletcher32, _ZSTD: Zstd}.get(code)
-        codecs.append(
-            (
-                number,
-                _Shuffle(values[0])
-                if code == _SHUFFLE
-                else made()
-                if made
-                else _UnknownFilter(code),
-            )
-        )
+        if code == _SHUFFLE:
+            codecs.append((number, _Shuffle(values[0])))
+        elif code in known_codecs:
+            codecs.append((number, known_codecs[code]()))
+        else:
+            codecs.append((number, _UnknownFilter(code)))
     return tuple(codecs)
 
 

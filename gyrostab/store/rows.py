@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import DamageError
-from gyrostab.store.chunk_cache import ChunkCache
-from gyrostab.store.layout import ChunkDamage, has_known_filters, read_written_chunk
+from gyrostab.store.layout import ChunkCache, ChunkDamage, has_known_filters, read_written_chunk
 
 __all__ = ["ChunkedRows", "EvenRows", "LibraryRows", "Rows", "hdf5_rows"]
 
@@ -216,15 +215,10 @@ def _load_hdf5(
 ) -> NDArray[Any] | None:
     try:
         chunk = read_written_chunk(path, name, at, opened=opened)
+        if chunk is not None and chunk.size != math.prod(chunks):
+            raise ChunkDamage(f"holds {chunk.size} values in place of {math.prod(chunks)}")
     except ChunkDamage as damage:
         raise DamageError(
             f"{path.name}: is damaged, a chunk of {name.strip('/')!r} {damage}; copy it again"
         ) from damage
-    if chunk is None:
-        return None
-    if chunk.size != int(np.prod(chunks)):
-        problem = f"holds {chunk.size} values in place of {int(np.prod(chunks))}"
-        raise DamageError(
-            f"{path.name}: is damaged, a chunk of {name.strip('/')!r} {problem}; copy it again"
-        )
-    return chunk.reshape(chunks)
+    return None if chunk is None else chunk.reshape(chunks)
