@@ -8,6 +8,7 @@ as JSON. `open_dataset` turns all of that back (`gyrostab.store.cf` and `.times`
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
 from collections.abc import Callable
@@ -115,9 +116,7 @@ def to_netcdf(
     ...     open_log(to_netcdf(log, folder + "/log.nc")).time.values[1]
     np.datetime64('1970-01-01T00:00:00.003333333')
     """
-    dataset = _compute_time_axes(dataset)
-    sources = find_sources(dataset)
-    stored = to_disk(dataset, "to_netcdf", stamps=_wants_stamps(dataset, stamps))
+    stored, sources = _encode_dataset(dataset, "to_netcdf", stamps)
     filters = _make_filters(compression)
 
     def write(packed: xr.Dataset) -> None:
@@ -151,9 +150,13 @@ def _compute_time_axes(dataset: Any) -> xr.Dataset:
     return dataset
 
 
-def _wants_stamps(dataset: xr.Dataset, stamps: bool | None) -> bool:
-    """Whether the computed times of a log are stored."""
-    return dataset.sizes.get("time", 0) < MAX_STAMPED_SAMPLES if stamps is None else stamps
+def _encode_dataset(dataset: Any, verb: str, stamps: bool | None) -> tuple[xr.Dataset, list[Path]]:
+    """Encode a dataset as the file will hold it, and find the files that it still reads from."""
+    dataset = _compute_time_axes(dataset)
+    sources = find_sources(dataset)
+    if stamps is None:
+        stamps = dataset.sizes.get("time", 0) < MAX_STAMPED_SAMPLES
+    return to_disk(dataset, verb, stamps=stamps), sources
 
 
 def _begin_netcdf(dataset: xr.Dataset, path: Path, encoding: dict[Any, dict[str, Any]]) -> None:
@@ -241,11 +244,8 @@ def to_zarr(
     overwrite : bool
         Replace an existing store, unless other files are in it, or the dataset is lazy and still
         reads from it.
-    stamps : bool, optional
-        Store the time of every sample of a log as a CF coordinate, for programs other than
-        gyrostab; by default in logs of less than 10 000 000 samples.
-    progress : callable, optional
-        Called with the share of the long variables that is written.
+    stamps, progress
+        As for `to_netcdf`.
 
     Returns
     -------
@@ -268,9 +268,7 @@ def to_zarr(
     ...     xr.open_zarr(to_zarr(cube, folder + "/cube.zarr")).avar.dims
     ('axis', 'tau', 'time')
     """
-    dataset = _compute_time_axes(dataset)
-    sources = find_sources(dataset)
-    stored = to_disk(dataset, "to_zarr", stamps=_wants_stamps(dataset, stamps))
+    stored, sources = _encode_dataset(dataset, "to_zarr", stamps)
 
     def write(packed: xr.Dataset) -> None:
         long = long_variables(packed) if _find_rate(packed) is not None else {}
@@ -369,15 +367,8 @@ def _is_data(dataset: xr.Dataset, name: Any) -> bool:
 
 def _plan_chunks(variable: xr.Variable, rate: float | None) -> tuple[int, ...]:
     """Plan chunks of one axis (and one term), all tau, and much time; 20 minutes for a log."""
-    inner = int(
-        np.prod(
-            [
-                size
-                for dim, size in variable.sizes.items()
-                if dim not in ("axis", "term", variable.dims[-1])
-            ]
-        )
-    )
+    split_dims = ("axis", "term", variable.dims[-1])
+    inner = math.prod(size for dim, size in variable.sizes.items() if dim not in split_dims)
     max_length = max(1, CHUNK_VALUES // max(1, inner))
     if rate is not None:
         on_time = variable.dims[-1] in ("time", index_dim("time")) and not _has_rule(variable)

@@ -32,29 +32,16 @@ class LayoutError(SchemaError):
 def write_windows(
     path: Path, parts: Iterable[tuple[slice, xr.Dataset]], *, size: int, unit: int, new: bool
 ) -> None:
-    """Write parts of a product to a Zarr store, which then has `size` windows.
+    """Write parts of a product, in memory, to a Zarr store, which then has `size` windows.
 
-    Parameters
-    ----------
-    path : Path
-        The store.
-    parts : iterable of (slice, xarray.Dataset)
-        Windows and their part of the product, in memory. If the store is new, the parts are all of
-        the product, in order.
-    size : int
-        Windows of the whole product.
-    unit : int
-        Windows of a part; chunks consist of whole parts.
-    new : bool
-        Make the store anew, in place of an existing one once it is complete.
+    Chunks consist of whole parts of `unit` windows. With `new`, the parts are all of the product,
+    in order, and the new store replaces an existing one once it is complete.
 
     Raises
     ------
     LayoutError
         When a part does not fit into the existing store, of which some windows may have been
         written.
-    OutputError
-        When the store cannot be written.
     """
     chunk = unit * -(-_MIN_CHUNK_WINDOWS // unit)
     if not new:

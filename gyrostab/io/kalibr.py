@@ -45,7 +45,7 @@ from gyrostab.noise import HOUR, LAWS
 from gyrostab.schema import check_product, texts
 from gyrostab.store.output import new_output
 
-__all__ = ["ACCELEROMETER_KEYS", "KEYS", "KalibrValue", "kalibr_noise", "to_kalibr"]
+__all__ = ["ACCELEROMETER_KEYS", "KEYS", "KalibrValue", "convert_terms", "to_kalibr"]
 
 _GRAVITY = 9.80665  # m/s^2
 #: Samples of an accelerometer that are read at a time.
@@ -74,31 +74,10 @@ class KalibrValue:
     share: float  # share of the windows that enter the median [1]
 
 
-def kalibr_noise(product: xr.Dataset) -> dict[str, dict[str, KalibrValue]]:
-    """Noise of each axis in the units of Kalibr.
-
-    Parameters
-    ----------
-    product : xarray.Dataset
-        Product with ``N`` [deg/sqrt(h)], ``K`` [deg/h^1.5], ``B`` [deg/h] and their upper limits,
-        dims ``(axis, time)``.
-
-    Returns
-    -------
-    dict
-        Axis to key of `KEYS` to `KalibrValue`.
-
-    Raises
-    ------
-    SchemaError
-        When `product` is not a product.
-    """
-    return _convert_terms(product, KEYS)
-
-
-def _convert_terms(
+def convert_terms(
     product: xr.Dataset, keys: Mapping[str, tuple[str, float, str]]
 ) -> dict[str, dict[str, KalibrValue]]:
+    """Find axis -> key of `keys` -> value of a product in the units of Kalibr."""
     by_symbol = {symbol: (key, factor) for key, (symbol, factor, _) in keys.items()}
     values_by_axis: dict[str, dict[str, KalibrValue]] = {}
     for term in summarise_terms(product):
@@ -196,7 +175,7 @@ def to_kalibr(
         *(_describe_fit(fit) for fit in summarise_fit(product)),
         f"update_rate: {float(rate)!r}  # Hz",
     ]
-    noise = {sensor: _convert_terms(*part) for sensor, part in fitted.items()}
+    noise = {sensor: convert_terms(*part) for sensor, part in fitted.items()}
     for sensor, (_, keys) in fitted.items():
         for key in keys:
             worst = _find_worst([values[key] for values in noise[sensor].values()])

@@ -94,22 +94,21 @@ def to_disk(
                 grids[name], variable.attrs, divisor
             )
             continue
+        is_index = name in dataset.dims
         stored = (
-            transpose_lazy(_make_lazy(variable), _disk_order(variable.dims))
-            if name not in dataset.dims
-            else variable
+            variable
+            if is_index
+            else transpose_lazy(_make_lazy(variable), _disk_order(variable.dims))
         )
         label = _LONG_NAMES.get(str(name), str(name).replace("_", " "))
         attrs = encode_attributes({"long_name": label, **variable.attrs})
-        data = stored.data if name not in dataset.dims else None
+        data = variable.values if is_index else stored.data
         if variable.dtype.kind == "M":
             data = encode_stamps(name, stored, divisor)
-            if name in dataset.dims:
+            if is_index:
                 attrs = {"standard_name": "time", "axis": "T", **attrs}
             if name not in bounds:
                 attrs |= time_attributes(divisor)
-        elif data is None:
-            data = variable.values
         packing = (
             {key: variable.encoding[key] for key in PACKING if key in variable.encoding}
             if "scale_factor" in variable.encoding

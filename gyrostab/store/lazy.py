@@ -177,13 +177,9 @@ def read_into(array: Any, row: int, begin: int, out: NDArray[Any]) -> None:
     source = find_source(array)
     if source is not None and source.dtype == out.dtype:
         source.read_into(row, begin, out)
-        return
-    place = slice(begin, begin + out.size)
-    if source is not None:
-        out[:] = source[place] if source.ndim == 1 else source[row : row + 1, place][0]
-        return
-    part = array[place] if array.ndim == 1 else array[row, place]
-    out[:] = part if isinstance(part, np.ndarray) else part.compute(scheduler="synchronous")
+    else:
+        box = (slice(row, row + 1), slice(begin, begin + out.size))
+        out[:] = read_box(array, box[-array.ndim :]).reshape(out.shape)
 
 
 def read_slice(array: Any, begin: int, end: int) -> NDArray[Any]:

@@ -51,15 +51,8 @@ def append_compressed(
 ) -> None:
     """Add variables to a NetCDF file, compressed in several threads.
 
-    The result is what the library would write: bytes shuffled, then deflated.
-
-    Parameters
-    ----------
-    large : mapping of str to xarray.Variable
-        Numeric variables, in memory or of dask; the latter are computed chunk by chunk.
-    encoding : mapping
-        ``zlib``, ``complevel``, ``shuffle``, ``chunksizes`` and ``_FillValue`` of each variable, as
-        for xarray.
+    The result is what the library would write: bytes shuffled, then deflated. Variables of dask are
+    computed chunk by chunk. `encoding` is as for xarray.
     """
     import h5py
     import netCDF4

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import warnings
-from collections.abc import Iterable
+from collections.abc import Container, Iterable, Mapping
 from typing import Any
 
 import xarray as xr
@@ -69,16 +69,7 @@ def make_names_storable(dataset: xr.Dataset) -> xr.Dataset:
             used_names.add(safe[name])
     if not safe:
         return dataset
-    renamed = dataset.rename(
-        {
-            **safe,
-            **{
-                f"time_{name}": f"time_{safe_name}"
-                for name, safe_name in safe.items()
-                if f"time_{name}" in used_names
-            },
-        }
-    )
+    renamed = _rename_with_times(dataset, safe, used_names)
     for name, safe_name in safe.items():
         # a name that was decoded wrongly may hold half a character
         shown = name.encode("utf-8", "backslashreplace").decode()
@@ -91,7 +82,7 @@ def make_names_storable(dataset: xr.Dataset) -> xr.Dataset:
     warnings.warn(
         "a file cannot hold a channel of this name, so it is stored under another one: "
         f"{renamings}",
-        stacklevel=4,
+        stacklevel=5,
     )
     return renamed
 
@@ -104,13 +95,14 @@ def restore_names(dataset: xr.Dataset) -> xr.Dataset:
             originals[name] = json.loads(variable.attrs.pop(ORIGINAL_NAME))
     if not originals:
         return dataset
+    return _rename_with_times(dataset, originals, dataset.dims)
+
+
+def _rename_with_times(
+    dataset: xr.Dataset, names: Mapping[Any, str], used_names: Container[Any]
+) -> xr.Dataset:
+    """Rename variables, and the time axes called after them that are among `used_names`."""
+    times = {f"time_{name}": f"time_{new_name}" for name, new_name in names.items()}
     return dataset.rename(
-        {
-            **originals,
-            **{
-                f"time_{name}": f"time_{original}"
-                for name, original in originals.items()
-                if f"time_{name}" in dataset.dims
-            },
-        }
+        {**names, **{name: new_name for name, new_name in times.items() if name in used_names}}
     )

@@ -206,20 +206,11 @@ def _parse_grid(text: Any) -> dict[str, Any]:
     ]
     if wrong:
         raise ValueError(f"no {' and no '.join(wrong)}")
-    first, last = (rule["first"] + rule["stride"] * n for n in (0, max(rule["size"], 1) - 1))
-    spans = (
-        (rule["start_ns"] + n * 1e9 / rule["rate_hz"] for n in (first, last))
-        if rule["rate_hz"] > 0
-        else ()
-    )
-    if not (
-        rule["rate_hz"] > 0
-        and math.isfinite(rule["rate_hz"])
-        and rule["size"] >= 0
-        and rule["stride"] != 0
-    ):
+    rate, size, stride = rule["rate_hz"], rule["size"], rule["stride"]
+    if not (0 < rate < math.inf and size >= 0 and stride != 0):
         raise ValueError(f"{text}")
-    if any(abs(stamp) >= 2.0**63 for stamp in spans):
+    ends = (rule["first"] + stride * n for n in (0, max(size, 1) - 1))
+    if any(abs(rule["start_ns"] + n * 1e9 / rate) >= 2.0**63 for n in ends):
         raise ValueError("it leaves the years 1678 to 2262")
     return dict(rule)
 

@@ -52,8 +52,8 @@ def chunk_samples(rate: float) -> int:
 
     Examples
     --------
-    >>> chunk_samples(400.0), chunk_samples(1.0)
-    (480000, 65536)
+    >>> chunk_samples(400.0), chunk_samples(1.0), chunk_samples(1e5)
+    (480000, 65536, 4194304)
     """
     return int(np.clip(round(CHUNK_SECONDS * rate), *CHUNK_LIMITS))
 

@@ -307,17 +307,6 @@ def test_missing_time_is_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_integer_counts_are_stored_as_integers(tmp_path):
-    log = synthetic.log()
-    log["rate"] = log.rate.copy(data=np.round(log.rate / 0.1) * 0.1)
-    log["rate"].encoding = {"dtype": np.dtype("i4"), "scale_factor": 0.1}
-    path = to_netcdf(log, tmp_path / "log.nc")
-    with netCDF4.Dataset(path) as file:
-        file.set_auto_maskandscale(False)
-        assert file["rate"].dtype == np.int32
-    np.testing.assert_array_equal(open_log(path).rate, log.rate)
-
-
 def test_a_lazy_log_is_never_held_whole(tmp_path):
     blocks = []
 

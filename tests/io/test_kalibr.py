@@ -12,8 +12,7 @@ import gyrostab
 from gyrostab.cli import main
 from gyrostab.errors import OutputError, SchemaError
 from gyrostab.io.datasets import to_netcdf
-from gyrostab.io.kalibr import ACCELEROMETER_KEYS, KEYS, kalibr_noise, to_kalibr
-from gyrostab.io.kalibr import _convert_terms as convert_terms
+from gyrostab.io.kalibr import ACCELEROMETER_KEYS, KEYS, convert_terms, to_kalibr
 from gyrostab.io.kalibr import _fit_accelerometers as fit_accelerometers
 from gyrostab.schema import OBSERVABLE
 from tests.support import synthetic
@@ -64,7 +63,7 @@ def parse(path) -> dict:
 
 
 def test_units_are_those_worked_out_by_hand(product):
-    noise = kalibr_noise(product)["x"]
+    noise = convert_terms(product, KEYS)["x"]
     for key, value in {
         "gyroscope_noise_density": 2.0,
         "gyroscope_random_walk": 3.0,
@@ -74,22 +73,10 @@ def test_units_are_those_worked_out_by_hand(product):
     assert KEYS["gyroscope_random_walk"][2] == "rad/s^2/sqrt(Hz)"
 
 
-def test_density_gives_the_scatter_of_the_samples():
-    """White noise of density s has standard deviation s sqrt(rate) and ADEV s at 1 s, in rad/s."""
-    rate, samples = 100.0, 400_000
-    density = 0.02 * BY_HAND["gyroscope_noise_density"]  # N = 0.02 deg/sqrt(h)
-    rates = np.random.default_rng(3).normal(0.0, density * math.sqrt(rate), samples)  # rad/s
-    means = rates.reshape(-1, int(rate)).mean(axis=1)
-    allan = (
-        math.sqrt(np.mean(np.diff(means) ** 2) / 2.0) * 180.0 / math.pi * 3600.0
-    )  # deg/h at tau = 1 s
-    assert allan / 60.0 == pytest.approx(0.02, rel=0.05)  # N^2 / tau at tau = 1/3600 h
-
-
 def test_median_over_observed_windows_only(product):
     product["N"][0] = [1.0, 2.0, 7.0, 1e6, 1e6, np.nan]
     product["observable"].loc[{"term": "N"}][0, 3:] = OBSERVABLE.index("not_observable")
-    value = kalibr_noise(product)["x"]["gyroscope_noise_density"]
+    value = convert_terms(product, KEYS)["x"]["gyroscope_noise_density"]
     assert value.value == pytest.approx(2.0 * BY_HAND["gyroscope_noise_density"])
     assert (value.meaning, value.share) == ("observed", 0.5)
 
@@ -154,7 +141,7 @@ def test_yaml_readers_see_numbers(product, tmp_path):
 
 def test_refusals(product, tmp_path):
     with pytest.raises(SchemaError, match="no variable"):
-        kalibr_noise(synthetic.surface())
+        convert_terms(synthetic.surface(), KEYS)
     del product.attrs["sampling_rate_hz"]
     with pytest.raises(SchemaError, match="sampling_rate_hz"):
         to_kalibr(product, tmp_path / "imu.yaml")

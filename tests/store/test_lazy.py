@@ -179,20 +179,6 @@ def test_a_joined_log_is_written_as_dask_would_give_it(tmp_path, monkeypatch, fo
     np.testing.assert_array_equal(stored[0].rate.values, log.rate.values)
 
 
-def test_a_large_product_is_that_of_the_small_way(tmp_path, monkeypatch):
-    paths = stored_logs(tmp_path, "zarr")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        run(paths, tmp_path / "small.nc", windows=WINDOW)
-        monkeypatch.setattr(checkpoint, "_MAX_MEMORY_BYTES", 0)
-        run(paths, tmp_path / "large.nc", windows=WINDOW)
-    small, large = (
-        open_product(tmp_path / f"{name}.nc").compute().drop_attrs(deep=False)
-        for name in ("small", "large")
-    )
-    xr.testing.assert_identical(small, large)
-
-
 def test_the_large_variables_of_a_large_product_are_written_without_dask(tmp_path, monkeypatch):
     paths, direct = stored_logs(tmp_path, "zarr"), []
 

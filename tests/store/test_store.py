@@ -17,7 +17,6 @@ from gyrostab.errors import OptionError, SchemaError, TimeError
 from gyrostab.io import datasets
 from gyrostab.io.datasets import open_log, to_netcdf, to_zarr
 from gyrostab.kernels.encoding.counts import from_counts, to_counts
-from gyrostab.store.write import chunk_samples
 from gyrostab.time.grid import TimeGridIndex, grid_times
 from tests.support import synthetic
 from tests.support.stored import (
@@ -237,10 +236,3 @@ def test_a_name_that_the_time_axis_needs(tmp_path):
     log = counts_log(samples=10).assign(time_start=3)
     with pytest.raises(SchemaError, match="'time_start' is needed for the time axis; rename"):
         to_netcdf(log, tmp_path / "log.nc")
-
-
-def test_chunks_of_slow_and_fast_logs():
-    assert chunk_samples(400.0) == 480_000
-    assert chunk_samples(300.0) == 360_000
-    assert chunk_samples(1.0) == 65_536
-    assert chunk_samples(1e5) == 2**22

@@ -46,12 +46,8 @@ def new_output(
     ----------
     path : path-like
         The final name; a symbolic link means its target.
-    find_foreign : callable, optional
-        Function that finds an item of an existing folder that must not be removed; the output is a
-        folder then. See `gyrostab.store.output.check_output`.
-    inputs : iterable of path-like
-        Files that a lazy dataset reads, which must not be replaced, in addition to those of
-        `gyrostab.store.output.protect_inputs`.
+    overwrite, find_foreign, inputs
+        As for `gyrostab.store.output.check_output`.
 
     Yields
     ------
