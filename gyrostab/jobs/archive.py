@@ -29,7 +29,7 @@ from gyrostab.store.remote import (
     full_name,
     is_folder,
     list_urls,
-    read_object,
+    read_bytes,
     remove_copies,
     walk_address,
 )
@@ -66,49 +66,23 @@ _FILES_PER_CALL = 50
 
 @dataclass(frozen=True)
 class Archive:
-    """Files of an archive.
+    """Files of an archive."""
 
-    Attributes
-    ----------
-    base : Path
-        Folder that the names of runs are relative to.
-    files : list of Path
-        Files and Zarr stores that may be logs, sorted.
-    diagnoses : list of Path
-        Folders that ``gyrostab diagnose`` wrote.
-    """
-
-    base: Path
-    files: list[Path]
-    diagnoses: list[Path]
+    base: Path  # folder that the names of runs are relative to
+    files: list[Path]  # files and Zarr stores that may be logs, sorted
+    diagnoses: list[Path]  # folders that ``gyrostab diagnose`` wrote
 
 
 @dataclass(frozen=True)
 class LogRun:
-    """Logs that are analysed as one record.
+    """Logs that are analysed as one record."""
 
-    Attributes
-    ----------
-    name : str
-        Path of the run in the archive, with slashes.
-    tool : str
-        Tool that recorded it.
-    files : tuple of Path
-        Its logs.
-    bytes : int
-        Their size together.
-    diagnosis : Path or None
-        Folder of its diagnosis.
-    verdict : str
-        Verdict of the diagnosis; empty without one, ``not readable`` of a damaged one.
-    """
-
-    name: str
-    tool: str
-    files: tuple[Path, ...]
-    bytes: int
-    diagnosis: Path | None
-    verdict: str
+    name: str  # path of the run in the archive, with slashes
+    tool: str  # tool that recorded it
+    files: tuple[Path, ...]  # absolute, or at addresses
+    bytes: int  # of all files
+    diagnosis: Path | None  # folder
+    verdict: str  # empty without a diagnosis, ``not readable`` of a damaged one
 
 
 def find_archive(paths: Sequence[str | Path]) -> Archive:
@@ -119,10 +93,6 @@ def find_archive(paths: Sequence[str | Path]) -> Archive:
     paths : sequence of path
         Folders, which are searched with all folders below, files, Zarr stores and patterns, or
         addresses of them. Hidden items and fleets that gyrostab wrote are left out.
-
-    Returns
-    -------
-    Archive
 
     Raises
     ------
@@ -220,13 +190,8 @@ def _walk_folder(folder: Path, visited: set[str]) -> Iterator[tuple[str, Path]]:
 
 def _is_diagnosis(folder: Path) -> bool:
     """Whether gyrostab wrote the diagnosis in a folder, also if it is damaged further on."""
-    path = folder / "diagnosis.json"
-    url = find_url(path)
     try:
-        if url:
-            return SCHEMA.encode() in read_object(url, _SCHEMA_BYTES)
-        with path.open("rb") as file:
-            return SCHEMA.encode() in file.read(_SCHEMA_BYTES)
+        return SCHEMA.encode() in read_bytes(folder / "diagnosis.json", _SCHEMA_BYTES)
     except OSError:
         return False
 
@@ -250,20 +215,7 @@ def index_files(
     pool: Pool,
     stage: Stage,
 ) -> pd.DataFrame:
-    """Tabulate the files of an archive; files that have not changed are not opened again.
-
-    Parameters
-    ----------
-    archive : Archive
-        The files.
-    reading : mapping
-        Options of `gyrostab.jobs.run.load_log`.
-    known : pandas.DataFrame or None
-        Earlier table.
-    pool : Pool
-        Where the files are opened.
-    stage : callable
-        Called with the number of files that are done.
+    """Tabulate the files of an archive; those unchanged since the table `known` are not opened.
 
     Returns
     -------
@@ -346,24 +298,9 @@ def _describe_log(name: str, reading: Mapping[str, Any]) -> dict[str, Any]:
 def find_runs(
     archive: Archive, table: pd.DataFrame, *, per: str = "folder", tool: str | None = None
 ) -> list[LogRun]:
-    """Group the logs of an archive into runs.
+    """Group the logs of an archive, in a table of `index_files`, into runs, sorted by name.
 
-    Parameters
-    ----------
-    archive : Archive
-        The files.
-    table : pandas.DataFrame
-        From `index_files`.
-    per : {"folder", "file"}
-        Whether the logs of a folder together, or each log, are a run.
-    tool : str, optional
-        Regular expression whose first match in the name of a run is its tool; by default, the
-        folders above the run.
-
-    Returns
-    -------
-    list of LogRun
-        By name.
+    The options are those of `gyrostab.jobs.fleet.run_fleet`.
 
     Raises
     ------

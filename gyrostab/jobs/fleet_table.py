@@ -16,7 +16,7 @@ from gyrostab.schema import texts
 from gyrostab.store.cf import from_disk
 from gyrostab.store.output import new_output
 from gyrostab.store.read import open_stored
-from gyrostab.store.remote import find_url, full_name, read_object, upload_file
+from gyrostab.store.remote import full_name, read_bytes, upload_file
 from gyrostab.units import DAY, INNER
 
 __all__ = [
@@ -72,9 +72,8 @@ def read_table(path: Path, *, content: str) -> pd.DataFrame | None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    url = find_url(path)
     try:
-        table = pq.read_table(pa.BufferReader(read_object(url)) if url else path)
+        table = pq.read_table(pa.BufferReader(read_bytes(path)))
     except (OSError, pa.ArrowException):
         return None
     is_own = (table.schema.metadata or {}).get(_METADATA) == content.encode()
@@ -97,12 +96,8 @@ def product_path(target: Path, name: str) -> Path:
 def open_fleet(folder: Path) -> xr.Dataset | None:
     """Open the windows of all runs of a fleet, or of those in a folder of it, as one product.
 
-    The surfaces are left out but for the longest averaging time of each run.
-
-    Returns
-    -------
-    xarray.Dataset or None
-        None if `folder` is neither a fleet nor a folder of runs in one.
+    The surfaces are left out but for the longest averaging time of each run. The result is None if
+    `folder` is neither a fleet nor a folder of runs in one.
     """
     folder = Path(full_name(folder))
     root = next((path for path in (folder, *folder.parents) if is_fleet(path)), None)
@@ -123,19 +118,11 @@ def open_fleet(folder: Path) -> xr.Dataset | None:
 
 
 def summarise_run(product: xr.Dataset) -> dict[str, Any]:
-    """Summarise a product in one row of a table.
+    """Summarise a product in one row of a table, whose names of columns end with the unit.
 
-    Parameters
-    ----------
-    product : xarray.Dataset
-        Product of a run.
-
-    Returns
-    -------
-    dict
-        Span, rate, windows, share of missing samples, worst window, and by axis the median of each
-        term where it is observed (NaN elsewhere), its median upper limit, and the misfit, and the
-        median of each temperature. Names of columns end with the unit.
+    It has span, rate, windows, share of missing samples, worst window, and by axis the median of
+    each term where it is observed (NaN elsewhere), its median upper limit, and the misfit, and the
+    median of each temperature.
 
     Examples
     --------
@@ -227,16 +214,9 @@ def write_rows(table: pd.DataFrame, target: Path) -> None:
 def list_effects(table: pd.DataFrame) -> pd.DataFrame:
     """List the effects that the diagnoses of runs name.
 
-    Parameters
-    ----------
-    table : pandas.DataFrame
-        One row a run, with the columns run, tool, start and diagnosis (a folder, or empty).
-
-    Returns
-    -------
-    pandas.DataFrame
-        One row for each run, effect and parameter: axes, driver, evidence [nats], and value with
-        95 % interval in the unit of the row.
+    `table` has the columns run, tool, start and diagnosis (a folder, or empty). The result has one
+    row for each run, effect and parameter: axes, driver, evidence [nats], and value with 95 %
+    interval in the unit of the row.
     """
     rows = []
     for run in table.to_dict("records"):
@@ -260,13 +240,6 @@ def find_trends(table: pd.DataFrame, effects: pd.DataFrame) -> pd.DataFrame:
 
     Each run is one point. Slopes are those of Theil and Sen, tests those of Kendall, which need no
     error of a point and resist outliers.
-
-    Parameters
-    ----------
-    table : pandas.DataFrame
-        One row a run, from `make_table`.
-    effects : pandas.DataFrame
-        From `list_effects`.
 
     Returns
     -------

@@ -22,7 +22,7 @@ from gyrostab.errors import FormatError, GyrostabError, OptionError, OutputError
 
 __all__ = [
     "describe_address", "fetch_file", "find_store", "find_url", "full_name", "has_content",
-    "has_file", "is_folder", "is_taken", "list_urls", "reaching", "read_object", "remove_address",
+    "has_file", "is_folder", "is_taken", "list_urls", "reaching", "read_bytes", "remove_address",
     "remove_copies", "upload", "upload_file", "walk_address",
 ]  # fmt: skip
 
@@ -101,17 +101,21 @@ def _describe_problem(scheme: str, problem: Exception) -> str:
     return f"the store cannot be reached ({text}); check the address and the network"
 
 
-def _open_filesystem(url: str) -> tuple[Any, str]:
-    import fsspec
+@contextlib.contextmanager
+def _open_filesystem(
+    url: str, *, error: type[GyrostabError] = FormatError
+) -> Iterator[tuple[Any, str]]:
+    """Provide the file system and the path of an address; exceptions are those of `reaching`."""
+    with reaching(url, error=error):
+        import fsspec
 
-    filesystem, path = fsspec.core.url_to_fs(url)
-    return filesystem, str(path).rstrip("/")
+        filesystem, path = fsspec.core.url_to_fs(url)
+        yield filesystem, str(path).rstrip("/")
 
 
 def is_taken(url: str) -> bool:
     """Whether there is something at an address; what an interrupted upload left does not count."""
-    with reaching(url, error=OutputError):
-        filesystem, path = _open_filesystem(url)
+    with _open_filesystem(url, error=OutputError) as (filesystem, path):
         if filesystem.isfile(path):
             return True
         return any(filesystem.exists(f"{path}/{name}") for name in _ROOT_METADATA)
@@ -119,8 +123,7 @@ def is_taken(url: str) -> bool:
 
 def has_content(url: str) -> bool:
     """Whether there is an object at an address or below it."""
-    with reaching(url, error=OutputError):
-        filesystem, path = _open_filesystem(url)
+    with _open_filesystem(url, error=OutputError) as (filesystem, path):
         filesystem.invalidate_cache()
         return bool(filesystem.exists(path))
 
@@ -130,18 +133,19 @@ def has_file(path: Path) -> bool:
     url = find_url(path)
     if url is None:
         return path.is_file()
-    with reaching(url):
-        filesystem, place = _open_filesystem(url)
+    with _open_filesystem(url) as (filesystem, place):
         return bool(filesystem.isfile(place))
 
 
-def read_object(url: str, count: int | None = None) -> bytes:
-    """Read an object, or its first `count` bytes; `FileNotFoundError` when there is none."""
-    with reaching(url):
-        filesystem, path = _open_filesystem(url)
-        with contextlib.suppress(FileNotFoundError):
-            content = filesystem.cat_file(path, end=count)
-            return bytes(content)
+def read_bytes(path: str | Path, count: int | None = None) -> bytes:
+    """Read a file or object, or its first `count` bytes; `OSError` when there is none."""
+    url = find_url(path)
+    if url is None:
+        with open(path, "rb") as file:
+            return file.read(-1 if count is None else count)
+    with _open_filesystem(url) as (filesystem, path), contextlib.suppress(FileNotFoundError):
+        content = filesystem.cat_file(path, end=count)
+        return bytes(content)
     raise FileNotFoundError(url)
 
 
@@ -155,8 +159,7 @@ def find_store(url: str) -> str | None:
     OptionError
         When the library for it is missing.
     """
-    with reaching(url):
-        filesystem, path = _open_filesystem(url)
+    with _open_filesystem(url) as (filesystem, path):
         if any(filesystem.exists(f"{path}/{name}") for name in _ROOT_METADATA):
             return url.rstrip("/")
         if not filesystem.exists(path):
@@ -166,8 +169,7 @@ def find_store(url: str) -> str | None:
 
 def list_urls(url: str) -> list[str]:
     """List the addresses that match a pattern."""
-    with reaching(url):
-        filesystem, path = _open_filesystem(url)
+    with _open_filesystem(url) as (filesystem, path):
         return [filesystem.unstrip_protocol(name) for name in sorted(filesystem.glob(path))]
 
 
@@ -179,8 +181,7 @@ def is_folder(url: str) -> bool:
     FormatError
         When there is nothing at the address, or it cannot be reached.
     """
-    with reaching(url):
-        filesystem, path = _open_filesystem(url)
+    with _open_filesystem(url) as (filesystem, path):
         if not filesystem.exists(path):
             raise FileNotFoundError(url)
         return bool(filesystem.isdir(path))
@@ -195,8 +196,7 @@ def walk_address(url: str) -> Iterator[tuple[str, dict[str, Any], list[str], boo
         Address of the folder, folders in it (those removed are not visited), names of files, and
         whether the folder is a Zarr store.
     """
-    with reaching(url):
-        filesystem, path = _open_filesystem(url)
+    with _open_filesystem(url) as (filesystem, path):
         filesystem.invalidate_cache()
         for place, folders, files in filesystem.walk(path, detail=True):
             is_store = any(name in files for name in _ROOT_METADATA)
@@ -211,12 +211,12 @@ def describe_address(url: str) -> dict[str, Any]:
     """
     infos = []
     try:
-        filesystem, path = _open_filesystem(url)
-        filesystem.invalidate_cache(path)
-        names = [path, *(f"{path}/{name}" for name in _ROOT_METADATA)]
-        for name in names[1:] if filesystem.isdir(path) else names[:1]:
-            with contextlib.suppress(FileNotFoundError):
-                infos.append(filesystem.info(name))
+        with _open_filesystem(url) as (filesystem, path):
+            filesystem.invalidate_cache(path)
+            names = [path, *(f"{path}/{name}" for name in _ROOT_METADATA)]
+            for name in names[1:] if filesystem.isdir(path) else names[:1]:
+                with contextlib.suppress(FileNotFoundError):
+                    infos.append(filesystem.info(name))
     except Exception:  # libraries raise exceptions of many kinds; reading says what is wrong
         return {"bytes": None, "changed_ns": None}
     states = [sorted((key, str(info[key])) for key in _CHANGES & set(info)) for info in infos]
@@ -229,8 +229,7 @@ def describe_address(url: str) -> dict[str, Any]:
 
 def fetch_file(url: str) -> Path:
     """Download a file to a temporary copy of the same name, again only after it has changed."""
-    with reaching(url):
-        filesystem, path = _open_filesystem(url)
+    with _open_filesystem(url) as (filesystem, path):
         filesystem.invalidate_cache(path)
         info = filesystem.info(path)
         if info["type"] == "directory":
@@ -241,12 +240,12 @@ def fetch_file(url: str) -> Path:
 @lru_cache(maxsize=2**10)
 def _download_file(url: str, info: str) -> Path:
     """Download a file that the store describes by `info`, once for the process."""
-    filesystem, path = _open_filesystem(url)
-    folder = tempfile.TemporaryDirectory(prefix="gyrostab-")
-    _COPIES.setdefault(threading.get_ident(), []).append(folder)
-    target = Path(folder.name, path.rpartition("/")[2])
-    filesystem.get_file(path, str(target))
-    return target
+    with _open_filesystem(url) as (filesystem, path):
+        folder = tempfile.TemporaryDirectory(prefix="gyrostab-")
+        _COPIES.setdefault(threading.get_ident(), []).append(folder)
+        target = Path(folder.name, path.rpartition("/")[2])
+        filesystem.get_file(path, str(target))
+        return target
 
 
 #: Folders of downloaded files by thread; removed when the process ends.
@@ -269,8 +268,7 @@ def remove_copies() -> Iterator[None]:
 
 def remove_address(url: str) -> None:
     """Remove all that is at an address, if there is something."""
-    with reaching(url, error=OutputError):
-        filesystem, path = _open_filesystem(url)
+    with _open_filesystem(url, error=OutputError) as (filesystem, path):
         filesystem.invalidate_cache()
         with contextlib.suppress(FileNotFoundError):
             filesystem.rm(path, recursive=True)
@@ -290,8 +288,7 @@ def upload_file(path: Path) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="gyrostab-") as folder:
         local = Path(folder, path.name)
         yield local
-        with reaching(url, error=OutputError):
-            filesystem, place = _open_filesystem(url)
+        with _open_filesystem(url, error=OutputError) as (filesystem, place):
             filesystem.put_file(str(local), place)
 
 
@@ -304,8 +301,7 @@ def upload(url: str) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="gyrostab-") as folder:
         yield Path(folder)
         names = [item.relative_to(folder) for item in Path(folder).rglob("*") if item.is_file()]
-        with reaching(url, error=OutputError):
-            filesystem, path = _open_filesystem(url)
+        with _open_filesystem(url, error=OutputError) as (filesystem, path):
             for is_last in (False, True):
                 chosen = [n for n in names if (n.as_posix() in _ROOT_METADATA) == is_last]
                 filesystem.put(

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gyrostab.store.remote import find_url, read_object
+from gyrostab.store.remote import read_bytes
 
 __all__ = ["FindForeign", "find_foreign_item", "is_store", "read_json"]
 
@@ -24,9 +24,8 @@ _CHUNK = re.compile(r"(c|(c\.)?\d+(\.\d+)*)(\.[0-9a-f]{32}\.partial)?")
 
 def read_json(path: Path) -> Any:
     """Read a JSON file, also at an address; None when it cannot be read."""
-    url = find_url(path)
     try:
-        return json.loads(read_object(url) if url else path.read_text(encoding="utf-8"))
+        return json.loads(read_bytes(path).decode())
     except (OSError, ValueError, RecursionError):
         return None
 
@@ -62,39 +61,23 @@ def find_foreign_item(folder: Path) -> str | None:
     ...     find_foreign_item(Path(name))
     'tide.jpg'
     """
-    foreign_item = _find_in_node(str(folder))
+    foreign_item = _find_in_node(str(folder), _find_node(str(folder)))
     return None if foreign_item is None else os.path.relpath(foreign_item, folder)
 
 
-def _find_in_node(folder: str) -> str | None:
-    """Do the work of `find_foreign_item` for a group or an array; return the full path."""
-    node = _find_node(folder)
-    for entry in _list_entries(folder):
-        if node is None or entry.is_symlink():
+def _find_in_node(folder: str, node: str | None) -> str | None:
+    """Find the full path of a foreign item in a group, an array or a folder of its chunks."""
+    with os.scandir(folder) as entries:
+        sorted_entries = sorted(entries, key=lambda entry: entry.name)
+    for entry in sorted_entries:
+        is_chunk = node in ("array", "chunks") and _CHUNK.fullmatch(entry.name)
+        if node is None or entry.is_symlink() or (node == "chunks" and not is_chunk):
             return entry.path
-        chunk = node == "array" and _CHUNK.fullmatch(entry.name)
         if entry.is_dir():
-            foreign_item = _find_in_chunks(entry.path) if chunk else _find_in_node(entry.path)
+            inner_node = "chunks" if is_chunk else _find_node(entry.path)
+            foreign_item = _find_in_node(entry.path, inner_node)
             if foreign_item is not None:
                 return foreign_item
-        elif not entry.is_file() or not (chunk or entry.name in _METADATA):
+        elif not entry.is_file() or not (is_chunk or entry.name in _METADATA):
             return entry.path
     return None
-
-
-def _find_in_chunks(folder: str) -> str | None:
-    for entry in _list_entries(folder):
-        if (
-            entry.is_symlink()
-            or not _CHUNK.fullmatch(entry.name)
-            or not (entry.is_dir() or entry.is_file())
-        ):
-            return entry.path
-        if entry.is_dir() and (foreign_item := _find_in_chunks(entry.path)) is not None:
-            return foreign_item
-    return None
-
-
-def _list_entries(folder: str) -> list[os.DirEntry[str]]:
-    with os.scandir(folder) as entries:
-        return sorted(entries, key=lambda entry: entry.name)
