@@ -30,28 +30,15 @@ _UNITS = {**{symbol: law.label for symbol, law in LAWS.items()}, _MISFIT: "", _L
 
 @dataclass
 class Alarm:
-    """A limit, and where it is exceeded now.
+    """A limit, and where it is exceeded now."""
 
-    Attributes
-    ----------
-    text : str
-        As the user wrote it.
-    axis : str or None
-        Axis; None for every axis.
-    name, sign, unit : str
-        Quantity, ``<`` or ``>``, and unit.
-    limit : float
-        Limit [unit].
-    active : set of str
-        Axes on which it has begun; "" for a channel.
-    """
-
-    text: str
-    axis: str | None
-    name: str
-    sign: str
+    text: str  # as the user wrote it
+    axis: str | None  # None for every axis
+    name: str  # of the quantity
+    sign: str  # < or >
     limit: float
     unit: str
+    #: Axes on which it has begun; "" for a channel.
     active: set[str] = field(default_factory=set)
 
     def update(self, window: Mapping[str, Any]) -> list[dict[str, str]]:
@@ -159,19 +146,11 @@ def _quantity_of(units: str) -> str | None:
 
 
 def describe_windows(part: xr.Dataset) -> list[dict[str, Any]]:
-    """Describe windows by plain numbers: coefficients, misfit and loss by axis, and channels.
+    """Describe the windows of a part of a product, in memory, by plain numbers.
 
-    Parameters
-    ----------
-    part : xarray.Dataset
-        Some windows of a product, in memory.
-
-    Returns
-    -------
-    list of dict
-        For each window ``time``, ``end`` (ISO 8601), ``axes`` (axis to a dict of the coefficients,
-        ``N_upper`` ..., ``misfit``, ``loss`` [%]) and ``channels`` (name to value and unit).
-        Missing values are None, and so is a coefficient that is not observed.
+    Each has ``time``, ``end`` (ISO 8601), ``axes`` (axis to a dict of the coefficients, ``N_upper``
+    ..., ``misfit``, ``loss`` [%]) and ``channels`` (name to value and unit). Missing values are
+    None, and so is a coefficient that is not observed.
     """
     axes = [str(axis) for axis in part["axis"].values]
     fields = {}

@@ -31,24 +31,13 @@ _MAX_MEMORY_BYTES = 2**26  # bytes of blocks up to which a product is put togeth
 
 
 class Block(NamedTuple):
-    """A finished part of a product on disk.
-
-    Attributes
-    ----------
-    path : pathlib.Path
-        Block file.
-    part : slice
-        Windows of the part.
-    header : dict
-        Job, windows; dimensions, dtypes, shapes, places and attributes of its variables.
-    begin : int
-        Byte at which the arrays begin.
-    """
+    """A finished part of a product on disk."""
 
     path: Path
-    part: slice
+    part: slice  # windows
+    #: Job, windows; dimensions, dtypes, shapes, places and attributes of the variables.
     header: dict[str, Any]
-    begin: int
+    begin: int  # byte at which the arrays begin
 
 
 def block_path(folder: Path, part: slice) -> Path:
@@ -59,22 +48,7 @@ def block_path(folder: Path, part: slice) -> Path:
 def write_block(folder: Path, part: slice, dataset: xr.Dataset, *, job: str) -> Block:
     """Write a part of a product, complete or not at all.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        The part, in memory.
-    job : str
-        Hash of inputs and options; a block of another job is not used.
-
-    Returns
-    -------
-    Block
-        The block, as `find_blocks` finds it.
-
-    Raises
-    ------
-    OutputError
-        When it cannot be written, with the reason.
+    `job` is the hash of inputs and options: a block of another job is not used.
     """
     described: dict[str, Any] = {}
     pieces: list[Any] = []
@@ -142,18 +116,10 @@ def _read_verified_header(path: Path) -> bytes:
 
 
 def assemble(blocks: Sequence[Block]) -> xr.Dataset:
-    """Assemble blocks to one dataset; long variables of a large one are read from the files lazily.
+    """Assemble blocks in their order to one dataset, in memory if it is small.
 
-    Parameters
-    ----------
-    blocks : sequence of Block
-        All parts, in order.
-
-    Returns
-    -------
-    xarray.Dataset
-        The product, in memory if it is small; otherwise with coordinates in memory, and dask arrays
-        in the chunks of the file that will be written.
+    The long variables of a large one are dask arrays, in the chunks of the file that will be
+    written.
     """
     first = blocks[0].header
     small = sum(block.path.stat().st_size for block in blocks) <= _MAX_MEMORY_BYTES
@@ -204,7 +170,7 @@ def _make_lazy(blocks: Sequence[Block], name: str) -> Any:
     edges = np.cumsum([0, *(block.part.stop - block.part.start for block in blocks)])
     shape = [int(edges[-1]) if i == along else size for i, size in enumerate(described["shape"])]
     dims = list(zip(described["dims"], shape, strict=True))
-    inner = int(np.prod([size for dim, size in dims if dim not in ("axis", "term", "time")]))
+    inner = math.prod(size for dim, size in dims if dim not in ("axis", "term", "time"))
     sizes = {"axis": 1, "term": 1, "time": max(1, min(shape[along], CHUNK_VALUES // max(1, inner)))}
 
     source = _BlockSource(blocks, name, along, edges, tuple(shape))

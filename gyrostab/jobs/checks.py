@@ -18,12 +18,7 @@ def check_windows(
     tau_max: str | None = None,
     **other: Any,
 ) -> None:
-    """Check the durations of windows and averaging times before the computation starts.
-
-    Parameters
-    ----------
-    window, step, taus, tau_max : str
-        Options of `gyrostab.allan.davar.davar`, as text; others are ignored.
+    """Check options of `gyrostab.allan.davar.davar`, as text; others than these are ignored.
 
     Raises
     ------

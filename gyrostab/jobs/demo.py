@@ -53,16 +53,8 @@ def sample_log(name: str = "mwd_sample.csv.gz") -> Path:
 def summarise(product: xr.Dataset) -> pd.DataFrame:
     """Tabulate the coefficients of each part, over the windows inside it.
 
-    Parameters
-    ----------
-    product : xarray.Dataset
-        Product of the demonstration.
-
-    Returns
-    -------
-    pandas.DataFrame
-        One row per axis and term: axis, term, unit, and one column of text per part. The text is
-        the median if most windows observe the term, else ``< x`` with the median upper limit.
+    The table has one row per axis and term: axis, term, unit, and one column of text per part. The
+    text is the median if most windows observe the term, else ``< x`` with the median upper limit.
     """
     begin, end = (
         (product["time_bounds"].values[:, side] - product["time_bounds"].values.min())
@@ -101,21 +93,7 @@ def format_summary(product: xr.Dataset) -> str:
 def run_demo(
     folder: str | Path, *, overwrite: bool = False, stage: Stage = no_stage
 ) -> tuple[xr.Dataset, list[Path]]:
-    """Run the whole analysis on the shipped log.
-
-    Parameters
-    ----------
-    folder : path
-        Folder to write to; it is made if it does not exist.
-    overwrite : bool
-        Whether files of an earlier run may be replaced.
-    stage : callable
-        Called with the name of each stage and its number of samples.
-
-    Returns
-    -------
-    xarray.Dataset, list of Path
-        The product, and the files written.
+    """Run the whole analysis on the shipped log; return the product, and the files written.
 
     Raises
     ------

@@ -85,14 +85,10 @@ def compute_blocks(
     ----------
     blocks : dict
         Finished parts; computed parts are added, also when an error follows.
-    job : str
-        Hash of the job.
     call : sequence
         Function and its first arguments; the part is the last one.
     check : callable
         Raises when an input has changed. A result is written only after a later check.
-    advance : callable
-        Called with the number of finished parts.
     """
     missing = [number for number in range(len(parts)) if number not in blocks]
     held: list[tuple[int, xr.Dataset]] = []
@@ -141,12 +137,7 @@ def write_blocks(
 ) -> xr.Dataset:
     """Write all blocks as one file or Zarr store, in a fixed order: its bytes are reproducible.
 
-    With `zarr`, a Zarr group is written instead.
-
-    Returns
-    -------
-    xarray.Dataset
-        The written dataset, which still reads from the blocks.
+    The written dataset, which is returned, still reads from the blocks.
     """
     import dask
 
@@ -168,12 +159,8 @@ def write_blocks(
 
     def share(written: float) -> None:
         if variables:
-            stage(
-                "writing",
-                variables,
-                max(min(done, variables), int(written * variables)),
-                "variables",
-            )
+            finished = max(min(done, variables), int(written * variables))
+            stage("writing", variables, finished, "variables")
 
     stage("writing", variables, 0, "variables")
     with dask.config.set(scheduler=in_order):

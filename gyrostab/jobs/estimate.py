@@ -29,20 +29,13 @@ def estimate_run(
     fitting: Mapping[str, Any] | None,
     workers: int | None = None,
 ) -> Iterator[str]:
-    """Describe what a run would do, without writing its output.
+    """Describe what `gyrostab.jobs.run.run` would do, without writing its output.
 
     First the record, its windows and averaging times, which need few compiled kernels; then time,
     memory and size of the output.
 
     The first part is computed on one core; the processor time and the size of the rest are taken to
     be in proportion to the number of windows. Cores that are busy with other programs need longer.
-
-    Parameters
-    ----------
-    reading, windows, fitting : mapping
-        Options as for `gyrostab.jobs.run.run`.
-    workers : int, optional
-        Number of cores; all by default.
     """
     with _measure_work() as work_s:
         log = load_log(paths, **reading)

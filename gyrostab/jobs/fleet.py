@@ -14,9 +14,8 @@ import json
 import os
 import time
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -343,8 +342,9 @@ def _compute_runs(
     done, saved = 0, time.monotonic()
     stage("computing", len(waiting), 0, "runs")
     try:
-        with _without_notes():
-            for _, row in run_calls(pool, ((work, _pack_run(item)) for item in waiting)):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # notes on single logs are in the table
+            for _, row in run_calls(pool, ((work, item) for item in waiting)):
                 rows[row["run"]] = row
                 done += 1
                 stage("computing", len(waiting), done, "runs")
@@ -366,14 +366,6 @@ def _compute_runs(
     return table
 
 
-@contextlib.contextmanager
-def _without_notes() -> Iterator[None]:
-    """Show no notes on single logs, which are in the table, in this thread and its workers."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        yield
-
-
 def _is_current(
     row: Mapping[str, Any] | None,
     target: Path,
@@ -393,52 +385,33 @@ def _has_product(target: Path, name: str) -> bool:
     return read_job_name(path) is not None if find_url(path) else path.exists()
 
 
-def _pack_run(item: LogRun) -> dict[str, Any]:
-    return {**asdict(item), "files": [full_name(path) for path in item.files]}
-
-
 def process_run(
-    target: str, options: str, reports: bool, overwrite: bool, item: Mapping[str, Any]
+    target: str, options: str, reports: bool, overwrite: bool, item: LogRun
 ) -> dict[str, Any]:
     """Compute a run in this thread, write its product and report, and return its row.
 
-    Parameters
-    ----------
-    target : str
-        The store.
-    options : str
-        Options of reading, windows and fitting, as JSON.
-    reports : bool
-        Whether to write a report.
-    overwrite : bool
-        Whether to compute a product again that is complete.
-    item : mapping
-        Fields of a `LogRun`.
-
-    Returns
-    -------
-    dict
-        The row; ``error`` is empty unless the run failed.
+    The options of reading, windows and fitting are JSON. In the row, ``error`` is empty unless the
+    run failed.
     """
     import dask
 
-    name, product = item["name"], product_path(Path(target), item["name"])
-    row = {
+    name, product = item.name, product_path(Path(target), item.name)
+    row: dict[str, Any] = {
         "run": name,
-        "tool": item["tool"],
+        "tool": item.tool,
         "error": "",
-        "files": len(item["files"]),
+        "files": len(item.files),
         "report": f"reports/{name}.html" if reports else "",
     }
     run_options = json.loads(options)
     try:
         _make_folders(Path(target), product.parent)
-        row["job"] = find_job_name(item["files"], **run_options)
+        row["job"] = find_job_name(item.files, **run_options)
         if (url := find_url(product)) and (overwrite or read_job_name(product) != row["job"]):
             remove_address(url)  # a run replaces nothing at an address
         with dask.config.set(scheduler="synchronous"), remove_copies():
             run(
-                item["files"],
+                item.files,
                 product,
                 **run_options,
                 workers=1,

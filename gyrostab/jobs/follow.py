@@ -59,19 +59,11 @@ def list_files(source: str) -> dict[Path, FileState]:
 
 
 class FileMemory:
-    """Reads files, and remembers those that have not changed since, on disk.
-
-    Attributes
-    ----------
-    files : dict
-        The files to read, as from `list_files`.
-    ended : bool
-        Whether no file grows any more.
-    """
+    """Reads files, and remembers those that have not changed since, on disk."""
 
     def __init__(self) -> None:
         self.files: dict[Path, FileState] = {}
-        self.ended = False
+        self.ended = False  # whether no file grows any more
         self._spool = Spool()
         self._kept: dict[Path, tuple[FileState, bool, xr.Dataset]] = {}
 
@@ -112,24 +104,12 @@ class FileMemory:
 class RowKeeper:
     """Keeps the rows of a stream in files of a folder, which a restart and a later run read.
 
-    Parameters
-    ----------
-    stream : binary file
-        Text rows, with or without a header; without one, rows of an earlier stream give it.
-    folder : Path
-        Where the rows are kept.
-
-    Attributes
-    ----------
-    ended : bool
-        Whether the stream has ended.
-    error : Exception or None
-        Error that ended the copying.
+    Rows without a header get that of an earlier stream.
     """
 
     def __init__(self, stream: IO[bytes], folder: Path):
         self.folder, self.ended = folder, False
-        self.error: Exception | None = None
+        self.error: Exception | None = None  # that ended the copying
         folder.mkdir(exist_ok=True)
         self._files = sorted(folder.glob(_ROW_FILE.format(0).replace("000000", "*")))
         self._thread = threading.Thread(target=self._copy_stream, args=(stream,), daemon=True)

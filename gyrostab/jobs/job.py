@@ -36,6 +36,7 @@ __all__ = [
     "count_finished_parts",
     "describe_differences",
     "describe_inputs",
+    "format_option",
     "has_finished_work",
     "hash_fingerprint",
     "is_lock",
@@ -100,16 +101,10 @@ def _is_marked(path: Path) -> bool:
 
 def is_lock(path: Path) -> bool:
     """Whether `lock_job` made a file."""
-    start = _read_start(path, 8)
-    return start is not None and b"process ".startswith(start)
-
-
-def _read_start(path: Path, count: int) -> bytes | None:
-    """Read the first bytes of a regular file; None for anything else."""
     if not path.is_file() or path.is_symlink():
-        return None
+        return False
     with path.open("rb") as file:
-        return file.read(count)
+        return b"process ".startswith(file.read(8))
 
 
 def describe_inputs(paths: Sequence[Path]) -> list[dict[str, Any]]:
@@ -171,7 +166,7 @@ def describe_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> s
     for kind in ("options", "versions"):
         old, new = before[kind], now[kind]
         differences += [
-            f"{name} is {_format_option(new.get(name))}, was {_format_option(old.get(name))}"
+            f"{name} is {format_option(new.get(name))}, was {format_option(old.get(name))}"
             for name in {**old, **new}
             if old.get(name) != new.get(name)
         ]
@@ -182,12 +177,13 @@ def describe_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> s
     )
 
 
-def _format_option(value: Any) -> str:
+def format_option(value: Any) -> str:
+    """Format the value of an option in one line."""
     if value is None:
         return "not given"
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         return ", ".join(f"{key}={setting}" for key, setting in value.items())
-    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+    return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
 def _describe_input_changes(before: list[dict[str, Any]], now: list[dict[str, Any]]) -> list[str]:

@@ -28,24 +28,7 @@ _POLICY = (
 class LivePage:
     """Serves the latest windows, alarms and notes to browsers on this machine.
 
-    Parameters
-    ----------
-    port : int
-        Port on 127.0.0.1; 0 for any that is free.
-    title : str
-        Heading of the page.
-
-    Attributes
-    ----------
-    port : int
-        Port.
-    address : str
-        Address of the page.
-
-    Raises
-    ------
-    OptionError
-        When the port cannot be used.
+    The port is on 127.0.0.1; 0 for any that is free.
     """
 
     def __init__(self, port: int, title: str):

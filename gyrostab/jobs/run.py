@@ -31,6 +31,7 @@ from gyrostab.jobs.job import (
     count_finished_parts,
     describe_differences,
     describe_inputs,
+    format_option,
     has_finished_work,
     hash_fingerprint,
     job_folder,
@@ -41,7 +42,6 @@ from gyrostab.jobs.job import (
     remove_job,
     write_store_checksum,
 )
-from gyrostab.jobs.memory import return_large_arrays
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool
 from gyrostab.kernels.workspace import Workspaces
 from gyrostab.progress import Stage, no_stage
@@ -55,6 +55,7 @@ from gyrostab.store.output import (
 )
 from gyrostab.store.private import library_lock
 from gyrostab.store.remote import find_url
+from gyrostab.store.system import return_large_arrays
 
 __all__ = ["count_samples", "find_job_name", "load_log", "read_job_name", "run"]
 
@@ -109,7 +110,7 @@ def load_log(
             log, rate=reading.get("rate"), max_gap=max_gap, limits=reading.get("limits")
         )
         options = "; ".join(
-            f"{name}: {_format_option(value)}"
+            f"{name}: {format_option(value)}"
             for name, value in reading.items()
             if value and name not in ("on_file", "read")
         )
@@ -121,13 +122,6 @@ def load_log(
     for note in log.attrs.get("notes", []):
         warnings.warn(note, stacklevel=2)
     return log
-
-
-def _format_option(value: Any) -> str:
-    """Format the value of an option in one line."""
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key}={setting}" for key, setting in value.items())
-    return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
 def count_samples(log: xr.Dataset) -> int:
@@ -425,7 +419,12 @@ def _compute_missing(
 
     if len(blocks) < len(parts):
         fitting = find_record_bands(log, windows, fitting)
-    call: tuple[Any, ...] = (_compute_part_of_log, log, Workspaces(), windows, fitting)
+    spaces = Workspaces()
+
+    def compute_own_part(part: slice) -> xr.Dataset:
+        return compute_part(log, part, windows, fitting, spaces.own)
+
+    call: tuple[Any, ...] = (compute_own_part,)
     if pool.remote and len(blocks) < len(parts):
         if not store.exists() and not any(
             map(_is_own_log, job.files)
@@ -457,16 +456,6 @@ def _check_inputs(job: _Job) -> None:
     now = {**job.fingerprint, "inputs": describe_inputs(job.files)}
     if differences := describe_differences(job.fingerprint, now):
         raise FormatError(f"{differences}; a log must not change while it is read: put it back")
-
-
-def _compute_part_of_log(
-    log: xr.Dataset,
-    spaces: Workspaces,
-    windows: Mapping[str, Any],
-    fitting: Mapping[str, Any] | None,
-    part: slice,
-) -> xr.Dataset:
-    return compute_part(log, part, windows, fitting, spaces.own)
 
 
 def _compute_part_of_copy(

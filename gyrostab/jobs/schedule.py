@@ -26,43 +26,17 @@ _NO_WORKER_TIMEOUT_S = 60.0  # s without any worker
 
 
 class Pool(NamedTuple):
-    """A pool of workers.
+    """A pool of workers."""
 
-    Attributes
-    ----------
-    submit : callable
-        ``submit(function, *arguments)`` returns a `concurrent.futures.Future`.
-    width : callable
-        Number of calls that can run in parallel now.
-    remote : bool
-        Whether calls run in other processes, with pickled functions and arguments.
-    share : callable
-        Replaces an argument of many calls by a reference, so that it is sent once.
-    """
-
-    submit: Callable[..., Future[Any]]
-    width: Callable[[], int]
-    remote: bool
+    submit: Callable[..., Future[Any]]  # takes a function and its arguments
+    width: Callable[[], int]  # number of calls that can run in parallel now
+    remote: bool  # whether calls run in other processes, with pickled functions and arguments
+    #: Replaces an argument of many calls by a reference, so that it is sent once.
     share: Callable[[Any], Any]
 
 
 def check_scheduler(scheduler: str) -> str:
-    """Check the name of a scheduler.
-
-    Parameters
-    ----------
-    scheduler : str
-        ``threads``, ``processes``, or the address of a dask.distributed scheduler.
-
-    Returns
-    -------
-    str
-        The name, with the protocol added to an address without one.
-
-    Raises
-    ------
-    OptionError
-        When it is none of these.
+    """Check the name of a scheduler; add the protocol to an address without one.
 
     Examples
     --------
@@ -85,6 +59,8 @@ def open_pool(
 ) -> Iterator[Pool]:
     """Open threads, processes, or a connection to a scheduler for the ``with`` block.
 
+    Waiting calls are cancelled at the end of the block.
+
     Parameters
     ----------
     scheduler : str
@@ -94,11 +70,6 @@ def open_pool(
         scheduler.
     files : sequence of Path
         Files that every worker of dask.distributed must see under the same name.
-
-    Yields
-    ------
-    Pool
-        Waiting calls are cancelled at the end of the block.
 
     Raises
     ------

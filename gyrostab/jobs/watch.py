@@ -17,7 +17,7 @@ import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, NamedTuple, Protocol
+from typing import IO, Any, Protocol
 
 import numpy as np
 import xarray as xr
@@ -39,13 +39,13 @@ from gyrostab.jobs.job import (
     make_fingerprint,
     remove_job,
 )
-from gyrostab.jobs.memory import release_memory, return_large_arrays
 from gyrostab.jobs.run import load_log
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.schema import log_channels, signal_name
 from gyrostab.store.lazy import find_source, read_slice
 from gyrostab.store.output import check_output, follow_inputs, resolve_link
 from gyrostab.store.remote import find_url
+from gyrostab.store.system import release_memory, return_large_arrays
 from gyrostab.time.durations import duration_seconds, samples
 from gyrostab.time.grid import first_stamp, grid_times
 
@@ -150,7 +150,7 @@ def watch(
     quiet = duration_seconds(idle, "--idle") if idle else np.inf
     path = Path(output)
     with follow_inputs([] if source == "-" else [source]):
-        state = _continue_product(path, options, overwrite=overwrite)
+        until = _continue_product(path, options, overwrite=overwrite)
         folder = job_folder(resolve_link(path))
         with lock_job(folder):
             try:
@@ -159,7 +159,7 @@ def watch(
                     _check_rows(path, overwrite=overwrite)
                     keeper = RowKeeper(stream or sys.stdin.buffer, rows_folder(path))
                     source = str(rows_folder(path))
-                view = _View(path, options, wait, list(alarms), listener, state)
+                view = _View(path, options, wait, list(alarms), listener, until)
                 _follow_source(view, source, keeper, quiet, poll)
             finally:
                 remove_job(folder, output=resolve_link(path))
@@ -197,14 +197,9 @@ def _check_rows(path: Path, *, overwrite: bool) -> None:
         )
 
 
-class _Continued(NamedTuple):
-    """What an earlier call has left."""
-
-    exists: bool
-    until: np.datetime64 | None
-
-
-def _continue_product(path: Path, options: dict[str, Any], *, overwrite: bool) -> _Continued:
+def _continue_product(
+    path: Path, options: dict[str, Any], *, overwrite: bool
+) -> np.datetime64 | None:
     """Check that the output can be written; find the last window of one that is continued."""
     if find_url(path):
         raise OptionError(
@@ -215,17 +210,17 @@ def _continue_product(path: Path, options: dict[str, Any], *, overwrite: bool) -
     if path.exists() and not overwrite:
         with contextlib.suppress(GyrostabError), open_product(path) as product:
             old_options = product.attrs.get(_OPTIONS)
-            until = product["time"].values[-1]
+            until: np.datetime64 = product["time"].values[-1]
     if old_options is None:
         check_output(path, suffixes=[".zarr"], overwrite=overwrite)
-        return _Continued(False, None)
+        return None
     check_output(path, suffixes=[".zarr"], overwrite=True)
     if changes := describe_differences(json.loads(old_options), _describe_options(options)):
         raise OutputError(
             f"output {str(path)!r} exists already, and {changes}; give the same options to "
             "continue it, --overwrite to replace it, or another name with -o"
         )
-    return _Continued(True, until)
+    return until
 
 
 def _describe_options(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -243,10 +238,11 @@ class _View:
         lateness: float,
         alarms: list[Alarm],
         listener: Listener,
-        state: _Continued,
+        until: np.datetime64 | None,
     ):
         self.path, self.options, self.lateness = path, options, lateness
-        self.alarms, self.listener, self.state = alarms, listener, state
+        self.alarms, self.listener = alarms, listener
+        self.until, self.exists = until, until is not None  # of a product that is continued
         self.memory = FileMemory()
         self.space = Workspace()
         self.digests: list[bytes] = []
@@ -275,7 +271,7 @@ class _View:
         try:
             self._update_product(final=final)
         except (FormatError, TimeError) as error:
-            if final and not self.state.exists:
+            if final and not self.exists:
                 raise
             self._show_note(f"waiting: {error}")
         release_memory()
@@ -315,7 +311,7 @@ class _View:
         wait = 0 if final else round(self.lateness * rate)
         points = samples(windows["window"], rate, "window") + (signal_name(log) == "angle")
         complete = self.samples - wait - points
-        if complete < 0 and not (final and not self.state.exists):
+        if complete < 0 and not (final and not self.exists):
             self.missing_samples = -complete
             return
         unit = make_plan(log, **windows).unit  # at the end, it raises that the record is too short
@@ -347,7 +343,7 @@ class _View:
         same_record: bool,
     ) -> None:
         """Compute the units whose samples have changed, write and show them."""
-        exists = self.state.exists and self.path.exists()
+        exists = self.exists and self.path.exists()
         old = self.digests if exists else []
         same = [i < len(old) and old[i] == digest for i, digest in enumerate(digests)]
         if all(same) and len(old) == len(digests):
@@ -370,7 +366,7 @@ class _View:
         except LayoutError:
             write_windows(self.path, compute(units), new=True, **layout)
         self.digests = digests
-        self.state = self.state._replace(exists=True)
+        self.exists = True
         revised = sum(not is_same for is_same in same[: len(old) - 1]) if same_record else 0
         if revised:
             self.listener.show_note(
@@ -382,9 +378,7 @@ class _View:
         """Show new windows and alarms; windows of an earlier call only set the alarms."""
         for window in windows:
             self.shown += 1
-            is_known = self.state.until is not None and bool(
-                np.datetime64(window["time"]) <= self.state.until
-            )
+            is_known = self.until is not None and bool(np.datetime64(window["time"]) <= self.until)
             if not is_known:
                 self.listener.show_window(window)
             for event in (event for alarm in self.alarms for event in alarm.update(window)):

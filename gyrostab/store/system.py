@@ -5,6 +5,7 @@ docs/durability.md lists what Linux, macOS and Windows guarantee.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import errno
 import importlib
@@ -19,8 +20,10 @@ __all__ = [
     "exchange_paths",
     "lock_file",
     "read_at",
+    "release_memory",
     "rename_new",
     "rename_with_flag",
+    "return_large_arrays",
     "sync_path",
     "write_at",
 ]
@@ -46,6 +49,9 @@ _AT_FDCWD = -100
 _UNSUPPORTED_ERRNOS = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM)
 
 _SEEK_LOCK = threading.Lock()
+
+_M_MMAP_THRESHOLD = -3  # of malloc.h of glibc
+_LARGE_BYTES = 2**17  # its first value, which it raises up to 32 MiB unless it is set
 
 
 def sync_path(path: Path) -> None:
@@ -162,3 +168,15 @@ def write_at(handle: int, data: bytes | memoryview, offset: int) -> int:
     with _SEEK_LOCK:
         os.lseek(handle, offset, os.SEEK_SET)
         return os.write(handle, data)
+
+
+def return_large_arrays() -> None:
+    """Let glibc return each large array to the system when it is freed, not only at first."""
+    with contextlib.suppress(TypeError, AttributeError):  # on Windows and without glibc
+        ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)
+
+
+def release_memory() -> None:
+    """Return memory that is free in the C library to the system; glibc alone keeps it."""
+    with contextlib.suppress(TypeError, AttributeError):  # on Windows and without glibc
+        ctypes.CDLL(None).malloc_trim(0)

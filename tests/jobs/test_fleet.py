@@ -60,7 +60,7 @@ def computed(monkeypatch) -> list[str]:
     names: list[str] = []
 
     def count(*arguments):
-        names.append(arguments[-1]["name"])
+        names.append(arguments[-1].name)
         return process_run(*arguments)
 
     monkeypatch.setattr(fleet_module, "process_run", count)
@@ -292,7 +292,7 @@ def test_a_given_table_cannot_name_products_outside_the_output(changes, message,
 
 
 def tell_name(*arguments):
-    return {"run": arguments[-1]["name"], "tool": "", "error": "not computed", "report": ""}
+    return {"run": arguments[-1].name, "tool": "", "error": "not computed", "report": ""}
 
 
 def test_nothing_foreign_is_replaced(archive, tmp_path):

@@ -334,7 +334,7 @@ import ctypes, gc, sys, warnings
 from pathlib import Path
 from gyrostab.jobs.follow import FileMemory, list_files
 from gyrostab.jobs.run import load_log
-from gyrostab.jobs.memory import release_memory, return_large_arrays
+from gyrostab.store.system import release_memory, return_large_arrays
 
 warnings.simplefilter("ignore")
 return_large_arrays()
