@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import (
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["plot_coefficients"]
+__all__ = ["find_shown_values", "plot_coefficients"]
 
 
 @draws_figure
@@ -149,14 +150,7 @@ def _draw_axis(
 
 def _set_scale(panel: Axes, product: xr.Dataset, symbol: str, names: list[str]) -> None:
     """Use a log scale if the values span more than a decade, else a linear one from zero."""
-    chosen = product.sel(axis=names)
-    state = chosen["observable"].sel(term=symbol).values
-    shown = (
-        chosen[symbol].values[state == OBSERVED],
-        chosen[f"{symbol}_upper"].values[state == UPPER_LIMIT_ONLY],
-    )
-    numbers = np.concatenate(shown)
-    numbers = numbers[np.isfinite(numbers) & (numbers > 0)]
+    numbers = find_shown_values(product.sel(axis=names), symbol)
     if numbers.size and numbers.max() > 10 * numbers.min():
         panel.set_yscale("log")
         panel.set_ylim(numbers.min() / 1.5, numbers.max() * 1.5)
@@ -166,6 +160,17 @@ def _set_scale(panel: Axes, product: xr.Dataset, symbol: str, names: list[str]) 
     else:
         panel.set_yticks([])
         write_in_middle(panel, "not observable in any window")
+
+
+def find_shown_values(product: xr.Dataset, symbol: str) -> NDArray[Any]:
+    """Find the values and upper limits of a term that figures show, if they are above zero."""
+    state = product["observable"].sel(term=symbol).values
+    shown = (
+        product[symbol].values[state == OBSERVED],
+        product[f"{symbol}_upper"].values[state == UPPER_LIMIT_ONLY],
+    )
+    numbers = np.concatenate(shown)
+    return np.asarray(numbers[np.isfinite(numbers) & (numbers > 0)])
 
 
 def _legend_handles(product: xr.Dataset, names: list[str]) -> list[Any]:

@@ -28,26 +28,11 @@ __all__ = ["product_figures", "save_figures"]
 def product_figures(
     product: xr.Dataset, *, width: float = PAGE_MM
 ) -> dict[str, Callable[[], Figure]]:
-    """List the figures of a product by name, as functions that draw them.
+    """List the figures of a product by name, as functions that draw them in a width [mm].
 
-    Parameters
-    ----------
-    product : xarray.Dataset
-        What `gyrostab.fit_noise` returns or `gyrostab.open_product` opens.
-    width : float
-        Width of the figures [mm]: 180 for a page, 85 for a column.
-
-    Returns
-    -------
-    dict
-        ``coefficients``, ``davar``, ``davar_change``, ``temperature`` if the product holds one, and
-        for each axis ``adev_<axis>`` and ``davar_3d_<axis>`` (the latter only with at least two
-        windows and two averaging times).
-
-    Raises
-    ------
-    SchemaError
-        If `product` is not a product.
+    They are ``coefficients``, ``davar``, ``davar_change``, ``temperature`` if the product holds
+    one, and for each axis ``adev_<axis>`` and ``davar_3d_<axis>`` (the latter only with at least
+    two windows and two averaging times).
     """
     check_product(product)
     figures: dict[str, Callable[[], Figure]] = {

@@ -218,14 +218,9 @@ def plot_davar_3d(
 def _merge_windows(
     product: xr.Dataset, names: list[str], columns: int
 ) -> tuple[list[tuple[NDArray[Any], NDArray[Any]]], int]:
-    """Average windows to at most `columns`.
+    """Average windows to at most `columns`, and count the windows per column.
 
-    Returns
-    -------
-    cells : list of (ndarray, ndarray)
-        For each axis the Allan deviation and the mask of weighted cells, shape (time, tau).
-    merged : int
-        Windows per column.
+    The cells of an axis are the Allan deviation and the mask of weighted cells, shape (time, tau).
     """
     size = product.sizes["time"]
     merged = max(1, -(-size // columns))

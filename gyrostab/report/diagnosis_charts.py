@@ -37,20 +37,9 @@ _MAX_LINES = 4000
 
 
 def diagnosis_charts(surfaces: xr.Dataset, content: Mapping[str, Any]) -> list[Chart]:
-    """Make the charts of a diagnosis.
+    """Make the charts of a diagnosis: ``change``, ``means``, ``deviations`` and ``spectra``.
 
-    Parameters
-    ----------
-    surfaces : xarray.Dataset
-        Contents of ``diagnosis.nc``: ``avar(axis, tau, case, window)`` [degree2 hour-2], means,
-        spectra and channels.
-    content : mapping
-        Contents of ``diagnosis.json``; its mismatches are framed.
-
-    Returns
-    -------
-    list of Chart
-        ``change``, ``means``, ``deviations`` and ``spectra``.
+    `surfaces` and `content` are the contents of ``diagnosis.nc`` and ``diagnosis.json``.
     """
     draw: dict[str, tuple[str, Callable[..., go.Figure], str]] = {
         "change": ("Where recording and simulation differ", _draw_change, _CHANGE_TEXT),

@@ -49,23 +49,8 @@ def write_overview(
 ) -> Path:
     """Write the overview of many runs as one self-contained HTML file.
 
-    Parameters
-    ----------
-    table : pandas.DataFrame
-        What `gyrostab.jobs.fleet.run_fleet` returns.
-    path : path-like
-        File to write; links to reports are relative to its folder.
-    effects : pandas.DataFrame, optional
-        Effects that diagnoses name, from `gyrostab.jobs.fleet_table.list_effects`.
-    trends : pandas.DataFrame, optional
-        Changes with age and temperature, from `gyrostab.jobs.fleet_table.find_trends`.
-    overwrite : bool
-        Replace an existing file.
-
-    Returns
-    -------
-    pathlib.Path
-        The file.
+    `table` is what `gyrostab.jobs.fleet.run_fleet` returns, `effects` and `trends` are from
+    `gyrostab.jobs.fleet_table`. Links to reports are relative to the folder of the file.
     """
     done, failed = table[table["error"] == ""], table[table["error"] != ""]
     axes = _find_axes(table)

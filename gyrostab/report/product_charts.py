@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from gyrostab.allan.variance import surface_columns, variance_name
 from gyrostab.noise import LAWS
 from gyrostab.plot.adev import band
+from gyrostab.plot.coefficients import find_shown_values
 from gyrostab.plot.style import axis_names, axis_style, unit_label, unit_of_time, unit_symbol
 from gyrostab.report.charts import (
     DEVIATION_LABEL,
@@ -45,21 +46,11 @@ _MAX_CHANNELS = 4
 
 
 def product_charts(product: xr.Dataset, log: xr.Dataset | None = None) -> list[Chart]:
-    """Make the charts of a product.
+    """Make the charts of a product, with the gaps of its log.
 
-    Parameters
-    ----------
-    product : xarray.Dataset
-        Product with ``avar(axis, time, tau)`` [degree2 hour-2] and the coefficients.
-    log : xarray.Dataset, optional
-        Its log, for the gaps.
-
-    Returns
-    -------
-    list of Chart
-        ``record``, ``coefficients``, ``map``, ``window`` and, with at least two windows and
-        averaging times, ``surface``. The last three show the first axis; `window_data` holds the
-        others.
+    They are ``record``, ``coefficients``, ``map``, ``window`` and, with at least two windows and
+    averaging times, ``surface``. The last three show the first axis; `window_data` holds the
+    others.
     """
     gaps, variance = gap_shapes(log), variance_name(product)
     surface = _thin_product(product, _MAX_SURFACE_WINDOWS, _MAX_TAUS)
@@ -89,17 +80,9 @@ def product_charts(product: xr.Dataset, log: xr.Dataset | None = None) -> list[C
 def window_data(product: xr.Dataset) -> str:
     """Return what the chart of one window shows, for every window and axis, as JSON.
 
-    Parameters
-    ----------
-    product : xarray.Dataset
-        As for `product_charts`.
-
-    Returns
-    -------
-    str
-        ``axes``, ``colours``, ``times`` (labels), ``tau`` [s] and for each axis ``measured``,
-        ``low``, ``high`` and ``fitted`` [degree hour-1], 32-bit floats in base 64, window by
-        window. It can stand in a script element.
+    It has ``axes``, ``colours``, ``times`` (labels), ``tau`` [s] and for each axis ``measured``,
+    ``low``, ``high`` and ``fitted`` [degree hour-1], 32-bit floats in base 64, window by window. It
+    can stand in a script element.
     """
     part = _thin_product(product, _MAX_SURFACE_WINDOWS, _MAX_TAUS)
     low, high = band(part["avar"].values, part["edf"].values)
@@ -250,7 +233,7 @@ def _add_coefficient(
 ) -> None:
     """Add estimates as points with standard errors, and upper limits as open triangles."""
     state = product["observable"].sel(term=symbol).values
-    figure.layout[panel.replace("y", "yaxis")].update(_scale_of(product, symbol, state))
+    figure.layout[panel.replace("y", "yaxis")].update(_scale_of(product, symbol))
     for row, name in enumerate(axis_names(product)):
         colour = axis_style(product, name)["color"]
         shared = {"x": milliseconds(product), "yaxis": panel, "legendgroup": name}
@@ -286,15 +269,9 @@ def _add_coefficient(
         )
 
 
-def _scale_of(product: xr.Dataset, symbol: str, state: NDArray[np.int8]) -> dict[str, Any]:
+def _scale_of(product: xr.Dataset, symbol: str) -> dict[str, Any]:
     """Choose a logarithmic scale for numbers over more than a decade, else one from zero."""
-    shown = np.concatenate(
-        [
-            product[symbol].values[state == OBSERVED],
-            product[f"{symbol}_upper"].values[state == UPPER_LIMIT_ONLY],
-        ]
-    )
-    shown = shown[np.isfinite(shown) & (shown > 0)]
+    shown = find_shown_values(product, symbol)
     is_wide = shown.size > 0 and shown.max() > 10 * shown.min()
     return log_axis("", shown, labels=5) if is_wide else {"rangemode": "tozero"}
 
