@@ -146,14 +146,6 @@ def test_ingest_stores_the_time_of_every_sample(log, tmp_path, form, option, sto
                 np.testing.assert_array_equal(plain.time.values, own.time.values)
 
 
-def test_ingest_to_zarr_holds_the_same_log(log, tmp_path):
-    assert call("ingest", log, "-o", tmp_path / "log.nc") == 0
-    assert call("ingest", log, "-o", tmp_path / "log.zarr") == 0
-    xr.testing.assert_equal(
-        open_log(tmp_path / "log.zarr")["rate"], open_log(tmp_path / "log.nc")["rate"]
-    )
-
-
 def test_one_axis_only(log, product, tmp_path):
     assert call("run", log, "-o", tmp_path / "y.nc", *WINDOW, "--axis", "y") == 0
     product_y = open_product(tmp_path / "y.nc")
@@ -226,12 +218,6 @@ def test_config_with_a_slip_of_the_pen(text, expected, log, tmp_path, capfd):
     (tmp_path / "run.toml").write_text(text)
     assert call("run", log, "-o", tmp_path / "out.nc", "--config", tmp_path / "run.toml") == 2
     assert re.search(expected, capfd.readouterr().err)
-
-
-def test_overwrite_replaces(log, tmp_path):
-    (tmp_path / "log.nc").write_text("old")
-    assert call("ingest", log, "-o", tmp_path / "log.nc", "--overwrite") == 0
-    assert open_log(tmp_path / "log.nc").sizes["time"] == 6000
 
 
 def test_report_is_one_page(product, tmp_path):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -304,18 +306,21 @@ def test_adev_refuses_an_impossible_time(product, when, words):
         plot_adev(product, "x", when=when)
 
 
+def save_all(product: xr.Dataset, folder: Path) -> None:
+    figures = (
+        plot_davar(product),
+        plot_davar(product, relative=True),
+        plot_coefficients(product),
+        plot_adev(product, "x"),
+    )
+    for number, figure in enumerate(figures):
+        figure.savefig(folder / f"{number}.png", dpi=40)
+
+
 @pytest.mark.parametrize("windows", [1, 2])
 def test_shortest_products_can_be_drawn(tmp_path, windows):
     short = synthetic.product(windows=40, axes="x").isel(time=slice(0, windows))
-    for number, figure in enumerate(
-        [
-            plot_davar(short),
-            plot_davar(short, relative=True),
-            plot_coefficients(short),
-            plot_adev(short, "x"),
-        ]
-    ):
-        figure.savefig(tmp_path / f"{number}.png", dpi=40)
+    save_all(short, tmp_path)
     if windows > 1:
         plot_davar_3d(short).savefig(tmp_path / "3d.png", dpi=40)
     else:
@@ -325,16 +330,7 @@ def test_shortest_products_can_be_drawn(tmp_path, windows):
 
 def test_product_without_any_sample_can_be_drawn(tmp_path):
     product = synthetic.product(axes="x")
-    blind = product.isel(time=slice(20, 24))
-    for number, figure in enumerate(
-        [
-            plot_davar(blind),
-            plot_davar(blind, relative=True),
-            plot_coefficients(blind),
-            plot_adev(blind, "x"),
-        ]
-    ):
-        figure.savefig(tmp_path / f"{number}.png", dpi=40)
+    save_all(product.isel(time=slice(20, 24)), tmp_path)
 
 
 def test_figures_do_not_use_pyplot(product):

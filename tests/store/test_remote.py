@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from gyrostab import make_log
 from gyrostab.cli import main
@@ -52,10 +53,7 @@ def folder(tmp_path, monkeypatch):
 
 def assert_same_values(left, right) -> None:
     with open_product(left) as a, open_product(right) as b:
-        assert a.sizes == b.sizes
-        assert set(a.variables) == set(b.variables)
-        for name in a.variables:
-            np.testing.assert_array_equal(a[name].values, b[name].values, err_msg=str(name))
+        xr.testing.assert_equal(a, b)
 
 
 @pytest.mark.parametrize("stamps", [pytest.param(True, marks=pytest.mark.slow), False])

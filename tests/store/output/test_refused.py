@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -47,62 +48,52 @@ def folder(made, tmp_path) -> Path:
     return tmp_path / "work"
 
 
-def refused(folder: Path, *arguments: object, says: str, capfd: pytest.CaptureFixture[str]) -> None:
-    """Call the command line in a folder: it refuses with one message, and changes nothing."""
-    before = read_tree(folder)
-    capfd.readouterr()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        assert call(*arguments, QUIET) == 2
-    shown = capfd.readouterr().err
-    assert says in shown, shown
-    assert "Traceback" not in shown
-    assert read_tree(folder) == before
+@pytest.fixture
+def check_refusal(folder, capfd) -> Callable[[str, str], None]:
+    """Call a command in the folder: it refuses with one message, and changes nothing."""
 
-
-COMMANDS = {
-    "ingest": ["ingest", "log.csv"],
-    "simulate": ["simulate", "model.toml", "--duration", "5s", "--rate", "10"],
-    "export": ["export", "product.nc", "--format", "zarr"],
-}
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-@pytest.mark.parametrize("overwrite", [(), ("--overwrite",)])
-def test_a_folder_that_another_program_made_is_never_replaced(folder, command, overwrite, capfd):
-    refused(
-        folder,
-        *COMMANDS[command],
-        "-o",
-        "photos.zarr",
-        *overwrite,
-        says="holds 'tide.jpg', which gyrostab did not make",
-        capfd=capfd,
-    )
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_a_store_that_holds_something_else_is_not_replaced(folder, command, capfd):
-    (folder / "log.zarr" / "rate" / "notes.txt").write_text("mine")
-    refused(
-        folder,
-        *COMMANDS[command],
-        "-o",
-        "log.zarr",
-        "--overwrite",
-        says="holds 'rate/notes.txt'",
-        capfd=capfd,
-    )
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_a_store_is_replaced_with_overwrite(folder, command, capfd):
-    before = read_tree(folder)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        assert call(*COMMANDS[command], "-o", "log.zarr", QUIET) == 2
+    def check(command: str, says: str) -> None:
+        before = read_tree(folder)
+        capfd.readouterr()
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(folder)
+            assert call(*command.split(), QUIET) == 2
+        shown = capfd.readouterr().err
+        assert says in shown, shown
+        assert "Traceback" not in shown
         assert read_tree(folder) == before
-        assert call(*COMMANDS[command], "-o", "log.zarr", "--overwrite", QUIET) == 0
+
+    return check
+
+
+COMMANDS = (
+    "ingest log.csv",
+    "simulate model.toml --duration 5s --rate 10",
+    "export product.nc --format zarr",
+)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("overwrite", ["", "--overwrite"])
+def test_a_folder_that_another_program_made_is_never_replaced(check_refusal, command, overwrite):
+    says = "holds 'tide.jpg', which gyrostab did not make"
+    check_refusal(f"{command} -o photos.zarr {overwrite}", says)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_store_that_holds_something_else_is_not_replaced(folder, command, check_refusal):
+    (folder / "log.zarr" / "rate" / "notes.txt").write_text("mine")
+    check_refusal(f"{command} -o log.zarr --overwrite", "holds 'rate/notes.txt'")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_store_is_replaced_with_overwrite(folder, command):
+    before = read_tree(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert call(*command.split(), "-o", "log.zarr", QUIET) == 2
+        assert read_tree(folder) == before
+        assert call(*command.split(), "-o", "log.zarr", "--overwrite", QUIET) == 0
     after = read_tree(folder)
     outside = {name for name in before if not name.startswith("log.zarr/")}
     assert outside == {name for name in after if not name.startswith("log.zarr/")}
@@ -111,101 +102,48 @@ def test_a_store_is_replaced_with_overwrite(folder, command, capfd):
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    "command",
     [
-        ["ingest", "log.nc", "-o", "log.nc"],
-        ["ingest", "log.zarr", "-o", "log.zarr"],
-        ["ingest", "log.*", "-o", "log.nc"],
-        ["ingest", "log.csv", "--channel", "log.nc", "-o", "log.nc"],
-        ["run", "*.nc", "-o", "product.nc"],
-        ["run", "log.csv", "--channel", "product.nc", "-o", "product.nc", "--resume"],
-        ["davar", "log.csv", "--channel", "log.*", "-o", "log.nc"],
-        ["fit", "product.nc", "-o", "product.nc"],
-        ["correlate", "product.nc", "-o", "product.nc"],
-        ["simulate", "model.toml", "--like", "log.nc", "-o", "log.nc"],
-        ["report", "product.nc", "--log", "log.html", "-o", "log.html"],
-        [
-            "export",
-            "product.nc",
-            "--format",
-            "zarr",
-            "-o",
-            "log.zarr",
-            "--config",
-            "log.zarr/.zattrs",
-        ],
+        "ingest log.nc -o log.nc",
+        "ingest log.zarr -o log.zarr",
+        "ingest log.* -o log.nc",
+        "ingest log.csv --channel log.nc -o log.nc",
+        "run *.nc -o product.nc",
+        "run log.csv --channel product.nc -o product.nc --resume",
+        "davar log.csv --channel log.* -o log.nc",
+        "fit product.nc -o product.nc",
+        "correlate product.nc -o product.nc",
+        "simulate model.toml --like log.nc -o log.nc",
+        "report product.nc --log log.html -o log.html",
+        "export product.nc --format zarr -o log.zarr --config log.zarr/.zattrs",
     ],
-    ids=" ".join,
 )
-def test_an_output_that_is_an_input_is_refused(folder, arguments, capfd):
+def test_an_output_that_is_an_input_is_refused(folder, command, check_refusal):
     (folder / "log.html").hardlink_to(folder / "log.nc")
     (folder / "log.zarr" / ".zattrs").write_text("")  # an empty TOML file, too
-    refused(folder, *arguments, "--overwrite", says="input", capfd=capfd)
+    check_refusal(f"{command} --overwrite", "input")
 
 
 @pytest.mark.parametrize("how", [Path.symlink_to, Path.hardlink_to])
 @pytest.mark.parametrize("command", ["ingest", "run"])
-def test_links_do_not_hide_an_input(folder, command, how, capfd):
+def test_links_do_not_hide_an_input(folder, command, how, check_refusal):
     how(folder / "other.nc", folder / "log.nc")
-    refused(
-        folder,
-        command,
-        "log.nc",
-        "-o",
-        "other.nc",
-        "--overwrite",
-        says="is also an input",
-        capfd=capfd,
-    )
-    refused(
-        folder,
-        command,
-        "other.nc",
-        "-o",
-        "log.nc",
-        "--overwrite",
-        says="is also an input",
-        capfd=capfd,
-    )
+    check_refusal(f"{command} log.nc -o other.nc --overwrite", "is also an input")
+    check_refusal(f"{command} other.nc -o log.nc --overwrite", "is also an input")
 
 
-def test_a_folder_around_an_input_is_refused(folder, capfd):
+def test_a_folder_around_an_input_is_refused(folder, check_refusal):
     (folder / "logs.zarr").mkdir()
     write_log(folder / "logs.zarr" / "in.csv", 20.0)
-    refused(
-        folder,
-        "ingest",
-        "logs.zarr/in.csv",
-        "-o",
-        "logs.zarr",
-        "--overwrite",
-        says="a folder around the input",
-        capfd=capfd,
-    )
     (folder / "away.zarr").symlink_to("logs.zarr")
-    refused(
-        folder,
-        "ingest",
-        "logs.zarr/in.csv",
-        "-o",
-        "away.zarr",
-        "--overwrite",
-        says="a folder around the input",
-        capfd=capfd,
-    )
+    for output in ("logs.zarr", "away.zarr"):
+        command = f"ingest logs.zarr/in.csv -o {output} --overwrite"
+        check_refusal(command, "a folder around the input")
 
 
-def test_an_output_inside_a_store_that_is_read_is_refused(folder, capfd):
-    refused(
-        folder,
-        "run",
-        "log.zarr",
-        "-o",
-        "log.zarr/product.nc",
-        *WINDOW,
-        says="lies inside the input",
-        capfd=capfd,
-    )
+def test_an_output_inside_a_store_that_is_read_is_refused(check_refusal):
+    command = "run log.zarr -o log.zarr/product.nc --window 20s --step 5s"
+    check_refusal(command, "lies inside the input")
 
 
 # ------------------------------------------------------------------------------
@@ -233,19 +171,10 @@ def test_a_link_to_a_file_stays_a_link(folder):
     assert not [name for name in os.listdir(folder) if name.startswith(".")]
 
 
-def test_links_in_a_loop_and_what_is_no_file(folder, capfd):
+def test_links_in_a_loop_and_what_is_no_file(folder, check_refusal):
     (folder / "a.nc").symlink_to("b.nc")
     (folder / "b.nc").symlink_to("a.nc")
-    refused(
-        folder,
-        "ingest",
-        "log.csv",
-        "-o",
-        "a.nc",
-        "--overwrite",
-        says="symbolic link in a loop",
-        capfd=capfd,
-    )
+    check_refusal("ingest log.csv -o a.nc --overwrite", "symbolic link in a loop")
     os.mkfifo(folder / "pipe.nc")
     with pytest.raises(OutputError, match="not a regular file"):
         check_output(folder / "pipe.nc", overwrite=True)
@@ -333,47 +262,22 @@ def test_a_folder_of_files_is_checked_before_the_first_is_moved(tmp_path):
 @pytest.mark.parametrize(
     "names", [["notes.txt"], ["report.html"], ["diagnosis.json", "notes.txt"], ["diagnosis.json"]]
 )
-def test_a_diagnosis_replaces_a_diagnosis_only(folder, names, capfd):
+def test_a_diagnosis_replaces_a_diagnosis_only(folder, names, check_refusal):
     (folder / "run7").mkdir()
     for name in names:
         (folder / "run7" / name).write_text(
             json.dumps({"schema": "gyrostab.diagnosis/1" if len(names) == 2 else "other"})
         )
-    refused(
-        folder,
-        "diagnose",
-        "log.nc",
-        "-o",
-        "run7",
-        "--overwrite",
-        says="which gyrostab did not make",
-        capfd=capfd,
-    )
+    check_refusal("diagnose log.nc -o run7 --overwrite", "which gyrostab did not make")
 
 
-def test_a_benchmark_replaces_a_benchmark_only(folder, capfd):
+def test_a_benchmark_replaces_a_benchmark_only(folder, check_refusal):
     for name in ("recordings", "truth"):
         (folder / "proof" / name).mkdir(parents=True)
     (folder / "proof" / "recordings" / "holiday.wav").write_text("waves")
-    refused(
-        folder,
-        "prove",
-        "-o",
-        "proof",
-        "--overwrite",
-        says="holds 'recordings/holiday.wav'",
-        capfd=capfd,
-    )
+    check_refusal("prove -o proof --overwrite", "holds 'recordings/holiday.wav'")
     (folder / "proof" / "benchmark.json").write_text('{"schema": "gyrostab.prove/1"}')
-    refused(
-        folder,
-        "prove",
-        "-o",
-        "proof",
-        "--overwrite",
-        says="holds 'recordings/holiday.wav'",
-        capfd=capfd,
-    )
+    check_refusal("prove -o proof --overwrite", "holds 'recordings/holiday.wav'")
 
 
 # ------------------------------------------------------------------------------
@@ -391,7 +295,7 @@ def test_a_benchmark_replaces_a_benchmark_only(folder, capfd):
     ],
 )
 @pytest.mark.parametrize("option", ["--overwrite", "--resume"])
-def test_a_folder_with_the_name_of_a_job_is_left_alone(folder, content, option, capfd):
+def test_a_folder_with_the_name_of_a_job_is_left_alone(folder, content, option, check_refusal):
     job = job_folder(folder / "out.nc")
     if content is None:
         job.write_text("a file")
@@ -399,17 +303,8 @@ def test_a_folder_with_the_name_of_a_job_is_left_alone(folder, content, option, 
         job.mkdir()
         for name, text in content.items():
             (job / name).write_text(text)
-    refused(
-        folder,
-        "run",
-        "log.csv",
-        "-o",
-        "out.nc",
-        *WINDOW,
-        option,
-        says="gyrostab did not make what is there",
-        capfd=capfd,
-    )
+    command = f"run log.csv -o out.nc --window 20s --step 5s {option}"
+    check_refusal(command, "gyrostab did not make what is there")
 
 
 # ---------------------------------------------------------------------------------------- the
