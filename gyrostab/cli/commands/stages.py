@@ -10,7 +10,32 @@ from cyclopts import Parameter
 from gyrostab.cli.frame import Logs, Output, app, show_stages
 from gyrostab.cli.options import Common, Fitting, Flag, Reading, Running, Windows
 
-__all__ = ["davar", "fit", "run"]
+__all__ = ["davar", "demo", "fit", "run"]
+
+
+@app.command(sort_key=0, help_epilogue="")
+def demo(*, output: Output = Path("gyrostab-demo"), common: Common = Common()) -> None:
+    """Run the whole analysis on the log shipped with gyrostab, a simulated day.
+
+    Writes the product, the log, a report and figures to a folder, and prints the noise coefficients
+    for warm-up, rest, vibration and rest.
+
+    Example: gyrostab demo -o demo-output
+
+    Parameters
+    ----------
+    output
+        Folder to write to.
+    """
+    with show_stages(common) as stage:
+        stage("loading the libraries")
+        from gyrostab.allan.compile_fit import compile_fit_ahead
+        from gyrostab.jobs.demo import format_summary, run_demo
+
+        compile_fit_ahead()
+        product, files = run_demo(output, overwrite=common.overwrite, stage=stage)
+    print("written:", *(f"  {file}" for file in files), sep="\n", end="\n\n")
+    print(format_summary(product))
 
 
 @app.command(sort_key=3, help_epilogue="")

@@ -1,4 +1,4 @@
-"""The command that compares a recording with a simulation."""
+"""Commands that simulate a log, and that compare a recording with a simulation."""
 
 from __future__ import annotations
 
@@ -8,10 +8,75 @@ from typing import Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from gyrostab.cli.frame import app, show_stages
+from gyrostab.cli.frame import Output, app, show_stages
 from gyrostab.cli.options import Common, Reading
+from gyrostab.errors import OptionError
 
-__all__ = ["diagnose"]
+__all__ = ["diagnose", "simulate"]
+
+
+@app.command(sort_key=10, help_epilogue="")
+def simulate(
+    model: Annotated[Path, Parameter(name="MODEL")],
+    /,
+    *,
+    output: Output,
+    duration: Annotated[str | None, Parameter(metavar="DURATION")] = None,
+    like: Annotated[list[Path] | None, Parameter(metavar="RECORDING", negative=())] = None,
+    seed: Annotated[int | None, Parameter(metavar="N")] = None,
+    stamps: bool | None = None,
+    reading: Reading = Reading(),
+    common: Common = Common(),
+) -> None:
+    """Simulate a gyro log from a model of noise, environment and physical effects.
+
+    Every command that reads logs also reads simulated ones. The log may be larger than memory.
+
+    Example: gyrostab simulate model.toml -o log.nc --duration 1h --rate 100 --seed 1
+
+    Parameters
+    ----------
+    model
+        TOML file with the tables [noise], [[effect]], [[environment]] and [log]; see
+        docs/simulate.md.
+    output
+        File to write: LOG.nc or LOG.zarr.
+    duration
+        Length of the log: 1h, 200h. --rate and --start set its sampling rate and first time. All
+        three may be set in the model instead.
+    like
+        Recording whose time stamps, gaps and channels the log takes over. Repeat for a recording in
+        several files.
+    seed
+        Seed of the random numbers. The same seed gives the same log, and the same noise with and
+        without effects (default: the seed in the model, or 0).
+    stamps
+        Store the time of every sample, which programs other than gyrostab need (default: yes, below
+        10 000 000 samples).
+    """
+    from gyrostab.io.datasets import to_netcdf, to_zarr
+    from gyrostab.jobs.run import count_samples, load_log
+    from gyrostab.simulate import simulate as make
+    from gyrostab.store.output import check_output
+
+    target = check_output(output, suffixes=[".nc", ".zarr"], overwrite=common.overwrite)
+    with show_stages(common) as stage:
+        stage("reading", 0)
+        if like:
+            log = make(
+                model, like=load_log(like, **reading.options()), duration=duration, seed=seed
+            )
+        else:
+            if reading.time_from or reading.time_to or reading.exclude:
+                raise OptionError(
+                    "--from, --to and --exclude cut the recording of --like; "
+                    "give that recording too, or --duration"
+                )
+            log = make(model, duration=duration, rate=reading.rate, start=reading.start, seed=seed)
+        stage("simulating", count_samples(log))
+        write = to_zarr if target.suffix.lower() == ".zarr" else to_netcdf
+        write(log, target, overwrite=common.overwrite, stamps=stamps)
+    print(target)
 
 
 @app.command(sort_key=11, help_epilogue="")
