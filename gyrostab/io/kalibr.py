@@ -38,7 +38,7 @@ import xarray as xr
 
 from gyrostab.allan.davar import davar
 from gyrostab.allan.fit import fit_noise
-from gyrostab.allan.summary import FitSummary, TermSummary, summarise_fit, summarise_terms
+from gyrostab.allan.summary import FitSummary, summarise_fit, summarise_terms
 from gyrostab.errors import SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.noise import HOUR, LAWS
@@ -83,7 +83,9 @@ def convert_terms(
     for term in summarise_terms(product):
         if term.symbol in by_symbol:
             key, factor = by_symbol[term.symbol]
-            values_by_axis.setdefault(term.axis, {})[key] = _convert_term(term, factor)
+            shares = {"observed": term.observed_share, "upper_limit_only": term.limited_share}
+            value = KalibrValue(term.value * factor, term.status, shares.get(term.status, 0.0))
+            values_by_axis.setdefault(term.axis, {})[key] = value
     return {axis: {key: values[key] for key in keys} for axis, values in values_by_axis.items()}
 
 
@@ -108,13 +110,6 @@ def _fit_accelerometers(log: xr.Dataset, product: xr.Dataset) -> xr.Dataset:
     )
     window, step = (f"{product.attrs[name]}s" for name in ("window_s", "step_s"))
     return fit_noise(davar(accelerations, window=window, step=step))
-
-
-def _convert_term(term: TermSummary, factor: float) -> KalibrValue:
-    share = {"observed": term.observed_share, "upper_limit_only": term.limited_share}.get(
-        term.status, 0.0
-    )
-    return KalibrValue(term.value * factor, term.status, share)
 
 
 def to_kalibr(

@@ -93,24 +93,9 @@ def write_file_table(
 ) -> pd.DataFrame:
     """Write the table of the files of an archive, which `run_fleet` takes in place of the archive.
 
-    Parameters
-    ----------
-    paths : sequence of path
-        Folders, files, Zarr stores and patterns, or addresses of them.
-    output : path
-        Parquet file, or address of one. An earlier table is brought up to date: files that have not
-        changed are not opened again.
-    reading : mapping
-        Options of `gyrostab.jobs.run.load_log`.
-    overwrite : bool
-        Open all files again.
-    scheduler, workers, stage
-        As for `run_fleet`.
-
-    Returns
-    -------
-    pandas.DataFrame
-        The table of `gyrostab.jobs.archive.index_files`.
+    The table is that of `gyrostab.jobs.archive.index_files`, in a Parquet file, which may be at an
+    address. An earlier table is brought up to date: files that have not changed are not opened
+    again, except with `overwrite`. The other options are those of `run_fleet`.
     """
     scheduler = check_scheduler(scheduler)
     known_table = read_table(Path(output), content=FILES)

@@ -256,7 +256,7 @@ class _Joined(RowSource):
 
     def __init__(self, columns: Sequence[Any]):
         self.parts, self.dtype = tuple(columns), columns[0].dtype
-        self.edges = np.cumsum([0, *map(len_of, columns)]).tolist()
+        self.edges = np.cumsum([0, *(column.shape[-1] for column in columns)]).tolist()
         self.shape = (self.edges[-1],)
 
     def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
@@ -267,11 +267,6 @@ class _Joined(RowSource):
             place = out[done : done + remaining]
             read_into(self.parts[piece], row, begin + done - self.edges[piece], place)
             done, piece = done + place.size, piece + 1
-
-
-def len_of(array: Any) -> int:
-    """Return the length of the last dimension of an array or a source."""
-    return int(array.shape[-1])
 
 
 def concatenate_columns(columns: Sequence[Any], chunk: int) -> Any:
@@ -293,7 +288,7 @@ class Stacked(RowSource):
 
     def __init__(self, rows: Sequence[Any]):
         self.parts, self.dtype = tuple(rows), rows[0].dtype
-        self.shape = (len(rows), len_of(rows[0]))
+        self.shape = (len(rows), rows[0].shape[-1])
 
     def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
         """Read samples of one row from `begin` on into `out`."""
