@@ -377,16 +377,8 @@ def test_progress_is_a_plain_line_per_stage_away_from_a_terminal(log, tmp_path, 
 
 def test_progress_is_a_bar_on_a_terminal(log, tmp_path):
     leader, follower = pty.openpty()
-    command = [
-        sys.executable,
-        "-m",
-        "gyrostab",
-        "run",
-        str(log),
-        "-o",
-        str(tmp_path / "out.nc"),
-        *WINDOW,
-    ]
+    arguments = ["run", str(log), "-o", str(tmp_path / "out.nc"), *WINDOW]
+    command = [sys.executable, "-m", "gyrostab", *arguments]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=follower, env={**os.environ, "COLUMNS": "120"}
     ) as running:

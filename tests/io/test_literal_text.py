@@ -118,15 +118,5 @@ def test_a_name_that_no_file_can_hold_goes_all_the_way(tmp_path, capfd):
     )
     assert call("run", log, "-o", tmp_path / "product.nc", *WINDOW, "--quiet-progress") == 0
     assert "'<svg_onload=x>' as 'svg_onload_x'" in capfd.readouterr().err
-    assert (
-        call(
-            "correlate",
-            tmp_path / "product.nc",
-            "--with",
-            "<svg_onload=x>",
-            "--max-lag",
-            "5s",
-            "--quiet-progress",
-        )
-        == 0
-    )
+    options = ["--with", "<svg_onload=x>", "--max-lag", "5s", "--quiet-progress"]
+    assert call("correlate", tmp_path / "product.nc", *options) == 0

@@ -52,31 +52,12 @@ def start_cluster(folder: Path, *, workers: int) -> Iterator[tuple[str, subproce
         "DASK_DISTRIBUTED__WORKER__DAEMON": "False",
         "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1",  # each starts a worker again
     }
-    scheduler = ["scheduler", "--host", "127.0.0.1", "--port", "0"]
-    worker = [
-        "worker",
-        "--host",
-        "127.0.0.1",
-        "--nworkers",
-        str(workers),
-        "--nthreads",
-        "1",
-        "--memory-limit",
-        "0",
-    ]
+    common = ["--scheduler-file", str(where), "--no-dashboard", "--host", "127.0.0.1"]
+    worker = f"worker --nworkers {workers} --nthreads 1 --memory-limit 0 --local-directory".split()
     with ExitStack() as stack:
         process, _ = (
-            stack.enter_context(
-                _program(
-                    "dask",
-                    *command,
-                    "--scheduler-file",
-                    str(where),
-                    "--no-dashboard",
-                    env=environment,
-                )
-            )
-            for command in (scheduler, [*worker, "--local-directory", str(folder)])
+            stack.enter_context(_program("dask", *command, *common, env=environment))
+            for command in (["scheduler", "--port", "0"], [*worker, str(folder)])
         )
         _wait_for(where)
         with distributed.Client(scheduler_file=str(where)) as client:
@@ -256,18 +237,8 @@ def test_what_is_sent_is_small_whatever_the_length(log, monkeypatch, tmp_path):
 
 def test_no_scheduler_there(log, tmp_path, capfd, monkeypatch):
     monkeypatch.setattr("gyrostab.jobs.schedule._CONNECT_TIMEOUT_S", 1.0)
-    arguments = [
-        "run",
-        str(log),
-        "-o",
-        str(tmp_path / "p.nc"),
-        "--window",
-        "40s",
-        "--scheduler",
-        "127.0.0.1:9",
-        "--quiet-progress",
-    ]
-    assert main(arguments) == 2
+    options = ["--window", "40s", "--scheduler", "127.0.0.1:9", "--quiet-progress"]
+    assert main(["run", str(log), "-o", str(tmp_path / "p.nc"), *options]) == 2
     shown = capfd.readouterr().err
     assert "no dask scheduler answers there" in shown
     assert "Traceback" not in shown

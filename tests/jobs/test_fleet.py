@@ -235,16 +235,8 @@ def test_files_that_are_not_read_are_named(tmp_path, capsys):
     write_log(tmp_path / "runs" / "log.nc", 5)
     (tmp_path / "runs" / "raw.csv").write_text("time [s],wx\n0,1\n1,2\n2,3\n")
     output = tmp_path / "fleet"
-    command = [
-        "fleet",
-        str(tmp_path / "runs"),
-        "-o",
-        str(output),
-        "--window",
-        "1min",
-        "--no-reports",
-    ]
-    assert main([*command, "--scheduler", "threads", "--quiet-progress"]) == 0
+    options = ["--window", "1min", "--no-reports", "--scheduler", "threads", "--quiet-progress"]
+    assert main(["fleet", str(tmp_path / "runs"), "-o", str(output), *options]) == 0
     printed = capsys.readouterr()
     assert printed.out.startswith("1 run of 1 tool\n")
     assert "1 of 2 files are logs\nnote: not logs, or not without options: raw.csv;" in printed.err

@@ -420,16 +420,8 @@ def test_two_runs_of_one_output_at_once(log, tmp_path, capfd):
 def test_killed_before_changes_of_the_disk_and_at_random(log, tmp_path, calls, kills):
     seed = random.SystemRandom().randrange(10**6)
     print(f"seed {seed}")
-    command = [
-        sys.executable,
-        "-m",
-        "tests.support.crashing",
-        str(tmp_path),
-        str(log),
-        str(seed),
-        str(calls),
-        str(kills),
-    ]
+    arguments = [str(argument) for argument in (tmp_path, log, seed, calls, kills)]
+    command = [sys.executable, "-m", "tests.support.crashing", *arguments]
     done = subprocess.run(
         command, capture_output=True, text=True, timeout=250, cwd=Path(__file__).parents[2]
     )

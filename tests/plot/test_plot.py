@@ -19,6 +19,7 @@ from gyrostab.noise import LAWS, model_avar
 from gyrostab.plot import plot_adev, plot_coefficients, plot_davar, plot_davar_3d, plot_signal
 from gyrostab.plot.adev import band
 from gyrostab.plot.signal import thin
+from gyrostab.plot.style import save_png
 from tests.support import synthetic
 
 
@@ -314,7 +315,7 @@ def save_all(product: xr.Dataset, folder: Path) -> None:
         plot_adev(product, "x"),
     )
     for number, figure in enumerate(figures):
-        figure.savefig(folder / f"{number}.png", dpi=40)
+        save_png(figure, folder / f"{number}.png", dpi=40)
 
 
 @pytest.mark.parametrize("windows", [1, 2])
@@ -322,7 +323,7 @@ def test_shortest_products_can_be_drawn(tmp_path, windows):
     short = synthetic.product(windows=40, axes="x").isel(time=slice(0, windows))
     save_all(short, tmp_path)
     if windows > 1:
-        plot_davar_3d(short).savefig(tmp_path / "3d.png", dpi=40)
+        save_png(plot_davar_3d(short), tmp_path / "3d.png", dpi=40)
     else:
         with pytest.raises(OptionError, match="two windows"):
             plot_davar_3d(short)

@@ -238,17 +238,13 @@ def kill_commands(inputs: Path, top: Path, seed: int, kills: int) -> dict[str, o
 
 
 def test_kills_leave_the_old_output_or_the_new_one(inputs, tmp_path):
-    command = [
-        sys.executable,
-        "-m",
-        "tests.store.output.test_property",
-        str(inputs),
-        str(tmp_path),
-        "1",
-        "4",
-    ]
+    command = ["-m", "tests.store.output.test_property", str(inputs), str(tmp_path), "1", "4"]
     done = subprocess.run(
-        command, capture_output=True, text=True, timeout=250, cwd=Path(__file__).parents[3]
+        [sys.executable, *command],
+        capture_output=True,
+        text=True,
+        timeout=250,
+        cwd=Path(__file__).parents[3],
     )
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout.splitlines()[-1])
