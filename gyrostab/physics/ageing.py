@@ -64,7 +64,6 @@ class AgeingBias(Effect):
     )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Compute the rate contribution [degree hour-1] at the middle of every sample."""
         middle = chunk.seconds + 0.5 / chunk.rate
         return self.slope * (middle / DAY) + self.logarithmic * np.log1p(
             middle / (self.time * HOUR)
@@ -86,7 +85,6 @@ class AgeingBias(Effect):
         return Prediction(mean={"slope": windows.centre / DAY, "logarithmic": bend})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         terms = [self.quantity("slope", errors)] if self.slope or not self.logarithmic else []
         if self.logarithmic:
             size, time = self.quantity("logarithmic", errors), self.quantity("time", errors)
@@ -134,7 +132,6 @@ class AgeingNoise(Effect):
     exponent: float = parameter("1", "power of time", default=1.0, low=0.1, high=5.0)
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
-        """Squared N of every sample."""
         hours = (chunk.seconds + 0.5 / chunk.rate) / HOUR
         base = chunk.setup.noise["N"][:, None] ** 2
         return {"N": chunk.level["N"] + base * (self.growth * hours**self.exponent)}, state
@@ -152,7 +149,6 @@ class AgeingNoise(Effect):
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         growth, power = self.quantity("growth", errors), self.quantity("exponent", errors)
         grows = f"grows by {growth} of its initial value in the first hour"
         law = f"as time to the power {power}"

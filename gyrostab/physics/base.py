@@ -237,6 +237,10 @@ class Effect:
         }
         return replace(self, **{name: zero[name] for name in self.size_parameters})
 
+    def list_sizes(self) -> tuple[str, ...]:
+        """List the size parameters that are not zero."""
+        return tuple(name for name in self.size_parameters if getattr(self, name))
+
     def refer_noise_to(self, drivers: Mapping[str, float]) -> Self:
         """Make the same change of noise for a model whose noise is that at these channel values.
 

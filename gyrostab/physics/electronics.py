@@ -11,8 +11,7 @@ import numpy as np
 
 from gyrostab.errors import OptionError
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
-from gyrostab.physics.lorentz import lorentz_density
-from gyrostab.physics.phase import fold, line_density, turn_means
+from gyrostab.physics.phase import fold, line_density, lorentz_density, sine_means
 from gyrostab.units import HOUR, INNER
 
 __all__ = ["Clipping", "ClockError", "GaussMarkov", "SupplyBias"]
@@ -100,7 +99,6 @@ class SupplyBias(Effect):
         return {}
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Compute the rate contribution [degree hour-1] of every sample."""
         bias = np.zeros(chunk.size)
         if not chunk.size:
             return bias, state
@@ -110,11 +108,7 @@ class SupplyBias(Effect):
         if self.power:
             bias += self.power * (lagged["light_power"] * 1e6 - self.reference_power)
         if self.ripple:
-            cycles = self.frequency / chunk.rate
-            middle = (
-                np.arange(chunk.first, chunk.first + chunk.size, dtype=np.float64) + 0.5
-            ) * cycles
-            bias += self.ripple * turn_means(middle, np.full(1, cycles), -math.pi / 2.0)
+            bias += self.ripple * sine_means(chunk, self.frequency)
         return bias, state
 
     def _lag_channel(self, chunk: Chunk, name: str, state: dict[str, Any]) -> Array:
@@ -171,7 +165,6 @@ class SupplyBias(Effect):
         return mean_followed(at, values, windows.begin, windows.end, self.lag)
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         parts = [f"by {self.quantity('voltage', errors)} of voltage"] if self.voltage else []
         parts += [f"by {self.quantity('power', errors)} of light power"] if self.power else []
         parts += [f"with a lag of {self.quantity('lag', errors)}"] if self.lag and parts else []
@@ -227,7 +220,6 @@ class GaussMarkov(Effect):
         return [(child, float(child.standard_normal())) for child in rng.spawn(len(setup.axes))]
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Compute the rate contribution [degree hour-1] of every sample."""
         from gyrostab.kernels.random.stochastic import ornstein_uhlenbeck_means
 
         unit, new_state = np.empty(chunk.shape), []
@@ -256,7 +248,6 @@ class GaussMarkov(Effect):
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         size, time = self.quantity("rms", errors), self.quantity("correlation_time", errors)
         return (
             f"The bias wanders by {size} rms {self.on_axes()}, with a correlation time of {time}."
@@ -311,7 +302,6 @@ class Clipping(Effect):
         return Prediction(marks=("extremes",))
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         limit, centre = self.quantity("limit", errors), self.quantity("centre", errors)
         return f"The rate is clipped {self.on_axes()}, beyond {limit} from {centre}."
 
@@ -441,7 +431,6 @@ class ClockError(Effect):
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         fast, size = ("slow", -self.error) if self.error < 0 else ("fast", self.error)
         number = self.quantity("error", errors).replace(f"{self.error:.4g}", f"{size:.4g}", 1)
         more = f", growing by {self.quantity('drift', errors)}," if self.drift else ""

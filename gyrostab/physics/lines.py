@@ -9,12 +9,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from gyrostab.errors import OptionError
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
 from gyrostab.physics.phase import (
     TURN,
     fold,
     line_density,
+    resonance_density,
+    sine_means,
     turn_means,
     turns_of_samples,
     turns_of_windows,
@@ -95,15 +96,9 @@ class SpectralLine(Effect):
         return reading, rng, draw_state(reading, rng.standard_normal(2))
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Compute the rate contribution [degree hour-1] of every sample."""
         amplitude = self.expand_to_axes("amplitude", chunk.setup.axes)[:, None]
         if isinstance(state, np.ndarray):
-            cycles = self.frequency / chunk.rate
-            middle: Array = (
-                np.arange(chunk.first, chunk.first + chunk.size, dtype=np.float64) + 0.5
-            ) * cycles
-            phase = state[:, None] - math.pi / 2.0
-            return np.asarray(amplitude * turn_means(middle, np.full(1, cycles), phase)), state
+            return amplitude * sine_means(chunk, self.frequency, state[:, None]), state
         from gyrostab.kernels.random.coloured import read_process
 
         reading, rng, position = state
@@ -127,18 +122,10 @@ class SpectralLine(Effect):
                 coherent=True,
                 line=place,
             )
-        from gyrostab.kernels.random.coloured import folded_psd, oscillator_psd
-
-        def density(f: Array) -> Array:
-            return oscillator_psd(f, self.frequency, self.quality)
-
-        highest = self.frequency * (1.0 + 20.0 / self.quality)
-        folded = 0.5 * folded_psd(density, windows.frequency, windows.rate, highest, average=True)
-        spectrum = np.broadcast_to(folded, (place.size, folded.size))
+        spectrum = 0.5 * resonance_density(windows, self.frequency, self.quality)
         return Prediction(spectrum={"amplitude": spectrum}, coherent=True, line=place)
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         size, place = self.quantity("amplitude", errors), self.quantity("frequency", errors)
         if math.isinf(self.quality):
             return f"There is a steady line of {size} at {place} {self.on_axes()}."
@@ -192,7 +179,9 @@ class RotationLine(Effect):
     order: float = parameter(
         "1", "frequency of the first line [per turn]", default=1.0, low=1e-3, high=1e3
     )
-    harmonics: float = parameter("1", "number of lines", default=1.0, low=1.0, high=100.0)
+    harmonics: float = parameter(
+        "1", "number of lines", default=1.0, low=1.0, high=100.0, whole="whole number of lines"
+    )
     rolloff: float = parameter(
         "1", "the k-th line is k^-rolloff of the first", default=1.0, low=-5.0, high=5.0
     )
@@ -200,20 +189,11 @@ class RotationLine(Effect):
         "deg", "phase of the first line at the start", default=(), low=-1e6, high=1e6, many=True
     )
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.harmonics != int(self.harmonics):
-            raise OptionError(
-                f"effect {self.name!r}, parameter 'harmonics': {self.harmonics:g} "
-                "is not a whole number of lines; give one"
-            )
-
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """Start with zero turns of the channel."""
         return 0.0
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Compute the rate contribution [degree hour-1] of every sample."""
         rotation = chunk.drivers["rotation_rate"]
         middle, inside, state = turns_of_samples(self.order * rotation, chunk.rate, state)
         amplitude = self.expand_to_axes("amplitude", chunk.setup.axes)
@@ -254,7 +234,6 @@ class RotationLine(Effect):
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         count, channel = int(self.harmonics), self.channel_names()["rotation_rate"]
         many = "There is a line" if count == 1 else f"There are {count} lines"
         first = "of" if count == 1 else "the first of"

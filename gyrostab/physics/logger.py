@@ -21,16 +21,6 @@ __all__ = ["HeldSamples", "LoggerFilter", "RateQuantization", "Spikes"]
 _FRAME_LENGTHS = 20.0
 
 
-def _whole_number(effect: Effect, name: str) -> int:
-    """Read a parameter that must be a whole number."""
-    value = float(getattr(effect, name))
-    if value != int(value):
-        raise OptionError(
-            f"effect {effect.name!r}, parameter {name!r}: {value:g} is not a whole number; give one"
-        )
-    return int(value)
-
-
 @dataclass(frozen=True, kw_only=True)
 class LoggerFilter(Effect):
     """Filter and decimation of the logger, at the rate of the instrument.
@@ -75,21 +65,28 @@ class LoggerFilter(Effect):
     cutoff: float = parameter(
         "Hz", "half power of the low-pass; 0 for none", default=0.0, typical=2.0, low=0.0, high=1e6
     )
-    order: float = parameter("1", "poles of the low-pass", default=2.0, low=1.0, high=12.0)
+    order: float = parameter(
+        "1", "poles of the low-pass", default=2.0, low=1.0, high=12.0, whole="whole number"
+    )
     length: float = parameter(
         "s", "length of the moving average; 0 for none", default=0.0, low=0.0, high=1e4
     )
     pick: float = parameter(
-        "1", "1: every n-th sample of the instrument; 0: means of n", default=0.0, low=0.0, high=1.0
+        "1",
+        "1: every n-th sample of the instrument; 0: means of n",
+        default=0.0,
+        low=0.0,
+        high=1.0,
+        whole="whole number",
     )
     instrument: float = parameter(
-        "1", "n, to explain a recording; 0: many", default=0.0, low=0.0, high=1000.0
+        "1",
+        "n, to explain a recording; 0: many",
+        default=0.0,
+        low=0.0,
+        high=1000.0,
+        whole="whole number",
     )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("order", "pick", "instrument"):
-            _whole_number(self, name)
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """Design the sections of the low-pass and the length of the average."""
@@ -208,7 +205,6 @@ class LoggerFilter(Effect):
         return np.asarray(response.sum(axis=-1))
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         parts = (
             [f"low-pass of order {int(self.order)} at {self.quantity('cutoff', errors)}"]
             if self.cutoff
@@ -286,7 +282,6 @@ class RateQuantization(Effect):
         return Prediction(mean=mean, spectrum={"step": white}, marks=("lattice",))
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         return (
             f"The rate is quantized in steps of {self.quantity('step', errors)} {self.on_axes()}."
         )
@@ -332,12 +327,10 @@ class Spikes(Effect):
     )
     kind: str = parameter("text", "what is wrong", default="bit", choices=("bit", "outlier"))
     lsb: float = parameter("deg/h", "what the lowest bit counts", default=0.1, low=1e-12, high=1e9)
-    bits: float = parameter("1", "bits of the number", default=16.0, low=2.0, high=48.0)
+    bits: float = parameter(
+        "1", "bits of the number", default=16.0, low=2.0, high=48.0, whole="whole number"
+    )
     size: float = parameter("deg/h", "rms of an outlier", default=100.0, low=0.0, high=1e12)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _whole_number(self, "bits")
 
     def _sample_probability(self, rate: float) -> float:
         """Compute the probability that a sample is wrong."""
@@ -384,7 +377,6 @@ class Spikes(Effect):
         return Prediction(spectrum={name: white}, marks=("outliers",))
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         bit = f"one of {int(self.bits)} bits flips (lowest bit: {self.quantity('lsb', errors)})"
         deviation = bit if self.kind == "bit" else f"by {self.quantity('size', errors)} rms"
         often = self.quantity("per_hour", errors).removesuffix(" 1/h")
@@ -511,7 +503,6 @@ class HeldSamples(Effect):
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         filling = {"repeat": "earlier ones", "zero": "zero", "frame": "the frame before"}[self.fill]
         often, length = (
             self.quantity("per_hour", errors).removesuffix(" 1/h"),

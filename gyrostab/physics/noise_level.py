@@ -108,7 +108,6 @@ class TemperatureNoise(Effect):
         )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
-        """Compute squared N for every sample."""
         above = chunk.drivers["temperature"] - self.reference
         return _raise_noise(self, chunk, above * (self.linear + above * self.quadratic)), state
 
@@ -118,9 +117,7 @@ class TemperatureNoise(Effect):
         return Prediction(level={("N", "linear"): above, ("N", "quadratic"): above**2})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
-        names = [name for name in self.size_parameters if getattr(self, name)] or ["linear"]
-        terms = [self.quantity(name, errors) for name in names]
+        terms = [self.quantity(name, errors) for name in self.list_sizes() or ("linear",)]
         change = f"changes by {', '.join(terms)} of its value at {self.quantity('reference')}"
         return f"The angle random walk follows the temperature {self.on_axes()}: N^2 {change}."
 
@@ -211,7 +208,6 @@ class LightPowerNoise(Effect):
         return self.needs()
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
-        """Compute squared N for every sample."""
         power = chunk.drivers["light_power"]
         if power.size and not float(power.min()) > 0.0:
             place = int(power.argmin())
@@ -235,7 +231,6 @@ class LightPowerNoise(Effect):
         return Prediction(level={("N", "thermal"): loss**2 - 1.0, ("N", "shot"): loss - 1.0})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         thermal, shot = self.quantity("thermal", errors), self.quantity("shot", errors)
         shares = f"{thermal} of N^2 is noise of the detector and {shot} shot noise"
         follows = f"The angle random walk follows the light power {self.on_axes()}"
@@ -321,7 +316,6 @@ class VibrationNoise(_FollowsVibration):
     )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
-        """Compute squared N and Q for every sample."""
         excited = self._raise_to_power(chunk.drivers)
         return {
             "N": chunk.level["N"] + self.white**2 * excited,
@@ -339,13 +333,8 @@ class VibrationNoise(_FollowsVibration):
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
-        named = (("white", "N"), ("quantization", "Q"))
-        terms = [
-            f"{self.quantity(name, errors)} of {symbol}"
-            for name, symbol in named
-            if getattr(self, name)
-        ]
+        symbols = {"white": "N", "quantization": "Q"}
+        terms = [f"{self.quantity(name, errors)} of {symbols[name]}" for name in self.list_sizes()]
         size = " and ".join(terms) or "nothing"
         return f"Vibration raises the noise {self.on_axes()}: {size}, {self._describe_law(errors)}."
 
@@ -391,7 +380,6 @@ class VibrationRandomWalk(_FollowsVibration):
     )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
-        """Compute squared K for every sample."""
         return {
             "K": chunk.level["K"] + self.sensitivity**2 * self._raise_to_power(chunk.drivers)
         }, state
@@ -406,6 +394,5 @@ class VibrationRandomWalk(_FollowsVibration):
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         size = f"{self.quantity('sensitivity', errors)} of K, {self._describe_law(errors)}"
         return f"Vibration adds rate random walk {self.on_axes()}: {size}."

@@ -12,8 +12,7 @@ import numpy as np
 from gyrostab.errors import OptionError
 from gyrostab.noise import sampled_psd
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
-from gyrostab.physics.lorentz import lorentz_density
-from gyrostab.physics.phase import fold, line_density
+from gyrostab.physics.phase import fold, line_density, lorentz_density
 from gyrostab.units import HOUR, INNER
 
 __all__ = ["DeadZone", "FeedbackReset", "SharedSource"]
@@ -98,7 +97,6 @@ class DeadZone(Effect):
         return Prediction(mean={"width": -outside * (self.edge == "offset")}, marks=("stuck",))
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         size, centre = self.quantity("width", errors), self.quantity("centre", errors)
         return f"The output sticks {self.on_axes()}, while the rate is within {size} of {centre}."
 
@@ -348,7 +346,6 @@ class FeedbackReset(Effect):
         }
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         parts = [self.quantity("kick", errors)] if self.kick else []
         parts += (
             [f"{self.quantity('tail', errors)} within {self.quantity('decay', errors)}"]
@@ -440,7 +437,6 @@ class SharedSource(Effect):
         return rng, (0.0 if math.isinf(self.bandwidth) else float(rng.standard_normal()))
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Compute the rate contribution [degree hour-1] of every sample."""
         rng, position = state
         if math.isinf(self.bandwidth):
             common = math.sqrt(chunk.rate) * rng.standard_normal(chunk.size)
@@ -477,7 +473,6 @@ class SharedSource(Effect):
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         below = (
             f", below {self.quantity('bandwidth', errors)}" if math.isfinite(self.bandwidth) else ""
         )

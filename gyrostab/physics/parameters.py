@@ -35,6 +35,8 @@ class Parameter:
         Allowed words of a text parameter.
     many : bool
         Whether it has one number per axis; see `Effect.expand_to_axes`.
+    whole : str
+        What the value must be, "whole number" or "whole number of fringes"; empty for any number.
     source : str
         Source of the typical size: author and year, or "estimate".
     """
@@ -48,6 +50,7 @@ class Parameter:
     high: float
     choices: tuple[str, ...]
     many: bool
+    whole: str
     source: str
 
     def check(self, value: Any, effect: str) -> Any:
@@ -72,6 +75,8 @@ class Parameter:
                     f"{where}: {number:g} {self.unit} is outside of the allowed range "
                     f"{self.low:g} to {self.high:g}"
                 )
+            if self.whole and number != int(number):
+                raise OptionError(f"{where}: {number:g} is not a {self.whole}; give one")
         return tuple(float(number) for number in numbers) if self.many else float(value)
 
 
@@ -85,6 +90,7 @@ def parameter(
     high: float = math.inf,
     choices: tuple[str, ...] = (),
     many: bool = False,
+    whole: str = "",
     source: str = "estimate",
 ) -> Any:
     """Declare a field of an effect; see `Parameter`. Without a default a model must give it."""
@@ -96,6 +102,7 @@ def parameter(
         "high": high,
     }
     properties |= {"choices": choices, "many": many, "source": source, "default": default}
+    properties |= {"whole": whole}
     return (
         field(metadata={"parameter": properties})
         if default is None

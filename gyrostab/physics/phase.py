@@ -1,4 +1,4 @@
-"""Phases, spectral lines and aliased frequencies."""
+"""Phases, and the spectra of lines, resonances and correlated bias in averaged samples."""
 
 from __future__ import annotations
 
@@ -6,9 +6,19 @@ import math
 
 import numpy as np
 
-from gyrostab.physics.base import Array, Windows
+from gyrostab.physics.base import Array, Chunk, Windows
 
-__all__ = ["TURN", "fold", "line_density", "turn_means", "turns_of_samples", "turns_of_windows"]
+__all__ = [
+    "TURN",
+    "fold",
+    "line_density",
+    "lorentz_density",
+    "resonance_density",
+    "sine_means",
+    "turn_means",
+    "turns_of_samples",
+    "turns_of_windows",
+]
 
 #: Degrees in a turn.
 TURN = 360.0
@@ -54,6 +64,13 @@ def turn_means(middle: Array, inside: Array, phase: Array | float = 0.0) -> Arra
     return np.asarray(np.sinc(inside) * np.cos(2.0 * math.pi * np.remainder(middle, 1.0) + phase))
 
 
+def sine_means(chunk: Chunk, frequency: float, phase: Array | float = 0.0) -> Array:
+    """Average ``sin(2 pi f t + phase)`` over every sample (`frequency` in Hz, `phase` in rad)."""
+    cycles = frequency / chunk.rate
+    middle = (np.arange(chunk.first, chunk.first + chunk.size, dtype=np.float64) + 0.5) * cycles
+    return turn_means(middle, np.full(1, cycles), phase - math.pi / 2.0)
+
+
 def turns_of_windows(windows: Windows, rotation: Array) -> tuple[Array, Array]:
     """Compute the turns up to the middle of every window, and within it, from its mean rate."""
     rate, centre = rotation / TURN, windows.centre
@@ -93,3 +110,53 @@ def line_density(windows: Windows, frequency: Array | float, power: Array | floa
     hit = (where >= edges[:-1]) & (where < edges[1:])
     strength = np.broadcast_to(np.asarray(power, np.float64), windows.begin.shape)[:, None]
     return hit * strength / (2.0 * np.diff(edges))
+
+
+def resonance_density(windows: Windows, frequency: float, quality: float) -> Array:
+    """Compute the two-sided density [Hz-1] of a resonance of unit mean square in the samples.
+
+    It is the same in all windows, shape (window, band).
+    """
+    from gyrostab.kernels.random.coloured import folded_psd, oscillator_psd
+
+    highest = frequency * (1.0 + 20.0 / quality)
+    folded = folded_psd(
+        lambda f: oscillator_psd(f, frequency, quality),
+        windows.frequency,
+        windows.rate,
+        highest,
+        average=True,
+    )
+    return np.broadcast_to(folded, (windows.begin.size, folded.size))
+
+
+def lorentz_density(frequency: Array, correlation_time: float, rate: float) -> Array:
+    """Compute the aliased two-sided density [Hz-1] of a unit exponentially correlated process.
+
+    A sample is the mean over its interval. With x the interval over the correlation time, the
+    samples have the covariances ``c_0 = 2 (x - 1 + e^-x) / x^2`` and ``c_k = ((1 - e^-x) / x)^2
+    e^-(k-1)x``, and the density is the Fourier sum of these.
+
+    Parameters
+    ----------
+    frequency : ndarray
+        Frequencies [Hz].
+    correlation_time : float
+        Time constant of the correlation [s].
+    rate : float
+        Sampling rate [Hz].
+
+    Examples
+    --------
+    At low frequency twice the correlation time, as without sampling:
+
+    >>> lorentz_density(np.array([1e-6]), 30.0, 10.0).round(3)
+    array([60.])
+    """
+    x = 1.0 / (rate * correlation_time)
+    lost = -math.expm1(-x)
+    at_once = 2.0 * (x - lost) / x**2 if x > 1e-4 else 1.0 - x / 3.0
+    turn = np.exp(-2j * np.pi * np.asarray(frequency, np.float64) / rate)
+    return np.asarray(
+        (at_once + 2.0 * (lost / x) ** 2 * (turn / (1.0 - math.exp(-x) * turn)).real) / rate
+    )

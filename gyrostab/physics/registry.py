@@ -15,7 +15,7 @@ from typing import Any
 import pandas as pd
 
 from gyrostab.errors import OptionError, UnitError
-from gyrostab.physics.base import Effect, Parameter
+from gyrostab.physics.base import Effect
 from gyrostab.units import DAY, HOUR, parse_unit
 
 __all__ = ["amount", "close_to", "effect_table", "effects", "make_effect"]
@@ -114,7 +114,9 @@ def make_effect(table: Mapping[str, Any], *, where: str = "effect") -> Effect:
     try:
         return kind(
             **{
-                key: _read_value(value, parameters[key]) if key in parameters else value
+                key: amount(value, item.unit, f"parameter {key!r}")
+                if (item := parameters.get(key)) and not item.choices
+                else value
                 for key, value in values.items()
             }
         )
@@ -130,11 +132,6 @@ def close_to(word: Any, words: Sequence[str]) -> str:
 
 _SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": HOUR, "d": DAY}
 _HERTZ = {"mHz": 1e-3, "Hz": 1.0, "kHz": 1e3, "MHz": 1e6, "1/min": 1 / 60}
-
-
-def _read_value(value: Any, item: Parameter) -> Any:
-    """Read a value of a model for a parameter, in its unit."""
-    return value if item.choices else amount(value, item.unit, f"parameter {item.name!r}")
 
 
 def amount(value: Any, unit: str, where: str) -> Any:
@@ -187,24 +184,15 @@ def effect_table() -> pd.DataFrame:
          parameter        unit  required
     ...  sensitivity  deg/h/degC      True
     """
-    rows = []
-    for name, kind in effects().items():
-        must = kind.required()
-        for item in kind.parameters():
-            rows.append(
-                {
-                    "effect": name,
-                    "parameter": item.name,
-                    "unit": item.unit,
-                    "required": item.name in must,
-                }
-                | _describe_parameter(item)
-            )
-    return pd.DataFrame(rows)
-
-
-def _describe_parameter(item: Parameter) -> dict[str, Any]:
-    return {
-        key: getattr(item, key)
-        for key in ("default", "typical", "low", "high", "meaning", "source")
-    }
+    attributes = ("default", "typical", "low", "high", "meaning", "source")
+    return pd.DataFrame(
+        {
+            "effect": name,
+            "parameter": item.name,
+            "unit": item.unit,
+            "required": item.name in kind.required(),
+            **{attribute: getattr(item, attribute) for attribute in attributes},
+        }
+        for name, kind in effects().items()
+        for item in kind.parameters()
+    )

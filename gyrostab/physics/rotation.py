@@ -11,7 +11,14 @@ import numpy as np
 
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
-from gyrostab.physics.phase import TURN, fold, turn_means, turns_of_samples, turns_of_windows
+from gyrostab.physics.phase import (
+    TURN,
+    fold,
+    resonance_density,
+    turn_means,
+    turns_of_samples,
+    turns_of_windows,
+)
 from gyrostab.units import HOUR, INNER
 
 __all__ = ["EarthRate", "Misalignment", "RealMotion", "ScaleFactor"]
@@ -94,7 +101,6 @@ class ScaleFactor(Effect):
         )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Compute the rate contribution [degree hour-1] of every sample."""
         if self.rotation == "channel":
             rate = chunk.drivers["rotation_rate"] * HOUR
         else:
@@ -123,12 +129,7 @@ class ScaleFactor(Effect):
         return Prediction(mean={name: _PPM * design for name, design in mean.items()})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
-        terms = [
-            f"{name} {self.quantity(name, errors)}"
-            for name in self.size_parameters
-            if getattr(self, name)
-        ]
+        terms = [f"{name} {self.quantity(name, errors)}" for name in self.list_sizes()]
         return f"The scale factor is wrong {self.on_axes()}: {', '.join(terms) or 'by nothing'}."
 
 
@@ -184,20 +185,12 @@ class Misalignment(Effect):
 
     def recorded_axes(self) -> tuple[str, ...]:
         """List the axes that leak in, if their recorded rates do."""
-        return (
-            tuple(name for name in self.size_parameters if getattr(self, name))
-            if self.motion == "recorded"
-            else ()
-        )
+        return self.list_sizes() if self.motion == "recorded" else ()
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Compute the rate contribution [degree hour-1] of every sample."""
         error = np.zeros(chunk.shape)
         rates = chunk.recorded if self.motion == "recorded" else chunk.true
-        for source in self.size_parameters:
-            size = getattr(self, source)
-            if not size:
-                continue
+        for source in self.list_sizes():
             if source not in rates:
                 raise SchemaError(
                     f"effect {self.name!r} needs the rate of axis {source!r}, which the log does "
@@ -206,7 +199,7 @@ class Misalignment(Effect):
                 )
             for row, axis in enumerate(chunk.setup.axes):
                 if axis != source:
-                    error[row] += size * _MRAD * rates[source]
+                    error[row] += getattr(self, source) * _MRAD * rates[source]
         return error, state
 
     def explain(self, windows: Windows) -> Prediction:
@@ -221,12 +214,7 @@ class Misalignment(Effect):
         return Prediction(mean=mean, transfer={(source, source): flat for source in mean})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
-        terms = [
-            f"{self.quantity(name, errors)} of {name}"
-            for name in self.size_parameters
-            if getattr(self, name)
-        ]
+        terms = [f"{self.quantity(name, errors)} of {name}" for name in self.list_sizes()]
         size = ", ".join(terms) or "nothing"
         return f"The rotation of other axes leaks in {self.on_axes()}, by {size}."
 
@@ -341,7 +329,6 @@ class EarthRate(Effect):
         return 0.0
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Compute the true rate [degree hour-1] of every sample."""
         middle, inside, state = turns_of_samples(chunk.drivers["rotation_rate"], chunk.rate, state)
         return self._average_rate(middle, inside, chunk.setup.axes), state
 
@@ -375,7 +362,6 @@ class EarthRate(Effect):
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         along, high, right = self.components()
         across = math.hypot(high, right)
         components = (
@@ -487,7 +473,6 @@ class RealMotion(Effect):
         return reading, rng, draw_state(reading, rng.standard_normal(2)), None
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Compute the true rate [degree hour-1] of every sample."""
         from gyrostab.kernels.random.coloured import read_process
 
         reading, rng, position, tilt = state
@@ -524,8 +509,6 @@ class RealMotion(Effect):
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict window means of rotation and tilt, and the coherent spectrum of the sway."""
-        from gyrostab.kernels.random.coloured import folded_psd, oscillator_psd
-
         direction = self.expand_to_axes("direction", windows.axes)[:, None]
         mean = {}
         if "rotation_rate" in windows.drivers:
@@ -535,12 +518,7 @@ class RealMotion(Effect):
                 slope = np.gradient(windows.drivers[f"accel_{name}"], windows.centre)
                 mean[name] = direction * (math.degrees(_MRAD) * HOUR * slope)
 
-        def density(f: Array) -> Array:
-            return oscillator_psd(f, self.frequency, self.quality)
-
-        highest = self.frequency * (1.0 + 20.0 / self.quality)
-        folded = folded_psd(density, windows.frequency, windows.rate, highest, average=True)
-        sway = np.broadcast_to(folded, (windows.begin.size, folded.size))
+        sway = resonance_density(windows, self.frequency, self.quality)
         place = np.full(windows.begin.size, float(fold(self.frequency, windows.rate)))
         turning = np.asarray(2j * np.pi * windows.frequency * (math.degrees(_MRAD) * HOUR))
         transfer = {(name, f"accel_{name}"): turning for name in "xyz"}
@@ -549,7 +527,6 @@ class RealMotion(Effect):
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         terms = []
         if self.sway:
             terms.append(

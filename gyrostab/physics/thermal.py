@@ -10,7 +10,7 @@ import numpy as np
 
 from gyrostab.errors import OptionError
 from gyrostab.noise import NORMAL_95
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
+from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Stage, Windows, parameter
 from gyrostab.units import HOUR, INNER
 
 __all__ = ["Shupe", "TemperatureBias", "ThermalGradient", "ThermalHysteresis"]
@@ -70,7 +70,6 @@ class TemperatureBias(Effect):
     )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Compute the rate contribution [degree hour-1] of every sample."""
         above = chunk.drivers["temperature"] - self.reference
         return above * (self.sensitivity + above * (self.quadratic + above * self.cubic)), state
 
@@ -80,9 +79,7 @@ class TemperatureBias(Effect):
         return Prediction(mean={"sensitivity": above, "quadratic": above**2, "cubic": above**3})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
-        names = [name for name in self.size_parameters if getattr(self, name)] or ["sensitivity"]
-        terms = [self.quantity(name, errors) for name in names]
+        terms = [self.quantity(name, errors) for name in self.list_sizes() or ("sensitivity",)]
         size = f"{', '.join(terms)} around {self.quantity('reference')}"
         return f"The bias follows the temperature {self.on_axes()}, by {size}."
 
@@ -159,7 +156,12 @@ class Shupe(Effect):
         "s", "relaxation time of the slowest mode", default=265.0, low=1e-3, high=1e6
     )
     modes: float = parameter(
-        "1", "number of modes; 1 for a simple lag", default=5.0, low=1.0, high=50.0
+        "1",
+        "number of modes; 1 for a simple lag",
+        default=5.0,
+        low=1.0,
+        high=50.0,
+        whole="whole number of modes",
     )
     sensor_lag: float = parameter(
         "s",
@@ -171,11 +173,6 @@ class Shupe(Effect):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.modes != int(self.modes):
-            raise OptionError(
-                f"effect {self.name!r}, parameter 'modes': {self.modes:g} "
-                "is not a whole number of modes; give one"
-            )
         if self.transient and self.modes < 2:
             raise OptionError(
                 f"effect {self.name!r}: transient needs at least 2 modes, "
@@ -186,12 +183,7 @@ class Shupe(Effect):
         """List the temperature, because its rate of change would be that of the noise."""
         return self.needs()
 
-    def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """Start in thermal equilibrium."""
-        return None
-
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Compute the rate contribution [degree hour-1] of every sample."""
         from gyrostab.kernels.thermal import relax, slab
 
         temperature = chunk.drivers["temperature"]
@@ -231,7 +223,6 @@ class Shupe(Effect):
         return Prediction(mean={"sensitivity": whole @ modes, "transient": halves @ modes})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         terms = (
             [self.quantity("sensitivity", errors)] if self.sensitivity or not self.transient else []
         )
@@ -324,12 +315,7 @@ class ThermalGradient(Effect):
         """List both temperatures if the effect follows the change of their difference."""
         return self.needs() if self.change else ()
 
-    def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """Start without a change."""
-        return None
-
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Compute the rate contribution [degree hour-1] of every sample."""
         from gyrostab.kernels.thermal import relax
 
         difference = chunk.drivers["temperature"] - chunk.drivers["temperature_2"]
@@ -355,7 +341,6 @@ class ThermalGradient(Effect):
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         terms = (
             [self.quantity("sensitivity", errors)] if self.sensitivity or not self.change else []
         )
@@ -418,12 +403,7 @@ class ThermalHysteresis(Effect):
         """List the temperature, because its extremes would be those of the noise."""
         return self.needs()
 
-    def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """Start without a position; the dead band will be centred on the first temperature."""
-        return None
-
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Compute the rate contribution [degree hour-1] of every sample."""
         from gyrostab.kernels.thermal import apply_dead_band
 
         temperature = np.ascontiguousarray(chunk.drivers["temperature"])
@@ -449,7 +429,6 @@ class ThermalHysteresis(Effect):
         return Prediction(mean={"sensitivity": apart})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         size, width = self.quantity("sensitivity", errors), self.quantity("width", errors)
         band = f"within a dead band of {width} to each side"
         return f"The bias has a temperature hysteresis {self.on_axes()}, of {size} {band}."

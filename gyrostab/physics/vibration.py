@@ -27,7 +27,6 @@ class _Vector(Effect):
         return tuple(channel for channel in self.channels if getattr(self, channel[-1]))
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Compute the rate contribution [degree hour-1] of every sample."""
         bias = np.zeros(chunk.size)
         for channel in self.needs():
             bias += getattr(self, channel[-1]) * chunk.drivers[channel]
@@ -43,12 +42,8 @@ class _Vector(Effect):
 
     def parts(self, errors: Mapping[str, float] | None) -> str:
         """Format the components: ``"0.01 deg/h/g along x"``."""
-        named = [
-            f"{self.quantity(name, errors)} along {name}"
-            for name in self.size_parameters
-            if getattr(self, name)
-        ]
-        return ", ".join(named) or "nothing"
+        parts = [f"{self.quantity(name, errors)} along {name}" for name in self.list_sizes()]
+        return ", ".join(parts) or "nothing"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +104,6 @@ class GSensitivity(_Vector):
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         return f"The bias follows the acceleration {self.on_axes()}, by {self.parts(errors)}."
 
 
@@ -165,7 +159,6 @@ class VibrationRectification(Effect):
     )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Compute the rate contribution [degree hour-1] of every sample."""
         square = chunk.drivers["vibration"] ** 2
         return square * (self.sensitivity + square * self.quartic), state
 
@@ -175,7 +168,6 @@ class VibrationRectification(Effect):
         return Prediction(mean={"sensitivity": square, "quartic": square**2})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         terms = []
         if self.sensitivity or not self.quartic:
             terms.append(
@@ -289,7 +281,6 @@ class AliasedVibration(Effect):
         )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Compute the rate contribution [degree hour-1] of every sample."""
         from gyrostab.kernels.random.coloured import read_process
 
         reading, rng, position, sensitivity = state
@@ -325,7 +316,6 @@ class AliasedVibration(Effect):
         return folded_psd(density, frequency, rate, 3.0 * self.high, average=average)
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         mount = (
             f", behind a mount with a resonance at {self.quantity('resonance', errors)}"
             if self.resonance
@@ -406,5 +396,4 @@ class Magnetic(_Vector):
     )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         return f"The bias follows the magnetic field {self.on_axes()}, by {self.parts(errors)}."

@@ -164,7 +164,6 @@ class WarmUp(Effect):
         return Prediction(mean=mean)
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Describe the effect in one sentence."""
         size, time = self.quantity("amplitude", errors), self.quantity("time", errors)
         settles = f"settles with a time constant of {time}"
         if self.slow_amplitude:

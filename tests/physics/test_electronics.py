@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.stats import norm
 
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.physics.lorentz import lorentz_density
+from gyrostab.physics.phase import lorentz_density
 from gyrostab.physics.registry import make_effect
 from gyrostab.simulate import simulate
 from tests.support.effect_bench import (

@@ -36,7 +36,7 @@ from gyrostab.kernels.spectra.periodogram import (
     ordinates,
     taper,
 )
-from gyrostab.physics.lorentz import lorentz_density
+from gyrostab.physics.phase import lorentz_density
 
 __all__ = ["SwitchingEvidence", "switching_evidence", "switching_powers"]
 
