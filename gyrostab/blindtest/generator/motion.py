@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from gyrostab.blindtest.generator import tool, vibration
+from gyrostab.blindtest.generator import telemetry, tool, vibration
 from gyrostab.blindtest.generator.detection_limits import band_density, learned_nats
 from gyrostab.blindtest.generator.measured_noise import BANDS
 from gyrostab.blindtest.generator.noise_floor import white_level
@@ -64,11 +64,6 @@ def vibration_rectification(
     )
 
 
-def _list_spans(active: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], active, [False]])))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
-
-
 def _shake_axis(
     scenario: Scenario,
     rng: np.random.Generator,
@@ -80,7 +75,7 @@ def _shake_axis(
 ) -> Array:
     """Draw the logged angular vibration of one axis (time,) for 1 deg/h per g of rms."""
     out = np.zeros(scenario.size)
-    for begin, end in _list_spans(scenario.busy) if share else []:
+    for begin, end in telemetry.list_spans(scenario.busy).tolist() if share else []:
         first, last = round(begin * scenario.rate), min(round(end * scenario.rate), scenario.size)
         fast = vibration.band_noise(
             rng,

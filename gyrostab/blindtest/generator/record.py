@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.blindtest.generator import noise_floor as floor
-from gyrostab.blindtest.generator import tool
+from gyrostab.blindtest.generator import telemetry, tool
 from gyrostab.blindtest.generator.environment import read_sensor
 from gyrostab.blindtest.generator.scenario import (
     AXES,
@@ -161,7 +161,7 @@ def make_channels(
 
 def make_gap_variables(missing: NDArray[np.bool_], *, start: int, rate: float) -> dict[str, Any]:
     """Make the gap table of a log from the missing samples."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], missing, [False]]))).reshape(-1, 2)
+    edges = telemetry.list_spans(missing)
     length, none = edges[:, 1] - edges[:, 0], np.zeros(len(edges), dtype=np.int64)
     return gap_variables(np.column_stack([edges, length, none, none]), start, rate)
 

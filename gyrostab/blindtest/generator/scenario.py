@@ -167,9 +167,7 @@ def _draw_missing(
     lost = telemetry.draw_losses(
         rng, size, share=gaps, frame=frame, burst=1.0 if rng.random() < 0.4 else rng.uniform(3, 30)
     )
-    t = np.arange(size) / rate
-    for begin, end in cuts:
-        lost |= (t >= begin) & (t < end)
+    lost |= telemetry.mark_power_cuts(cuts, size, rate)
     lost[: round(5 * rate)] = False  # a log begins and ends with samples
     lost[-round(5 * rate) :] = False
     return lost

@@ -26,10 +26,10 @@ __all__ = [
     "axes_with_share",
     "draw_shares",
     "fit_lagged_driver",
-    "fit_sensitivity",
     "make_mean_effect",
     "make_variance_effect",
     "scale_by_axis",
+    "signed_peaks",
 ]
 
 Array = NDArray[np.float64]
@@ -58,9 +58,14 @@ def scale_by_axis(shares: Array, value: float) -> dict[str, float]:
     }
 
 
-def fit_sensitivity(scenario: Scenario, mean: Array, driver: Array, *, axis: int) -> float:
-    """Fit the sensitivity of a mean (time,) to a driver (time,), weighted by an axis's noise."""
-    return _fit_driver(scenario, mean, driver, axis=axis)[0]
+def signed_peaks(effect: Effect, shares: Array) -> dict[str, float]:
+    """Find the largest mean of every axis with a nonzero share [deg/h], with the share's sign."""
+    assert effect.mean is not None
+    return {
+        axis: float(np.sign(share) * np.abs(row).max())
+        for axis, share, row in zip(AXES, shares, effect.mean, strict=True)
+        if share
+    }
 
 
 def fit_lagged_driver(
@@ -152,7 +157,7 @@ def make_mean_effect(
     parameters["size_white"] = {"value": mean_size(scenario, mean, white=True), "unit": "1"}
     if regressor is not None:
         values = {
-            axis: fit_sensitivity(scenario, mean[i], regressor[1], axis=i)
+            axis: _fit_driver(scenario, mean[i], regressor[1], axis=i)[0]
             for i, axis in enumerate(AXES)
             if shares[i]
         }

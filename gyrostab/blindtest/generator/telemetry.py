@@ -7,7 +7,16 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["draw_losses", "draw_power_cuts", "flip_bits", "limit_losses", "repeat_frames"]
+__all__ = [
+    "MIN_POWER_CUT_S",
+    "draw_losses",
+    "draw_power_cuts",
+    "flip_bits",
+    "limit_losses",
+    "list_spans",
+    "mark_power_cuts",
+    "repeat_frames",
+]
 
 Array = NDArray[np.float64]
 
@@ -50,6 +59,11 @@ def draw_losses(
     return np.asarray(np.repeat(bad, frame)[:size])
 
 
+def list_spans(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """List the first index and one past the last of every run in a mask, shape (run, 2)."""
+    return np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]))).reshape(-1, 2)
+
+
 def limit_losses(lost: NDArray[np.bool_], *, longest: int) -> NDArray[np.bool_]:
     """Split losses longer than `longest` samples by restoring short pieces.
 
@@ -60,7 +74,7 @@ def limit_losses(lost: NDArray[np.bool_], *, longest: int) -> NDArray[np.bool_]:
     """
     out = lost.copy()
     back = max(1, longest // 4)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], lost, [False]]))).reshape(-1, 2)
+    edges = list_spans(lost)
     for begin, end in edges[edges[:, 1] - edges[:, 0] > longest].tolist():
         for first in range(begin + longest, end, longest + back):
             out[first : min(first + back, end)] = False
@@ -80,6 +94,15 @@ def draw_power_cuts(rng: np.random.Generator, seconds: float, *, number: int) ->
     begin = (np.arange(number) + rng.uniform(0.45, 0.75, number)) * part
     off = np.maximum(rng.uniform(0.01, 0.12, number) * part, MIN_POWER_CUT_S)
     return np.stack([begin, begin + off], axis=1)
+
+
+def mark_power_cuts(cuts: Array, size: int, rate: float) -> NDArray[np.bool_]:
+    """Mark the samples without power, shape (size,)."""
+    t = np.arange(size) / rate
+    off = np.zeros(size, dtype=bool)
+    for begin, end in cuts:
+        off |= (t >= begin) & (t < end)
+    return off
 
 
 def flip_bits(

@@ -7,12 +7,13 @@ from numpy.typing import NDArray
 
 from gyrostab.blindtest.generator import coil, light
 from gyrostab.blindtest.generator.environment import lag
-from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario, to_samples
+from gyrostab.blindtest.generator.scenario import Effect, Scenario, to_samples
 from gyrostab.blindtest.generator.shapes import (
     axes_with_share,
     draw_shares,
     make_mean_effect,
     make_variance_effect,
+    signed_peaks,
 )
 
 __all__ = [
@@ -55,13 +56,8 @@ def shupe(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> E
     )
     # steady response to 1 K/min over the largest value
     steady = float(weights.sum()) / 60.0 / float(np.abs(shape).max())
-    largest = {axis: float(np.abs(row).max()) for axis, row in zip(AXES, effect.mean, strict=True)}  # type: ignore[arg-type]
-    signs = {
-        axis: float(np.sign(share)) * steady * largest[axis]
-        for axis, share in zip(AXES, shares, strict=True)
-        if share
-    }
-    effect.parameters["sensitivity"] = {"values": signs, "unit": "deg/h/(degC/min)"}
+    values = {axis: steady * peak for axis, peak in signed_peaks(effect, shares).items()}
+    effect.parameters["sensitivity"] = {"values": values, "unit": "deg/h/(degC/min)"}
     return effect
 
 
@@ -116,13 +112,9 @@ def thermal_hysteresis(scenario: Scenario, rng: np.random.Generator, *, strength
         form="eight dead bands of different widths" if many else "one dead band",
         form_differs=many,
     )
-    if not many and effect.mean is not None:
+    if not many:
         largest = float(np.abs(np.asarray(loop)).max())
-        slopes = {
-            a: float(np.sign(r) * np.abs(row).max()) / largest
-            for a, r, row in zip(AXES, shares, effect.mean, strict=True)
-            if r
-        }
+        slopes = {axis: peak / largest for axis, peak in signed_peaks(effect, shares).items()}
         effect.parameters["sensitivity"] = {"values": slopes, "unit": "deg/h/degC"}
         effect.parameters["width"] = {"value": float(widths[0]), "unit": "degC"}
     return effect
@@ -159,14 +151,9 @@ def warm_up(scenario: Scenario, rng: np.random.Generator, *, strength: float) ->
         form_differs=bool(kind != "exponential"),
         active=x < 2,
     )
-    if kind == "exponential" and effect.mean is not None:
-        first = {
-            axis: float(np.sign(share) * np.abs(row).max())
-            for axis, share, row in zip(AXES, shares, effect.mean, strict=True)
-            if share
-        }
+    if kind == "exponential":
         effect.parameters["amplitude"] = {
-            "values": first,
+            "values": signed_peaks(effect, shares),
             "unit": "deg/h",
             "unless": ["slow_amplitude"],
         }

@@ -66,7 +66,7 @@ def _pool_strengths(part: pd.DataFrame) -> pd.DataFrame:
     import numpy as np
     import pandas as pd
 
-    from gyrostab.blindtest.scoring.proportions import wilson
+    from gyrostab.blindtest.scoring.proportions import share_columns
 
     out = []
     for _, group in part.groupby(np.digitize(part["strength"], _POOL_LIMITS)):
@@ -77,8 +77,7 @@ def _pool_strengths(part: pd.DataFrame) -> pd.DataFrame:
         }
         for key in ("detected", "named"):
             hits = round(float((group[key] * group["n"]).sum()))
-            low, high = wilson(hits, number)
-            line |= {key: hits / number, f"{key}_low": low, f"{key}_high": high}
+            line |= share_columns(key, hits, number)
         out.append(line)
     return pd.DataFrame(out)
 

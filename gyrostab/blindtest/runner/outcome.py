@@ -34,7 +34,7 @@ from gyrostab.blindtest.scoring.detection import (
 )
 from gyrostab.blindtest.scoring.injections import injection_differences, injection_table
 from gyrostab.blindtest.scoring.probability import calibration_curve, risk_coverage
-from gyrostab.blindtest.scoring.score import drawn_rows, score_case
+from gyrostab.blindtest.scoring.score import drawn_rows, first_rows, score_case
 from gyrostab.blindtest.scoring.table import list_missed, markdown
 from gyrostab.store.output import replace_file
 
@@ -174,7 +174,7 @@ def page_text(
         *_describe_counterparts(rows),
         "### Wrong names",
         _format_list(
-            [_describe_wrong_name(row) for row in _first_rows(drawn) if row["wrong"]], "none"
+            [_describe_wrong_name(row) for row in first_rows(drawn) if row["wrong"]], "none"
         ),
         "### Undetected effects of strength 1.5 or more",
         _format_list(
@@ -225,7 +225,7 @@ def _describe_counterparts(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     if not len(table):
         return ["None in this run."]
     named = [
-        f"{_describe_case(row)}; named {', '.join(row['wrong_names'])}"
+        _describe_wrong_name(row)
         for row in rows
         if row["kind"] == "counterpart" and row["wrong_names"]
     ]
@@ -274,7 +274,7 @@ _COPY_LABELS = {
 def _tabulate_cost(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Tabulate the time of a diagnosis [s] by rate and length."""
     costs = pd.DataFrame(
-        [{key: row[key] for key in ("rate", "length", "seconds")} for row in _first_rows(rows)]
+        [{key: row[key] for key in ("rate", "length", "seconds")} for row in first_rows(rows)]
     )
     costs["length"] = pd.cut(
         costs["length"],
@@ -297,7 +297,7 @@ def _tabulate_cost(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 def _describe_run(
     rows: Sequence[Mapping[str, Any]], job: Mapping[str, Any], commitment: str
 ) -> str:
-    kinds = pd.Series([row["kind"] for row in _first_rows(rows)]).value_counts()
+    kinds = pd.Series([row["kind"] for row in first_rows(rows)]).value_counts()
     numbers = ", ".join(f"{number} {kind}" for kind, number in kinds.items())
     options = ("cases", "seed", "nulls", "counterparts")
     repeat = " ".join(["gyrostab prove", *(f"--{name} {job[name]}" for name in options)])
@@ -319,11 +319,6 @@ def _describe_run(
             "these figures are not those of one version.**"
         )
     return "  \n".join(_wrap_text(line) for line in lines)
-
-
-def _first_rows(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Keep the first row of every case."""
-    return list({row["name"]: row for row in reversed(rows)}.values())[::-1]
 
 
 def _describe_case(row: Mapping[str, Any]) -> str:

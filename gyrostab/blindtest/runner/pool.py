@@ -55,7 +55,11 @@ def run_in_processes(
     """
     report = report or (lambda done: None)
     if workers == 0 or not jobs:
-        return [_report_done(function(*job), report, done) for done, job in enumerate(jobs, 1)]
+        done: list[T] = []
+        for job in jobs:
+            done.append(function(*job))
+            report(len(done))
+        return done
     with _limit_threads(), _open_executor(min(workers, len(jobs))) as executor:
         places = {executor.submit(function, *job): place for place, job in enumerate(jobs)}
         results: dict[int, T] = {}
@@ -69,11 +73,6 @@ def run_in_processes(
                 "continue with --resume and fewer --workers"
             ) from error
     return [results[place] for place in range(len(jobs))]
-
-
-def _report_done(result: T, report: Callable[[int], None], done: int) -> T:
-    report(done)
-    return result
 
 
 @contextlib.contextmanager

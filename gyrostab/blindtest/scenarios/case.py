@@ -16,7 +16,6 @@ from gyrostab.blindtest.generator.catalogue import CATALOGUE, OUT_OF_CATALOGUE, 
 from gyrostab.blindtest.generator.detection_limits import learned_nats
 from gyrostab.blindtest.generator.record import find_missing, make_channels, make_log, make_record
 from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario, draw_scenario, stream
-from gyrostab.blindtest.generator.telemetry import MIN_POWER_CUT_S
 from gyrostab.blindtest.scenarios.drivers import degrade_driver
 from gyrostab.blindtest.scenarios.plan import STRENGTHS
 from gyrostab.blindtest.scoring.visibility import find_visibility
@@ -75,11 +74,8 @@ def draw_suitable(plan: dict[str, Any], entries: Sequence[Entry], attempt: int) 
 
 def _shorten_losses(scenario: Scenario) -> NDArray[np.bool_]:
     """Shorten telemetry losses so that they cannot be mistaken for a power cut."""
-    t = np.arange(scenario.size) / scenario.rate
-    off = np.zeros(scenario.size, dtype=bool)
-    for begin, end in scenario.cuts:
-        off |= (t >= begin) & (t < end)
-    longest = max(1, round((MIN_POWER_CUT_S - 2.0) * scenario.rate))
+    off = telemetry.mark_power_cuts(scenario.cuts, scenario.size, scenario.rate)
+    longest = max(1, round((telemetry.MIN_POWER_CUT_S - 2.0) * scenario.rate))
     return np.asarray(
         off & scenario.missing | telemetry.limit_losses(scenario.missing & ~off, longest=longest)
     )
@@ -194,10 +190,9 @@ def list_intervals(scenario: Scenario, active: NDArray[np.bool_] | None) -> list
     """List the ISO 8601 intervals in which an effect is active; without a mask the whole record."""
     if active is None:
         return [[_format_time(scenario, 0.0), _format_time(scenario, scenario.seconds)]]
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], active, [False]]))).reshape(-1, 2)
     return [
         [_format_time(scenario, float(a)), _format_time(scenario, min(float(b), scenario.seconds))]
-        for a, b in edges
+        for a, b in telemetry.list_spans(active)
     ]
 
 

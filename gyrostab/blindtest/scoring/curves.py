@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gyrostab.blindtest.scoring.proportions import wilson
-from gyrostab.blindtest.scoring.score import drawn_rows, first_rows
+from gyrostab.blindtest.scoring.proportions import share_columns, wilson
+from gyrostab.blindtest.scoring.score import CATALOGUE_KINDS, catalogue_rows, drawn_rows, first_rows
 from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH, SURE_STRENGTH
 
 __all__ = [
@@ -46,8 +46,7 @@ def curves(rows: Sequence[Row]) -> pd.DataFrame:
     selected = [
         row
         for row in rows
-        if row["kind"] in ("single", "pair", "triple", "sub_threshold", "out_of_catalogue")
-        and row["effect"]
+        if row["kind"] in (*CATALOGUE_KINDS, "out_of_catalogue") and row["effect"]
     ]
     out = []
     for effect in ["all", *sorted({row["effect"] for row in selected})]:
@@ -78,10 +77,8 @@ def fitted_noise_curve(rows: Sequence[Row]) -> pd.DataFrame:
     """
     selected = [
         (row, row["learned_strength"])
-        for row in rows
-        if row["kind"] in ("single", "pair", "triple", "sub_threshold")
-        and row["effect"]
-        and row.get("learned_strength") is not None
+        for row in catalogue_rows(rows)
+        if row.get("learned_strength") is not None
     ]
     out = []
     for low, high in pairwise((0.0, *_FITTED_LIMITS, math.inf)):
@@ -97,8 +94,7 @@ def _count_shares(part: Sequence[Row]) -> dict[str, Any]:
     line: dict[str, Any] = {"n": len(part)}
     for key in ("detected", "named"):
         hits = sum(bool(row[_column_of(row, key)]) for row in part)
-        low, high = wilson(hits, len(part))
-        line |= {key: hits / len(part), f"{key}_low": low, f"{key}_high": high}
+        line |= share_columns(key, hits, len(part))
     return line
 
 
@@ -144,10 +140,7 @@ def rank_histogram(rows: Sequence[Row]) -> pd.DataFrame:
 
     pulls = [
         number["pull"]
-        for row in rows
-        if row["kind"] in ("single", "pair", "triple", "sub_threshold")
-        and row["effect"]
-        and row["strength"] >= CLEAR_STRENGTH
+        for row in catalogue_rows(rows, min_strength=CLEAR_STRENGTH)
         for number in row["parameter_scores"]
         if number["pull"] is not None
     ]
@@ -207,11 +200,7 @@ def by_effect(rows: Sequence[Row]) -> pd.DataFrame:
         95 % intervals. None where there is nothing to count.
     """
     identifications = {line["name"]: line for line in reliability(rows).to_dict("records")}
-    selected = [
-        row
-        for row in rows
-        if row["kind"] in ("single", "pair", "triple", "sub_threshold") and row["effect"]
-    ]
+    selected = catalogue_rows(rows)
     out = []
     for effect in sorted({row["effect"] for row in selected} | set(identifications)):
         clear = [

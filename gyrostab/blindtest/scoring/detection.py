@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from gyrostab.blindtest.scoring.proportions import Target, share
-from gyrostab.blindtest.scoring.score import drawn_rows, first_rows
+from gyrostab.blindtest.scoring.score import CATALOGUE_KINDS, drawn_rows, first_rows
 from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH
 
 __all__ = [
@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 FALSE_ALARM_RATES = (0.02, 0.05)
 #: Kinds of cases whose detection is counted together.
 _GROUPS = {
-    "catalogue": ("single", "pair", "triple", "sub_threshold"),
+    "catalogue": CATALOGUE_KINDS,
     "out of catalogue or degraded driver": ("out_of_catalogue", "degraded_driver"),
 }
 _RESAMPLINGS = 1000

@@ -9,7 +9,17 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["NO_TARGET", "Line", "Target", "make_line", "median", "share", "spread", "wilson"]
+__all__ = [
+    "NO_TARGET",
+    "Line",
+    "Target",
+    "make_line",
+    "median",
+    "share",
+    "share_columns",
+    "spread",
+    "wilson",
+]
 
 Line = dict[str, Any]
 
@@ -64,6 +74,12 @@ def wilson(hits: int, total: int) -> tuple[float, float]:
 
     interval = binomtest(hits, total).proportion_ci(0.95, "wilson")
     return float(interval.low), float(interval.high)
+
+
+def share_columns(key: str, hits: int, total: int) -> dict[str, float]:
+    """Make the columns of a share and of the ends of its Wilson's interval."""
+    low, high = wilson(hits, total)
+    return {key: hits / total, f"{key}_low": low, f"{key}_high": high}
 
 
 def make_line(

@@ -13,6 +13,8 @@ from gyrostab.blindtest.generator.detection_limits import NATS
 from gyrostab.errors import SchemaError
 
 __all__ = [
+    "CATALOGUE_KINDS",
+    "catalogue_rows",
     "detection_score",
     "drawn_rows",
     "first_rows",
@@ -22,6 +24,8 @@ __all__ = [
 
 Intervals = Sequence[Sequence[str]]
 
+#: Kinds of cases with catalogue effects and an undisturbed driver.
+CATALOGUE_KINDS = ("single", "pair", "triple", "sub_threshold")
 #: Parameters with an arbitrary sign: that of a source which several axes share is a convention.
 _UNSIGNED = ("N",)
 _RELATIVE_TOLERANCE = 1e-9
@@ -183,11 +187,23 @@ def drawn_rows(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     return [row for row in rows if row["kind"] not in ("counterpart", "injected", "control")]
 
 
+def catalogue_rows(
+    rows: Sequence[Mapping[str, Any]], *, min_strength: float = 0.0
+) -> list[Mapping[str, Any]]:
+    """Keep the rows of catalogue effects with an undisturbed driver."""
+    return [
+        row
+        for row in rows
+        if row["kind"] in CATALOGUE_KINDS and row["effect"] and row["strength"] >= min_strength
+    ]
+
+
 def first_rows(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Keep one row per case."""
+    """Keep one row per case, and per copy of a case or of a real recording."""
     rows_by_case: dict[Any, Mapping[str, Any]] = {}
     for i, row in enumerate(rows):
-        rows_by_case.setdefault(row["index"] if row["index"] is not None else ("no number", i), row)
+        number = row["index"] if row["index"] is not None else ("no number", i)
+        rows_by_case.setdefault((number, row.get("copy")), row)
     return list(rows_by_case.values())
 
 
@@ -334,20 +350,9 @@ def _score_effect(
     other_names = accepted.union(
         *(merge_ambiguous(other) for other in true if other != name)
     ) - merge_ambiguous(name)
-    mine = [
-        identification
-        for identification in identifications
-        if identification["name"] not in other_names
-    ]
+    mine = [entry for entry in identifications if entry["name"] not in other_names]
     top = mine[0] if mine else None
-    match = next(
-        (
-            identification
-            for identification in mine
-            if identification["name"] in merge_ambiguous(name)
-        ),
-        None,
-    )
+    match = next((entry for entry in mine if entry["name"] in merge_ambiguous(name)), None)
     row: dict[str, Any] = {
         "effect": name,
         "strength": effect["strength"],
@@ -358,15 +363,12 @@ def _score_effect(
         "form_differs": effect["form_differs"],
         "named": bool(top and top["name"] in merge_ambiguous(name)),
         "named_exactly": bool(top and top["name"] == name),
-        "in_set": None,
-        "set_size": None,
+        "in_set": name in _ambiguity_set(top) if top else None,
+        "set_size": len(_ambiguity_set(top)) if top else None,
         "iou": None,
         "tau_hit": None,
         "parameter_scores": [],
     }
-    if top is not None:
-        row["in_set"] = name in _ambiguity_set(top)
-        row["set_size"] = len(_ambiguity_set(top))
     if match is not None:
         row["parameter_scores"] = _score_parameters(match, effect) if match["name"] == name else []
         row["tau_hit"] = _tau_hit(diagnosis, match["name"], effect)

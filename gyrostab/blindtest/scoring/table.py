@@ -12,7 +12,7 @@ import pandas as pd
 from gyrostab.blindtest.scoring.baseline_detectors import RANDOM
 from gyrostab.blindtest.scoring.probability import probability_lines
 from gyrostab.blindtest.scoring.proportions import Line, Target, median, share, spread
-from gyrostab.blindtest.scoring.score import drawn_rows, first_rows
+from gyrostab.blindtest.scoring.score import catalogue_rows, drawn_rows, first_rows
 
 __all__ = ["CLEAR_STRENGTH", "SURE_STRENGTH", "list_missed", "markdown", "score_table"]
 
@@ -56,17 +56,6 @@ def score_table(rows: Sequence[Row]) -> pd.DataFrame:
     return pd.DataFrame([line for group in groups for line in group(rows)])
 
 
-def _catalogue_rows(rows: Sequence[Row], *, min_strength: float = 0.0) -> list[Row]:
-    """Select rows of catalogue effects with an undisturbed driver."""
-    return [
-        row
-        for row in rows
-        if row["kind"] in ("single", "pair", "triple", "sub_threshold")
-        and row["effect"]
-        and row["strength"] >= min_strength
-    ]
-
-
 def _false_alarm_lines(rows: Sequence[Row]) -> list[Line]:
     nulls = [row for row in rows if row["kind"] == "null"]
     target = Target("<= 1 %, upper bound <= 2 %", most=0.01, surely=0.02)
@@ -81,17 +70,17 @@ def _false_alarm_lines(rows: Sequence[Row]) -> list[Line]:
 
 
 def _naming_lines(rows: Sequence[Row]) -> list[Line]:
-    clear = _catalogue_rows(rows, min_strength=CLEAR_STRENGTH)
+    clear = catalogue_rows(rows, min_strength=CLEAR_STRENGTH)
     detected = [row for row in clear if row["detected"]]
     single = [row for row in clear if row["kind"] in ("single", "sub_threshold")]
     shown = [row for row in single if (row.get("learned_strength") or 0.0) >= CLEAR_STRENGTH]
-    sure = [row for row in _catalogue_rows(rows) if _is_sure(row)]
+    sure = [row for row in catalogue_rows(rows) if _is_sure(row)]
     claimed = [row for row in clear if row["set_size"]]
     percent = Target(">= 95 %", least=0.95)
     return [
         share(
             "effects of a form that the diagnosis does not fit",
-            (row["form_differs"] for row in _catalogue_rows(rows)),
+            (row["form_differs"] for row in catalogue_rows(rows)),
             Target(">= 33 %", least=0.33),
         ),
         share("detected, strength 1.5 or more", (row["detected"] for row in clear), percent),
@@ -191,17 +180,11 @@ def _out_of_catalogue_lines(rows: Sequence[Row]) -> list[Line]:
 
 
 def _degraded_driver_lines(rows: Sequence[Row]) -> list[Line]:
-    gone = [
-        row
-        for row in rows
-        if row["kind"] == "degraded_driver" and row["degradation"] in ("withheld", "substituted")
-    ]
-    bent = [
-        row
-        for row in rows
-        if row["kind"] == "degraded_driver"
-        and row["degradation"] not in ("withheld", "substituted")
-    ]
+    degraded = [row for row in rows if row["kind"] == "degraded_driver"]
+    gone, bent = (
+        [row for row in degraded if (row["degradation"] in ("withheld", "substituted")) == lost]
+        for lost in (True, False)
+    )
     return [
         share(
             "driver withheld or substituted: wrong name",
@@ -225,7 +208,7 @@ def _degraded_driver_lines(rows: Sequence[Row]) -> list[Line]:
 
 
 def _parameter_lines(rows: Sequence[Row]) -> list[Line]:
-    clear = _catalogue_rows(rows, min_strength=CLEAR_STRENGTH)
+    clear = catalogue_rows(rows, min_strength=CLEAR_STRENGTH)
     scores = [(row, number) for row in clear for number in row["parameter_scores"]]
     coverage = Target("92-98 %", least=0.92, most=0.98)
     gains = [
@@ -327,10 +310,8 @@ def _model_lines(rows: Sequence[Row]) -> list[Line]:
 
 def _baseline_lines(rows: Sequence[Row]) -> list[Line]:
     """Make the lines of the baseline detectors and of the cost per case."""
-    nulls, clear = (
-        [row for row in rows if row["kind"] == "null"],
-        _catalogue_rows(rows, min_strength=CLEAR_STRENGTH),
-    )
+    nulls = [row for row in rows if row["kind"] == "null"]
+    clear = catalogue_rows(rows, min_strength=CLEAR_STRENGTH)
     names = sorted({name for row in rows for name in row["baseline_detectors"]} - {RANDOM})
     lines = [
         share(
