@@ -17,7 +17,7 @@ from gyrostab.simulate.noise import Units, shape
 from gyrostab.time.grid import grid_times
 from gyrostab.units import HOUR
 
-__all__ = ["BlockState", "Plan", "Step", "check_effects", "next_block"]
+__all__ = ["BlockState", "Plan", "Step", "next_block"]
 
 Array = NDArray[np.float64]
 
@@ -29,8 +29,8 @@ class Step:
     effect: Effect
     setup: Setup
     rows: tuple[int, ...]
-    factors: Mapping[str, float] = field(default_factory=dict)
-    sources: Mapping[str, str] = field(default_factory=dict)  # source of each channel it needs
+    factors: Mapping[str, float]
+    sources: Mapping[str, str]  # source of each channel it needs
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class Plan:
     turning: str  # axis that feels the channel ``rotation_rate``; empty when none does
     #: (n, 2): samples of the log that are missing, [first, one past last], rising.
     gaps: NDArray[np.int64]
-    recorded: Mapping[str, str] = field(default_factory=dict)  # axis -> source of its recorded rate
-    bias: tuple[float, ...] = ()  # constant rate of each axis [degree hour-1]
+    recorded: Mapping[str, str]  # axis -> source of its recorded rate
+    bias: tuple[float, ...]  # constant rate of each axis [degree hour-1]
 
 
 @dataclass
@@ -188,7 +188,7 @@ def _add_noise(
             state.noise.get(axis, {}),
             ramp=plan.coefficients[row]["R"],
         )
-        signal[row] = noise + (true[axis] + (plan.bias[row] if plan.bias else 0.0))
+        signal[row] = noise + (true[axis] + plan.bias[row])
     return signal
 
 
@@ -225,12 +225,3 @@ def _drop_gaps(plan: Plan, rate: Array, first: int) -> None:
         )
     ]:
         rate[:, max(begin - first, 0) : end - first] = np.nan
-
-
-def check_effects(steps: Sequence[Step]) -> list[Step]:
-    """Parameters with one number for each axis fit the axes of the log, or `OptionError`."""
-    for step in steps:
-        for item in step.effect.parameters():
-            if item.many and getattr(step.effect, item.name):
-                step.effect.expand_to_axes(item.name, step.setup.axes)
-    return list(steps)

@@ -40,8 +40,12 @@ def inner_unit(unit: str, values: Any) -> tuple[str, Any]:
     return INNER[source.quantity], np.asarray(values) * source.factor + source.offset
 
 
-def check_points(points: Any, where: str, columns: Sequence[str]) -> Array:
-    """Rows of numbers, the first of which is a time that does not fall."""
+def check_points(
+    points: Any, where: str, columns: Sequence[str], *, optional: bool = False
+) -> Array:
+    """Rows of numbers, the first of which is a time that does not fall; none if `optional`."""
+    if optional and not len(points):
+        return np.empty((0, len(columns)))
     try:
         table = np.asarray(points, dtype=np.float64)
     except (ValueError, TypeError):

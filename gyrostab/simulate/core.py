@@ -7,7 +7,7 @@ import inspect
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,7 @@ from gyrostab.schema import (
     log_channels,
     signal_name,
 )
-from gyrostab.simulate.block import BlockState, Plan, Step, check_effects
+from gyrostab.simulate.block import BlockState, Plan, Step
 from gyrostab.simulate.channels import combine
 from gyrostab.simulate.drivers import Source, make_course, make_source
 from gyrostab.simulate.lazy import lazy_rates
@@ -118,8 +118,7 @@ def simulate(
         raise OptionError(f"chunk={chunk!r}: give at least 1 sample")
     environment = _make_world(made, frame, like, environment)
     table = _gap_table(environment, frame)
-    steps = _list_steps(made, frame, table)
-    plan = _make_plan(made, frame, environment, table, steps, like)
+    plan = _make_plan(made, frame, environment, table, like)
     starts = [
         begin_noise(
             frame.seed,
@@ -290,31 +289,26 @@ def _gap_table(environment: xr.Dataset, frame: _Frame) -> NDArray[np.int64]:
     return table
 
 
-def _list_steps(model: Model, frame: _Frame, table: NDArray[np.int64]) -> list[Step]:
-    """The effects in the order in which they act."""
-    steps = []
-    for effect in sorted(
-        model.effects, key=lambda effect: STAGES.index(effect.stage)
-    ):  # keeps the model's order within a stage
-        rows = tuple(
-            row for row, axis in enumerate(frame.axes) if not effect.axes or axis in effect.axes
-        )
-        factor = 1 if effect.stage == "logger" else frame.oversampling
-        noise = [model.coefficients(frame.axes[row]) for row in rows]
-        setup = Setup(
-            rate=frame.rate * factor,
-            size=frame.size * factor,
-            start=frame.start,
-            axes=tuple(frame.axes[row] for row in rows),
-            noise={
-                term: np.array([coefficients[term] for coefficients in noise]) for term in TERMS
-            },
-            gaps=table[:, :2] * factor,
-            restarts=table[table[:, 4] == _RESTART, :2] * factor,
-            oversampling=frame.oversampling,
-        )
-        steps.append(Step(effect, setup, rows))
-    return check_effects(steps)
+def _make_setup(
+    model: Model, frame: _Frame, table: NDArray[np.int64], effect: Effect, rows: tuple[int, ...]
+) -> Setup:
+    """Make the setup of an effect; its parameters with one number per axis must fit the rows."""
+    factor = 1 if effect.stage == "logger" else frame.oversampling
+    axes = tuple(frame.axes[row] for row in rows)
+    noise = [model.coefficients(axis) for axis in axes]
+    for item in effect.parameters():
+        if item.many and getattr(effect, item.name):
+            effect.expand_to_axes(item.name, axes)
+    return Setup(
+        rate=frame.rate * factor,
+        size=frame.size * factor,
+        start=frame.start,
+        axes=axes,
+        noise={term: np.array([coefficients[term] for coefficients in noise]) for term in TERMS},
+        gaps=table[:, :2] * factor,
+        restarts=table[table[:, 4] == _RESTART, :2] * factor,
+        oversampling=frame.oversampling,
+    )
 
 
 def _convert_units(effect: Effect, environment: xr.Dataset, present: list[str]) -> dict[str, float]:
@@ -344,19 +338,18 @@ def _make_plan(
     frame: _Frame,
     environment: xr.Dataset,
     table: NDArray[np.int64],
-    steps: list[Step],
     like: xr.Dataset | None,
 ) -> Plan:
     present = log_channels(environment)
     measured = [] if like is None else log_channels(like)
-    steps = [
-        replace(
-            step,
-            factors=_convert_units(step.effect, environment, present),
-            sources=_choose_sources(step.effect, measured),
+    steps = []
+    for effect in sorted(model.effects, key=lambda effect: STAGES.index(effect.stage)):
+        rows = tuple(
+            row for row, axis in enumerate(frame.axes) if not effect.axes or axis in effect.axes
         )
-        for step in steps
-    ]
+        setup = _make_setup(model, frame, table, effect, rows)
+        factors = _convert_units(effect, environment, present)
+        steps.append(Step(effect, setup, rows, factors, _choose_sources(effect, measured)))
     needed = {name for step in steps for name in step.sources.values()}
     turning = (
         str(environment["rotation_rate"].attrs.get("rotation_axis", ""))

@@ -44,16 +44,14 @@ def _make_from_points(
 ) -> xr.Dataset:
     table = check_points(points, f"points of {name}", ("time [s]", f"{name} [{unit}]"))
     inner, table[:, 1] = inner_unit(unit, table[:, 1])
-    more = {**(HELD if held else {}), **extra}
-    function = piecewise(table, held=held)
     return channel(
         name,
         inner,
-        function,
+        piecewise(table, held=held),
         duration=duration,
         start=start,
         sensor_rate=sensor_rate,
-        attributes=more,
+        attributes={**(HELD if held else {}), **extra},
     )
 
 
@@ -212,7 +210,7 @@ def chamber(
     table = np.stack([np.stack([begin, begin + wait], axis=1).ravel(), np.repeat(ends, 2)], axis=1)
     return _make_temperature(
         channel,
-        lambda t: piecewise(table, held=False)(t),
+        piecewise(table, held=False),
         seconds,
         start,
         sensor_rate,
@@ -284,11 +282,8 @@ def trip(
     (array([15., 45.]), np.float64(1000.0))
     """
     table = check_points(depths, "depths of trip", ("time [s]", "depth [m]"))
-    pumps = (
-        check_points(circulation, "circulation of trip", ("from [s]", "to [s]"))
-        if len(circulation)
-        else np.empty((0, 2))
-    )
+    ends = ("from [s]", "to [s]")
+    pumps = check_points(circulation, "circulation of trip", ends, optional=True)
     depth = piecewise(table, held=False)
 
     def mud(t: Array) -> Array:
@@ -334,11 +329,8 @@ def supply(
     >>> supply(duration=4.0, life=4.0, loads=[[1, 2, 0.5]]).supply_voltage.values.round(2)
     array([29.  , 28.28, 28.11, 26.68])
     """
-    table = (
-        check_points(loads, "loads of supply", ("from [s]", "to [s]", "drop [V]"))
-        if len(loads)
-        else np.empty((0, 3))
-    )
+    columns = ("from [s]", "to [s]", "drop [V]")
+    table = check_points(loads, "loads of supply", columns, optional=True)
     end = duration_seconds(life, "life")
 
     def voltage(t: Array) -> Array:
@@ -383,11 +375,8 @@ def light_power(
     >>> found.light_power[[0, 1800]].values.round(7)
     array([1.00e-04, 7.07e-05])
     """
-    table = (
-        check_points(points, "points of light_power", ("time [s]", "loss [dB]"))
-        if len(points)
-        else np.zeros((1, 2))
-    )
+    columns = ("time [s]", "loss [dB]")
+    table = check_points(points if len(points) else [(0, 0)], "points of light_power", columns)
     more = piecewise(table, held=False)
 
     def level(t: Array) -> Array:

@@ -9,6 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
+from gyrostab.ingest.gap_table import gap_variables
 from gyrostab.schema import GAP_CAUSES
 from gyrostab.simulate.channels import Points, check_points
 from gyrostab.simulate.noise import stream
@@ -22,31 +23,12 @@ _MISSING, _RESTART = (GAP_CAUSES.index(name) for name in ("missing", "restart"))
 
 
 def _make_table(spans: NDArray[np.float64], cause: int, start: Any) -> xr.Dataset:
-    """Gaps from seconds; they are cut to samples when the log is made."""
-    edges = stamp_ns(start) + np.rint(spans.reshape(-1, 2) * 1e9).astype(np.int64)
-    flags = {
-        "flag_values": np.arange(len(GAP_CAUSES), dtype=np.int8),
-        "flag_meanings": " ".join(GAP_CAUSES),
-    }
-    return xr.Dataset(
-        {
-            "gap_start": (
-                "gap",
-                edges[:, 0].view("datetime64[ns]"),
-                {"long_name": "first missing sample"},
-            ),
-            "gap_end": (
-                "gap",
-                edges[:, 1].view("datetime64[ns]"),
-                {"long_name": "first present sample after the gap"},
-            ),
-            "gap_cause": (
-                "gap",
-                np.full(len(edges), cause, np.int8),
-                {"long_name": "cause of the gap", **flags},
-            ),
-        }
-    )
+    """Make gaps from seconds; they are cut to samples when the log is made."""
+    edges = np.rint(spans.reshape(-1, 2) * 1e9).astype(np.int64)
+    unknown = np.zeros((len(edges), 2), np.int64)  # samples and rows
+    table = np.column_stack([edges, unknown, np.full(len(edges), cause)])
+    variables = gap_variables(table, stamp_ns(start), rate=1e9)
+    return xr.Dataset({name: variables[name] for name in ("gap_start", "gap_end", "gap_cause")})
 
 
 def gaps(spans: Points, *, duration: Any = None, start: Any = "1970-01-01") -> xr.Dataset:
@@ -166,11 +148,7 @@ def power_cuts(
     >>> power_cuts([[100, 160]], duration="1h").gap_cause.values
     array([6], dtype=int8)
     """
-    table = (
-        check_points(cuts, "cuts of power_cuts", ("from [s]", "to [s]"))
-        if len(cuts)
-        else np.empty((0, 2))
-    )
+    table = check_points(cuts, "cuts of power_cuts", ("from [s]", "to [s]"), optional=True)
     rng = stream(seed, "power_cuts")
     begin = _draw_poisson(rng, 0.0, duration_seconds(duration, "duration"), per_day / 24.0)
     more = np.stack(

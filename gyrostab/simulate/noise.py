@@ -12,6 +12,7 @@ import math
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -200,33 +201,30 @@ def shape(
     return total, new_carry
 
 
-@dataclass(frozen=True)
-class _Parts:
-    """What `make_noise` was asked for."""
-
-    rate: float
-    coefficients: Mapping[str, float]
-    markov: tuple[float, float] | None
-    sinusoid: tuple[float, float, float] | None
-
-
 def _add_parts(
-    parts: _Parts, state: tuple[Any, ...], first: int, size: int
+    state: tuple[Any, ...],
+    first: int,
+    size: int,
+    *,
+    rate: float,
+    coefficients: Mapping[str, float],
+    markov: tuple[float, float] | None,
+    sinusoid: tuple[float, float, float] | None,
 ) -> tuple[Array, tuple[Any, ...]]:
-    """The next `size` samples."""
+    """Make the next `size` samples of `make_noise`, and the state after them."""
     noise, carry, rng, position = copy.deepcopy(state)
     units, noise = draw(noise, first, size)
-    level = {term: value**2 for term, value in parts.coefficients.items()}
-    total, carry = shape(units, level, parts.rate, carry, ramp=parts.coefficients.get("R", 0.0))
-    if parts.markov:
-        sigma, time = parts.markov
+    level = {term: value**2 for term, value in coefficients.items()}
+    total, carry = shape(units, level, rate, carry, ramp=coefficients["R"])
+    if markov:
+        sigma, time = markov
         means, position = ornstein_uhlenbeck_means(
-            rng.standard_normal((size, 2)), time * parts.rate, position
+            rng.standard_normal((size, 2)), time * rate, position
         )
         total += sigma * means
-    if parts.sinusoid:
-        amplitude, frequency, phase = parts.sinusoid
-        total += amplitude * sinusoid_means(first + np.arange(size), frequency, parts.rate, phase)
+    if sinusoid:
+        amplitude, frequency, phase = sinusoid
+        total += amplitude * sinusoid_means(first + np.arange(size), frequency, rate, phase)
     return total, (noise, carry, rng, position)
 
 
@@ -303,23 +301,20 @@ def make_noise(
     noise = begin_noise(seed, axis, rate=rate, terms=terms, flicker_band=flicker_band)
     rng = stream(seed, "noise", axis, "gauss_markov")
     state: tuple[Any, ...] = (noise, {}, rng, float(rng.standard_normal()))
-    parts = _Parts(rate, coefficients, gauss_markov, sinusoid)
+    add = partial(
+        _add_parts, rate=rate, coefficients=coefficients, markov=gauss_markov, sinusoid=sinusoid
+    )
     spans = [(first, min(chunk, size - first)) for first in range(0, size, chunk)]
-    if lazy:
-        return _lazy_noise(parts, state, spans)
-    values = np.empty(size)
-    for first, count in spans:
-        values[first : first + count], state = _add_parts(parts, state, first, count)
-    return values
-
-
-def _lazy_noise(parts: _Parts, state: Any, spans: list[tuple[int, int]]) -> Any:
+    if not lazy:
+        values = np.empty(size)
+        for first, count in spans:
+            values[first : first + count], state = add(state, first, count)
+        return values
     import dask
     import dask.array as da
 
-    step = dask.delayed(_add_parts, pure=False, nout=2)
-    blocks = []
+    add_later, blocks = dask.delayed(add, pure=False, nout=2), []
     for first, count in spans:
-        values, state = step(parts, state, first, count)
-        blocks.append(da.from_delayed(values, (count,), dtype=np.float64))
+        block, state = add_later(state, first, count)
+        blocks.append(da.from_delayed(block, (count,), dtype=np.float64))
     return da.concatenate(blocks)
