@@ -49,37 +49,21 @@ STAGES: tuple[Stage, ...] = (
 
 @dataclass(frozen=True)
 class Setup:
-    """Properties that are constant over a whole simulation.
+    """Properties that are constant over a whole simulation."""
 
-    Attributes
-    ----------
-    rate : float
-        Sampling rate at the effect's stage [Hz].
-    size : int
-        Samples of the whole log at that rate.
-    start : int
-        Stamp of sample 0 [ns since 1970].
-    axes : tuple of str
-        The effect's axes, in the order of the rows of every array.
-    noise : mapping of str to ndarray, shape (axes,)
-        Noise coefficients of the model by symbol [unit of the law]: Q, N, B, K, R.
-    gaps : ndarray of int64, shape (n, 2)
-        All gaps of the log, [first missing sample, first sample after].
-    restarts : ndarray of int64, shape (n, 2)
-        All losses of power, [sample of the loss, sample of the return]; the start of the log is not
-        among them.
-    oversampling : int
-        Samples of the instrument in one sampling interval of the log; `rate` is higher by this
-        factor before the stage "logger".
-    """
-
-    rate: float
-    size: int
-    start: int
-    axes: tuple[str, ...]
+    rate: float  # sampling rate at the effect's stage [Hz]
+    size: int  # samples of the whole log at that rate
+    start: int  # stamp of sample 0 [ns since 1970]
+    axes: tuple[str, ...]  # the effect's axes, in the order of the rows of every array
+    #: (axes,): noise coefficients of the model by symbol [unit of the law]: Q, N, B, K, R.
     noise: Mapping[str, Array] = field(default_factory=dict)
+    #: (n, 2): all gaps of the log, [first missing sample, first sample after].
     gaps: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    #: (n, 2): all losses of power, [sample of the loss, sample of the return]; the start of the log
+    #: is not among them.
     restarts: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    #: Samples of the instrument in one sampling interval of the log; `rate` is higher by this
+    #: factor before the stage "logger".
     oversampling: int = 1
 
 
@@ -88,36 +72,22 @@ class Chunk:
     """Input of *generate* for a span of time.
 
     Sample i covers the interval from ``seconds[i]`` to ``seconds[i] + 1 / rate``.
-
-    Attributes
-    ----------
-    setup : Setup
-        Constant properties: rate, axes, gaps and more.
-    first : int
-        Number of the first sample, counted from the start of the log.
-    size : int
-        Number of samples.
-    drivers : mapping of str to ndarray, shape (size,)
-        Channels that the effect needs, by the names of `Effect.channels`, without NaN, in the units
-        given there.
-    true : mapping of str to ndarray, shape (size,)
-        True rotation rate of every axis of the log [degree hour-1], including axes that the effect
-        does not act on; complete after "motion".
-    recorded : mapping of str to ndarray, shape (size,)
-        Recorded rate of the axes of `Effect.recorded_axes` [degree hour-1], without NaN.
-    signal : ndarray, shape (axes, size)
-        Signal before the effect [degree hour-1]; for the stages "sensor" and later.
-    level : mapping of str to ndarray, shape (axes, size)
-        Squared noise coefficients by symbol before the effect; for the stage "noise".
     """
 
-    setup: Setup
-    first: int
-    size: int
+    setup: Setup  # constant properties: rate, axes, gaps and more
+    first: int  # number of the first sample, counted from the start of the log
+    size: int  # number of samples
+    #: (size,): channels that the effect needs, by the names of `Effect.channels`, without NaN, in
+    #: the units given there.
     drivers: Mapping[str, Array] = field(default_factory=dict)
+    #: (size,): true rotation rate of every axis of the log [degree hour-1], including axes that the
+    #: effect does not act on; complete after "motion".
     true: Mapping[str, Array] = field(default_factory=dict)
+    #: (size,): recorded rate of the axes of `Effect.recorded_axes` [degree hour-1], without NaN.
     recorded: Mapping[str, Array] = field(default_factory=dict)
+    #: (axes, size): signal before the effect [degree hour-1]; for the stages "sensor" and later.
     signal: Array = field(default_factory=lambda: np.empty((0, 0)))
+    #: (axes, size): squared noise coefficients by symbol before the effect; for the stage "noise".
     level: Mapping[str, Array] = field(default_factory=dict)
 
     @property

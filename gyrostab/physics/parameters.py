@@ -15,43 +15,20 @@ __all__ = ["Parameter", "parameter"]
 
 @dataclass(frozen=True)
 class Parameter:
-    """Description of one parameter of an effect.
+    """Description of one parameter of an effect."""
 
-    Attributes
-    ----------
-    name : str
-        Name in a model.
-    unit : str
-        Unit of the number, for instance "deg/h/degC"; "text" for a word.
-    meaning : str
-        Meaning in a few words.
-    default : object
-        Value if a model does not give it; None where it must be given.
-    typical : object
-        Published or estimated size, for documentation and tests.
-    low, high : float
-        Allowed range, ends included.
-    choices : tuple of str
-        Allowed words of a text parameter.
-    many : bool
-        Whether it has one number per axis; see `Effect.expand_to_axes`.
-    whole : str
-        What the value must be, "whole number" or "whole number of fringes"; empty for any number.
-    source : str
-        Source of the typical size: author and year, or "estimate".
-    """
-
-    name: str
-    unit: str
-    meaning: str
-    default: Any
-    typical: Any
-    low: float
+    name: str  # name in a model
+    unit: str  # unit of the number, for instance "deg/h/degC"; "text" for a word
+    meaning: str  # meaning in a few words
+    default: Any  # value if a model does not give it; None where it must be given
+    typical: Any  # published or estimated size, for documentation and tests
+    low: float  # allowed range, ends included
     high: float
-    choices: tuple[str, ...]
-    many: bool
+    choices: tuple[str, ...]  # allowed words of a text parameter
+    many: bool  # whether it has one number per axis; see `Effect.expand_to_axes`
+    #: What the value must be, "whole number" or "whole number of fringes"; empty for any number.
     whole: str
-    source: str
+    source: str  # source of the typical size: author and year, or "estimate"
 
     def check(self, value: Any, effect: str) -> Any:
         """Return `value` as a float, a tuple of floats or a word, or raise `OptionError`."""

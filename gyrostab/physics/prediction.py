@@ -15,48 +15,31 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Windows:
-    """Reduced data for which *explain* predicts means and spectra.
+    """Reduced data for which *explain* predicts means and spectra."""
 
-    Attributes
-    ----------
-    begin, end : ndarray, shape (window,)
-        Edges of the windows since the start of the log [s].
-    frequency : ndarray, shape (band,)
-        Centres of the bands of the spectra [Hz].
-    rate : float
-        Sampling rate of the log [Hz].
-    axes : tuple of str
-        Axes to predict.
-    drivers : mapping of str to ndarray, shape (window,)
-        Channels averaged over each window, by the names of `Effect.channels`; vibration as the rms
-        over the window.
-    fine : mapping of str to ndarray, shape (window, part)
-        Denoised channels averaged over equal parts of each window, where sampled often enough.
-    own : mapping of str to ndarray, shape (window,)
-        Measured rate of every axis of the log, averaged over each window [degree hour-1].
-    gaps, restarts : ndarray, shape (n, 2)
-        As in `Setup`, in seconds.
-    phase : ndarray, shape (phase,)
-        Centres of the bins of the ramp's phase, from 0 to 1; empty where no ramp was recorded.
-    turns : ndarray, shape (window,)
-        Turns of the ramp per second, negative where it falls [Hz]; empty where no ramp was
-        recorded.
-    bands : mapping of str to (float, float)
-        Edges [Hz] of the band of which a channel is the rms, if the log states them.
-    """
-
-    begin: Array
+    begin: Array  # (window,): edges of the windows since the start of the log [s]
     end: Array
-    frequency: Array
-    rate: float
-    axes: tuple[str, ...]
+    frequency: Array  # (band,): centres of the bands of the spectra [Hz]
+    rate: float  # sampling rate of the log [Hz]
+    axes: tuple[str, ...]  # axes to predict
+    #: (window,): channels averaged over each window, by the names of `Effect.channels`; vibration
+    #: as the rms over the window.
     drivers: Mapping[str, Array] = field(default_factory=dict)
+    #: (window, part): denoised channels averaged over equal parts of each window, where sampled
+    #: often enough.
     fine: Mapping[str, Array] = field(default_factory=dict)
+    #: (window,): measured rate of every axis of the log, averaged over each window [degree hour-1].
     own: Mapping[str, Array] = field(default_factory=dict)
+    #: (n, 2): as in `Setup`, in seconds
     gaps: Array = field(default_factory=lambda: np.empty((0, 2)))
     restarts: Array = field(default_factory=lambda: np.empty((0, 2)))
+    #: (phase,): centres of the bins of the ramp's phase, from 0 to 1; empty where no ramp was
+    #: recorded.
     phase: Array = field(default_factory=lambda: np.empty(0))
+    #: (window,): turns of the ramp per second, negative where it falls [Hz]; empty where no ramp
+    #: was recorded.
     turns: Array = field(default_factory=lambda: np.empty(0))
+    #: Edges [Hz] of the band of which a channel is the rms, if the log states them.
     bands: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
@@ -80,55 +63,42 @@ class Prediction:
 
     The fields are linear in the parameters named by their keys, so that a fit can solve for these.
     Nonlinear parameters, see `Effect.nuisance`, are fixed at the values of the effect.
-
-    Attributes
-    ----------
-    mean : mapping of str to ndarray, shape (window,) or (axis, window)
-        Parameter -> window mean per unit of it [degree hour-1 per unit].
-    level : mapping of (str, str) to ndarray, shape (window,) or (axis, window)
-        (symbol of the noise term, parameter) -> change of the term's squared coefficient per unit,
-        as a share of it.
-    spectrum : mapping of str to ndarray, shape (window, band) or (axis, window, band)
-        Parameter -> added two-sided power spectral density per unit of its square [degree2 hour-2
-        Hz-1].
-    response : ndarray, shape (band,), or None
-        Squared magnitude by which the whole spectrum is multiplied (a filter).
-    coherent : bool
-        Whether the added spectrum is one process on all axes, which then appears in the
-        cross-spectra with one signed factor per axis.
-    line : ndarray, shape (window,) or (harmonic, window), or None
-        Frequency of a line in every window [Hz], folded below half of the sampling rate.
-    marks : tuple of str
-        Kinds of anomalous samples that it causes: outliers, repeats (of any value but zero and the
-        ends of the range), extremes, stuck (zeros of one axis alone), filled (zeros of all axes at
-        once, or of a single axis in runs), lattice (a quantization grid).
-    transfer : mapping of (str, str) to complex ndarray, shape (band,)
-        (parameter, channel) -> transfer function from the channel to the rate, per unit [degree
-        hour-1 per unit of the channel]. The channel can be an axis, whose rate is meant.
-    order : mapping of str to complex ndarray, shape (axis, harmonic)
-        Parameter -> pattern of the harmonics of the rotation over axes, up to one complex factor
-        (size and phase); where the parameter has one number per axis, every axis and harmonic has a
-        separate factor.
-    phase_locked : mapping of str to ndarray, shape (phase,)
-        Parameter -> mean by phase of the ramp, per unit [degree hour-1 per unit].
-    wander : mapping of str to (float, ndarray of shape (window,))
-        Parameter -> a random mean: time constant of its memory [s], inf for a walk; and per squared
-        unit its variance [degree2 hour-2], for a walk the growth of its variance [degree2 hour-2
-        s-1], in every window.
-    levels : str
-        Parameter that is the step between two levels, where the mean switches between them at
-        random.
     """
 
+    #: (window,) or (axis, window): parameter -> window mean per unit of it [degree hour-1 per
+    #: unit].
     mean: Mapping[str, Array] = field(default_factory=dict)
+    #: (window,) or (axis, window): (symbol of the noise term, parameter) -> change of the term's
+    #: squared coefficient per unit, as a share of it.
     level: Mapping[tuple[str, str], Array] = field(default_factory=dict)
+    #: (window, band) or (axis, window, band): parameter -> added two-sided power spectral density
+    #: per unit of its square [degree2 hour-2 Hz-1].
     spectrum: Mapping[str, Array] = field(default_factory=dict)
+    #: (band,): squared magnitude by which the whole spectrum is multiplied (a filter).
     response: Array | None = None
+    #: Whether the added spectrum is one process on all axes, which then appears in the
+    #: cross-spectra with one signed factor per axis.
     coherent: bool = False
+    #: (window,) or (harmonic, window): frequency of a line in every window [Hz], folded below half
+    #: of the sampling rate.
     line: Array | None = None
+    #: Kinds of anomalous samples that it causes: outliers, repeats (of any value but zero and the
+    #: ends of the range), extremes, stuck (zeros of one axis alone), filled (zeros of all axes at
+    #: once, or of a single axis in runs), lattice (a quantization grid).
     marks: tuple[str, ...] = ()
+    #: (band,): (parameter, channel) -> transfer function from the channel to the rate, per unit
+    #: [degree hour-1 per unit of the channel]. The channel can be an axis, whose rate is meant.
     transfer: Mapping[tuple[str, str], NDArray[np.complex128]] = field(default_factory=dict)
+    #: (axis, harmonic): parameter -> pattern of the harmonics of the rotation over axes, up to one
+    #: complex factor (size and phase); where the parameter has one number per axis, every axis and
+    #: harmonic has a separate factor.
     order: Mapping[str, NDArray[np.complex128]] = field(default_factory=dict)
+    #: (phase,): parameter -> mean by phase of the ramp, per unit [degree hour-1 per unit].
     phase_locked: Mapping[str, Array] = field(default_factory=dict)
+    #: (window,): parameter -> a random mean: time constant of its memory [s], inf for a walk; and
+    #: per squared unit its variance [degree2 hour-2], for a walk the growth of its variance
+    #: [degree2 hour-2 s-1], in every window.
     wander: Mapping[str, tuple[float, Array]] = field(default_factory=dict)
+    #: Parameter that is the step between two levels, where the mean switches between them at
+    #: random.
     levels: str = ""

@@ -18,7 +18,7 @@ from gyrostab.errors import OptionError, UnitError
 from gyrostab.physics.base import Effect
 from gyrostab.units import DAY, HOUR, parse_unit
 
-__all__ = ["amount", "close_to", "effect_table", "effects", "make_effect"]
+__all__ = ["amount", "close_to", "effect_table", "effects", "is_number", "make_effect"]
 
 
 @cache
@@ -132,6 +132,11 @@ def close_to(word: Any, words: Sequence[str]) -> str:
 
 _SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": HOUR, "d": DAY}
 _HERTZ = {"mHz": 1e-3, "Hz": 1.0, "kHz": 1e3, "MHz": 1e6, "1/min": 1 / 60}
+
+
+def is_number(value: Any) -> bool:
+    """Test whether a value of a model is a number, which true and false are not."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def amount(value: Any, unit: str, where: str) -> Any:

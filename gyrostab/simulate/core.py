@@ -19,6 +19,7 @@ from gyrostab.ingest.convert import as_log
 from gyrostab.ingest.gap_table import gap_variables
 from gyrostab.noise import TERMS
 from gyrostab.physics.base import STAGES, Effect, Setup, driver_error
+from gyrostab.physics.registry import is_number
 from gyrostab.schema import (
     GAP_CAUSES,
     SIGNAL_LONG_NAMES,
@@ -194,11 +195,7 @@ def _make_frame(
                 f"{model.source}: there is no {name}; give {name} = {example} in [log], "
                 f"--{name}, or --like RECORDING"
             )
-    if (
-        isinstance(hertz, bool)
-        or not isinstance(hertz, int | float)
-        or not (math.isfinite(hertz) and 0 < hertz <= 1e6)
-    ):
+    if not (is_number(hertz) and math.isfinite(hertz) and 0 < hertz <= 1e6):
         raise OptionError(
             f"{model.source}: rate {hertz!r} is not a number of Hz above 0 and up to 1e6"
         )

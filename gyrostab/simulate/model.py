@@ -14,7 +14,7 @@ from typing import Any
 from gyrostab.errors import FormatError, OptionError
 from gyrostab.noise import LAWS, TERMS
 from gyrostab.physics.base import Effect
-from gyrostab.physics.registry import amount, close_to, make_effect
+from gyrostab.physics.registry import amount, close_to, is_number, make_effect
 from gyrostab.simulate import environment, losses
 from gyrostab.simulate.noise import FLICKER_LOW
 from gyrostab.store.toml import parse_toml
@@ -77,38 +77,22 @@ _LOG = ("rate", "duration", "start", "seed", "axes", "oversampling")
 
 @dataclass(frozen=True)
 class Model:
-    """Model from which `gyrostab.simulate` makes a log.
+    """Model from which `gyrostab.simulate` makes a log."""
 
-    Attributes
-    ----------
-    axes : tuple of str
-        Axes that the model names; empty when it names none.
-    noise : mapping of str to (mapping of str to float)
-        Axis (or "" for all others) -> symbol -> coefficient [unit of the noise table].
-    flicker_band : (float, float)
-        Lowest and highest frequency of B [Hz].
-    bias : mapping of str to float
-        Constant rate of axes [deg/h]; 0 for others.
-    effects : tuple of Effect
-    environment : tuple of (str, mapping)
-        Function of `PROFILES` and its arguments.
-    log : mapping
-        Of rate [Hz], duration [s], start, seed, oversampling what the model gives.
-    source : str
-        Where the model came from.
-    text : str
-        The model as it was written.
-    """
-
-    axes: tuple[str, ...] = ()
+    axes: tuple[str, ...] = ()  # axes that the model names; empty when it names none
+    #: Axis (or "" for all others) -> symbol -> coefficient [unit of the noise table].
     noise: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    #: Lowest and highest frequency of B [Hz]
     flicker_band: tuple[float, float] = (FLICKER_LOW, math.inf)
+    #: Constant rate of axes [deg/h]; 0 for others
     bias: Mapping[str, float] = field(default_factory=dict)
-    effects: tuple[Effect, ...] = ()
+    effects: tuple[Effect, ...] = ()  #
+    #: Function of `PROFILES` and its arguments
     environment: tuple[tuple[str, Mapping[str, Any]], ...] = ()
+    #: What the model gives of rate [Hz], duration [s], start, seed and oversampling.
     log: Mapping[str, Any] = field(default_factory=dict)
-    source: str = "model"
-    text: str = ""
+    source: str = "model"  # where the model came from
+    text: str = ""  # the model as it was written
 
     def coefficients(self, axis: str) -> dict[str, float]:
         """Noise coefficients of an axis, all five."""
@@ -231,11 +215,7 @@ def _read_bias(table: Mapping[str, Any], where: str) -> dict[str, float]:
     biases = {}
     for axis, value in table.items():
         number = amount(value, "deg/h", f"{where}: bias of {axis}")
-        if (
-            isinstance(number, bool)
-            or not isinstance(number, int | float)
-            or not abs(number) <= _MAX_COEFFICIENT
-        ):
+        if not is_number(number) or not abs(number) <= _MAX_COEFFICIENT:
             raise OptionError(
                 f"{where}, [bias]: {axis} = {value!r} is not a number; give one in deg/h for an "
                 "axis of the log"
@@ -252,12 +232,7 @@ def _read_coefficient(term: str, value: Any, where: str) -> float:
             f"there are {listed}, and flicker_band in [noise]"
         )
     number = amount(value, LAWS[term].label, f"{where}: {term}")
-    if (
-        isinstance(number, bool)
-        or not isinstance(number, int | float)
-        or not abs(number) <= _MAX_COEFFICIENT
-        or (number < 0 and term != "R")
-    ):
+    if not is_number(number) or not abs(number) <= _MAX_COEFFICIENT or (number < 0 and term != "R"):
         raise OptionError(
             f"{where}: {term} = {value!r} is not a number from 0 to {_MAX_COEFFICIENT:g}; give one "
             f"in {LAWS[term].label}"
@@ -374,10 +349,6 @@ def _read_profile(table: Mapping[str, Any], where: str) -> tuple[str, Mapping[st
     }
     for key, unit in units.items():
         number = converted.get(key, 0.0)
-        if key != "band" and (
-            isinstance(number, bool)
-            or not isinstance(number, int | float)
-            or not math.isfinite(number)
-        ):
+        if key != "band" and not (is_number(number) and math.isfinite(number)):
             raise OptionError(f"{where}: {key} = {number!r} is not a number; give one in {unit}")
     return str(name), converted
