@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -119,15 +119,12 @@ def make_mean_effect(
     shares: Array,
     *,
     strength: float,
-    name: str,
-    driver: str | None,
-    form: str,
     form_differs: bool,
     tau: tuple[float, float] | None = None,
-    active: NDArray[np.bool_] | None = None,
+    parameters: Mapping[str, Any] | None = None,
     regressor: tuple[str, Array, str] | None = None,
     unless: tuple[str, ...] = (),
-    **more: Any,
+    **description: Any,
 ) -> Effect:
     """Make an effect that adds ``shape * shares``, scaled to `strength`.
 
@@ -149,34 +146,30 @@ def make_mean_effect(
     """
     mean = np.asarray(shares[:, None] * (shape if shape.ndim == 2 else shape[None, :]))
     mean *= strength / mean_size(scenario, mean)
-    parameters = dict(more.pop("parameters", {}))
-    parameters["peak"] = {
-        "value": float(np.abs(mean - np.median(mean, axis=1, keepdims=True)).max()),
-        "unit": "deg/h",
+    peak = float(np.abs(mean - np.median(mean, axis=1, keepdims=True)).max())
+    described = {
+        **(parameters or {}),
+        "peak": {"value": peak, "unit": "deg/h"},
+        "size_white": {"value": mean_size(scenario, mean, white=True), "unit": "1"},
     }
-    parameters["size_white"] = {"value": mean_size(scenario, mean, white=True), "unit": "1"}
     if regressor is not None:
         values = {
             axis: _fit_driver(scenario, mean[i], regressor[1], axis=i)[0]
             for i, axis in enumerate(AXES)
             if shares[i]
         }
-        parameters[regressor[0]] = {"values": values, "unit": regressor[2]} | (
+        described[regressor[0]] = {"values": values, "unit": regressor[2]} | (
             {"unless": list(unless)} if form_differs and unless else {}
         )
     return Effect(
-        name=name,
         axes=axes_with_share(shares),
-        driver=driver,
-        form=form,
         form_differs=form_differs,
         size=strength,
         nats=NATS * strength**2,
         tau=tau or (max(1.0, 2 / scenario.rate), scenario.seconds / 3),
-        active=active,
         mean=mean,
-        parameters=parameters,
-        **more,
+        parameters=described,
+        **description,
     )
 
 
@@ -185,14 +178,9 @@ def make_variance_effect(
     ratio: Callable[[float], Array],
     *,
     strength: float,
-    name: str,
-    axes: tuple[str, ...],
-    driver: str | None,
-    form: str,
-    form_differs: bool,
     first: float,
     tau: tuple[float, float] | None = None,
-    active: NDArray[np.bool_] | None = None,
+    **description: Any,
 ) -> tuple[Effect, float]:
     """Make an effect on the noise density, and return it with its amplitude.
 
@@ -210,16 +198,11 @@ def make_variance_effect(
     amplitude = amplitude_for(lambda a: variance_size(scenario, ratio(a)), strength, first=first)
     final = ratio(amplitude)
     effect = Effect(
-        name=name,
-        axes=axes,
-        driver=driver,
-        form=form,
-        form_differs=form_differs,
         size=variance_size(scenario, final),
-        nats=variance_nats(scenario, final, quiescent=active is not None),
+        nats=variance_nats(scenario, final, quiescent=description.get("active") is not None),
         tau=tau or (1 / scenario.rate, 30.0),
-        active=active,
         variance=final if final.ndim == 2 and final.shape[1] > 1 else None,
         parameters={"ratio": {"value": float(np.abs(final - 1).max()), "unit": "1"}},
+        **description,
     )
     return effect, amplitude

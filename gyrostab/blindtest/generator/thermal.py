@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -167,10 +169,7 @@ def _make_light_noise(
     *,
     strength: float,
     loss: Array,
-    name: str,
-    driver: str,
-    form: str,
-    form_differs: bool,
+    **description: Any,
 ) -> Effect:
     """Make a noise effect from a scalable `loss` of light [dB] by the budget of the detector."""
     shares = np.abs(draw_shares(rng, single_probability=0.4))
@@ -186,12 +185,9 @@ def _make_light_noise(
         scenario,
         ratio,
         strength=strength,
-        name=name,
         axes=axes_with_share(shares),
-        driver=driver,
-        form=form,
-        form_differs=form_differs,
         first=1e-4,
+        **description,
     )
     return effect
 

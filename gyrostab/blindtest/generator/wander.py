@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,11 +65,9 @@ def _make_random_bias(
     waveform: Array,
     *,
     strength: float,
-    name: str,
     time: float,
-    form: str,
-    form_differs: bool,
     normal: bool,
+    **description: Any,
 ) -> Effect:
     """Make a random bias; one of a normal law shows in its spectrum only."""
     shares = draw_shares(rng)
@@ -77,11 +76,8 @@ def _make_random_bias(
     )
     size, nats = wander_size(scenario, shares, time=time, rms=rms)
     return Effect(
-        name=name,
         axes=axes_with_share(shares),
         driver=None,
-        form=form,
-        form_differs=form_differs,
         size=size,
         nats=nats,
         learned_nats=learned_random_nats(
@@ -92,6 +88,7 @@ def _make_random_bias(
         tau=(max(1.0, 0.2 * time), scenario.seconds / 3),
         mean=shares[:, None] * rms * to_samples(scenario, waveform)[None, :],
         parameters={"correlation_time": {"value": time, "unit": "s"}},
+        **description,
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from gyrostab.blindtest.scoring.proportions import Target, share
+from gyrostab.blindtest.scoring.proportions import Target, share, share_of
 from gyrostab.blindtest.scoring.score import CATALOGUE_KINDS, drawn_rows, first_rows
 from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH
 
@@ -158,16 +158,14 @@ def counterpart_table(rows: Sequence[Row]) -> pd.DataFrame:
     ]
     return pd.DataFrame(
         [
-            share(
-                "false alarms: effect named on a counterpart",
-                (bool(row["identifications"]) for row in mine),
-            ),
-            share(
+            share_of("false alarms: effect named on a counterpart", mine, "identifications"),
+            share_of(
                 "effect named on a counterpart or a null record",
-                (bool(row["identifications"]) for row in noise),
+                noise,
+                "identifications",
                 Target("<= 1 %, upper bound <= 1.5 %", most=0.01, surely=0.015),
             ),
-            share("counterparts with any mismatch", (row["detected"] for row in mine)),
+            share_of("counterparts with any mismatch", mine, "detected"),
             share(
                 "detected with its effects, and not without them",
                 (case["detected"] and not row["detected"] for case, row in pairs),

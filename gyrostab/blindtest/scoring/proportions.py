@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,10 +13,13 @@ __all__ = [
     "NO_TARGET",
     "Line",
     "Target",
+    "at_least",
+    "at_most",
     "make_line",
     "median",
     "share",
     "share_columns",
+    "share_of",
     "spread",
     "wilson",
 ]
@@ -58,6 +61,16 @@ class Target:
 
 
 NO_TARGET = Target("")
+
+
+def at_least(least: float) -> Target:
+    """Make the target of a share that should be so large."""
+    return Target(f">= {100 * least:.0f} %", least=least)
+
+
+def at_most(most: float) -> Target:
+    """Make the target of a share that should be so small."""
+    return Target(f"<= {100 * most:.0f} %", most=most)
 
 
 def wilson(hits: int, total: int) -> tuple[float, float]:
@@ -109,6 +122,13 @@ def share(name: str, flags: Iterable[bool], target: Target = NO_TARGET) -> Line:
         total,
         target,
     )
+
+
+def share_of(
+    name: str, rows: Iterable[Mapping[str, Any]], key: str, target: Target = NO_TARGET
+) -> Line:
+    """Make the line of the share of rows in which a column is true, or not zero or empty."""
+    return share(name, (row[key] for row in rows), target)
 
 
 def median(name: str, values: Iterable[float | None], target: Target = NO_TARGET) -> Line:

@@ -11,7 +11,16 @@ import pandas as pd
 
 from gyrostab.blindtest.scoring.baseline_detectors import RANDOM
 from gyrostab.blindtest.scoring.probability import probability_lines
-from gyrostab.blindtest.scoring.proportions import Line, Target, median, share, spread
+from gyrostab.blindtest.scoring.proportions import (
+    Line,
+    Target,
+    at_least,
+    at_most,
+    median,
+    share,
+    share_of,
+    spread,
+)
 from gyrostab.blindtest.scoring.score import catalogue_rows, drawn_rows, first_rows
 
 __all__ = ["CLEAR_STRENGTH", "SURE_STRENGTH", "list_missed", "markdown", "score_table"]
@@ -60,12 +69,8 @@ def _false_alarm_lines(rows: Sequence[Row]) -> list[Line]:
     nulls = [row for row in rows if row["kind"] == "null"]
     target = Target("<= 1 %, upper bound <= 2 %", most=0.01, surely=0.02)
     return [
-        share(
-            "false alarms: effect named on a null record",
-            (bool(row["identifications"]) for row in nulls),
-            target,
-        ),
-        share("null records with any mismatch", (row["detected"] for row in nulls)),
+        share_of("false alarms: effect named on a null record", nulls, "identifications", target),
+        share_of("null records with any mismatch", nulls, "detected"),
     ]
 
 
@@ -76,39 +81,32 @@ def _naming_lines(rows: Sequence[Row]) -> list[Line]:
     shown = [row for row in single if (row.get("learned_strength") or 0.0) >= CLEAR_STRENGTH]
     sure = [row for row in catalogue_rows(rows) if _is_sure(row)]
     claimed = [row for row in clear if row["set_size"]]
-    percent = Target(">= 95 %", least=0.95)
+    percent = at_least(0.95)
     return [
-        share(
+        share_of(
             "effects of a form that the diagnosis does not fit",
-            (row["form_differs"] for row in catalogue_rows(rows)),
-            Target(">= 33 %", least=0.33),
+            catalogue_rows(rows),
+            "form_differs",
+            at_least(0.33),
         ),
-        share("detected, strength 1.5 or more", (row["detected"] for row in clear), percent),
-        share("detected, single effects", (row["detected"] for row in single)),
-        share(
-            "detected, single effects of that strength with fitted noise",
-            (row["detected"] for row in shown),
+        share_of("detected, strength 1.5 or more", clear, "detected", percent),
+        share_of("detected, single effects", single, "detected"),
+        share_of("detected, single effects of that strength with fitted noise", shown, "detected"),
+        share_of(
+            "detected, 3 times the limit in fitted noise or more", sure, "detected", at_least(0.97)
         ),
-        share(
-            "detected, 3 times the limit in fitted noise or more",
-            (row["detected"] for row in sure),
-            Target(">= 97 %", least=0.97),
-        ),
-        share(
+        share_of(
             "named correctly, 3 times the limit in fitted noise or more",
-            (row["named"] for row in sure),
-            Target(">= 92 %", least=0.92),
+            sure,
+            "named",
+            at_least(0.92),
         ),
         share(
             "both effects of a pair named correctly, each of that strength",
             (all(row["named"] for row in pair) for pair in _sure_pairs(rows)),
-            Target(">= 80 %", least=0.80),
+            at_least(0.80),
         ),
-        share(
-            "named correctly, of the detected (sets merged)",
-            (row["named"] for row in detected),
-            percent,
-        ),
+        share_of("named correctly, of the detected (sets merged)", detected, "named", percent),
         share(
             "named correctly, single effects",
             (row["named"] for row in single if row["detected"]),
@@ -117,17 +115,13 @@ def _naming_lines(rows: Sequence[Row]) -> list[Line]:
             "named correctly, in pairs and triples",
             (row["named"] for row in detected if row["kind"] in ("pair", "triple")),
         ),
-        share("named exactly, of the detected", (row["named_exactly"] for row in detected)),
+        share_of("named exactly, of the detected", detected, "named_exactly"),
         share(
             "named exactly where the form differs",
             (row["named_exactly"] for row in detected if row["form_differs"]),
         ),
-        share("cases with a wrong name", (row["wrong"] > 0 for row in first_rows(clear))),
-        share(
-            "truth in the ambiguity set",
-            (row["in_set"] for row in claimed),
-            Target(">= 97 %", least=0.97),
-        ),
+        share_of("cases with a wrong name", first_rows(clear), "wrong"),
+        share_of("truth in the ambiguity set", claimed, "in_set", at_least(0.97)),
         median(
             "size of the ambiguity set, median",
             (row["set_size"] for row in claimed),
@@ -165,17 +159,9 @@ def _out_of_catalogue_lines(rows: Sequence[Row]) -> list[Line]:
     ]
     detected = [row for row in strange if row["detected"]]
     return [
-        share("out of catalogue: detected", (row["detected"] for row in strange)),
-        share(
-            "out of catalogue: unidentified",
-            (row["unidentified"] for row in detected),
-            Target(">= 90 %", least=0.90),
-        ),
-        share(
-            "out of catalogue: wrong name",
-            (row["wrong"] > 0 for row in detected),
-            Target("<= 5 %", most=0.05),
-        ),
+        share_of("out of catalogue: detected", strange, "detected"),
+        share_of("out of catalogue: unidentified", detected, "unidentified", at_least(0.90)),
+        share_of("out of catalogue: wrong name", detected, "wrong", at_most(0.05)),
     ]
 
 
@@ -186,24 +172,14 @@ def _degraded_driver_lines(rows: Sequence[Row]) -> list[Line]:
         for lost in (True, False)
     )
     return [
-        share(
-            "driver withheld or substituted: wrong name",
-            (row["wrong"] > 0 for row in gone),
-            Target("<= 2 %", most=0.02),
-        ),
+        share_of("driver withheld or substituted: wrong name", gone, "wrong", at_most(0.02)),
         share(
             "driver withheld or substituted: unidentified, if detected",
             (row["unidentified"] for row in gone if row["detected"]),
-            Target(">= 90 %", least=0.90),
+            at_least(0.90),
         ),
-        share(
-            "driver lagged, noisy, clipped or confounded: wrong name",
-            (row["wrong"] > 0 for row in bent),
-        ),
-        share(
-            "driver lagged, noisy, clipped or confounded: named correctly",
-            (row["named"] for row in bent),
-        ),
+        share_of("driver lagged, noisy, clipped or confounded: wrong name", bent, "wrong"),
+        share_of("driver lagged, noisy, clipped or confounded: named correctly", bent, "named"),
     ]
 
 
@@ -303,7 +279,7 @@ def _model_lines(rows: Sequence[Row]) -> list[Line]:
         share(
             "simulated records nearer to the recording with the effects, without refit",
             (check["runs"] and check["nats"] > 0.0 for check in checks),
-            Target(">= 95 %", least=0.95),
+            at_least(0.95),
         ),
     ]
 
