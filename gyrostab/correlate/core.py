@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -186,10 +187,7 @@ def _usable_windows(
         ]
     )
     lags = lags[: last_lag + 1]
-    drivers = [
-        Driver(driver.name, driver.label, driver.units, driver.values[: last_lag + 1])
-        for driver in drivers
-    ]
+    drivers = [replace(driver, values=driver.values[: last_lag + 1]) for driver in drivers]
     masks = {}
     for v, name in enumerate(names):
         good = np.isfinite(product[name].values) & (product["window_coverage"].values > 0.05)

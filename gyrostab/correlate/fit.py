@@ -247,22 +247,9 @@ def _law_covariance(blocks: Blocks, law: int) -> Array:
 
 
 def _empty_entry(limits: set[str], *, windows: int = 0) -> dict[str, Any]:
-    names = (
-        "lag",
-        "slope",
-        "stderr",
-        "low",
-        "high",
-        "p_value",
-        "p_search",
-        "correlation",
-        "partial_time",
-        "partial_channels",
-    )
-    empty = dict.fromkeys(
-        (*names, "effective", "rising", "rising_stderr", "falling", "falling_stderr"), np.nan
-    )
-    return {**empty, "limits": limits, "windows": windows}
+    names = "lag slope stderr low high p_value p_search correlation partial_time partial_channels"
+    names += " effective rising rising_stderr falling falling_stderr"
+    return {**dict.fromkeys(names.split(), np.nan), "limits": limits, "windows": windows}
 
 
 def _largest_leverage(x: Array, columns: Array) -> float:

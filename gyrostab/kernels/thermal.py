@@ -164,9 +164,7 @@ def mean_changes(value_times: Array, values: Array, begin: Array, end: Array, ti
     """
     at, line = _polygon_corners(value_times, values, begin, end)
     followed = _follow_values(at, line, time)
-    return np.asarray(
-        (followed[np.searchsorted(at, end)] - followed[np.searchsorted(at, begin)]) / (end - begin)
-    )
+    return _average_growth(at, followed, begin, end)
 
 
 def mean_followed(
@@ -192,13 +190,9 @@ def mean_followed(
     """
     at, line = _polygon_corners(value_times, values, begin, end)
     followed = _follow_values(at, line, time)
-    total = np.concatenate([[0.0], np.cumsum((line[1:] + line[:-1]) / 2.0 * np.diff(at))])
-    integral = (
-        total - time * followed
-    )  # the integral of y is that of T less t times the growth of y
-    return np.asarray(
-        (integral[np.searchsorted(at, end)] - integral[np.searchsorted(at, begin)]) / (end - begin)
-    )
+    # the integral of y is that of T less t times the growth of y
+    integral = _integrate_polygon(at, line) - time * followed
+    return _average_growth(at, integral, begin, end)
 
 
 def mean_rates(value_times: Array, values: Array, begin: Array, end: Array) -> Array:
@@ -221,9 +215,7 @@ def mean_rates(value_times: Array, values: Array, begin: Array, end: Array) -> A
     array([0.2, 0.2])
     """
     at, line = _polygon_corners(value_times, values, begin, end)
-    return np.asarray(
-        (line[np.searchsorted(at, end)] - line[np.searchsorted(at, begin)]) / (end - begin)
-    )
+    return _average_growth(at, line, begin, end)
 
 
 def _polygon_corners(
@@ -237,6 +229,18 @@ def _polygon_corners(
             slope = (values[outer] - values[inner]) / (value_times[outer] - value_times[inner])
             line[edge] = values[outer] + slope * (at[edge] - value_times[outer])
     return at, line
+
+
+def _average_growth(at: Array, values: Array, begin: Array, end: Array) -> Array:
+    """Average the slope of a curve over intervals, whose edges are among its corners."""
+    return np.asarray(
+        (values[np.searchsorted(at, end)] - values[np.searchsorted(at, begin)]) / (end - begin)
+    )
+
+
+def _integrate_polygon(at: Array, values: Array) -> Array:
+    """Integrate a polygon from its first corner to each."""
+    return np.concatenate([[0.0], np.cumsum((values[1:] + values[:-1]) / 2.0 * np.diff(at))])
 
 
 @njit(**KERNEL)
@@ -301,8 +305,5 @@ def mean_dead_band_distance(
         np.interp(corner, np.arange(at.size), line),
     )
     slider, _ = apply_dead_band(line, width, float(line[0]))
-    apart = line - slider
-    total = np.concatenate([[0.0], np.cumsum((apart[1:] + apart[:-1]) / 2.0 * np.diff(at))])
-    return np.asarray(
-        (total[np.searchsorted(at, end)] - total[np.searchsorted(at, begin)]) / (end - begin)
-    )
+    total = _integrate_polygon(at, line - slider)
+    return _average_growth(at, total, begin, end)

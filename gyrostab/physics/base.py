@@ -108,46 +108,22 @@ class Chunk:
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
-    """A physical effect; subclasses are frozen dataclasses whose fields are made with `parameter`.
+    """A physical effect; subclasses are frozen dataclasses with fields made by `parameter`."""
 
-    Class attributes
-    ----------------
-    name : str
-        Name in models, results and documents.
-    short : str
-        Description in a few words.
-    plain : str
-        What a sentence calls the effect; `short` by default.
-    next_measurement : str
-        Measurement that separates it from the effects that it is confused with.
-    stage : str
-        One of `STAGES`; it determines what *generate* returns.
-    channels : mapping of str to str
-        Driving channel -> required unit (`gyrostab.units.INNER`).
-    size_parameters : tuple of str
-        Parameters that disable the effect when all of them are zero.
-    terms : str
-        For the stage "noise": symbols that it may change, of QNBK; all by default.
-
-    Attributes
-    ----------
-    axes : tuple of str
-        Axes of the log that it acts on; empty for all.
-    driver : tuple of str
-        Names of its channels in the log, in the order of `channels`; empty if unchanged. Names for
-        the channels of `needs` alone are completed.
-    """
-
-    name: ClassVar[str] = ""
-    short: ClassVar[str] = ""
-    plain: ClassVar[str] = ""
+    name: ClassVar[str] = ""  # name in models, results and documents
+    short: ClassVar[str] = ""  # description in a few words
+    plain: ClassVar[str] = ""  # what a sentence calls the effect; `short` by default
+    #: Measurement that separates it from the effects that it is confused with.
     next_measurement: ClassVar[str] = ""
-    stage: ClassVar[Stage] = "rate"
-    channels: ClassVar[Mapping[str, str]] = {}
+    stage: ClassVar[Stage] = "rate"  # determines what *generate* returns
+    channels: ClassVar[Mapping[str, str]] = {}  # driver -> required unit (`gyrostab.units.INNER`)
+    #: Parameters that disable the effect when all of them are zero.
     size_parameters: ClassVar[tuple[str, ...]] = ()
-    terms: ClassVar[str] = "QNBK"
+    terms: ClassVar[str] = "QNBK"  # symbols that an effect of the stage "noise" may change
 
-    axes: tuple[str, ...] = ()
+    axes: tuple[str, ...] = ()  # axes of the log that it acts on; empty for all
+    #: Names of its channels in the log, in the order of `channels`; empty if unchanged. Names for
+    #: the channels of `needs` alone are completed.
     driver: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

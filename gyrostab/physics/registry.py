@@ -10,7 +10,7 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeGuard
 
 import pandas as pd
 
@@ -114,8 +114,8 @@ def make_effect(table: Mapping[str, Any], *, where: str = "effect") -> Effect:
     try:
         return kind(
             **{
-                key: amount(value, item.unit, f"parameter {key!r}")
-                if (item := parameters.get(key)) and not item.choices
+                key: amount(value, definition.unit, f"parameter {key!r}")
+                if (definition := parameters.get(key)) and not definition.choices
                 else value
                 for key, value in values.items()
             }
@@ -134,7 +134,7 @@ _SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": HOUR
 _HERTZ = {"mHz": 1e-3, "Hz": 1.0, "kHz": 1e3, "MHz": 1e6, "1/min": 1 / 60}
 
 
-def is_number(value: Any) -> bool:
+def is_number(value: Any) -> TypeGuard[float]:
     """Test whether a value of a model is a number, which true and false are not."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 

@@ -371,6 +371,11 @@ class EarthRate(Effect):
         return f"{earth}; at latitude {self.quantity('latitude')}, the tool sees {components}."
 
 
+def _declare_tilt(axis: str) -> Any:
+    meaning = f"tilt of the mounting per acceleration along {axis}"
+    return parameter("mrad/g", meaning, default=0.0, typical=0.01, low=-100.0, high=100.0)
+
+
 @dataclass(frozen=True, kw_only=True)
 class RealMotion(Effect):
     """Real rotation: sway, rotation of the tool, and tilt of the mounting under acceleration.
@@ -434,30 +439,9 @@ class RealMotion(Effect):
         low=-1.1,
         high=1.1,
     )
-    x: float = parameter(
-        "mrad/g",
-        "tilt of the mounting per acceleration along x",
-        default=0.0,
-        typical=0.01,
-        low=-100.0,
-        high=100.0,
-    )
-    y: float = parameter(
-        "mrad/g",
-        "tilt of the mounting per acceleration along y",
-        default=0.0,
-        typical=0.01,
-        low=-100.0,
-        high=100.0,
-    )
-    z: float = parameter(
-        "mrad/g",
-        "tilt of the mounting per acceleration along z",
-        default=0.0,
-        typical=0.01,
-        low=-100.0,
-        high=100.0,
-    )
+    x: float = _declare_tilt("x")
+    y: float = _declare_tilt("y")
+    z: float = _declare_tilt("z")
 
     def needs(self) -> tuple[str, ...]:
         """List the rotation rate if there is spin, and the accelerations that cause tilt."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
 from gyrostab.physics.base import STAGES, Chunk, Effect, Setup
-from gyrostab.simulate.drivers import Source, Stretch
+from gyrostab.simulate.drivers import Source
 from gyrostab.simulate.noise import Units, shape
 from gyrostab.time.grid import grid_times
 from gyrostab.units import HOUR
@@ -66,7 +66,7 @@ def next_block(
     first: int,
     count: int,
     units: Sequence[Units],
-    parts: Mapping[str, tuple[Stretch, Any]],
+    parts: Mapping[str, tuple[slice, Any]],
 ) -> tuple[Array, BlockState]:
     """Make the samples ``first`` to ``first + count`` of a log.
 

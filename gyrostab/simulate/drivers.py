@@ -16,7 +16,7 @@ from gyrostab.time.grid import TimeGridIndex, grid_index, grid_times
 from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import INNER
 
-__all__ = ["Source", "Stretch", "make_course", "make_source"]
+__all__ = ["Source", "make_course", "make_source"]
 
 Array = NDArray[np.float64]
 #: Longer channels are read stretch by stretch.
@@ -26,14 +26,6 @@ SHORT = 2**22
 PART_S, MIN_PARTS, MAX_PARTS = 5.0, 360, 4000
 LONGEST_PARTS = 8.0  # over which a recorded channel is smoothed: two blocks of the diagnosis
 LEAST_POWER_SHARE = 0.01  # of the median, below which a light power is a fault; design choice
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """The part of a long channel that some instants need."""
-
-    low: int
-    high: int
 
 
 @dataclass(frozen=True)
@@ -52,7 +44,7 @@ class Source:
     first: float = np.nan  # first value that is a number
     size: int = 0  # number of its values
 
-    def stretch(self, before: int, end: int) -> Stretch | None:
+    def stretch(self, before: int, end: int) -> slice | None:
         """Find the values needed for times after `before` up to `end` [ns]; None if in memory."""
         if self.stamps is not None:
             return None
@@ -60,10 +52,10 @@ class Source:
             np.floor(grid_index(self.start, self.rate, [before, end])).astype(int).tolist()
         )
         size = self.size
-        return Stretch(min(max(first, 0), size - 1), min(max(last + 2, 1), size))
+        return slice(min(max(first, 0), size - 1), min(max(last + 2, 1), size))
 
     def at(
-        self, instants: NDArray[np.int64], part: tuple[Stretch, Any] | None, carry: float | None
+        self, instants: NDArray[np.int64], part: tuple[slice, Any] | None, carry: float | None
     ) -> tuple[Array, float | None]:
         """Interpolate at increasing `instants` [ns since 1970].
 
@@ -93,7 +85,7 @@ class Source:
         )
         position = np.clip(position, 0, self.size - 1)
         base = np.floor(position).astype(np.int64)
-        place = base - stretch.low + 1
+        place = base - stretch.start + 1
         interpolated = filled[place]
         # from the number of the sample itself, so that the last bit is the same in every stretch
         if not self.held:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.simulate.block import BlockState, Plan, next_block
-from gyrostab.simulate.drivers import SHORT, Stretch
+from gyrostab.simulate.drivers import SHORT
 from gyrostab.simulate.noise import NoiseState, draw
 from gyrostab.time.grid import grid_times
 
@@ -89,14 +89,16 @@ class _Channel:
         graph = array.__dask_graph__()
         self.chunks = [(graph.cull([key]).to_dict(), key) for key in array.__dask_keys__()]
 
-    def __call__(self, stretch: Stretch) -> NDArray[np.float64]:
+    def __call__(self, stretch: slice) -> NDArray[np.float64]:
         from dask.local import get_sync
 
-        first, last = np.searchsorted(self.edges, [stretch.low, stretch.high - 1], side="right") - 1
+        first, last = (
+            np.searchsorted(self.edges, [stretch.start, stretch.stop - 1], side="right") - 1
+        )
         pieces = [get_sync(*self.chunks[number]) for number in range(first, last + 1)]
         offset = int(self.edges[first])
         return np.concatenate(pieces).astype(np.float64)[
-            stretch.low - offset : stretch.high - offset
+            stretch.start - offset : stretch.stop - offset
         ]
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Mapping
-from itertools import combinations
+from itertools import combinations, pairwise
 from typing import Any
 
 import numpy as np
@@ -209,22 +209,26 @@ def _segment_spectra(values: Array, count: int) -> NDArray[np.complex128]:
     return np.asarray(np.fft.rfft(centred * np.hanning(segments.shape[1]), axis=1))
 
 
+def _list_octaves(size: int) -> list[tuple[int, int]]:
+    """List first frequency and end of the octaves below half of the rate."""
+    edges = np.unique(size // 2 ** np.arange(_BANDS + 1))
+    return list(pairwise(edges[edges > 0].tolist()))
+
+
 def _octave_powers(values: Array) -> dict[str, Array]:
     """Return log powers of segments, by octave."""
     power = np.abs(_segment_spectra(values, _SEGMENTS)) ** 2
-    edges = np.unique(power.shape[1] // 2 ** np.arange(_BANDS + 1))
     with np.errstate(divide="ignore"):
         return {
             f"octave {low}": np.log(power[:, low:high].mean(axis=1))
-            for low, high in zip(edges[edges > 0][:-1], edges[edges > 0][1:], strict=True)
+            for low, high in _list_octaves(power.shape[1])
         }
 
 
 def _measure_coherencies(spectrum: NDArray[Any], other_spectrum: NDArray[Any]) -> Array:
     """Return real and imaginary coherency of two axes by octave, in standard deviations."""
-    edges = np.unique(spectrum.shape[1] // 2 ** np.arange(_BANDS + 1))
     out = []
-    for low, high in zip(edges[edges > 0][:-1], edges[edges > 0][1:], strict=True):
+    for low, high in _list_octaves(spectrum.shape[1]):
         first, second = spectrum[:, low:high], other_spectrum[:, low:high]
         size = np.sqrt((np.abs(first) ** 2).sum() * (np.abs(second) ** 2).sum())
         out.append((first * second.conj()).sum() / size * np.sqrt(2.0 * first.size))

@@ -129,7 +129,7 @@ def channel_at(
     values = (
         None
         if stretch is None
-        else (stretch, lazy.read_slice(source.values, stretch.low, stretch.high))
+        else (stretch, lazy.read_slice(source.values, stretch.start, stretch.stop))
     )
     return source.at(instants, values, carry)
 
