@@ -17,13 +17,10 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
-import xarray as xr
-
 from gyrostab.errors import DamageError
-from gyrostab.ingest.formats.collect import Messages
 from gyrostab.ingest.formats.recognise import read_head
-from gyrostab.ingest.formats.tables import Table, library, read_tables, scan_tables
-from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.ingest.formats.tables import Messages, TablesOfFile, library, make_reader
+from gyrostab.ingest.options import ReadOptions
 
 __all__ = ["matches", "read", "scan"]
 
@@ -49,16 +46,6 @@ def matches(path: Path) -> bool:
     return head.startswith(_BINARY) or bool(_TEXT.search(head))
 
 
-def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Summarise messages and stamps; reads the whole file."""
-    return scan_tables(path, "ardupilot", _read_messages(path), options)
-
-
-def read(path: Path, options: ReadOptions) -> xr.Dataset:
-    """Return the raw log of an ArduPilot log; see `gyrostab.ingest.read_log`."""
-    return read_tables(path, _read_messages(path), options)
-
-
 def _open_binary(reader: Any, path: Path) -> Any:
     """Open a binary log; the library would read a message without length again for ever."""
 
@@ -76,7 +63,7 @@ def _open_binary(reader: Any, path: Path) -> Any:
     return Forward(str(path))
 
 
-def _read_messages(path: Path) -> list[Table]:
+def _read_messages(path: Path, options: ReadOptions) -> TablesOfFile:
     """Return a table for each message and instance of a sensor."""
     reader = library("pymavlink.DFReader", path, extra="ardupilot")
     binary = read_head(path).startswith(_BINARY)
@@ -95,15 +82,20 @@ def _read_messages(path: Path) -> list[Table]:
             stamp = fields.pop("SampleUS", stamp)
             if isinstance(stamp, int):
                 numbers = {
-                    name: value for name, value in fields.items() if isinstance(value, int | float)
+                    f"{kind}[{instance}].{name}": value
+                    for name, value in fields.items()
+                    if isinstance(value, int | float)
                 }
                 by_instance.setdefault((kind, instance), Messages()).add(stamp, numbers)
     axes = "IMU" if ("IMU", 0) in by_instance else "GYR"
+    targets = {
+        f"{kind}[0].{field}": target
+        for kind in (axes, "MAG", "BARO")
+        for field, target in _MEANINGS[kind].items()
+    }
     return [
-        messages.make_table(
-            [f"{kind}[{instance}].{name}" for name in messages.columns],
-            time_unit="us",
-            meanings=_MEANINGS[kind] if instance == 0 and kind in (axes, "MAG", "BARO") else None,
-        )
-        for (kind, instance), messages in by_instance.items()
-    ]
+        messages.make_table(time_unit="us", targets=targets) for messages in by_instance.values()
+    ], ()
+
+
+scan, read = make_reader("ardupilot", _read_messages)

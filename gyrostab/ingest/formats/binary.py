@@ -20,7 +20,14 @@ from gyrostab.errors import FormatError, OptionError
 from gyrostab.ingest.columns.stamps import TimeUnit, integers_to_ns
 from gyrostab.ingest.formats.layout import Field, Layout, find_layout, layout_path
 from gyrostab.ingest.formats.messages import find_messages, unwrap_counter
-from gyrostab.ingest.formats.tables import Table, read_tables, scan_tables, sliced
+from gyrostab.ingest.formats.tables import (
+    NO_NAME,
+    Table,
+    TableColumn,
+    read_tables,
+    scan_tables,
+    sliced,
+)
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
 __all__ = ["has_layout", "matches", "read", "scan"]
@@ -76,10 +83,9 @@ def _make_table(path: Path, options: ReadOptions, *, needs_rate: bool) -> tuple[
         expected = "part of a message" if layout.sync else f"a whole record of {layout.size} bytes"
         where = "" if layout.sync else "the last "
         notes.append(f"{where}{extra_bytes} bytes are not {expected}; is the layout right?")
-    names = tuple(field.name for field in layout.fields)
-    columns = tuple(partial(fetch, field) for field in layout.fields)
-    units = (None,) * len(names)
-    return Table(rows, names, units, columns, stamps, "ns" if stamps else None), notes
+    columns = [TableColumn((field.name,), partial(fetch, field)) for field in layout.fields]
+    clock = None if stamps is None else TableColumn(NO_NAME, stamps, "ns")
+    return Table(rows, columns, clock), notes
 
 
 def _count_time(

@@ -17,19 +17,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import xarray as xr
-
 from gyrostab.ingest.columns.headers import is_time_unit
 from gyrostab.ingest.formats.recognise import begins_like
 from gyrostab.ingest.formats.tables import (
     Table,
+    TableColumn,
+    TablesOfFile,
     library,
-    plain_names,
-    read_tables,
-    scan_tables,
+    make_reader,
     sliced,
 )
-from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.ingest.options import ReadOptions
 
 __all__ = ["matches", "read", "scan"]
 
@@ -42,42 +40,13 @@ def matches(path: Path) -> bool:
     return begins_like(path, rb"(?s).{4}V1\.00RECORD", ".dlis")
 
 
-def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Summarise frames, channels and stamps; reads the whole file."""
-    return scan_tables(path, "dlis", _read_frames(path), options)
-
-
-def read(path: Path, options: ReadOptions) -> xr.Dataset:
-    """Return the raw log of a DLIS file; see `gyrostab.ingest.read_log`."""
-    return read_tables(path, _read_frames(path), options)
-
-
-def _read_frames(path: Path) -> list[Table]:
+def _read_frames(path: Path, options: ReadOptions) -> TablesOfFile:
     """Return a table for each frame of each logical file."""
     dlis = library("dlisio.dlis", path, extra="dlis")
     with _process_settings(path), dlis.load(str(path)) as files:
-        frames = [
-            (
-                frame,
-                [
-                    channel
-                    for channel in frame.channels
-                    if channel and list(channel.dimension) == [1]
-                ],
-            )
-            for logical in files
-            for frame in logical.frames
-        ]
-        names = iter(
-            plain_names(
-                [(frame.name, channel.name) for frame, channels in frames for channel in channels]
-            )
-        )
-        return [
-            _make_table(frame, channels, [next(names) for _ in channels])
-            for frame, channels in frames
-            if channels
-        ]
+        frames = [frame for logical in files for frame in logical.frames]
+        tables = (_make_table(frame) for frame in frames)
+        return [table for table in tables if table is not None], ()
 
 
 @contextlib.contextmanager
@@ -96,18 +65,27 @@ def _process_settings(path: Path) -> Iterator[None]:
             logger.setLevel(level)
 
 
-def _make_table(frame: Any, channels: list[Any], names: list[str]) -> Table:
+def _make_table(frame: Any) -> Table | None:
+    """Return the channels with one value a row; None if there are none."""
+    channels = [c for c in frame.channels if c and list(c.dimension) == [1]]
+    if not channels:
+        return None
     values = frame.curves()
-    units = [str(channel.units or "").strip() or None for channel in channels]
-    columns = [sliced(values[channel.name]) for channel in channels]
+    columns = [
+        TableColumn(
+            (frame.name, channel.name),
+            sliced(values[channel.name]),
+            str(channel.units or "").strip() or None,
+        )
+        for channel in channels
+    ]
     kind = str(frame.index_type or "").upper()
-    timed = "TIME" in kind and channels[0].name == frame.index and is_time_unit(units[0] or "")
-    first = 1 if timed else 0
-    return Table(
-        len(values),
-        tuple(names[first:]),
-        tuple(units[first:]),
-        tuple(columns[first:]),
-        columns[0] if timed else None,
-        units[0] if timed else None,
+    is_timed = (
+        "TIME" in kind and channels[0].name == frame.index and is_time_unit(columns[0].unit or "")
     )
+    if is_timed:
+        return Table(len(values), columns[1:], columns[0])
+    return Table(len(values), columns)
+
+
+scan, read = make_reader("dlis", _read_frames)

@@ -12,15 +12,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.stamps import dates_to_ns
 from gyrostab.ingest.columns.typed import holds_dates
 from gyrostab.ingest.formats.recognise import read_head
-from gyrostab.ingest.formats.tables import Table, library, read_tables, scan_tables, sliced
-from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.ingest.formats.tables import (
+    NO_NAME,
+    Table,
+    TableColumn,
+    TablesOfFile,
+    library,
+    make_reader,
+    sliced,
+)
+from gyrostab.ingest.options import ReadOptions
 
 __all__ = ["matches", "read", "scan"]
 
@@ -36,30 +43,21 @@ def matches(path: Path) -> bool:
     return any(line.lstrip().startswith(b"~") for line in lines)
 
 
-def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Summarise curves, rows, and first and last stamps."""
-    return scan_tables(path, "las", [_read_curves(path, options)], options)
-
-
-def read(path: Path, options: ReadOptions) -> xr.Dataset:
-    """Return the raw log of a LAS file; see `gyrostab.ingest.read_log`."""
-    return read_tables(path, [_read_curves(path, options)], options)
-
-
-def _read_curves(path: Path, options: ReadOptions) -> Table:
+def _read_curves(path: Path, options: ReadOptions) -> TablesOfFile:
     lasio = library("lasio", path, extra="las")
     curves = list(lasio.read(str(path)).curves)
     clocks, dates = _find_clock(path, curves, options)
-    names = tuple(
-        "" if any(curve is clock for clock in clocks) else str(curve.mnemonic) for curve in curves
-    )
-    units = tuple(
-        None if holds_dates(curve.data) else str(curve.unit or "").strip() or None
+    columns = [
+        TableColumn(
+            NO_NAME if any(curve is clock for clock in clocks) else (str(curve.mnemonic),),
+            sliced(np.asarray(curve.data)),
+            None if holds_dates(curve.data) else str(curve.unit or "").strip() or None,
+        )
         for curve in curves
-    )
-    columns = tuple(sliced(np.asarray(curve.data)) for curve in curves)
+    ]
     rows = len(curves[0].data) if curves else 0
-    return Table(rows, names, units, columns, None if dates is None else sliced(dates))
+    stamps = None if dates is None else TableColumn(NO_NAME, sliced(dates))
+    return [Table(rows, columns, stamps)], ()
 
 
 def _find_clock(
@@ -156,3 +154,6 @@ def _has_date_format(order: str, days: list[str]) -> bool:
     except ValueError:
         return False
     return bool(filled)
+
+
+scan, read = make_reader("las", _read_curves)

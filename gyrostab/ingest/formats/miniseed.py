@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from gyrostab.ingest.formats.recognise import begins_like
 from gyrostab.ingest.formats.tables import (
+    NO_NAME,
     ReadSlice,
     Table,
+    TableColumn,
     library,
-    plain_names,
     read_tables,
     scan_tables,
 )
@@ -33,9 +34,7 @@ __all__ = ["matches", "read", "scan"]
 SUFFIXES = (".mseed", ".miniseed", ".msd", ".ms", ".mseed3")
 _HEAD = re.compile(rb"\d{6}[DRQM][ \0]|MS\x03")
 _MAX_RECORD_BYTES = 2**20  # version 2 allows longer records, which nobody writes
-_ROTATION = re.compile(
-    r"(?:^|\.)[A-Z]J([A-Z0-9])$"
-)  # band, instrument J, orientation: SEED manual, appendix A
+_ROTATION = re.compile(r"[A-Z]J([A-Z0-9])")  # band, instrument J, orientation: SEED, appendix A
 _MAX_START_DIFFERENCE = 0.1  # of channels that share their stamps [samples]
 
 
@@ -124,23 +123,19 @@ def _group_traces(traces: list[_Trace]) -> list[Table]:
     for trace in traces:
         same = [group for group in groups if _in_step(group[0], trace)]
         same[0].append(trace) if same else groups.append([trace])
-    names = dict(zip(map(id, traces), plain_names([trace.name for trace in traces]), strict=True))
     tables = []
     for group in groups:
         longest = max(group, key=lambda trace: sum(trace.sizes))
         rows = sum(longest.sizes)
-        values = tuple(partial(_join_values, trace.values, rows) for trace in group)
-        group_names = tuple(names[id(trace)] for trace in group)
-        tables.append(
-            Table(
-                rows,
-                group_names,
-                (None,) * len(group),
-                values,
-                _trace_stamps(longest),
-                coded=tuple(map(_axis_of_code, group_names)),
+        columns = [
+            TableColumn(
+                trace.name,
+                partial(_join_values, trace.values, rows),
+                target=_axis_of_code(trace.name[-1]),
             )
-        )
+            for trace in group
+        ]
+        tables.append(Table(rows, columns, TableColumn(NO_NAME, _trace_stamps(longest))))
     return tables
 
 
@@ -156,9 +151,9 @@ def _in_step(first: _Trace, second: _Trace) -> bool:
     )
 
 
-def _axis_of_code(name: str) -> str | None:
+def _axis_of_code(code: str) -> str | None:
     """Return the gyro axis of a rotation sensor channel, None for other channels."""
-    match = _ROTATION.search(name)
+    match = _ROTATION.fullmatch(code)
     return f"gyro_{match.group(1).lower()}" if match else None
 
 

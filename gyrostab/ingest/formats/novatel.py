@@ -13,13 +13,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import xarray as xr
-
 from gyrostab.ingest.columns.stamps import NAT
-from gyrostab.ingest.formats.collect import Messages
 from gyrostab.ingest.formats.recognise import read_head
-from gyrostab.ingest.formats.tables import Table, library, plain_names, read_tables, scan_tables
-from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.ingest.formats.tables import Messages, TablesOfFile, library, make_reader
+from gyrostab.ingest.options import ReadOptions
 
 __all__ = ["matches", "read", "scan"]
 
@@ -37,19 +34,7 @@ def matches(path: Path) -> bool:
     return head.startswith(_SYNC) or bool(_TEXT.search(head))
 
 
-def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Summarise messages and stamps; reads the whole file."""
-    tables, notes = _read_messages(path)
-    return scan_tables(path, "novatel", tables, options, notes)
-
-
-def read(path: Path, options: ReadOptions) -> xr.Dataset:
-    """Return the raw log of a SPAN log; see `gyrostab.ingest.read_log`."""
-    tables, notes = _read_messages(path)
-    return read_tables(path, tables, options, notes=notes)
-
-
-def _read_messages(path: Path) -> tuple[list[Table], list[str]]:
+def _read_messages(path: Path, options: ReadOptions) -> TablesOfFile:
     """Return a table for each kind of message, and a note on their time."""
     oem = library("novatel_edie.oem", path, extra="novatel")
     by_kind: dict[str, Messages] = {}
@@ -63,15 +48,8 @@ def _read_messages(path: Path) -> tuple[list[Table], list[str]]:
         usable = 0 <= week < 10_000 and 0.0 <= seconds <= _WEEK
         stamp = (_GPS_EPOCH + week * _WEEK) * 10**9 + round(seconds * 1e9) if usable else NAT
         by_kind.setdefault(message.name, Messages()).add(stamp, counts)
-    names = iter(
-        plain_names(
-            [(kind, name) for kind, messages in by_kind.items() for name in messages.columns]
-        )
-    )
-    tables = [
-        messages.make_table([next(names) for _ in messages.columns])
-        for messages in by_kind.values()
-    ]
-    return tables, [
-        "the stamps are GPS time, which has no leap seconds (18 s ahead of UTC in 2026)"
-    ]
+    note = "the stamps are GPS time, which has no leap seconds (18 s ahead of UTC in 2026)"
+    return [messages.make_table(kind) for kind, messages in by_kind.items()], [note]
+
+
+scan, read = make_reader("novatel", _read_messages)

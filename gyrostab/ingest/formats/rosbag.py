@@ -15,18 +15,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import xarray as xr
-
-from gyrostab.ingest.formats.collect import Messages
 from gyrostab.ingest.formats.recognise import read_head
-from gyrostab.ingest.formats.tables import (
-    Table,
-    library,
-    plain_names,
-    read_tables,
-    scan_tables,
-)
-from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.ingest.formats.tables import Messages, TablesOfFile, library, make_reader
+from gyrostab.ingest.options import ReadOptions
 
 __all__ = ["matches", "read", "scan"]
 
@@ -52,19 +43,7 @@ def matches(path: Path) -> bool:
     return read_head(path).startswith(_MAGICS)
 
 
-def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Summarise topics and stamps; reads the whole bag."""
-    tables, notes = _read_topics(path)
-    return scan_tables(path, "rosbag", tables, options, notes)
-
-
-def read(path: Path, options: ReadOptions) -> xr.Dataset:
-    """Return the raw log of a bag; see `gyrostab.ingest.read_log`."""
-    tables, notes = _read_topics(path)
-    return read_tables(path, tables, options, notes=notes)
-
-
-def _read_topics(path: Path) -> tuple[list[Table], list[str]]:
+def _read_topics(path: Path, options: ReadOptions) -> TablesOfFile:
     """Return a table for each topic with numbers, and a note on topics that are left out."""
     highlevel = library("rosbags.highlevel", path, extra="rosbag")
     typesys = library("rosbags.typesys", path, extra="rosbag")
@@ -79,13 +58,9 @@ def _read_topics(path: Path) -> tuple[list[Table], list[str]]:
             message = reader.deserialize(raw, connection.msgtype)
             messages = by_topic.setdefault((connection.topic, connection.msgtype), Messages())
             messages.add(_message_time(message) or received, dict(_select_numbers(message)))
-    fields = [
-        (topic, name) for (topic, _), messages in by_topic.items() for name in messages.columns
-    ]
-    names = iter(plain_names(fields))
     tables = [
-        messages.make_table([next(names) for _ in messages.columns], meanings=_MEANINGS.get(kind))
-        for (_, kind), messages in by_topic.items()
+        messages.make_table(topic, targets=_MEANINGS.get(kind))
+        for (topic, kind), messages in by_topic.items()
     ]
     notes = [f"left out, as their messages are large: {', '.join(left_out)}"] if left_out else []
     return tables, notes
@@ -105,3 +80,6 @@ def _select_numbers(message: Any, prefix: str = "") -> Iterator[tuple[str, float
             yield prefix + field.name, float(value)
         elif dataclasses.is_dataclass(value) and field.name != "header":
             yield from _select_numbers(value, f"{prefix}{field.name}.")
+
+
+scan, read = make_reader("rosbag", _read_topics)

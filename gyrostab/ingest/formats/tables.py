@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from array import array
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -14,37 +16,109 @@ import xarray as xr
 
 from gyrostab.errors import FormatError, OptionError
 from gyrostab.ingest.columns.plan import Plan, plan_columns
+from gyrostab.ingest.columns.stamps import NAT
 from gyrostab.ingest.columns.typed import read_columns, summarise_columns
 from gyrostab.ingest.combine import concatenate, with_channels
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
-__all__ = ["Table", "library", "plain_names", "read_tables", "scan_tables", "sliced"]
+__all__ = [
+    "NO_NAME",
+    "Messages",
+    "Table",
+    "TableColumn",
+    "library",
+    "make_reader",
+    "read_tables",
+    "scan_tables",
+    "sliced",
+]
 
 #: First row, row after the last one -> values.
 ReadSlice = Callable[[int, int], Any]
 
 
 @dataclass(frozen=True)
-class Table:
-    """Columns of one length.
+class TableColumn:
+    """A column; its name is used alone, or after the names of its groups if several share it."""
 
-    `names` and `units` are those of the columns; `stamps` are in the unit `time_unit`, or dates if
-    that is None; without stamps a column of the table may hold the time. `coded` holds targets of
-    columns by a code of the format, in the form of ``--map``.
+    name: tuple[str, ...]
+    values: ReadSlice
+    unit: str | None = None
+    target: str | None = None  # by a code of the format, in the form of ``--map``
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of one length, and the stamps: numbers of a unit, or dates without one.
+
+    Without stamps a column of the table may hold the time.
     """
 
     rows: int
-    names: tuple[str, ...]
-    units: tuple[str | None, ...]
-    columns: tuple[ReadSlice, ...]
-    stamps: ReadSlice | None = None
-    time_unit: str | None = None
-    coded: tuple[str | None, ...] = ()
+    columns: Sequence[TableColumn]
+    stamps: TableColumn | None = None
+
+
+#: Tables of a file, and notes on it.
+TablesOfFile = tuple[Sequence[Table], Sequence[str]]
+
+
+class Messages:
+    """Stamps and numbers of messages of one kind, a row each.
+
+    Examples
+    --------
+    >>> messages = Messages()
+    >>> messages.add(0, {"x": 1.0})
+    >>> messages.add(10, {"x": 2.0, "t": 20.5})
+    >>> [column.values(0, 2).tolist() for column in messages.make_table("imu").columns]
+    [[1.0, 2.0], [nan, 20.5]]
+    """
+
+    def __init__(self) -> None:
+        self.stamps: array[int] = array("q")
+        self.columns: dict[str, array[float]] = {}
+
+    def add(self, stamp: int, values: Mapping[str, float]) -> None:
+        """Add a message; fields that it lacks are NaN, and a stamp beyond 64 bits is NaT."""
+        for name, value in values.items():
+            column = self.columns.setdefault(name, array("d"))
+            self._fill_column(column)
+            column.append(value)
+        self.stamps.append(stamp if abs(stamp) < 2**63 else NAT)
+
+    def make_table(
+        self, *group: str, time_unit: str | None = None, targets: Mapping[str, str] | None = None
+    ) -> Table:
+        """Return the columns with the names of their group, and targets of fields as of ``--map``.
+
+        Without `time_unit` the stamps are nanoseconds since 1970.
+        """
+        for column in self.columns.values():
+            self._fill_column(column)
+        stamps = np.frombuffer(self.stamps, dtype=np.int64)
+        columns = [
+            TableColumn(
+                (*group, name), sliced(np.frombuffer(column)), target=(targets or {}).get(name)
+            )
+            for name, column in self.columns.items()
+        ]
+        clock = sliced(stamps if time_unit else stamps.view("datetime64[ns]"))
+        return Table(len(stamps), columns, TableColumn(NO_NAME, clock, time_unit))
+
+    def _fill_column(self, column: array[float]) -> None:
+        if len(column) < len(self.stamps):
+            column.extend([np.nan] * (len(self.stamps) - len(column)))
 
 
 def sliced(values: Any) -> ReadSlice:
     """Return a function that slices an array, or what can be sliced like one."""
     return lambda start, stop: np.asarray(values[start:stop])
+
+
+#: Name of a column without one.
+NO_NAME = ("",)
+_NO_STAMPS = TableColumn(NO_NAME, sliced(()))
 
 
 def plain_names(names: Sequence[tuple[str, ...]]) -> list[str]:
@@ -73,63 +147,55 @@ class _PlannedTables:
 
     def part(self, place: int) -> tuple[Plan, Any]:
         """Return the plan of one table's columns, and the function that fetches them."""
-        table, begin = self.tables[place], self.first[place]
-        clocks = [
-            replace(column, source=begin)
-            for column in self.plan.of("time")
-            if table.stamps is not None
+        begin, stored = self.first[place], _with_stamps(self.tables[place])
+        columns = [
+            column for column in self.plan.columns if begin <= column.source < begin + len(stored)
         ]
-        table_columns = [
-            column
-            for column in self.plan.columns
-            if begin <= column.source < begin + 1 + len(table.names)
-        ]
-        columns = clocks + [
-            column for column in table_columns if not (clocks and column.role == "time")
-        ]
+        if stored[0] is not _NO_STAMPS:
+            clocks = [replace(clock, source=begin) for clock in self.plan.of("time")]
+            columns = clocks + [c for c in columns if not (clocks and c.role == "time")]
 
         def fetch(source: int, start: int, stop: int) -> Any:
-            part = table.stamps if source == begin else table.columns[source - begin - 1]
-            assert part is not None
-            return part(start, stop)
+            return stored[source - begin].values(start, stop)
 
         return replace(self.plan, columns=tuple(columns)), fetch
 
 
+def _with_stamps(table: Table) -> list[TableColumn]:
+    return [table.stamps or _NO_STAMPS, *table.columns]
+
+
 def _plan_tables(path: Path, tables: Sequence[Table], options: ReadOptions) -> _PlannedTables:
-    filled = [table for table in tables if table.rows and table.names]
+    names = iter(plain_names([c.name for table in tables for c in _with_stamps(table)]))
+    filled: list[Table] = []
+    first: list[int] = []
+    headers: list[str] = []
+    units: dict[int, str] = {}
+    targets: dict[int, str] = {}
+    for table in tables:
+        columns = _with_stamps(table)
+        _, *column_names = islice(names, len(columns))
+        if not table.rows or not column_names:
+            continue
+        is_first_clock = table.stamps is not None and all(held.stamps is None for held in filled)
+        filled.append(table)
+        first.append(len(headers))
+        for source, column in enumerate(columns, len(headers)):
+            if column.unit:
+                units[source] = column.unit
+            if column.target:
+                targets[source] = column.target
+        headers += ["time" if is_first_clock else "", *column_names]
     if not filled:
         raise FormatError(
             f"{path.name}: it holds no values; copy it again, or check what the logger wrote"
         )
-    headers: list[str] = []
-    units: dict[int, str] = {}
-    coded: dict[int, str] = {}
-    first = []
-    for table in filled:
-        first.append(len(headers))
-        named = table.stamps is not None and not any(
-            earlier.stamps is not None for earlier in filled[: len(first) - 1]
-        )
-        if named and table.time_unit:
-            units[len(headers)] = table.time_unit
-        for offset, unit in enumerate(table.units, 1):
-            if unit:
-                units[len(headers) + offset] = unit
-        coded.update(
-            {
-                len(headers) + offset: meaning
-                for offset, meaning in enumerate(table.coded, 1)
-                if meaning
-            }
-        )
-        headers += ["time" if named else "", *table.names]
     stamped = [
         begin
         for begin, table in zip(first, filled, strict=True)
-        if table.stamps is not None and table.time_unit is None
+        if table.stamps is not None and table.stamps.unit is None
     ]
-    plan = plan_columns(path, headers, options, units=units, stamped=stamped, coded=coded)
+    plan = plan_columns(path, headers, options, units=units, stamped=stamped, coded=targets)
     main_columns = plan.of("gyro") or plan.of("channel")
     holders = {
         max(place for place, begin in enumerate(first) if begin <= column.source)
@@ -175,25 +241,34 @@ def read_tables(
     for place, table in enumerate(planned.tables):
         plan, fetch = planned.part(place)
         if place in planned.main:
-            table_notes = notes if not main else ()
-            main.append(
-                read_columns(
-                    plan if not main else replace(plan, notes=()),
-                    options,
-                    table.rows,
-                    fetch,
-                    notes=table_notes,
-                )
-            )
+            if main:
+                plan, notes = replace(plan, notes=()), ()
+            main.append(read_columns(plan, options, table.rows, fetch, notes=notes))
         elif plan.of("channel"):
             plan = replace(plan, signal=None, kind=None, notes=())
             channel_logs.append(read_columns(plan, options, table.rows, fetch))
     log = with_channels(concatenate(main) if len(main) > 1 else main[0], channel_logs)
-    return (
-        log.assign_attrs(source_files=[path.name], row_start=[0])
-        if "axis_rows" not in log.attrs
-        else log
-    )
+    if "axis_rows" in log.attrs:
+        return log
+    return log.assign_attrs(source_files=[path.name], row_start=[0])
+
+
+def make_reader(
+    form: str, find_tables: Callable[[Path, ReadOptions], TablesOfFile]
+) -> tuple[Callable[[Path, ReadOptions], FileSummary], Callable[[Path, ReadOptions], xr.Dataset]]:
+    """Make the functions `scan` and `read` of a format whose tables are read as a whole."""
+
+    def scan(path: Path, options: ReadOptions) -> FileSummary:
+        """Summarise columns, rows, and first and last stamps."""
+        tables, notes = find_tables(path, options)
+        return scan_tables(path, form, tables, options, notes)
+
+    def read(path: Path, options: ReadOptions) -> xr.Dataset:
+        """Return the raw log of a file; see `gyrostab.ingest.read_log`."""
+        tables, notes = find_tables(path, options)
+        return read_tables(path, tables, options, notes=notes)
+
+    return scan, read
 
 
 def library(name: str, path: Path, *, extra: str) -> Any:

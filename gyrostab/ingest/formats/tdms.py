@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,11 @@ from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.stamps import NAT, dates_to_ns
 from gyrostab.ingest.formats.recognise import begins_like
 from gyrostab.ingest.formats.tables import (
+    NO_NAME,
     ReadSlice,
     Table,
+    TableColumn,
     library,
-    plain_names,
     read_tables,
     scan_tables,
     sliced,
@@ -58,20 +60,13 @@ def _open_tables(path: Path) -> Iterator[list[Table]]:
     """Group channels of one length and clock into tables; without a clock, of one group."""
     nptdms = library("nptdms", path, extra="tdms")
     with nptdms.TdmsFile.open(str(path)) as file:
-        channels = [
-            channel for group in file.groups() for channel in group.channels() if len(channel)
-        ]
-        names = plain_names([(channel.group_name, channel.name) for channel in channels])
-        groups: dict[Any, list[tuple[str, Any]]] = {}
-        for name, channel in zip(names, channels, strict=True):
-            clock = _waveform_clock(path, channel)
-            groups.setdefault((len(channel), clock or channel.group_name), []).append(
-                (name, channel)
-            )
-        yield [
-            _make_table(members, _waveform_clock(path, members[0][1]))
-            for members in groups.values()
-        ]
+        groups: dict[Any, list[Any]] = {}
+        for group in file.groups():
+            for channel in group.channels():
+                if len(channel):
+                    clock = _waveform_clock(path, channel) or channel.group_name
+                    groups.setdefault((len(channel), clock), []).append(channel)
+        yield [_make_table(path, channels) for channels in groups.values()]
 
 
 def _waveform_clock(path: Path, channel: Any) -> tuple[float, Any] | None:
@@ -102,28 +97,26 @@ def _waveform_clock(path: Path, channel: Any) -> tuple[float, Any] | None:
     return step, first if start is None else np.datetime64(began + first, "ns")
 
 
-def _make_table(members: list[tuple[str, Any]], clock: tuple[float, Any] | None) -> Table:
-    fields = [(name, channel) for name, channel in members]
-    dates = None
-    if clock is None:
-        dates = next(
-            (channel for _, channel in fields if np.dtype(channel.dtype).kind == "M"), None
+def _make_table(path: Path, channels: list[Any]) -> Table:
+    columns = [
+        TableColumn(
+            (channel.group_name, channel.name),
+            sliced(channel),
+            str(channel.properties.get("unit_string") or "").strip() or None,
         )
-        fields = [(name, channel) for name, channel in fields if channel is not dates]
-    units = tuple(
-        str(channel.properties.get("unit_string") or "").strip() or None for _, channel in fields
-    )
-    stamps = _waveform_stamps(*clock) if clock else None if dates is None else sliced(dates)
-    dated = clock is None or isinstance(clock[1], np.datetime64)
-    columns = tuple(sliced(channel) for _, channel in fields)
-    return Table(
-        len(members[0][1]),
-        tuple(name for name, _ in fields),
-        units,
-        columns,
-        stamps,
-        None if dated else "ns",
-    )
+        for channel in channels
+    ]
+    clock = _waveform_clock(path, channels[0])
+    if clock is not None:
+        unit = None if isinstance(clock[1], np.datetime64) else "ns"
+        return Table(
+            len(channels[0]), columns, TableColumn(NO_NAME, _waveform_stamps(*clock), unit)
+        )
+    kinds = [np.dtype(channel.dtype).kind for channel in channels]
+    if "M" not in kinds:
+        return Table(len(channels[0]), columns)
+    dates = columns.pop(kinds.index("M"))
+    return Table(len(channels[0]), columns, replace(dates, unit=None))
 
 
 def _waveform_stamps(step: float, start: Any) -> ReadSlice:

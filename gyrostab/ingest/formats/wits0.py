@@ -16,13 +16,10 @@ import re
 from datetime import UTC, datetime
 from pathlib import Path
 
-import xarray as xr
-
 from gyrostab.ingest.columns.stamps import NAT
-from gyrostab.ingest.formats.collect import Messages
 from gyrostab.ingest.formats.recognise import begins_like
-from gyrostab.ingest.formats.tables import Table, read_tables, scan_tables
-from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.ingest.formats.tables import Messages, TablesOfFile, make_reader
+from gyrostab.ingest.options import ReadOptions
 
 __all__ = ["matches", "read", "scan"]
 
@@ -36,17 +33,7 @@ def matches(path: Path) -> bool:
     return begins_like(path, _HEAD)
 
 
-def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Summarise items, and first and last stamps; reads the whole file."""
-    return scan_tables(path, "wits0", _read_records(path), options)
-
-
-def read(path: Path, options: ReadOptions) -> xr.Dataset:
-    """Return the raw log of a WITS stream; see `gyrostab.ingest.read_log`."""
-    return read_tables(path, _read_records(path), options)
-
-
-def _read_records(path: Path) -> list[Table]:
+def _read_records(path: Path, options: ReadOptions) -> TablesOfFile:
     """Return a table for each record type."""
     records: dict[str, Messages] = {}
     frame: dict[str, dict[str, str]] = {}
@@ -60,7 +47,10 @@ def _read_records(path: Path) -> list[Table]:
                 frame = {}
             elif item := _ITEM.match(line):
                 frame.setdefault(item[1], {})[item[2]] = item[3]
-    return [messages.make_table() for messages in records.values()]
+    return [messages.make_table() for messages in records.values()], ()
+
+
+scan, read = make_reader("wits0", _read_records)
 
 
 def _parse_stamp(text: str) -> int:

@@ -10,20 +10,25 @@ Energistics, WITSML data schema 1.4.1.1, object log.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from io import StringIO
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import pandas as pd
-import xarray as xr
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.stamps import texts_to_ns
 from gyrostab.ingest.formats.recognise import begins_like
-from gyrostab.ingest.formats.tables import Table, read_tables, scan_tables, sliced
-from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.ingest.formats.tables import (
+    NO_NAME,
+    Table,
+    TableColumn,
+    TablesOfFile,
+    make_reader,
+    sliced,
+)
+from gyrostab.ingest.options import ReadOptions
 
 __all__ = ["matches", "read", "scan"]
 
@@ -35,37 +40,27 @@ def matches(path: Path) -> bool:
     return begins_like(path, _HEAD)
 
 
-def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Summarise curves, rows, and first and last stamps."""
-    return scan_tables(path, "witsml", list(_read_logs(path)), options)
-
-
-def read(path: Path, options: ReadOptions) -> xr.Dataset:
-    """Return the raw log of a WITSML document; see `gyrostab.ingest.read_log`."""
-    return read_tables(path, list(_read_logs(path)), options)
-
-
-def _read_logs(path: Path) -> Iterator[Table]:
-    """Yield a table for each log with data and an index of dates and times.
+def _read_logs(path: Path, options: ReadOptions) -> TablesOfFile:
+    """Return a table for each log with data and an index of dates and times.
 
     Raises
     ------
     FormatError
         When there is none.
     """
-    n_tables = 0
+    tables: list[Table] = []
     for _, log in ElementTree.iterparse(path):
         if _local_name(log) == "log":
             table = _make_table(log)
             log.clear()
             if table is not None:
-                n_tables += 1
-                yield table
-    if not n_tables:
+                tables.append(table)
+    if not tables:
         raise FormatError(
             f"{path.name}: this WITSML document has no log of version 1 with values over dates "
             "and times; export the log by time as WITSML 1.4.1.1, LAS or CSV"
         )
+    return tables, ()
 
 
 def _make_table(log: Any) -> Table | None:
@@ -93,14 +88,12 @@ def _make_table(log: Any) -> Table | None:
     index = _child_text(log, "indexCurve")
     place = names.index(index) if index in names else 0
     stamps = texts_to_ns(cells[place].astype(str).tolist()).view("datetime64[ns]")
-    places = [number for number in range(len(names)) if number != place]
-    return Table(
-        len(cells),
-        tuple(names[number] for number in places),
-        tuple(units.get(names[number]) or None for number in places),
-        tuple(sliced(cells[number].to_numpy()) for number in places),
-        sliced(stamps),
-    )
+    columns = [
+        TableColumn((name,), sliced(cells[number].to_numpy()), units.get(name) or None)
+        for number, name in enumerate(names)
+        if number != place
+    ]
+    return Table(len(cells), columns, TableColumn(NO_NAME, sliced(stamps)))
 
 
 def _local_name(element: Any) -> str:
@@ -111,3 +104,6 @@ def _local_name(element: Any) -> str:
 def _child_text(parent: Any, name: str) -> str:
     """Return the text of a child, empty if there is none."""
     return next(((child.text or "").strip() for child in parent if _local_name(child) == name), "")
+
+
+scan, read = make_reader("witsml", _read_logs)
