@@ -29,7 +29,7 @@ from gyrostab.ingest.damaged_files import (
     reason_of,
 )
 from gyrostab.ingest.formats.binary import has_layout
-from gyrostab.ingest.formats.unread import refuse_unread
+from gyrostab.ingest.formats.recognise import refuse_unread
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.ingest.overlap import stamp_span
 from gyrostab.schema import texts

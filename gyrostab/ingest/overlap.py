@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.ingest.columns.stamps import NAT, read_stamps
-from gyrostab.ingest.copies import count_alike, is_copy
+from gyrostab.ingest.concat.place import count_alike, is_copy
 from gyrostab.schema import SIGNAL_UNITS
 
 __all__ = ["drop_repeats", "first_known_stamp", "stamp_span"]

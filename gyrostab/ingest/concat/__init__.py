@@ -1,8 +1,8 @@
 """Concatenate regular logs lazily: their samples on one grid, with one table of gaps."""
 
 from gyrostab.ingest.concat.axes import group_axes, split_axes
-from gyrostab.ingest.concat.core import concatenate_logs, log_span
-from gyrostab.ingest.concat.notes import absence_notes, merge_notes
+from gyrostab.ingest.concat.core import absence_notes, concatenate_logs, merge_notes
+from gyrostab.ingest.concat.grid import log_span
 
 __all__ = [
     "absence_notes",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,8 @@ from gyrostab.errors import TimeError, UnitError
 from gyrostab.ingest.concat.axes import group_axes
 from gyrostab.ingest.concat.channels import concatenate_channels
 from gyrostab.ingest.concat.gaps import merge_gaps
-from gyrostab.ingest.concat.grid import PlacedLog, Source, log_span, source_of
+from gyrostab.ingest.concat.grid import PlacedLog, Source, source_of
 from gyrostab.ingest.concat.lazy import chunk_of, place_on_grid
-from gyrostab.ingest.concat.notes import absence_notes, merge_notes
 from gyrostab.ingest.concat.place import place_logs
 from gyrostab.ingest.gap_table import gap_variables, name_lost
 from gyrostab.ingest.limits import describe_limit, is_absurd_grid
@@ -27,8 +26,9 @@ from gyrostab.time.clock import time_of_day
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import grid_times, time_coordinate
 from gyrostab.time.stamps import format_stamp
+from gyrostab.wording import list_some
 
-__all__ = ["concatenate_logs", "log_span"]
+__all__ = ["absence_notes", "concatenate_logs", "merge_notes"]
 
 #: Smallest share of a log without an axis of other logs that is noted; recorders are started one
 #: after the other.
@@ -254,6 +254,31 @@ def _common_attributes(
         "notes": [*merge_notes(zip(labels, notes_of_logs, strict=True)), *notes],
         **({"unreadable_files": lost} if lost else {}),
     }
+
+
+def absence_notes(absent: Mapping[str, Sequence[str]]) -> list[str]:
+    """Return notes on axes and channels that some files lack, by the names of these files."""
+    return [
+        f"{name} is not in {list_some(files)} and is missing there"
+        for name, files in absent.items()
+        if files
+    ]
+
+
+def merge_notes(notes_by_file: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
+    """Merge the notes of all files, with file names in front; equal notes appear once.
+
+    Examples
+    --------
+    >>> note = "2 rows are unreadable"
+    >>> merge_notes([("a.csv", [f"a.csv: {note}"]), ("b.csv", [f"b.csv: {note}"])])
+    ['a.csv, b.csv: 2 rows are unreadable']
+    """
+    pooled: dict[str, list[str]] = {}
+    for name, notes in notes_by_file:
+        for note in notes:
+            pooled.setdefault(note.removeprefix(f"{name}: "), []).append(name)
+    return [f"{list_some(names)}: {note}" for note, names in pooled.items()]
 
 
 def _is_equal(value: Any, other: Any) -> bool:

@@ -10,20 +10,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.ingest.concat.grid import LogSlice, PlacedLog, Source, read_log_slices, runs_of
-from gyrostab.ingest.concat.notes import first_notes
-from gyrostab.ingest.copies import MIN_ALIKE_SHARE, count_alike, is_copy
 from gyrostab.ingest.gap_table import describe_break, format_duration
 from gyrostab.schema import GAP_CAUSES
 from gyrostab.time.grid import grid_index, grid_times
 from gyrostab.time.stamps import format_stamp
 from gyrostab.wording import list_some
 
-__all__ = ["place_logs"]
+__all__ = ["count_alike", "is_copy", "place_logs"]
+
+#: Smallest share of equal samples in a copy, which may be damaged.
+MIN_ALIKE_SHARE = 0.9
 
 #: Largest distance from the grid that is not noted [samples].
 NOTED_OFFSET_SAMPLES = 0.01
@@ -38,8 +40,22 @@ _COMPARED_SAMPLES = 2**13  # samples at each end of an overlap whose values are 
 _PROBED_SAMPLES = 64  # compared samples that are tried at every displacement
 _MIN_COMMON_SAMPLES = 32  # common samples needed to find a displacement
 _BATCH_LOGS = 50  # logs whose overlaps are read at once
+_MAX_NAMED = 5  # events of one kind that are listed one by one
 _Cache = dict[LogSlice, NDArray[np.float64]]
 _STEP, _RESTART = GAP_CAUSES.index("clock_step"), GAP_CAUSES.index("restart")
+
+
+def count_alike(held: NDArray[np.float64], new: NDArray[np.float64]) -> tuple[Any, Any]:
+    """Count the samples known in both arrays (axis, ..., sample), and the equal ones."""
+    is_known = np.isfinite(held) & np.isfinite(new)
+    has_values = is_known.any(axis=0)
+    same = (np.isclose(held, new, rtol=1e-6, atol=0.0) | ~is_known).all(axis=0) & has_values
+    return has_values.sum(axis=-1), same.sum(axis=-1)
+
+
+def is_copy(common: int, same: int) -> bool:
+    """Return whether so many equal samples among those in common show a copy."""
+    return common >= 2 and same >= MIN_ALIKE_SHARE * common
 
 
 @dataclass(frozen=True)
@@ -170,11 +186,17 @@ def place_logs(sources: Sequence[Source], *, max_gap: float) -> tuple[list[Place
         pieces.append(piece)
     notes = [
         *_grid_notes(pieces, rate),
-        *first_notes(breaks, "steps of the clock are in the table of gaps"),
-        *first_notes(overlaps, "overlaps"),
+        *_first_notes(breaks, "steps of the clock are in the table of gaps"),
+        *_first_notes(overlaps, "overlaps"),
     ]
     lowest = min(piece.first for piece in pieces)
     return [_shift_samples(piece, -lowest) for piece in pieces], notes
+
+
+def _first_notes(notes: Sequence[str], subject: str) -> list[str]:
+    """Return the first of many notes of one kind, and how many more there are."""
+    more = len(notes) - _MAX_NAMED
+    return [*notes[:_MAX_NAMED], *([f"{more} more {subject}"] if more > 0 else [])]
 
 
 def _shift_samples(piece: PlacedLog, by: int) -> PlacedLog:

@@ -1,11 +1,13 @@
 """MATLAB 5 and 7.3 and HDF5 files: vectors by name, matrix columns as ``name/3`` (from 0).
 
-The rows of a matrix run along its longer side. Fields of a structure are called ``name.field``.
+The rows of a matrix run along its longer side. Fields of a structure are called ``name.field``, as
+are variables of tables and timetables, which the library mat-io reads.
 """
 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -13,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
@@ -23,10 +26,11 @@ from gyrostab.ingest.columns.headers import (
     TIME_PATTERN,
     is_time_unit,
 )
+from gyrostab.ingest.columns.stamps import dates_to_ns
 from gyrostab.ingest.formats.matlab5 import check_structure
-from gyrostab.ingest.formats.matlab_tables import read_matlab_tables
 from gyrostab.ingest.formats.packing import ATTRIBUTES
 from gyrostab.ingest.formats.stored import StoredColumn, StoredTable, plan_stored
+from gyrostab.ingest.formats.tables import library
 from gyrostab.ingest.limits import check_chunk
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.store.hdf5_heaps import check_global_heaps
@@ -69,7 +73,7 @@ def _plan_file(path: Path, options: ReadOptions, stack: ExitStack) -> StoredTabl
         for column in _columns_of(path, name, array, options)
     ]
     if not sized_columns:
-        sized_columns = list(read_matlab_tables(path, objects))
+        sized_columns = list(_read_tables(path, objects))
     if not sized_columns and objects:
         problem = f"it holds {', '.join(dict.fromkeys(objects))}, which MATLAB alone can read"
         raise FormatError(f"{path.name}: {problem}; save plain arrays instead: {_PLAIN_ARRAYS}")
@@ -211,3 +215,41 @@ def _find_hdf_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterat
 
     file.visititems(visit)
     yield from arrays
+
+
+def _read_tables(path: Path, objects: list[str]) -> Iterator[tuple[int, StoredColumn]]:
+    """Yield length and column for all tables and timetables; row times are columns too.
+
+    `objects` describes what the file holds, such as "a table 'log'"; tables are removed from it.
+    """
+    if not any(text.startswith(("a table", "a timetable")) for text in objects):
+        return
+    option = "future.infer_string"  # of all of pandas, and mat-io sets it
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with pd.option_context(option, pd.get_option(option)):
+            matio = library("matio", path, extra="matlab")
+            content = matio.load_from_mat(str(path), add_table_attrs=True)
+    for name, table in content.items():
+        if not isinstance(table, pd.DataFrame):
+            continue
+        objects[:] = [text for text in objects if not text.endswith(f" {name!r}")]
+        units = table.attrs.get("VariableUnits") or table.attrs.get("varUnits") or []
+        if table.index.dtype.kind in "mM":
+            yield from _make_column(f"{name}.{table.index.name or 'Time'}", table.index.to_numpy())
+        for place, variable in enumerate(table.columns):
+            unit = str(units[place]) if place < len(units) else ""
+            yield from _make_column(f"{name}.{variable}", table[variable].to_numpy(), unit)
+
+
+def _make_column(
+    header: str, values: NDArray[Any], unit: str = ""
+) -> Iterator[tuple[int, StoredColumn]]:
+    """Yield length and column of numbers; dates and durations become nanoseconds."""
+    if values.dtype.kind == "M":
+        values, unit = dates_to_ns(values), "nanoseconds since 1970-01-01"
+    elif values.dtype.kind == "m":
+        values, unit = values.astype("timedelta64[ns]").view(np.int64), "ns"
+    if values.dtype.kind in "biuf":
+        attributes = {"units": unit} if unit else {}
+        yield len(values), StoredColumn(header, values.dtype, attributes, LibraryRows(values))

@@ -1,14 +1,24 @@
-"""Recognition of files by their first bytes and suffixes."""
+"""Recognise formats by first bytes and suffixes, and refuse those that are not read."""
 
 from __future__ import annotations
 
+import bz2
+import lzma
 import re
+import zlib
 from pathlib import Path
 
-__all__ = ["begins_like", "read_head"]
+from gyrostab.errors import FormatError
+
+__all__ = ["begins_like", "read_head", "refuse_unread"]
 
 #: Bytes at the beginning of a file that decide its format.
 _HEAD_BYTES = 8192
+
+_R_DATA = (b"RDX2\n", b"RDX3\n", b"RDA2\n", b"RDA3\n", b"X\n\0\0\0")
+_PACKED = (b"PK\x03\x04", b"7z\xbc\xaf\x27\x1c", b"Rar!", b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd")
+_OLD_OFFICE = b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
+_SHEETS = (".xls", ".xlsx", ".xlsm", ".xlsb", ".ods")
 
 
 def read_head(path: Path) -> bytes:
@@ -22,14 +32,7 @@ def read_head(path: Path) -> bytes:
 def begins_like(path: Path, pattern: bytes | re.Pattern[bytes], *suffixes: str) -> bool:
     """Return whether a file begins with a regular expression or has one of the suffixes.
 
-    Parameters
-    ----------
-    path : Path
-        File; a folder never matches.
-    pattern : bytes or re.Pattern
-        Regular expression for the beginning of the file.
-    *suffixes : str
-        Suffixes in lower case, with a dot.
+    Suffixes are in lower case, with a dot. A folder never matches.
 
     Examples
     --------
@@ -43,3 +46,34 @@ def begins_like(path: Path, pattern: bytes | re.Pattern[bytes], *suffixes: str) 
     if not path.is_file():
         return False
     return path.suffix.lower() in suffixes or bool(re.match(pattern, read_head(path)))
+
+
+def refuse_unread(path: Path) -> None:
+    """Raise an error for a file of a format that is recognised but not read."""
+    head = read_head(path)
+    if _decompress(head).startswith(_R_DATA):
+        raise FormatError(
+            f"{path.name}: this is a file of R data, which is not read; save it as CSV in R: "
+            "write.csv(as.data.frame(x), 'log.csv', row.names = FALSE)"
+        )
+    if head.startswith((*_PACKED, _OLD_OFFICE)) and path.suffix.lower() in _SHEETS:
+        raise FormatError(
+            f"{path.name}: spreadsheets are not read; save the sheet with the log as CSV, with all "
+            "decimals of the time"
+        )
+    if head.startswith(_PACKED):
+        raise FormatError(f"{path.name}: this file is packed; unpack it and give the files in it")
+
+
+def _decompress(head: bytes) -> bytes:
+    """Decompress the first bytes, or return them if they are not compressed."""
+    try:
+        if head.startswith(b"\x1f\x8b"):
+            return zlib.decompressobj(wbits=31).decompress(head, 16)
+        if head.startswith(b"BZh"):
+            return bz2.BZ2Decompressor().decompress(head, 16)
+        if head.startswith(b"\xfd7zXZ"):
+            return lzma.LZMADecompressor().decompress(head, 16)
+    except (OSError, EOFError, lzma.LZMAError, zlib.error):
+        return b""
+    return head

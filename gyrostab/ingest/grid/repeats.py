@@ -7,7 +7,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.ingest.columns.stamps import read_stamps
-from gyrostab.ingest.copies import is_copy
+from gyrostab.ingest.concat.place import is_copy
 from gyrostab.ingest.grid.fill import samples_of
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS
