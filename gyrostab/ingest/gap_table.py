@@ -17,18 +17,24 @@ from gyrostab.units import HOUR
 
 __all__ = [
     "CAUSE",
+    "CLOCK_STEP",
     "COLUMNS",
+    "DUPLICATE",
     "END",
     "FIRST",
+    "MISSING",
+    "OUTSIDE_RANGE",
+    "RESTART",
     "ROWS",
     "SAMPLES",
+    "UNREADABLE",
     "clip_table",
     "format_duration",
     "gap_variables",
-    "merge_neighbours",
     "name_lost",
     "read_gap_columns",
     "read_gaps",
+    "sort_gaps",
 ]
 
 #: Largest table; in a longer one, neighbours of one cause are merged into one row.
@@ -38,9 +44,11 @@ _MAX_TABLE_ROWS = 10_000
 #: concerned, cause.
 COLUMNS = FIRST, END, SAMPLES, ROWS, CAUSE = range(5)
 
-_MISSING, _UNREADABLE = GAP_CAUSES.index("missing"), GAP_CAUSES.index("unreadable")
-_RESTART = GAP_CAUSES.index("restart")
-_NEVER_THINNED = (GAP_CAUSES.index("clock_step"), _RESTART)
+#: Causes of gaps, as numbers in the table.
+MISSING, UNREADABLE, DUPLICATE, OUTSIDE_RANGE, CLOCK_STEP, RESTART = map(
+    GAP_CAUSES.index,
+    ("missing", "unreadable", "duplicate", "outside_range", "clock_step", "restart"),
+)
 
 
 def format_duration(seconds: float) -> str:
@@ -62,7 +70,7 @@ def describe_break(place: str, cause: int, before: int, after: int, samples: str
     `samples` names what the log consists of, rows or samples.
     """
     jump = (after - before) / 1e9
-    event = "time restarts" if cause == _RESTART else "the clock steps"
+    event = "time restarts" if cause == RESTART else "the clock steps"
     return (
         f"{event}{place}: from {format_stamp(before)} to {format_stamp(after)}, "
         f"{format_duration(abs(jump))} {'back' if jump < 0 else 'ahead'}; "
@@ -71,15 +79,19 @@ def describe_break(place: str, cause: int, before: int, after: int, samples: str
     )
 
 
-def merge_neighbours(table: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Reduce a table that is too long by merging the nearest neighbours of one cause."""
-    if len(table) <= _MAX_TABLE_ROWS:
-        return table
+def sort_gaps(table: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Sort a table by sample; merge nearest neighbours of one cause in one that is too long."""
+    if len(table) > _MAX_TABLE_ROWS:
+        table = _merge_neighbours(table)
+    return np.asarray(table[np.lexsort((table[:, CAUSE], table[:, FIRST]))])
+
+
+def _merge_neighbours(table: NDArray[np.int64]) -> NDArray[np.int64]:
     parts = []
     for cause in np.unique(table[:, CAUSE]):
         part = table[table[:, CAUSE] == cause]
         room = max(1, int(_MAX_TABLE_ROWS * len(part) / len(table)))
-        if len(part) > room and cause not in _NEVER_THINNED:
+        if len(part) > room and cause not in (CLOCK_STEP, RESTART):
             distance = part[1:, FIRST] - part[:-1, END]
             at = np.concatenate(
                 [[0], np.sort(np.argsort(distance, kind="stable")[len(distance) - room + 1 :]) + 1]
@@ -128,11 +140,11 @@ def name_lost(
         shared = np.minimum(table[:, END], high) - np.maximum(table[:, FIRST], low)
         length = table[:, END] - table[:, FIRST]
         belongs = (
-            (table[:, CAUSE] == _MISSING)
+            (table[:, CAUSE] == MISSING)
             & (shared > 0)
             & (shared >= 0.5 * np.minimum(length, high - low))
         )
-        table[belongs, CAUSE] = _UNREADABLE
+        table[belongs, CAUSE] = UNREADABLE
     return table
 
 

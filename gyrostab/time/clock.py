@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 from datetime import UTC, datetime
+from typing import Any
 
 from gyrostab.errors import OptionError
 
-__all__ = ["time_of_day"]
+__all__ = ["extend_history", "time_of_day"]
 
 
 def time_of_day() -> str:
@@ -40,3 +41,9 @@ def time_of_day() -> str:
             "since 1970; unset it"
         ) from error
     return f"{now:%Y-%m-%dT%H:%M:%SZ}"
+
+
+def extend_history(log: Any, done: str) -> str:
+    """Return the history of a log with one more line: the current time, and what was done."""
+    earlier = str(log.attrs.get("history") or "")
+    return "\n".join(filter(None, [earlier, f"{time_of_day()} {done}"]))

@@ -22,7 +22,7 @@ from gyrostab.ingest.limits import describe_limit, is_absurd_grid
 from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name, texts
 from gyrostab.store.private import close_function
 from gyrostab.store.write import common_packing
-from gyrostab.time.clock import time_of_day
+from gyrostab.time.clock import extend_history
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import grid_times, time_coordinate
 from gyrostab.time.stamps import format_stamp
@@ -239,9 +239,8 @@ def _common_attributes(
         names[0] if len(names) == 1 else source.name
         for names, source in zip(files, sources, strict=True)
     ]
-    now = time_of_day()
     done = (
-        f"{now} gyrostab.read_log: {len(sources)} regular logs on {size} samples at "
+        f"gyrostab.read_log: {len(sources)} regular logs on {size} samples at "
         f"{sources[0].rate:.10g} Hz"
     )
     lost = [name for source in sources for name in texts(source.log, "unreadable_files")]
@@ -250,7 +249,7 @@ def _common_attributes(
         "kind": signal_name(sources[0].log),
         "sampling_rate_hz": sources[0].rate,
         "source_files": list(dict.fromkeys(name for names in files for name in names)),
-        "history": "\n".join(filter(None, [first.get("history"), done])),
+        "history": extend_history(sources[0].log, done),
         "notes": [*merge_notes(zip(labels, notes_of_logs, strict=True)), *notes],
         **({"unreadable_files": lost} if lost else {}),
     }

@@ -11,20 +11,19 @@ from numpy.typing import NDArray
 from gyrostab.ingest.concat.axes import group_axes
 from gyrostab.ingest.concat.grid import PlacedLog
 from gyrostab.ingest.gap_table import (
-    CAUSE,
+    DUPLICATE,
     END,
     FIRST,
+    MISSING,
     clip_table,
-    merge_neighbours,
     read_gaps,
+    sort_gaps,
 )
-from gyrostab.schema import GAP_CAUSES
 
 __all__ = ["merge_gaps"]
 
 Table = NDArray[np.int64]
 
-_MISSING, _DUPLICATE = GAP_CAUSES.index("missing"), GAP_CAUSES.index("duplicate")
 _EMPTY: Table = np.empty((0, 5), dtype=np.int64)
 _MAX_SAMPLE = np.iinfo(np.int64).max // 2
 
@@ -43,7 +42,7 @@ def _rate_slips(piece: PlacedLog) -> Table:
     """Return the samples left empty or dropped where a different rate has drifted by one sample."""
     end, own_end = piece.runs[:-1, 0] + piece.runs[:-1, 2], piece.runs[:-1, 1] + piece.runs[:-1, 2]
     start, own_start = piece.runs[1:, 0], piece.runs[1:, 1]
-    cause = np.where(start > end, _MISSING, _DUPLICATE)
+    cause = np.where(start > end, MISSING, DUPLICATE)
     return np.stack([end, start, start - end, own_start - own_end, cause], axis=1)
 
 
@@ -74,16 +73,11 @@ def merge_gaps(pieces: Sequence[PlacedLog]) -> Table:
         (min(piece.first for piece in group), max(piece.end for piece in group)) for group in groups
     )
     if len(groups) == 1 or any(later[0] >= earlier[1] for earlier, later in pairwise(spans)):
-        table = merge_neighbours(
-            _merge_group(pieces, pieces[0].first, None)
-        )  # shared axes, or other axes at another time
-    else:
-        end = max(end for _, end in spans)
-        tables = [_merge_group(group, spans[0][0], end) for group in groups]
-        table = merge_neighbours(
-            np.unique(np.concatenate(tables), axis=0)
-        )  # a gap of several axes is one line
-    return table[np.lexsort((table[:, CAUSE], table[:, FIRST]))]
+        # shared axes, or other axes at another time
+        return sort_gaps(_merge_group(pieces, pieces[0].first, None))
+    end = max(end for _, end in spans)
+    tables = [_merge_group(group, spans[0][0], end) for group in groups]
+    return sort_gaps(np.unique(np.concatenate(tables), axis=0))  # a gap of several axes is one line
 
 
 def _merge_group(pieces: Sequence[PlacedLog], begin: int, stop_at: int | None) -> Table:
@@ -96,7 +90,7 @@ def _merge_group(pieces: Sequence[PlacedLog], begin: int, stop_at: int | None) -
         new = _own_gaps(piece)
         tables.append(new)
         if piece.first > end:
-            cause = piece.cause if piece.cause >= 0 else _MISSING
+            cause = piece.cause if piece.cause >= 0 else MISSING
             tables[-1] = np.concatenate([[[end, piece.first, piece.first - end, 0, cause]], new])
         stop = min(piece.end, end)
         if piece.first < stop:
@@ -119,5 +113,5 @@ def _merge_group(pieces: Sequence[PlacedLog], begin: int, stop_at: int | None) -
         ends.append(piece.end)
         end = max(end, piece.end)
     if stop_at is not None and stop_at > end:
-        tables.append(np.array([[end, stop_at, stop_at - end, 0, _MISSING]], dtype=np.int64))
+        tables.append(np.array([[end, stop_at, stop_at - end, 0, MISSING]], dtype=np.int64))
     return np.concatenate([*tables, _EMPTY])

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.ingest.concat.grid import LogSlice, PlacedLog, Source, read_log_slices, runs_of
-from gyrostab.ingest.gap_table import describe_break, format_duration
-from gyrostab.schema import GAP_CAUSES
+from gyrostab.ingest.gap_table import CLOCK_STEP, RESTART, describe_break, format_duration
 from gyrostab.time.grid import grid_index, grid_times
 from gyrostab.time.stamps import format_stamp
 from gyrostab.wording import list_some
@@ -42,7 +41,6 @@ _MIN_COMMON_SAMPLES = 32  # common samples needed to find a displacement
 _BATCH_LOGS = 50  # logs whose overlaps are read at once
 _MAX_NAMED = 5  # events of one kind that are listed one by one
 _Cache = dict[LogSlice, NDArray[np.float64]]
-_STEP, _RESTART = GAP_CAUSES.index("clock_step"), GAP_CAUSES.index("restart")
 
 
 def count_alike(held: NDArray[np.float64], new: NDArray[np.float64]) -> tuple[Any, Any]:
@@ -243,7 +241,7 @@ def _place_next(
         first - end > max_gap * rate,
     )
     if back or ahead:
-        cause = _RESTART if back and _begins_again(pieces, source) else _STEP
+        cause = RESTART if back and _begins_again(pieces, source) else CLOCK_STEP
         return PlacedLog(
             source, runs_of(end + 1, 0.0, source.size, ratio), 0.0, (source.start, end + 1), cause
         ), None

@@ -8,7 +8,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import SchemaError
-from gyrostab.ingest.gap_table import CAUSE, FIRST, merge_neighbours
+from gyrostab.ingest.gap_table import MISSING, OUTSIDE_RANGE, UNREADABLE, sort_gaps
 from gyrostab.ingest.grid.fill import samples_of
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.scan_pass import ScanPass
@@ -16,10 +16,6 @@ from gyrostab.kernels.grid.stamps import DUPLICATE, OUT_OF_ORDER, RESTART, STEP
 from gyrostab.schema import GAP_CAUSES
 
 __all__ = ["find_gaps", "gap_table"]
-
-_MISSING, _UNREADABLE, _OUTSIDE = (
-    GAP_CAUSES.index(name) for name in ("missing", "unreadable", "outside_range")
-)
 
 
 def _missing_samples(placement: Placement, scanned: ScanPass) -> NDArray[np.int64]:
@@ -39,7 +35,7 @@ def _missing_samples(placement: Placement, scanned: ScanPass) -> NDArray[np.int6
     broken = events[np.isin(events[:, 0], (STEP, RESTART))]
     at = np.searchsorted(broken[:, 1], end)
     at_break = np.zeros(len(end), dtype=bool)
-    cause = np.where(skipped > 0, _UNREADABLE, _MISSING)
+    cause = np.where(skipped > 0, UNREADABLE, MISSING)
     if len(broken):
         at = np.minimum(at, len(broken) - 1)
         at_break = broken[at, 1] == end
@@ -78,13 +74,12 @@ def find_gaps(placement: Placement, scanned: ScanPass) -> NDArray[np.int64]:
     table = np.concatenate(
         [
             _missing_samples(placement, scanned),
-            _unusable_cells(scanned.unreadable, _UNREADABLE, placement),
-            _unusable_cells(scanned.infinite, _OUTSIDE, placement),
+            _unusable_cells(scanned.unreadable, UNREADABLE, placement),
+            _unusable_cells(scanned.infinite, OUTSIDE_RANGE, placement),
             _dropped_rows(placement.events),
         ]
     )
-    table = merge_neighbours(table)
-    return table[np.lexsort((table[:, CAUSE], table[:, FIRST]))]
+    return sort_gaps(table)
 
 
 def gap_table(log: xr.Dataset) -> pd.DataFrame:

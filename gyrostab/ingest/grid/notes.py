@@ -6,14 +6,14 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.ingest.gap_table import describe_break, format_duration
+from gyrostab.ingest.gap_table import CLOCK_STEP, MISSING, RESTART, describe_break, format_duration
 from gyrostab.ingest.grid.fill import samples_of
 from gyrostab.ingest.grid.jitter import MIN_SIGMA
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.rate import RateEstimate
 from gyrostab.ingest.grid.scan_pass import ScanPass, file_of, record_name
-from gyrostab.kernels.grid.stamps import DUPLICATE, OUT_OF_ORDER, RESTART
-from gyrostab.schema import GAP_CAUSES, log_channels
+from gyrostab.kernels.grid.stamps import DUPLICATE, OUT_OF_ORDER
+from gyrostab.schema import log_channels
 from gyrostab.time.grid import grid_times
 from gyrostab.time.stamps import format_stamp, to_nanoseconds
 
@@ -144,9 +144,7 @@ def describe_rate(
 
 def _describe_breaks(raw: xr.Dataset, placement: Placement) -> list[str]:
     notes = []
-    events = placement.events[
-        placement.events[:, 0] >= min(GAP_CAUSES.index("clock_step"), RESTART)
-    ]
+    events = placement.events[placement.events[:, 0] >= min(CLOCK_STEP, RESTART)]
     for cause, _sample, row, before, after in events[:_MAX_NAMED].tolist():
         file, local = file_of(raw, row)
         notes.append(f"{file}: {describe_break(f' at row {local}', cause, before, after, 'rows')}")
@@ -161,7 +159,7 @@ def _describe_breaks(raw: xr.Dataset, placement: Placement) -> list[str]:
 def _describe_missing(
     raw: xr.Dataset, placement: Placement, table: NDArray[np.int64], rate: float
 ) -> list[str]:
-    holes = table[(table[:, 4] == GAP_CAUSES.index("missing")) & (table[:, 2] > 0)]
+    holes = table[(table[:, 4] == MISSING) & (table[:, 2] > 0)]
     if len(holes) == 0:
         return []
     notes = []

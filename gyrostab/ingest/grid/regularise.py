@@ -50,7 +50,7 @@ from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import SIGNAL_UNITS, check_raw, signal_name, texts
 from gyrostab.store.lazy import find_source, read_slice
 from gyrostab.store.write import chunk_samples
-from gyrostab.time.clock import time_of_day
+from gyrostab.time.clock import extend_history
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import check_rate, check_span, period_ns, stamp_ns, time_coordinate
 from gyrostab.units import HOUR
@@ -297,18 +297,13 @@ def _log_attributes(
     raw: xr.Dataset, kind: str, rate: float, done: str, notes: list[str]
 ) -> dict[str, Any]:
     attributes = {key: value for key, value in raw.attrs.items() if key not in _OWN_ATTRIBUTES}
-    now = time_of_day()
-    history = "\n".join(
-        filter(None, [raw.attrs.get("history"), f"{now} gyrostab.regularise: {done}"])
-    )
-    all_notes = [*texts(raw, "notes"), *notes]
     return {
         "source_files": [],
         **attributes,
         "kind": kind,
         "sampling_rate_hz": rate,
-        "history": history,
-        "notes": all_notes,
+        "history": extend_history(raw, f"gyrostab.regularise: {done}"),
+        "notes": [*texts(raw, "notes"), *notes],
     }
 
 

@@ -11,19 +11,19 @@ from numpy.typing import NDArray
 from gyrostab.errors import SchemaError, TimeError
 from gyrostab.ingest.concat.lazy import chunk_of, place_on_grid
 from gyrostab.ingest.gap_table import (
-    CAUSE,
     END,
     FIRST,
+    MISSING,
     ROWS,
     SAMPLES,
     clip_table,
     gap_variables,
-    merge_neighbours,
     read_gap_columns,
     read_gaps,
+    sort_gaps,
 )
 from gyrostab.ingest.uniform.grid import UniformGrid, find_grid
-from gyrostab.schema import GAP_CAUSES, check_log, signal_name, texts
+from gyrostab.schema import check_log, signal_name, texts
 from gyrostab.store.private import close_function
 from gyrostab.time.grid import TimeGridIndex, grid_index, time_coordinate
 from gyrostab.time.stamps import to_nanoseconds
@@ -240,8 +240,6 @@ def _place_array(array: Any, runs: Runs, size: int) -> Any:
 
 Table = NDArray[np.int64]
 
-_MISSING = GAP_CAUSES.index("missing")
-
 
 def has_gap_table(log: xr.Dataset) -> bool:
     """Return whether a log has variables by gap."""
@@ -293,9 +291,9 @@ def add_holes(table: Table, runs: Table) -> Table:
         within = np.zeros_like(first)
     samples = end - first - np.maximum(within, 0)
     new = (end > first) & (samples > 0)
-    cause = np.full(int(new.sum()), _MISSING)
+    cause = np.full(int(new.sum()), MISSING)
     holes = np.stack([first[new], end[new], samples[new], np.zeros_like(cause), cause], axis=1)
-    return _sort_table(np.concatenate([table, holes]))
+    return sort_gaps(np.concatenate([table, holes]))
 
 
 def merge_lines(table: Table) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -316,12 +314,7 @@ def add_spans(table: Table, spans: Table, cause: int) -> Table:
         np.array([[first, end, end - first, 0, cause]], dtype=np.int64)
         for first, end in spans.tolist()
     ]
-    return _sort_table(np.concatenate([table, *rows]))
-
-
-def _sort_table(table: Table) -> Table:
-    table = merge_neighbours(table)
-    return np.asarray(table[np.lexsort((table[:, CAUSE], table[:, FIRST]))])
+    return sort_gaps(np.concatenate([table, *rows]))
 
 
 def with_table(log: xr.Dataset, table: Table | None, start: int, rate: float) -> xr.Dataset:

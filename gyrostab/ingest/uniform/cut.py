@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.ingest.gap_table import clip_table, read_gaps
+from gyrostab.ingest.gap_table import OUTSIDE_RANGE, clip_table, read_gaps
 from gyrostab.ingest.uniform.core import (
     add_spans,
     grid_of,
@@ -23,15 +23,14 @@ from gyrostab.ingest.uniform.core import (
     with_table,
 )
 from gyrostab.ingest.uniform.grid import UniformGrid
-from gyrostab.schema import GAP_CAUSES, check_log
-from gyrostab.time.clock import time_of_day
+from gyrostab.schema import check_log
+from gyrostab.time.clock import extend_history
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import grid_index, grid_times, stamp_ns
 from gyrostab.time.stamps import to_nanoseconds
 
 __all__ = ["cut_log", "parse_instant"]
 
-_EXCLUDED = GAP_CAUSES.index("outside_range")
 _EXAMPLE = "2026-11-20T14:00 (UTC) or 10min after the start"
 _SPAN_EXAMPLE = "2026-11-20T14:00/2026-11-20T14:05 or 10min/15min after the start"
 
@@ -147,7 +146,7 @@ def cut_log(
     part = _cut_channels(part, grid, low, high, excluded)
     if has_gap_table(log) or len(excluded):
         part = with_table(part, _cut_table(log, grid, low, high, excluded), start, grid.rate)
-    return part.assign_attrs(history=_extend_history(log, time_from, time_to, spans, size))
+    return part.assign_attrs(history=_describe_cut(log, time_from, time_to, spans, size))
 
 
 def _is_pair(value: Any) -> bool:
@@ -265,12 +264,12 @@ def _cut_table(
     for first, end in zip(edges[::2], edges[1::2], strict=True):
         if table is not None and end > first:
             pieces.append(clip_table(table, first, end))
-    cut = add_spans(np.concatenate(pieces), excluded, _EXCLUDED)
+    cut = add_spans(np.concatenate(pieces), excluded, OUTSIDE_RANGE)
     cut[:, :2] -= low
     return cut
 
 
-def _extend_history(
+def _describe_cut(
     log: xr.Dataset, time_from: Any, time_to: Any, spans: Sequence[Span], size: int
 ) -> str:
     options = [
@@ -281,5 +280,4 @@ def _extend_history(
     options += [
         f"without {span if isinstance(span, str) else '/'.join(map(str, span))}" for span in spans
     ]
-    done = f"{time_of_day()} gyrostab.cut_log: {', '.join(options)}: {size} samples"
-    return "\n".join(filter(None, [str(log.attrs.get("history", "")), done]))
+    return extend_history(log, f"gyrostab.cut_log: {', '.join(options)}: {size} samples")
