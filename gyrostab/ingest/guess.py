@@ -34,8 +34,6 @@ __all__ = ["Guess", "guess_columns"]
 
 #: Number of a column, in its name.
 _NUMBER = re.compile(r"[0-9]{1,9}\Z")
-
-
 #: Typical rate of gyro logs [Hz], and spread [decades].
 TYPICAL_RATE_HZ, RATE_DECADES = 100.0, 1.0
 
@@ -67,12 +65,8 @@ _COUNTER_WORD = re.compile(
     r"count|packet|seq|index|sample|(^|[^a-z])(n|no|nr|id|row|frame)($|[^a-z])"
 )
 
-_EPOCHS = {
-    "s": 1e9,
-    "ms": 1e12,
-    "us": 1e15,
-    "ns": 1e18,
-}  # Unix time between 2001 and 2033 is 1 to 2 of these
+#: Unix time between 2001 and 2033 is 1 to 2 of these.
+_EPOCHS = {"s": 1e9, "ms": 1e12, "us": 1e15, "ns": 1e18}
 
 _TIME_UNIT_PATTERNS = (
     (r"nanos|(^|[^a-z])ns$|_ns|nsec", "ns"),
@@ -273,16 +267,13 @@ def _guess_axes(
 
 def _may_be_gyro(column: ColumnInspection) -> bool:
     """Return whether the unit of a column, in header or name, allows a gyro."""
-    if column.unit is not None and is_unit_of(column.unit, ("rate", "angle", "number")):
+    if is_unit_of(column.unit, ("rate", "angle", "number")):
         return True
-    if column.unit is not None and any(
-        is_unit_of(column.unit, (kind,))
-        for kind in ("acceleration", "temperature", "magnetic", "pressure")
-    ):
+    others = ("acceleration", "temperature", "magnetic", "pressure")
+    if is_unit_of(column.unit, others):
         return False
-    kinds = ("acceleration", "temperature", "magnetic", "pressure", "voltage")
     return name_unit(column, "rate") is not None or not any(
-        name_unit(column, kind) for kind in kinds
+        name_unit(column, kind) for kind in (*others, "voltage")
     )
 
 
@@ -299,15 +290,9 @@ def _group_columns(
         letters = set(by_label)
         for trio in ("xyz", "XYZ", "pqr", "ENZ"):
             if len(letters & set(trio)) >= 2 and (trio != "pqr" or template == "*"):
-                axes = trio.lower() if trio in ("ENZ",) else "xyz"
-                yield (
-                    template,
-                    {
-                        axis: by_label[letter]
-                        for letter, axis in zip(trio, axes, strict=True)
-                        if letter in by_label
-                    },
-                )
+                axes = "enz" if trio == "ENZ" else "xyz"
+                labelled = zip(trio, axes, strict=True)
+                yield template, {axis: by_label[x] for x, axis in labelled if x in by_label}
         numbered = [(int(text), column) for text, column in by_label.items() if _NUMBER.match(text)]
         digits = sorted(
             ((number, column) for number, column in numbered if column.rising < 0.9),
@@ -321,10 +306,8 @@ def _group_columns(
         if not column.key.isdigit():
             letter = re.search(r"[xyzXYZ](?![a-zA-Z])", column.key)
             place = letter.start() if letter else len(column.key)
-            yield (
-                f"{column.key[:place]}*{column.key[place + 1 :]}",
-                {letter[0].lower() if letter else "x": column},
-            )
+            template = f"{column.key[:place]}*{column.key[place + 1 :]}"
+            yield template, {letter[0].lower() if letter else "x": column}
 
 
 def _gyro_score(
@@ -337,18 +320,11 @@ def _gyro_score(
         score = 4.0
     else:
         score = 2.5 * any(name_unit(column, "rate") for column in group)
-        score += (
-            1.0
-            * any(name_unit(column, "angle") is not None for column in group)
-            * bool(_STRONG.search(low))
-        )
-    score += (
-        3.0
-        if _STRONG.search(low)
-        else 2.0
-        if _LETTER.search(low) or re.search(r"(^|\.)[A-Z]J(\*|\w)", template)
-        else 0.0
-    )
+        score += bool(_STRONG.search(low)) and any(name_unit(c, "angle") for c in group)
+    if _STRONG.search(low):
+        score += 3.0
+    elif _LETTER.search(low) or re.search(r"(^|\.)[A-Z]J(\*|\w)", template):
+        score += 2.0
     score -= 4.0 if _OTHER.search(low) and not _STRONG.search(low) else 0.0
     score -= 1.0 if _DERIVED.search(low) else 0.0
     score += 0.5 * (len(group) - 1)
@@ -391,10 +367,9 @@ def _mean_over_scatter(group: Sequence[ColumnInspection]) -> float:
 
 
 def _is_temperature(column: ColumnInspection) -> bool:
-    has_unit = column.unit is not None and is_unit_of(column.unit, ("temperature",))
     return (
         bool(TEMPERATURE_PATTERN.search(column.key.lower()))
         and column.role != "channel"  # that has its name already
         and column.std > 0
-        and (has_unit or name_unit(column, "temperature") is not None)
+        and (given_unit(column, "temperature") or name_unit(column, "temperature") is not None)
     )

@@ -41,7 +41,7 @@ TYPICAL_ARW, ARW_DECADES = 0.3, 1.0
 
 def given_unit(column: ColumnInspection, quantity: str = "rate") -> bool:
     """Return whether the header gives a unit of rates, or of another quantity."""
-    return column.unit is not None and is_unit_of(column.unit, (quantity,))
+    return is_unit_of(column.unit, (quantity,))
 
 
 def name_unit(column: ColumnInspection, quantity: str) -> str | None:
@@ -53,13 +53,7 @@ def name_unit(column: ColumnInspection, quantity: str) -> str | None:
         last = tokens[-count:]
         for text in (" ".join(last), "/".join(last)):
             if len(text) > 1 or text in ("C", "K", "F", "g", "V", "T", "G"):
-                text = (
-                    text.replace("degs", "deg/s")
-                    if text == "degs"
-                    else "rad/s"
-                    if text == "rads"
-                    else text
-                )
+                text = {"degs": "deg/s", "rads": "rad/s"}.get(text, text)
                 if is_unit_of(text, (quantity,)) and text not in ("1", "-"):
                     return parse_unit(text, quantity).text.replace(" per ", "/")
     return None
@@ -67,7 +61,7 @@ def name_unit(column: ColumnInspection, quantity: str) -> str | None:
 
 def temperature_unit(column: ColumnInspection) -> str:
     """Return the unit of a temperature column, from its header or its name."""
-    has_unit = column.unit is not None and is_unit_of(column.unit, ("temperature",))
+    has_unit = given_unit(column, "temperature")
     return str(column.unit if has_unit else name_unit(column, "temperature") or "degC")
 
 

@@ -132,9 +132,9 @@ def is_unit(text: str) -> bool:
     return False
 
 
-def is_unit_of(text: str, quantities: Collection[str]) -> bool:
+def is_unit_of(text: str | None, quantities: Collection[str]) -> bool:
     """Return whether a text is a unit of one of these quantities."""
-    for quantity in quantities:
+    for quantity in quantities if text is not None else ():
         try:
             if parse_unit(text, quantity).quantity == quantity:
                 return True

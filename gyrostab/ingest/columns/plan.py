@@ -134,15 +134,10 @@ def plan_columns(
             f"taken for axes: {list_some(preset_axes, MAX_HEADERS)}; --map overrules it"
         )
     if time is None and options.rate is None and rate is None and not draft.problems:
-        message = (
-            f"{path.name}: there is no time column; give the sampling rate with --rate HZ "
-            "(and --start)"
-        )
-        draft.problems.append(
-            OptionError(
-                f"{message}, or name the column: --map NAME=time. Columns: "
-                f"{list_some(headers, MAX_HEADERS)}"
-            )
+        draft.refuse(
+            OptionError,
+            "there is no time column; give the sampling rate with --rate HZ (and --start), or "
+            f"name the column: --map NAME=time. Columns: {list_some(headers, MAX_HEADERS)}",
         )
     draft.add_notes(headers)
     unused = [f"--unit {key}" for key in options.unit if key not in draft.used_units]

@@ -106,6 +106,10 @@ class PlanDraft:
         )
         return written
 
+    def refuse(self, error: type[GyrostabError], problem: str) -> None:
+        """Add a problem, which prevents reading; the name of the file is put in front."""
+        self.problems.append(error(f"{self.path.name}: {problem}"))
+
     def leave_out(self, column: Header) -> None:
         """Add the summary of a column that is left out."""
         self.add_summary(column, column.name, "left out", None, column.unit or column.stored)
@@ -208,11 +212,7 @@ def resolve_duplicates(draft: PlanDraft, named: list[Header]) -> list[Header]:
         if len(asked) > 1 or (AXIS_PATTERN.match(name) and not asked):
             headers = ", ".join(repr(column.header) for column in same[:5])
             fix = f'drop the others, for instance --map "{(asked or same)[1].key}=-"'
-            draft.problems.append(
-                FormatError(
-                    f"{draft.path.name}: {len(same)} columns are called {name!r} ({headers}); {fix}"
-                )
-            )
+            draft.refuse(FormatError, f"{len(same)} columns are called {name!r} ({headers}); {fix}")
         elif AXIS_PATTERN.match(name):
             unmapped = [column for column in same if not column.mapped]
             dropped.update(column.source for column in unmapped)

@@ -84,31 +84,12 @@ def find_time(draft: PlanDraft, named: list[Header]) -> Header | None:
         named[:] = [c for c in named if id(c) not in dropped]
     unit = None if column.stamped else _time_unit(draft, column)
     order = _date_order(draft, column) if column.stamped else YEAR_FIRST
-    draft.columns.append(
-        Column(
-            column.source,
-            column.header,
-            "time",
-            "time",
-            "time",
-            "ns",
-            time_unit=unit,
-            date_order=order,
-        )
-    )
-    draft.add_summary(
-        column,
-        "time",
-        "time",
-        "time",
-        unit.text
-        if unit
-        else None
-        if not column.stamped
-        else "ISO 8601"
-        if order == YEAR_FIRST
-        else order,
-    )
+    planned = column.source, column.header, "time", "time", "time", "ns"
+    draft.columns.append(Column(*planned, time_unit=unit, date_order=order))
+    written = unit.text if unit else None
+    if column.stamped:
+        written = "ISO 8601" if order == YEAR_FIRST else order
+    draft.add_summary(column, "time", "time", "time", written)
     if (
         unit is not None
         and unit.epoch is None
@@ -154,20 +135,16 @@ def _date_order(draft: PlanDraft, column: Header) -> str:
             return order
     order = parse_order(column.unit or column.stored or "") or column.date_order
     if order == NO_DATE:
-        draft.problems.append(
-            UnitError(
-                f"{draft.path.name}: the time column {column.header!r} holds times of day "
-                "without a date; write the date before the time, in this column or in one to its "
-                "left"
-            )
+        draft.refuse(
+            UnitError,
+            f"the time column {column.header!r} holds times of day without a date; write the date "
+            "before the time, in this column or in one to its left",
         )
     if order is None:
-        draft.problems.append(
-            UnitError(
-                f"{draft.path.name}: the dates in the time column {column.header!r} can be read in "
-                f"two ways; say which number is the day: --unit time={DAY_FIRST} or --unit "
-                f"time={MONTH_FIRST}"
-            )
+        draft.refuse(
+            UnitError,
+            f"the dates in the time column {column.header!r} can be read in two ways; say which "
+            f"number is the day: --unit time={DAY_FIRST} or --unit time={MONTH_FIRST}",
         )
     return order or YEAR_FIRST
 
@@ -181,25 +158,19 @@ def _time_unit(draft: PlanDraft, column: Header) -> TimeUnit | None:
     keys = [column.name, column.key, column.header, "time"]
     text = draft.find_unit(column, keys, written, is_time_unit, prefer_given=column.unit is None)
     if text is None:
-        message = (
-            f"{draft.path.name}: the time column {column.header!r} carries no unit, and holds no "
-            "dates in a form that is known (2026-05-01T08:00:00, 01.05.2026 8:00:00)"
-        )
-        draft.problems.append(
-            MissingUnitError(
-                f"{message}; give the unit of numbers with --unit time=s (or ms, us, ns)"
-            )
+        draft.refuse(
+            MissingUnitError,
+            f"the time column {column.header!r} carries no unit, and holds no dates in a form "
+            "that is known (2026-05-01T08:00:00, 01.05.2026 8:00:00); give the unit of numbers "
+            "with --unit time=s (or ms, us, ns)",
         )
         return None
     try:
         return parse_time_unit(text, column.calendar if text == column.stored else None)
     except GyrostabError as error:
         advice = '"time=seconds since 2026-01-02T00:00:00"' if names_epoch(text) else "time=s"
-        draft.problems.append(
-            UnitError(
-                f"{draft.path.name}: column {column.header!r}: {error}; or give it with --unit "
-                f"{advice}"
-            )
+        draft.refuse(
+            UnitError, f"column {column.header!r}: {error}; or give it with --unit {advice}"
         )
         return None
 
@@ -215,7 +186,7 @@ def plan_gyro(
         return None, None
     if not gyro:
         if not draft.problems:
-            draft.problems.append(_no_gyro(draft.path, headers))
+            draft.refuse(FormatError, _describe_lack(draft.path, headers))
         return None, None
     quantities: dict[str, str] = {}
     for column in gyro:
@@ -224,9 +195,10 @@ def plan_gyro(
             quantities[column.header] = quantity
     if len(set(quantities.values())) > 1:
         listed = ", ".join(f"{header!r} ({quantity})" for header, quantity in quantities.items())
-        message = f"{draft.path.name}: the gyro axes are partly rates, partly angles: {listed}"
-        draft.problems.append(
-            UnitError(f"{message}; keep one kind and drop the others with --map NAME=-")
+        draft.refuse(
+            UnitError,
+            f"the gyro axes are partly rates, partly angles: {listed}; keep one kind and drop the "
+            "others with --map NAME=-",
         )
     if not quantities:
         return None, None
@@ -240,41 +212,43 @@ def _plan_axis(draft: PlanDraft, column: Header) -> str | None:
     assert match is not None
     stem, axis = match.groups()
     example, allowed = ("deg/s", ("rate", "angle")) if stem == "gyro" else ("deg", ("angle",))
-    where = f"{draft.path.name}: column {column.header!r}"
     keys = [column.low, column.key, column.header, stem]
     text = draft.find_unit(column, keys, column.unit, lambda written: is_unit_of(written, allowed))
 
-    def refuse(error: UnitError | MissingUnitError, quantity: str | None = None) -> None:
-        draft.problems.append(error)
+    def refuse(error: type[UnitError], problem: str, quantity: str | None = None) -> None:
+        draft.refuse(error, problem)
         draft.add_summary(column, column.low, "gyro", quantity, text)
 
     if text is None:
-        advice = f"give it with --unit {stem}={example} (all axes) or --unit {column.low}={example}"
-        message = f"{draft.path.name}: the gyro column {column.header!r} carries no unit; {advice}"
-        refuse(MissingUnitError(f"{message}, or write it in the header: {column.low} [{example}]"))
+        refuse(
+            MissingUnitError,
+            f"the gyro column {column.header!r} carries no unit; give it with --unit "
+            f"{stem}={example} (all axes) or --unit {column.low}={example}, or write it in the "
+            f"header: {column.low} [{example}]",
+        )
         return None
     quantity = next((quantity for quantity in allowed if is_unit_of(text, (quantity,))), None)
     try:
         unit = parse_unit(text, quantity)
     except UnitError as error:
         if "factor" in str(error):
-            draft.problems.append(UnitError(f"{where}: {error}"))
+            draft.refuse(UnitError, f"column {column.header!r}: {error}")
             return None
-        hint = (
-            f"known are {known_units('rate')}; give it with --unit {stem}={example}, or with "
-            f'a factor --unit "{stem}=0.1 arcsec/s"'
+        refuse(
+            UnitError,
+            f"column {column.header!r}: unit {text!r} is not known; known are "
+            f"{known_units('rate')}; give it with --unit {stem}={example}, or with a factor "
+            f'--unit "{stem}=0.1 arcsec/s"',
         )
-        refuse(UnitError(f"{where}: unit {text!r} is not known; {hint}"))
         return None
     if unit.quantity not in allowed:
-        kinds = f"a unit of {unit.quantity}, not of {allowed[0]}"
-        advice = (
-            f"{allowed[0]} units are {known_units(allowed[0])}; give the right one with --unit "
-            f"{stem}={example}, or with a factor for counts: --unit "
-            f'"{stem}=0.1 {"arcsec/s" if stem == "gyro" else "arcsec"}"'
-        )
         refuse(
-            UnitError(f"{where} has the unit {text!r}, which is {kinds}; {advice}"), unit.quantity
+            UnitError,
+            f"column {column.header!r} has the unit {text!r}, which is a unit of {unit.quantity}, "
+            f"not of {allowed[0]}; {allowed[0]} units are {known_units(allowed[0])}; give the "
+            f"right one with --unit {stem}={example}, or with a factor for counts: --unit "
+            f'"{stem}=0.1 {"arcsec/s" if stem == "gyro" else "arcsec"}"',
+            unit.quantity,
         )
         return None
     inner = INNER[unit.quantity]
@@ -287,23 +261,24 @@ def _plan_axis(draft: PlanDraft, column: Header) -> str | None:
 def _find_kind(draft: PlanDraft, signal: str, header: str, key: str, name: str) -> str | None:
     if signal == "rate":
         if draft.options.kind == "angle":
-            message = f"{draft.path.name}: --kind angle, but column {header!r} is a rate"
-            fix = f'leave --kind out, or correct the unit with --map "{key}={name} [deg]"'
-            draft.problems.append(OptionError(f"{message}; {fix}"))
+            draft.refuse(
+                OptionError,
+                f"--kind angle, but column {header!r} is a rate; leave --kind out, or correct the "
+                f'unit with --map "{key}={name} [deg]"',
+            )
         return "rate"
     if draft.options.kind is None:
-        message = f"{draft.path.name}: column {header!r} is an angle of unknown kind"
-        advice = (
-            "--kind angle if it is the cumulative angle, --kind rate if each row is the "
-            "increment since the row before"
+        draft.refuse(
+            OptionError,
+            f"column {header!r} is an angle of unknown kind; give --kind angle if it is the "
+            "cumulative angle, --kind rate if each row is the increment since the row before",
         )
-        draft.problems.append(OptionError(f"{message}; give {advice}"))
     if draft.options.kind == "angle" and name.startswith("gyro") and INCREMENT_PATTERN.search(key):
-        message = f"{draft.path.name}: --kind angle, but column {header!r} is named as an increment"
-        axis = name.removeprefix("gyro_")
-        advice = f'if it is the cumulative angle, name it so with --map "{key}=angle_{axis}"'
-        draft.problems.append(
-            OptionError(f"{message}; give --kind rate if each row is an increment, or {advice}")
+        draft.refuse(
+            OptionError,
+            f"--kind angle, but column {header!r} is named as an increment; give --kind rate if "
+            "each row is an increment, or if it is the cumulative angle, name it so with "
+            f'--map "{key}=angle_{name.removeprefix("gyro_")}"',
         )
     return "angle" if draft.options.kind == "angle" else "increment"
 
@@ -333,12 +308,10 @@ def plan_channels(draft: PlanDraft, rest: list[Header]) -> None:
             or (is_known and draft.options.channels_only)
         )
         if text is None and asked:
-            message = (
-                f"{draft.path.name}: column {column.header!r} carries no unit; give it "
-                f"with --unit {name}={example_unit(likely)}"
-            )
-            draft.problems.append(
-                MissingUnitError(f'{message}, or drop the column with --map "{column.key}=-"')
+            draft.refuse(
+                MissingUnitError,
+                f"column {column.header!r} carries no unit; give it with --unit "
+                f'{name}={example_unit(likely)}, or drop the column with --map "{column.key}=-"',
             )
         if (
             text is not None
@@ -407,7 +380,7 @@ def _plan_channel(
                 draft.leave_out(column)
                 return
             fix = f'{advice}, or drop the column with --map "{column.key}=-"'
-            draft.problems.append(UnitError(f"{draft.path.name}: {message}; {fix}"))
+            draft.refuse(UnitError, f"{message}; {fix}")
         else:
             quantity = None
     draft.kept_channels += 1
@@ -416,7 +389,8 @@ def _plan_channel(
     draft.add_summary(column, name, "channel", quantity or "other", text)
 
 
-def _no_gyro(path: Path, headers: Sequence[str]) -> FormatError:
+def _describe_lack(path: Path, headers: Sequence[str]) -> str:
+    """Say that no column is a gyro axis, and how to name the likely ones."""
     columns = [column for column in distinct_columns(headers) if column.header]
     free = [c for c in columns if not TIME_PATTERN.match(c.low) and quantity_of(c.low) is None]
     candidates = (c for pattern in GYRO_PATTERNS for c in free if pattern.search(c.name))
@@ -430,15 +404,11 @@ def _no_gyro(path: Path, headers: Sequence[str]) -> FormatError:
         options = ""
     elif likely and likely.unit and is_unit_of(likely.unit, ("angle",)):
         options = f" --kind {'rate' if INCREMENT_PATTERN.search(likely.name) else 'angle'}"
-    message = (
-        f"{path.name}: no gyro column (gyro_x, gyro_y, gyro_z or angle_x ...). Columns: "
-        f"{list_some([c.name for c in columns], 100)}"
+    return (
+        "no gyro column (gyro_x, gyro_y, gyro_z or angle_x ...). Columns: "
+        f"{list_some([c.name for c in columns], 100)}. Say which they are, for instance: --map "
+        f'"{likely.key if likely else "NAME"}=gyro_x"{options}{scan_advice(path)}'
     )
-    advice = (
-        "Say which they are, for instance: --map "
-        f'"{likely.key if likely else "NAME"}=gyro_x"{options}'
-    )
-    return FormatError(f"{message}. {advice}{scan_advice(path)}")
 
 
 def scan_advice(path: Path) -> str:
