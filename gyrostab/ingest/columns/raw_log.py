@@ -72,6 +72,26 @@ class ConvertedBlock(NamedTuple):
 _NO_ROWS = np.empty(0, np.int64)
 
 
+class _Places:
+    """Number of bad places, and the names of the first ones."""
+
+    def __init__(self) -> None:
+        self.total, self.names = 0, list[str]()
+
+    def add(self, rows: NDArray[np.int64], locate: Locate) -> None:
+        self.total += len(rows)
+        if room := MAX_NAMED_PLACES - len(self.names):
+            self.names += locate(rows[:room].tolist())
+
+    def describe(self) -> str:
+        """Join the names: ``lines 7, 8, 9 and others``."""
+        kind, names = self.names[0].split(" ")[0], self.names
+        numbers = ", ".join(name.removeprefix(f"{kind} ") for name in names)
+        return (
+            f"{kind}{'s' * (len(names) > 1)} {numbers}{' and others' * (self.total > len(names))}"
+        )
+
+
 class RawLogBuilder:
     """Collect the blocks of one file and build its raw log."""
 
@@ -88,9 +108,8 @@ class RawLogBuilder:
         self.grids: dict[int, tuple[float, float] | None] = {
             column.source: (1.0, 1.0) for column in [*self.gyro, *self.channels]
         }  # step and divisor to try when packing; None: not packed
-        self.bad_rows = self.bad_cells = self.cells = self.cell_rows = 0
-        self.bad_places: list[str] = []
-        self.cell_places: list[str] = []
+        self.bad_cells = self.cells = 0
+        self.bad_rows, self.cell_rows = _Places(), _Places()
         self.bad_index: list[NDArray[np.int64]] = []
         self.low, self.high = np.iinfo(np.int64).max, NAT
         unit = None if self.time is None else self.time.time_unit
@@ -171,9 +190,11 @@ class RawLogBuilder:
             if span is not None and missing < converted.rows:
                 self.whole[source] = (min(span[0], low), max(span[1], high)) if is_whole else None
         if converted.bad_rows.size:
-            self._note_rows(converted.bad_rows, locate)
+            self.bad_rows.add(converted.bad_rows, locate)
+            self.bad_index.append(converted.bad_rows + first)
         if converted.cell_rows.size:
-            self._note_cells(converted.cell_rows, converted.cells, locate)
+            self.cell_rows.add(converted.cell_rows, locate)
+            self.cells += converted.cells
         self.low, self.high = min(self.low, converted.low), max(self.high, converted.high)
         self.inspections += [converted.inspection] if converted.inspection is not None else []
         self.buffers.add(converted.block)
@@ -231,22 +252,6 @@ class RawLogBuilder:
         dtype = next((kind for kind in ("int16", "int32") if reach < np.iinfo(kind).max), None)
         return {"dtype": np.dtype(dtype), "scale_factor": factors.pop()} if dtype else {}
 
-    def _note_rows(self, rows: NDArray[np.int64], locate: Locate) -> None:
-        self.bad_rows += len(rows)
-        self.bad_index.append(rows + self.buffers.rows)
-        if len(self.bad_places) < MAX_NAMED_PLACES:
-            self.bad_places += locate(
-                [int(row) for row in rows[: MAX_NAMED_PLACES - len(self.bad_places)]]
-            )
-
-    def _note_cells(self, rows: NDArray[np.int64], cells: int, locate: Locate) -> None:
-        self.cells += cells
-        self.cell_rows += len(rows)
-        if len(self.cell_places) < MAX_NAMED_PLACES:
-            self.cell_places += locate(
-                [int(row) for row in rows[: MAX_NAMED_PLACES - len(self.cell_places)]]
-            )
-
     def finish(self, notes: Sequence[str] = ()) -> xr.Dataset:
         """Return the raw log.
 
@@ -261,8 +266,8 @@ class RawLogBuilder:
                 f"{name}: there is a header but no data row below it; copy it again, or check "
                 "what the logger wrote"
             )
-        if self.bad_rows > MAX_UNREADABLE_SHARE * rows:
-            share, first = self.bad_rows / rows, self.bad_places[0]
+        if self.bad_rows.total > MAX_UNREADABLE_SHARE * rows:
+            share, first = self.bad_rows.total / rows, self.bad_rows.names[0]
             suspects = (
                 "the separator, the columns that --map names and the unit of time (stamps lie "
                 "in the years 1678 to 2262)"
@@ -283,7 +288,7 @@ class RawLogBuilder:
                 f"{name}: {note}"
                 for note in [*self.plan.notes, *notes, *self._describe_faults(rows)]
             ],
-            unreadable_rows=self.bad_rows,
+            unreadable_rows=self.bad_rows.total,
             unreadable_cells=self.bad_cells,
             unmatched_options=list(self.plan.unmatched),
             headers=[summary.header for summary in self.plan.summaries],
@@ -340,16 +345,14 @@ class RawLogBuilder:
 
     def _describe_faults(self, rows: int) -> list[str]:
         notes = []
-        if self.bad_rows:
+        if self.bad_rows.total:
             notes.append(
-                f"{self.bad_rows} of {rows} rows are unreadable: "
-                f"{_join_places(self.bad_places, self.bad_rows)}"
+                f"{self.bad_rows.total} of {rows} rows are unreadable: {self.bad_rows.describe()}"
             )
-        if self.cell_places:
-            where = _join_places(self.cell_places, self.cell_rows)
+        if self.cell_rows.total:
             notes.append(
                 f"{self.cells} gyro cells hold no number in rows that are readable otherwise: "
-                f"{where}"
+                f"{self.cell_rows.describe()}"
             )
         if self.turns:
             period = "a day" if max(self.turns) == CLOCK_PERIODS[0] else "a week"
@@ -385,13 +388,6 @@ def _pack_stamps(stamps: NDArray[np.int64]) -> NDArray[np.int64] | EvenStampsPie
 
     table = even_steps(stamps)
     return stamps if table is None else EvenStampsPiece(table, len(stamps))
-
-
-def _join_places(places: Sequence[str], total: int) -> str:
-    """Join the names of bad places: ``lines 7, 8, 9 and others``."""
-    kind = places[0].split(" ")[0]
-    numbers = ", ".join(place.removeprefix(f"{kind} ") for place in places)
-    return f"{kind}{'s' * (len(places) > 1)} {numbers}{' and others' * (total > len(places))}"
 
 
 def summary_of(

@@ -36,11 +36,9 @@ __all__ = ["RateEstimate", "deviating_stretches", "estimate_near", "estimate_rat
 
 
 _MAX_TRUSTED_SAMPLES = 500.0  # reached in a long log
-
 # Larger than the share of backward steps by jitter: 0.12 at a scatter of 0.6 samples; random order
 # has 0.5.
 _MAX_BACKWARD_SHARE = 0.35
-
 _MIN_SINGLE_SHARE = 0.1  # of steps that are one sample of a given rate
 
 #: Largest scatter of the steps about whole samples at which single stamps give the sample: jitter
@@ -125,7 +123,7 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
             "(--map) and give --rate HZ"
         )
     period, counted, coarse = starting_period(parts)
-    sure = _trusted_samples(len(steps))
+    sure = _trusted_samples(parts)
     finer = None if counted else finer_period(parts, period)
     lost = None if finer is None else _estimate_sharp(stamps, parts, SECOND / finer)
     if lost is not None:
@@ -139,9 +137,7 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
         if jitter is not None:
             return _estimate_with_jitter(stamps, jitter, coarse, sure)
     longest = longest_step(parts, period) if counted else sure * period
-    estimate = _estimate_pooled(
-        fit_pieces(stamps, period, counted, coarse, longest), period, counted, coarse
-    )
+    estimate = _estimate_pooled(stamps, period, longest, counted=counted, coarse=coarse)
     return estimate if finer is None else replace(estimate, finer=float(f"{SECOND / finer:.4g}"))
 
 
@@ -171,10 +167,8 @@ def _estimate_with_jitter(
 ) -> RateEstimate:
     """Estimate the rate along the sequence of samples of jittered stamps."""
     longest = sure * jitter.period * max(1.0, jitter.group)
-    pieces = fit_pieces(stamps, jitter.period, False, False, longest, jitter)
-    return replace(
-        _estimate_pooled(pieces, jitter.period, False, False), coarse=coarse, jitter=jitter
-    )
+    estimate = _estimate_pooled(stamps, jitter.period, longest, jitter=jitter)
+    return replace(estimate, coarse=coarse, jitter=jitter)
 
 
 def _mean_rate(parts: list[NDArray[np.int64]]) -> float:
@@ -185,14 +179,21 @@ def _mean_rate(parts: list[NDArray[np.int64]]) -> float:
     return float(f"{np.median(rates):.4g}")
 
 
-def _trusted_samples(steps: int) -> float:
-    """Return the samples over which counting by a period from so many steps is reliable."""
-    return min(_MAX_TRUSTED_SAMPLES, max(5.0, steps / 20))
+def _trusted_samples(parts: list[NDArray[np.int64]]) -> float:
+    """Return the samples over which counting by a period from these stretches is reliable."""
+    return min(_MAX_TRUSTED_SAMPLES, max(5.0, sum(len(part) - 1 for part in parts) / 20))
 
 
 def _estimate_pooled(
-    pieces: NDArray[np.float64], period: float, counted: bool, coarse: bool
+    stamps: Stamps,
+    period: float,
+    longest: float,
+    *,
+    counted: bool = False,
+    coarse: bool = False,
+    jitter: JitterModel | None = None,
 ) -> RateEstimate:
+    pieces = fit_pieces(stamps, period, counted, coarse, longest, jitter)
     period, error, samples = pool_pieces(pieces, period, counted and not coarse)
     rate = SECOND / period
     stderr = rate * error / period
@@ -226,7 +227,7 @@ def estimate_near(stamps: Stamps, rate: float) -> RateEstimate | None:
     sharp = _estimate_sharp(stamps, parts, rate)
     if sharp is not None:
         return sharp
-    sure = _trusted_samples(sum(len(part) - 1 for part in parts))
+    sure = _trusted_samples(parts)
     for observe in ("all", "last"):
         jitter = fit_jitter_near(parts, SECOND / rate, observe, sure=sure)
         if jitter is not None:
@@ -249,12 +250,8 @@ def is_far_worse(stamps: Stamps, given: RateEstimate, estimated: RateEstimate) -
     jitter = estimated.jitter
     if jitter is None and not estimated.counted:
         parts = sample_stretches(partial(recut_blocks, stamps, _BLOCK))
-        jitter = fit_jitter_near(
-            parts,
-            SECOND / estimated.raw,
-            "all",
-            sure=_trusted_samples(sum(len(part) - 1 for part in parts)),
-        )
+        sure = _trusted_samples(parts)
+        jitter = fit_jitter_near(parts, SECOND / estimated.raw, "all", sure=sure)
     return (
         given.jitter is not None
         and jitter is not None
@@ -277,12 +274,7 @@ def _estimate_sharp(
         return None
     if abs(np.median(single) / period - 1) > 0.02:  # a different rate
         return None
-    return _estimate_pooled(
-        fit_pieces(stamps, period, False, False, _trusted_samples(len(steps)) * period),
-        period,
-        False,
-        False,
-    )
+    return _estimate_pooled(stamps, period, _trusted_samples(parts) * period)
 
 
 _STRETCH = 1024  # stretch whose rate is compared with that of the log [stamps]

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -163,8 +163,17 @@ def _place_rows(
         placement = place_by_count(counted, estimate, rate, max_gap=max_gap)
         deviating: list[tuple[int, int, float]] = []
     else:
-        limits = _OrderOptions(tolerance, max_gap, count_all_rows, where)
-        placement, deviating = _place_stamped(raw, scanned, stamps, estimate, rate, limits)
+        placement, deviating = _place_stamped(
+            raw,
+            scanned,
+            stamps,
+            estimate,
+            rate,
+            count_all_rows=count_all_rows,
+            tolerance=tolerance,
+            max_gap=max_gap,
+            where=where,
+        )
     notes += describe_rate(raw, estimate, rate, deviating, placement)
     return placement, rate
 
@@ -204,45 +213,29 @@ def _place_even(
     return replace(placement, runs=np.array([[0, 0, scanned.rows]], dtype=np.int64)), rate
 
 
-class _OrderOptions(NamedTuple):
-    """Further options of `place_in_order`."""
-
-    tolerance: float
-    max_gap: float
-    by_row: bool  # false if rows are repetitions, which occupy no samples
-    where: str
-
-
 def _place_stamped(
     raw: xr.Dataset,
     scanned: ScanPass,
     stamps: Stamps,
     estimate: RateEstimate,
     rate: float,
-    limits: _OrderOptions,
+    *,
+    count_all_rows: bool,
+    **options: Any,
 ) -> tuple[Placement, list[tuple[int, int, float]]]:
     """Place rows by their stamps, or in order if stamps have jitter; return deviating stretches."""
     jitter = estimate.jitter
 
     def place_along(jitter: JitterModel) -> Placement:
-        def place() -> Placement:
-            return place_in_order(
-                stamps,
-                jitter,
-                rate,
-                **limits._replace(by_row=limits.by_row and not scanned.repeated)._asdict(),
-            )
+        def place() -> Placement:  # repetitions occupy no samples
+            by_row = count_all_rows and not scanned.repeated
+            return place_in_order(stamps, jitter, rate, by_row=by_row, **options)
 
         return _place_once(raw, scanned, place)
 
     if jitter is not None and jitter.sigma > _SHARP_SIGMA:
         return place_along(jitter), []
-    tolerance, max_gap, where = limits.tolerance, limits.max_gap, limits.where
-    placement = _place_once(
-        raw,
-        scanned,
-        partial(place_by_stamp, stamps, rate, tolerance=tolerance, max_gap=max_gap, where=where),
-    )
+    placement = _place_once(raw, scanned, partial(place_by_stamp, stamps, rate, **options))
     dropped = scanned.rows - scanned.absent - scanned.repeated - placement.placed
     if not scanned.repeated and (
         dropped >= _MIN_DROPPED_ROWS or placement.has_late_rows
