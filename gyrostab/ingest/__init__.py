@@ -36,16 +36,7 @@ _MODULES = {
     "scan_file": "files",
 }
 
-__all__ = [
-    "ColumnSummary",
-    "FileSummary",
-    "ReadOptions",
-    "gap_variables",
-    "read_channel",
-    "read_log",
-    "readers",
-    "scan_file",
-]
+__all__ = [*_MODULES]
 
 
 def __getattr__(name: str) -> Any:

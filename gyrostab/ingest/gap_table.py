@@ -16,7 +16,6 @@ from gyrostab.time.stamps import format_stamp, to_nanoseconds
 from gyrostab.units import HOUR
 
 __all__ = [
-    "CAUSE",
     "CLOCK_STEP",
     "COLUMNS",
     "DUPLICATE",

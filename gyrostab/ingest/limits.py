@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,8 +23,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "LIMITS",
-    "Limit",
-    "bytes_present",
     "check_chunk",
     "check_columns",
     "check_declared",
@@ -37,54 +34,29 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True)
-class Limit:
-    """A limit that ``--limit NAME=NUMBER`` raises (``limits={"NAME": NUMBER}`` in Python)."""
-
-    value: float
-    unit: str
-    reason: str
-
-
-LIMITS: Mapping[str, Limit] = {
-    "columns": Limit(
-        30_000,
-        "columns",
-        "A logger writes tens of columns, a bus recorder thousands. The header of this many is "
-        "understood in a few seconds; beyond it "
-        "the separator is probably wrong, or the table is transposed.",
-    ),
-    "channels": Limit(
-        200,
-        "channels",
-        "A channel takes 8 bytes a row in memory or in a temporary file, and xarray looks "
-        "through all variables for each of them. "
-        "Channels with a known name, and those that --map or --unit names, are kept beyond it.",
-    ),
-    "grid_samples": Limit(
-        1e9,
-        "samples of one axis",
-        "The default --max-gap of 10 days at 1 kHz makes 8.6e8 samples. An axis of 1e9 samples "
-        "takes about ten seconds to analyse "
-        "(10 ns a sample) even if the file has a hundred rows. Above it a grid may have 100 "
-        "samples for each row, which allows a "
-        "recorder that runs for 1 % of the time.",
-    ),
-    "stored_samples": Limit(
-        1e9,
-        "samples of all columns",
-        "As for grid_samples. Above it a file may have 1000 samples for each of its bytes: "
-        "deflate never packs more than 1032 "
-        "bytes into one, so a file below that ratio holds almost no written values.",
-    ),
-    "chunk_bytes": Limit(
-        2**28,
-        "bytes",
-        "A chunk is decoded as a whole in memory, and those of all columns that are read side by "
-        "side are held: 256 MiB keep a run "
-        "near 1.5 GiB. Such a chunk holds 23 hours of one axis at 400 Hz in doubles; usual "
-        "chunks hold 1 to 128 MiB.",
-    ),
+#: Name -> largest number and what it counts; ``--limit NAME=NUMBER`` raises it
+#: (``limits={"NAME": NUMBER}`` in Python).
+LIMITS: Mapping[str, tuple[float, str]] = {
+    # A logger writes tens of columns, a bus recorder thousands. The header of this many is
+    # understood in a few seconds; beyond it the separator is probably wrong, or the table is
+    # transposed.
+    "columns": (30_000, "columns"),
+    # A channel takes 8 bytes a row in memory or in a temporary file, and xarray looks through all
+    # variables for each of them. Channels with a known name, and those that --map or --unit names,
+    # are kept beyond it.
+    "channels": (200, "channels"),
+    # The default --max-gap of 10 days at 1 kHz makes 8.6e8 samples. An axis of 1e9 samples takes
+    # about ten seconds to analyse (10 ns a sample) even if the file has a hundred rows. Above it a
+    # grid may have 100 samples for each row, which allows a recorder that runs for 1 % of the time.
+    "grid_samples": (1e9, "samples of one axis"),
+    # As for grid_samples. Above it a file may have 1000 samples for each of its bytes: deflate
+    # never packs more than 1032 bytes into one, so a file below that ratio holds almost no written
+    # values.
+    "stored_samples": (1e9, "samples of all columns"),
+    # A chunk is decoded as a whole in memory, and those of all columns that are read side by side
+    # are held: 256 MiB keep a run near 1.5 GiB. Such a chunk holds 23 hours of one axis at 400 Hz
+    # in doubles; usual chunks hold 1 to 128 MiB.
+    "chunk_bytes": (2**28, "bytes"),
 }
 
 #: Largest plausible ratio of grid samples to rows, and of declared samples to bytes; see `LIMITS`.
@@ -112,9 +84,8 @@ def check_limits(given: Mapping[str, Any] | None) -> dict[str, float]:
         try:
             limits[name] = float(text)
         except (TypeError, ValueError) as error:
-            raise OptionError(
-                f"--limit {name}={text}: give a number of {LIMITS[name].unit}"
-            ) from error
+            unit = LIMITS[name][1]
+            raise OptionError(f"--limit {name}={text}: give a number of {unit}") from error
         if not limits[name] > 0:
             raise OptionError(f"--limit {name}={text}: give a number above 0")
     return limits
@@ -128,7 +99,7 @@ def limit_value(name: str, given: Mapping[str, float] | None = None) -> float:
     >>> limit_value("columns"), limit_value("columns", {"columns": 5e4})
     (30000, 50000.0)
     """
-    return (given or {}).get(name, LIMITS[name].value)
+    return (given or {}).get(name, LIMITS[name][0])
 
 
 def describe_limit(name: str, needed: float, given: Mapping[str, float] | None = None) -> str:
@@ -141,7 +112,7 @@ def describe_limit(name: str, needed: float, given: Mapping[str, float] | None =
     """
     allowed = limit_value(name, given)
     return (
-        f"the limit is {allowed:.4g} {LIMITS[name].unit}, and --limit "
+        f"the limit is {allowed:.4g} {LIMITS[name][1]}, and --limit "
         f"{name}={_round_up(needed)} lifts it"
     )
 

@@ -7,7 +7,7 @@ import shlex
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -79,32 +79,15 @@ def _print_wrapped(lines: Iterable[str], indent: str = "") -> None:
 
 
 def _print_framed(table: pd.DataFrame) -> None:
-    from rich.console import Console
     from rich.markup import escape
-    from rich.table import Table
 
-    console = Console()
-    framed = Table()
-    for heading in (
-        "file",
-        "start (UTC)",
-        "span",
-        "rate [Hz]",
-        "axes",
-        "channels",
-        "rows",
-        "gaps",
-        "missing",
-    ):
-        framed.add_column(
-            heading,
-            overflow="fold",
-            justify="right" if heading in ("rows", "gaps", "missing") else "left",
-        )
+    headings = ("file", "start (UTC)", "span", "rate [Hz]", "axes", "channels")
+    counts = ("rows", "gaps", "missing")
+    rows: list[tuple[str, ...]] = []
     for _, row in table.iterrows():
         if pd.isna(row["rate_hz"]):
             lines = "cannot be read" if pd.isna(row["format"]) else "needs options, see below"
-            framed.add_row(escape(row["file"]), f"[red]{lines}[/red]")
+            rows.append((escape(row["file"]), f"[red]{lines}[/red]"))
             continue
         cells = (
             f"{row['file']} ({row['format']})",
@@ -117,8 +100,27 @@ def _print_framed(table: pd.DataFrame) -> None:
             f"{row['gaps']:,.0f}",
             f"{100 * row['missing_share']:.2f} %",
         )
-        framed.add_row(*map(escape, cells))
-    console.print(framed)
+        rows.append(tuple(map(escape, cells)))
+    _print_frame((*headings, *counts), rows, right=counts)
+
+
+def _print_frame(
+    headings: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    *,
+    right: Collection[str],
+    title: str | None = None,
+) -> None:
+    """Print rows of text with markup in a frame; columns of numbers are aligned `right`."""
+    from rich.console import Console
+    from rich.table import Table
+
+    framed = Table(title=title)
+    for heading in headings:
+        framed.add_column(heading, overflow="fold", justify="right" if heading in right else "left")
+    for row in rows:
+        framed.add_row(*row)
+    Console().print(framed)
 
 
 def _format_span(seconds: float) -> str:
@@ -139,18 +141,8 @@ def _inspection_rows(inspected_file: InspectedFile) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
     if inspected_file.inspection.time is not None:
         time = inspected_file.inspection.time
-        rows.append(
-            (
-                time.header,
-                time.unit or "",
-                "",
-                "",
-                "",
-                "",
-                _format_number(inspected_file.inspection.rate_hz),
-                "time",
-            )
-        )
+        rate = _format_number(inspected_file.inspection.rate_hz)
+        rows.append((time.header, time.unit or "", *[""] * 4, rate, "time"))
     for column in inspected_file.inspection.columns:
         has_rate = math.isfinite(column.rate_hz) or column.rows == 0
         numbers = (
@@ -204,20 +196,15 @@ def print_inspection(inspected: InspectedFile) -> None:
             print("# " + "\t".join(row))
         _print_wrapped(lines)
         return
-    from rich.console import Console
     from rich.markup import escape
-    from rich.table import Table
 
-    framed = Table(title=escape(f"{inspected.paths[0]}: {inspected.inspection.rows:,} rows"))
-    for heading in INSPECTION_COLUMNS:
-        framed.add_column(
-            heading.replace("_", " "),
-            overflow="fold",
-            justify="left" if heading in ("column", "unit", "taken_for") else "right",
-        )
-    for row in rows:
-        framed.add_row(*map(escape, row))
-    Console().print(framed)
+    headings = [heading.replace("_", " ") for heading in INSPECTION_COLUMNS]
+    _print_frame(
+        headings,
+        [tuple(map(escape, row)) for row in rows],
+        right=headings[2:-1],
+        title=escape(f"{inspected.paths[0]}: {inspected.inspection.rows:,} rows"),
+    )
     _print_wrapped(lines)
 
 

@@ -16,7 +16,6 @@ __all__ = [
     "averaging_factors",
     "duration_seconds",
     "format_duration",
-    "is_bare_number",
     "samples",
     "thin",
 ]

@@ -242,12 +242,8 @@ class _GridTransform(CoordinateTransform):
         dim: str = "time",
     ):
         super().__init__([name], {dim: size}, dtype=np.dtype("datetime64[ns]"))
-        self.start, self.rate, self.first, self.stride = (
-            int(start),
-            float(rate),
-            int(first),
-            int(stride),
-        )
+        self.start, self.rate = int(start), float(rate)
+        self.first, self.stride = int(first), int(stride)
 
     @property
     def size(self) -> int:
@@ -270,24 +266,21 @@ class _GridTransform(CoordinateTransform):
     def _key(self) -> tuple[Any, ...]:
         return (self.start, self.rate, self.first, self.stride, self.size)
 
-    def cut(self, part: slice) -> _GridTransform:
-        chosen = range(self.size)[part]
+    def select(self, positions: range) -> _GridTransform:
+        """Return the samples at these positions, also beyond the end."""
+        first, stride = self.first + self.stride * positions.start, self.stride * positions.step
         return _GridTransform(
             self.start,
             self.rate,
-            len(chosen),
-            first=self.first + self.stride * chosen.start,
-            stride=self.stride * chosen.step,
+            len(positions),
+            first=first,
+            stride=stride,
             name=str(self.coord_names[0]),
             dim=self.dims[0],
         )
 
-    def extended(self, size: int) -> _GridTransform:
-        """Return the same grid with another number of samples."""
-        name, dim = str(self.coord_names[0]), self.dims[0]
-        return _GridTransform(
-            self.start, self.rate, size, first=self.first, stride=self.stride, name=name, dim=dim
-        )
+    def cut(self, part: slice) -> _GridTransform:
+        return self.select(range(self.size)[part])
 
     def has_ends_of(self, other: _GridTransform) -> bool:
         """Whether another grid of the same size has the same first and last stamp."""
@@ -328,7 +321,7 @@ class TimeGridIndex(CoordinateTransformIndex):
         """Concatenate axes; the result is computed if each begins where the previous one ends."""
         if positions is None and all(isinstance(index, cls) for index in indexes):
             grids = [index.transform for index in indexes]
-            full_grid, at, fits = grids[0].extended(sum(grid.size for grid in grids)), 0, True
+            full_grid, at, fits = grids[0].select(range(sum(grid.size for grid in grids))), 0, True
             for grid in grids:
                 fits = fits and full_grid.cut(slice(at, at + grid.size)).has_ends_of(grid)
                 at += grid.size

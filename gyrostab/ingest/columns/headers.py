@@ -134,7 +134,9 @@ def is_unit(text: str) -> bool:
 
 def is_unit_of(text: str | None, quantities: Collection[str]) -> bool:
     """Return whether a text is a unit of one of these quantities."""
-    for quantity in quantities if text is not None else ():
+    if text is None:
+        return False
+    for quantity in quantities:
         try:
             if parse_unit(text, quantity).quantity == quantity:
                 return True

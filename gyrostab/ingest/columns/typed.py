@@ -27,13 +27,11 @@ from gyrostab.store.row_inspection import inspect_rows
 from gyrostab.store.threads import map_in_order
 
 __all__ = [
-    "Fetch",
     "batch_rows",
     "convert_batch",
     "holds_dates",
     "read_columns",
     "summarise_columns",
-    "to_floats",
     "to_stamps",
 ]
 

@@ -19,7 +19,7 @@ from gyrostab.store.lazy import (
     read_into,
 )
 
-__all__ = ["GridSource", "PlacedArray", "chunk_of", "place_on_grid"]
+__all__ = ["GridSource", "PlacedArray", "chunk_of", "place_in_memory", "place_on_grid"]
 
 #: An array (time), or (axis, time) with the row to read, and its runs: first sample of the grid,
 #: first of the array, length.
@@ -38,6 +38,16 @@ def chunk_of(arrays: Sequence[Any]) -> int:
         for length in getattr(array, "chunks", [[array.shape[-1]]])[-1][:1]
     )
     return int(np.clip(lengths.most_common(1)[0][0], _MIN_CHUNK_SAMPLES, _MAX_CHUNK_SAMPLES))
+
+
+def place_in_memory(array: NDArray[Any], runs: NDArray[np.int64], size: int) -> NDArray[np.float64]:
+    """Place the runs of one array (..., sample) on a grid in memory, NaN where it has no sample."""
+    out = np.full((*array.shape[:-1], size), np.nan)
+    length = runs[:, 2]
+    within = np.arange(int(length.sum())) - np.repeat(np.cumsum(length) - length, length)
+    samples, rows = (np.repeat(runs[:, column], length) + within for column in (0, 1))
+    out[..., samples] = array[..., rows]
+    return out
 
 
 class GridSource(RowSource):

@@ -36,7 +36,6 @@ __all__ = [
     "ATTRIBUTES",
     "Decoder",
     "Packing",
-    "attribute_text",
     "decode_variables",
     "fold_packing",
     "text_attributes",

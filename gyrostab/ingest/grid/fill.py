@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.ingest.columns.stamps import read_stamps
-from gyrostab.ingest.concat.lazy import GridSource, place_on_grid
+from gyrostab.ingest.concat.lazy import GridSource, place_in_memory, place_on_grid
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS
 from gyrostab.kernels.grid.stamps import NO_STAMP, RESTART, STEP
@@ -53,9 +53,7 @@ def rows_on_grid(
     size, lead, runs = placement.size, rows.shape[:-1], placement.runs
     convert = partial(_scale_samples, scale=scale, unit=unit)
     if size * max(1, int(np.prod(lead))) <= MAX_PLAIN_NUMBERS:
-        values, out = np.asarray(rows), np.full((*lead, size), np.nan)
-        for sample, row, length in runs:
-            out[..., sample : sample + length] = values[..., row : row + length]
+        out = place_in_memory(np.asarray(rows), runs, size)
         convert(out)
         return out
     placed = [[(rows, row if lead else None, runs)] for row in range(lead[0] if lead else 1)]

@@ -19,7 +19,6 @@ __all__ = [
     "period_of_lines",
     "readable_stamps",
     "recut_blocks",
-    "refine_period",
     "rms_misfit",
     "sample_stretches",
     "starting_period",

@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import SchemaError, TimeError
-from gyrostab.ingest.concat.lazy import chunk_of, place_on_grid
+from gyrostab.ingest.concat.lazy import chunk_of, place_in_memory, place_on_grid
 from gyrostab.ingest.gap_table import (
     END,
     FIRST,
@@ -29,10 +29,8 @@ from gyrostab.time.grid import TimeGridIndex, grid_index, time_coordinate
 from gyrostab.time.stamps import to_nanoseconds
 
 __all__ = [
-    "add_holes",
     "add_spans",
     "as_uniform",
-    "change_rate",
     "grid_of",
     "has_gap_table",
     "merge_lines",
@@ -226,13 +224,7 @@ def place_samples(log: xr.Dataset, runs: Runs, start: int, rate: float, size: in
 def _place_array(array: Any, runs: Runs, size: int) -> Any:
     lead = int(np.prod(array.shape[:-1], dtype=np.int64))
     if isinstance(array, np.ndarray) and size * lead <= max(SMALL_SIZE, 2 * array.size):
-        out = np.full((*array.shape[:-1], size), np.nan)
-        length = runs[:, 2]
-        within = np.arange(int(length.sum())) - np.repeat(np.cumsum(length) - length, length)
-        out[..., np.repeat(runs[:, 0], length) + within] = array[
-            ..., np.repeat(runs[:, 1], length) + within
-        ]
-        return out
+        return place_in_memory(array, runs, size)
     chunk = CHUNK_SAMPLES if isinstance(array, np.ndarray) else chunk_of([array])
     rows = [None] if array.ndim == 1 else range(array.shape[0])
     return place_on_grid([[(array, row, runs)] for row in rows], size, chunk, flat=array.ndim == 1)
