@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -16,16 +16,24 @@ from gyrostab.ingest import read_log, scan_file
 from gyrostab.ingest.columns import preset
 
 RAD = math.degrees(1) * 3600  # deg/h
+IN_RADIANS = (0.001 * RAD, -0.002 * RAD, 0.003 * RAD)
+IN_DEGREES = (1800, -900, 450)
 
 
 class Sample(NamedTuple):
     """A file of a program: its name, its text, and the expected first row."""
 
     file: str
-    text: str
+    header: str
+    row: Callable[[int], str]
     rate: tuple[float, float, float]  # deg/h, first row
     step: float | None  # s, None without stamps
     channels: Mapping[str, float] = MappingProxyType({})  # first row, inner units
+
+    def write_to(self, folder: Path) -> Path:
+        path = folder / self.file
+        path.write_text(self.header + "".join(map(self.row, range(4))))
+        return path
 
 
 XSENS = (
@@ -35,34 +43,28 @@ SAMPLES = {
     "xsens-mt-manager": Sample(
         "MT_001-000.txt",
         "// General information: \n//  MT Manager version: 2022.2.0 \n// Coordinate system: ENU\n"
-        + XSENS
-        + "".join(
+        + XSENS,
+        lambda n: (
             f"{n}\t{1000 + 100 * n}\t0.1\t0.2\t9.80665\t0.001\t-0.002\t0.003\t0.4\t0.5\t0.6\n"
-            for n in range(4)
         ),
-        (0.001 * RAD, -0.002 * RAD, 0.003 * RAD),
+        IN_RADIANS,
         0.01,
         {"accel_z": 1.0},
     ),
     "xsens-mt-manager, wireless": Sample(
         "MT_001-001.txt",
-        "// Start Time: Unknown\n// Update Rate: 50.0Hz\n// Filter Profile: human (46.1)\n"
-        + XSENS
-        + "".join(
-            f"{n}\t\t0.1\t0.2\t9.80665\t0.001\t-0.002\t0.003\t0.4\t0.5\t0.6\n" for n in range(4)
-        ),
-        (0.001 * RAD, -0.002 * RAD, 0.003 * RAD),
+        "// Start Time: Unknown\n// Update Rate: 50.0Hz\n// Filter Profile: human (46.1)\n" + XSENS,
+        lambda n: f"{n}\t\t0.1\t0.2\t9.80665\t0.001\t-0.002\t0.003\t0.4\t0.5\t0.6\n",
+        IN_RADIANS,
         None,
         {"accel_z": 1.0},
     ),
     "xsens-dot": Sample(
         "dot.csv",
         "DeviceTag:,D1\nFirmwareVersion:,1.6.0\nOutputRate:,60Hz\n\n"
-        "PacketCounter,SampleTimeFine,Euler_X,Euler_Y,Euler_Z,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z,Status\n"
-        + "".join(
-            f"{n},{7 + 16667 * n},1,2,3,0.1,0.2,9.80665,0.5,-0.25,0.125,0\n" for n in range(4)
-        ),
-        (1800, -900, 450),
+        "PacketCounter,SampleTimeFine,Euler_X,Euler_Y,Euler_Z,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z,Status\n",
+        lambda n: f"{n},{7 + 16667 * n},1,2,3,0.1,0.2,9.80665,0.5,-0.25,0.125,0\n",
+        IN_DEGREES,
         0.016667,
         {"accel_z": 1.0},
     ),
@@ -74,11 +76,9 @@ SAMPLES = {
         "DEVICE_INFO\nModelName,3DM\nSerialNumber,6225-1\nFirmwareVersion,1.1.19\n\nDATA_START\n"
         "GPS TFlags,GPS Week,GPS TOW,X Accel [x8004],Y Accel [x8004],Z Accel [x8004],X Gyro "
         "[x8005],Y Gyro [x8005],Z Gyro [x8005],"
-        "Lat [x8103],Flags [x8103],Flags [x8108]\n"
-        + "".join(
-            f"5,1936,{494410 + n / 50:.6f},0.1,0.2,1.0,0.001,-0.002,0.003,,,\n" for n in range(4)
-        ),
-        (0.001 * RAD, -0.002 * RAD, 0.003 * RAD),
+        "Lat [x8103],Flags [x8103],Flags [x8108]\n",
+        lambda n: f"5,1936,{494410 + n / 50:.6f},0.1,0.2,1.0,0.001,-0.002,0.003,,,\n",
+        IN_RADIANS,
         0.02,
         {"accel_z": 1.0},
     ),
@@ -88,12 +88,9 @@ SAMPLES = {
         "[Gauss],UnCompMagZ [Gauss],"
         "UnCompAccX [m/s^2],UnCompAccY [m/s^2],UnCompAccZ [m/s^2],UnCompGyroX "
         "[rad/s],UnCompGyroY [rad/s],UnCompGyroZ [rad/s],"
-        "Temperature [Celsius]\n"
-        + "".join(
-            f"{n / 100},,,,{n * 10**7 + 5},1,2,3,0.1,0.2,9.80665,0.001,-0.002,0.003,21.5\n"
-            for n in range(4)
-        ),
-        (0.001 * RAD, -0.002 * RAD, 0.003 * RAD),
+        "Temperature [Celsius]\n",
+        lambda n: f"{n / 100},,,,{n * 10**7 + 5},1,2,3,0.1,0.2,9.80665,0.001,-0.002,0.003,21.5\n",
+        IN_RADIANS,
         0.01,
         {"accel_z": 1.0, "temperature": 21.5, "mag_x": 100.0},
     ),
@@ -103,20 +100,18 @@ SAMPLES = {
         "[Gauss],IMU::UncompAccel::X [m/s^2],"
         "IMU::UncompAccel::Y [m/s^2],IMU::UncompAccel::Z [m/s^2],IMU::UncompGyro::X "
         "[rad/s],IMU::UncompGyro::Y [rad/s],"
-        "IMU::UncompGyro::Z [rad/s],IMU::Temp [Celsius],IMU::Pres [kPa]\n"
-        + "".join(
-            f",,,,{n * 10**7 + 5},1,0.1,0.2,9.80665,0.001,-0.002,0.003,21.5,101.3\n"
-            for n in range(4)
-        ),
-        (0.001 * RAD, -0.002 * RAD, 0.003 * RAD),
+        "IMU::UncompGyro::Z [rad/s],IMU::Temp [Celsius],IMU::Pres [kPa]\n",
+        lambda n: f",,,,{n * 10**7 + 5},1,0.1,0.2,9.80665,0.001,-0.002,0.003,21.5,101.3\n",
+        IN_RADIANS,
         0.01,
         {"accel_z": 1.0, "temperature": 21.5, "mag_x": 100.0, "pressure": 101300.0},
     ),
     "phyphox": Sample(
         "Gyroscope.csv",
         '"Time (s)","Gyroscope x (rad/s)","Gyroscope y (rad/s)","Gyroscope z (rad/s)","Absolute '
-        '(rad/s)"\n' + "".join(f"{n / 100:.9E},1.0E-3,-2.0E-3,3.0E-3,3.7E-3\n" for n in range(4)),
-        (0.001 * RAD, -0.002 * RAD, 0.003 * RAD),
+        '(rad/s)"\n',
+        lambda n: f"{n / 100:.9E},1.0E-3,-2.0E-3,3.0E-3,3.7E-3\n",
+        IN_RADIANS,
         0.01,
     ),
     "x-io": Sample(
@@ -124,9 +119,9 @@ SAMPLES = {
         "Time (s),Gyroscope X (deg/s),Gyroscope Y (deg/s),Gyroscope Z (deg/s),Accelerometer X "
         "(g),Accelerometer Y (g),"
         "Accelerometer Z (g),Magnetometer X (uT),Magnetometer Y (uT),Magnetometer Z "
-        "(uT),Barometer (hPa)\n"
-        + "".join(f"{n / 100},0.5,-0.25,0.125,0.1,0.2,1.0,20,0,-40,1013\n" for n in range(4)),
-        (1800, -900, 450),
+        "(uT),Barometer (hPa)\n",
+        lambda n: f"{n / 100},0.5,-0.25,0.125,0.1,0.2,1.0,20,0,-40,1013\n",
+        IN_DEGREES,
         0.01,
         {"accel_z": 1.0, "mag_z": -40.0, "pressure": 101300.0},
     ),
@@ -134,30 +129,25 @@ SAMPLES = {
         "LoggedData_CalInertialAndMag.csv",
         "Packet number,Gyroscope X (deg/s),Gyroscope Y (deg/s),Gyroscope Z (deg/s),Accelerometer "
         "X (g),Accelerometer Y (g),"
-        "Accelerometer Z (g),Magnetometer X (G),Magnetometer Y (G),Magnetometer Z (G)\n"
-        + "".join(f"{n},0.5,-0.25,0.125,0.1,0.2,1.0,0.2,0,-0.4\n" for n in range(4)),
-        (1800, -900, 450),
+        "Accelerometer Z (g),Magnetometer X (G),Magnetometer Y (G),Magnetometer Z (G)\n",
+        lambda n: f"{n},0.5,-0.25,0.125,0.1,0.2,1.0,0.2,0,-0.4\n",
+        IN_DEGREES,
         None,
         {"accel_z": 1.0, "mag_z": -40.0},
     ),
     "sensor-logger": Sample(
         "Gyroscope.csv",
-        "time,seconds_elapsed,z,y,x\n"
-        + "".join(
-            f"{1767620467350470700 + n * 10**7},{n / 100},0.003,-0.002,0.001\n" for n in range(4)
-        ),
-        (0.001 * RAD, -0.002 * RAD, 0.003 * RAD),
+        "time,seconds_elapsed,z,y,x\n",
+        lambda n: f"{1767620467350470700 + n * 10**7},{n / 100},0.003,-0.002,0.001\n",
+        IN_RADIANS,
         0.01,
     ),
     "euroc": Sample(
         "data.csv",
         "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
-        "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n"
-        + "".join(
-            f"{1403636579758555392 + n * 5 * 10**6},0.001,-0.002,0.003,0.1,0.2,9.80665\n"
-            for n in range(4)
-        ),
-        (0.001 * RAD, -0.002 * RAD, 0.003 * RAD),
+        "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n",
+        lambda n: f"{1403636579758555392 + n * 5 * 10**6},0.001,-0.002,0.003,0.1,0.2,9.80665\n",
+        IN_RADIANS,
         0.005,
         {"accel_z": 1.0},
     ),
@@ -165,37 +155,30 @@ SAMPLES = {
         "imu.csv",
         "%time,field.header.seq,field.header.stamp,field.header.frame_id,field.orientation.x,field.orientation.y,field.orientation.z,"
         "field.orientation.w,field.orientation_covariance0,field.angular_velocity.x,field.angular_velocity.y,field.angular_velocity.z,"
-        "field.linear_acceleration.x,field.linear_acceleration.y,field.linear_acceleration.z\n"
-        + "".join(
+        "field.linear_acceleration.x,field.linear_acceleration.y,field.linear_acceleration.z\n",
+        lambda n: (
             f"{1609060336768428032 + n * 10**7 + 999},{n},"
             f"{1609060336768428032 + n * 10**7},imu_link,0,0,0,1,-1,"
             "0.001,-0.002,0.003,0.1,0.2,9.80665\n"
-            for n in range(4)
         ),
-        (0.001 * RAD, -0.002 * RAD, 0.003 * RAD),
+        IN_RADIANS,
         0.01,
         {"accel_z": 1.0},
     ),
     "px4-sensor-combined": Sample(
         "log_sensor_combined_0.csv",
         "timestamp,gyro_rad[0],gyro_rad[1],gyro_rad[2],gyro_integral_dt,accelerometer_timestamp_relative,"
-        "accelerometer_m_s2[0],accelerometer_m_s2[1],accelerometer_m_s2[2],accelerometer_integral_dt\n"
-        + "".join(
-            f"{n * 4000 + 112574307},0.001,-0.002,0.003,4000,0,0.1,0.2,9.80665,4000\n"
-            for n in range(4)
-        ),
-        (0.001 * RAD, -0.002 * RAD, 0.003 * RAD),
+        "accelerometer_m_s2[0],accelerometer_m_s2[1],accelerometer_m_s2[2],accelerometer_integral_dt\n",
+        lambda n: f"{n * 4000 + 112574307},0.001,-0.002,0.003,4000,0,0.1,0.2,9.80665,4000\n",
+        IN_RADIANS,
         0.004,
         {"accel_z": 1.0},
     ),
     "px4-sensor-gyro": Sample(
         "log_sensor_gyro_0.csv",
-        "timestamp,timestamp_sample,device_id,x,y,z,temperature,error_count,samples\n"
-        + "".join(
-            f"{n * 4000 + 112574307},{n * 4000 + 112574100},42,0.001,-0.002,0.003,41.5,0,8\n"
-            for n in range(4)
-        ),
-        (0.001 * RAD, -0.002 * RAD, 0.003 * RAD),
+        "timestamp,timestamp_sample,device_id,x,y,z,temperature,error_count,samples\n",
+        lambda n: f"{n * 4000 + 112574307},{n * 4000 + 112574100},42,0.001,-0.002,0.003,41.5,0,8\n",
+        IN_RADIANS,
         0.004,
         {"temperature": 41.5},
     ),
@@ -214,8 +197,7 @@ def test_each_preset_has_a_sample() -> None:
 @pytest.mark.parametrize("name", SAMPLES)
 def test_a_file_of_a_known_program_needs_no_options(tmp_path: Path, name: str) -> None:
     sample = SAMPLES[name]
-    path = tmp_path / sample.file
-    path.write_text(sample.text)
+    path = sample.write_to(tmp_path)
     note_text = f"(preset {key_of(name)})"
     assert any(note_text in note for note in scan_file(path).notes)
     raw = read_log(path, rate=100.0 if name == "x-io, x-IMU" else None)
@@ -235,8 +217,7 @@ def test_a_file_of_a_known_program_needs_no_options(tmp_path: Path, name: str) -
 
 def test_options_overrule_a_preset(tmp_path: Path) -> None:
     sample = SAMPLES["xsens-mt-manager"]
-    path = tmp_path / sample.file
-    path.write_text(sample.text)
+    path = sample.write_to(tmp_path)
     in_degrees = read_log(path, unit={"gyro": "deg/s", "time": "s"})
     np.testing.assert_allclose(in_degrees.rate.values[:, 0], [3.6, -7.2, 10.8])
     assert np.diff(in_degrees.time.values).astype(np.int64).tolist() == [100 * 10**9] * 3
@@ -261,7 +242,6 @@ def test_contract_names_match_no_preset(tmp_path: Path) -> None:
 
 def test_preset_without_time_or_rate_requires_the_rate(tmp_path: Path) -> None:
     sample = SAMPLES["x-io, x-IMU"]
-    path = tmp_path / sample.file
-    path.write_text(sample.text)
+    path = sample.write_to(tmp_path)
     with pytest.raises(OptionError, match="--rate HZ"):
         read_log(path)
