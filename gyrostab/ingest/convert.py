@@ -155,7 +155,7 @@ def _read_frame(
         renamed |= {
             header: f"gyro_{split_header(header)[0].lower()}"
             for header in headers
-            if _is_axis_name(split_header(header)[0])
+            if split_header(header)[0].lower() in ("x", "y", "z")
         }
     units_by_name = {"gyro": str(units)} if isinstance(units, str) else dict(units or {})
     options = ReadOptions(map=renamed, unit=units_by_name, kind=kind)
@@ -176,11 +176,6 @@ def _read_frame(
             "name of the column, 'gyro_x [deg/s]'"
         ) from error
     return raw
-
-
-def _is_axis_name(name: str) -> bool:
-    """Return whether a column has the bare name of an axis: x, y, z."""
-    return len(name) == 1 and name.lower() in "xyz"
 
 
 def _check_index(table: pd.DataFrame) -> pd.DatetimeIndex:

@@ -212,15 +212,17 @@ def read_log(
         them lacks is NaN there. Either raw logs, or regular logs that gyrostab wrote, which become
         one regular log without being loaded.
     rate : float, optional
-        Sampling rate [Hz] of files without a time column.
+        Sampling rate [Hz] of files without a time column; otherwise the rate to check against.
     start : str, optional
         Stamp of the first row (ISO 8601, UTC) of files without a time column.
     epoch : str, optional
         Zero of a numeric time column (ISO 8601, UTC); 1970-01-01 when not given.
     map : mapping of str to str, optional
-        Header name -> contract name, ``{"wx": "gyro_x [deg/s]"}``; ``"-"`` drops a column.
+        Header name -> contract name, ``{"wx": "gyro_x [deg/s]"}``; ``"-"`` drops a column. Files
+        without a header row are mapped by column number from 0: ``{"1": "gyro_x"}``.
     unit : mapping of str to str, optional
-        Name -> unit, ``{"gyro": "deg/s", "time": "us"}``.
+        Name -> unit: ``{"gyro": "deg/s"}`` (all gyro axes), ``{"gyro_x": ...}``, ``{"time":
+        "us"}``; factors allowed (``"0.1 arcsec/s"``).
     kind : {"rate", "angle"}, optional
         How angle columns are meant: ``"angle"`` cumulative, ``"rate"`` increments.
     channel : path or sequence of path, optional

@@ -37,7 +37,6 @@ _NUMBER = re.compile(r"[0-9]{1,9}\Z")
 #: Typical rate of gyro logs [Hz], and spread [decades].
 TYPICAL_RATE_HZ, RATE_DECADES = 100.0, 1.0
 
-
 #: Smallest score of a group of columns that is taken for the gyro: one sign in its name, or a unit.
 MIN_SCORE = 1.5
 

@@ -21,7 +21,6 @@ __all__ = [
     "temperature_unit",
 ]
 
-
 #: Rotation of the Earth [deg/h].
 EARTH_RATE_DPH = 15.041
 
@@ -33,7 +32,6 @@ EARTH_NEIGHBOURHOOD = 0.3
 
 #: Largest full scale of gyros [deg/h].
 MAX_RATE_DPH = 4000.0 * HOUR
-
 
 #: Angle random walk of a usual sensor [deg/sqrt(h)], and spread of other sensors [decades].
 TYPICAL_ARW, ARW_DECADES = 0.3, 1.0

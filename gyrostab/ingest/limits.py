@@ -33,7 +33,6 @@ __all__ = [
     "limit_value",
 ]
 
-
 #: Name -> largest number and what it counts; ``--limit NAME=NUMBER`` raises it
 #: (``limits={"NAME": NUMBER}`` in Python).
 LIMITS: Mapping[str, tuple[float, str]] = {

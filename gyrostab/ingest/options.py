@@ -21,32 +21,12 @@ class ReadOptions:
 
     Parameters
     ----------
-    rate : float, optional
-        Sampling rate [Hz] of files without a time column; otherwise the rate to check against.
-    start : str, optional
-        Stamp of the first row (ISO 8601, UTC) of files without a time column.
-    epoch : str, optional
-        Zero of a numeric time column (ISO 8601, UTC); 1970-01-01 when not given.
-    map : mapping of str to str
-        Header name -> contract name, optionally with a unit: ``{"wx": "gyro_x [deg/s]"}``. ``""``
-        or ``"-"`` drops the column. Files without a header row are mapped by column number from 0:
-        ``{"1": "gyro_x"}``.
-    unit : mapping of str to str
-        Name -> unit: ``{"gyro": "deg/s"}`` (all gyro axes), ``{"gyro_x": ...}``, ``{"time":
-        "us"}``; factors allowed (``"0.1 arcsec/s"``).
-    kind : {"rate", "angle"}, optional
-        How angle columns are meant: ``"angle"`` cumulative, ``"rate"`` the increment of each
-        sample.
-    channel : sequence of path
-        Files with further channels.
+    rate, start, epoch, map, unit, kind, channel, strict, limits
+        As for `gyrostab.read_log`.
     channels_only : bool
         Whether the file is read only for its channels, without gyro axes.
     growing : bool
         Whether the file is still written: the last line of a text file counts once it has its end.
-    strict : bool
-        Whether damage in a regular log is an error instead of a gap.
-    limits : mapping of str to float
-        Limits of `gyrostab.ingest.limits` with other values.
 
     Examples
     --------

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 __all__ = ["COLUMNS", "InspectedFile", "ScanResult", "scan", "scan_and_inspect"]
 
-
 #: Largest share of missing samples at a plausible sampling rate; above it, the mean rate of the
 #: rows is tried.
 MAX_MISSING_SHARE = 0.1

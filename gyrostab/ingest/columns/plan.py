@@ -7,10 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gyrostab.errors import GyrostabError, OptionError
-from gyrostab.ingest.columns.headers import (
-    AXIS_PATTERN,
-    split_header,
-)
+from gyrostab.ingest.columns.headers import AXIS_PATTERN, split_header
 from gyrostab.ingest.columns.plan_draft import (
     MAX_HEADERS,
     Column,

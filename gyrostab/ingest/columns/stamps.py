@@ -32,12 +32,11 @@ __all__ = [
     "continue_clock",
     "dates_to_ns",
     "find_turn",
-    "floats_to_ns",
     "integers_to_ns",
     "names_epoch",
+    "numbers_to_ns",
     "parse_time_unit",
     "read_stamps",
-    "signed_counts",
     "texts_to_ns",
 ]
 
@@ -241,7 +240,7 @@ def integers_to_ns(values: NDArray[np.int64], unit: TimeUnit, epoch: int) -> NDA
     return np.where(inside, np.where(inside, scaled, 0) + remainder, NAT)
 
 
-def signed_counts(counts: NDArray[Any]) -> NDArray[np.int64]:
+def _signed_counts(counts: NDArray[Any]) -> NDArray[np.int64]:
     """Return whole numbers as int64; larger unsigned ones become its maximum."""
     wide = (
         np.minimum(counts, np.uint64(_MAX_INT64))
@@ -261,6 +260,13 @@ def floats_to_ns(
     stamps = integers_to_ns(whole_units.astype(np.int64), unit, epoch)
     part = np.rint((np.where(usable, wide, 0.0) - whole_units) * float(unit.ns)).astype(np.int64)
     return np.where(usable & (stamps != NAT), stamps + part, NAT)
+
+
+def numbers_to_ns(values: NDArray[Any], unit: TimeUnit, epoch: int) -> NDArray[np.int64]:
+    """Convert counts of `unit` since `epoch`, whole or not, to stamps."""
+    if values.dtype.kind == "f":
+        return floats_to_ns(values, unit, epoch)
+    return integers_to_ns(_signed_counts(values), unit, epoch)
 
 
 def cells_to_ns(

@@ -14,14 +14,7 @@ from gyrostab.ingest.columns.dates import is_iso
 from gyrostab.ingest.columns.pieces import EvenStampsPiece, FilePiece
 from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
-from gyrostab.ingest.columns.stamps import (
-    NAT,
-    cells_to_ns,
-    dates_to_ns,
-    floats_to_ns,
-    integers_to_ns,
-    signed_counts,
-)
+from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, dates_to_ns, numbers_to_ns
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.store.row_inspection import inspect_rows
 from gyrostab.store.threads import map_in_order
@@ -80,10 +73,8 @@ def to_stamps(values: Any, column: Column, options: ReadOptions) -> NDArray[np.i
             options.epoch_ns,
             column.date_order,
         )
-    elif array.dtype.kind == "f":
-        stamps = floats_to_ns(array, unit, options.epoch_ns)
     else:
-        stamps = integers_to_ns(signed_counts(array), unit, options.epoch_ns)
+        stamps = numbers_to_ns(array, unit, options.epoch_ns)
     return stamps if mask is None else np.where(mask, NAT, stamps)
 
 

@@ -11,13 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.store.lazy import (
-    RowSource,
-    can_read_directly,
-    find_source,
-    make_dask,
-    read_into,
-)
+from gyrostab.store.lazy import RowSource, can_read_directly, find_source, make_dask, read_into
 
 __all__ = ["GridSource", "PlacedArray", "chunk_of", "place_in_memory", "place_on_grid"]
 

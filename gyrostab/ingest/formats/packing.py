@@ -24,11 +24,9 @@ from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.stamps import (
     NAT,
     TimeUnit,
-    floats_to_ns,
-    integers_to_ns,
     names_epoch,
+    numbers_to_ns,
     parse_time_unit,
-    signed_counts,
 )
 from gyrostab.store.lazy import Converted, FileVariable, Source, make_dask
 
@@ -376,9 +374,5 @@ def _read_stamps(packing: Packing, unit: TimeUnit, stored: Any) -> NDArray[np.da
     folded = unit if packing.is_plain else _fold_time(unit, packing)
     counts = packing.read_values(stored) if folded is None else packing.read_counts(stored)
     array = np.ma.getdata(counts)
-    stamps = (
-        floats_to_ns(array, unit, 0)
-        if array.dtype.kind == "f"
-        else integers_to_ns(signed_counts(array), folded or unit, 0)
-    )
+    stamps = numbers_to_ns(array, folded or unit, 0)
     return np.where(np.ma.getmaskarray(counts), NAT, stamps).view("datetime64[ns]")

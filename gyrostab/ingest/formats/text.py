@@ -27,13 +27,7 @@ from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summa
 from gyrostab.ingest.columns.stamps import NAT, cells_to_ns
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.ingest.text.cells import VOID_CELLS, BlockParser
-from gyrostab.ingest.text.layout import (
-    Layout,
-    find_layout,
-    is_number,
-    is_text,
-    unit_of_duration,
-)
+from gyrostab.ingest.text.layout import Layout, find_layout, is_number, is_text, unit_of_duration
 from gyrostab.store.threads import map_in_order
 
 __all__ = ["matches", "read", "read_head", "scan"]

@@ -28,7 +28,6 @@ __all__ = [
     "observe_rows",
 ]
 
-
 Integers = NDArray[np.int64]
 
 ObservedStamps = tuple[Integers, Integers]
@@ -36,25 +35,20 @@ ObservedStamps = tuple[Integers, Integers]
 #: Smallest standard deviation of the jitter that is passed to the kernel [samples].
 MIN_SIGMA = 0.1
 
-
 #: Gain with which the phase follows a deviation, in the search for the period and afterwards. An
 #: undetected loss costs 1 / (4 gain sigma^2) nats before the phase has absorbed it: 140 at a
 #: scatter of 0.6 samples, compared with 5 for a loss and 30 for a row without a sample.
 _SEARCH_GAIN, GAIN = 0.02, 0.005
 
-
 #: Largest scatter [samples]; beyond it, an undetected loss costs less than 80 nats.
 _MAX_SIGMA = 0.8
-
 
 #: Largest share of rows without a sample, and largest cost of a row [nats], of stamps that fit the
 #: model. Jitter alone costs 0.5 nats; every second sample missing at random costs 2.5 more.
 _MAX_DROPPED_SHARE, _MAX_NATS = 0.01, 3.0
 
-
 #: Rows used in the search, candidates for the period, and candidates that are refined.
 _SEARCH_ROWS, _MAX_CANDIDATES, _MAX_REFINED = 8_000, 200, 4
-
 
 #: Relative step of candidate periods. With half of it as error, the phase, which follows with a
 #: gain of 0.02, lags by a fortieth of a sample.

@@ -14,7 +14,6 @@ from gyrostab.store.threads import map_in_order
 
 __all__ = ["fit_pieces", "longest_step", "pool_pieces"]
 
-
 _MAX_PIECES = 200_000
 
 

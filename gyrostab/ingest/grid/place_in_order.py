@@ -23,12 +23,9 @@ from gyrostab.time.grid import period_ns
 
 __all__ = ["place_in_order"]
 
-
 _AHEAD_ROWS = 1 << 12
 
-
 _MAX_ROWS, _MAX_AHEAD_ROWS = 1 << 20, 1 << 18
-
 
 #: Largest delay of a row that is not taken as a clock set back [samples].
 _LATE_SAMPLES = 16.0
