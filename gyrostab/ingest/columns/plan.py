@@ -101,7 +101,10 @@ def plan_columns(
         ``Plan.check()`` raises the first problem.
     """
     check_columns(path, len(headers), options.limits)
-    preset = _known_program(path, headers, above, is_filled)
+    split = [(header, split_header(header)[0]) for header in headers]
+    preset = PresetMatch("")
+    if not any(AXIS_PATTERN.match(name.lower()) for _, name in split):  # named gyro_x ... already
+        preset = find_preset(path, split, above=above, is_filled=is_filled)
     draft = PlanDraft(path, options, rising)
     named = name_columns(
         draft,
@@ -155,16 +158,3 @@ def plan_columns(
         tuple(unmatched),
         rate,
     )
-
-
-def _known_program(
-    path: Path,
-    headers: Sequence[str],
-    above: Sequence[str],
-    is_filled: Callable[[int], bool] | None,
-) -> PresetMatch:
-    """Return the preset of a file, unless the file names its axes ``gyro_x`` ... itself."""
-    split = [(header, split_header(header)[0]) for header in headers]
-    if any(AXIS_PATTERN.match(name.lower()) for _, name in split):
-        return PresetMatch("")
-    return find_preset(path, split, above=above, is_filled=is_filled) or PresetMatch("")

@@ -52,8 +52,8 @@ def find_preset(
     *,
     above: Sequence[str] = (),
     is_filled: Callable[[int], bool] | None = None,
-) -> PresetMatch | None:
-    """Find the preset that fits a file; None for the files of other programs.
+) -> PresetMatch:
+    """Find the preset that fits a file, with an empty name for the files of other programs.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def find_preset(
             above,
             is_filled or (lambda place: True),
         )
-    return None
+    return PresetMatch("")
 
 
 def _apply_preset(

@@ -163,29 +163,24 @@ def _convert_span(
     block: dict[int, Any] = {}
     for column in plan.columns:
         piece = converted.block[column.source]
-        read = partial(
-            _read_stamps if column.role == "time" else _read_values, column, options, fetch
-        )
-        block[column.source] = (
-            piece if isinstance(piece, EvenStampsPiece) else FilePiece(read, begin, rows)
-        )
+        if not isinstance(piece, EvenStampsPiece):
+            piece = FilePiece(partial(_read_column, column, options, fetch), begin, rows)
+        block[column.source] = piece
     return converted._replace(block=block, inspection=inspection)
 
 
-def _read_values(
+def _read_column(
     column: Column, options: ReadOptions, fetch: Fetch, start: int, stop: int
-) -> NDArray[np.float64]:
+) -> NDArray[Any]:
+    """Read a range of a column as stamps, or as values in the inner unit."""
     from gyrostab.kernels.encoding.rows import clean_column
 
-    values, _ = to_floats(fetch(column.source, start, stop))
+    stored = fetch(column.source, start, stop)
+    if column.role == "time":
+        return to_stamps(stored, column, options)
+    values, _ = to_floats(stored)
     clean_column(values, column.factor, column.offset)
     return values
-
-
-def _read_stamps(
-    column: Column, options: ReadOptions, fetch: Fetch, start: int, stop: int
-) -> NDArray[np.int64]:
-    return to_stamps(fetch(column.source, start, stop), column, options)
 
 
 def convert_batch(

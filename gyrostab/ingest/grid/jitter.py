@@ -130,7 +130,8 @@ def fit_jitter(
         return None
     sure *= max(1.0, group)
     periods = _candidate_periods(observed, slope, group)
-    sample = _shorten_parts(observed, _SEARCH_ROWS)
+    n_rows = max(64, _SEARCH_ROWS // len(observed))
+    sample = [(count[:n_rows], stamps[:n_rows]) for count, stamps in observed]
     best = sorted(periods, key=lambda period: _row_cost(sample, period, sigma_ns, sure))[
         :_MAX_REFINED
     ]
@@ -215,11 +216,6 @@ def _candidate_periods(
     low, high = low * 0.995, max(high * 1.005, np.median(slope))
     steps = int(min(np.ceil(np.log(high / low) * group / _PERIOD_STEP), _MAX_CANDIDATES)) + 1
     return [float(period) for period in np.geomspace(low, high, steps)]
-
-
-def _shorten_parts(observed: list[ObservedStamps], rows: int) -> list[ObservedStamps]:
-    n_rows = max(64, rows // len(observed))
-    return [(count[:n_rows], stamps[:n_rows]) for count, stamps in observed]
 
 
 def _row_cost(observed: list[ObservedStamps], period: float, sigma_ns: float, sure: float) -> float:

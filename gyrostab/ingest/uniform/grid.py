@@ -101,7 +101,8 @@ def find_grid(read: ReadStamps, count: int, *, nominal: float | None = None) -> 
             plain = _place_stamps(read, count, start, rate)
             if plain is not None:
                 return _checked_size(UniformGrid(start, rate, samples + 1, plain[1]), count, steps)
-    shortest, longest = steps.smallest / NANOSECONDS, _longest_step(read, count) / NANOSECONDS
+    longest_step = max(int(np.diff(stamps).max()) for _, stamps in _stamp_blocks(read, count))
+    shortest, longest = steps.smallest / NANOSECONDS, longest_step / NANOSECONDS
     raise TimeError(
         f"the time of the log is not uniform: its steps of {shortest:.9g} s to {longest:.9g} s "
         "fit no sampling rate, even with samples "
@@ -149,10 +150,6 @@ def _describe_disorder(place: int, before: int, after: int) -> str:
         f"at {second}; sort it, "
         "log.sortby('time'), or give overlapping logs to gyrostab.read_log, which joins them"
     )
-
-
-def _longest_step(read: ReadStamps, count: int) -> int:
-    return max(int(np.diff(stamps).max()) for _, stamps in _stamp_blocks(read, count))
 
 
 def _fit_period(read: ReadStamps, count: int, span: int, base: float) -> tuple[float, int] | None:
