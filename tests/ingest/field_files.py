@@ -6,10 +6,11 @@ import struct
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from gyrostab.ingest.formats.messages import crc32_mpeg2
 
@@ -28,6 +29,20 @@ class Made(NamedTuple):
     path: Path
     form: str
     options: dict[str, Any]
+
+
+def write_trace(
+    file: IO[bytes], code: str, values: NDArray[Any], rate: float, start: Any, **records: Any
+) -> None:
+    """Append a trace of miniSEED that starts at an instant, as integer [ns] or datetime64[ns]."""
+    from pymseed import MS3TraceList
+
+    traces = MS3TraceList()
+    kind = "d" if values.dtype.kind == "f" else "i"
+    first = int(np.asarray(start).astype(np.int64))
+    traces.add_data(f"FDSN:XX_TOOL__{code}", values, kind, rate, starttime=first)
+    for record in traces.generate(max_record_length=512, **records):
+        file.write(record)
 
 
 def write_las(place: Path) -> Made:

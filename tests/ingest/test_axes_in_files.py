@@ -17,6 +17,7 @@ from gyrostab.ingest.columns import pieces
 from gyrostab.ingest.concat import group_axes
 from gyrostab.ingest.grid.regularise import gap_table, regularise
 from gyrostab.store.lazy import find_source
+from tests.ingest.field_files import write_trace
 
 N, PERIOD_NS = 2000, 10_000_000
 START = np.datetime64("2026-03-01T06:00:00", "ns").astype(np.int64)
@@ -180,16 +181,11 @@ def write_miniseed(
     path: Path, codes: dict[str, str], *, skew: dict[str, float], start: int = 0, size: int = N
 ) -> Path:
     """Write channels by code, 100 counts for each deg/h, with stamps in microseconds."""
-    from pymseed import MS3TraceList
-
     with path.open("wb") as file:
         for code, axis in codes.items():
-            traces = MS3TraceList()
             begin = START + round((start + skew.get(axis, 0.0)) * PERIOD_NS / 1000) * 1000
             counts = np.round(100 * truth(axis)[start : start + size]).astype(np.int32)
-            traces.add_data(f"FDSN:XX_TOOL__{code}", counts, "i", 100.0, starttime=begin)
-            for record in traces.generate(max_record_length=512):
-                file.write(record)
+            write_trace(file, code, counts, 100.0, begin)
     return path
 
 

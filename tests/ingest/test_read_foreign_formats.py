@@ -11,6 +11,7 @@ import pytest
 
 from gyrostab.errors import FormatError, MissingUnitError
 from gyrostab.ingest import read_log, scan_file
+from tests.ingest.field_files import write_trace
 
 RATE = 50.0
 ROWS = 3000
@@ -20,22 +21,12 @@ VALUES = np.random.default_rng(11).integers(-20000, 20000, (3, ROWS)).astype(np.
 
 def write_miniseed(path: Path, codes: str = "ENZ", band: str = "H") -> bytes:
     """Write channels of a rotation sensor one after the other, as in archives."""
-    from pymseed import DataEncoding, MS3TraceList
+    from pymseed import DataEncoding
 
+    steim = {"encoding": DataEncoding.STEIM2, "format_version": 2}
     with path.open("wb") as file:
         for code, values in zip(codes, VALUES, strict=True):
-            traces = MS3TraceList()
-            traces.add_data(
-                f"FDSN:XX_TOOL__{band}_J_{code}",
-                values,
-                "i",
-                RATE,
-                starttime=int(START.astype(np.int64)),
-            )
-            for record in traces.generate(
-                max_record_length=512, encoding=DataEncoding.STEIM2, format_version=2
-            ):
-                file.write(record)
+            write_trace(file, f"{band}_J_{code}", values, RATE, START, **steim)
     return path.read_bytes()
 
 

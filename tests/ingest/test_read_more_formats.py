@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any
 
 import numpy as np
 import pandas as pd
@@ -15,6 +14,7 @@ import xarray as xr
 from gyrostab.errors import FormatError, GyrostabError, OptionError
 from gyrostab.ingest import ReadOptions, read_log, scan_file
 from gyrostab.ingest.grid.regularise import gap_table, regularise
+from tests.ingest.field_files import write_trace
 
 Find = Callable[[str], Path]
 ROWS = 500
@@ -92,39 +92,17 @@ def test_px4_log_matches_its_text_export(recordings: Find) -> None:
 
 
 def write_miniseed(path: Path, *, gap: int = 0) -> None:
-    from pymseed import DataEncoding, MS3TraceList
-
-    def add(
-        file: IO[bytes],
-        code: str,
-        values: Any,
-        kind: str,
-        rate: float,
-        begin: np.datetime64,
-        encoding: Any,
-    ) -> None:
-        traces = MS3TraceList()
-        traces.add_data(
-            f"FDSN:XX_TOOL__{code}", values, kind, rate, starttime=int(begin.astype(np.int64))
-        )
-        for record in traces.generate(max_record_length=512, encoding=encoding):
-            file.write(record)
+    from pymseed import DataEncoding
 
     half = ROWS // 2
     with path.open("wb") as file:
         for first in (0, half):
             begin = STAMPS[first] + np.timedelta64(20_000_000 * gap * (first > 0), "ns")
             for code, values in zip(("H_J_1", "H_J_2"), VALUES.astype(np.int32), strict=True):
-                add(file, code, values[first : first + half], "i", RATE, begin, DataEncoding.STEIM2)
-        add(
-            file,
-            "L_K_O",
-            np.arange(10, dtype=np.float64),
-            "d",
-            1.0,
-            STAMPS[0],
-            DataEncoding.FLOAT64,
-        )
+                part = values[first : first + half]
+                write_trace(file, code, part, RATE, begin, encoding=DataEncoding.STEIM2)
+        slow = np.arange(10, dtype=np.float64)
+        write_trace(file, "L_K_O", slow, 1.0, STAMPS[0], encoding=DataEncoding.FLOAT64)
 
 
 MINISEED = {
