@@ -5,8 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import xarray as xr
@@ -16,7 +15,7 @@ from gyrostab.ingest.options import FileSummary
 from gyrostab.schema import texts
 from gyrostab.time.stamps import format_stamp, to_nanoseconds
 
-__all__ = ["LostFile", "add_lost_notes", "check_share", "find_lost_spans", "is_damage"]
+__all__ = ["add_lost_notes", "check_share", "find_lost_spans", "is_damage", "reason_of"]
 
 #: Largest share of unreadable files; more suggest a wrong option instead of damage.
 MAX_LOST_SHARE = 0.5
@@ -25,14 +24,8 @@ MAX_LOST_SHARE = 0.5
 _SYSTEM = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOSPC, errno.EDQUOT, errno.EINTR)
 
 Span = tuple[int, int]
-
-
-@dataclass(frozen=True)
-class LostFile:
-    """A file that cannot be read, and the reason."""
-
-    path: Path
-    reason: str
+#: Files that cannot be read, and why.
+LostFiles = Mapping[Path, str]
 
 
 def is_damage(path: Path, error: Exception) -> bool:
@@ -55,12 +48,12 @@ def reason_of(path: Path, error: Exception) -> str:
     return text if path.name in text.split(": ")[0] else f"{path.name}: {text}"
 
 
-def check_share(lost: Sequence[LostFile], total: int) -> None:
+def check_share(lost: LostFiles, total: int) -> None:
     """Refuse to go on when more than half of the files cannot be read."""
     if len(lost) > MAX_LOST_SHARE * total:
         advice = "that is more than damage: check the names and the reading options"
         raise FormatError(
-            f"{lost[0].reason}; {len(lost)} of {total} files cannot be read, {advice}"
+            f"{next(iter(lost.values()))}; {len(lost)} of {total} files cannot be read, {advice}"
         )
 
 
@@ -74,7 +67,7 @@ def _name_key(path: Path) -> list[tuple[int, int, str]]:
 
 
 def find_lost_spans(
-    lost: Sequence[LostFile], spans: Mapping[Path, Span], scan: Callable[[Path], FileSummary]
+    lost: LostFiles, spans: Mapping[Path, Span], scan: Callable[[Path], FileSummary]
 ) -> dict[Path, Span]:
     """Find the time spans of lost files, as far as they can be determined.
 
@@ -93,9 +86,9 @@ def find_lost_spans(
     dict of Path to (int, int)
         First and last instant [ns since 1970].
     """
-    names = sorted([*spans, *(file.path for file in lost)], key=_name_key)
+    names = sorted([*spans, *lost], key=_name_key)
     lost_spans: dict[Path, Span] = {}
-    for path in (file.path for file in lost):
+    for path in lost:
         place = names.index(path)
         previous_path = next((name for name in reversed(names[:place]) if name in spans), None)
         next_path = next((name for name in names[place:] if name in spans), None)
@@ -125,26 +118,24 @@ def _span_of_stamps(path: Path, scan: Callable[[Path], FileSummary]) -> Span | N
     return None
 
 
-def add_lost_notes(
-    log: xr.Dataset, lost: Sequence[LostFile], spans: Mapping[Path, Span]
-) -> xr.Dataset:
+def add_lost_notes(log: xr.Dataset, lost: LostFiles, spans: Mapping[Path, Span]) -> xr.Dataset:
     """Add notes on the lost files, and their names as ``unreadable_files``."""
     if not lost:
         return log
     notes = []
-    for file in lost:
+    for path, reason in lost.items():
         where = "where no other file has its time, there is a gap"
-        if file.path in spans:
-            first, last = map(format_stamp, spans[file.path])
+        if path in spans:
+            first, last = map(format_stamp, spans[path])
             where = (
                 f"its time is between {first} and {last}, which is a gap unless another file "
                 "covers it"
             )
-        notes.append(f"{file.reason}; the file is left out: {where}")
+        notes.append(f"{reason}; the file is left out: {where}")
     return log.assign_attrs(
         notes=[*texts(log, "notes"), *notes],
         unreadable_files=[
             *log.attrs.get("unreadable_files", []),
-            *(file.path.name for file in lost),
+            *(path.name for path in lost),
         ],
     )

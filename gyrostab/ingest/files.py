@@ -21,7 +21,6 @@ from gyrostab.ingest.columns.pieces import SPILL_BYTES, Spool
 from gyrostab.ingest.combine import attach_channels, concatenate, memory_bytes, move_to_disk
 from gyrostab.ingest.concat import concatenate_logs, log_span
 from gyrostab.ingest.damaged_files import (
-    LostFile,
     add_lost_notes,
     check_share,
     find_lost_spans,
@@ -309,25 +308,21 @@ def read_log(
         log = concatenate(list(parts.values()))
         if lost and "time" not in log.variables:
             raise FormatError(
-                f"{lost[0].reason}; the files have no time stamps, so the time of those that "
-                "follow it is not known: mend it"
+                f"{next(iter(lost.values()))}; the files have no time stamps, so the time of "
+                "those that follow it is not known: mend it"
             )
         if spans:
-            log.attrs["unreadable_spans"] = [
-                list(span) for span in spans.values()
-            ]  # regularise marks the gaps there
+            # regularise marks the gaps there
+            log.attrs["unreadable_spans"] = [list(span) for span in spans.values()]
     return attach_channels(add_lost_notes(log, lost, spans), channels)
 
 
 def _read_all(
-    paths: Sequence[Path],
-    options: ReadOptions,
-    on_file: OnFile | None = None,
-    read_one: ReadFile | None = None,
-) -> tuple[dict[Path, xr.Dataset], list[LostFile]]:
+    paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None, read_one: ReadFile | None
+) -> tuple[dict[Path, xr.Dataset], dict[Path, str]]:
     """Read the files one by one; move them to disk when they exceed the memory limit together."""
     parts: dict[Path, xr.Dataset] = {}
-    lost: list[LostFile] = []
+    lost: dict[Path, str] = {}
     spool = Spool()
     held = 0
     with closing(_read_ahead(paths, options, on_file, read_one)) as reading:
@@ -337,7 +332,7 @@ def _read_all(
             except (GyrostabError, OSError) as error:
                 if options.strict or len(paths) == 1 or not is_damage(path, error):
                     raise
-                lost.append(LostFile(path, reason_of(path, error)))
+                lost[path] = reason_of(path, error)
                 continue
             held += memory_bytes(part)
             if held > SPILL_BYTES and len(paths) > 1:

@@ -45,6 +45,9 @@ class ClockBlock(NamedTuple):
     turns: list[int]  # periods that were added within the block
 
 
+_NO_ROWS = np.empty(0, np.int64)
+
+
 class ConvertedBlock(NamedTuple):
     """A converted block of rows for `RawLogBuilder.add`; row numbers count from its first row."""
 
@@ -55,21 +58,17 @@ class ConvertedBlock(NamedTuple):
     #: whether these are whole numbers.
     ranges: dict[int, tuple[int, float, float, bool]]
     #: Unreadable rows, and other rows with an unreadable gyro cell.
-    bad_rows: NDArray[np.int64]
-    cell_rows: NDArray[np.int64]
+    bad_rows: NDArray[np.int64] = _NO_ROWS
+    cell_rows: NDArray[np.int64] = _NO_ROWS
     #: Unreadable cells, and unreadable gyro cells of `cell_rows`.
-    bad_cells: int
-    cells: int
+    bad_cells: int = 0
+    cells: int = 0
     #: Range of the stamps of readable rows [ns since 1970]; high < low if there are none.
-    low: int
-    high: int
-    inspection: RowInspection | None = (
-        None  # findings of the scan pass over values that stay in the file
-    )
+    low: int = np.iinfo(np.int64).max
+    high: int = NAT
+    #: Findings of the scan pass over values that stay in the file.
+    inspection: RowInspection | None = None
     clock: ClockBlock | None = None
-
-
-_NO_ROWS = np.empty(0, np.int64)
 
 
 class _Places:
@@ -140,7 +139,7 @@ class RawLogBuilder:
             len(next(iter(values.values()))) if values else len(stamps) if stamps is not None else 0
         )
         if size == 0:
-            return ConvertedBlock(0, {}, {}, _NO_ROWS, _NO_ROWS, 0, 0, np.iinfo(np.int64).max, NAT)
+            return ConvertedBlock(0, {}, {})
         bad = stamps == NAT if stamps is not None else np.zeros(size, dtype=bool)
         block: dict[int, NDArray[Any] | Piece] = {}
         bad_cells, ranges, masks = words + int(np.count_nonzero(bad)), {}, []
@@ -155,20 +154,24 @@ class RawLogBuilder:
             bad = bad | np.logical_and.reduce([mask for mask in masks if mask is not None])
         any_bad = bool(bad.any())
         cell_masks = [mask & ~bad for mask in gyro]
-        low, high, clock = np.iinfo(np.int64).max, NAT, None
-        if stamps is not None and self.time is not None:
-            if self.continues_clock:
-                stamps, clock = _continue_block(stamps)
-            good = stamps[~bad] if any_bad else stamps
-            if len(good):
-                low, high = int(good.min()), int(good.max())
-            block[self.time.source] = _pack_stamps(stamps)
-        return ConvertedBlock(
-            size, block, ranges, np.flatnonzero(bad) if any_bad else _NO_ROWS,
-            np.flatnonzero(np.logical_or.reduce(cell_masks)) if cell_masks else _NO_ROWS,
-            bad_cells, sum(int(np.count_nonzero(mask)) for mask in cell_masks), low, high,
-            clock=clock,
-        )  # fmt: skip
+        converted = ConvertedBlock(size, block, ranges, bad_cells=bad_cells)
+        if any_bad:
+            converted = converted._replace(bad_rows=np.flatnonzero(bad))
+        if cell_masks:
+            converted = converted._replace(
+                cell_rows=np.flatnonzero(np.logical_or.reduce(cell_masks)),
+                cells=sum(int(np.count_nonzero(mask)) for mask in cell_masks),
+            )
+        if stamps is None or self.time is None:
+            return converted
+        if self.continues_clock:
+            stamps, clock = _continue_block(stamps)
+            converted = converted._replace(clock=clock)
+        block[self.time.source] = _pack_stamps(stamps)
+        good = stamps[~bad] if any_bad else stamps
+        if len(good):
+            converted = converted._replace(low=int(good.min()), high=int(good.max()))
+        return converted
 
     def add(self, converted: ConvertedBlock, locate: Locate | None = None) -> None:
         """Add one block.
