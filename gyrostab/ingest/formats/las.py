@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.stamps import dates_to_ns
+from gyrostab.ingest.columns.stamps import NAT, dates_to_ns
 from gyrostab.ingest.columns.typed import holds_dates
 from gyrostab.ingest.formats.recognise import read_head
 from gyrostab.ingest.formats.tables import (
@@ -114,7 +114,7 @@ def _to_stamps(
             numbers = numbers // 10000 * 3600 + numbers // 100 % 100 * 60 + numbers % 100
         usable = np.isfinite(numbers)
         counts = np.rint(np.where(usable, numbers, 0.0) * 1e9).astype(np.int64)
-        since = np.where(usable, counts, np.iinfo(np.int64).min).view("timedelta64[ns]")
+        since = np.where(usable, counts, NAT).view("timedelta64[ns]")
     return np.asarray(start + since)
 
 

@@ -110,7 +110,7 @@ def _plan_file(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
             head += _read_chunk(path, file, size, size)
             size *= 2
         layout = find_layout(path, head, complete=len(head) < size, limits=options.limits)
-    rows = [row for row in layout.samples if len(row) == layout.width]
+    rows = layout.full_samples
     orders = {
         column: find_order(row[column] for row in rows)
         for column in range(layout.width)
@@ -132,24 +132,18 @@ def _plan_file(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
 
 def _duration_units(layout: Layout) -> dict[int, str]:
     """Return the units of columns whose cells contain them, such as ``0.01 sec``."""
-    rows = [row for row in layout.samples if len(row) == layout.width]
-    units = (
-        {column: unit for column, cell in enumerate(rows[0]) if (unit := unit_of_duration(cell))}
-        if rows
-        else {}
-    )
+    rows = layout.full_samples
     return {
         column: unit
-        for column, unit in units.items()
-        if all(unit_of_duration(row[column]) == unit for row in rows)
+        for column, cell in enumerate(rows[0] if rows else ())
+        if (unit := unit_of_duration(cell))
+        and all(unit_of_duration(row[column]) == unit for row in rows)
     }
 
 
 def _is_rising(layout: Layout, column: int) -> bool:
     """Return whether the first filled cells of a column rise from row to row, as stamps do."""
-    cells = [
-        row[column] for row in layout.samples if len(row) == layout.width and row[column].strip()
-    ]
+    cells = [row[column] for row in layout.full_samples if row[column].strip()]
     if all(is_number(cell, comma=layout.decimal_comma) for cell in cells):
         steps = np.diff([float(cell.replace(",", ".")) for cell in cells])
     else:

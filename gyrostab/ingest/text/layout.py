@@ -65,6 +65,11 @@ class Layout:
         """Number of cells in a row."""
         return len(self.headers)
 
+    @property
+    def full_samples(self) -> list[tuple[str, ...]]:
+        """The first few rows, without those that have too few or too many cells."""
+        return [row for row in self.samples if len(row) == self.width]
+
     def split_row(self, line: str) -> list[str]:
         """Split a data row into cells."""
         return _join_pair(split_line(line, self.separator), self.paired)
