@@ -136,8 +136,8 @@ def make_mean_effect(
         Signed shares of the axes.
     strength : float
         Size in units of the limit.
-    name, driver, form, differs, tau, active
-        See `Effect`.
+    form_differs, tau, parameters, **description
+        Fields of `Effect`.
     regressor : (str, ndarray, str), optional
         Name of a parameter, the driver it multiplies (time,) and its unit; its true value on every
         axis is the least-squares fit to the mean.
@@ -192,8 +192,8 @@ def make_variance_effect(
         Size in units of the limit.
     first : float
         Small amplitude at which the search starts.
-    name, axes, driver, form, differs, tau, active
-        See `Effect`.
+    tau, **description
+        Fields of `Effect`.
     """
     amplitude = amplitude_for(lambda a: variance_size(scenario, ratio(a)), strength, first=first)
     final = ratio(amplitude)
