@@ -29,9 +29,10 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.known_lines import remove_known_lines
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
+from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
-from gyrostab.diagnose.identify.selection import Search
+from gyrostab.diagnose.identify.selection import select_effects
 from gyrostab.diagnose.nulls.records import repeatable_null_records
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.aligned_channels import align_channels
@@ -73,7 +74,7 @@ def main() -> None:
         plan = plan_pair(index, options.seed, GROUPS[options.group])
         stored = options.folder / f"{options.group}-{options.seed}-{index}.pickle"
         if not stored.exists():
-            stored.write_bytes(pickle.dumps(prepare_searches(plan)))
+            stored.write_bytes(pickle.dumps(prepare_examinations(plan)))
         effects = zip(plan["names"], plan["strengths"], strict=True)
         print(f"{index}:", " + ".join(f"{name} {size:g}" for name, size in effects), flush=True)
         counts.update(count_draw(pickle.loads(stored.read_bytes())))
@@ -101,13 +102,13 @@ def plan_pair(index: int, seed: int, names: tuple[str, ...]) -> dict[str, Any]:
     }
 
 
-def prepare_searches(plan: dict[str, Any]) -> dict[str, tuple[Search, Any, dict[str, Any]]]:
-    """Draw the four records; return the search of each, what it starts from, and the truth."""
+def prepare_examinations(plan: dict[str, Any]) -> dict[str, tuple[Examination, dict[str, Any]]]:
+    """Draw the four records; return what is searched in each, and the truth."""
     scenario = draw_suitable(plan, [CATALOGUE[name] for name in plan["names"]], 0)
     effects = draw_effects(plan, scenario)
     seed = int(stream(plan["seed"], "case", plan["index"]).integers(2**40))
     channels = make_channels(scenario, effects, stream(seed, "channels"))
-    searches: dict[str, tuple[Search, Any, dict[str, Any]]] = {}
+    examinations: dict[str, tuple[Examination, dict[str, Any]]] = {}
     null: Any = None
     for part, members in MEMBERS.items():
         chosen = [effects[member] for member in members]
@@ -123,20 +124,26 @@ def prepare_searches(plan: dict[str, Any]) -> dict[str, tuple[Search, Any, dict[
             *effect_candidates(blocks, baseline["coefficient"])[0],
             *nuisance_alternatives(blocks),
         ]
-        search = Search(candidates, fold_blocks(blocks), null.count_evidence, null.threshold)
+        examination = Examination(
+            candidates,
+            fold_blocks(blocks),
+            null.count_evidence,
+            null.threshold,
+            initial_state(blocks, baseline),
+        )
         strengths = [plan["strengths"][member] for member in members]
         truth = describe_truth(scenario, chosen, strengths=strengths)
-        searches[part] = search, initial_state(blocks, baseline), truth
-    return searches
+        examinations[part] = examination, truth
+    return examinations
 
 
-def count_draw(searches: dict[str, tuple[Search, Any, dict[str, Any]]]) -> Counter[str]:
+def count_draw(examinations: dict[str, tuple[Examination, dict[str, Any]]]) -> Counter[str]:
     """Repeat the searches of a draw, print the names, and count what is named."""
     counts: Counter[str] = Counter()
     singles_named = True
-    for part, (search, start, truth) in searches.items():
+    for part, (examination, truth) in examinations.items():
         started = time.process_time()
-        identified, unidentified, *_ = search.run(start)
+        identified, unidentified, *_ = select_effects(examination)
         seconds = time.process_time() - started
         true = [effect["name"] for effect in truth["effects"]]
         sets = [

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from itertools import pairwise
+from collections.abc import Sequence
 
 import numpy as np
 
 from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
-from gyrostab.diagnose.predict.condition import condition_on
-from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import combine_rows
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
@@ -22,10 +17,8 @@ __all__ = [
     "candidates_of",
     "evidence_of",
     "find_components",
-    "find_layers_again",
     "group_components",
     "merge_lines",
-    "split_layers",
     "sum_evidence",
 ]
 
@@ -151,50 +144,3 @@ def axes_of(components: Sequence[Component], order: Sequence[str]) -> tuple[str,
     """Return the axes of components, in order."""
     named = {axis for component in components for axis in component.row}
     return tuple(sorted(named, key=lambda axis: (order.index(axis) if axis in order else 0, axis)))
-
-
-def split_layers(components: Sequence[Component]) -> list[list[Component]]:
-    """Split components by how often their statistic, row and reference channel occurred before."""
-    out: list[list[Component]] = []
-    occurrences: Counter[tuple[object, ...]] = Counter()
-    for component in components:
-        place = component.statistic, component.row, component.candidate.reference
-        if occurrences[place] == len(out):
-            out.append([])
-        out[occurrences[place]].append(component)
-        occurrences[place] += 1
-    return out
-
-
-def find_layers_again(
-    components: Sequence[Component],
-    first: Sequence[Component],
-    state: State,
-    gains: Callable[[Sequence[Candidate], State], list[CandidateEvidence]],
-) -> list[list[Component]]:
-    """Find the components of each layer again, with the layers before it in the model.
-
-    The evidence of several variants together is not that of one of them: the first of two opposite
-    jumps explains little alone.
-
-    Parameters
-    ----------
-    components : sequence of Component
-        Components of the identification.
-    first : sequence of Component
-        Those found with none of the identification in the model.
-    state : State
-        With all other identifications in the model.
-    gains : callable
-        Computes the evidence of candidates in a state.
-    """
-    out = [list(first)]
-    weight, key = state.weight, components[0].candidate.key
-    axes = {axis for component in components for axis in component.row}
-    for previous_layer, layer in pairwise(split_layers(components)):
-        state = replace(condition_on(state, previous_layer), weight=weight)
-        layer_components = group_components(
-            gains(candidates_of(layer), state), settings=state.settings
-        ).get(key, [])
-        out.append([component for component in layer_components if set(component.row) & axes])
-    return out

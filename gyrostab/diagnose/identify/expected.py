@@ -5,11 +5,13 @@ These are anomalous samples, lines locked to the rotation, and telegraph biases.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 
-from gyrostab.diagnose.identify.components import axes_of, group_components, sum_evidence
-from gyrostab.diagnose.identify.identification import Identification
-from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
+from gyrostab.diagnose.identify.components import sum_evidence
+from gyrostab.diagnose.identify.examination import Examination
+from gyrostab.diagnose.identify.identification import Identification, make_identification
+from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.physics.base import Effect
@@ -20,45 +22,21 @@ MAX_ROUNDS_PER_EFFECT = 6  # components of one kind that an effect may add, one 
 _SINGLE_EVENT = {"telegraph": "bias_jump"}  # a switch that does not return
 
 
-def identify_expected_effects(
-    known: Sequence[Effect],
-    candidates: Sequence[Candidate],
-    start: State,
-    gains: Callable[[Sequence[Candidate], State], list[CandidateEvidence]],
-) -> tuple[list[Identification], State]:
+def identify_expected_effects(known: Sequence[Effect], examination: Examination) -> Examination:
     """Identify effects that are expected, and put them into the model before any others.
 
     Their sizes are free: the model says how often something happens, and the recording when. The
     strongest comes first, but anomalous samples before all others, because they raise powers and
     means too. An effect with several components of a kind, such as two jumps, is taken as long as
-    it adds evidence.
-
-    Parameters
-    ----------
-    known : sequence of Effect
-        Effects of the model that its baseline leaves out.
-    candidates : sequence of Candidate
-        All that are tried on this recording.
-    start : State
-        Without any effect.
-    gains : callable
-        Computes the evidence of candidates in a state.
-
-    Returns
-    -------
-    identified : list of Identification
-    state : State
-        With these in the model.
+    it adds evidence. `known` are the effects of the model that its baseline leaves out.
     """
     identified: list[Identification] = []
-    state, remaining = start, list(known)
-    needed = start.settings.component_nats
+    state, remaining = examination.start, list(known)
+    needed = examination.settings.component_nats
     rounds = MAX_ROUNDS_PER_EFFECT * len(remaining)
     while remaining and rounds > 0:
         rounds -= 1
-        choices = [
-            (_best_components(effect, candidates, state, gains), effect) for effect in remaining
-        ]
+        choices = [(_best_components(effect, examination, state), effect) for effect in remaining]
         remaining = [effect for components, effect in choices if sum_evidence(components) > needed]
         components, effect = max(
             choices,
@@ -66,11 +44,11 @@ def identify_expected_effects(
         )
         if sum_evidence(components) <= needed:
             break
-        identified.append(_make_identification(components, state))
+        identified.append(make_identification(components, needed, order=state.axes))
         state = condition_on(state, components)
         if _are_anomalous_samples(components, needed):  # their counts cannot be taken out
             remaining = [other for other in remaining if other is not effect]
-    return identified, state
+    return replace(examination, expected=tuple(identified), start=state)
 
 
 def _are_anomalous_samples(components: Sequence[Component], needed: float) -> bool:
@@ -87,37 +65,17 @@ def _is_candidate_of(candidate: Candidate, effect: Effect) -> bool:
     }
 
 
-def _best_components(
-    effect: Effect,
-    candidates: Sequence[Candidate],
-    state: State,
-    gains: Callable[[Sequence[Candidate], State], list[CandidateEvidence]],
-) -> list[Component]:
+def _best_components(effect: Effect, examination: Examination, state: State) -> list[Component]:
     """Return the components of an effect with the most evidence on its axes."""
-    components_by_key = group_components(
-        gains(
-            [candidate for candidate in candidates if _is_candidate_of(candidate, effect)], state
-        ),
-        settings=state.settings,
-    )
+    candidates = [
+        candidate for candidate in examination.candidates if _is_candidate_of(candidate, effect)
+    ]
     components_on_axes = [
         [
             component
             for component in components
             if not effect.axes or set(component.row) <= set(effect.axes)
         ]
-        for components in components_by_key.values()
+        for components in examination.find_components(candidates, state).values()
     ]
     return max(components_on_axes, key=sum_evidence, default=[])
-
-
-def _make_identification(components: Sequence[Component], state: State) -> Identification:
-    first = components[0].candidate
-    return Identification(
-        first.effect,
-        first.driver,
-        axes_of(components, state.axes),
-        tuple(components),
-        sum_evidence(components),
-        state.settings.component_nats,
-    )

@@ -14,10 +14,11 @@ from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence, ExpectedCounts, has_coarse_grid
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.equivalents import settle_forms
+from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.expected import identify_expected_effects
 from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
-from gyrostab.diagnose.identify.selection import Search
+from gyrostab.diagnose.identify.selection import select_effects
 from gyrostab.diagnose.predict.candidates import Candidate
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.search import compute_evidence, evidence_by_effect
@@ -78,34 +79,22 @@ def name_effects(
             if has_coarse_grid(blocks).any()
             else "not identifiable: the quantization grid is that of angles, or too fine to show"
         )
-    expected, start = identify_expected_effects(
-        known,
-        effects,
-        start,
-        lambda group, state: compute_evidence(
-            group, state.blocks, state, folds, count_evidence=count_evidence
-        ),
+    threshold = tail_level(best, level, settings=settings)
+    examination = identify_expected_effects(
+        known, Examination(candidates, folds, count_evidence, threshold, start)
     )
-    search = Search(
-        candidates,
-        folds,
-        count_evidence,
-        tail_level(best, level, settings=settings),
-        tuple(expected),
-        settings,
-    )
-    identified, unidentified, rejected, state = search.run(start)
+    identified, unidentified, rejected, state = select_effects(examination)
     identifications = Identifications(
         tuple(identified),
         tuple(unidentified),
-        search.threshold,
+        threshold,
         best,
         reasons,
         tuple(candidates),
         state,
         folds,
         count_evidence,
-        tuple(expected),
+        examination.expected,
         tuple(rejected),
     )
     return settle_forms(identifications, baseline)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.evidence.telegraph import telegraph_evidence
 from gyrostab.diagnose.evidence.visits import compare_visits
 from gyrostab.diagnose.identify.effect_candidates import largest_size
+from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identification import (
     Identification,
     Selection,
@@ -21,12 +22,12 @@ from gyrostab.diagnose.identify.identification import (
 from gyrostab.diagnose.identify.jumps import event_nats, gradual_nats, scatter_nats
 from gyrostab.diagnose.identify.logger_filters import separate_axes_nats
 from gyrostab.diagnose.identify.steady import intermittent_nats
-from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component, Variant
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.diagnose.reduce.zero_bin import possibly_truncated_axes
-from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.statistics.telegraph import add_fast_switching, fast_switching_evidence
 from gyrostab.physics.registry import effects
 
@@ -60,9 +61,7 @@ DIFFERENT_SPECTRUM: dict[str, tuple[str, ...]] = {
 EQUIVALENTS = {"thermal_hysteresis": "temperature_bias"}
 
 
-def without_pulses(
-    chosen: Sequence[Selection], *, settings: Settings = DEFAULTS
-) -> list[Selection]:
+def without_pulses(chosen: Sequence[Selection], settings: Settings) -> list[Selection]:
     """Drop spikes on axes that have a comb of lines or a profile of the feedback ramp.
 
     A comb is a periodic pulse, and the outliers are the pulse itself. Bad samples would make no
@@ -400,21 +399,12 @@ def find_spectral_alternatives(
     effect: str,
     components: Sequence[Component],
     state: State,
-    gains: Callable[[Sequence[Candidate], State], list[CandidateEvidence]],
+    examination: Examination,
 ) -> list[str]:
     """Return effects of the same channel, if a spectrum of another form explains clearly more.
 
     The forms that were tried then do not tell the effects apart: vibration through the resonance of
-    a mount has a hump like an aliased band.
-
-    Parameters
-    ----------
-    components : sequence of Component
-        Components of the effect.
-    state : State
-        With all other effects in the model.
-    gains : callable
-        Computes the evidence of candidates in a state.
+    a mount has a hump like an aliased band. `state` has all other effects in the model.
     """
     powers = [component for component in components if component.statistic.is_power]
     if effect not in DIFFERENT_SPECTRUM or not powers:
@@ -422,7 +412,7 @@ def find_spectral_alternatives(
     own_nats = sum(component.evidence_nats for component in powers)
     free = 0.0
     for component in powers:
-        evidence = gains([_any_spectrum(component, state)], state)[0]
+        evidence = examination.compute_evidence([_any_spectrum(component, state)], state)[0]
         free += float(evidence.evidence_nats[0, evidence.rows.index(component.row)])
     allowed = state.settings.ambiguous_nats + state.settings.form_error_share * own_nats
     return list(DIFFERENT_SPECTRUM[effect]) if free - own_nats > allowed else []

@@ -30,6 +30,7 @@ __all__ = [
     "conditioned_states",
     "find_unidentified",
     "form_error",
+    "make_identification",
     "remove_phase_locked",
     "with_axes_of",
 ]
@@ -295,6 +296,28 @@ def _is_same_effect(first: Identification, other: Identification) -> bool:
         if component.statistic.is_line
     }
     return (first.effect, first.driver) == (other.effect, other.driver) and len(lines) < 2
+
+
+def make_identification(
+    components: Sequence[Component],
+    threshold: float,
+    *,
+    order: Sequence[str] = (),
+    alternatives: Iterable[str] = (),
+    surrogate_p: float = math.nan,
+) -> Identification:
+    """Make an identification of components that passed a threshold, with its axes in order."""
+    first = components[0].candidate
+    return Identification(
+        first.effect,
+        first.driver,
+        axes_of(components, order),
+        tuple(components),
+        sum_evidence(components),
+        threshold,
+        tuple(dict.fromkeys(name for name in alternatives if name != first.effect)),
+        surrogate_p,
+    )
 
 
 def find_unidentified(

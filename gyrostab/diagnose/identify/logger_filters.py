@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.expected_statistics import band_columns, common_variance
 from gyrostab.diagnose.baseline.posterior import Fit, fit_squares
-from gyrostab.diagnose.predict.candidates import Candidate, Component
+from gyrostab.diagnose.identify.examination import Examination
+from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import State, unspread_share
-from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.predict.sizes import component_size, disagreement_nats
 from gyrostab.diagnose.settings import INTERVAL_TAILS
 from gyrostab.noise import NORMAL_95
@@ -31,7 +30,10 @@ MIN_ELSEWHERE_SHARE = 0.02  # of the probability, from which on other places wid
 
 
 def without_slopes(
-    passing: list[str], components: Mapping[str, list[Component]], state: State, folds: xr.DataArray
+    passing: list[str],
+    components: Mapping[str, list[Component]],
+    state: State,
+    examination: Examination,
 ) -> list[str]:
     """Drop lines that a passing filter explains, or the filter if lines remain.
 
@@ -45,7 +47,9 @@ def without_slopes(
     if not lines or not filters:
         return passing
     trial = condition_on(state, list(components[filters[0]]))
-    line_evidence = compute_evidence(_candidates_of(components, lines), trial.blocks, trial, folds)
+    line_evidence = examination.compute_evidence(
+        [components[key][0].candidate for key in lines], trial
+    )
     nats_after = {
         evidence.candidate.key: float(np.maximum(evidence.evidence_nats[0], 0.0).sum())
         for evidence in line_evidence
@@ -83,12 +87,6 @@ def separate_axes_nats(components: Sequence[Component], state: State) -> float:
     nats = disagreement_nats(share, error**-2.0)
     allowed = state.settings.reject_nats + state.settings.spectrum_error_share * evidence
     return nats if nats > allowed else 0.0
-
-
-def _candidates_of(
-    components: Mapping[str, list[Component]], keys: Iterable[str]
-) -> list[Candidate]:
-    return [components[key][0].candidate for key in keys]
 
 
 def fit_filter_sizes(

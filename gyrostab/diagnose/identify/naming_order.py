@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import xarray as xr
-
 from gyrostab.diagnose.identify.components import sum_evidence
+from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifiability import find_plainer_effect
 from gyrostab.diagnose.identify.logger_filters import without_slopes
 from gyrostab.diagnose.identify.switching import identify_switching, put_followers_first
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.settings import Settings
 
 __all__ = ["order_passing", "order_rivals"]
 
@@ -22,7 +20,7 @@ def order_passing(
     components: Mapping[str, list[Component]],
     required: Mapping[str, float],
     state: State,
-    folds: xr.DataArray,
+    examination: Examination,
 ) -> list[str]:
     """Return the keys that pass, in the order in which they are to be named.
 
@@ -54,7 +52,7 @@ def order_passing(
             _without_locked_lines(passing, components, state),
             components,
             state,
-            folds,
+            examination,
         )
     )
     return put_followers_first(first, components, state)
@@ -64,11 +62,10 @@ def order_rivals(
     passing: Sequence[str],
     components: Mapping[str, list[Component]],
     state: State,
-    candidates: Sequence[Candidate],
-    *,
-    settings: Settings,
+    examination: Examination,
 ) -> list[str]:
     """Return the effects that come close to the best, plainer ones first."""
+    settings = examination.settings
     best = sum_evidence(components[passing[0]])
     min_nats = best - settings.ambiguous_nats - settings.form_error_share * best
     rivals = [
@@ -78,7 +75,7 @@ def order_rivals(
     ]
     effects = {components[key][0].candidate.effect for key in rivals}
     is_later = {
-        key: _is_on_single_axis(components[key], candidates)
+        key: _is_on_single_axis(components[key], examination.candidates)
         or find_plainer_effect(components[key], state) in effects
         for key in rivals
     }

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-
-import xarray as xr
+from dataclasses import replace
 
 from gyrostab.diagnose.identify.components import axes_of, sum_evidence
+from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifiability import find_better_form
 from gyrostab.diagnose.identify.identification import (
     Identification,
@@ -17,6 +17,7 @@ from gyrostab.diagnose.identify.identification import (
     form_error,
 )
 from gyrostab.diagnose.identify.nuisance_alternatives import NUISANCE_ALTERNATIVES
+from gyrostab.diagnose.identify.settling import evidence_instead
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State
@@ -28,11 +29,10 @@ _NOISE = "noise"
 
 def find_rejections(
     components: Mapping[str, Sequence[Component]],
-    chosen: Sequence[Selection],
-    expected: Sequence[Identification],
-    threshold: float,
+    identified: Sequence[Identification],
+    unidentified: Sequence[Unidentified],
     state: State,
-    folds: xr.DataArray,
+    examination: Examination,
 ) -> list[Rejection]:
     """Return for each effect that was not named what beats it, and by how much.
 
@@ -40,24 +40,20 @@ def find_rejections(
     place of any of them. A selection beats it if the effect has enough evidence in its place;
     among several, it is the one in whose place the evidence is largest. If the effect has enough
     evidence although all selections are in the model, another form of it or a time-shifted channel
-    beats it.
-
-    Parameters
-    ----------
-    components : mapping of str to sequence of Component
-        Components of every candidate by its key, with all selections in the model.
-    chosen : sequence of Identification or Unidentified
-        All selections, with the evidence of others `instead`.
-    expected : sequence of Identification
-        Effects that the simulation contains as well.
-    threshold : float
-        Evidence that any effect needs [nats].
-    state : State
-        With all selections in the model.
-    folds : xarray.DataArray
-        Blocks that are held out together.
+    beats it. `components` of every candidate and `state` have all selections in the model.
     """
-    selections = [*expected, *chosen]
+    settled = [*identified, *unidentified]
+    chosen: list[Selection] = [
+        *identified,
+        *(
+            replace(selection, instead=evidence_instead(examination, selection, settled))
+            if selection.components
+            else selection
+            for selection in unidentified
+        ),
+    ]
+    selections = [*examination.expected, *chosen]
+    threshold = examination.threshold
     named = {selection.effect for selection in selections if isinstance(selection, Identification)}
     out: dict[str, tuple[float, Rejection]] = {}
     for key, effect_components in components.items():
@@ -71,7 +67,7 @@ def find_rejections(
         )
         instead = winner.instead.get(key, -math.inf) if winner else -math.inf
         if added_nats > threshold + error:
-            name, nats = _find_veto(effect_components, chosen, state, folds, error)
+            name, nats = _find_veto(effect_components, chosen, state, examination, error)
         elif winner and instead > threshold:
             name, nats = _name_of(winner), winner.evidence_nats - instead
         else:
@@ -89,7 +85,7 @@ def _find_veto(
     components: Sequence[Component],
     chosen: Sequence[Selection],
     state: State,
-    folds: xr.DataArray,
+    examination: Examination,
     error: float,
 ) -> tuple[str, float]:
     """Return what beats an effect with enough evidence, and by how much."""
@@ -104,7 +100,7 @@ def _find_veto(
     better_form = find_better_form(components, state, error=error)
     if better_form:
         return better_form
-    shifts = passes_time_shift_test(components, state, folds)
+    shifts = passes_time_shift_test(components, state, examination.folds)
     if not shifts.passed:
         return "a time-shifted channel", shifts.nats
     statistics = {component.statistic for component in components}

@@ -6,20 +6,21 @@ other effects in the model.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from gyrostab.diagnose.evidence.telegraph import telegraph_evidence
 from gyrostab.diagnose.identify.components import axes_of, evidence_of
+from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identification import (
     Identifications,
     Selection,
     components_of,
 )
 from gyrostab.diagnose.identify.jumps import is_free_jump
-from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
+from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
 
@@ -106,47 +107,38 @@ def identify_switching(
     ]
 
 
-def drop_explained_jumps(
-    chosen: Sequence[Selection],
-    state_with: Callable[[Sequence[Selection]], State],
-    gains: Callable[[Sequence[Candidate], State], list[CandidateEvidence]],
-    threshold: float,
-) -> list[Selection]:
+def drop_explained_jumps(chosen: Sequence[Selection], examination: Examination) -> list[Selection]:
     """Drop jumps that a telegraph bias on their axis explains when fitted without them.
 
     The first and the last of a few switches are jumps of the same step, and a telegraph bias that
-    is fitted with them in the model lacks these switches.
-
-    Parameters
-    ----------
-    chosen : sequence of Identification or Unidentified
-        With the evidence with which they were selected.
-    state_with : callable
-        Returns the state with some of them in the model.
-    gains : callable
-        Computes the evidence of candidates in a state.
-    threshold : float
-        Evidence that jumps must add to the telegraph bias [nats].
+    is fitted with them in the model lacks these switches. The selections have the evidence with
+    which they were selected.
     """
     out = list(chosen)
     for component in [
         component for component in components_of(chosen) if component.statistic.is_switching
     ]:
-        jumps = _jumps_on_axis(component, out, state_with([]))
+        jumps = _jumps_on_axis(component, out, examination.start)
         for dropped_jumps in [jumps, *([jump] for jump in jumps if len(jumps) > 1)]:
             if not dropped_jumps or not _contains_all(out, dropped_jumps):
                 continue
             with_jumps, without_jumps = (
-                state_with(_drop_components(out, left_out))
+                examination.state_with(_drop_components(out, left_out))
                 for left_out in ([component], [component, *dropped_jumps])
             )
             own_nats = _block_evidence(component, with_jumps)
             if (
                 np.isfinite(own_nats)
                 and own_nats + sum(jump.evidence_nats for jump in dropped_jumps)
-                < _block_evidence(component, without_jumps) + threshold
+                < _block_evidence(component, without_jumps) + examination.threshold
             ):
-                instead = _component_found(component, gains([component.candidate], without_jumps))
+                (evidence,) = examination.compute_evidence([component.candidate], without_jumps)
+                row = evidence.rows.index(component.row)
+                instead = replace(
+                    component,
+                    variant=evidence.best[row],
+                    evidence_nats=float(evidence.evidence_nats[0, row]),
+                )
                 out = [
                     _replace_component(selection, component, instead)
                     for selection in _drop_components(out, dropped_jumps)
@@ -221,15 +213,6 @@ def _drop_components(chosen: Sequence[Selection], left_out: Sequence[Component])
                 continue
         out.append(selection)
     return out
-
-
-def _component_found(component: Component, all_evidence: Sequence[CandidateEvidence]) -> Component:
-    """Return the component as found again."""
-    (evidence,) = all_evidence
-    row = evidence.rows.index(component.row)
-    return replace(
-        component, variant=evidence.best[row], evidence_nats=float(evidence.evidence_nats[0, row])
-    )
 
 
 def renew_component(components: Sequence[Component], component: Component) -> Component:

@@ -3,29 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-
-import xarray as xr
 
 from gyrostab.diagnose.identify.completeness import (
     excess_low_frequency_noise,
     variance_fluctuation,
     with_neighbouring_variants,
 )
-from gyrostab.diagnose.identify.components import group_components
+from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identification import (
     Identification,
     Unidentified,
     components_of,
-    condition_on_selections,
     find_unidentified,
 )
-from gyrostab.diagnose.predict.candidates import Candidate
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.search import compute_evidence
-from gyrostab.diagnose.settings import DEFAULTS, Settings
 
-__all__ = ["Withdrawal"]
+__all__ = ["withdraw_effects"]
 
 #: Effects that change the white variance of the means, which the calibration then misjudges.
 _SPECTRAL_SHAPES = ("logger_filter", "held_samples", "gauss_markov", "telegraph")
@@ -33,114 +26,106 @@ _SPECTRAL_SHAPES = ("logger_filter", "held_samples", "gauss_markov", "telegraph"
 _DRIFTS = ("~bias(t)", "~levels")
 
 
-@dataclass(frozen=True)
-class Withdrawal:
-    """Withdrawal of effects that explain too little for what they leave.
+def withdraw_effects(
+    examination: Examination,
+    state: State,
+    identified: list[Identification],
+    unidentified: Sequence[Unidentified],
+) -> tuple[list[Identification], list[Unidentified]]:
+    """Withdraw effects that leave structure in time, in the means or in the powers.
 
-    Attributes
-    ----------
-    start : State
-        With the expected effects in the model.
-    candidates, folds, threshold, settings
-        Those of `gyrostab.diagnose.identify.selection.Search`.
+    `state` has all selections in the model. The second result is what is unidentified instead.
     """
-
-    start: State
-    candidates: Sequence[Candidate]
-    folds: xr.DataArray
-    threshold: float
-    settings: Settings = DEFAULTS
-
-    def run(
-        self,
-        state: State,
-        identified: list[Identification],
-        unidentified: Sequence[Unidentified],
-    ) -> tuple[list[Identification], list[Unidentified]]:
-        """Withdraw effects that leave structure in time, in the means or in the powers."""
-        remaining, withdrawn = list(identified), []
-        for axis in state.axes:
-            remaining, unexplained = self._withdraw_in_means(state, remaining, unidentified, axis)
-            withdrawn += unexplained
-        for axis in state.axes:
-            on_axis = _identified_on(remaining, axis, in_means=False)
-            if not on_axis:
-                continue
-            weak, _ = self._find_weak(
-                on_axis, variance_fluctuation(condition_on_selections(self.start, remaining), axis)
-            )
-            if weak:
-                remaining = [
-                    identification for identification in remaining if identification not in weak
-                ]
-                reduced_state = condition_on_selections(self.start, [*remaining, *unidentified])
-                withdrawn += self._find_fluctuation(reduced_state, axis, weak)
-        return remaining, withdrawn
-
-    def _withdraw_in_means(
-        self,
-        state: State,
-        remaining: list[Identification],
-        unidentified: Sequence[Unidentified],
-        axis: str,
-    ) -> tuple[list[Identification], list[Unidentified]]:
-        """Withdraw effects on the means of an axis that leave more slow noise than calibrated."""
-        on_axis = _identified_on(remaining, axis, in_means=True)
-        part_of_drift = _find_part_of_drift(on_axis, unidentified, axis)
-        remaining = [
-            identification for identification in remaining if identification not in part_of_drift
-        ]
-        has_alternative = any(
-            selection.generic in (*_DRIFTS, "~S(f)", "~cov") and axis in selection.axes
-            for selection in unidentified
+    remaining, withdrawn = list(identified), []
+    for axis in state.axes:
+        remaining, unexplained = _withdraw_in_means(
+            examination, state, remaining, unidentified, axis
         )
-        has_shape = any(
-            component.candidate.effect in _SPECTRAL_SHAPES and axis in component.row
-            for component in components_of(remaining)
-        )
-        if has_alternative or has_shape:
-            return remaining, []
-        excess_nats = excess_low_frequency_noise(
-            with_neighbouring_variants(state, on_axis, axis), axis, self.folds
-        )
-        weak, strength = self._find_weak(on_axis, excess_nats)
-        if not weak and excess_nats <= self.threshold + self.settings.form_error_share * strength:
-            return remaining, []
-        names = tuple(identification.effect for identification in weak)
-        unexplained = Unidentified("~red", (axis,), excess_nats, self.threshold, names)
-        return [identification for identification in remaining if identification not in weak], [
-            unexplained
-        ]
+        withdrawn += unexplained
+    for axis in state.axes:
+        on_axis = _identified_on(remaining, axis, in_means=False)
+        if not on_axis:
+            continue
+        excess_nats = variance_fluctuation(examination.state_with(remaining), axis)
+        weak, _ = _find_weak(examination, on_axis, excess_nats)
+        if weak:
+            remaining = [
+                identification for identification in remaining if identification not in weak
+            ]
+            reduced_state = examination.state_with([*remaining, *unidentified])
+            withdrawn += _find_fluctuation(examination, reduced_state, axis, weak)
+    return remaining, withdrawn
 
-    def _find_weak(
-        self, identified: Sequence[Identification], excess_nats: float
-    ) -> tuple[list[Identification], float]:
-        """Return the effects that explain too little for what they leave [nats], and their sum."""
-        settings = self.settings
-        strength = sum(identification.evidence_nats for identification in identified)
-        allowed = settings.component_nats + settings.form_error_share * strength
-        share = settings.spectrum_error_share
-        return [
-            identification
-            for identification in identified
-            if excess_nats > max(allowed, share * identification.evidence_nats)
-        ], strength
 
-    def _find_fluctuation(
-        self, state: State, axis: str, weak: Sequence[Identification]
-    ) -> list[Unidentified]:
-        """Return what a free noise level explains on an axis, instead of withdrawn effects."""
-        free = [candidate for candidate in self.candidates if candidate.effect == "~N(t)"]
-        components_by_key = group_components(
-            compute_evidence(free, state.blocks, state, self.folds), settings=self.settings
-        )
-        components = [
-            component
-            for component in components_by_key.get("~N(t)", [])
-            if component.row == (axis,) and component.evidence_nats > self.threshold
-        ]
-        names = [identification.effect for identification in weak]
-        return [find_unidentified("~N(t)", components, self.threshold, names)] if components else []
+def _withdraw_in_means(
+    examination: Examination,
+    state: State,
+    remaining: list[Identification],
+    unidentified: Sequence[Unidentified],
+    axis: str,
+) -> tuple[list[Identification], list[Unidentified]]:
+    """Withdraw effects on the means of an axis that leave more slow noise than calibrated."""
+    on_axis = _identified_on(remaining, axis, in_means=True)
+    part_of_drift = _find_part_of_drift(on_axis, unidentified, axis)
+    remaining = [
+        identification for identification in remaining if identification not in part_of_drift
+    ]
+    has_alternative = any(
+        selection.generic in (*_DRIFTS, "~S(f)", "~cov") and axis in selection.axes
+        for selection in unidentified
+    )
+    has_shape = any(
+        component.candidate.effect in _SPECTRAL_SHAPES and axis in component.row
+        for component in components_of(remaining)
+    )
+    if has_alternative or has_shape:
+        return remaining, []
+    excess_nats = excess_low_frequency_noise(
+        with_neighbouring_variants(state, on_axis, axis), axis, examination.folds
+    )
+    weak, strength = _find_weak(examination, on_axis, excess_nats)
+    if (
+        not weak
+        and excess_nats <= examination.threshold + examination.settings.form_error_share * strength
+    ):
+        return remaining, []
+    names = tuple(identification.effect for identification in weak)
+    unexplained = Unidentified("~red", (axis,), excess_nats, examination.threshold, names)
+    return [identification for identification in remaining if identification not in weak], [
+        unexplained
+    ]
+
+
+def _find_weak(
+    examination: Examination, identified: Sequence[Identification], excess_nats: float
+) -> tuple[list[Identification], float]:
+    """Return the effects that explain too little for what they leave [nats], and their sum."""
+    settings = examination.settings
+    strength = sum(identification.evidence_nats for identification in identified)
+    allowed = settings.component_nats + settings.form_error_share * strength
+    share = settings.spectrum_error_share
+    return [
+        identification
+        for identification in identified
+        if excess_nats > max(allowed, share * identification.evidence_nats)
+    ], strength
+
+
+def _find_fluctuation(
+    examination: Examination, state: State, axis: str, weak: Sequence[Identification]
+) -> list[Unidentified]:
+    """Return what a free noise level explains on an axis, instead of withdrawn effects."""
+    free = [candidate for candidate in examination.candidates if candidate.effect == "~N(t)"]
+    components_by_key = examination.find_components(free, state)
+    components = [
+        component
+        for component in components_by_key.get("~N(t)", [])
+        if component.row == (axis,) and component.evidence_nats > examination.threshold
+    ]
+    names = [identification.effect for identification in weak]
+    return (
+        [find_unidentified("~N(t)", components, examination.threshold, names)] if components else []
+    )
 
 
 def _identified_on(

@@ -1,6 +1,7 @@
 """A bias that switches between two levels in the block means: evidence, look-alikes, diagnosis."""
 
 from collections.abc import Sequence
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -323,7 +324,10 @@ def test_switches_are_not_also_jumps(
         evidence_nats,
         8.0,
     )
-    left = drop_explained_jumps([first, hopping], state_with, gains, 8.0)
+    examination = SimpleNamespace(
+        start=start, threshold=8.0, state_with=state_with, compute_evidence=gains
+    )
+    left = drop_explained_jumps([first, hopping], examination)
     assert [identification.effect for identification in left] == ["bias_jump"] * bool(remaining) + [
         "telegraph"
     ]

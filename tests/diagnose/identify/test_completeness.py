@@ -12,13 +12,13 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.completeness import variance_fluctuation
+from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
-from gyrostab.diagnose.identify.selection import Search
+from gyrostab.diagnose.identify.selection import score_candidates
 from gyrostab.diagnose.predict.candidates import CandidateEvidence
 from gyrostab.diagnose.predict.condition import refit_weights
 from gyrostab.diagnose.predict.linear_model import State, initial_state
-from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 from tests.support.named import nulls
@@ -117,7 +117,9 @@ def test_noisy_axes_are_not_correlated() -> None:
         )
     )
     state = initial_state(blocks, calibrate_noise(blocks))
-    search = Search(nuisance_alternatives(blocks), fold_blocks(blocks), CountEvidence({}), 7.0)
+    examination = Examination(
+        nuisance_alternatives(blocks), fold_blocks(blocks), CountEvidence({}), 7.0, state
+    )
 
     def common(evidence: list[CandidateEvidence]) -> float:
         return max(
@@ -126,8 +128,8 @@ def test_noisy_axes_are_not_correlated() -> None:
             if result.candidate.effect == "~cov"
         )
 
-    assert common(compute_evidence(search.candidates, blocks, state, search.folds)) > 100.0
-    assert common(search._score_candidates(state, set())) < 3.0
+    assert common(examination.compute_evidence(examination.candidates, state)) > 100.0
+    assert common(score_candidates(examination, state, ())) < 3.0
 
 
 @pytest.mark.slow

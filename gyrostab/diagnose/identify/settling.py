@@ -1,0 +1,211 @@
+"""Test each selection again with all others in the model: evidence, axes and alternatives."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+from gyrostab.diagnose.identify.components import (
+    PLAIN_LINE,
+    candidates_of,
+    sum_evidence,
+)
+from gyrostab.diagnose.identify.examination import Examination
+from gyrostab.diagnose.identify.identifiability import (
+    find_equivalent_effects,
+    find_spectral_alternatives,
+    is_physical,
+)
+from gyrostab.diagnose.identify.identification import (
+    Identification,
+    Selection,
+    components_of,
+    with_axes_of,
+)
+from gyrostab.diagnose.identify.switching import renew_component
+from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.condition import condition_on
+from gyrostab.diagnose.predict.linear_model import State
+
+__all__ = ["evidence_instead", "prune_selections", "settle_selections"]
+
+
+def prune_selections(examination: Examination, chosen: list[Selection]) -> list[Selection]:
+    """Drop what fails the threshold with the others in the model, the weakest first.
+
+    Unidentified ones are tested before identifications, and these lose the axes that no longer
+    show them. The first selection stays, unless it is of anomalous samples, which come first
+    whatever their evidence.
+    """
+    for selection in sorted(
+        chosen,
+        key=lambda selection: (isinstance(selection, Identification), selection.evidence_nats),
+    ):
+        if len(chosen) < 2:
+            break
+        components_by_key = examination.find_components(
+            candidates_of(selection.components), examination.state_with(chosen, without=selection)
+        )
+        is_leading = (
+            selection is chosen[0]
+            and isinstance(selection, Identification)
+            and not selection.components[0].statistic.is_count
+        )
+        best = max(map(sum_evidence, components_by_key.values()), default=0.0)
+        if not is_leading and best < examination.threshold:
+            chosen = [other for other in chosen if other is not selection]
+        elif isinstance(selection, Identification):
+            reduced = with_axes_of(selection, components_by_key, settings=examination.settings)
+            chosen = [reduced if other is selection else other for other in chosen]
+    return chosen
+
+
+def settle_selections(
+    examination: Examination, chosen: list[Selection]
+) -> tuple[list[Selection], list[Identification]]:
+    """Finish the identifications, and drop the weakest until all reach their threshold."""
+    while True:
+        identified = {
+            place: _finish_identification(examination, selection, chosen)
+            for place, selection in enumerate(chosen)
+            if isinstance(selection, Identification)
+        }
+        margin = {}
+        for place, identification in identified.items():
+            others = [other for other in identified.values() if other is not identification]
+            required = examination.required_nats(identification.components, others)
+            # whatever was named first
+            margin[place] = identification.evidence_nats - max(identification.threshold, required)
+        weakest = min(margin, key=lambda place: margin[place], default=None)
+        if weakest is None or margin[weakest] >= 0.0:
+            return chosen, list(identified.values())
+        chosen = [*chosen[:weakest], *chosen[weakest + 1 :]]
+
+
+def _finish_identification(
+    examination: Examination, identification: Identification, chosen: Sequence[Selection]
+) -> Identification:
+    """Return an identification with its evidence and its rivals, all others in the model."""
+    state = examination.state_with(chosen, without=identification)
+    key = identification.components[0].candidate.key
+    on_axes, weighted = _find_instead(examination, identification, state)
+    layers = _find_layers_again(
+        examination, identification.components, on_axes.get(key, []), weighted
+    )
+    evidence_nats = (
+        sum(max(sum_evidence(layer), 0.0) for layer in layers) or identification.evidence_nats
+    )
+    min_nats = evidence_nats - examination.settings.ambiguous_nats
+    rivals = [
+        components[0].candidate.effect
+        for other, components in on_axes.items()
+        if components
+        and other != key
+        and not other.startswith("~")
+        and sum_evidence(components) >= min_nats
+        and sum_evidence(is_physical(components, state)) >= min_nats
+    ]
+    lines = {
+        component.place
+        for component in components_of(chosen)
+        if component.candidate.effect == PLAIN_LINE
+    }
+    rivals += find_equivalent_effects(
+        identification.effect, identification.components, state, lines=len(lines)
+    )
+    of_any_spectrum = find_spectral_alternatives(
+        identification.effect,
+        [component for layer in layers for component in layer],
+        weighted,
+        examination,
+    )
+    rivals += of_any_spectrum
+    alternatives = dict.fromkeys([*identification.alternatives, *rivals])
+    alternatives.pop(identification.effect, None)
+    components = tuple(
+        renew_component(layer_components, component)
+        for layer, layer_components in zip(
+            _split_layers(identification.components), layers, strict=True
+        )
+        for component in layer
+    )
+    return replace(
+        identification,
+        evidence_nats=evidence_nats,
+        alternatives=tuple(alternatives),
+        components=components,
+        # as probable as this effect, whatever their own form explains
+        instead=_sum_by_key(on_axes) | dict.fromkeys(of_any_spectrum, evidence_nats),
+    )
+
+
+def evidence_instead(
+    examination: Examination, selection: Selection, chosen: Sequence[Selection]
+) -> dict[str, float]:
+    """Return the evidence [nats] of candidates in the place of one of the selections, by key."""
+    state = examination.state_with(chosen, without=selection)
+    return _sum_by_key(_find_instead(examination, selection, state)[0])
+
+
+def _find_instead(
+    examination: Examination, selection: Selection, state: State
+) -> tuple[dict[str, list[Component]], State]:
+    """Return the components of candidates that could take the place of a selection.
+
+    They are in its statistics and on its axes. `state` has all others in the model; it is returned
+    with the weights that it has with the selection.
+    """
+    weighted = replace(state, weight=condition_on(state, list(selection.components)).weight)
+    statistics = {component.statistic for component in selection.components}
+    candidates = [
+        candidate for candidate in examination.candidates if candidate.statistic in statistics
+    ]
+    axes = set(selection.axes)
+    return {
+        key: [component for component in components if set(component.row) & axes]
+        for key, components in examination.find_components(candidates, weighted).items()
+    }, weighted
+
+
+def _sum_by_key(components: Mapping[str, Sequence[Component]]) -> dict[str, float]:
+    return {
+        key: sum_evidence(effect_components)
+        for key, effect_components in components.items()
+        if effect_components
+    }
+
+
+def _split_layers(components: Sequence[Component]) -> list[list[Component]]:
+    """Split components by how often their statistic, row and reference channel occurred before."""
+    out: list[list[Component]] = []
+    occurrences: Counter[tuple[object, ...]] = Counter()
+    for component in components:
+        place = component.statistic, component.row, component.candidate.reference
+        if occurrences[place] == len(out):
+            out.append([])
+        out[occurrences[place]].append(component)
+        occurrences[place] += 1
+    return out
+
+
+def _find_layers_again(
+    examination: Examination,
+    components: Sequence[Component],
+    first: Sequence[Component],
+    state: State,
+) -> list[list[Component]]:
+    """Find the components of each layer again, with the layers before it in the model.
+
+    The evidence of several variants together is not that of one of them: the first of two opposite
+    jumps explains little alone. `first` was found with none of the identification in the model.
+    """
+    out = [list(first)]
+    weight, key = state.weight, components[0].candidate.key
+    axes = {axis for component in components for axis in component.row}
+    for previous_layer, layer in pairwise(_split_layers(components)):
+        state = replace(condition_on(state, previous_layer), weight=weight)
+        layer_components = examination.find_components(candidates_of(layer), state).get(key, [])
+        out.append([component for component in layer_components if set(component.row) & axes])
+    return out
