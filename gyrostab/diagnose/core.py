@@ -18,7 +18,7 @@ from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.baseline.from_simulation import baseline_from_simulation
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion
 from gyrostab.diagnose.baseline.known_lines import remove_known_lines
-from gyrostab.diagnose.estimate.expected_effects import expected_baseline, without_expected
+from gyrostab.diagnose.estimate.conditioned_baseline import expected_baseline, without_expected
 from gyrostab.diagnose.estimate.recalibrate import remove_fast_switching
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identification import components_of

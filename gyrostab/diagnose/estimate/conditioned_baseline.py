@@ -1,4 +1,4 @@
-"""Put the identified effects into the baseline."""
+"""Put identified effects, expected effects, or anomalous samples into the baseline."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.identify.identification import (
     Identification,
     Identifications,
     components_of,
+    condition_on_selections,
     conditioned_states,
 )
 from gyrostab.diagnose.predict.candidates import Component
@@ -26,9 +28,13 @@ from gyrostab.diagnose.predict.linear_model import (
     pair_rows,
 )
 from gyrostab.diagnose.predict.sizes import component_mixture, mean_mixture
+from gyrostab.diagnose.predict.windows import make_windows
+from gyrostab.noise import sampled_psd
 from gyrostab.physics.registry import effects
 
-__all__ = ["predict_baseline"]
+__all__ = ["add_outlier_power", "expected_baseline", "predict_baseline", "without_expected"]
+
+_EVERYWHERE = "lattice"  # rounding affects every sample, so that the calibrated noise includes it
 
 
 def predict_baseline(
@@ -145,3 +151,61 @@ def _cross_spectra(
         for size, design in zip(mean, component.variant.design, strict=True):
             total[row] += size * cross_column(design, row, state.blocks)
     return total
+
+
+def expected_baseline(
+    identifications: Identifications, baseline: xr.Dataset, known: NDArray[np.bool_] | None = None
+) -> xr.Dataset:
+    """Return the baseline with the expected effects only, fitted to the `known` blocks."""
+    return (
+        predict_baseline(replace(identifications, identified=(), unknown=()), baseline, known)
+        if identifications.expected
+        else baseline
+    )
+
+
+def without_expected(
+    blocks: xr.Dataset, baseline: xr.Dataset, expected: Sequence[Identification]
+) -> xr.Dataset:
+    """Drop the blocks in which expected effects leave anomalous samples or move the rate."""
+    if not expected:
+        return blocks
+    state = condition_on_selections(initial_state(blocks, baseline), expected)
+    moved = xr.DataArray(state.masked, dims=("axis", "block"))
+    return state.blocks.assign(power=state.blocks["power"].where(~moved))
+
+
+def add_outlier_power(
+    baseline: xr.Dataset, blocks: xr.Dataset, fitted: Sequence[Fitted]
+) -> xr.Dataset:
+    """Add the mean power of anomalous samples to a baseline, from their fitted sizes.
+
+    The identification leaves their blocks out; a surface of the simulation must include them.
+    Effects without anomalous samples are ignored.
+    """
+    axes = [str(axis) for axis in blocks["axis"].values]
+    frequency, rate = blocks["frequency"].values, float(blocks.attrs["sampling_rate_hz"])
+    spectrum = baseline["spectrum"]
+    added = np.zeros(spectrum.shape)
+    for effect_fit in fitted:
+        if effect_fit.effect is None or not any(
+            component.statistic.is_count for component in effect_fit.identification.components
+        ):
+            continue
+        rows = [axes.index(axis) for axis in effect_fit.axes]
+        prediction = effect_fit.effect.explain(
+            replace(make_windows(blocks, {}), axes=tuple(effect_fit.axes))
+        )
+        if _EVERYWHERE in prediction.marks:
+            continue
+        for name, density in prediction.spectrum.items():
+            added[rows] += getattr(effect_fit.effect, name) ** 2 * density
+        for (term, name), share in prediction.level.items():
+            square = baseline["coefficient"].sel(term=term, axis=list(effect_fit.axes)).values ** 2
+            added_square = square[:, None] * getattr(effect_fit.effect, name) * share
+            added[rows] += added_square[..., None] * sampled_psd(term, frequency, rate)
+    return (
+        baseline.assign(spectrum=spectrum.copy(data=spectrum.values + added))
+        if added.any()
+        else baseline
+    )

@@ -14,14 +14,12 @@ from scipy.special import ndtr, ndtri
 from gyrostab.diagnose.identify.identification import (
     Identification,
     Identifications,
-    Selection,
-    condition_on_selections,
 )
 from gyrostab.diagnose.identify.jumps import is_step
 from gyrostab.diagnose.identify.logger_filters import fit_filter_sizes
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on_components
-from gyrostab.diagnose.predict.linear_model import State, initial_state
+from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.windows import TIME_PARAMETER
 from gyrostab.diagnose.reduce.zero_bin import truncated_axes
 from gyrostab.diagnose.statistics import Statistic
@@ -36,7 +34,7 @@ from gyrostab.physics.prediction import Windows
 from gyrostab.physics.registry import effects
 from gyrostab.physics.rotation import EarthRate
 
-__all__ = ["Estimate", "Fitted", "fit_identifications"]
+__all__ = ["Estimate", "Fitted", "fit_expected", "fit_identifications"]
 
 _ANGLE = "deg"
 _TAIL = float(ndtr(-NORMAL_95))  # beyond either end of an interval
@@ -92,23 +90,19 @@ def fit_identifications(identifications: Identifications, baseline: xr.Dataset) 
         One entry per axis of an effect with a single size for all of its axes; one entry for all
         axes where each has its own size.
     """
-    start = initial_state(
-        identifications.state.blocks, baseline, settings=identifications.state.settings
-    )
     fitted: list[Fitted] = []
     for identification in identifications.identified:
-        selections: list[Selection] = [
-            *identifications.expected,
-            *identifications.identified,
-            *identifications.unknown,
-        ]
-        state = replace(
-            condition_on_selections(start, selections, identification),
-            weight=identifications.state.weight,
-            masked=identifications.state.masked,
-        )
+        state = identifications.state_without(identification, baseline)
         fitted += _fit_identification(identification, state, identifications)
     return fitted
+
+
+def fit_expected(identifications: Identifications, baseline: xr.Dataset) -> list[Fitted]:
+    """Fit the expected effects with all identified ones in the model."""
+    swapped = replace(
+        identifications, identified=identifications.expected, expected=identifications.identified
+    )
+    return fit_identifications(swapped, baseline)
 
 
 def _fit_identification(

@@ -35,7 +35,7 @@ from gyrostab.diagnose.identify.identification import (
 )
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.filter_response import band_response
-from gyrostab.diagnose.predict.linear_model import State, initial_state, spread_by_gaps
+from gyrostab.diagnose.predict.linear_model import State, spread_by_gaps
 from gyrostab.diagnose.predict.windows import make_windows, rebuild_variant
 from gyrostab.diagnose.reduce.block_statistics import MIN_BLOCKS
 from gyrostab.physics.base import Effect
@@ -88,8 +88,9 @@ def recalibrate(
         return baseline
     blocks = identifications.state.blocks
     use = np.ones(blocks.sizes["block"], np.bool_) if known is None else np.asarray(known, np.bool_)
-    state = initial_state(blocks, baseline, settings=identifications.state.settings)
-    state = condition_on_selections(state, identifications.identified)
+    state = condition_on_selections(
+        identifications.start_state(baseline), identifications.identified
+    )
     posteriors: list[Posterior] = []
     power = baseline["spectrum"].values.copy()
     columns = noise_powers(blocks)
@@ -267,9 +268,7 @@ def _add_component(
     """Add what a component takes from the noise of an axis."""
     if component.is_filter:
         return
-    state = initial_state(
-        identifications.state.blocks, baseline, settings=identifications.state.settings
-    )
+    state = identifications.start_state(baseline)
     known_power, free, means = component.statistic.noise_shares(
         component, axis, state, identifications.state.weight
     )

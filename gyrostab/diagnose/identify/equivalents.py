@@ -11,11 +11,9 @@ import xarray as xr
 from gyrostab.diagnose.identify.identification import (
     Identification,
     Identifications,
-    Selection,
-    condition_on_selections,
 )
 from gyrostab.diagnose.predict.candidates import Component, Variant
-from gyrostab.diagnose.predict.linear_model import State, initial_state
+from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.physics.registry import effects
 
@@ -29,21 +27,9 @@ def settle_forms(identifications: Identifications, baseline: xr.Dataset) -> Iden
     have the same choice of each parameter that is a text. Noise that is calibrated with another
     form than the model has does not belong to that model.
     """
-    start = initial_state(
-        identifications.state.blocks, baseline, settings=identifications.state.settings
-    )
-    chosen: list[Selection] = [
-        *identifications.expected,
-        *identifications.identified,
-        *identifications.unknown,
-    ]
 
     def settle(identification: Identification) -> Identification:
-        state = replace(
-            condition_on_selections(start, chosen, identification),
-            weight=identifications.state.weight,
-            masked=identifications.state.masked,
-        )
+        state = identifications.state_without(identification, baseline)
         components = _share_choices(identification.components, state)
         return replace(
             identification,

@@ -15,7 +15,7 @@ from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.components import are_lines, axes_of, sum_evidence
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.condition import condition_on_components, refit_weights
-from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
 __all__ = [
@@ -42,63 +42,30 @@ _FILTER = "logger_filter"
 
 @dataclass(frozen=True)
 class Identification:
-    """An effect that was identified.
+    """An effect that was identified."""
 
-    Attributes
-    ----------
-    effect : str
-        Name in the registry.
-    driver : tuple of str
-        Channels of the log that it follows, in the order of the effect's channels.
-    components : tuple of Component
-        Statistics and rows in which it shows.
-    evidence_nats : float
-        Held-out log Bayes factor with all others in the model [nats].
-    threshold : float
-        Evidence that it needed [nats].
-    alternatives : tuple of str
-        Effects that these data do not separate from it.
-    surrogate_p : float
-        Share of the time-shifted surrogates of its channel that explain as much; NaN without
-        channel.
-    instead : mapping of str to float
-        Key of each candidate that could take its place -> evidence there [nats].
-    """
-
-    effect: str
-    driver: tuple[str, ...]
+    effect: str  # name in the registry
+    driver: tuple[str, ...]  # channels of the log that it follows, in the order of the effect's
     axes: tuple[str, ...]
-    components: tuple[Component, ...]
-    evidence_nats: float
-    threshold: float
-    alternatives: tuple[str, ...] = ()
+    components: tuple[Component, ...]  # statistics and rows in which it shows
+    evidence_nats: float  # held-out log Bayes factor with all others in the model [nats]
+    threshold: float  # evidence that it needed [nats]
+    alternatives: tuple[str, ...] = ()  # effects that these data do not separate from it
+    #: Share of the time-shifted surrogates of its channel that explain as much; NaN without one.
     surrogate_p: float = math.nan
+    #: Key of each candidate that could take its place -> evidence there [nats].
     instead: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Unidentified:
-    """A difference that no effect explains.
+    """A difference that no effect explains; fields without a comment as in `Identification`."""
 
-    Attributes
-    ----------
-    generic : str
-        One of `gyrostab.diagnose.identify.nuisance_alternatives.NUISANCE_ALTERNATIVES`.
-    evidence_nats : float
-        Held-out log Bayes factor [nats].
-    threshold : float
-        Evidence that it needed [nats].
-    candidates : tuple of str
-        Effects that come nearest, or whose channel is missing.
-    instead : mapping of str to float
-        As for an `Identification`.
-    """
-
-    generic: str
+    generic: str  # one of `gyrostab.diagnose.identify.nuisance_alternatives.NUISANCE_ALTERNATIVES`
     axes: tuple[str, ...]
     evidence_nats: float
     threshold: float
-    candidates: tuple[str, ...] = ()
+    candidates: tuple[str, ...] = ()  # effects that come nearest, or whose channel is missing
     components: tuple[Component, ...] = ()
     instead: Mapping[str, float] = field(default_factory=dict)
 
@@ -108,63 +75,34 @@ Selection = Identification | Unidentified
 
 
 class Rejection(NamedTuple):
-    """An effect that was examined and not named.
+    """An effect that was examined and not named."""
 
-    Attributes
-    ----------
-    effect : str
-        Name in the registry.
-    beaten_by : str
-        What explains more: an effect, "noise", or another form in words.
-    nats : float
-        By how much it explains more; NaN where physics excludes the effect. Below zero, an order
-        decides: anomalous samples and real motion come before their consequences.
-    """
-
-    effect: str
+    effect: str  # name in the registry
     axes: tuple[str, ...]
-    beaten_by: str
+    beaten_by: str  # what explains more: an effect, "noise", or another form in words
+    #: By how much it explains more [nats]; NaN where physics excludes the effect. Below zero, an
+    #: order decides: anomalous samples and real motion come before their consequences.
     nats: float
 
 
 @dataclass(frozen=True)
 class Identifications:
-    """What the identification found.
+    """What the identification found."""
 
-    Attributes
-    ----------
-    identified : tuple of Identification
-        The strongest first.
-    threshold : float
-        Evidence that noise alone exceeds, in any effect, axis and grid point, with the false-alarm
-        probability [nats].
-    null_best : ndarray
-        Best evidence in each null record, sorted [nats].
-    reasons : dict of str to str
-        Effect -> why this record cannot show it.
-    candidates : tuple of Candidate
-        All that were tried.
-    state : State
-        With all of the above in the model.
-    folds : xarray.DataArray
-        Blocks that are held out together.
-    expected : tuple of Identification
-        Effects that the simulation contains as well, with size and time from the recording; they
-        are in `state` too.
-    rejected : tuple of Rejection
-        What beats each effect that was examined and not identified.
-    """
-
-    identified: tuple[Identification, ...]
+    identified: tuple[Identification, ...]  # the strongest first
     unknown: tuple[Unidentified, ...]
+    #: Evidence that noise alone exceeds, in any effect, axis and grid point, with the false-alarm
+    #: probability [nats].
     threshold: float
-    null_best: Array
-    reasons: dict[str, str]
-    candidates: tuple[Candidate, ...]
-    state: State
-    folds: xr.DataArray
+    null_best: Array  # best evidence in each null record, sorted [nats]
+    reasons: dict[str, str]  # effect -> why this record cannot show it
+    candidates: tuple[Candidate, ...]  # all that were tried
+    state: State  # with all of the above, and the expected effects, in the model
+    folds: xr.DataArray  # blocks that are held out together
     count_evidence: CountEvidence = field(default_factory=lambda: CountEvidence({}))
+    #: Effects that the simulation contains as well, with size and time from the recording.
     expected: tuple[Identification, ...] = ()
+    #: What beats each effect that was examined and not identified.
     rejected: tuple[Rejection, ...] = ()
 
     @property
@@ -173,6 +111,19 @@ class Identifications:
         if not self.identified:
             return "unknown" if self.unknown else "no mismatch"
         return "partly explained" if self.unknown else "explained"
+
+    def start_state(self, baseline: xr.Dataset) -> State:
+        """Return the state without any effect."""
+        return initial_state(self.state.blocks, baseline, settings=self.state.settings)
+
+    def state_without(self, identification: Identification, baseline: xr.Dataset) -> State:
+        """Return the state with all selections but one in the model, weighted with all of them."""
+        chosen: list[Selection] = [*self.expected, *self.identified, *self.unknown]
+        return replace(
+            condition_on_selections(self.start_state(baseline), chosen, identification),
+            weight=self.state.weight,
+            masked=self.state.masked,
+        )
 
 
 def components_of(chosen: Iterable[Selection]) -> list[Component]:
@@ -215,22 +166,14 @@ def remove_phase_locked(
     """
     identified, evidence_nats = [], 0.0
     for identification in identifications.identified:
-        locked = [
-            part.statistic.is_only_in_phase(part, blocks) for part in identification.components
-        ]
-        rest = tuple(
-            part for part, out in zip(identification.components, locked, strict=True) if not out
-        )
-        evidence_nats += sum(
-            part.evidence_nats
-            for part, out in zip(identification.components, locked, strict=True)
-            if out
-        )
+        locked, rest = [], []
+        for component in identification.components:
+            is_locked = component.statistic.is_only_in_phase(component, blocks)
+            (locked if is_locked else rest).append(component)
+        evidence_nats += sum(component.evidence_nats for component in locked)
         if rest:
             identified.append(
-                replace(identification, components=rest)
-                if len(rest) < len(identification.components)
-                else identification
+                replace(identification, components=tuple(rest)) if locked else identification
             )
     return replace(identifications, identified=tuple(identified)), evidence_nats
 

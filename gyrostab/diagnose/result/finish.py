@@ -12,10 +12,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
-from gyrostab.diagnose.estimate.expected_effects import expected_baseline, fit_expected
-from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_identifications
-from gyrostab.diagnose.estimate.outlier_power import add_outlier_power
+from gyrostab.diagnose.estimate.conditioned_baseline import (
+    add_outlier_power,
+    expected_baseline,
+    predict_baseline,
+)
+from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_expected, fit_identifications
 from gyrostab.diagnose.estimate.recalibrate import recalibrate, refer_to_kept_noise, with_noise
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
 from gyrostab.diagnose.identify.identification import (

@@ -9,9 +9,8 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
-from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
+from gyrostab.diagnose.estimate.conditioned_baseline import add_outlier_power, predict_baseline
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
-from gyrostab.diagnose.estimate.outlier_power import add_outlier_power
 from gyrostab.diagnose.estimate.recalibrate import recalibrate
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.forward_search import name_effects
