@@ -3,7 +3,7 @@
     python benchmarks/name_probability.py proof-tuning [MORE ...]
 
 Fits `set_probability` of `gyrostab.diagnose.settings` to the names of the diagnoses in these
-folders by maximum likelihood (`gyrostab.diagnose.result.probability` has the law), and with it the
+folders by maximum likelihood (`gyrostab.diagnose.result.verdict` has the law), and with it the
 prior weight of an alternative relative to the name, which should be 1. Prints both with their
 standard errors, the calibration error of the law, and its log score against that of one
 probability for all names, which is fitted to nine tenths and scored on the other, ten times. Seeds

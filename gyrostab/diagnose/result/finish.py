@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -33,17 +33,15 @@ from gyrostab.diagnose.result.attribution import active_blocks, attribute_mismat
 from gyrostab.diagnose.result.content import HELD_OUT, SCHEMA, check_diagnosis
 from gyrostab.diagnose.result.diagnosis import Diagnosis, plain
 from gyrostab.diagnose.result.held_out import held_out, select_forecast_start
+from gyrostab.diagnose.result.mismatch_tables import mismatch_tables
 from gyrostab.diagnose.result.size_gate import keep_supported
-from gyrostab.diagnose.result.surfaces import make_surfaces
+from gyrostab.diagnose.result.surfaces import make_surfaces, surfaces_with_blocks
 from gyrostab.diagnose.result.tables import (
     baseline_table,
     effect_tables,
-    limit_tables,
-    mismatch_tables,
     model_tables,
     recording_table,
     rejected_tables,
-    surfaces_with_blocks,
 )
 from gyrostab.diagnose.result.verdict import decide_verdict
 from gyrostab.diagnose.settings import Settings
@@ -86,7 +84,9 @@ def finish_diagnosis(task: Task, comparison: Comparison, started: float) -> Diag
         "mismatches": mismatches,
         "effects": effects,
         "unexplained": unexplained,
-        "not_found": limit_tables(find_upper_limits(fit.identifications)),
+        "not_found": {
+            name: asdict(limit) for name, limit in find_upper_limits(fit.identifications).items()
+        },
         "rejected": rejected_tables(fit.identifications),
         "unused_channels": unused_channels(blocks, _used_channels(fit.identifications)),
         "held_out": {name: held[name] for name in HELD_OUT},
@@ -267,9 +267,7 @@ def _attributed_mismatches(
         still=lines,
         settings=task.settings,
     )
-    return mismatch_tables(
-        mismatches, explained, fit.identifications, blocks, settings=task.settings
-    )
+    return mismatch_tables(mismatches, explained, fit.identifications, blocks)
 
 
 def _make_surfaces_with_outliers(

@@ -6,18 +6,20 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
 from gyrostab.diagnose.statistics.mean import window_means
 from gyrostab.diagnose.statistics.power import allan_surface
 from gyrostab.diagnose.statistics.scores import Array, Windows, sum_over_windows
 
-__all__ = ["CASES", "make_surfaces"]
+__all__ = ["CASES", "make_surfaces", "surfaces_with_blocks"]
 
 #: The three cases side by side: the simulation without and with the effects.
 CASES = ("recording", "before", "after")
 WINDOW_BLOCKS = 15  # 5 min at 20 s: the length of the windows of the DAVAR in the report
 MAX_WINDOWS = 240  # columns that a page can show
+MAX_LINES = 4000  # bins of the line spectrum in `diagnosis.nc`: enough for a page, small on disk
 
 
 def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> xr.Dataset:
@@ -42,11 +44,9 @@ def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> 
     recorded = allan_surface(blocks, plain, windows)
     keep = (recorded["columns"]["what"] == "avar") & np.isfinite(recorded["shape"]).any(axis=(0, 1))
     avar = [recorded["observed"][..., keep]]
-    low = [np.full(recorded["observed"][..., keep].shape, np.nan)]
-    high = []
-    high.append(low[0])
-    mean, error = [_average_windows(blocks, blocks["mean"].values, windows)], []
-    error.append(np.full(mean[0].shape, np.nan))
+    low, high = ([np.full(avar[0].shape, np.nan)] for _ in range(2))
+    mean = [_average_windows(blocks, blocks["mean"].values, windows)]
+    error = [np.full(mean[0].shape, np.nan)]
     for baseline in (before, after):
         noise = allan_surface(blocks, baseline, windows)
         shape = noise["shape"][..., keep]
@@ -158,3 +158,66 @@ def _attach_labels(
         if name in blocks.attrs
     }
     return xr.Dataset(data, coords=coordinates, attrs=attributes)
+
+
+def surfaces_with_blocks(
+    surfaces: xr.Dataset, blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset
+) -> xr.Dataset:
+    """Add block means, channels and spectra of the whole record to the surfaces, for the report."""
+    power = "degree2 hour-2 s"
+    channels = {
+        str(name): blocks[name] for name in blocks.data_vars if str(name).startswith("channel_")
+    }
+    with np.errstate(invalid="ignore"):
+        cases = [blocks["power"], before["spectrum"], after["spectrum"]]
+        has_data = np.isfinite(blocks["power"].values)
+        density = np.stack([_average_where(case.values, has_data) for case in cases])
+        lines = blocks["line_power"].weighted(blocks["line_weight"].fillna(0.0)).mean("part")
+    step = max(1, lines.sizes["line"] // MAX_LINES)
+    lines = lines.coarsen(line=step, boundary="trim").max() if step > 1 else lines
+    frequency = (
+        blocks["line_frequency"].coarsen(line=step, boundary="trim").mean()
+        if step > 1
+        else blocks["line_frequency"]
+    )
+    added = xr.Dataset(
+        {
+            "block_mean": (("axis", "block"), blocks["mean"].values, dict(blocks["mean"].attrs)),
+            "density": (
+                ("case", "axis", "band"),
+                density,
+                {"units": power, "long_name": "two-sided power density of the record"},
+            ),
+            "line_density": (
+                ("axis", "line"),
+                lines.values,
+                {
+                    "units": power,
+                    "long_name": "two-sided power density of the recording at full resolution",
+                },
+            ),
+            **{
+                name: ("block", values.values, dict(values.attrs))
+                for name, values in channels.items()
+            },
+        },
+        coords={
+            "block_begin": ("block", blocks["begin"].values, dict(blocks["begin"].attrs)),
+            "block_end": ("block", blocks["end"].values, dict(blocks["end"].attrs)),
+            "frequency": ("band", blocks["frequency"].values, dict(blocks["frequency"].attrs)),
+            "line_frequency": ("line", frequency.values, dict(blocks["line_frequency"].attrs)),
+        },
+    )
+    return surfaces.merge(added, compat="no_conflicts", join="exact")
+
+
+def _average_where(values: Array, has_data: NDArray[np.bool_]) -> Array:
+    count = has_data.sum(axis=1)
+    return np.asarray(
+        np.divide(
+            np.where(has_data, values, 0.0).sum(axis=1),
+            count,
+            out=np.full(count.shape, np.nan),
+            where=count > 0,
+        )
+    )

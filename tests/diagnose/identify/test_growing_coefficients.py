@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,8 @@ from gyrostab.diagnose.identify.identification import Identification, Identifica
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import drop_changed_tails
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.result.tables import identified_mismatches
+from gyrostab.diagnose.result.mismatch_tables import identified_mismatches
+from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.ingest.make_log import make_log
 from tests.conftest import ROOT
@@ -135,8 +137,9 @@ def identifications(
         7.0,
     )
     null = np.sort(np.random.default_rng(1).exponential(1.0, 400))
+    state: Any = SimpleNamespace(settings=DEFAULTS)
     nothing: Any = None
-    return Identifications((identification,), (), 7.0, null, {}, (), nothing, nothing)
+    return Identifications((identification,), (), 7.0, null, {}, (), state, nothing)
 
 
 def blocks() -> xr.Dataset:

@@ -13,7 +13,7 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.identify.moving_axes import moving_blocks, unexplained_motion, without_motion
 from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.diagnose.reduce.block_statistics import measured, reduce_log
-from gyrostab.diagnose.result.tables import motion_mismatches
+from gyrostab.diagnose.result.mismatch_tables import motion_mismatches
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.errors import SchemaError
 from gyrostab.simulate import simulate

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gyrostab.diagnose.identify.identification import Identification
-from gyrostab.diagnose.result.probability import name_probability
+from gyrostab.diagnose.result.verdict import name_probability
 from gyrostab.diagnose.settings import Settings
 
 SETTINGS = Settings(set_probability=0.9)

@@ -1,0 +1,127 @@
+"""Split an effect into components that are fitted apart: harmonics, steps at several times."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gyrostab.diagnose.identify.identification import Identification
+from gyrostab.diagnose.identify.jumps import is_step
+from gyrostab.diagnose.predict.candidates import Component, Variant
+from gyrostab.diagnose.predict.condition import condition_on_components
+from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.predict.windows import TIME_PARAMETER
+from gyrostab.diagnose.statistics.rotation_order import fit_amplitude, harmonic_sets
+
+__all__ = ["split_harmonics", "split_steps"]
+
+MAX_BLOCKS_OF_STEP = 2  # by which the times of a step on two axes may differ; design choice
+
+
+def split_harmonics(identification: Identification, state: State) -> list[list[Component]]:
+    """Split the components of several harmonics of the rotation, each with its amplitude and phase.
+
+    Harmonics other than the strongest are dropped when their amplitude is within two standard
+    errors on every axis.
+    """
+    turning = [
+        component
+        for component in identification.components
+        if component.statistic.is_rotation and component.candidate.is_per_axis
+    ]
+    sets = harmonic_sets(state.blocks.sizes["harmonic"]) if turning else []
+    harmonics = sorted({k for component in turning for k in sets[component.place]})
+    by_harmonic = [
+        [replace(component, place=k) for component in turning if k in sets[component.place]]
+        for k in harmonics
+    ]
+    if len(by_harmonic) < 2:
+        return [list(identification.components)]
+    clear = [
+        max(
+            size / error
+            for size, error, _ in (fit_amplitude(component, state) for component in components)
+        )
+        for components in by_harmonic
+    ]
+    visible_harmonics = [
+        components
+        for components, times in zip(by_harmonic, clear, strict=True)
+        if times > state.settings.visible_sigma or times == max(clear)
+    ]
+    rest = [component for component in identification.components if component not in turning]
+    return [[*visible_harmonics[0], *rest], *visible_harmonics[1:]]
+
+
+def split_steps(
+    components: Sequence[Component], state: State
+) -> list[tuple[list[Component], State]]:
+    """Split the components of steps at several times, each with the other steps in the model.
+
+    Steps of different axes are one if hardly any block lies between their times. The grid of times
+    of each step ends half way to the others: at their times it could not be distinguished from
+    them.
+    """
+    steps = [step for component in components for step in _single_steps(component)]
+    groups = _group_steps(steps, state)
+    if len(groups) < 2:
+        return [([*steps, *(part for part in components if not is_step(part))], state)]
+    out = []
+    for group in groups:
+        others = [step for other in groups if other is not group for step in other]
+        with_others = condition_on_components(state, others)
+        nearest = [_nearest_times(step, [_step_time(other) for other in others]) for step in group]
+        out.append((nearest, replace(state, given=with_others.given)))
+    return out
+
+
+def _group_steps(steps: Sequence[Component], state: State) -> list[list[Component]]:
+    """Group steps of different axes at the same time, in the order of time."""
+    middle = (state.blocks["begin"].values + state.blocks["end"].values) / 2.0
+    present = np.isfinite(state.blocks["mean"].values).any(axis=0)
+    groups: list[list[Component]] = []
+    for step in sorted(steps, key=_step_time):
+        if groups:
+            between = (middle > _step_time(groups[-1][0])) & (middle < _step_time(step))
+            is_other = (present & between).sum() > MAX_BLOCKS_OF_STEP
+            if not is_other and all(step.row != other.row for other in groups[-1]):
+                groups[-1].append(step)
+                continue
+        groups.append([step])
+    return groups
+
+
+def _nearest_times(step: Component, other_times: Sequence[float]) -> Component:
+    """Return a step with only those times of its grid that are nearer to it than to others."""
+
+    def is_nearest(variant: Variant) -> bool:
+        time = float(variant.values[TIME_PARAMETER])
+        return abs(time - _step_time(step)) < min(abs(time - other) for other in other_times)
+
+    nearest = tuple(filter(is_nearest, step.candidate.variants))
+    return replace(step, candidate=replace(step.candidate, variants=nearest))
+
+
+def _single_steps(component: Component) -> list[Component]:
+    """Return a component for each step of a component in the means; empty without one.
+
+    The times of steps at every restart are known.
+    """
+    variant = component.variant
+    if not is_step(component):
+        return []
+    if len(variant.columns) == 1:
+        return [component]
+    single = [other for other in component.candidate.variants if len(other.columns) == 1]
+    return [
+        replace(component, variant=other, candidate=replace(component.candidate, variants=(other,)))
+        for column in variant.design
+        for other in single
+        if np.array_equal(other.design[0], column)
+    ]
+
+
+def _step_time(component: Component) -> float:
+    return float(component.variant.values[TIME_PARAMETER])

@@ -1,0 +1,265 @@
+"""Build the tables of the mismatches in `diagnosis.json`, each with its sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.diagnose.identify.forward_search import MIN_P_VALUE, tail_probability
+from gyrostab.diagnose.identify.identification import Identification, Identifications, Unidentified
+from gyrostab.diagnose.identify.nuisance_alternatives import NUISANCE_ALTERNATIVES
+from gyrostab.diagnose.reduce.block_statistics import measured
+from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
+from gyrostab.diagnose.result.text import (
+    chance,
+    mismatch_statement,
+    motion_statement,
+    named_statement,
+    plain_name,
+    span_text,
+)
+from gyrostab.diagnose.statistics.wording import axes_text
+from gyrostab.wording import join_words
+
+__all__ = [
+    "identified_mismatches",
+    "iso",
+    "mismatch_tables",
+    "motion_mismatches",
+    "unidentified_mismatches",
+]
+
+#: Nuisance alternative -> `view` in `diagnosis.json`.
+_NUISANCE_VIEWS = {
+    "~bias(t)": "mean", "~levels": "mean", "~red": "mean", "~N(t)": "davar", "~burst": "davar",
+    "~S(f)": "davar", "~cov": "cross_axis", "~outliers": "distribution",
+}  # fmt: skip
+
+
+def iso(blocks: xr.Dataset, seconds: float) -> str:
+    """Write a time [s since the start of the record] as ISO 8601."""
+    start = np.datetime64(int(blocks.attrs["start_ns"]), "ns")
+    return f"{(start + np.timedelta64(round(seconds * 1e9), 'ns')).astype('datetime64[ms]')}Z"
+
+
+def _mismatch(
+    blocks: xr.Dataset,
+    view: str,
+    axes: Sequence[str],
+    span: tuple[float, float],
+    taus: tuple[float, float],
+    p_value: float,
+    statement: str,
+    *,
+    ratio: float | None = None,
+    explained_by: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Return a mismatch as a table, without its id; span and averaging times in s."""
+    return {
+        "view": view,
+        "axes": list(axes),
+        "start": iso(blocks, span[0]),
+        "end": iso(blocks, span[1]),
+        "tau_min_s": taus[0],
+        "tau_max_s": taus[1],
+        "ratio": ratio,
+        "p_value": p_value,
+        "explained_by": list(explained_by),
+        "statement": statement,
+    }
+
+
+def mismatch_tables(
+    located: xr.Dataset,
+    explained: Sequence[Sequence[str]],
+    identifications: Identifications,
+    blocks: xr.Dataset,
+) -> list[dict[str, Any]]:
+    """Return the mismatches that were located, identified or left out, each with its sentence."""
+    out = _located_mismatches(located, blocks, explained)
+    out += identified_mismatches(identifications, blocks, out)
+    out += unidentified_mismatches(identifications, blocks, out)
+    out += motion_mismatches(identifications.identified, blocks)
+    return [{"id": number, **table} for number, table in enumerate(out, start=1)]
+
+
+def _located_mismatches(
+    mismatches: xr.Dataset, blocks: xr.Dataset, explained: Sequence[Sequence[str]]
+) -> list[dict[str, Any]]:
+    """Return the located mismatches."""
+    record_s = float(blocks["end"].values[-1])
+    out = []
+    for number, names in enumerate(explained):
+        region = {
+            str(name): mismatches[name].values[number].item()
+            for name in mismatches.data_vars
+            if mismatches[name].dtype.kind != "M"
+        }
+        region["axes"] = str(region["axes"]).split()
+        out.append(
+            _mismatch(
+                blocks,
+                region["view"],
+                region["axes"],
+                (region["begin"], region["end"]),
+                (region["tau_min_s"], region["tau_max_s"]),
+                region["p_value"],
+                mismatch_statement(region, record_s),
+                ratio=region["ratio"],
+                explained_by=names,
+            )
+        )
+    return out
+
+
+def identified_mismatches(
+    identifications: Identifications, blocks: xr.Dataset, known: Sequence[Mapping[str, Any]]
+) -> list[dict[str, Any]]:
+    """Return mismatches that only the identification shows.
+
+    These are the places of named effects that explain no other mismatch. The statistic of the
+    strongest component describes them.
+    """
+    out: list[dict[str, Any]] = []
+    begin, end = blocks["begin"].values, blocks["end"].values
+    settings = identifications.state.settings
+    for identification in identifications.identified:
+        if any(
+            identification.effect in region["explained_by"]
+            and set(region["axes"]) & set(identification.axes)
+            for region in known
+        ):
+            continue
+        strongest = max(identification.components, key=lambda component: component.evidence_nats)
+        view = strongest.statistic.view
+        taus = strongest.statistic.averaging_times(strongest, blocks)
+        p_value = tail_probability(
+            identifications.null_best, identification.evidence_nats, settings=settings
+        )
+        for span in join_blocks(
+            active_blocks(identification, blocks, settings=settings), begin, end
+        ):
+            text = named_statement(
+                view,
+                identification.effect,
+                identification.axes,
+                span_text(*span, float(end[-1])),
+                p_value,
+            )
+            out.append(
+                _mismatch(
+                    blocks,
+                    view,
+                    identification.axes,
+                    span,
+                    taus,
+                    p_value,
+                    text,
+                    explained_by=[identification.effect],
+                )
+            )
+    return out
+
+
+def unidentified_mismatches(
+    identifications: Identifications, blocks: xr.Dataset, known: Sequence[Mapping[str, Any]]
+) -> list[dict[str, Any]]:
+    """Return mismatches without an effect, where no other unexplained mismatch covers them."""
+    out: list[dict[str, Any]] = []
+    rate, block = float(blocks.attrs["sampling_rate_hz"]), float(blocks.attrs["block_s"])
+    longest = float(blocks["end"].values[-1]) / 2.0
+    for unidentified in identifications.unknown:
+        view = _NUISANCE_VIEWS.get(unidentified.generic, "davar")
+        if any(
+            region["view"] == view
+            and set(region["axes"]) & set(unidentified.axes)
+            and not region["explained_by"]
+            for region in known
+        ):
+            continue
+        p_value = tail_probability(
+            identifications.null_best,
+            unidentified.evidence_nats,
+            settings=identifications.state.settings,
+        )
+        nearest = unidentified.candidates
+        verb = "comes" if len(nearest) == 1 else "come"
+        explanation = (
+            f"{join_words([plain_name(name) for name in nearest])} {verb} closest, but "
+            "another form explains more"
+            if nearest
+            else "no known effect explains it"
+        )
+        description = NUISANCE_ALTERNATIVES.get(unidentified.generic, "something differs")
+        begin, end, when = _find_event(unidentified, blocks)
+        text = (
+            f"On {axes_text(unidentified.axes)} {description}{when}; {explanation} "
+            f"({chance(p_value)})."
+        )
+        taus = (block, longest) if view == "mean" else (1.0 / rate, block)
+        out.append(_mismatch(blocks, view, unidentified.axes, (begin, end), taus, p_value, text))
+    return out
+
+
+def _find_event(unidentified: Unidentified, blocks: xr.Dataset) -> tuple[float, float, str]:
+    """Return begin and end [s] of an unidentified event with their text, or the whole record."""
+    record_s = float(blocks["end"].values[-1])
+    spans = [
+        (component.variant.values["begin"], component.variant.values["end"])
+        for component in unidentified.components
+        if "begin" in component.variant.values
+    ]
+    if not spans:
+        return float(blocks["begin"].values[0]), record_s, ""
+    begin, end = min(first for first, _ in spans), max(last for _, last in spans)
+    return begin, end, f", {span_text(begin, end, record_s)}"
+
+
+def motion_mismatches(
+    identified: Sequence[Identification], blocks: xr.Dataset
+) -> list[dict[str, Any]]:
+    """Return one mismatch for each axis with moving blocks that the comparison left out.
+
+    It extends from the first of these blocks to the last.
+    """
+    if "moving" not in blocks:
+        return []
+    begin, end = blocks["begin"].values, blocks["end"].values
+    means = measured(blocks, "mean").values
+    out: list[dict[str, Any]] = []
+    for row, axis in enumerate(map(str, blocks["axis"].values)):
+        moving, mean = blocks["moving"].values[row], means[row]
+        if not moving.any():
+            continue
+        first, last = float(begin[moving][0]), float(end[moving][-1])
+        largest = float(np.nanmax(np.abs(mean - np.nanmedian(mean[~moving]))[moving]))
+        followers = _axes_following(axis, identified)
+        when = span_text(first, last, float(end[-1]))
+        text = motion_statement(axis, when, largest, followers)
+        taus = (
+            1.0 / float(blocks.attrs["sampling_rate_hz"]),
+            max((last - first) / 2.0, float(blocks.attrs["block_s"])),
+        )
+        out.append(_mismatch(blocks, "mean", [axis], (first, last), taus, MIN_P_VALUE, text))
+    return out
+
+
+def _axes_following(axis: str, identified: Sequence[Identification]) -> list[str]:
+    """Return the axes that sense the rate of `axis` through their misalignment."""
+    components = [
+        component
+        for identification in identified
+        if identification.effect == "misalignment"
+        for component in identification.components
+    ]
+    return sorted(
+        {
+            name
+            for component in components
+            if axis in (*component.variant.columns, *component.candidate.reference)
+            for name in component.row
+        }
+    )
