@@ -33,7 +33,7 @@ from gyrostab.diagnose.identify.identification import (
     components_of,
     condition_on_selections,
 )
-from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import State, spread_by_gaps
 from gyrostab.diagnose.predict.windows import make_windows, rebuild_variant
@@ -229,32 +229,23 @@ def _collect_effects(
             ),
             None,
         )
-        effect = None if numbers is None else numbers.effect
-        in_power = any(
-            component.statistic.is_power for component in components
-        )  # that power has a free size
-        if (
-            numbers is not None
-            and effect is not None
-            and not in_power
-            and any(
-                component.statistic.has_power_of_effect(component, identifications.state)
-                for component in components
-            )
+        if numbers is None or numbers.effect is None:
+            continue
+        # power in a statistic of powers has a free size
+        is_in_power = any(component.statistic.is_power for component in components)
+        if not is_in_power and any(
+            component.statistic.has_power_of_effect(component, identifications.state)
+            for component in components
         ):
-            out.known += _effect_power(effect, blocks, axis)
-            out.doubt = max(
-                [
-                    out.doubt,
-                    *(
-                        2.0 * estimate.stderr / abs(estimate.value)
-                        for estimate in numbers.parameters.values()
-                        if estimate.value
-                    ),
-                ]
-            )
-        if effect is not None and any(component.is_filter for component in components):
-            out.response = out.response * band_response(effect, blocks)
+            out.known += _effect_power(numbers.effect, blocks, axis)
+            errors = [
+                2.0 * estimate.stderr / abs(estimate.value)
+                for estimate in numbers.parameters.values()
+                if estimate.value
+            ]
+            out.doubt = max([out.doubt, *errors])
+        if any(component.is_filter for component in components):
+            out.response = out.response * band_response(numbers.effect, blocks)
     return out if touched else None
 
 
@@ -409,34 +400,34 @@ def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identi
     A share of N^2 is a share of the new one.
     """
     blocks = identifications.state.blocks
-    swapped = {}
+    candidates: dict[int, Candidate] = {}  # by the identity of the old one
+    variants: dict[int, Variant] = {}
     for component in components_of(identifications.identified):
-        candidate = component.candidate
-        if candidate.statistic.is_power and id(candidate) not in swapped:
-            made = [
-                rebuild_variant(candidate, variant, blocks, baseline["coefficient"]) or variant
-                for variant in candidate.variants
-            ]
-            swapped[id(candidate)] = (candidate, replace(candidate, variants=tuple(made)))
+        old = component.candidate
+        if old.statistic.is_power and id(old) not in candidates:
+            made = tuple(
+                rebuild_variant(old, variant, blocks, baseline["coefficient"]) or variant
+                for variant in old.variants
+            )
+            candidates[id(old)] = replace(old, variants=made)
+            variants |= zip(map(id, old.variants), made, strict=True)
 
-    def part_of(component: Component) -> Component:
-        if id(component.candidate) not in swapped:
+    def renew(component: Component) -> Component:
+        if id(component.candidate) not in candidates:
             return component
-        old, new = swapped[id(component.candidate)]
-        place = next(
-            number for number, variant in enumerate(old.variants) if variant is component.variant
+        return replace(
+            component,
+            candidate=candidates[id(component.candidate)],
+            variant=variants[id(component.variant)],
         )
-        return replace(component, candidate=new, variant=new.variants[place])
 
-    identified = tuple(
-        replace(
-            identification,
-            components=tuple(part_of(component) for component in identification.components),
-        )
-        for identification in identifications.identified
+    return replace(
+        identifications,
+        identified=tuple(
+            replace(identification, components=tuple(map(renew, identification.components)))
+            for identification in identifications.identified
+        ),
+        candidates=tuple(
+            candidates.get(id(candidate), candidate) for candidate in identifications.candidates
+        ),
     )
-    candidates = tuple(
-        swapped[id(candidate)][1] if id(candidate) in swapped else candidate
-        for candidate in identifications.candidates
-    )
-    return replace(identifications, identified=identified, candidates=candidates)

@@ -133,15 +133,6 @@ def _power_levels(state: State, row: int, axis: str) -> tuple[Array, Array, Arra
             for column in state.given.get(("power", axis), [])
         ]
     columns = np.nan_to_num(np.stack(named, axis=-1)) if named else np.empty((total.size, 0))
-    moves = (
-        np.ptp(columns, axis=0) > 1e-9 * np.abs(columns).max(axis=0, initial=1e-300)
-        if named
-        else np.zeros(0, bool)
-    )
-    columns = columns[:, moves]
-    columns = (
-        columns / np.maximum(np.abs(columns).max(axis=0, initial=0.0), 1e-300)
-        if columns.shape[1]
-        else columns
-    )
-    return level, variance, columns
+    largest = np.abs(columns).max(axis=0, initial=1e-300)
+    moves = np.ptp(columns, axis=0) > 1e-9 * largest
+    return level, variance, columns[:, moves] / largest[moves]

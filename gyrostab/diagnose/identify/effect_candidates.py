@@ -182,9 +182,7 @@ def _candidates_of_effect(
             obstacle = str(error)
     driver = tuple(drivers.get(channel, "") for channel in kind.channels) if drivers else ()
     constant_channels = [
-        name
-        for name in drivers.values()
-        if np.ptp(windows.drivers[_effect_channel(drivers, name)]) == 0.0
+        name for channel, name in drivers.items() if np.ptp(windows.drivers[channel]) == 0.0
     ]
     if constant_channels:
         verb = "does" if len(constant_channels) == 1 else "do"
@@ -197,11 +195,6 @@ def _candidates_of_effect(
         )
     ]
     return built, obstacle
-
-
-def _effect_channel(drivers: Mapping[str, str], name: str) -> str:
-    """Return the effect's name of a channel of the log."""
-    return next(inner for inner, outer in drivers.items() if outer == name)
 
 
 def _nuisance_grid(kind: type[Effect], windows: Windows) -> Iterator[dict[str, Any]]:

@@ -87,9 +87,7 @@ def _select_texts(component: Component, state: State, texts: Mapping[str, str]) 
     variants = [
         variant
         for variant in component.candidate.variants
-        if variant.columns == component.variant.columns
-        and variant.squared == component.variant.squared
-        and variant.texts == texts
+        if variant.has_columns_of(component.variant) and variant.texts == texts
     ]
     if not variants:
         return None

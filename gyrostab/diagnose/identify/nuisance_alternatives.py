@@ -82,39 +82,24 @@ def nuisance_alternatives(blocks: xr.Dataset) -> list[Candidate]:
         _burst_variant(first, stop, blocks, white)
         for first, stop in burst_intervals(blocks.sizes["block"]).tolist()
     )
-    candidates = [
-        Candidate(
-            "~bias(t)",
-            find_statistic("mean"),
-            (),
-            (Variant({}, _numbered_columns(len(hats)), hats[:, None, :]),),
+    hat_columns = _numbered_columns(len(hats))
+    variants: dict[tuple[str, str], tuple[Variant, ...]] = {
+        ("~bias(t)", "mean"): (Variant({}, hat_columns, hats[:, None, :]),),
+        ("~levels", "telegraph"): (Variant({}, ("0",), np.empty(0)),),
+        ("~N(t)", "power"): (Variant({}, hat_columns, level),),
+        ("~burst", "power"): bursts,
+        ("~S(f)", "power"): (
+            *_single_designs(shapes),
+            Variant({}, _numbered_columns(bands), shapes),
         ),
-        Candidate("~levels", find_statistic("telegraph"), (), (Variant({}, ("0",), np.empty(0)),)),
-        Candidate(
-            "~N(t)",
-            find_statistic("power"),
-            (),
-            (Variant({}, _numbered_columns(len(hats)), level),),
-        ),
-        Candidate("~burst", find_statistic("power"), (), bursts),
-        Candidate(
-            "~S(f)",
-            find_statistic("power"),
-            (),
-            (*_single_designs(shapes), Variant({}, _numbered_columns(bands), shapes)),
-        ),
-        Candidate(
-            "~outliers",
-            find_statistic("sample_counts"),
-            (),
-            (Variant({}, ("kurtosis",), np.empty(0)),),
-        ),
-    ]
+        ("~outliers", "sample_counts"): (Variant({}, ("kurtosis",), np.empty(0)),),
+    }
     if "cross" in blocks and blocks.sizes["pair"]:
-        candidates.append(
-            Candidate("~cov", find_statistic("cross_spectrum"), (), _covariance_variants(bands))
-        )
-    return candidates
+        variants["~cov", "cross_spectrum"] = _covariance_variants(bands)
+    return [
+        Candidate(name, find_statistic(statistic), (), tried)
+        for (name, statistic), tried in variants.items()
+    ]
 
 
 def _burst_variant(first: int, stop: int, blocks: xr.Dataset, white: Array) -> Variant:

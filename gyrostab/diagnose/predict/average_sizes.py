@@ -168,9 +168,7 @@ def _variant_family(component: Component, candidates: Sequence[Candidate]) -> li
     return [
         variant
         for variant in candidate.variants
-        if variant.columns == component.variant.columns
-        and variant.squared == component.variant.squared
-        and variant.texts == component.variant.texts
+        if variant.has_columns_of(component.variant) and variant.texts == component.variant.texts
     ]
 
 

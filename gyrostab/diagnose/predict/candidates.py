@@ -45,6 +45,10 @@ class Variant:
         """Values that are texts."""
         return {name: value for name, value in self.values.items() if isinstance(value, str)}
 
+    def has_columns_of(self, other: Variant) -> bool:
+        """Return whether two variants have the same parameters, in the same power."""
+        return self.columns == other.columns and self.squared == other.squared
+
 
 class Prospect(NamedTuple):
     """An effect with given nuisance values, before a statistic makes variants of it."""

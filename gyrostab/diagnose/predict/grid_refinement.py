@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 import numpy as np
 
@@ -76,11 +76,7 @@ def refine_grid(component: Component, state: State, points: Sequence[Point]) -> 
         PlacedPoint(_make_point(point.variant, point.sizes), *place)
         for point, place in zip(points, _place_points(points, name), strict=True)
     ]
-    for line in sorted({placed.line for placed in placed_points}):
-        members = sorted(
-            (placed for placed in placed_points if placed.line == line),
-            key=lambda placed: placed.place,
-        )
+    for members in _split_lines(placed_points):
         for down in (True, False) if len(members) > 1 else ():
             placed_points += _extend_line(component, state, name, members, placed_points, down)
     for _ in range(MAX_ROUNDS):
@@ -147,9 +143,10 @@ def _value_at(point: Point, name: str) -> float:
     return float(point.variant.values[name])
 
 
-def _neighbour_pairs(placed_points: Sequence[PlacedPoint]) -> list[tuple[PlacedPoint, PlacedPoint]]:
+def _split_lines(placed_points: Sequence[PlacedPoint]) -> list[list[PlacedPoint]]:
+    """Return the points of each line in order."""
     ordered = sorted(placed_points, key=lambda placed: (placed.line, placed.place))
-    return [(left, right) for left, right in pairwise(ordered) if left.line == right.line]
+    return [list(line) for _, line in groupby(ordered, key=lambda placed: placed.line)]
 
 
 def _steps_to_halve(placed_points: Sequence[PlacedPoint]) -> list[tuple[PlacedPoint, PlacedPoint]]:
@@ -157,7 +154,7 @@ def _steps_to_halve(placed_points: Sequence[PlacedPoint]) -> list[tuple[PlacedPo
     best = max(placed_points, key=lambda placed: placed.point.evidence)
     top, first = best.point.evidence, not any(placed.place % 1.0 for placed in placed_points)
     out = []
-    for left, right in _neighbour_pairs(placed_points):
+    for left, right in (pair for line in _split_lines(placed_points) for pair in pairwise(line)):
         likely = max(left.point.evidence, right.point.evidence) > top - LIKELY_NATS
         if (first and (best is left or best is right)) or (
             likely and _are_different(left.point, right.point)
@@ -247,11 +244,7 @@ def _place_point(
 def _share_steps(placed_points: Sequence[PlacedPoint]) -> list[Point]:
     """Return the points with their shares: half of both steps next to them, or half a step."""
     out = []
-    for line in sorted({placed.line for placed in placed_points}):
-        ordered = sorted(
-            (placed for placed in placed_points if placed.line == line),
-            key=lambda placed: placed.place,
-        )
+    for ordered in _split_lines(placed_points):
         place = np.array([placed.place for placed in ordered])
         edge = np.concatenate([[place[0] - 0.5], 0.5 * (place[1:] + place[:-1]), [place[-1] + 0.5]])
         out += [

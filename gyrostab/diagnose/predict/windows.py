@@ -159,14 +159,7 @@ def rebuild_variant(
     built = candidate.statistic.design(
         Prospect(dict(variant.values), prediction, blocks, coefficient)
     )
-    return next(
-        (
-            rebuilt
-            for rebuilt in built
-            if rebuilt.columns == variant.columns and rebuilt.squared == variant.squared
-        ),
-        None,
-    )
+    return next((rebuilt for rebuilt in built if rebuilt.has_columns_of(variant)), None)
 
 
 def distinct_variants(variants: list[Variant]) -> tuple[Variant, ...]:

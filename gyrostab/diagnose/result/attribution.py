@@ -169,6 +169,7 @@ def attribute_mismatches(
     explained = []
     for region in regions:
         score, limit = score_left(region, scores, null, level, settings.score_error_share)
+        axes = set(str(region["axes"]).split())
         shown = []
         for identification, its_time, its_moves in zip(identified, when, moves, strict=True):
             moved = _is_within_blocks(region, blocks) and any(
@@ -178,15 +179,11 @@ def attribute_mismatches(
                 component
                 for component in identification.components
                 if component.statistic.can_explain(component, region, blocks, settings)
+                and (moved or not component.statistic.is_in_means or region["view"] != "spectrum")
             ]
-            components = [
-                component
-                for component in components
-                if moved or not component.statistic.is_in_means or region["view"] != "spectrum"
-            ]
-            if not components or not set(str(region["axes"]).split()) & set(identification.axes):
+            common = axes & set(identification.axes)
+            if not components or not common:
                 continue
-            common = set(str(region["axes"]).split()) & set(identification.axes)
             together = str(region["what"]) == "slow" and len(common) > 1
             if score >= limit and all(
                 component.statistic.is_modelled_in(region, together=together)
