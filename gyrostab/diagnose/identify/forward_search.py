@@ -92,7 +92,6 @@ def name_effects(
         reasons,
         tuple(candidates),
         state,
-        folds,
         count_evidence,
         examination.expected,
         tuple(rejected),

@@ -98,7 +98,6 @@ class Identifications:
     reasons: dict[str, str]  # effect -> why this record cannot show it
     candidates: tuple[Candidate, ...]  # all that were tried
     state: State  # with all of the above, and the expected effects, in the model
-    folds: xr.DataArray  # blocks that are held out together
     count_evidence: CountEvidence = field(default_factory=lambda: CountEvidence({}))
     #: Effects that the simulation contains as well, with size and time from the recording.
     expected: tuple[Identification, ...] = ()

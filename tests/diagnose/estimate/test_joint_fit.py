@@ -14,7 +14,6 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.estimate.joint_fit import _make_estimate, fit_identifications
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
-from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.equivalents import settle_forms
 from gyrostab.diagnose.identify.identification import Identification, Identifications
@@ -25,6 +24,7 @@ from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics.spectral_line import estimate_line, line_quality
 from gyrostab.simulate import simulate
+from tests.support.candidates import make_identifications, select_candidate
 from tests.support.named import COEFFICIENT, record
 
 RECORDS = 60
@@ -47,25 +47,12 @@ def identify_by_hand(
 ) -> Identifications:
     """Return the identification of one effect on one axis."""
     candidates, reasons = effect_candidates(blocks, COEFFICIENT)
-    candidate = next(
-        candidate
-        for candidate in candidates
-        if candidate.effect == effect and candidate.statistic.name == statistic
-    )
+    candidate = select_candidate(candidates, effect, statistic)
     variant = next(variant for variant in candidate.variants if variant.columns == columns)
     component = Component(candidate, variant, (axis,), 50.0)
     identification = Identification(effect, candidate.driver, (axis,), (component,), 50.0, 8.0)
     state = condition_on(initial_state(blocks, baseline), [component])
-    return Identifications(
-        (identification,),
-        (),
-        8.0,
-        np.zeros(1),
-        reasons,
-        tuple(candidates),
-        state,
-        fold_blocks(blocks),
-    )
+    return make_identifications([identification], state, candidates, reasons)
 
 
 def fit_records(noise_only, change, effect, statistic, columns):
@@ -350,11 +337,7 @@ def test_axes_missing_in_the_strongest_statistic_get_sizes_from_the_next():
     baseline = calibrate_noise(blocks)
     candidates, reasons = effect_candidates(blocks, baseline["coefficient"])
     power, cross = (
-        next(
-            candidate
-            for candidate in candidates
-            if (candidate.effect, candidate.statistic.name) == (effect["name"], statistic)
-        )
+        select_candidate(candidates, effect["name"], statistic)
         for statistic in ("power", "cross_spectrum")
     )
     components = [
@@ -366,16 +349,7 @@ def test_axes_missing_in_the_strongest_statistic_get_sizes_from_the_next():
     )
     state = condition_on(initial_state(blocks, baseline), components)
     (fitted,) = fit_identifications(
-        Identifications(
-            (identification,),
-            (),
-            8.0,
-            np.zeros(1),
-            reasons,
-            tuple(candidates),
-            state,
-            fold_blocks(blocks),
-        ),
+        make_identifications([identification], state, candidates, reasons),
         baseline,
     )
     assert fitted.effect.sensitivity == pytest.approx(

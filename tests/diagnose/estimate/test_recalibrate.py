@@ -16,11 +16,10 @@ from gyrostab.diagnose.baseline.calibrate import (
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.estimate.recalibrate import recalibrate, with_noise
-from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.equivalents import settle_forms
-from gyrostab.diagnose.identify.identification import Identification, Identifications
+from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
@@ -28,6 +27,7 @@ from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result import finish as conclude
 from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.simulate import simulate
+from tests.support.candidates import make_identifications, select_candidate
 
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
 SHAKE = {"profile": "vibration", "points": [[0, 3.0], [850, 3.0], [851, 6.0], [1800, 6.0]]}
@@ -52,11 +52,7 @@ def reduce_simulation(*effects, axes=("x", "y"), environment=(), lost=0.0):
 def identify_by_hand(blocks, baseline, effect, statistic, columns, **values):
     """Return the identification of one effect on x, or on both axes if it belongs to the pair."""
     known, reasons = effect_candidates(blocks, baseline["coefficient"])
-    candidate = next(
-        candidate
-        for candidate in known
-        if candidate.effect == effect and candidate.statistic.name == statistic
-    )
+    candidate = select_candidate(known, effect, statistic)
     fits = [variant for variant in candidate.variants if variant.columns == columns]
     variant = min(
         fits,
@@ -69,9 +65,7 @@ def identify_by_hand(blocks, baseline, effect, statistic, columns, **values):
     components = tuple(Component(candidate, variant, row, 500.0) for row in rows)
     identification = Identification(effect, candidate.driver, rows[0], components, 500.0, 8.0)
     state = condition_on(initial_state(blocks, baseline), list(components))
-    return Identifications(
-        (identification,), (), 8.0, np.zeros(1), reasons, tuple(known), state, fold_blocks(blocks)
-    )
+    return make_identifications([identification], state, known, reasons)
 
 
 def noise_coefficient(baseline, term, axis="x"):
@@ -287,9 +281,7 @@ def test_phase_locked_power_is_counted_once():
         "aliased_vibration", statistics["power"].driver, ("x", "y"), components, 500.0, 8.0
     )
     state = condition_on(initial_state(blocks, baseline), list(components))
-    identifications = Identifications(
-        (identification,), (), 8.0, np.zeros(1), reasons, tuple(known), state, fold_blocks(blocks)
-    )
+    identifications = make_identifications([identification], state, known, reasons)
     first = fit_identifications(identifications, baseline)
     noise = recalibrate(identifications, baseline, first)
     for fitted in (first, fit_identifications(with_noise(identifications, noise), noise)):

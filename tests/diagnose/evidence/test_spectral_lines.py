@@ -25,6 +25,7 @@ from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.diagnose.statistics.spectral_line import estimate_line
 from gyrostab.ingest.make_log import make_log
+from tests.support.candidates import find_components
 from tests.support.named import nulls
 
 WEIGHT = np.full((1, 8), 22.0)
@@ -142,7 +143,7 @@ def test_another_line_in_a_free_band_changes_the_evidence_of_lines_only() -> Non
     blocks = sines({3.4: 0.4}, size=9_000, axes=2)
     state, folds = initial_state(blocks, calibrate_noise(blocks)), fold_blocks(blocks)
     candidates, _ = effect_candidates(blocks, state.baseline["coefficient"])
-    line = group_components(compute_evidence(candidates, blocks, state, folds))["spectral_line"][0]
+    line = find_components(candidates, state)["spectral_line"][0]
     first = condition_on(state, [line])
     second = condition_on(first, [replace(line, place=line.place + 1)])
     evidence = compute_evidence(candidates, blocks, first, folds)

@@ -8,13 +8,12 @@ import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.core import diagnose
-from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.components import group_components, sum_evidence
+from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.predict.linear_model import initial_state
-from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
+from tests.support.candidates import find_components
 
 SHAKE = {
     "profile": "vibration",
@@ -58,9 +57,7 @@ def test_walk_under_vibration_has_evidence_in_the_means(seed: int) -> None:
             if (candidate.effect, candidate.statistic.name)
             == ("vibration_random_walk", "random_process")
         ]
-        components = group_components(
-            compute_evidence(walks, blocks, initial_state(blocks, baseline), fold_blocks(blocks))
-        )
+        components = find_components(walks, initial_state(blocks, baseline))
         evidence.append(sum(map(sum_evidence, components.values())))
     assert evidence[0] > 10.0
     assert evidence[1] < 3.0

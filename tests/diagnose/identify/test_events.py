@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.components import group_components, sum_evidence
+from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import is_physical
@@ -22,6 +22,7 @@ from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.ingest.make_log import make_log
+from tests.support.candidates import find_components
 from tests.support.named import nulls
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -62,9 +63,7 @@ def candidate(state: State, effect: str, statistic: str) -> Candidate:
 
 
 def components_of(state: State, tried: Candidate) -> list[Component]:
-    return group_components(
-        compute_evidence([tried], state.blocks, state, fold_blocks(state.blocks))
-    )[tried.key]
+    return find_components([tried], state)[tried.key]
 
 
 @pytest.mark.slow

@@ -21,6 +21,7 @@ from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.search import combine_rows
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
+from tests.support.candidates import select_candidate
 from tests.support.named import WORLD, nulls, record
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -91,11 +92,7 @@ def test_chance_on_another_axis_does_not_veto_an_effect(shaken, monkeypatch):
 
 def test_sizes_outside_the_registry_are_rejected(shaken):
     """15 deg/h for some 40 degC is that of a broken instrument, or not an effect of temperature."""
-    bias = next(
-        candidate
-        for candidate in shaken.candidates
-        if candidate.effect == "temperature_bias" and candidate.statistic.name == "mean"
-    )
+    bias = select_candidate(shaken.candidates, "temperature_bias", "mean")
     variant = next(variant for variant in bias.variants if variant.columns == ("sensitivity",))
     component = Component(bias, variant, ("y",), 50.0)
     for size, answer in ((5.0, [component]), (15.0, [])):
@@ -175,12 +172,12 @@ def test_two_effects_are_both_identified():
 
 def test_time_shifted_channels_explain_less(shaken):
     (identification,) = shaken.identified
-    start = replace(shaken.state, given={})
-    beats, p_value, _ = passes_time_shift_test(identification.components, start, shaken.folds)
+    start, folds = replace(shaken.state, given={}), fold_blocks(shaken.state.blocks)
+    beats, p_value, _ = passes_time_shift_test(identification.components, start, folds)
     assert beats
     assert p_value <= 0.01
     elsewhere = [replace(component, row=("z",)) for component in identification.components]
-    assert not passes_time_shift_test(elsewhere, start, shaken.folds)[0]
+    assert not passes_time_shift_test(elsewhere, start, folds)[0]
 
 
 def test_identified_effect_is_in_the_model_of_the_next(shaken):

@@ -138,8 +138,7 @@ def identifications(
     )
     null = np.sort(np.random.default_rng(1).exponential(1.0, 400))
     state: Any = SimpleNamespace(settings=DEFAULTS)
-    nothing: Any = None
-    return Identifications((identification,), (), 7.0, null, {}, (), state, nothing)
+    return Identifications((identification,), (), 7.0, null, {}, (), state)
 
 
 def blocks() -> xr.Dataset:

@@ -1,24 +1,38 @@
-"""A jump is sudden: a gradual change is another effect, or unidentified."""
+"""A jump is sudden, may come several times, and is not a gradual change."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+import xarray as xr
 
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
-from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.components import group_components, sum_evidence
+from gyrostab.diagnose.core import diagnose
+from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identifiability import is_physical
 from gyrostab.diagnose.identify.jumps import gradual_nats, is_free_jump
-from gyrostab.diagnose.predict.candidates import Component
-from gyrostab.diagnose.predict.linear_model import initial_state
-from gyrostab.diagnose.predict.search import compute_evidence
+from gyrostab.diagnose.predict.candidates import Candidate, Component
+from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
+from tests.support.candidates import find_components
 
 MODEL = {"noise": {"N": 0.003, "B": 0.004, "K": 0.02}, "log": {"axes": ["x", "y"]}}
 MIDDLE = 905.0  # inside a block
+RATE = 2.0
+RESTARTS = ((3000.0, 3090.0), (6200.0, 6500.0), (8500.0, 8560.0))
+
+
+def try_jumps(blocks: xr.Dataset, baseline: xr.Dataset) -> tuple[Candidate, State]:
+    """Return the jumps that are tried in the means of a record, and its state without effects."""
+    (jumps,) = (
+        candidate
+        for candidate in effect_candidates(blocks, baseline["coefficient"])[0]
+        if (candidate.effect, candidate.statistic.name) == ("bias_jump", "mean")
+    )
+    return jumps, initial_state(blocks, baseline)
 
 
 @pytest.mark.parametrize(
@@ -32,16 +46,8 @@ def test_gradual_change_is_not_a_jump(way: float, size: float, jump: bool) -> No
         0.003 * 60.0 * np.sqrt(10.0) * np.random.default_rng(4).standard_normal((2, second.size))
     )
     blocks = reduce_log(make_log(noise + size * course * [[1.0], [-0.8]], rate=10.0, unit="deg/h"))
-    baseline = baseline_from_model(blocks, MODEL)
-    (jumps,) = (
-        candidate
-        for candidate in effect_candidates(blocks, baseline["coefficient"])[0]
-        if (candidate.effect, candidate.statistic.name) == ("bias_jump", "mean")
-    )
-    state = initial_state(blocks, baseline)
-    components = group_components(compute_evidence([jumps], blocks, state, fold_blocks(blocks)))[
-        jumps.key
-    ]
+    jumps, state = try_jumps(blocks, baseline_from_model(blocks, MODEL))
+    components = find_components([jumps], state)[jumps.key]
     assert sum_evidence(components) > 10.0
     assert abs(float(components[0].variant.values["at"]) - MIDDLE) <= 30.0
     assert all(is_free_jump(component, state) for component in components)
@@ -56,13 +62,7 @@ def test_jump_at_a_restart_may_settle() -> None:
     rate = 0.6 * np.random.default_rng(4).standard_normal((2, second.size)) + 0.8 * course
     rate[:, (second >= 850.0) & (second < 960.0)] = np.nan
     blocks = reduce_log(make_log(rate, rate=10.0, unit="deg/h"))
-    baseline = baseline_from_model(blocks, MODEL)
-    (jumps,) = (
-        candidate
-        for candidate in effect_candidates(blocks, baseline["coefficient"])[0]
-        if (candidate.effect, candidate.statistic.name) == ("bias_jump", "mean")
-    )
-    state = initial_state(blocks, baseline)
+    jumps, state = try_jumps(blocks, baseline_from_model(blocks, MODEL))
     at = np.array([variant.values["at"] for variant in jumps.variants])
     components = {
         instant: Component(jumps, jumps.variants[int(np.abs(at - instant).argmin())], ("x",), 20.0)
@@ -73,3 +73,67 @@ def test_jump_at_a_restart_may_settle() -> None:
         False,
         True,
     ]
+
+
+def drifting_log(seed: int, steps: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> xr.Dataset:
+    """Make a log with N = 0.05, K = 0.4 and `steps` (axis, sample) [deg/h]."""
+    rng = np.random.default_rng(seed)
+    second = np.arange(steps.shape[1]) / RATE
+    rate = 0.05 * 60.0 * np.sqrt(RATE) * rng.standard_normal(steps.shape) + steps
+    rate += 0.4 * np.sqrt(1.0 / RATE / 3600.0) * rng.standard_normal(steps.shape).cumsum(axis=1)
+    for begin, end in gaps:
+        rate[:, (second >= begin) & (second < end)] = np.nan
+    return make_log(rate, rate=RATE, unit="deg/h")
+
+
+def levels(sizes: tuple[float, ...], times: tuple[float, ...], seconds: float) -> np.ndarray:
+    """Sum steps of these sizes at these times."""
+    second = np.arange(round(seconds * RATE)) / RATE
+    return sum(size * (second >= at) for size, at in zip(sizes, times, strict=True))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_jumps_at_every_restart_compete_as_one_design(seed: int) -> None:
+    """One jump alone is no larger than the random walk that would explain the others."""
+    times = tuple(end for _, end in RESTARTS)
+    steps = np.stack(
+        [levels(sizes, times, 10_800.0) for sizes in ((1.6, -1.9, 1.1), (-1.1, 1.7, -2.0))]
+    )
+    blocks = reduce_log(drifting_log(seed, steps, RESTARTS))
+    jumps, state = try_jumps(blocks, calibrate_noise(blocks))
+    components = find_components([jumps], state)[jumps.key]
+    assert {component.row for component in components} == {("x",), ("y",)}
+    assert all(len(component.variant.columns) == 3 for component in components)
+    assert sum_evidence(components) > 15.0
+
+
+@pytest.mark.parametrize("seed", [1])
+def test_jumps_at_all_restarts_are_sized(seed: int) -> None:
+    times = tuple(end for _, end in RESTARTS)
+    sizes = np.array([(1.6, -1.9, 1.1), (-1.1, 1.7, -2.0)])
+    steps = np.stack([levels(tuple(row), times, 10_800.0) for row in sizes])
+    found = diagnose(drifting_log(seed, steps, RESTARTS), nulls=100)
+    assert [effect["name"] for effect in found.effects] == ["bias_jump"] * 3
+    assert [effect["at"] for effect in found.model["effect"]] == list(times)
+    for effect, truth in zip(found.effects, sizes.T, strict=True):
+        for axis, size in zip(("x", "y"), truth, strict=True):
+            estimate = effect["parameters"][f"step.{axis}"]
+            assert abs(estimate["value"] - size) < 4.0 * estimate["stderr"]
+            assert estimate["stderr"] < 0.5
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_two_jumps_beat_a_course_of_levels(seed: int) -> None:
+    steps = levels((2.6, -2.1), (9500.0, 11_800.0), 14_400.0)[None]
+    found = diagnose(drifting_log(seed, steps, ()), nulls=100)
+    sizes = {
+        effect["parameters"]["at"]["value"]: effect["parameters"]["step"]
+        for effect in found.effects
+        if effect["name"] == "bias_jump"
+    }
+    assert len(sizes) == 2
+    for (at, estimate), truth_at, truth in zip(
+        sorted(sizes.items()), (9500.0, 11_800.0), (2.6, -2.1), strict=True
+    ):
+        assert at == pytest.approx(truth_at, abs=60.0)
+        assert abs(estimate["value"] - truth) < 4.0 * estimate["stderr"] < 4.0

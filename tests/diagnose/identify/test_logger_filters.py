@@ -8,16 +8,15 @@ import xarray as xr
 from scipy.signal import butter, lfilter, sosfilt
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
-from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.components import group_components, sum_evidence
+from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identifiability import is_physical
 from gyrostab.diagnose.identify.logger_filters import fit_filter_sizes, separate_axes_nats
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import initial_state
-from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
+from tests.support.candidates import find_components
 
 
 @pytest.mark.parametrize(
@@ -43,9 +42,7 @@ def test_filter_must_fit_all_axes(late, one_filter):
         if candidate.effect == "logger_filter"
     ]
     state = initial_state(blocks, baseline)
-    components = group_components(compute_evidence(filters, blocks, state, fold_blocks(blocks)))[
-        "logger_filter"
-    ]
+    components = find_components(filters, state)["logger_filter"]
     assert sum_evidence(components) > 10.0
     assert (separate_axes_nats(components, state) == 0.0) == one_filter
     assert is_physical(components, state) == (components if one_filter else [])

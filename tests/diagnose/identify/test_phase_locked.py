@@ -11,12 +11,12 @@ import xarray as xr
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.identify.identification import (
     Identification,
-    Identifications,
     remove_phase_locked,
 )
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.simulate import simulate
+from tests.support.candidates import make_identifications
 
 N = 0.003  # deg/sqrt(h)
 
@@ -48,16 +48,9 @@ def test_only_phase_locked_components_are_removed() -> None:
         component("rotation_order", 20.0),
         component("ramp_phase", 7.0),
     )
-    identifications = Identifications(
-        (identification(mean, wave), identification(comb), identification(mean)),
-        (),
-        6.0,
-        np.zeros(1),
-        {},
-        (),
-        None,
-        xr.DataArray(),
-    )  # type: ignore[arg-type]
+    identifications = make_identifications(
+        [identification(mean, wave), identification(comb), identification(mean)], None
+    )
     left, evidence_nats = remove_phase_locked(identifications, xr.Dataset())
     assert evidence_nats == 27.0
     assert [identification.components for identification in left.identified] == [(mean,), (mean,)]

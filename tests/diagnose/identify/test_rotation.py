@@ -13,7 +13,6 @@ from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence
-from gyrostab.diagnose.identify.components import group_components
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import find_plainer_effect, is_physical
@@ -26,6 +25,7 @@ from gyrostab.diagnose.task import Task, take_lines_at_rest
 from gyrostab.ingest.make_log import make_log
 from gyrostab.progress import no_stage
 from gyrostab.simulate import simulate
+from tests.support.candidates import find_components
 from tests.support.named import nulls
 
 _TURNS = [
@@ -60,15 +60,11 @@ def _find_components(blocks: xr.Dataset):
         candidate
         for candidate in effect_candidates(blocks, baseline["coefficient"])[0]
         if candidate.effect in ("scale_factor", "real_motion")
+        and candidate.statistic.name == "mean"
     ]
     state = initial_state(blocks, baseline)
-    components = group_components(
-        compute_evidence(
-            [candidate for candidate in known if candidate.statistic.name == "mean"],
-            blocks,
-            state,
-            fold_blocks(blocks),
-        )
+    components = find_components(
+        [candidate for candidate in known if candidate.statistic.name == "mean"], state
     )
     return {group[0].candidate.effect: group for group in components.values()}, state
 

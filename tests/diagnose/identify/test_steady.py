@@ -7,16 +7,14 @@ import pytest
 from scipy.signal import lfilter
 
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
-from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.components import group_components
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identifiability import is_physical
 from gyrostab.diagnose.identify.steady import intermittent_nats
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State, initial_state
-from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
+from tests.support.candidates import find_components
 
 MODEL = {"noise": {"N": 0.003}, "log": {"axes": ["x"]}}
 SECOND = np.arange(24_000) / 10.0
@@ -38,9 +36,7 @@ def _simulate_wander(size: float, share: float, seed: int) -> tuple[list[Compone
         if candidate.key == "gauss_markov" and candidate.statistic.name == "power"
     ]
     state = initial_state(blocks, baseline)
-    return group_components(compute_evidence(biases, blocks, state, fold_blocks(blocks)))[
-        "gauss_markov"
-    ], state
+    return find_components(biases, state)["gauss_markov"], state
 
 
 @pytest.mark.parametrize("size", [0.12, 0.18])

@@ -12,6 +12,7 @@ from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
+from tests.support.candidates import select_candidate
 
 
 def _run_time_shift_test(sensitivity: float, period: float) -> tuple[bool, float]:
@@ -36,11 +37,7 @@ def _run_time_shift_test(sensitivity: float, period: float) -> tuple[bool, float
     blocks = reduce_log(simulate(model, duration="30min", rate=10.0, seed=5).compute())
     baseline = calibrate_noise(blocks)
     known, _ = effect_candidates(blocks, baseline["coefficient"])
-    candidate = next(
-        candidate
-        for candidate in known
-        if candidate.effect == "temperature_bias" and candidate.statistic.name == "mean"
-    )
+    candidate = select_candidate(known, "temperature_bias", "mean")
     variant = next(variant for variant in candidate.variants if variant.columns == ("sensitivity",))
     return passes_time_shift_test(
         [Component(candidate, variant, ("x",), 50.0)],

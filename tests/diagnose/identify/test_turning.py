@@ -7,15 +7,14 @@ import pytest
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
-from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.components import group_components, sum_evidence
+from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
-from gyrostab.diagnose.identify.identification import Identification, Identifications
+from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
-from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
+from tests.support.candidates import find_components, make_identifications
 
 
 def _simulate_rotation(*effects, points=((0, 108.0), (1200, 108.0))):
@@ -51,25 +50,15 @@ def test_earth_rate_is_recovered(around):
     baseline = calibrate_noise(blocks)
     known, reasons = effect_candidates(blocks, baseline["coefficient"])
     orders = [candidate for candidate in known if candidate.statistic.name == "rotation_order"]
-    start, folds = initial_state(blocks, baseline), fold_blocks(blocks)
-    components = group_components(compute_evidence(orders, blocks, start, folds))[
-        "earth_rate(rotation_rate)"
-    ]
+    start = initial_state(blocks, baseline)
+    components = find_components(orders, start)["earth_rate(rotation_rate)"]
     assert sum_evidence(components) > 1000.0
     state = condition_on(start, components)
-    assert (
-        max(
-            sum_evidence(group)
-            for group in group_components(compute_evidence(orders, blocks, state, folds)).values()
-        )
-        < 5.0
-    )
+    assert max(map(sum_evidence, find_components(orders, state).values())) < 5.0
     identification = Identification(
         "earth_rate", components[0].candidate.driver, ("x", "y"), tuple(components), 500.0, 8.0
     )
-    identifications = Identifications(
-        (identification,), (), 8.0, np.zeros(1), reasons, tuple(known), state, folds
-    )
+    identifications = make_identifications([identification], state, known, reasons)
     (fitted,) = fit_identifications(identifications, baseline)
     simulated = _simulate_rotation(
         _some_parameters(fitted.effect, "latitude", "toolface", "off", "around")
@@ -92,27 +81,14 @@ def test_angles_have_the_relative_error_of_the_size(latitude, most):
     blocks = reduce_log(log)
     baseline = calibrate_noise(blocks)
     known, reasons = effect_candidates(blocks, baseline["coefficient"])
-    start, folds = initial_state(blocks, baseline), fold_blocks(blocks)
-    components = group_components(
-        compute_evidence(
-            [candidate for candidate in known if candidate.statistic.name == "rotation_order"],
-            blocks,
-            start,
-            folds,
-        )
-    )["earth_rate(rotation_rate)"]
+    start = initial_state(blocks, baseline)
+    orders = [candidate for candidate in known if candidate.statistic.name == "rotation_order"]
+    components = find_components(orders, start)["earth_rate(rotation_rate)"]
     identification = Identification(
         "earth_rate", components[0].candidate.driver, ("x", "y"), tuple(components), 500.0, 8.0
     )
-    identifications = Identifications(
-        (identification,),
-        (),
-        8.0,
-        np.zeros(1),
-        reasons,
-        tuple(known),
-        condition_on(start, components),
-        folds,
+    identifications = make_identifications(
+        [identification], condition_on(start, components), known, reasons
     )
     estimates = fit_identifications(identifications, baseline)[0].parameters
     assert estimates["latitude"].low < latitude < estimates["latitude"].high
@@ -146,10 +122,8 @@ def test_all_harmonics_of_the_rotation_are_recovered():
         for candidate in known
         if candidate.statistic.name == "rotation_order" and candidate.effect == "rotation_line"
     ]
-    start, folds = initial_state(blocks, baseline), fold_blocks(blocks)
-    components = group_components(compute_evidence(orders, blocks, start, folds))[
-        "rotation_line(rotation_rate)"
-    ]
+    start = initial_state(blocks, baseline)
+    components = find_components(orders, start)["rotation_line(rotation_rate)"]
     identification = Identification(
         "rotation_line",
         components[0].candidate.driver,
@@ -158,15 +132,8 @@ def test_all_harmonics_of_the_rotation_are_recovered():
         sum_evidence(components),
         8.0,
     )
-    identifications = Identifications(
-        (identification,),
-        (),
-        8.0,
-        np.zeros(1),
-        reasons,
-        tuple(known),
-        condition_on(start, components),
-        folds,
+    identifications = make_identifications(
+        [identification], condition_on(start, components), known, reasons
     )
     fitted = fit_identifications(identifications, baseline)
     assert [(fitted_effect.effect.order, fitted_effect.axes) for fitted_effect in fitted] == [

@@ -24,6 +24,7 @@ from gyrostab.ingest.make_log import make_log
 from gyrostab.noise import sampled_psd
 from gyrostab.physics.registry import effects
 from gyrostab.simulate import simulate
+from tests.support.candidates import select_candidate
 from tests.support.evidence import power_factors
 from tests.support.named import COEFFICIENT, WORLD, record
 
@@ -123,11 +124,7 @@ def test_a_constant_channel_has_no_effect(plain):
 def test_an_axis_does_not_explain_itself(plain, tried_effects):
     turning = 500.0 * np.sin(np.linspace(0.0, 6.0, plain.sizes["block"]))
     moving = plain.assign(mean=plain["mean"] + turning)
-    leak = next(
-        candidate
-        for candidate in effect_candidates(moving, COEFFICIENT)[0]
-        if candidate.effect == "misalignment" and candidate.statistic.name == "mean"
-    )
+    leak = select_candidate(effect_candidates(moving, COEFFICIENT)[0], "misalignment", "mean")
     for variant in leak.variants:
         for name, design in zip(variant.columns, variant.design, strict=True):
             assert not design["xyz".index(name)].any()
@@ -146,11 +143,7 @@ def test_axes_at_rest_do_not_leak(plain, tried_effects):
     ]
     course = xr.DataArray(np.linspace(0.0, 500.0, plain.sizes["block"]), dims="block")
     turning = plain.assign(mean=plain["mean"] + course.where(plain["axis"] == "z", 0.0))
-    leak = next(
-        candidate
-        for candidate in effect_candidates(turning, COEFFICIENT)[0]
-        if candidate.effect == "misalignment" and candidate.statistic.name == "mean"
-    )
+    leak = select_candidate(effect_candidates(turning, COEFFICIENT)[0], "misalignment", "mean")
     assert [variant.columns for variant in leak.variants] == [("z",)]
 
 
@@ -167,11 +160,7 @@ def test_mean_designs_match_the_simulator(plain):
 
 def test_earth_rate_is_in_quadrature_between_the_cross_axes(rich):
     candidates, _ = effect_candidates(rich, COEFFICIENT)
-    candidate = next(
-        candidate
-        for candidate in candidates
-        if candidate.effect == "earth_rate" and candidate.statistic.name == "rotation_order"
-    )
+    candidate = select_candidate(candidates, "earth_rate", "rotation_order")
     pattern = candidate.variants[0].design[0, :, 0]
     turning = [*WORLD["turning"]]
     table = {"name": "earth_rate", "latitude": 60.0}

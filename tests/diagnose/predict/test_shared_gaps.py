@@ -14,6 +14,7 @@ from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 from gyrostab.simulate import simulate
+from tests.support.candidates import select_candidate
 
 
 @pytest.fixture(scope="module")
@@ -34,11 +35,7 @@ def test_random_gaps_do_not_bias_a_shared_band(log, rows):
     blocks = reduce_log(log.assign(rate=rate.where(is_present).assign_attrs(rate.attrs)))
     baseline = calibrate_noise(blocks)
     known, _ = effect_candidates(blocks, baseline["coefficient"])
-    candidate = next(
-        candidate
-        for candidate in known
-        if candidate.effect == "shared_source" and candidate.statistic.name == "cross_spectrum"
-    )
+    candidate = select_candidate(known, "shared_source", "cross_spectrum")
     variant = next(variant for variant in candidate.variants if variant.values["bandwidth"] == 0.5)
     mean, covariance = component_mixture(
         Component(candidate, variant, ("x", "y"), 1.0), initial_state(blocks, baseline)

@@ -14,6 +14,7 @@ from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.predict.step_times import select_step_times
 from gyrostab.physics.prediction import Windows
+from tests.support.candidates import select_candidate
 from tests.support.named import COEFFICIENT, record
 
 _BACK = 1913.0  # s, between two values of the thinned grid
@@ -29,11 +30,7 @@ def restarted():
 
 
 def _jump_candidates(blocks):
-    return next(
-        candidate
-        for candidate in effect_candidates(blocks, COEFFICIENT)[0]
-        if candidate.effect == "bias_jump" and candidate.statistic.name == "mean"
-    )
+    return select_candidate(effect_candidates(blocks, COEFFICIENT)[0], "bias_jump", "mean")
 
 
 def test_a_restart_is_as_probable_as_all_other_times(restarted):

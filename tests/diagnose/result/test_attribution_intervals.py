@@ -11,6 +11,7 @@ from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
+from tests.support.candidates import select_candidate
 from tests.support.named import COEFFICIENT, WORLD, record
 
 
@@ -26,11 +27,7 @@ def turning():
 
 def identification(blocks, effect, statistic):
     candidates, _ = effect_candidates(blocks, COEFFICIENT)
-    candidate = next(
-        candidate
-        for candidate in candidates
-        if candidate.effect == effect and candidate.statistic.name == statistic
-    )
+    candidate = select_candidate(candidates, effect, statistic)
     component = Component(candidate, candidate.variants[0], ("x",), 50.0, place=0)
     return Identification(effect, candidate.driver, ("x",), (component,), 50.0, 8.0)
 

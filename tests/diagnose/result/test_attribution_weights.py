@@ -9,9 +9,8 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
-from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
-from gyrostab.diagnose.identify.identification import Identification, Identifications
+from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.locate.mismatches import locate_mismatches
 from gyrostab.diagnose.locate.regions import merge_regions
 from gyrostab.diagnose.nulls.scores import null_scores
@@ -22,6 +21,7 @@ from gyrostab.diagnose.result.attribution import attribute_mismatches
 from gyrostab.diagnose.result.attribution_weights import needed_effects
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.diagnose.statistics.sample_counts import find_anomalous_blocks
+from tests.support.candidates import make_identifications, select_candidate
 from tests.support.named import COEFFICIENT, nulls, record
 
 NAMES = (
@@ -32,11 +32,7 @@ NAMES = (
 
 
 def _make_identification(candidates, effect, statistic, column):
-    candidate = next(
-        candidate
-        for candidate in candidates
-        if (candidate.effect, candidate.statistic.name) == (effect, statistic)
-    )
+    candidate = select_candidate(candidates, effect, statistic)
     variant = next(
         variant
         for variant in candidate.variants
@@ -67,9 +63,7 @@ def shaken():
     state = initial_state(changed, baseline)
     for identification in identified[::-1]:  # anomalous samples are named first
         state = condition_on(state, list(identification.components))
-    identifications = Identifications(
-        identified, (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(changed)
-    )
+    identifications = make_identifications(identified, state, candidates, reasons)
     return changed, baseline, identifications, null_scores(baseline, chance)
 
 
@@ -145,11 +139,7 @@ def test_jump_explains_the_mean_on_either_side(shaken, step, attributed):
         mean=blocks["mean"] + step * np.stack([after_it, 0 * after_it, 0 * after_it])
     )
     candidates, reasons = effect_candidates(moved, COEFFICIENT)
-    candidate = next(
-        candidate
-        for candidate in candidates
-        if (candidate.effect, candidate.statistic.name) == ("bias_jump", "mean")
-    )
+    candidate = select_candidate(candidates, "bias_jump", "mean")
     variant = next(variant for variant in candidate.variants if variant.values["at"] == 1800.0)
     identification = Identification(
         "bias_jump",
@@ -160,16 +150,7 @@ def test_jump_explains_the_mean_on_either_side(shaken, step, attributed):
         8.0,
     )
     state = condition_on(initial_state(moved, baseline), list(identification.components))
-    identifications = Identifications(
-        (identification,),
-        (),
-        8.0,
-        np.zeros(1),
-        reasons,
-        tuple(candidates),
-        state,
-        fold_blocks(moved),
-    )
+    identifications = make_identifications([identification], state, candidates, reasons)
     fields = {
         "statistic": "mean",
         "view": "mean",
@@ -296,11 +277,7 @@ def test_line_on_two_axes_explains_their_covariance(shaken, axes, attributed):
     shared = quiet.assign(cross=cross)
     place = int(np.abs(shared["line_frequency"].values - 2.0).argmin())
     candidates, _ = effect_candidates(shared, COEFFICIENT)
-    candidate = next(
-        candidate
-        for candidate in candidates
-        if (candidate.effect, candidate.statistic.name) == ("spectral_line", "spectral_line")
-    )
+    candidate = select_candidate(candidates, "spectral_line", "spectral_line")
     identification = Identification(
         "spectral_line",
         (),

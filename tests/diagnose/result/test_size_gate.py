@@ -19,7 +19,7 @@ import gyrostab
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.joint_fit import Estimate, Fitted, fit_identifications
 from gyrostab.diagnose.estimate.upper_limits import mixture_limit
-from gyrostab.diagnose.identify.identification import Identification, Identifications
+from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.result import finish as conclude
 from gyrostab.diagnose.result.mismatch_tables import unidentified_mismatches
@@ -30,6 +30,7 @@ from gyrostab.diagnose.result.verdict import decide_verdict, failed_checks
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.physics.registry import effects
 from tests.diagnose.estimate.test_recalibrate import SHAKE, identify_by_hand, reduce_simulation
+from tests.support.candidates import make_identifications
 from tests.support.diagnosed import content
 
 SHUPE: dict[str, Any] = content()["effects"][0] | {
@@ -60,10 +61,6 @@ def make_identification(
     return Identification(effect, (), tuple(axes), components, 20.0 * len(axes), 8.0)
 
 
-def make_identifications(*identified: Identification) -> Identifications:
-    return Identifications(identified, (), 8.0, np.zeros(1), {}, (), *[None] * 2)  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize(
     ("parameters", "axes"),
     [
@@ -91,7 +88,7 @@ def test_line_of_zero_amplitude_is_not_an_effect():
         "frequency": Estimate(0.0, 0.1, 0.0, 0.2, "Hz"),
     }
     identifications = keep_supported(
-        make_identifications(identification), [[Fitted(identification, ("x",), nothing, None)]]
+        make_identifications([identification]), [[Fitted(identification, ("x",), nothing, None)]]
     )
     assert not identifications.identified
     assert [
@@ -113,7 +110,7 @@ def test_effect_keeps_axes_with_a_size():
     ]
     rival = identification.evidence_nats - 2.0
     identification = replace(identification, instead={"shupe": rival})
-    before = make_identifications(identification, other)
+    before = make_identifications([identification, other])
     identifications = keep_supported(before, numbers)
     assert [
         (identification.effect, identification.axes)
@@ -141,7 +138,7 @@ def test_unsupported_rest_below_the_threshold_is_dropped():
             for axis, error in (("x", 0.1), ("y", 1.0))
         ]
     ]
-    identifications = keep_supported(make_identifications(identification), numbers)
+    identifications = keep_supported(make_identifications([identification]), numbers)
     assert [identification.axes for identification in identifications.identified] == [("x",)]
     assert not identifications.unknown
 
