@@ -114,7 +114,7 @@ def predict_baseline(
     if not shared:
         return predicted
     expected = expected_cross(baseline)
-    cross = _cross_spectra(shared, state, identifications)
+    cross = _cross_spectra(shared, state)
     return predicted.assign(
         cross=(("pair", "block", "band"), cross if expected is None else cross + expected)
     )
@@ -135,9 +135,7 @@ def _powers_without(
     return weight
 
 
-def _cross_spectra(
-    components: Sequence[Component], state: State, identifications: Identifications
-) -> NDArray[np.complex128]:
+def _cross_spectra(components: Sequence[Component], state: State) -> NDArray[np.complex128]:
     """Return the cross-spectra of noise that axes have in common."""
     shape = state.weight.shape[1:]
     pairs = pair_rows(state.blocks)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -19,6 +20,7 @@ __all__ = [
     "find_components",
     "group_components",
     "merge_lines",
+    "split_layers",
     "sum_evidence",
 ]
 
@@ -144,3 +146,16 @@ def axes_of(components: Sequence[Component], order: Sequence[str]) -> tuple[str,
     """Return the axes of components, in order."""
     named = {axis for component in components for axis in component.row}
     return tuple(sorted(named, key=lambda axis: (order.index(axis) if axis in order else 0, axis)))
+
+
+def split_layers(components: Sequence[Component]) -> list[list[Component]]:
+    """Split components by how often their statistic, row and reference channel occurred before."""
+    out: list[list[Component]] = []
+    occurrences: Counter[tuple[object, ...]] = Counter()
+    for component in components:
+        place = component.statistic, component.row, component.candidate.reference
+        if occurrences[place] == len(out):
+            out.append([])
+        out[occurrences[place]].append(component)
+        occurrences[place] += 1
+    return out

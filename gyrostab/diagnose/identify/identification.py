@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -51,8 +50,6 @@ class Identification:
     evidence_nats: float  # held-out log Bayes factor with all others in the model [nats]
     threshold: float  # evidence that it needed [nats]
     alternatives: tuple[str, ...] = ()  # effects that these data do not separate from it
-    #: Share of the time-shifted surrogates of its channel that explain as much; NaN without one.
-    surrogate_p: float = math.nan
     #: Key of each candidate that could take its place -> evidence there [nats].
     instead: Mapping[str, float] = field(default_factory=dict)
 
@@ -246,7 +243,6 @@ def make_identification(
     *,
     order: Sequence[str] = (),
     alternatives: Iterable[str] = (),
-    surrogate_p: float = math.nan,
 ) -> Identification:
     """Make an identification of components that passed a threshold, with its axes in order."""
     first = components[0].candidate
@@ -258,7 +254,6 @@ def make_identification(
         sum_evidence(components),
         threshold,
         tuple(dict.fromkeys(name for name in alternatives if name != first.effect)),
-        surrogate_p,
     )
 
 

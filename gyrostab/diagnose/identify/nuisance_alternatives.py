@@ -31,7 +31,7 @@ _SPLINE_KNOTS = 12  # over the record; design choice
 _MAX_INTERVALS = 240  # intervals of a burst that are tried; limits time
 
 
-def burst_intervals(block_count: int, most: int = _MAX_INTERVALS) -> NDArray[np.int64]:
+def burst_intervals(block_count: int) -> NDArray[np.int64]:
     """List intervals of blocks, (interval, 2) as first and stop: 1, 2, 4, ... up to half of all.
 
     Each starts half its length after the one before. If there are too many of a length, only the
@@ -46,7 +46,7 @@ def burst_intervals(block_count: int, most: int = _MAX_INTERVALS) -> NDArray[np.
     """
     lengths = [2**power for power in range(max(1, block_count // 2).bit_length())]
     first = [np.arange(0, block_count - length + 1, max(1, length // 2)) for length in lengths]
-    while sum(starts.size for starts in first) > most:
+    while sum(starts.size for starts in first) > _MAX_INTERVALS:
         # The shortest intervals are the most numerous.
         longest = next(number for number, starts in enumerate(first) if starts.size > 2)
         first[longest] = np.array([0, block_count - lengths[longest]])

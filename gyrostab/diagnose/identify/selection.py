@@ -16,7 +16,7 @@ from gyrostab.diagnose.identify.components import (
     sum_evidence,
 )
 from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.identifiability import is_physical, without_pulses
+from gyrostab.diagnose.identify.identifiability import is_physical
 from gyrostab.diagnose.identify.identification import (
     Identification,
     Rejection,
@@ -30,7 +30,7 @@ from gyrostab.diagnose.identify.identification import (
 from gyrostab.diagnose.identify.naming_order import order_passing, order_rivals
 from gyrostab.diagnose.identify.pairs import find_pair
 from gyrostab.diagnose.identify.rejected import find_rejections
-from gyrostab.diagnose.identify.settling import prune_selections, settle_selections
+from gyrostab.diagnose.identify.settling import prune_selections, settle_selections, without_pulses
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.identify.switching import drop_explained_jumps
 from gyrostab.diagnose.identify.withdrawal import withdraw_effects
@@ -216,8 +216,7 @@ def _select_next(
         rivals = [key]
     rejected: set[str] = set()
     for key in rivals:
-        shifts = passes_time_shift_test(components[key], state, examination.folds)
-        if shifts.passed:
+        if passes_time_shift_test(components[key], state, examination.folds).passed:
             min_nats = sum_evidence(components[key]) - settings.ambiguous_nats
             close = [
                 components[other][0].candidate.effect
@@ -226,9 +225,7 @@ def _select_next(
                 and other not in rejected
                 and sum_evidence(components[other]) >= min_nats
             ]
-            identification = make_identification(
-                components[key], required[key], alternatives=close, surrogate_p=shifts.p_value
-            )
+            identification = make_identification(components[key], required[key], alternatives=close)
             return identification, rejected
         rejected.add(key)
     if rejected:

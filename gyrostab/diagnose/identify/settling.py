@@ -7,17 +7,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
+from gyrostab.diagnose.identify.ambiguity import (
+    find_equivalent_effects,
+    find_spectral_alternatives,
+)
 from gyrostab.diagnose.identify.components import (
     PLAIN_LINE,
     candidates_of,
+    split_layers,
     sum_evidence,
 )
 from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.identifiability import (
-    find_equivalent_effects,
-    find_spectral_alternatives,
-    is_physical,
-)
+from gyrostab.diagnose.identify.identifiability import is_physical
 from gyrostab.diagnose.identify.identification import (
     Identification,
     Selection,
@@ -28,8 +29,44 @@ from gyrostab.diagnose.identify.switching import renew_component
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.settings import Settings
 
-__all__ = ["evidence_instead", "prune_selections", "settle_selections"]
+__all__ = ["evidence_instead", "prune_selections", "settle_selections", "without_pulses"]
+
+
+def without_pulses(chosen: Sequence[Selection], settings: Settings) -> list[Selection]:
+    """Drop spikes on axes that have a comb of lines or a profile of the feedback ramp.
+
+    A comb is a periodic pulse, and the outliers are the pulse itself. Bad samples would make no
+    lines.
+    """
+    lines: Counter[str] = Counter()
+    for component in components_of(chosen):
+        has_profile = component.statistic.is_phase_locked and not component.statistic.is_rotation
+        weight = settings.min_comb_lines if has_profile else int(component.statistic.is_line)
+        lines.update(dict.fromkeys(component.row, weight))
+    out: list[Selection] = []
+    for selection in chosen:
+        if isinstance(selection, Identification) and selection.effect == "spikes":
+            remaining = tuple(
+                component
+                for component in selection.components
+                if lines[component.row[0]] < settings.min_comb_lines
+            )
+            out += (
+                [
+                    replace(
+                        selection,
+                        components=remaining,
+                        axes=tuple(component.row[0] for component in remaining),
+                    )
+                ]
+                if remaining
+                else []
+            )
+        else:
+            out.append(selection)
+    return out
 
 
 def prune_selections(examination: Examination, chosen: list[Selection]) -> list[Selection]:
@@ -127,7 +164,7 @@ def _finish_identification(
     components = tuple(
         renew_component(layer_components, component)
         for layer, layer_components in zip(
-            _split_layers(identification.components), layers, strict=True
+            split_layers(identification.components), layers, strict=True
         )
         for component in layer
     )
@@ -177,19 +214,6 @@ def _sum_by_key(components: Mapping[str, Sequence[Component]]) -> dict[str, floa
     }
 
 
-def _split_layers(components: Sequence[Component]) -> list[list[Component]]:
-    """Split components by how often their statistic, row and reference channel occurred before."""
-    out: list[list[Component]] = []
-    occurrences: Counter[tuple[object, ...]] = Counter()
-    for component in components:
-        place = component.statistic, component.row, component.candidate.reference
-        if occurrences[place] == len(out):
-            out.append([])
-        out[occurrences[place]].append(component)
-        occurrences[place] += 1
-    return out
-
-
 def _find_layers_again(
     examination: Examination,
     components: Sequence[Component],
@@ -204,7 +228,7 @@ def _find_layers_again(
     out = [list(first)]
     weight, key = state.weight, components[0].candidate.key
     axes = {axis for component in components for axis in component.row}
-    for previous_layer, layer in pairwise(_split_layers(components)):
+    for previous_layer, layer in pairwise(split_layers(components)):
         state = replace(condition_on(state, previous_layer), weight=weight)
         layer_components = examination.find_components(candidates_of(layer), state).get(key, [])
         out.append([component for component in layer_components if set(component.row) & axes])

@@ -61,9 +61,7 @@ def passes_time_shift_test(
     state : State
         What is in the model without it.
     """
-    following_components = [
-        component for component in components if _follows_channel(component, state)
-    ]
+    following_components = [component for component in components if _follows_channel(component)]
     if not following_components:
         return TimeShifts(True)
     block_count = state.blocks.sizes["block"]
@@ -104,7 +102,7 @@ def passes_time_shift_test(
     return TimeShifts(passed, p_value, float(shifted[valid].max() - real))
 
 
-def _follows_channel(component: Component, state: State) -> bool:
+def _follows_channel(component: Component) -> bool:
     """Return whether a component follows a channel, or the means of other axes."""
     if not (component.statistic.is_linear_in_means or component.statistic.is_power):
         return False

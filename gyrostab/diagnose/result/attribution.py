@@ -142,8 +142,9 @@ def attribute_mismatches(
         for number in range(located.sizes["mismatch"])
     ]
     score_with = partial(statistic_scores, still=still, settings=settings)
-    scores = score_with(blocks, after, null, regions, identified)
-    scores_without: dict[tuple[int, ...], Scores] = {(): scores}
+    scores_without: dict[tuple[int, ...], Scores] = {
+        (): score_with(blocks, after, null, regions, identified)
+    }
 
     def score_without(
         region: Mapping[str, Any], out: Sequence[Identification]
@@ -168,7 +169,7 @@ def attribute_mismatches(
     ]
     explained = []
     for region in regions:
-        score, limit = score_left(region, scores, null, level, settings.score_error_share)
+        score, limit = score_without(region, ())
         axes = set(str(region["axes"]).split())
         shown = []
         for identification, its_time, its_moves in zip(identified, when, moves, strict=True):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,7 +30,7 @@ def statistic_scores(
     after: xr.Dataset,
     null: NullScores,
     regions: Sequence[Region],
-    identified: Iterable[Identification] = (),
+    identified: Sequence[Identification],
     *,
     still: xr.Dataset | None = None,
     settings: Settings = DEFAULTS,
@@ -43,7 +43,7 @@ def statistic_scores(
     """
     out = []
     blocks = remove_known_motion(blocks, after, settings=settings)
-    after = _with_shared_lines(blocks, after, identified := list(identified))
+    after = _with_shared_lines(blocks, after, identified)
     masked = mask_anomalous_blocks(blocks, components_of(identified), settings)
     turns_left_out = drop_changed_tails(blocks, after["spectrum"].values, settings)
     lines = masked
