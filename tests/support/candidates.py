@@ -31,7 +31,7 @@ def find_components(candidates: Sequence[Candidate], state: State) -> dict[str, 
 
 def make_identifications(
     identified: Iterable[Identification],
-    state: State | None,
+    state: State | None = None,
     candidates: Iterable[Candidate] = (),
     reasons: Mapping[str, str] | None = None,
 ) -> Identifications:

@@ -159,7 +159,7 @@ def _fit_components(
     identifications: Identifications,
 ) -> Fitted:
     kind = effects()[identification.effect]
-    units = {item.name: item.unit for item in kind.parameters()}
+    parameters = {item.name: item for item in kind.parameters()}
     values: dict[str, Any] = {}
     likeliest: dict[str, Any] = {}
     estimates: dict[str, Estimate] = {}
@@ -185,14 +185,16 @@ def _fit_components(
             **own_sizes,
         }
     for name, (mean, sd, *ends) in sizes.items():
-        unit = units.get(name.split(".")[0], "1")
+        parameter = parameters.get(name.split(".")[0])
+        unit = parameter.unit if parameter else "1"
         # a low-pass of infinite bandwidth is not given; nor is an exponent that was not measured
         if math.isfinite(mean) and not math.isnan(sd):
             # the error of an angle contains it
             is_exact = unit == _ANGLE or (statistic.is_line and name == _PLACE)
             form = 0.0 if is_exact else state.settings.size_error_share * mean
+            positive = parameter is not None and parameter.low >= 0.0
             estimates[name] = _make_estimate(
-                mean, sd, unit, ends=ends, positive=_is_positive(kind, name), form=form
+                mean, sd, unit, ends=ends, positive=positive, form=form
             )
         _store_value(values, name, mean, axes)
     values |= {
@@ -254,12 +256,6 @@ def _estimate_sizes(
     candidates = () if is_step(components[0]) else identifications.candidates
     fit = SizeFit(components, axes, state, candidates, identifications.count_evidence)
     return components[0].statistic.estimate(fit), fit.likeliest
-
-
-def _is_positive(kind: type[Effect], name: str) -> bool:
-    return next(
-        (item.low >= 0.0 for item in kind.parameters() if item.name == name.split(".")[0]), False
-    )
 
 
 def _store_value(values: dict[str, Any], name: str, value: Any, axes: tuple[str, ...]) -> None:

@@ -138,9 +138,7 @@ def _limit_row(component: Component, family: Sequence[Variant], state: State) ->
     if not usable:
         return math.nan
     mean, sd = np.array([moments[place] for place in usable]).T
-    evidence = np.array(
-        [float(np.logaddexp.reduce(sizes[place].log_weight)) for place in usable]
-    ) - np.log(sd)
+    evidence = np.array([sizes[place].evidence for place in usable]) - np.log(sd)
     if not np.isfinite(evidence).any():
         return math.nan
     share = np.exp(evidence - np.logaddexp.reduce(evidence))

@@ -162,7 +162,8 @@ def remove_phase_locked(
     """
     identified, evidence_nats = [], 0.0
     for identification in identifications.identified:
-        locked, rest = [], []
+        locked: list[Component] = []
+        rest: list[Component] = []
         for component in identification.components:
             is_locked = component.statistic.is_only_in_phase(component, blocks)
             (locked if is_locked else rest).append(component)
@@ -258,12 +259,17 @@ def make_identification(
 
 
 def find_unidentified(
-    key: str, components: Sequence[Component], threshold: float, nearest: Sequence[str]
+    key: str,
+    components: Sequence[Component],
+    threshold: float,
+    nearest: Sequence[str],
+    *,
+    order: Sequence[str] = (),
 ) -> Unidentified:
     """Return what a nuisance alternative explains; `nearest` are the effects that come nearest."""
     return Unidentified(
         key,
-        axes_of(components, ()),
+        axes_of(components, order),
         sum_evidence(components),
         threshold,
         tuple(dict.fromkeys(nearest)),

@@ -80,11 +80,7 @@ def event_nats(components: Sequence[Component], state: State) -> float:
     if not spans:
         return 0.0
     events = [
-        sum(
-            float(np.logaddexp.reduce(_fit_event(component, state, span)[0].log_weight))
-            for component in jumps
-        )
-        for span in spans
+        sum(_fit_event(component, state, span)[0].evidence for component in jumps) for span in spans
     ]
     best = int(np.argmax(events))
     if events[best] - step <= np.log(len(spans)) + _allowed_nats(jumps, state):
@@ -122,8 +118,7 @@ def _evidence_in_scatter(component: Component, state: State) -> float:
     jump = [component_mixture(component, state, variance=variance) for variance in variances]
     none = [mean_mixture(state, component.row[0], [], variance=variance) for variance in variances]
     with_jump, without = (
-        np.array([np.logaddexp.reduce(mixture.log_weight) for mixture in mixtures])
-        for mixtures in (jump, none)
+        np.array([mixture.evidence for mixture in mixtures]) for mixtures in (jump, none)
     )
     likely = jump[int(with_jump.argmax())]
     size, covariance = likely.moments()
@@ -217,4 +212,4 @@ def _transition_evidence(component: Component, state: State, length: int) -> flo
         )
         way = np.clip(middle / (length * block) + 0.5, 0.0, 1.0)
         variant = replace(variant, design=np.broadcast_to(way, variant.design.shape))
-    return float(np.logaddexp.reduce(component_mixture(component, state, variant).log_weight))
+    return component_mixture(component, state, variant).evidence

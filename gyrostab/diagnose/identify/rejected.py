@@ -42,7 +42,7 @@ def find_rejections(
     evidence although all selections are in the model, another form of it or a time-shifted channel
     beats it. `components` of every candidate and `state` have all selections in the model.
     """
-    settled = [*identified, *unidentified]
+    settled: list[Selection] = [*identified, *unidentified]
     chosen: list[Selection] = [
         *identified,
         *(

@@ -43,7 +43,7 @@ class Point:
     @property
     def evidence(self) -> float:
         """Return the log likelihood, up to a constant."""
-        return float(np.logaddexp.reduce(self.sizes.log_weight)) - self.unlikely
+        return self.sizes.evidence - self.unlikely
 
     def weighed(self) -> Mixture:
         """Return the sizes, weighted by likelihood, prior and share."""

@@ -35,6 +35,11 @@ class Mixture:
     mean: Array  # (point, size)
     covariance: Array  # (point, size, size)
 
+    @property
+    def evidence(self) -> float:
+        """Log likelihood over all points, up to a constant."""
+        return float(np.logaddexp.reduce(self.log_weight))
+
     def weights(self) -> Array:
         """Return the probabilities of the points."""
         return np.asarray(np.exp(self.log_weight - np.logaddexp.reduce(self.log_weight)))

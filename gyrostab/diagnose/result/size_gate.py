@@ -13,14 +13,14 @@ from gyrostab.diagnose.identify.identification import (
     Identifications,
     Rejection,
     Unidentified,
+    find_unidentified,
 )
-from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.physics.registry import effects
 
-__all__ = ["has_zero", "keep_supported", "supported_axes"]
+__all__ = ["keep_supported", "supported_axes"]
 
 
-def has_zero(estimate: Estimate) -> bool:
+def _has_zero(estimate: Estimate) -> bool:
     """Return whether the 95 % interval of a parameter contains zero, or is unknown."""
     return not (estimate.low > 0.0 or estimate.high < 0.0)
 
@@ -49,7 +49,7 @@ def supported_axes(fitted: Fitted) -> tuple[str, ...]:
         axis_sizes = [
             estimate for name, estimate in measured.items() if name.partition(".")[2] in ("", axis)
         ]
-        if not axis_sizes or not all(has_zero(estimate) for estimate in axis_sizes):
+        if not axis_sizes or not all(_has_zero(estimate) for estimate in axis_sizes):
             axes.append(axis)
     return tuple(axes)
 
@@ -103,7 +103,15 @@ def keep_supported(
                 Rejection(identification.effect, identification.axes, "a size of zero", math.nan)
             )
         if sum_evidence(lost) > identification.threshold:
-            unknown.append(_make_unidentified(identification, lost))
+            strongest = max(lost, key=lambda component: component.evidence_nats).statistic
+            unidentified = find_unidentified(
+                strongest.nuisance_alternative,
+                lost,
+                identification.threshold,
+                [identification.effect],
+                order=identification.axes,
+            )
+            unknown.append(unidentified)
         changed = True
     if not changed:
         return identifications
@@ -112,24 +120,4 @@ def keep_supported(
         identified=tuple(identified),
         unknown=(*identifications.unknown, *unknown),
         rejected=(*identifications.rejected, *rejected),
-    )
-
-
-def _make_unidentified(
-    identification: Identification, components: tuple[Component, ...]
-) -> Unidentified:
-    """Turn the components of an effect whose size may be zero into something unidentified."""
-    strongest = max(components, key=lambda component: component.evidence_nats).statistic
-    axes = tuple(
-        axis
-        for axis in identification.axes
-        if any(axis in component.row for component in components)
-    )
-    return Unidentified(
-        strongest.nuisance_alternative,
-        axes,
-        sum_evidence(components),
-        identification.threshold,
-        (identification.effect,),
-        components,
     )

@@ -49,7 +49,7 @@ def test_only_phase_locked_components_are_removed() -> None:
         component("ramp_phase", 7.0),
     )
     identifications = make_identifications(
-        [identification(mean, wave), identification(comb), identification(mean)], None
+        [identification(mean, wave), identification(comb), identification(mean)]
     )
     left, evidence_nats = remove_phase_locked(identifications, xr.Dataset())
     assert evidence_nats == 27.0
