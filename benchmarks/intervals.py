@@ -22,7 +22,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
-from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identification import Identification, Identifications
 from gyrostab.diagnose.nulls.records import null_records
@@ -54,7 +53,6 @@ def frames(reduced, baseline, effect, view, column):
         reasons,
         tuple(known),
         initial_state(reduced, baseline),
-        fold_blocks(reduced),
     )
 
 
