@@ -13,6 +13,7 @@ import xarray as xr
 from gyrostab.errors import GyrostabError, MissingUnitError, UnitError
 from gyrostab.ingest import read_log
 from gyrostab.ingest.columns.headers import split_header
+from gyrostab.ingest.files import scan_file
 
 
 def write(folder: Path, text: str, name: str = "log.csv") -> Path:
@@ -283,3 +284,27 @@ def test_aligned_columns_without_a_header_are_mapped_by_number(tmp_path: Path) -
         map={"0": "time [s]", "1": "gyro_x [deg/h]", "2": "gyro_y [deg/h]"},
     )
     assert raw.rate.values.tolist() == [[0, 1, 2, 3, 4], [0, -1, -2, -3, -4]]
+
+
+@pytest.mark.parametrize("ending", [".nc", ".zarr"])
+def test_a_slow_channel_with_its_own_stamps_is_read(tmp_path: Path, ending: str) -> None:
+    times = np.datetime64("2026-03-14T08:00:00") + np.arange(100) * np.timedelta64(20, "ms")
+    celsius = np.array([20.0, 21.0])
+    foreign = xr.Dataset(
+        {
+            "gyro_x": ("time", np.arange(100.0), {"units": "deg/h"}),
+            "T_case": ("time_t", celsius + 273.15, {"units": "K"}),
+        },
+        coords={"time": times, "time_t": times[::50]},
+    )
+    path = tmp_path / f"foreign{ending}"
+    foreign.to_zarr(path) if ending == ".zarr" else foreign.to_netcdf(path)
+    raw = read_log(path, map={"T_case": "temperature"})
+    assert raw.rate[0].values.tolist() == list(range(100))
+    assert raw.temperature.values == pytest.approx(celsius, abs=1e-9)
+    assert raw.time_temperature.values.tolist() == times[::50].astype("M8[ns]").tolist()
+    assert not has_note(raw, "left out")
+    assert scan_file(path).channels == ("T_case",)
+    write(tmp_path, "time,gyro_x [deg/h]\n2026-03-14T08:00:00,1\n2026-03-14T08:00:01,2\n")
+    joined = read_log(tmp_path / "log.csv", channel=path)
+    assert joined.T_case.values == pytest.approx(celsius + 273.15)  # in K, as in the file

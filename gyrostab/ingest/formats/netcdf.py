@@ -11,6 +11,7 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, SchemaError, TimeError
 from gyrostab.ingest.columns.stamps import names_epoch
+from gyrostab.ingest.combine import with_channels
 from gyrostab.ingest.concat.grid import log_span
 from gyrostab.ingest.formats.netcdf_classic import read_classic_header
 from gyrostab.ingest.formats.netcdf_variables import (
@@ -34,7 +36,7 @@ from gyrostab.ingest.formats.stored import StoredColumn, StoredTable, plan_store
 from gyrostab.ingest.limits import check_declared, check_stored
 from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
 from gyrostab.ingest.uniform import as_uniform
-from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name
+from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name, texts
 from gyrostab.store.attributes import decode_attributes
 from gyrostab.store.blosc_chunks import check_blosc_chunks
 from gyrostab.store.cf import from_disk
@@ -82,7 +84,10 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
         with log:
             return _summarise_log(path, log)
     with open_variables(path, options.limits) as variables:
-        return _plan_file(path, variables, options).scan("zarr" if path.is_dir() else "netcdf")
+        table, slower = _plan_file(path, variables, options)
+        summary = table.scan("zarr" if path.is_dir() else "netcdf")
+        names = [column.name for part in slower for column in part.plan.of("channel")]
+        return replace(summary, channels=tuple(dict.fromkeys([*summary.channels, *names])))
 
 
 def read(path: Path, options: ReadOptions) -> xr.Dataset:
@@ -91,7 +96,8 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
     if log is not None:
         return log
     with open_variables(path, options.limits) as variables:
-        return _plan_file(path, variables, options).read()
+        table, slower = _plan_file(path, variables, options)
+        return _add_slower_channels(table.read(), slower)
 
 
 def _open_remote(path: Path) -> xr.Dataset:
@@ -350,7 +356,8 @@ def _make_summary(
 
 def _plan_file(
     path: Path, variables: Mapping[str, StoredVariable], options: ReadOptions
-) -> StoredTable:
+) -> tuple[StoredTable, list[StoredTable]]:
+    """Plan the variables on the longest dimension, and channels on others that have stamps."""
     numeric = [v for v in variables.values() if v.dtype.kind in "iuf" and len(v.shape) in (1, 2)]
     sizes = {dim: size for v in numeric for dim, size in zip(v.dimensions, v.shape, strict=True)}
     lines = Counter(v.dimensions[0] for v in numeric if len(v.shape) == 1)
@@ -360,19 +367,49 @@ def _plan_file(
             f"{path.name}: there is no numeric variable on a dimension; groups are not searched, "
             "so store variables at the top level"
         )
-    dim = max(lines, key=lambda d: (sizes[d], lines[d]))
-    columns: list[StoredColumn] = []
-    notes: list[str] = []
+    main_dim = max(lines, key=lambda d: (sizes[d], lines[d]))
+    stamped = {
+        v.dimensions[0]: v
+        for v in numeric
+        if len(v.shape) == 1 and names_epoch(str(v.attributes.get("units", "")))
+    }
+    columns: dict[str, list[StoredColumn]] = {dim: [] for dim in (main_dim, *stamped)}
     left_out: list[str] = []
     for variable in numeric:
+        dim = next((dim for dim in columns if dim in variable.dimensions), main_dim)
         variable_columns = _columns_of(variables, variable, dim)
-        columns += variable_columns
+        if dim != main_dim and variable is stamped[dim]:
+            variable_columns = [replace(variable_columns[0], header="time")]
+        columns[dim] += variable_columns
         left_out += [] if variable_columns else [variable.name]
-    if left_out:
-        notes.append(
-            f"left out, as they do not run along {dim!r} alone: {', '.join(left_out[:20])}"
-        )
-    return plan_stored(path, columns, sizes[dim], options, notes=notes)
+    notes = (
+        [f"left out, as they do not run along {main_dim!r} alone: {', '.join(left_out[:20])}"]
+        if left_out
+        else []
+    )
+    table = plan_stored(path, columns.pop(main_dim), sizes[main_dim], options, notes=notes)
+    channel_options = replace(options, channels_only=True, start=None)
+    slower = [
+        plan_stored(path, part, sizes[dim], channel_options)
+        for dim, part in columns.items()
+        if len(part) > 1
+    ]
+    return table, slower
+
+
+def _add_slower_channels(log: xr.Dataset, tables: Sequence[StoredTable]) -> xr.Dataset:
+    """Add the channels of other dimensions, each on ``time_<channel>``."""
+    for table in tables:
+        part = table.read()
+        part = part.drop_vars([name for name in part.data_vars if name in log.variables])
+        lists = {
+            name: list(dict.fromkeys([*texts(log, name), *texts(part, name)]))
+            for name in ("notes", "headers")
+        }
+        unmatched = set(texts(log, "unmatched_options")) & set(texts(part, "unmatched_options"))
+        log = log.assign_attrs(lists, unmatched_options=sorted(unmatched))
+        log = with_channels(log, [part]) if part.data_vars else log
+    return log
 
 
 def _columns_of(
