@@ -6,7 +6,7 @@ import csv
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import islice, pairwise
+from itertools import islice, pairwise, takewhile
 from pathlib import Path
 
 from gyrostab.errors import FormatError
@@ -298,6 +298,8 @@ def _find_header(
         rows = [(mark, split_line(line, mark)) for mark, line in following]
         solid = [(mark, row) for mark, row in rows if _is_data(row, comma=mark == ";")]
         widths = {len(row) for mark, row in solid or rows if mark == separator}
+        if separator != BLANK and _precedes_header(names, separator, rows):
+            continue  # a line above the header, padded to the width of the table
         if _find_pair([row for _, row in solid]) is not None:
             widths |= {width - 1 for width in widths}  # one name for date and time of day
         if (
@@ -311,6 +313,15 @@ def _find_header(
         f"{path.name}: {problem}; if this is a gyro log, put # before the lines above its header "
         "row, or delete them"
     )
+
+
+def _precedes_header(
+    names: Sequence[str], separator: str, rows: Sequence[tuple[str, list[str]]]
+) -> bool:
+    """Return whether a row above the data fills more cells than this one."""
+    above = takewhile(lambda row: not _is_data(row[1], comma=row[0] == ";"), rows)
+    filled = [sum(map(bool, row)) for mark, row in above if mark == separator]
+    return len(filled) < len(rows) and max(filled, default=0) > sum(map(bool, names))
 
 
 def _find_units(cells: Sequence[str], header: Sequence[str]) -> dict[int, str]:

@@ -352,3 +352,11 @@ def test_layout_is_that_of_the_first_lines_and_a_later_bad_byte_is_noted() -> No
         Path("x.csv"), head[3:].replace(b"\n2500,1.5", b"\n2500,\xb0"), complete=True
     )
     assert strange.notes == ("line 5003 is not UTF-8 (b'\\xb0'); the text was read as Latin-1",)
+
+
+def test_lines_above_the_header_may_be_padded_to_its_width(tmp_path: Path) -> None:
+    """Spreadsheets write a title with the separators of the table."""
+    text = "Tester v3;;;\nSerial;123;;\ntime;gyro_x;gyro_y;gyro_z\ns;deg/h;deg/h;deg/h\n"
+    raw = read_log(write(tmp_path, text + "0;1;2;3\n1;4;5;6\n"))
+    assert raw.rate.values.T.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert any("skipped 2 lines above the header" in note for note in raw.attrs["notes"])
