@@ -72,6 +72,15 @@ def test_patterns_and_repeated_paths(pair: list[Path]) -> None:
         read_log(folder)
 
 
+def test_the_working_directory_is_refused_like_any_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in (".", "/"):
+        with pytest.raises(FormatError, match="name the files in it"):
+            read_log(name)
+
+
 @pytest.mark.parametrize(
     ("name", "head", "message"),
     [

@@ -46,7 +46,7 @@ def matches(path: Path) -> bool:
 
 def has_layout(path: Path) -> bool:
     """Return whether a file has a layout file named after it."""
-    return layout_path(path).is_file()
+    return not path.is_dir() and layout_path(path).is_file()
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
