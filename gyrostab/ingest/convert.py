@@ -192,9 +192,10 @@ def _check_index(table: pd.DataFrame) -> pd.DatetimeIndex:
             f"the index of the DataFrame holds {index.inferred_type}, not times; {advice}"
         )
     index = index.tz_convert("UTC").tz_localize(None) if index.tz is not None else index
-    if not index.is_monotonic_increasing:
-        values = index.to_numpy()
-        at = int(np.argmax(values[1:] < values[:-1]))
+    places = np.flatnonzero(index.notna())  # rows without a stamp are placed by their neighbours
+    if not index[places].is_monotonic_increasing:
+        values = index[places].to_numpy()
+        at = int(places[np.argmax(values[1:] < values[:-1])])
         raise TimeError(
             f"the index of the DataFrame runs backwards after row {at} ({index[at]}); sort it: "
             "df.sort_index()"

@@ -634,3 +634,13 @@ class TestSurface:
         check_against(
             reader(path), x[:, ::2][:, present[0] : present[-1] + 1], rate=50.0, window=400
         )
+
+
+@pytest.mark.filterwarnings("ignore:.*unreadable")
+def test_a_row_of_a_table_without_a_stamp_is_placed_by_its_neighbours() -> None:
+    index = pd.date_range("2026-03-14", periods=200, freq="20ms")
+    table = pd.DataFrame({"gyro_x [deg/h]": np.arange(200.0)}, index.where(np.arange(200) != 5))
+    log = gyrostab.from_dataframe(table)
+    assert log.rate.values[0].tolist() == list(range(200))
+    with pytest.raises(TimeError, match=r"backwards after row 7 \(2026-03-14 00:00:00.140000\)"):
+        gyrostab.from_dataframe(table.iloc[[*range(8), *range(6, 200)]])
