@@ -93,6 +93,11 @@ def _find_reader(path: Path) -> Reader:
         return cast(Reader, _entry_points()["netcdf"].load())
     if not path.exists():
         raise FormatError(f"{path}: there is no such file")
+    if not (path.is_file() or path.is_dir()):
+        raise FormatError(
+            f"{path}: is a pipe or a device, which can be read only once; write its content to a "
+            "file and give that"
+        )
     first = "binary" if has_layout(path) else None
     if first is None:
         refuse_unread(path)

@@ -81,6 +81,11 @@ def test_the_working_directory_is_refused_like_any_other(
             read_log(name)
 
 
+def test_a_pipe_is_refused_with_advice() -> None:
+    with pytest.raises(FormatError, match=r"a pipe or a device.*write its content to a file"):
+        read_log("/dev/null")
+
+
 @pytest.mark.parametrize(
     ("name", "head", "message"),
     [
