@@ -103,7 +103,7 @@ def fit_jitter(
     Parameters
     ----------
     parts : list of ndarray of int64
-        Stretches of stamps [ns], all readable.
+        Stretches of stamps [ns], `NO_STAMP` where unreadable.
     guesses : list of float
         Periods to try in addition to those found in the stretches [ns].
     observe : str

@@ -59,22 +59,19 @@ def _piece_sums(
     jitter: JitterModel | None,
 ) -> tuple[tuple[int, int] | None, NDArray[np.float64]]:
     """Return first stamp, reference stamp and sums of the pieces of a block."""
-    rows, block = rows_and_stamps
-    block = readable_stamps(block)
+    _, stamps = rows_and_stamps
+    block = readable_stamps(stamps)
     if len(block) == 0:
         return None, np.empty((0, 6))
     first = int(block[0])
     if jitter is not None:
-        block, count, piece = count_samples(
-            np.arange(len(rows_and_stamps[1])), rows_and_stamps[1], jitter, longest
-        )
+        block, count, piece = count_samples(np.arange(len(stamps)), stamps, jitter, longest)
         return (first, int(block[0])) if len(block) else None, piece_sums(
             block, count, piece, period
         )
     if counted:
-        readable = np.flatnonzero(rows != NO_STAMP)
         piece = np.concatenate([[0], np.cumsum(np.abs(np.diff(block)) > longest)])
-        count = readable  # rows without a stamp count too
+        count = np.flatnonzero(stamps != NO_STAMP)  # rows without a readable stamp count too
     else:
         count, piece = track(block, period, GAIN, longest)
     if (

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
@@ -206,12 +207,10 @@ def _make_windows(stamps: Stamps, period: float, width: int) -> tuple[_Windows, 
         table = values.reshape(-1, width) if len(values) >= width else values[None]
         ahead = (table - zero) / period - (np.arange(values.size) + first_row).reshape(table.shape)
         ahead[table == NO_STAMP] = np.nan
-        filled = np.where(
-            np.isnan(ahead), np.nanmedian(ahead) if np.isfinite(ahead).any() else 0.0, ahead
-        )
-        step = np.diff(filled.ravel(), prepend=last[0] if last else filled[0, 0]).reshape(
-            filled.shape
-        )
+        # a row without a readable stamp has the lead of the last one before it
+        leads = pd.Series(np.concatenate([last, ahead.ravel()])).ffill().bfill().fillna(0.0)
+        filled = leads.to_numpy()[len(last) :].reshape(table.shape)
+        step = np.diff(filled.ravel(), prepend=leads.iloc[0]).reshape(table.shape)
         last[:] = [filled[-1, -1]]
         at = np.arange(len(table)) * width + first_row
         low, high = filled.min(axis=1), filled.max(axis=1)

@@ -24,6 +24,7 @@ from gyrostab.ingest.grid.starting_period import (
     Stamps,
     finer_period,
     period_of_lines,
+    readable_stamps,
     recut_blocks,
     rms_misfit,
     sample_stretches,
@@ -101,7 +102,8 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
     300.0
     """
     stamps = partial(recut_blocks, stamps, _BLOCK)
-    parts = sample_stretches(stamps)
+    stretches = sample_stretches(stamps)
+    parts = [readable_stamps(stretch) for stretch in stretches]
     if not parts:
         raise TimeError(
             f"{where}: there is only one sample with a readable stamp, so no sampling rate can "
@@ -121,7 +123,7 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
             f"{where}: {problem} throughout; check the time column and its unit, or leave it out "
             "(--map) and give --rate HZ"
         )
-    period, counted, coarse = starting_period(parts)
+    period, counted, coarse = starting_period(stretches)
     sure = _trusted_samples(parts)
     finer = None if counted else finer_period(parts, period)
     lost = None if finer is None else _estimate_sharp(stamps, parts, SECOND / finer)
@@ -132,7 +134,7 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
         or step_scatter(steps, period) > _SHARP_SCATTER
         or np.mean(steps == 0) >= SHARED_SHARE
     ):
-        jitter = _fit_jitter(parts, period, coarse, sure)
+        jitter = _fit_jitter(stretches, period, coarse, sure)
         if jitter is not None:
             return _estimate_with_jitter(stamps, jitter, coarse, sure)
     longest = longest_step(parts, period) if counted else sure * period
@@ -220,7 +222,8 @@ def estimate_near(stamps: Stamps, rate: float) -> RateEstimate | None:
     (100.0, 60.0)
     """
     stamps = partial(recut_blocks, stamps, _BLOCK)
-    parts = sample_stretches(stamps)
+    stretches = sample_stretches(stamps)
+    parts = [readable_stamps(stretch) for stretch in stretches]
     if not parts:
         return None
     sharp = _estimate_sharp(stamps, parts, rate)
@@ -228,7 +231,7 @@ def estimate_near(stamps: Stamps, rate: float) -> RateEstimate | None:
         return sharp
     sure = _trusted_samples(parts)
     for observe in ("all", "last"):
-        jitter = fit_jitter_near(parts, SECOND / rate, observe, sure=sure)
+        jitter = fit_jitter_near(stretches, SECOND / rate, observe, sure=sure)
         if jitter is not None:
             return _estimate_with_jitter(stamps, jitter, False, sure)
     return None
@@ -248,9 +251,9 @@ def is_far_worse(stamps: Stamps, given: RateEstimate, estimated: RateEstimate) -
     """
     jitter = estimated.jitter
     if jitter is None and not estimated.counted:
-        parts = sample_stretches(partial(recut_blocks, stamps, _BLOCK))
-        sure = _trusted_samples(parts)
-        jitter = fit_jitter_near(parts, SECOND / estimated.raw, "all", sure=sure)
+        stretches = sample_stretches(partial(recut_blocks, stamps, _BLOCK))
+        sure = _trusted_samples(stretches)
+        jitter = fit_jitter_near(stretches, SECOND / estimated.raw, "all", sure=sure)
     return (
         given.jitter is not None
         and jitter is not None

@@ -77,14 +77,17 @@ _MAX_STRETCHES = 128
 
 
 def sample_stretches(stamps: Stamps) -> list[NDArray[np.int64]]:
-    """Return stretches of stamps from the whole log, a few hundred thousand in all."""
+    """Return stretches of stamps from the whole log, a few hundred thousand in all.
+
+    Each has at least two readable stamps; unreadable ones are `NO_STAMP`, so that rows can be
+    counted.
+    """
     stretches: list[NDArray[np.int64]] = []
     for _, block in stamps():
-        block = readable_stamps(block)
         stretches += [block[i : i + _STRETCH] for i in range(0, len(block), _STRETCH)]
         if len(stretches) > _MAX_STRETCHES:
             stretches = stretches[::2]
-    return [part for part in stretches if len(part) > 1]
+    return [part for part in stretches if np.count_nonzero(part != NO_STAMP) > 1]
 
 
 _PATTERN = 8  # longest pattern of steps [steps]
@@ -207,12 +210,16 @@ def period_of_lines(parts: list[NDArray[np.int64]]) -> float | None:
     return period
 
 
-def starting_period(parts: list[NDArray[np.int64]]) -> tuple[float, bool, bool]:
-    """Return period [ns] to 0.1 %, whether rows are counted, whether stamps are shared."""
+def starting_period(stretches: list[NDArray[np.int64]]) -> tuple[float, bool, bool]:
+    """Return period [ns] to 0.1 %, whether rows are counted, whether stamps are shared.
+
+    The stretches are those of `sample_stretches`.
+    """
+    parts = [readable_stamps(stretch) for stretch in stretches]
     steps = np.concatenate([np.diff(part) for part in parts]).astype(np.float64)
     rising = steps[steps > 0]
     if _has_shared_stamps(parts, steps):
-        return _time_per_row(parts, ticks=True), True, True
+        return _time_per_row(stretches, ticks=True), True, True
     period = period_of_lines(parts)
     if period is None:
         period = refine_period(steps, float(np.quantile(rising, 0.5, method="lower")))
@@ -222,7 +229,7 @@ def starting_period(parts: list[NDArray[np.int64]]) -> tuple[float, bool, bool]:
             shorter = refine_period(steps, float(np.quantile(rising, 0.1)))
             period = shorter if rms_misfit(steps, shorter) < 0.15 else period
     return (
-        (_time_per_row(parts), True, False)
+        (_time_per_row(stretches), True, False)
         if _is_bursty(parts, steps, period)
         else (period, False, False)
     )
@@ -246,17 +253,21 @@ def _is_bursty(parts: list[NDArray[np.int64]], steps: NDArray[np.float64], perio
     return bool(scatter**2 < 0.2 * length * inliers.var())  # random losses would accumulate
 
 
-def _time_per_row(parts: list[NDArray[np.int64]], *, ticks: bool = False) -> float:
-    """Return the mean time per row [ns]; with `ticks`, between changes of a shared stamp."""
+def _time_per_row(stretches: list[NDArray[np.int64]], *, ticks: bool = False) -> float:
+    """Return the mean time per row [ns]; with `ticks`, between changes of a shared stamp.
+
+    Rows without a readable stamp count.
+    """
     rates = []
-    for part in parts:
-        steps = np.diff(part).astype(np.float64)
+    for stretch in stretches:
+        rows = np.flatnonzero(stretch != NO_STAMP)
+        steps = np.diff(stretch[rows]).astype(np.float64)
         if ticks and (steps > 0).sum() > 1:
-            times, counts = _tick_steps(steps)
+            times, counts = _tick_steps(steps, rows)
         else:
             usual = np.median(steps[steps > 0]) if (steps > 0).any() else SECOND
             good = (steps >= 0) & (steps <= max(SECOND, 1000 * usual))
-            times, counts = float(steps[good].sum()), int(good.sum())
+            times, counts = float(steps[good].sum()), int(np.diff(rows)[good].sum())
         if times > 0 and counts > 0:
             rates.append((times, counts))
     totals = np.array(rates, dtype=np.float64)
@@ -264,14 +275,14 @@ def _time_per_row(parts: list[NDArray[np.int64]], *, ticks: bool = False) -> flo
     return float(np.median(totals[is_long, 0] / totals[is_long, 1]))
 
 
-def _tick_steps(steps: NDArray[np.float64]) -> tuple[float, int]:
+def _tick_steps(steps: NDArray[np.float64], rows: NDArray[np.int64]) -> tuple[float, int]:
     """Return time [ns] and rows between changes of a shared stamp, without gaps.
 
     A change whose time per row exceeds three times the median is a gap. Each change is kept or left
     out together with its rows, because some stamps may be shared by one row and others by five.
     """
     rising = np.flatnonzero(steps > 0)
-    times, counts = steps[rising[1:]], np.diff(rising)
+    times, counts = steps[rising[1:]], np.diff(rows[rising + 1])
     paces = times / counts
     good = paces <= 3 * np.median(np.repeat(paces, counts))
     return float(times[good].sum()), int(counts[good].sum())

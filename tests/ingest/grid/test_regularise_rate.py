@@ -11,6 +11,7 @@ from gyrostab.errors import TimeError
 from gyrostab.ingest.grid.place import place_by_stamp
 from gyrostab.ingest.grid.rate import estimate_rate
 from gyrostab.ingest.grid.regularise import gap_table, regularise
+from gyrostab.kernels.grid.stamps import NO_STAMP
 from gyrostab.time.grid import time_coordinate
 from tests.support.raw_rows import START, expected, raw_log, stamps_of
 
@@ -60,6 +61,32 @@ def test_bursts_are_placed_by_count_and_a_loss_shows_as_a_lasting_delay():
     present = np.flatnonzero(np.isfinite(log.rate.values[0]))
     assert len(present) == n
     assert np.abs(present - samples).max() <= 10
+
+
+@pytest.mark.parametrize("share", [0.05, 0.2])
+@pytest.mark.parametrize("clock", ["bursts", "tenths", "jitter"])
+def test_rows_without_a_readable_stamp_count(clock, share):
+    """They are present samples, so that neither the rate nor a loss depends on their number."""
+    random = np.random.default_rng(4)
+    n, lost = 40_000, 3000
+    samples = np.arange(n) + lost * (np.arange(n) >= n // 2)
+    sent = samples / 100.0
+    packet = np.ceil(sent / 0.07)
+    stamps = {
+        "bursts": packet * 0.07
+        + 0.002 * (np.arange(n) - np.searchsorted(packet, packet))
+        + random.uniform(0, 0.0005, n),
+        "tenths": np.floor(sent * 10) / 10,
+        "jitter": sent + random.normal(0, 0.005, n),
+    }[clock]
+    readable = START + np.rint(stamps * 1e9).astype(np.int64)
+    log = regularise(raw_log(np.where(random.random(n) < share, NO_STAMP, readable)))
+    assert log.attrs["sampling_rate_hz"] == 100.0
+    present = np.flatnonzero(np.isfinite(log.rate.values[0]))
+    rows = log.rate.values[0, present].astype(int) - 1
+    assert len(rows) >= n - 1
+    far = np.abs(present - present[0] - samples[rows]) > 10
+    assert far.sum() <= 5  # next to the loss
 
 
 def test_whole_seconds_shared_by_many_rows_are_not_duplicates():
