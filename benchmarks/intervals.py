@@ -23,50 +23,41 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
-from gyrostab.diagnose.identify.identification import Identification, Identifications
+from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
+from tests.support.candidates import make_identifications, select_candidate
 from tests.support.named import COEFFICIENT, record
 
 
-def frames(reduced, baseline, effect, view, column):
-    """A naming of the effect on x, with the usual values of its other parameters."""
+def identify_effect(reduced, baseline, effect, statistic, column):
+    """Return identifications of the effect on x, with the usual values of its other parameters."""
     known, reasons = effect_candidates(reduced, COEFFICIENT)
-    candidate = next(
-        candidate for candidate in known if candidate.effect == effect and candidate.view == view
-    )
+    candidate = select_candidate(known, effect, statistic)
     variant = next(
         variant
         for variant in candidate.variants
         if variant.columns == (column,) and variant.values.get("exponent", 1.0) == 1.0
     )
-    claim = Identification(
-        effect, candidate.driver, ("x",), (Component(candidate, variant, ("x",), 50.0),), 50.0, 8.0
-    )
-    return Identifications(
-        (claim,),
-        (),
-        8.0,
-        np.zeros(1),
-        reasons,
-        tuple(known),
-        initial_state(reduced, baseline),
-    )
+    components = (Component(candidate, variant, ("x",), 50.0),)
+    identification = Identification(effect, candidate.driver, ("x",), components, 50.0, 8.0)
+    return make_identifications([identification], initial_state(reduced, baseline), known, reasons)
 
 
-def held(reduced, baseline, drawn, effect, view, column, truth, change):
+def held(reduced, baseline, drawn, effect, statistic, column, truth, change):
     """Return the share of intervals that contain the truth, and the mean relative error."""
-    frame = frames(reduced, baseline, effect, view, column)
+    identifications = identify_effect(reduced, baseline, effect, statistic, column)
+    components = list(identifications.identified[0].components)
     inside, ratio = [], []
     for number in range(drawn.sizes["record"]):
         record = reduced.assign(
             mean=drawn["mean"].isel(record=number).transpose("axis", "block"),
             power=drawn["power"].isel(record=number).transpose("axis", "block", "band"),
         )
-        state = condition_on(initial_state(change(record), baseline), list(frame.claims[0].parts))
-        (fitted,) = fit_identifications(replace(frame, state=state), baseline)
+        state = condition_on(initial_state(change(record), baseline), components)
+        (fitted,) = fit_identifications(replace(identifications, state=state), baseline)
         parameter = fitted.parameters[column]
         inside.append(parameter.low <= truth <= parameter.high)
         ratio.append(parameter.value / truth)
@@ -74,7 +65,7 @@ def held(reduced, baseline, drawn, effect, view, column, truth, change):
 
 
 def cases(reduced):
-    """Effect, view, parameter, level, form, true size, and what it does to a record."""
+    """Effect, statistic, parameter, level, form, true size, and what it does to a record."""
     g, heat = reduced["channel_vibration"].values, reduced["channel_temperature"].values
     warm = (heat - 25.0) / np.ptp(heat)
 
@@ -143,8 +134,10 @@ def main():
         f"| effect | signal | form | inside 95 %, of {count} | bias | scatter |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
-    for effect, view, column, level, form, truth, change in cases(reduced):
-        share, bias, scatter = held(reduced, baseline, drawn, effect, view, column, truth, change)
+    for effect, statistic, column, level, form, truth, change in cases(reduced):
+        share, bias, scatter = held(
+            reduced, baseline, drawn, effect, statistic, column, truth, change
+        )
         lines.append(f"| {effect} | {level} | {form} | {share:.1%} | {bias:+.1%} | {scatter:.1%} |")
         print(lines[-1], flush=True)
     if options.output:
