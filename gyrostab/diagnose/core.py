@@ -217,7 +217,7 @@ def _compare_blocks(task: Task, blocks: xr.Dataset, baseline: xr.Dataset) -> Com
         else blocks_without_lines
     )
     mismatches = locate_mismatches(
-        without_expected(at_rest, baseline, expected),
+        without_expected(at_rest, baseline, expected, task.settings),
         conditioned_baseline,
         null,
         level=level,

@@ -6,6 +6,7 @@ import contextlib
 import gzip
 import io
 import os
+import shutil
 import tomllib
 import warnings
 from collections.abc import Callable, Iterator
@@ -54,7 +55,7 @@ def call(*arguments: str) -> None:
             code = main(list(arguments))
         except SystemExit as ended:
             code = int(ended.code or 0)
-    name = "-".join(word.strip("-") for word in arguments[:2]).replace("/", "_")
+    name = "-".join(Path(word).name.strip("-") for word in arguments[:2])
     count = len(list(Path.cwd().glob("*.txt")))
     Path(f"{count:02d}-{name}.txt").write_text(
         f"exit {code}\n{printed.getvalue()}", encoding="utf-8"
@@ -82,7 +83,7 @@ def read_seed(seed: Seed) -> Job:
 def demo() -> None:
     """The shipped log to its product, and the stages one by one in every container."""
     call("demo", "-o", "demo")
-    log = str(ROOT / "data" / "mwd_sample.csv.gz")
+    log = shutil.copy(ROOT / "data" / "mwd_sample.csv.gz", "mwd_sample.csv.gz")
     for ending in ("nc", "zarr"):
         call("ingest", log, "-o", f"log.{ending}")
         call(
@@ -147,7 +148,7 @@ def simulated(name: str) -> Job:
     duration, rate = SIMULATED[name]
 
     def job() -> None:
-        model = str(ROOT / "data" / "models" / f"{name}.toml")
+        model = shutil.copy(ROOT / "data" / "models" / f"{name}.toml", f"{name}.toml")
         call(
             "simulate", model, "-o", "log.nc", "--duration", duration, "--rate", rate, "--seed", "3"
         )

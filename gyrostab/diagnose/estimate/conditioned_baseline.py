@@ -29,6 +29,7 @@ from gyrostab.diagnose.predict.linear_model import (
 )
 from gyrostab.diagnose.predict.sizes import component_mixture, mean_mixture
 from gyrostab.diagnose.predict.windows import make_windows
+from gyrostab.diagnose.settings import Settings
 from gyrostab.noise import sampled_psd
 from gyrostab.physics.registry import effects
 
@@ -163,12 +164,15 @@ def expected_baseline(
 
 
 def without_expected(
-    blocks: xr.Dataset, baseline: xr.Dataset, expected: Sequence[Identification]
+    blocks: xr.Dataset,
+    baseline: xr.Dataset,
+    expected: Sequence[Identification],
+    settings: Settings,
 ) -> xr.Dataset:
     """Drop the blocks in which expected effects leave anomalous samples or move the rate."""
     if not expected:
         return blocks
-    state = condition_on_selections(initial_state(blocks, baseline), expected)
+    state = condition_on_selections(initial_state(blocks, baseline, settings=settings), expected)
     moved = xr.DataArray(state.masked, dims=("axis", "block"))
     return state.blocks.assign(power=state.blocks["power"].where(~moved))
 
