@@ -35,7 +35,7 @@ __all__ = ["MIN_LAZY_VALUES", "Stored", "make_variable_lazy", "open_stored"]
 
 #: Dataset as it is on disk.
 Stored = xr.Dataset | StoredLog
-#: Values from which a variable of a log is a dask array.
+#: Values from which a variable is a dask array.
 MIN_LAZY_VALUES = 2**17
 #: Bytes of the cache of chunks of which only a part was requested.
 _CACHE_BYTES = 2**24
@@ -58,7 +58,7 @@ def open_stored(
         Called with the path and the variables before any of its values is read; it raises
         `FormatError` when the declared sizes are out of proportion.
     lazy : bool
-        False loads a surface or product, without dask.
+        False loads the long variables too, without dask.
 
     Raises
     ------
@@ -83,9 +83,7 @@ def _open_remote(path: Path, url: str) -> xr.Dataset:
         stored = xr.open_dataset(
             address, engine="zarr", chunks=None, decode_times=False, create_default_indexes=False
         )
-        is_log = stored.attrs.get("gyrostab_content") == "log"
-        stored = replace_stamps(stored, path)
-        return _make_variables_lazy(stored, {}, path, small=MIN_LAZY_VALUES if is_log else 0)
+        return _make_variables_lazy(replace_stamps(stored, path), {}, path, small=MIN_LAZY_VALUES)
 
 
 def _open_dataset(
@@ -127,7 +125,7 @@ def _open_dataset(
     long = _find_long_variables(stored, path, strict=strict) if is_log else {}
     if path.is_dir() and sampled_names.difference(long):
         check_blosc_chunks(path, skip=list(long))
-    small = MIN_LAZY_VALUES if is_log else 0 if lazy else sys.maxsize
+    small = MIN_LAZY_VALUES if lazy else sys.maxsize
     opened = _make_variables_lazy(stored, long, path, small=small)
     if is_log:
         # opened again when needed: an archive of any length keeps only a few files open

@@ -32,7 +32,7 @@ from gyrostab.io.datasets import (
 )
 from gyrostab.noise import LAWS, TERMS, model_avar
 from gyrostab.schema import VARIABLES, attributes
-from gyrostab.store import netcdf_compression
+from gyrostab.store import netcdf_compression, read
 from gyrostab.time.grid import TimeGridIndex, grid_times, time_coordinate
 from gyrostab.units import INNER
 from tests.support import synthetic
@@ -339,8 +339,11 @@ def test_a_lazy_log_is_never_held_whole(tmp_path):
     assert int(after.time[-1].values.view(np.int64)) == int(grid_times(0, 300.0, size - 1))
 
 
-def test_a_file_can_be_rewritten_from_itself(tmp_path):
+def test_a_file_can_be_rewritten_from_itself(tmp_path, monkeypatch):
     path = to_netcdf(synthetic.product(), tmp_path / "p.nc")
+    to_netcdf(open_product(path), path, overwrite=True)  # small variables are in memory
+    assert_same(synthetic.product(), open_product(path))
+    monkeypatch.setattr(read, "MIN_LAZY_VALUES", 0)
     with pytest.raises(OptionError, match=r"load the dataset first, with its load\(\)"):
         to_netcdf(open_product(path), path, overwrite=True)
     to_netcdf(open_product(path).load(), path, overwrite=True)
@@ -425,11 +428,8 @@ def test_a_flipped_bit_is_noticed(tmp_path):
     for chunk in chunks:
         place = chunk.byte_offset + chunk.size // 2
         path.write_bytes(data[:place] + bytes([data[place] ^ 0x10]) + data[place + 1 :])
-        with (
-            open_product(path) as copy,
-            pytest.raises(FormatError, match=r"product\.nc: is damaged"),
-        ):
-            copy.load()
+        with pytest.raises(FormatError, match=r"product\.nc: is damaged"):
+            open_product(path).load()
 
 
 @pytest.mark.parametrize("lazy", [False, True])
