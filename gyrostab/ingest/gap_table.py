@@ -28,6 +28,8 @@ __all__ = [
     "SAMPLES",
     "UNREADABLE",
     "clip_table",
+    "describe_break",
+    "describe_clock_change",
     "format_duration",
     "gap_variables",
     "name_lost",
@@ -38,6 +40,10 @@ __all__ = [
 
 #: Largest table; in a longer one, neighbours of one cause are merged into one row.
 _MAX_TABLE_ROWS = 10_000
+
+#: Difference from one hour up to which a step of local stamps may be a change of daylight saving
+#: time [1]: where many rows share one stamp, the step is known to a few stamps.
+_MAX_HOUR_ERROR = 0.01
 
 #: Columns of the table: first missing sample, first present sample after, samples missing, rows
 #: concerned, cause.
@@ -75,6 +81,30 @@ def describe_break(place: str, cause: int, before: int, after: int, samples: str
         f"{format_duration(abs(jump))} {'back' if jump < 0 else 'ahead'}; "
         f"the pause is of unknown length, so the {samples} that follow come after one missing "
         f"sample{'' if jump < 0 else '; if the pause is real, raise max_gap'}"
+    )
+
+
+def describe_clock_change(jump: float) -> str:
+    """Describe a step [s] of local stamps of about one hour as a change of daylight saving time.
+
+    Returns "" for other steps.
+
+    Examples
+    --------
+    >>> describe_clock_change(-3599.0)[:63], describe_clock_change(-3500.0)
+    ('; as the stamps carry no offset from UTC, this is probably the ', '')
+    """
+    if abs(abs(jump) / HOUR - 1.0) > _MAX_HOUR_ERROR:
+        return ""
+    event, effect = (
+        ("is probably the end", "the times of the rows that follow are an hour later than written")
+        if jump < 0
+        else ("may be the beginning", "the rows that follow come an hour too late in the log")
+    )
+    return (
+        f"; as the stamps carry no offset from UTC, this {event} of daylight saving time: if so, "
+        f"{effect}; log in UTC, or write the offset into the stamps (+02:00), or split the file "
+        "at this row and run the parts on their own"
     )
 
 

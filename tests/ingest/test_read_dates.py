@@ -184,3 +184,30 @@ def test_cells_in_any_order_give_the_same_stamp(stamp, mark, order):  # type: ig
 def test_impossible_dates_are_unreadable(cell: str) -> None:
     assert as_iso("5/1/2026", YEAR_FIRST) is None
     assert cells_to_ns([cell], None, 0, DAY_FIRST)[0] == NAT
+
+
+@pytest.mark.parametrize(("day", "form", "expected"), [
+    ("2026-10-25", "%Y-%m-%d %H:%M:%S", "probably the end of daylight saving time"),
+    ("2026-03-29", "%d.%m.%Y %H:%M:%S", "may be the beginning of daylight saving time"),
+    ("2026-10-25", "%Y-%m-%dT%H:%M:%S%z", ""),
+    ("2026-10-26", "%Y-%m-%d %H:%M:%S", ""),
+])  # fmt: skip
+@pytest.mark.parametrize("rate", [1, 10])
+def test_change_of_daylight_saving_time_is_named(
+    day: str, form: str, expected: str, rate: int, tmp_path: Path
+) -> None:
+    stamps = pd.date_range(day, periods=3 * 3600 * rate, freq=f"{1000 // rate}ms", tz="UTC")
+    cells = stamps.tz_convert("Europe/Berlin").strftime(form)
+    rows = [f"{cell},{n % 7}" for n, cell in enumerate(cells)]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["time,gyro_x [deg/h]", *rows]) + "\n")
+    notes = scan(path).loc[0, "odd"]
+    assert (expected in notes) if expected else ("daylight" not in notes)
+    assert ("log in UTC" in notes) == bool(expected)
+
+
+def test_restart_of_a_clock_by_an_hour_is_not_daylight_saving_time(tmp_path: Path) -> None:
+    clock = np.concatenate([np.arange(5000), np.arange(1400, 4000)])
+    path = tmp_path / "log.csv"
+    pd.DataFrame({"time [s]": clock, "gyro_x [deg/h]": clock % 7}).to_csv(path, index=False)
+    assert "daylight" not in scan(path).loc[0, "odd"]

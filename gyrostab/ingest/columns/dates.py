@@ -17,6 +17,7 @@ __all__ = [
     "YEAR_FIRST",
     "as_iso",
     "find_order",
+    "has_offset",
     "holds_date",
     "is_iso",
     "is_time_of_day",
@@ -39,6 +40,7 @@ _DATE = re.compile(
     rf"(?:[T,\s]\s*{_CLOCK}\s*(?P<half>[AaPp][Mm])?\s*(?P<zone>Z|[+-]\d\d(?::?\d\d)?)?)?\s*$"
 )
 _TIME_OF_DAY = re.compile(rf"^\s*{_CLOCK}\s*(?:[AaPp][Mm])?\s*$")
+_OFFSET = re.compile(r":\d\d(?:[.,]\d+)?\s*(?:Z|[+-]\d\d(?::?\d\d)?)\s*$")
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 
 
@@ -56,6 +58,17 @@ def holds_date(text: str) -> bool:
     [True, True, False, False]
     """
     return is_iso(text) or bool(_DATE.match(text))
+
+
+def has_offset(text: str) -> bool:
+    """Return whether a date and time ends with its offset from UTC.
+
+    Examples
+    --------
+    >>> has_offset("2026-05-01T08:00:00.5+02:00"), has_offset("2026-05-01T08:00:00")
+    (True, False)
+    """
+    return bool(_OFFSET.search(text))
 
 
 def is_time_of_day(text: str) -> bool:

@@ -21,7 +21,14 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.dates import DAY_FIRST, NO_DATE, find_order, holds_date, is_time_of_day
+from gyrostab.ingest.columns.dates import (
+    DAY_FIRST,
+    NO_DATE,
+    find_order,
+    has_offset,
+    holds_date,
+    is_time_of_day,
+)
 from gyrostab.ingest.columns.plan import Column, Plan, plan_columns
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
 from gyrostab.ingest.columns.stamps import NAT, cells_to_ns
@@ -98,7 +105,11 @@ def read(
             raise CancelledError
         builder.add(converted, partial(_line_names, block, starts, line))
         line += lines
-    return builder.finish(layout.notes)
+    raw = builder.finish(layout.notes)
+    if plan.time is not None and plan.time.time_unit is None:
+        cells = [row[plan.time.source] for row in layout.full_samples]
+        raw.attrs["local_time"] = not any(map(has_offset, cells))
+    return raw
 
 
 def _plan_file(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:

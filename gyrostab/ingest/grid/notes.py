@@ -6,7 +6,14 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.ingest.gap_table import CLOCK_STEP, MISSING, RESTART, describe_break, format_duration
+from gyrostab.ingest.gap_table import (
+    CLOCK_STEP,
+    MISSING,
+    RESTART,
+    describe_break,
+    describe_clock_change,
+    format_duration,
+)
 from gyrostab.ingest.grid.fill import samples_of
 from gyrostab.ingest.grid.jitter import MIN_SIGMA
 from gyrostab.ingest.grid.place import Placement
@@ -147,13 +154,19 @@ def _describe_breaks(raw: xr.Dataset, placement: Placement) -> list[str]:
     events = placement.events[placement.events[:, 0] >= min(CLOCK_STEP, RESTART)]
     for cause, _sample, row, before, after in events[:_MAX_NAMED].tolist():
         file, local = file_of(raw, row)
-        notes.append(f"{file}: {describe_break(f' at row {local}', cause, before, after, 'rows')}")
+        text = describe_break(f" at row {local}", cause, before, after, "rows")
+        notes.append(f"{file}: {text}{_describe_local(raw, (after - before) / 1e9)}")
     if len(events) > _MAX_NAMED:
         notes.append(
             f"{record_name(raw)}: {len(events) - _MAX_NAMED} more restarts and steps of the clock "
             "are in the table of gaps"
         )
     return notes
+
+
+def _describe_local(raw: xr.Dataset, jump: float) -> str:
+    """Name a step of local stamps [s] that daylight saving time may cause."""
+    return describe_clock_change(jump) if raw.attrs.get("local_time") else ""
 
 
 def _describe_missing(
@@ -173,7 +186,7 @@ def _describe_missing(
         since = format_stamp(int(grid_times(placement.start, rate, first)))
         notes.append(
             f"{file}: {format_duration(samples / rate)} without samples from {since} (after row "
-            f"{local})"
+            f"{local}){_describe_local(raw, samples / rate)}"
         )
     if len(holes) > len(longest):
         total = int(holes[:, 2].sum())

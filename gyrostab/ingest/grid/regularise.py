@@ -68,6 +68,7 @@ _MAX_ROUNDS = 4  # a repetition within another is found after the latter is remo
 _OWN_ATTRIBUTES = (
     "declared_rate_hz",
     "start",
+    "local_time",
     "row_start",
     "kind",
     "notes",
