@@ -13,6 +13,7 @@ from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.dates import holds_date, is_time_of_day, parse_order
 from gyrostab.ingest.columns.headers import is_unit
 from gyrostab.ingest.limits import check_columns
+from gyrostab.wording import list_some
 
 __all__ = [
     "BLANK",
@@ -29,6 +30,9 @@ BLANK = " "
 HEAD_LINES = 200
 #: Lines that are read: those that may be the header, those that follow it, and the first data rows.
 MAX_LINES = 2 * HEAD_LINES + 20
+#: Least number of rows for each word of a column that tells tools apart, and least share of rows
+#: with another word than the row before: random words of two kinds have half.
+_MIN_RECURRENCES, _MIN_CHANGING_SHARE = 4, 0.75
 
 _NUMBER = re.compile(r"^[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?$")
 _HEADER_CELLS = re.compile(r"(?:[^\s\[]+(?:\[[^\]]*\])?(?:[ \t]+\[[^\]]*\])?)")
@@ -167,6 +171,7 @@ def find_layout(
             f"{skipped[0]})"
         )
     comma = separator == ";" and _has_decimal_comma(rows)
+    notes += _describe_sources(headers, rows)
     top = tuple(lines[:above]) if header is not None else ()
     return Layout(
         tuple(headers), separator, offset, first + 1, tuple(rows[:50]), comma, tuple(notes), top,
@@ -216,6 +221,33 @@ def _find_pair(rows: Sequence[Sequence[str]]) -> int | None:
         if 2 * pairs > len(full_rows):  # damaged rows are few
             return column
     return None
+
+
+def _describe_sources(headers: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return a note on each column of words that alternate from row to row."""
+    notes = []
+    full_rows = [row for row in rows if len(row) == len(headers)]
+    for header, *cells in zip(headers, *full_rows, strict=True):
+        values = list(dict.fromkeys(cell.strip() for cell in cells))
+        changes = sum(before.strip() != after.strip() for before, after in pairwise(cells))
+        if (
+            1 < len(values) <= len(cells) / _MIN_RECURRENCES
+            and changes >= _MIN_CHANGING_SHARE * (len(cells) - 1)
+            and not any(
+                value.lower() in ("", "nan", "null", "na", "n/a", "none")
+                or is_number(value, comma=True)
+                or holds_date(value)
+                or is_time_of_day(value)
+                or unit_of_duration(value)
+                for value in values
+            )
+        ):
+            notes.append(
+                f"the rows alternate between {list_some(values)} in column {header!r}, as if "
+                "several tools wrote to one file; they are read as one tool: if they are several, "
+                "write a file for each value of that column and run each on its own"
+            )
+    return notes
 
 
 def _check_seconds(path: Path, row: Sequence[str], line: int) -> None:

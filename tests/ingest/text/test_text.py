@@ -360,3 +360,23 @@ def test_lines_above_the_header_may_be_padded_to_its_width(tmp_path: Path) -> No
     raw = read_log(write(tmp_path, text + "0;1;2;3\n1;4;5;6\n"))
     assert raw.rate.values.T.tolist() == [[1, 2, 3], [4, 5, 6]]
     assert any("skipped 2 lines above the header" in note for note in raw.attrs["notes"])
+
+
+@pytest.mark.parametrize(
+    ("labels", "is_noted"), [("AB", True), ("ABC", True), ("AAAABBBB", False), ("A", False)]
+)
+@pytest.mark.parametrize("lag", [0, 37])
+def test_rows_of_several_tools_in_one_file_are_noted(
+    tmp_path: Path, labels: str, lag: int, is_noted: bool
+) -> None:
+    """Rows of tools that log at the same time, or one shortly after another."""
+    tools = len(set(labels))
+    rows = "".join(
+        f"{n // tools * 100 + n % tools * lag},{labels[n % len(labels)]},{n % 7}\n"
+        for n in range(300)
+    )
+    path = write(tmp_path, "time [ms],tool,gyro_x [deg/h]\n" + rows)
+    notes = [*scan_file(path).notes, *read_log(path).attrs["notes"]]
+    found = [note for note in notes if "several tools" in note]
+    assert len(found) == 2 * is_noted
+    assert all("'tool'" in note and "write a file for each" in note for note in found)
