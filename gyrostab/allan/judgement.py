@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.noise import HOUR, LAWS
-from gyrostab.schema import OBSERVED, check_product
+from gyrostab.schema import OBSERVED, check_product, texts
 from gyrostab.time.durations import format_duration
 from gyrostab.wording import join_words
 
@@ -105,8 +105,9 @@ def judge_product(product: xr.Dataset) -> list[str]:
     Returns
     -------
     list of str
-        One sentence on the largest change with a channel, or on how steady N is; and one on the
-        terms that are not observed, or only observed while a channel is high or low.
+        One sentence on a change of the sampling rate within the record, on the largest change with
+        a channel, or on how steady N is; and one on the terms that are not observed, or only
+        observed while a channel is high or low.
 
     Examples
     --------
@@ -119,7 +120,24 @@ def judge_product(product: xr.Dataset) -> list[str]:
     check_product(product)
     product = product.drop_dims("tau").compute()
     changes, absences = _compare_channels(product)
-    return [_judge_changes(product, changes), _judge_terms(product, absences)]
+    return [
+        _judge_sampling(product) or _judge_changes(product, changes),
+        _judge_terms(product, absences),
+    ]
+
+
+def _judge_sampling(product: xr.Dataset) -> str:
+    """Say from when on the samples come at another rate than the log states, or return ""."""
+    half_window = np.timedelta64(round(0.5e9 * product.attrs.get("window_s", 0.0)), "ns")
+    end = product["time"].values.max() + half_window
+    changes = [text for text in texts(product, "rate_changes") if np.datetime64(text) < end]
+    if not changes:
+        return ""
+    return (
+        f"N cannot be judged: from {min(changes)[:19].replace('T', ' ')} on the samples come at "
+        f"another rate than {product.attrs['sampling_rate_hz']:.6g} Hz, so their times and "
+        "coefficients are wrong; split the log there and run the parts on their own."
+    )
 
 
 def _compare_channels(

@@ -243,7 +243,10 @@ def _common_attributes(
         f"gyrostab.read_log: {len(sources)} regular logs on {size} samples at "
         f"{sources[0].rate:.10g} Hz"
     )
-    lost = [name for source in sources for name in texts(source.log, "unreadable_files")]
+    collected = {
+        key: list(dict.fromkeys(text for source in sources for text in texts(source.log, key)))
+        for key in ("unreadable_files", "rate_changes")
+    }
     return {
         **common,
         "kind": signal_name(sources[0].log),
@@ -251,7 +254,7 @@ def _common_attributes(
         "source_files": list(dict.fromkeys(name for names in files for name in names)),
         "history": extend_history(sources[0].log, done),
         "notes": [*merge_notes(zip(labels, notes_of_logs, strict=True)), *notes],
-        **({"unreadable_files": lost} if lost else {}),
+        **{key: values for key, values in collected.items() if values},
     }
 
 

@@ -61,6 +61,8 @@ class Placement:
     events: NDArray[np.int64]
     #: Largest distance of the smoothed stamps from the grid [samples]; only for counted rows.
     wander: float = 0.0
+    #: Stamps from which the rate of the rows deviates from that of the grid [ns since 1970].
+    rate_changes: tuple[int, ...] = ()
 
     @property
     def size(self) -> int:

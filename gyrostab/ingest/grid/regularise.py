@@ -53,6 +53,7 @@ from gyrostab.store.write import chunk_samples
 from gyrostab.time.clock import extend_history
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import check_rate, check_span, period_ns, stamp_ns, time_coordinate
+from gyrostab.time.stamps import format_stamp
 from gyrostab.units import HOUR
 
 __all__ = ["gap_table", "regularise"]
@@ -176,7 +177,7 @@ def _place_rows(
             where=where,
         )
     notes += describe_rate(raw, estimate, rate, deviating, placement)
-    return placement, rate
+    return replace(placement, rate_changes=tuple(stamp for _, stamp, _ in deviating)), rate
 
 
 def _place_even(
@@ -433,4 +434,6 @@ def regularise(
         f"{placement.placed} of {scanned.rows} rows on {placement.size} samples at {hertz:.10g} Hz"
     )
     log = xr.Dataset(variables, coordinates, _log_attributes(raw, signal, hertz, done, notes))
+    if placement.rate_changes:
+        log.attrs["rate_changes"] = list(map(format_stamp, placement.rate_changes))
     return log.assign_attrs(notes=[*log.attrs["notes"], *describe_channels(log)])

@@ -7,10 +7,13 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from gyrostab import davar, fit_noise, open_log, to_netcdf
+from gyrostab.allan.judgement import judge_product
 from gyrostab.errors import TimeError
 from gyrostab.ingest.grid.place import place_by_stamp
 from gyrostab.ingest.grid.rate import estimate_rate
 from gyrostab.ingest.grid.regularise import gap_table, regularise
+from gyrostab.ingest.uniform import cut_log
 from gyrostab.kernels.grid.stamps import NO_STAMP
 from gyrostab.time.grid import time_coordinate
 from tests.support.raw_rows import START, expected, raw_log, stamps_of
@@ -234,3 +237,25 @@ def test_even_stamps_and_then_shared_ones(
     stamps = np.concatenate([np.arange(even), shared]) * period_ms * 1_000_000
     estimate = estimate_rate(lambda: iter([(np.arange(rows), stamps)]), where="tool.csv")
     assert estimate.rate == pytest.approx(1000 / period_ms, rel=2e-3)
+
+
+@pytest.mark.parametrize("rates", [(10.0, 50.0), (10.0, 1.0), (100.0, 80.0)])
+def test_noise_is_not_judged_across_a_change_of_the_rate(rates, tmp_path):
+    steps = np.repeat([1e9 / rate for rate in rates], 4000)
+    stamps = START + np.rint(np.cumsum(steps)).astype(np.int64)
+    raw = raw_log(stamps)
+    raw["rate"] = raw["rate"].copy(data=np.random.default_rng(1).standard_normal((1, 8000)))
+    log = regularise(raw)
+    path = tmp_path / "log.nc"
+    to_netcdf(log, path)
+    for record in (log, open_log(path)):
+        judgement = judge_product(fit_noise(davar(record, window="60s", step="30s")))[0]
+        assert "N cannot be judged: from " in judgement
+        assert "split the log there" in judgement
+    change = np.datetime64(log.attrs["rate_changes"][0])
+    assert abs(change - stamps[4000].astype("datetime64[ns]")) < 2000 * np.timedelta64(
+        int(max(steps)), "ns"
+    )
+    before = cut_log(log, time_to=str(change - np.timedelta64(10, "s")))
+    judgement = judge_product(fit_noise(davar(before, window="10s", step="5s")))[0]
+    assert "N cannot be judged" not in judgement
