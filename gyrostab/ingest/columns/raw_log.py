@@ -109,6 +109,7 @@ class RawLogBuilder:
         }  # step and divisor to try when packing; None: not packed
         self.bad_cells = self.cells = 0
         self.bad_rows, self.cell_rows = _Places(), _Places()
+        self.missing = dict[int, int]()  # missing values by column number
         self.bad_index: list[NDArray[np.int64]] = []
         self.low, self.high = np.iinfo(np.int64).max, NAT
         unit = None if self.time is None else self.time.time_unit
@@ -189,6 +190,7 @@ class RawLogBuilder:
         locate = locate or (lambda rows: [f"row {first + row}" for row in rows])
         self.bad_cells += converted.bad_cells
         for source, (missing, low, high, is_whole) in converted.ranges.items():
+            self.missing[source] = self.missing.get(source, 0) + missing
             span = self.whole[source]
             if span is not None and missing < converted.rows:
                 self.whole[source] = (min(span[0], low), max(span[1], high)) if is_whole else None
@@ -352,10 +354,12 @@ class RawLogBuilder:
             notes.append(
                 f"{self.bad_rows.total} of {rows} rows are unreadable: {self.bad_rows.describe()}"
             )
-        if self.cell_rows.total:
+        empty = sum(self.missing.get(column.source, 0) == rows for column in self.gyro)
+        cells = self.cells - empty * (rows - self.bad_rows.total)  # empty axes have a note later
+        if cells:
+            places = "" if empty else f": {self.cell_rows.describe()}"
             notes.append(
-                f"{self.cells} gyro cells hold no number in rows that are readable otherwise: "
-                f"{self.cell_rows.describe()}"
+                f"{cells} gyro cells hold no number in rows that are readable otherwise{places}"
             )
         if self.turns:
             period = "a day" if max(self.turns) == CLOCK_PERIODS[0] else "a week"

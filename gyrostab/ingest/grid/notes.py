@@ -247,4 +247,15 @@ def describe_placement(
         "wrong one?"
         for axis in scanned.constant
     ]
+    nothing = "no row holds a number for"
+    notes += [
+        f"{where}: {nothing} axis {axis}; is its column empty, or the wrong one? --axis names the "
+        "axes to analyse"
+        for axis in scanned.empty
+    ]
+    notes += [
+        f"{where}: {nothing} channel {channel}, which is left out; check its column"
+        for channel, count in scanned.filled.items()
+        if count == 0
+    ]
     return notes

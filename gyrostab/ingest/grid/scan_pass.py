@@ -36,6 +36,7 @@ class ScanPass:
     unreadable: NDArray[np.int64]
     infinite: NDArray[np.int64]
     constant: list[str]  # axes whose value never changes
+    empty: list[str]  # axes without a number
     #: Channel on ``row`` -> number of rows with a value.
     filled: dict[str, int] = field(default_factory=dict)
     repeated: int = 0  # number of rows that repeat others
@@ -134,10 +135,11 @@ def scan_rows(raw: xr.Dataset, name: str, *, block: int = BLOCK_ROWS) -> ScanPas
         for axis, lowest, highest in zip(axes, low, high, strict=True)
         if lowest == highest and rows - absent > 1
     ]
-    packed = np.concatenate(bits)
-    return ScanPass(
-        rows, packed, absent, _join_spans(unreadable), _join_spans(infinite), still, filled
-    )
+    empty = [
+        axis for axis, lowest, highest in zip(axes, low, high, strict=True) if lowest > highest
+    ]
+    packed, spans = np.concatenate(bits), (_join_spans(unreadable), _join_spans(infinite))
+    return ScanPass(rows, packed, absent, *spans, still, empty, filled)
 
 
 def stamp_blocks(

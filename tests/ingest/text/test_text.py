@@ -23,6 +23,7 @@ from gyrostab.ingest.columns.stamps import (
     parse_time_unit,
 )
 from gyrostab.ingest.formats import text as text_reader
+from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.ingest.text.layout import find_layout
 from tests.support.text_logs import PLAIN, ns, write
 
@@ -380,3 +381,22 @@ def test_rows_of_several_tools_in_one_file_are_noted(
     found = [note for note in notes if "several tools" in note]
     assert len(found) == 2 * is_noted
     assert all("'tool'" in note and "write a file for each" in note for note in found)
+
+
+@pytest.mark.parametrize("damage", ["", "4,bad,,3,2\n"])
+def test_axes_and_channels_without_a_number_are_named(tmp_path: Path, damage: str) -> None:
+    header = "time [s],gyro_x [deg/h],gyro_y [deg/h],gyro_z [deg/h],temperature [degC]\n"
+    rows = "".join(f"{n},{n % 3},{n % 2},,\n" for n in range(40))
+    path = write(tmp_path, header + rows.replace("4,1,0,,\n", damage or "4,1,0,,\n", 1))
+    text = "\n".join(regularise(read_log(path)).attrs["notes"])
+    named = ["axis z", "channel temperature"] if not damage else []
+    for name in named:
+        assert f"no row holds a number for {name}" in text
+    assert ("lines 2, 3, 4" in text) == bool(damage)
+
+
+def test_cells_without_a_number_are_counted_without_those_of_an_empty_axis(tmp_path: Path) -> None:
+    rows = "".join(f"{n},{'' if n == 7 else n % 3},{n % 2},\n" for n in range(40))
+    header = "time [s],gyro_x [deg/h],gyro_y [deg/h],gyro_z [deg/h]\n"
+    (note,) = read_log(write(tmp_path, header + rows + "bad,1,2,\n")).attrs["notes"][-1:]
+    assert note.endswith("1 gyro cells hold no number in rows that are readable otherwise")
