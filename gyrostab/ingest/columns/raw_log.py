@@ -23,6 +23,7 @@ from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.stamps import CLOCK_PERIODS, NAT, continue_clock, find_turn
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.schema import SIGNAL_UNITS
+from gyrostab.store.lazy import read_slice
 from gyrostab.store.row_inspection import RowInspection
 
 __all__ = ["ConvertedBlock", "RawLogBuilder", "summary_of"]
@@ -31,6 +32,12 @@ __all__ = ["ConvertedBlock", "RawLogBuilder", "summary_of"]
 MAX_NAMED_PLACES = 10
 #: Largest share of unreadable rows; a file with more is refused.
 MAX_UNREADABLE_SHARE = 0.5
+
+#: Rows at the beginning in which a code for missing values is searched.
+_CODE_ROWS = 2**18
+#: A code repeats, is farther from the other values than their range times this number, and the
+#: latter have at least so many different values, unlike the states of a switch.
+_MIN_CODE_REPEATS, _MIN_CODE_DISTANCE, _MIN_READINGS = 3, 3.0, 16
 
 Values = dict[int, NDArray[np.float64]]
 Locate = Callable[[Sequence[int]], list[str]]
@@ -282,6 +289,7 @@ class RawLogBuilder:
                 f"look at it, and check {suspects}"
             )
         columns = self.buffers.finish()
+        notes = [*notes, *self._describe_codes(columns)]
         stamps = self._finish_stamps(columns)
         dataset = self._make_dataset(
             {key: as_lazy(column) for key, column in columns.items()}, stamps
@@ -348,6 +356,21 @@ class RawLogBuilder:
             dataset.attrs["start"] = self.options.start
         return dataset
 
+    def _describe_codes(self, columns: dict[int, Any]) -> list[str]:
+        """Return notes on values that repeat far outside all others, as codes for missing do."""
+        notes = []
+        for column in [*self.gyro, *self.channels]:
+            head = np.asarray(read_slice(columns[column.source], 0, _CODE_ROWS), dtype=np.float64)
+            code = _find_code(head[np.isfinite(head)])
+            if code is not None:
+                number, written = int((head == code).sum()), (code - column.offset) / column.factor
+                notes.append(
+                    f"{column.header!r} is {written:.10g} in {number} of the first {len(head)} "
+                    "rows, far outside all other values; if that is a code for a missing value, "
+                    "replace it by nan before the log is read"
+                )
+        return notes
+
     def _describe_faults(self, rows: int) -> list[str]:
         notes = []
         if self.bad_rows.total:
@@ -371,6 +394,26 @@ class RawLogBuilder:
         if self.options.start is not None and self.time is not None:
             notes.append("--start is not used: the file has its own time column")
         return notes
+
+
+def _find_code(values: NDArray[np.float64]) -> float | None:
+    """Return the lowest or highest value if it repeats far outside all others; zero is a reading.
+
+    Examples
+    --------
+    >>> _find_code(np.r_[np.arange(100.0), [-999.25] * 3]), _find_code(np.arange(100.0))
+    (-999.25, None)
+    """
+    for code in (values.min(initial=np.inf), values.max(initial=-np.inf)):
+        others = values[values != code]
+        if code == 0 or not _MIN_CODE_REPEATS <= len(values) - len(others) < len(others):
+            continue
+        low, high = others.min(), others.max()
+        if max(low - code, code - high) > _MIN_CODE_DISTANCE * (high - low) and (
+            len(np.unique(others)) >= _MIN_READINGS
+        ):
+            return float(code)
+    return None
 
 
 def _continue_block(

@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from gyrostab.errors import FormatError, GyrostabError, MissingUnitError, OptionError, UnitError
@@ -366,3 +367,25 @@ def test_the_log_on_the_page_is_read(tmp_path: Path) -> None:
     assert raw["axis"].values.tolist() == ["x", "y", "z"]
     assert raw["temperature"].values[0] == 61.2
     assert np.diff(ns(raw)).tolist() == [10_000_000]
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+@pytest.mark.parametrize(("code", "repeats", "is_noted"), [
+    (-999.25, 120, True), (9999.0, 3, True), (-999.25, 2, False), (0.0, 120, False),
+])  # fmt: skip
+def test_a_value_that_repeats_far_outside_all_others_is_noted(
+    tmp_path: Path, code: float, repeats: int, is_noted: bool, suffix: str
+) -> None:
+    random = np.random.default_rng(1)
+    gyro = 40.0 + np.round(random.standard_normal((2, 3000)), 4)
+    gyro[0, random.choice(3000, repeats, replace=False)] = code
+    switch = np.repeat([0.0, 5.0], 1500)
+    table = pd.DataFrame({
+        "time [s]": np.arange(3000) / 10.0, "gyro_x [deg/s]": gyro[0], "gyro_y [deg/s]": gyro[1],
+        "supply_voltage [V]": switch,
+    })  # fmt: skip
+    path = tmp_path / f"log.{suffix}"
+    table.to_csv(path, index=False) if suffix == "csv" else table.to_parquet(path)
+    notes = [note for note in read_log(path).attrs["notes"] if "code for a missing" in note]
+    assert len(notes) == is_noted
+    assert all(f"'gyro_x [deg/s]' is {code:g} in {repeats} of the first" in note for note in notes)
