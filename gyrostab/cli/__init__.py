@@ -16,6 +16,7 @@ from collections.abc import Sequence
 
 from gyrostab.cli import commands
 from gyrostab.cli.console import (
+    attach_negative_values,
     describe_error,
     print_error,
     read_config,
@@ -59,7 +60,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             tokens, [command for command in app if not command.startswith("-")]
         )
         with show_plain_warnings(), sigterm_as_interrupt(), relaxed_gc():
-            command, bound, _ = app.parse_args(tokens, exit_on_error=False, print_error=False)
+            attached = attach_negative_values(tokens)
+            command, bound, _ = app.parse_args(attached, exit_on_error=False, print_error=False)
             with protect_inputs(find_inputs(bound.arguments)):
                 command(*bound.args, **bound.kwargs)
     except KeyboardInterrupt as stop:

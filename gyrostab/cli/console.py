@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import gc
+import re
 import signal
 import sys
 import threading
@@ -19,6 +20,7 @@ from gyrostab.cli.options import read_toml
 from gyrostab.errors import GyrostabError, OptionError
 
 __all__ = [
+    "attach_negative_values",
     "describe_error",
     "print_error",
     "read_config",
@@ -26,6 +28,23 @@ __all__ = [
     "show_plain_warnings",
     "sigterm_as_interrupt",
 ]
+
+
+def attach_negative_values(tokens: Sequence[str]) -> list[str]:
+    """Attach each negative number to the option before it, so that it is not parsed as an option.
+
+    Examples
+    --------
+    >>> attach_negative_values(["run", "a.csv", "--window", "-5min", "-o", "p.nc"])
+    ['run', 'a.csv', '--window=-5min', '-o', 'p.nc']
+    """
+    attached: list[str] = []
+    for token in tokens:
+        if attached and re.match(r"--[a-z][a-z-]*$", attached[-1]) and re.match(r"-\.?\d", token):
+            attached[-1] += f"={token}"
+        else:
+            attached.append(token)
+    return attached
 
 
 def read_config(tokens: Sequence[str], commands: Collection[str]) -> Any:

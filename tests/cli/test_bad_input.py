@@ -146,6 +146,10 @@ BAD_INPUT = {
     "damaged log of ours": (_damaged_log, r"bad\.nc: .*is damaged"),
     "window without a unit": (_bad_log("--window", "20", "--step", "5s"), "window|20"),
     "window that is not a duration": (_bad_log("--window", "long"), "long"),
+    **{
+        f"negative {option}": (_bad_log(f"--{option}", "-5min"), "'-5min' must be longer than zero")
+        for option in ("window", "step", "max-gap", "tau-max", "fit-from")
+    },
     "axis that is not there": (_bad_log("--axis", "w", *WINDOW), "axis|'w'"),
     "more than half unreadable": (_bad_log(change=_words), "unreadable"),
     "no such file": (lambda folder: [folder / "none.csv", "-o", folder / "out.nc"], "none.csv"),
