@@ -308,17 +308,44 @@ def _bits(terms: Iterable[str]) -> int:
     return sum(1 << TERMS.index(term) for term in terms)
 
 
-def _check_options(
-    surface: xr.Dataset, terms: str | Iterable[str], method: str, tau_min: Any, tau_max: Any
-) -> tuple[list[str], NDArray[np.int64]]:
-    """Check the options of a fit; return the terms, and the positions of the averaging times."""
-    check_surface(surface)
+def check_fit_options(
+    terms: str | Iterable[str] = "QNBKR",
+    method: str = "gls",
+    tau_min: Any = None,
+    tau_max: Any = None,
+    **other: Any,
+) -> tuple[list[str], float, float]:
+    """Check options of `fit_noise` as far as they do not depend on the surface; ignore others.
+
+    Returns
+    -------
+    terms : list of str
+        Terms to fit.
+    low, high : float
+        Shortest and longest averaging time to fit [s].
+
+    Examples
+    --------
+    >>> check_fit_options("NB", tau_min="1min")
+    (['N', 'B'], 60.0, inf)
+    """
     fitted_terms = list(terms)
     unknown = [term for term in fitted_terms if term not in TERMS]
     if unknown or not fitted_terms:
         raise OptionError(f"terms {unknown or fitted_terms}: choose among {', '.join(TERMS)}")
     if method not in ("gls", "adev"):
         raise OptionError(f"method={method!r}: give 'gls' or 'adev'")
+    low = 0.0 if tau_min in (None, "all") else duration_seconds(tau_min, "tau_min")
+    high = np.inf if tau_max is None else duration_seconds(tau_max, "tau_max")
+    return fitted_terms, low, high
+
+
+def _check_options(
+    surface: xr.Dataset, terms: str | Iterable[str], method: str, tau_min: Any, tau_max: Any
+) -> tuple[list[str], NDArray[np.int64]]:
+    """Check the options of a fit; return the terms, and the positions of the averaging times."""
+    check_surface(surface)
+    fitted_terms, low, high = check_fit_options(terms, method, tau_min, tau_max)
     variance = surface.attrs.get("variance", "avar")
     if method == "adev" and variance != "avar":
         raise OptionError(
@@ -326,13 +353,11 @@ def _check_options(
         )
     if variance == "hadamard" and fitted_terms == ["R"]:
         raise OptionError("terms 'R': the Hadamard variance does not see a ramp")
-    return fitted_terms, _select_taus(surface["tau"].values, tau_min, tau_max)
+    return fitted_terms, _select_taus(surface["tau"].values, low, high)
 
 
-def _select_taus(tau: NDArray[np.float64], tau_min: Any, tau_max: Any) -> NDArray[np.int64]:
-    """Find the positions of the averaging times to fit."""
-    low = 0.0 if tau_min in (None, "all") else duration_seconds(tau_min, "tau_min")
-    high = np.inf if tau_max is None else duration_seconds(tau_max, "tau_max")
+def _select_taus(tau: NDArray[np.float64], low: float, high: float) -> NDArray[np.int64]:
+    """Find the positions of the averaging times to fit, from `low` to `high` [s]."""
     chosen = np.flatnonzero((tau >= low * (1 - 1e-9)) & (tau <= high * (1 + 1e-9)))
     if chosen.size == 0:
         raise OptionError(

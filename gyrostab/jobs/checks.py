@@ -3,11 +3,33 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 from gyrostab.errors import OptionError
 
-__all__ = ["check_windows"]
+__all__ = ["check_options"]
+
+
+def check_options(
+    *,
+    reading: Mapping[str, Any],
+    windows: Mapping[str, Any],
+    fitting: Mapping[str, Any] | None = None,
+) -> None:
+    """Check the options of a run as far as they do not depend on the log.
+
+    Raises
+    ------
+    OptionError
+        When one of them cannot be used.
+    """
+    from gyrostab.allan.fit import check_fit_options
+    from gyrostab.ingest.uniform import check_cut
+
+    check_cut(**reading)
+    check_windows(**windows)
+    check_fit_options(**(fitting or {}))
 
 
 def check_windows(
@@ -35,24 +57,23 @@ def check_windows(
     from gyrostab.time.durations import TAUS, averaging_factors, duration_seconds, samples
 
     fine = 1e6  # Hz; the true rate is not known yet
-    if window is None:  # chosen when the record is known
-        return
-    length = samples(window, fine, "window")
+    length = math.inf if window is None else samples(window, fine, "window")
     step_length = samples(step, fine, "step") if step else 1
-    if step and ("sample" in window) == ("sample" in step) and step_length > length:
+    if window and step and ("sample" in window) == ("sample" in step) and step_length > length:
         raise OptionError(
             f"the step of {step} is longer than the window of {window}, "
             "so samples would be left out; give a shorter --step"
         )
     # the duration of a number of samples depends on the rate
-    half = None if "sample" in window else length / fine / 2
-    tau_texts = [tau_max] if tau_max else []
-    if taus.strip().isdigit():
+    half = math.inf if window and "sample" in window else length / fine / 2
+    lengths = [(tau_max, duration_seconds(tau_max, "tau_max"))] if tau_max else []
+    if isinstance(taus, int) or (isinstance(taus, str) and taus.strip().isdigit()):
         averaging_factors(taus, rate=fine, window=2)
-    elif taus.strip() not in ("octave", "all"):
-        tau_texts += taus.split(",")
-    for tau in tau_texts:
-        if duration_seconds(tau, "tau", example=TAUS) > (half or math.inf):
+    elif isinstance(taus, str) and taus.strip() not in ("octave", "all"):
+        listed = taus.split(",")
+        lengths += [(tau, duration_seconds(tau, "tau", example=TAUS)) for tau in listed]
+    for tau, seconds in lengths:
+        if seconds > half:
             raise OptionError(
                 f"tau {tau.strip()} is longer than half of the window of {window}, "
                 "so no second difference fits; "

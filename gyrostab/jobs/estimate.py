@@ -14,6 +14,7 @@ from typing import Any
 from gyrostab.allan.davar import davar_parts
 from gyrostab.allan.plan import make_plan
 from gyrostab.io.datasets import to_netcdf
+from gyrostab.jobs.checks import check_options
 from gyrostab.jobs.engine import compute_part
 from gyrostab.jobs.run import load_log
 from gyrostab.progress import watch_compiler
@@ -37,6 +38,7 @@ def estimate_run(
     The first part is computed on one core; the processor time and the size of the rest are taken to
     be in proportion to the number of windows. Cores that are busy with other programs need longer.
     """
+    check_options(reading=reading, windows=windows, fitting=fitting)
     with _measure_work() as work_s:
         log = load_log(paths, **reading)
         plan, parts = make_plan(log, **windows), davar_parts(log, **windows)

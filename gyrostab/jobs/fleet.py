@@ -34,7 +34,7 @@ from gyrostab.jobs.archive import (
     index_files,
     is_fleet,
 )
-from gyrostab.jobs.checks import check_windows
+from gyrostab.jobs.checks import check_options
 from gyrostab.jobs.fleet_table import (
     FILES,
     find_trends,
@@ -186,7 +186,7 @@ def run_fleet(
         "windows": dict(windows or {}),
         "fitting": dict(fitting or {}),
     }
-    check_windows(**options["windows"])
+    check_options(**options)
     if url := find_url(output):
         _check_address(url, ".zarr", is_own=is_fleet(Path(output)))
     else:

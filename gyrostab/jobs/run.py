@@ -15,7 +15,7 @@ import xarray as xr
 
 from gyrostab.errors import FormatError, GyrostabError, OutputError, ResumeError
 from gyrostab.jobs.checkpoint import find_blocks
-from gyrostab.jobs.checks import check_windows
+from gyrostab.jobs.checks import check_options
 from gyrostab.jobs.engine import (
     Blocks,
     compute_blocks,
@@ -202,7 +202,7 @@ def run(
         "windows": dict(windows or {}),
         "fitting": fitting,
     }
-    check_windows(**options["windows"])
+    check_options(**options)
     with protect_inputs(paths), protect_inputs(options["reading"].get("channel", ())):
         zarr = zarr or Path(output).suffix.lower() == ".zarr"
         job = _describe_job(paths, resolve_link(output), options, zarr=zarr)

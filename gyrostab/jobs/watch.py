@@ -29,7 +29,7 @@ from gyrostab.ingest.uniform import cut_log
 from gyrostab.io.datasets import open_product
 from gyrostab.io.growing import LayoutError, write_windows
 from gyrostab.jobs.alarms import Alarm, check_alarms, describe_windows
-from gyrostab.jobs.checks import check_windows
+from gyrostab.jobs.checks import check_options
 from gyrostab.jobs.engine import compute_part, find_record_bands
 from gyrostab.jobs.follow import FileMemory, RowKeeper, list_files
 from gyrostab.jobs.job import (
@@ -144,7 +144,7 @@ def watch(
         "windows": {"window": "10min", **(windows or {})},
         "fitting": dict(fitting or {}),
     }
-    check_windows(**options["windows"])
+    check_options(**options)
     return_large_arrays()
     wait = duration_seconds(lateness, "--lateness") if lateness else 0.0
     quiet = duration_seconds(idle, "--idle") if idle else np.inf

@@ -205,6 +205,23 @@ def test_bad_input_is_one_message_and_nothing_left_behind(case, tmp_path, capfd)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
+@pytest.mark.parametrize("options", [
+    "--taus banana", "--taus 0", "--tau-max banana", "--step 0s", "--terms XYZ",
+    "--fit-from banana", "--fit-to 0s", "--exclude 1min", "--exclude 1min/banana", "--from banana",
+])  # fmt: skip
+@pytest.mark.parametrize("dry", [[], ["--dry-run"]])
+def test_wrong_options_are_refused_before_the_log_is_read(options, dry, log, tmp_path, capfd):
+    assert call("run", log, "-o", tmp_path / "out.nc", *options.split(), *dry) == 2
+    (message,) = [
+        line for line in capfd.readouterr().err.splitlines() if not line.startswith("reading")
+    ]
+    assert message.startswith("gyrostab: ")
+    unread = tmp_path / "unread.csv"
+    unread.write_text("time [s],gyro_x\n0,1\n")  # would be refused for its missing unit
+    assert call("run", unread, "-o", tmp_path / "out.nc", *options.split(), *dry) == 2
+    assert message in capfd.readouterr().err
+
+
 def test_disk_full_while_writing(tmp_path):
     path = write_log(tmp_path / "tool.csv", 900.0)
     code = (

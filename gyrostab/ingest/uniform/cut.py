@@ -29,7 +29,7 @@ from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import grid_index, grid_times, stamp_ns
 from gyrostab.time.stamps import to_nanoseconds
 
-__all__ = ["cut_log", "parse_instant"]
+__all__ = ["check_cut", "cut_log", "parse_instant"]
 
 _EXAMPLE = "2026-11-20T14:00 (UTC) or 10min after the start"
 _SPAN_EXAMPLE = "2026-11-20T14:00/2026-11-20T14:05 or 10min/15min after the start"
@@ -118,9 +118,7 @@ def cut_log(
     >>> cut_log(log, time_from="2s", time_to="8s", exclude="3s/5s").rate.values
     array([[ 2., nan, nan,  5.,  6.,  7.]])
     """
-    if isinstance(exclude, str) or _is_pair(exclude):
-        exclude = (exclude,)  # type: ignore[assignment]
-    spans: list[Span] = list(exclude)
+    spans = _list_spans(exclude)
     if time_from is None and time_to is None and not spans:
         return log
     check_log(log)
@@ -147,6 +145,42 @@ def cut_log(
     if has_gap_table(log) or len(excluded):
         part = with_table(part, _cut_table(log, grid, low, high, excluded), start, grid.rate)
     return part.assign_attrs(history=_describe_cut(log, time_from, time_to, spans, size))
+
+
+def check_cut(
+    *, time_from: Any = None, time_to: Any = None, exclude: Span | Sequence[Span] = (), **other: Any
+) -> None:
+    """Check options of `cut_log` as far as they do not depend on the log; ignore others.
+
+    Examples
+    --------
+    >>> check_cut(exclude="1min")
+    Traceback (most recent call last):
+    gyrostab.errors.OptionError: --exclude '1min': write START/END, for instance ...
+    """
+    for option, value in (("--from", time_from), ("--to", time_to)):
+        if value is not None:
+            parse_instant(value, option)
+    for span in _list_spans(exclude):
+        for value in _split_span(span):
+            parse_instant(value, "--exclude", example=_SPAN_EXAMPLE)
+
+
+def _list_spans(exclude: Span | Sequence[Span]) -> list[Span]:
+    return [exclude] if isinstance(exclude, str) or _is_pair(exclude) else list(exclude)  # type: ignore[list-item]
+
+
+def _split_span(span: Span) -> list[Any]:
+    """Return the two ends of an excluded span."""
+    ends = [part.strip() for part in span.split("/")] if isinstance(span, str) else list(span)
+    if len(ends) != 2 or not all(str(end) for end in ends):
+        text = _format_span(span)
+        raise OptionError(f"--exclude {text!r}: write START/END, for instance {_SPAN_EXAMPLE}")
+    return ends
+
+
+def _format_span(span: Span) -> str:
+    return span if isinstance(span, str) else "/".join(map(str, span))
 
 
 def _is_pair(value: Any) -> bool:
@@ -192,10 +226,7 @@ class _Clock:
 
     def span_of(self, span: Span, low: int, high: int) -> tuple[int, int]:
         """Return the samples of an excluded span within the kept part."""
-        ends = [part.strip() for part in span.split("/")] if isinstance(span, str) else list(span)
-        text = span if isinstance(span, str) else "/".join(map(str, span))
-        if len(ends) != 2 or not all(str(end) for end in ends):
-            raise OptionError(f"--exclude {text!r}: write START/END, for instance {_SPAN_EXAMPLE}")
+        ends, text = _split_span(span), _format_span(span)
         first, end = (self.first_at(value, "--exclude", example=_SPAN_EXAMPLE) for value in ends)
         if end < first:
             raise OptionError(
@@ -277,7 +308,5 @@ def _describe_cut(
         for name, value in (("from", time_from), ("to", time_to))
         if value is not None
     ]
-    options += [
-        f"without {span if isinstance(span, str) else '/'.join(map(str, span))}" for span in spans
-    ]
+    options += [f"without {_format_span(span)}" for span in spans]
     return extend_history(log, f"gyrostab.cut_log: {', '.join(options)}: {size} samples")
