@@ -34,6 +34,8 @@ MOST_CELLS = 2**20
 MOST_TAUS = 48
 #: Default windows [s]; the longest that fits four times into the record is used.
 WINDOWS_S = (600, 300, 120, 60, 30, 20, 10, 5, 2, 1)
+#: Shortest window [samples].
+MIN_WINDOW_SAMPLES = 4
 _METHODS = ("blocks", "direct", "recursive")
 _GAPS = ("bridge", "zero")
 _OVERLAPS = ("full", "octave")
@@ -113,9 +115,10 @@ def choose_window(log: xr.Dataset) -> str:
     '20s'
     """
     size, rate = log.sizes["time"], float(log.attrs["sampling_rate_hz"])
+    _check_size(size)
     seconds = next((window for window in WINDOWS_S if 4 * window * rate <= size), None)
     if seconds is None:
-        return f"{max(4, size // 4)}samples"
+        return f"{max(MIN_WINDOW_SAMPLES, size // 4)}samples"
     return f"{seconds}s" if seconds < 60 else f"{seconds // 60}min"
 
 
@@ -155,17 +158,27 @@ def _select_axes(signal: xr.DataArray, axis: str | Sequence[str]) -> xr.DataArra
     return signal.sel(axis=axes)
 
 
+def _check_size(available: int) -> None:
+    """Refuse a record that is shorter than the shortest window."""
+    if available < MIN_WINDOW_SAMPLES:
+        raise OptionError(
+            f"the record has {available} sample{'s' * (available > 1)}, and a window needs at "
+            f"least {MIN_WINDOW_SAMPLES}; no --window helps: give a longer log"
+        )
+
+
 def _window_and_step(window: Any, step: Any, rate: float, available: int) -> tuple[int, int]:
     length = samples(window, rate, "window")
+    _check_size(available)
     if length > available:
         raise OptionError(
             f"the window of {length / rate:g} s ({length} samples) is longer than the record of "
             f"{available / rate:g} s; give a shorter --window"
         )
-    if length < 4:
+    if length < MIN_WINDOW_SAMPLES:
         raise OptionError(
-            f"the window of {length} samples is too short; it needs at least 4 ({4 / rate:g} s at "
-            f"{rate:g} Hz)"
+            f"the window of {length} samples is too short; it needs at least {MIN_WINDOW_SAMPLES} "
+            f"({MIN_WINDOW_SAMPLES / rate:g} s at {rate:g} Hz)"
         )
     hop = max(1, length // 10) if step is None else samples(step, rate, "step")
     if hop > length:

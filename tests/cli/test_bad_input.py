@@ -150,6 +150,10 @@ BAD_INPUT = {
         f"negative {option}": (_bad_log(f"--{option}", "-5min"), "'-5min' must be longer than zero")
         for option in ("window", "step", "max-gap", "tau-max", "fit-from")
     },
+    "two samples": (
+        _bad_text(b"time [s],gyro_x [deg/h]\n0,1\n1,2\n"),
+        "record has 2 samples, .* at least 4; no --window helps: give a longer log",
+    ),
     "axis that is not there": (_bad_log("--axis", "w", *WINDOW), "axis|'w'"),
     "more than half unreadable": (_bad_log(change=_words), "unreadable"),
     "no such file": (lambda folder: [folder / "none.csv", "-o", folder / "out.nc"], "none.csv"),
@@ -220,6 +224,16 @@ def test_wrong_options_are_refused_before_the_log_is_read(options, dry, log, tmp
     unread.write_text("time [s],gyro_x\n0,1\n")  # would be refused for its missing unit
     assert call("run", unread, "-o", tmp_path / "out.nc", *options.split(), *dry) == 2
     assert message in capfd.readouterr().err
+
+
+def test_record_without_a_whole_window_gets_no_advice_on_the_window(tmp_path, capfd):
+    path = tmp_path / "three.csv"
+    path.write_text("time [s],gyro_x [deg/h]\n0,1\n1,2\n2,0\n")
+    assert call("run", path, "-o", tmp_path / "out.nc") == 2
+    shown = capfd.readouterr().err
+    assert "the record has 3 samples" in shown
+    assert "give a shorter --window" not in shown
+    assert "the window is" not in shown
 
 
 def test_disk_full_while_writing(tmp_path):
