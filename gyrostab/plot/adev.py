@@ -93,8 +93,6 @@ def plot_adev(
 
         estimates = refit(windows).isel(axis=0, time=0)
         _draw_terms(panel, window, estimates, [shade for shade in COLOURS if shade != colour])
-    panel.set_xscale("log")
-    panel.set_yscale("log")
     shown = deviation[np.isfinite(deviation) & (deviation > 0)]
     panel.set_xlim(tau.min() / 1.3, tau.max() * 1.3)
     if not shown.size:
@@ -102,6 +100,8 @@ def plot_adev(
         write_in_middle(panel, "no estimate in this window")
     else:
         panel.set_ylim(shown.min() / 4.0, np.nanmax(np.sqrt(high)) * 1.5)
+    panel.set_xscale("log")  # after the limits, which data of a constant signal do not give
+    panel.set_yscale("log")
     label_log_axis(panel.xaxis, *panel.get_xlim())
     label_log_axis(panel.yaxis, *panel.get_ylim())
     panel.set_xlabel("averaging time τ [s]")

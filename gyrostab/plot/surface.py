@@ -241,10 +241,11 @@ def _merge_windows(
 
 
 def _divide_by_median(deviation: NDArray[Any]) -> NDArray[Any]:
-    out = np.full_like(deviation, np.nan)
+    """Divide by the median over time; NaN where that is zero, as of a constant signal."""
+    median = np.zeros(deviation.shape[1])
     has_values = np.isfinite(deviation).any(axis=0)
-    out[:, has_values] = deviation[:, has_values] / np.nanmedian(deviation[:, has_values], axis=0)
-    return out
+    median[has_values] = np.nanmedian(deviation[:, has_values], axis=0)
+    return np.divide(deviation, median, out=np.full_like(deviation, np.nan), where=median > 0)
 
 
 def _colour_limits(values: list[NDArray[Any]], *, relative: bool) -> tuple[float, float]:

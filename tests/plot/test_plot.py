@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from matplotlib.collections import PathCollection, QuadMesh
 from matplotlib.dates import date2num
 from scipy.stats import chi2
 
+from gyrostab import davar, fit_noise, make_log
 from gyrostab.allan.fit import refit
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import LAWS, model_avar
@@ -20,6 +22,7 @@ from gyrostab.plot import plot_adev, plot_coefficients, plot_davar, plot_davar_3
 from gyrostab.plot.adev import band
 from gyrostab.plot.signal import thin
 from gyrostab.plot.style import save_png
+from gyrostab.report.product import write_report
 from tests.support import synthetic
 
 
@@ -357,3 +360,16 @@ def test_negative_variance_has_no_deviation(product):
         for surface in (product, spoiled)
     )
     assert np.isnan(after).sum() == np.isnan(before).sum() + 1
+
+
+@pytest.mark.parametrize("share", [1.0, 0.7])
+def test_product_of_a_constant_signal_is_drawn_without_warnings(share, tmp_path):
+    values = np.random.default_rng(1).standard_normal(6000)
+    values[: int(share * 6000)] = 7.5
+    log = make_log(values, rate=10.0, unit="deg/h")
+    product = fit_noise(davar(log, window="1min", step="30s")).load()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        save_all(product, tmp_path)
+        save_png(plot_davar_3d(product), tmp_path / "3d.png", dpi=40)
+        write_report(product, tmp_path / "report.html")
