@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,14 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from gyrostab.errors import MissingUnitError, OptionError, SchemaError, TimeError, UnitError
+from gyrostab.errors import (
+    GyrostabError,
+    MissingUnitError,
+    OptionError,
+    SchemaError,
+    TimeError,
+    UnitError,
+)
 from gyrostab.ingest.uniform import as_uniform
 from gyrostab.noise import HOUR
 from gyrostab.schema import SIGNAL_LONG_NAMES, SIGNAL_UNITS, texts
@@ -20,6 +29,25 @@ from gyrostab.store.read import MIN_LAZY_VALUES, make_variable_lazy
 from gyrostab.units import Unit, known_units, parse_unit
 
 __all__ = ["as_log", "from_dataarray", "from_dataframe"]
+
+#: An option of a command with its value, as messages on files advise it.
+_OPTION = re.compile(
+    r"--(map|unit|kind|rate|max-gap|axis)\b"
+    r'(?: ("[^"]*=[^"]*"|[^\s,;:()]+=[^\s,;:()]+)'
+    r"|(?<=kind) (angle|rate)\b|(?<=rate) (HZ|[\d.e+-]+))?"
+)
+#: Advice that only concerns files, and its replacement.
+_FILE_ADVICE = (
+    ("; gyrostab scan DataFrame inspects each column", ""),
+    (
+        "the separator, the columns that --map names and the unit of time",
+        "the columns and the index",
+    ),
+    (
+        "check the time column and its unit, or leave it out (--map) and give --rate HZ",
+        "correct the times, or use gyrostab.make_log(values, rate=..., unit=...)",
+    ),
+)
 
 
 def as_log(data: Any) -> xr.Dataset:
@@ -119,7 +147,10 @@ def from_dataframe(
     """
     from gyrostab.ingest.grid.regularise import regularise
 
-    log = regularise(_read_frame(df, units=units, map=map, kind=kind), rate=rate, max_gap=max_gap)
+    with _keyword_advice():
+        raw = _read_frame(df, units=units, map=map, kind=kind)
+        log = regularise(raw, rate=rate, max_gap=max_gap)
+    log.attrs["notes"] = [_name_keywords(note) for note in texts(log, "notes")]
     _warn_notes(log)
     return log
 
@@ -148,6 +179,11 @@ def _read_frame(
             "DatetimeIndex"
         )
     index = _check_index(table)
+    if table.empty:
+        raise SchemaError(
+            f"the DataFrame has {len(table)} rows and {table.shape[1]} columns; a log needs at "
+            "least two rows and a column for a gyro axis"
+        )
     units = frame.attrs.get("units") if units is None else units
     headers = [str(column) for column in table.columns]
     renamed = dict(map or {})
@@ -176,6 +212,43 @@ def _read_frame(
             "name of the column, 'gyro_x [deg/s]'"
         ) from error
     return raw
+
+
+@contextmanager
+def _keyword_advice() -> Iterator[None]:
+    """Let errors name keywords of functions, where those on files name options of commands."""
+    try:
+        yield
+    except GyrostabError as error:
+        error.args = (_name_keywords(str(error)),)
+        raise
+
+
+def _name_keywords(message: str) -> str:
+    """Name keywords in the place of options, and leave out what only concerns files.
+
+    Examples
+    --------
+    >>> _name_keywords('DataFrame: keep one: --map "x y=gyro_x" --unit gyro=deg/s or --kind rate')
+    "DataFrame: keep one: map={'x y': 'gyro_x'}, units={'gyro': 'deg/s'} or kind='rate'"
+    """
+
+    def name_keyword(match: re.Match[str]) -> str:
+        option, value = (
+            match[1].replace("-", "_"),
+            next(filter(None, match.groups()[1:]), "").strip('"'),
+        )
+        keyword = "units" if option == "unit" else option
+        key, equals, target = value.rpartition("=")
+        if equals:
+            return f"{keyword}={{{key!r}: {target!r}}}"
+        if not value or value == "HZ":
+            return keyword + f"={value}" * bool(value)
+        return f"{keyword}={value if option == 'rate' else repr(value)}"
+
+    for text, replacement in _FILE_ADVICE:
+        message = message.replace(text, replacement)
+    return _OPTION.sub(name_keyword, message.replace('" --unit ', '", --unit '))
 
 
 def _check_index(table: pd.DataFrame) -> pd.DatetimeIndex:
@@ -267,9 +340,10 @@ def from_dataarray(
             .rename_dims(time="row")
             .assign_coords(time=("row", stamps.astype("datetime64[ns]")))
         )
-        regular_log = regularise(
-            raw.assign_attrs(source_files=["DataArray"]), rate=rate, max_gap=max_gap
-        )
+        with _keyword_advice():
+            regular_log = regularise(
+                raw.assign_attrs(source_files=["DataArray"]), rate=rate, max_gap=max_gap
+            )
         _warn_notes(regular_log)
     if rate is not None and abs(rate / regular_log.attrs["sampling_rate_hz"] - 1) > 1e-6:
         raise TimeError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 
 import numpy as np
 import pandas as pd
@@ -644,3 +645,32 @@ def test_a_row_of_a_table_without_a_stamp_is_placed_by_its_neighbours() -> None:
     assert log.rate.values[0].tolist() == list(range(200))
     with pytest.raises(TimeError, match=r"backwards after row 7 \(2026-03-14 00:00:00.140000\)"):
         gyrostab.from_dataframe(table.iloc[[*range(8), *range(6, 200)]])
+
+
+def _frame(**columns) -> pd.DataFrame:
+    values = {name: np.arange(200.0) if value is None else value for name, value in columns.items()}
+    return pd.DataFrame(values, index=pd.date_range("2026-03-01", periods=200, freq="10ms"))
+
+
+@pytest.mark.parametrize(("table", "options", "expected"), [
+    (_frame(a=None), {"units": "deg/h"}, r"map=\{'a': 'gyro_x'\}, units=\{'gyro': 'deg/s'\}$"),
+    (_frame(gyro_x=None), {"units": "furlong"}, r"with a factor units=\{'gyro': '0.1 arcsec/s'\}"),
+    (_frame(gyro_x=None), {"units": "deg"}, "give kind='angle' if it is the cumulative angle"),
+    (_frame(gyro_x=np.nan), {"units": "deg/h"}, "unreadable.*check the columns and the index"),
+    (_frame(gyro_x=None, angle_x=None), {"units": {"gyro": "deg/h", "angle": "deg"}},
+     r"drop the others with map=\{'NAME': '-'\}"),
+    (_frame(gyro_x=None)[:0], {"units": "deg/h"}, "the DataFrame has 0 rows"),
+    (_frame(gyro_x=None)[:1], {"units": "deg/h"}, "give it with rate=HZ"),
+    (_frame(gyro_x=None).set_index(pd.DatetimeIndex(["2026-03-01"] * 200)), {"units": "deg/h"},
+     "all stamps are the same.*make_log"),
+])  # fmt: skip
+def test_errors_on_tables_advise_keywords_and_nothing_of_files(table, options, expected):
+    with pytest.raises(GyrostabError, match=expected) as raised:
+        gyrostab.from_dataframe(table, **options)
+    assert not re.search("--|copy it|separator|gyrostab scan", str(raised.value))
+
+
+def test_notes_on_tables_advise_keywords():
+    with pytest.warns(UserWarning, match=r"units=\{'temperature': 'degC'\}"):
+        log = gyrostab.from_dataframe(_frame(gyro_x=None, temperature=None), units="deg/h")
+    assert not any("--" in note for note in log.attrs["notes"])
