@@ -21,7 +21,7 @@ from gyrostab.errors import (
     TimeError,
     UnitError,
 )
-from gyrostab.ingest.uniform import as_uniform
+from gyrostab.ingest.uniform import advise_dates, as_uniform
 from gyrostab.noise import HOUR
 from gyrostab.schema import SIGNAL_LONG_NAMES, SIGNAL_UNITS, texts
 from gyrostab.store.private import is_in_memory
@@ -259,6 +259,10 @@ def _check_index(table: pd.DataFrame) -> pd.DatetimeIndex:
         advice = (
             "transpose it: df.T"
             if isinstance(columns, pd.DatetimeIndex)
+            else "convert it: df.to_timestamp()"
+            if isinstance(index, pd.PeriodIndex)
+            else "convert it: df.set_index(df.index.to_datetimeindex(time_unit='ns'))"
+            if isinstance(index, xr.CFTimeIndex)
             else "set one: df.set_index(pd.DatetimeIndex(...))"
         )
         raise SchemaError(
@@ -365,9 +369,14 @@ def _dataset_of(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[
             "rename them, da.rename(...)"
         )
     if "time" not in da.coords or da["time"].dtype.kind != "M":
+        advice = advise_dates(da["time"].values, "da") if "time" in da.coords else ""
         raise SchemaError(
-            "the DataArray has no datetime64 coordinate 'time'; give it one, or use "
-            "gyrostab.make_log(values, rate=..., unit=...)"
+            "the DataArray has no datetime64 coordinate 'time'; "
+            + (
+                f"convert its dates: {advice}"
+                if advice
+                else "give it one, or use gyrostab.make_log(values, rate=..., unit=...)"
+            )
         )
     unit = _unit_of(da, units)
     if kind not in (None, "rate", "angle"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import re
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -674,3 +675,29 @@ def test_notes_on_tables_advise_keywords():
     with pytest.warns(UserWarning, match=r"units=\{'temperature': 'degC'\}"):
         log = gyrostab.from_dataframe(_frame(gyro_x=None, temperature=None), units="deg/h")
     assert not any("--" in note for note in log.attrs["notes"])
+
+
+@pytest.mark.parametrize("calendar", ["standard", "noleap", "periods"])
+def test_advice_for_other_dates_gives_a_log(calendar):
+    """The calls that the messages advise are run as they are written."""
+    values = np.arange(200.0)[None]
+    time: Any = (
+        pd.period_range("2026-03-01", periods=200, freq="s")
+        if calendar == "periods"
+        else xr.date_range("2026-03-01", periods=200, freq="s", calendar=calendar, use_cftime=True)
+    )
+    expected = pd.date_range("2026-03-01", periods=200, freq="s")
+    da = xr.DataArray(values, {"axis": ["x"], "time": time}, attrs={"units": "deg/h"})
+    log = make_log(values, rate=1.0, unit="deg/h").assign_coords(time=time)
+    for name, data in (("da", da), ("log", log)):
+        with pytest.raises(SchemaError) as raised:
+            gyrostab.davar(data, window="20s")
+        advice = re.search(rf"(?<= ){name}\..*", str(raised.value))
+        assert advice is not None, raised.value
+        converted = eval(advice[0], {name: data})
+        np.testing.assert_array_equal(as_log(converted).time.values, expected)
+    df = pd.DataFrame({"gyro_x [deg/h]": values[0]}, index=da.indexes["time"])
+    with pytest.raises(SchemaError, match=r"convert it: df\.") as raised:
+        gyrostab.from_dataframe(df)
+    converted = eval(str(raised.value).split("convert it: ")[1], {"df": df})
+    np.testing.assert_array_equal(gyrostab.from_dataframe(converted).time.values, expected)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
@@ -30,6 +31,7 @@ from gyrostab.time.stamps import to_nanoseconds
 
 __all__ = [
     "add_spans",
+    "advise_dates",
     "as_uniform",
     "grid_of",
     "has_gap_table",
@@ -102,13 +104,29 @@ def grid_of(log: xr.Dataset, nominal: float | None = None) -> tuple[UniformGrid,
     if time.dtype.kind != "M":
         raise SchemaError(
             f"the time of the log is of type {time.dtype}, not dates; give it datetime64 stamps: "
-            "log.assign_coords(time=...)"
+            f"{advise_dates(time.values, 'log') or 'log.assign_coords(time=...)'}"
         )
 
     def read(begin: int, end: int) -> NDArray[np.int64]:
         return to_nanoseconds(time[begin:end].values)
 
     return find_grid(read, size, nominal=nominal), False
+
+
+def advise_dates(times: NDArray[Any], name: str) -> str:
+    """Return the call that makes datetime64 of cftime dates or pandas periods, or "".
+
+    Parameters
+    ----------
+    name : str
+        Name of the Dataset or DataArray in the call.
+    """
+    first = times.flat[0] if times.size else None
+    if isinstance(first, pd.Period):
+        return f"{name}.assign_coords(time={name}.indexes['time'].to_timestamp())"
+    if hasattr(first, "calendar"):
+        return f"{name}.convert_calendar('standard', use_cftime=False)"
+    return ""
 
 
 def _with_dimensions(log: Any) -> xr.Dataset:
