@@ -19,8 +19,16 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.errors import FormatError, OptionError, SchemaError, TimeError, reading_of
+from gyrostab.errors import (
+    DamageError,
+    FormatError,
+    OptionError,
+    SchemaError,
+    TimeError,
+    reading_of,
+)
 from gyrostab.ingest.convert import as_log
+from gyrostab.ingest.formats.text import matches as is_text_log
 from gyrostab.ingest.limits import check_declared
 from gyrostab.schema import SIGNAL_UNITS, check_log, check_product, check_surface
 from gyrostab.store.cf import find_kind, from_disk, to_disk
@@ -554,7 +562,14 @@ def _restore_log(log: xr.Dataset, path: str | os.PathLike[str]) -> xr.Dataset:
 def _open_path(
     path: str | os.PathLike[str], content: str, check: Any, advice: str, *, strict: bool = False
 ) -> xr.Dataset:
-    dataset = open_dataset(path, strict=strict)
+    try:
+        dataset = open_dataset(path, strict=strict)
+    except DamageError as error:
+        if not is_text_log(Path(path)):
+            raise
+        raise FormatError(
+            f"{path}: is a text file, not {content}; if it is a log, {advice}"
+        ) from error
     try:
         with reading_of(path):
             check(dataset)

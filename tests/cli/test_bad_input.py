@@ -314,6 +314,14 @@ def test_constant_signal_runs_with_a_note(tmp_path, capfd):
 
 def test_stages_refuse_what_is_not_theirs(log, tmp_path, capfd):
     assert call("fit", log, "-o", tmp_path / "product.nc") == 2
-    assert call("report", log, "-o", tmp_path / "report.html") == 2
-    assert "Traceback" not in capfd.readouterr().err
+    assert "not a DAVAR surface; if it is a log, make one with 'gyrostab davar'" in (
+        capfd.readouterr().err
+    )
+    for command, name in (("report", "report.html"), ("correlate", "out.nc"), ("plot", "figures")):
+        assert call(command, log, "-o", tmp_path / name) == 2
+        shown = capfd.readouterr().err
+        assert (
+            "is a text file, not a product; if it is a log, make one with 'gyrostab run'" in shown
+        )
+        assert "Traceback" not in shown
     assert list(tmp_path.iterdir()) == []
