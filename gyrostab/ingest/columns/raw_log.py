@@ -117,6 +117,7 @@ class RawLogBuilder:
         self.bad_cells = self.cells = 0
         self.bad_rows, self.cell_rows = _Places(), _Places()
         self.missing = dict[int, int]()  # missing values by column number
+        self.first_bad_row = ""
         self.bad_index: list[NDArray[np.int64]] = []
         self.low, self.high = np.iinfo(np.int64).max, NAT
         unit = None if self.time is None else self.time.time_unit
@@ -181,13 +182,20 @@ class RawLogBuilder:
             converted = converted._replace(low=int(good.min()), high=int(good.max()))
         return converted
 
-    def add(self, converted: ConvertedBlock, locate: Locate | None = None) -> None:
+    def add(
+        self,
+        converted: ConvertedBlock,
+        locate: Locate | None = None,
+        quote: Callable[[int], str] | None = None,
+    ) -> None:
         """Add one block.
 
         Parameters
         ----------
         locate : callable, optional
             Row numbers within the block -> names of the rows for messages.
+        quote : callable, optional
+            Row number within the block -> the row as it is written, for messages.
         """
         if converted.rows == 0:
             return
@@ -202,6 +210,8 @@ class RawLogBuilder:
             if span is not None and missing < converted.rows:
                 self.whole[source] = (min(span[0], low), max(span[1], high)) if is_whole else None
         if converted.bad_rows.size:
+            if quote is not None and not self.bad_rows.total:
+                self.first_bad_row = f": {quote(int(converted.bad_rows[0])):.100}"
             self.bad_rows.add(converted.bad_rows, locate)
             self.bad_index.append(converted.bad_rows + first)
         if converted.cell_rows.size:
@@ -285,8 +295,8 @@ class RawLogBuilder:
                 "in the years 1678 to 2262)"
             )
             raise FormatError(
-                f"{name}: {100 * share:.0f} % of {rows} rows are unreadable, the first is {first}; "
-                f"look at it, and check {suspects}"
+                f"{name}: {100 * share:.0f} % of {rows} rows are unreadable, the first is {first}"
+                f"{self.first_bad_row}; look at it, and check {suspects}"
             )
         columns = self.buffers.finish()
         notes = [*notes, *self._describe_codes(columns)]

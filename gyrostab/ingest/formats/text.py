@@ -103,7 +103,8 @@ def read(
     ):
         if stop is not None and stop():
             raise CancelledError
-        builder.add(converted, partial(_line_names, block, starts, line))
+        quote = partial(_quote_line, block, starts)
+        builder.add(converted, partial(_line_names, block, starts, line), quote)
         line += lines
     raw = builder.finish(layout.notes)
     if plan.time is not None and plan.time.time_unit is None:
@@ -261,6 +262,11 @@ def _parse_block(
 ) -> tuple[ConvertedBlock, bytes, NDArray[np.int64], int]:
     values, stamps, words, starts, lines = parser.parse(block)
     return builder.prepare(values, stamps, words=words), block, starts, lines
+
+
+def _quote_line(block: bytes, starts: NDArray[np.int64], row: int) -> str:
+    start = int(starts[row])
+    return repr(block[start : block.index(b"\n", start)].decode("latin-1").strip())
 
 
 def _line_names(

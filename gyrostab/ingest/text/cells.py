@@ -12,7 +12,7 @@ from gyrostab.ingest.columns.dates import DAY_FIRST, YEAR_FIRST
 from gyrostab.ingest.columns.plan import Plan
 from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, integers_to_ns
 from gyrostab.ingest.options import ReadOptions
-from gyrostab.ingest.text.layout import BLANK, Layout
+from gyrostab.ingest.text.layout import BLANK, Layout, is_number
 
 __all__ = ["VOID_CELLS", "BlockParser", "ParsedBlock"]
 
@@ -138,8 +138,11 @@ class BlockParser:
 
 
 def _parse_number(cell: str, layout: Layout) -> float:
+    text = cell.replace(",", ".") if layout.decimal_comma else cell
+    if is_number(text):
+        text = text.upper().replace("D", "E")  # as Fortran writes exponents
     try:
-        value = float(cell.replace(",", ".") if layout.decimal_comma else cell)
+        value = float(text)
     except ValueError:
         return np.nan
     return np.nan if "_" in cell else value

@@ -400,3 +400,17 @@ def test_cells_without_a_number_are_counted_without_those_of_an_empty_axis(tmp_p
     header = "time [s],gyro_x [deg/h],gyro_y [deg/h],gyro_z [deg/h]\n"
     (note,) = read_log(write(tmp_path, header + rows + "bad,1,2,\n")).attrs["notes"][-1:]
     assert note.endswith("1 gyro cells hold no number in rows that are readable otherwise")
+
+
+def test_exponents_of_fortran_are_read(tmp_path: Path) -> None:
+    rows = "".join(f"{n},{n - 3}.5D-01,{n}d0\n" for n in range(20))
+    raw = read_log(write(tmp_path, "time [s],gyro_x [deg/h],gyro_y [deg/h]\n" + rows))
+    expected = [[float(f"{n - 3}.5e-1") for n in range(20)], list(range(20))]
+    assert raw.rate.values.tolist() == expected
+    assert not any("unreadable" in note for note in raw.attrs["notes"])
+
+
+def test_the_first_of_many_unreadable_rows_is_quoted(tmp_path: Path) -> None:
+    rows = "0,1\n" + "".join(f"{n},1.5*10^{n}\n" for n in range(1, 20))
+    with pytest.raises(FormatError, match=r"the first is line 3: '1,1\.5\*10\^1'; look at it"):
+        read_log(write(tmp_path, "time [s],gyro_x [deg/h]\n" + rows))
