@@ -36,7 +36,7 @@ def check_windows(
     *,
     window: str | None = None,
     step: str | None = None,
-    taus: str = "40",
+    taus: Any = "40",
     tau_max: str | None = None,
     **other: Any,
 ) -> None:

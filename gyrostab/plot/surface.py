@@ -245,7 +245,9 @@ def _divide_by_median(deviation: NDArray[Any]) -> NDArray[Any]:
     median = np.zeros(deviation.shape[1])
     has_values = np.isfinite(deviation).any(axis=0)
     median[has_values] = np.nanmedian(deviation[:, has_values], axis=0)
-    return np.divide(deviation, median, out=np.full_like(deviation, np.nan), where=median > 0)
+    ratio = np.full_like(deviation, np.nan)
+    np.divide(deviation, median, out=ratio, where=median > 0)
+    return ratio
 
 
 def _colour_limits(values: list[NDArray[Any]], *, relative: bool) -> tuple[float, float]:
