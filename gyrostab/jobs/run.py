@@ -45,7 +45,6 @@ from gyrostab.jobs.job import (
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool
 from gyrostab.kernels.workspace import Workspaces
 from gyrostab.progress import Stage, no_stage
-from gyrostab.schema import texts
 from gyrostab.store.output import (
     check_output,
     find_foreign_item,
@@ -473,7 +472,10 @@ def _unpack_log(copy: bytes) -> xr.Dataset:
 
 
 def _write_product(job: _Job, blocks: Blocks, *, overwrite: bool, stage: Stage) -> None:
-    """Write the product, and warn of windows in which an axis is constant, once for each axis."""
+    """Write the product, and warn of windows in which an axis is constant.
+
+    An axis that is constant throughout has a note in the log.
+    """
     product = write_blocks(
         blocks,
         job.target,
@@ -483,9 +485,8 @@ def _write_product(job: _Job, blocks: Blocks, *, overwrite: bool, stage: Stage) 
         zarr=job.zarr,
     )
     stage("checking", 0)
-    notes = "\n".join(texts(product, "notes"))
     for axis, share in find_constant_shares(product).items():
-        if share > 0.0 and f"axis {axis} never changes its value" not in notes:
+        if 0.0 < share < 1.0:
             warnings.warn(
                 f"gyro axis {axis} is constant in {100 * share:.0f} % of the windows: "
                 "is the sensor stuck, or its column a filler?",
