@@ -335,8 +335,8 @@ def check_fit_options(
         raise OptionError(f"terms {unknown or fitted_terms}: choose among {', '.join(TERMS)}")
     if method not in ("gls", "adev"):
         raise OptionError(f"method={method!r}: give 'gls' or 'adev'")
-    low = 0.0 if tau_min in (None, "all") else duration_seconds(tau_min, "tau_min")
-    high = np.inf if tau_max is None else duration_seconds(tau_max, "tau_max")
+    low = 0.0 if tau_min in (None, "all") else duration_seconds(tau_min, "tau_min (--fit-from)")
+    high = np.inf if tau_max is None else duration_seconds(tau_max, "tau_max (--fit-to)")
     return fitted_terms, low, high
 
 
