@@ -239,7 +239,14 @@ def test_even_stamps_and_then_shared_ones(
     assert estimate.rate == pytest.approx(1000 / period_ms, rel=2e-3)
 
 
-@pytest.mark.parametrize("rates", [(10.0, 50.0), (10.0, 1.0), (100.0, 80.0)])
+@pytest.mark.parametrize(
+    "rates",
+    [
+        pytest.param((10.0, 50.0), marks=pytest.mark.slow),
+        pytest.param((10.0, 1.0), marks=pytest.mark.slow),
+        (100.0, 80.0),
+    ],
+)
 def test_noise_is_not_judged_across_a_change_of_the_rate(rates, tmp_path):
     steps = np.repeat([1e9 / rate for rate in rates], 4000)
     stamps = START + np.rint(np.cumsum(steps)).astype(np.int64)
