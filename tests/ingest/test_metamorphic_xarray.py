@@ -648,22 +648,23 @@ def test_a_row_of_a_table_without_a_stamp_is_placed_by_its_neighbours() -> None:
         gyrostab.from_dataframe(table.iloc[[*range(8), *range(6, 200)]])
 
 
-def _frame(**columns) -> pd.DataFrame:
+def make_table(**columns) -> pd.DataFrame:
     values = {name: np.arange(200.0) if value is None else value for name, value in columns.items()}
     return pd.DataFrame(values, index=pd.date_range("2026-03-01", periods=200, freq="10ms"))
 
 
 @pytest.mark.parametrize(("table", "options", "expected"), [
-    (_frame(a=None), {"units": "deg/h"}, r"map=\{'a': 'gyro_x'\}, units=\{'gyro': 'deg/s'\}$"),
-    (_frame(gyro_x=None), {"units": "furlong"}, r"with a factor units=\{'gyro': '0.1 arcsec/s'\}"),
-    (_frame(gyro_x=None), {"units": "deg"}, "give kind='angle' if it is the cumulative angle"),
-    (_frame(gyro_x=np.nan), {"units": "deg/h"}, "unreadable.*check the columns and the index"),
-    (_frame(gyro_x=None, angle_x=None), {"units": {"gyro": "deg/h", "angle": "deg"}},
+    (make_table(a=None), {"units": "deg/h"}, r"map=\{'a': 'gyro_x'\}, units=\{'gyro': 'deg/s'\}$"),
+    (make_table(gyro_x=None), {"units": "furlong"},
+     r"with a factor units=\{'gyro': '0.1 arcsec/s'\}"),
+    (make_table(gyro_x=None), {"units": "deg"}, "give kind='angle' if it is the cumulative angle"),
+    (make_table(gyro_x=np.nan), {"units": "deg/h"}, "unreadable.*check the columns and the index"),
+    (make_table(gyro_x=None, angle_x=None), {"units": {"gyro": "deg/h", "angle": "deg"}},
      r"drop the others with map=\{'NAME': '-'\}"),
-    (_frame(gyro_x=None)[:0], {"units": "deg/h"}, "the DataFrame has 0 rows"),
-    (_frame(gyro_x=None)[:1], {"units": "deg/h"}, "give it with rate=HZ"),
-    (_frame(gyro_x=None).set_index(pd.DatetimeIndex(["2026-03-01"] * 200)), {"units": "deg/h"},
-     "all stamps are the same.*make_log"),
+    (make_table(gyro_x=None)[:0], {"units": "deg/h"}, "the DataFrame has 0 rows"),
+    (make_table(gyro_x=None)[:1], {"units": "deg/h"}, "give it with rate=HZ"),
+    (make_table(gyro_x=None).set_index(pd.DatetimeIndex(["2026-03-01"] * 200)),
+     {"units": "deg/h"}, "all stamps are the same.*make_log"),
 ])  # fmt: skip
 def test_errors_on_tables_advise_keywords_and_nothing_of_files(table, options, expected):
     with pytest.raises(GyrostabError, match=expected) as raised:
@@ -673,7 +674,7 @@ def test_errors_on_tables_advise_keywords_and_nothing_of_files(table, options, e
 
 def test_notes_on_tables_advise_keywords():
     with pytest.warns(UserWarning, match=r"units=\{'temperature': 'degC'\}"):
-        log = gyrostab.from_dataframe(_frame(gyro_x=None, temperature=None), units="deg/h")
+        log = gyrostab.from_dataframe(make_table(gyro_x=None, temperature=None), units="deg/h")
     assert not any("--" in note for note in log.attrs["notes"])
 
 

@@ -45,7 +45,7 @@ def iso(blocks: xr.Dataset, seconds: float) -> str:
     return f"{(start + np.timedelta64(round(seconds * 1e9), 'ns')).astype('datetime64[ms]')}Z"
 
 
-def _mismatch(
+def _make_mismatch(
     blocks: xr.Dataset,
     view: str,
     axes: Sequence[str],
@@ -100,7 +100,7 @@ def _located_mismatches(
         }
         region["axes"] = str(region["axes"]).split()
         out.append(
-            _mismatch(
+            _make_mismatch(
                 blocks,
                 region["view"],
                 region["axes"],
@@ -150,7 +150,7 @@ def identified_mismatches(
                 p_value,
             )
             out.append(
-                _mismatch(
+                _make_mismatch(
                     blocks,
                     view,
                     identification.axes,
@@ -200,7 +200,9 @@ def unidentified_mismatches(
             f"({chance(p_value)})."
         )
         taus = (block, longest) if view == "mean" else (1.0 / rate, block)
-        out.append(_mismatch(blocks, view, unidentified.axes, (begin, end), taus, p_value, text))
+        out.append(
+            _make_mismatch(blocks, view, unidentified.axes, (begin, end), taus, p_value, text)
+        )
     return out
 
 
@@ -243,7 +245,7 @@ def motion_mismatches(
             1.0 / float(blocks.attrs["sampling_rate_hz"]),
             max((last - first) / 2.0, float(blocks.attrs["block_s"])),
         )
-        out.append(_mismatch(blocks, "mean", [axis], (first, last), taus, MIN_P_VALUE, text))
+        out.append(_make_mismatch(blocks, "mean", [axis], (first, last), taus, MIN_P_VALUE, text))
     return out
 
 

@@ -51,7 +51,7 @@ def begins_like(path: Path, pattern: bytes | re.Pattern[bytes], *suffixes: str) 
 def refuse_unread(path: Path) -> None:
     """Raise an error for a file of a format that is recognised but not read."""
     head = read_head(path)
-    if _decompress(head).startswith(_R_DATA):
+    if _decompress_head(head).startswith(_R_DATA):
         raise FormatError(
             f"{path.name}: this is a file of R data, which is not read; save it as CSV in R: "
             "write.csv(as.data.frame(x), 'log.csv', row.names = FALSE)"
@@ -65,7 +65,7 @@ def refuse_unread(path: Path) -> None:
         raise FormatError(f"{path.name}: this file is packed; unpack it and give the files in it")
 
 
-def _decompress(head: bytes) -> bytes:
+def _decompress_head(head: bytes) -> bytes:
     """Decompress the first bytes, or return them if they are not compressed."""
     try:
         if head.startswith(b"\x1f\x8b"):
