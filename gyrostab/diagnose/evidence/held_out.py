@@ -37,6 +37,7 @@ from gyrostab.diagnose.evidence.products import (
     power_products,
     remove_common_part,
 )
+from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.errors import OptionError
 
 __all__ = [
@@ -45,9 +46,10 @@ __all__ = [
     "held_out_evidence",
     "linear_model_factors",
     "mean_factors",
+    "mean_residual",
     "noise_columns",
+    "noise_weight",
     "stack_designs",
-    "values_by_record",
     "with_independent_cells",
 ]
 
@@ -75,18 +77,19 @@ def stack_designs(
     return np.concatenate([*products, np.empty((int(np.prod(shape)), 0))], axis=1), numbers
 
 
-def values_by_record(values: xr.DataArray, *dims: str) -> Array:
-    """Return values with `dims` first and records last; one record if there is no such dim."""
-    array = values if "record" in values.dims else values.expand_dims("record")
-    return np.asarray(array.transpose(*dims, "record").values, dtype=np.float64)
+def mean_residual(data: xr.Dataset, baseline: xr.Dataset, axis: str) -> Array:
+    """Return the block means of an axis less those of known effects, (block, record)."""
+    mean = data.variables["mean"].isel(axis=data["axis"].values.tolist().index(axis))
+    by_record = mean.transpose("block", ...).values.reshape(data.sizes["block"], -1)
+    return np.asarray(by_record - axis_values(baseline, "known_mean", axis)[:, None])
 
 
-def _log_weight(baseline: xr.Dataset, axis: str, tier: Tier) -> Array:
-    """Return the log weights of the noise grid."""
+def noise_weight(baseline: xr.Dataset, axis: str, tier: Tier) -> Array:
+    """Return the log weights of the grid of K and B, (grid,)."""
     if tier not in ("free", "calibrated"):
         raise OptionError(f"tier={tier!r}: there are 'free' and 'calibrated'")
     name = "grid_prior" if tier == "free" else "grid_calibrated"
-    return np.asarray(baseline[name].sel(axis=axis).values, dtype=np.float64)
+    return np.asarray(axis_values(baseline, name, axis), dtype=np.float64)
 
 
 def mean_factors(
@@ -98,6 +101,7 @@ def mean_factors(
     tier: Tier = "free",
     given: Array | None = None,
     folds: xr.DataArray | None = None,
+    walk: Array | None = None,
 ) -> Array:
     """Compute factors of designs in the block means of an axis, one record or many of equal gaps.
 
@@ -107,6 +111,8 @@ def mean_factors(
         Columns in any unit.
     given : ndarray, shape (block, column), optional
         Columns in the model with and without the design (effects already named).
+    walk : ndarray, shape (block,), optional
+        Growth of the variance of a random walk in addition to the baseline [degree2 hour-2 s-1].
 
     Returns
     -------
@@ -115,7 +121,7 @@ def mean_factors(
         evidence without any design.
     """
     n = data.sizes["block"]
-    values = values_by_record((data["mean"] - baseline["known_mean"]).sel(axis=axis), "block")
+    values = mean_residual(data, baseline, axis)
     columns, numbers = stack_designs(designs, (n,))
     columns_given = (
         np.empty((n, 0)) if given is None else np.asarray(given, dtype=np.float64).reshape(n, -1)
@@ -127,6 +133,8 @@ def mean_factors(
         "step": float(data["end"][0] - data["begin"][0]),
         "pairs": column_pairs(columns.shape[1], numbers, columns_given.shape[1]),
     }
+    if walk is not None:
+        setup["wander"] = setup["wander"].with_walk(walk)
     white = mean_products(
         values[:, :0],
         columns,
@@ -138,7 +146,7 @@ def mean_factors(
     precision = np.diag(1.0 / np.square(np.where(errors > 0.0, errors, 1.0) * WIDTHS[-1]))
     without_given = marginalise(white, columns_given.shape[1], precision)
     limits = factor_errors(raw_square[:design_width], np.diagonal(without_given.gram[0]))
-    log_weight = _log_weight(baseline, axis, tier)
+    log_weight = noise_weight(baseline, axis, tier)
     subsets = fold_subsets(fold_blocks(data) if folds is None else folds)
     out = np.empty((len(subsets), 1 + len(designs), values.shape[1]))
     for number, subset in enumerate(subsets):
@@ -165,15 +173,15 @@ def noise_columns(baseline: xr.Dataset, *, axis: str, tier: Tier = "free") -> tu
     precision : ndarray, shape (term, term)
         For changes of the squared coefficients.
     """
-    spectrum = baseline["spectrum"].sel(axis=axis).values
-    columns = baseline["columns"].sel(axis=axis).values / spectrum[..., None]
-    square = baseline["square"].sel(axis=axis).values
-    error = baseline["square_stderr"].sel(axis=axis).values
+    spectrum = axis_values(baseline, "spectrum", axis)
+    columns = axis_values(baseline, "columns", axis) / spectrum[..., None]
+    square = axis_values(baseline, "square", axis)
+    error = axis_values(baseline, "square_stderr", axis)
     if tier == "free":
         names = [str(name) for name in baseline["noise"].values]
         freedom = np.array([{"Q": 1.0, "N": 1e3, "B": 3.0, "K": 3.0}[name] for name in names])
         if "posterior" in baseline:
-            within = baseline["posterior"].sel(axis=axis).values.std(axis=0)
+            within = axis_values(baseline, "posterior", axis).std(axis=0)
             error = np.where(np.array(names) == "Q", np.minimum(error, within), error)
         error = freedom * np.hypot(square, error)
     free = error > 0.0

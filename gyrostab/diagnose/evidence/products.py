@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.folds import FOLDS
 from gyrostab.diagnose.evidence.wandering import RandomProcesses, expected_processes
+from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.kernels.regression.evidence import chosen_products, mixed_evidence
 from gyrostab.kernels.regression.state_space import flicker_states, whiten
 from gyrostab.noise import HOUR
@@ -82,9 +83,9 @@ def factor_errors(before: Array, after: Array) -> Array:
 def axis_noise(baseline: xr.Dataset, axis: str) -> dict[str, Any]:
     """Return the noise of the means of an axis, as `mean_products` takes it."""
     return {
-        "variance": baseline["mean_variance"].sel(axis=axis).values,
-        "K": baseline["grid_K"].sel(axis=axis).values,
-        "B": baseline["grid_B"].sel(axis=axis).values,
+        "variance": axis_values(baseline, "mean_variance", axis),
+        "K": axis_values(baseline, "grid_K", axis),
+        "B": axis_values(baseline, "grid_B", axis),
         "wander": expected_processes(baseline, axis),
     }
 

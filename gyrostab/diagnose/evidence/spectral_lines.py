@@ -9,6 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.folds import FOLDS
+from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.line_levels import EDGE_LINES, LEAK_LINES, level_around, local_level
 
@@ -78,8 +79,8 @@ def line_skirt(
     The skirt extends on both sides until the power falls to the level. A line with a wandering
     phase is wider than the leakage; its slopes are not further lines.
     """
-    weight = blocks["line_weight"].sel(axis=axis).values
-    power = blocks["line_power"].sel(axis=axis).values
+    weight = axis_values(blocks, "line_weight", axis)
+    power = axis_values(blocks, "line_power", axis)
     good = (weight > 0) & np.isfinite(power).all(axis=1)
     count = float(weight[good].sum())
     total = (power[good] * weight[good, None]).sum(axis=0) / max(count, 1e-300)

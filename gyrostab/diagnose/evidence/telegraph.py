@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.evidence.held_out import values_by_record
+from gyrostab.diagnose.evidence.held_out import mean_residual
 from gyrostab.diagnose.evidence.products import (
     WIDTHS,
     Products,
@@ -28,6 +28,7 @@ from gyrostab.diagnose.evidence.products import (
     mean_products,
     scale_columns,
 )
+from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.regression.evidence import mixed_evidence
 from gyrostab.kernels.regression.levels import level_tables, levels_smooth
@@ -288,14 +289,14 @@ def telegraph_evidence(
     `min_switches` switches. Data, baseline and given columns are as in
     `gyrostab.diagnose.evidence.held_out.mean_factors`.
     """
-    values = values_by_record((data["mean"] - baseline["known_mean"]).sel(axis=axis), "block")
+    values = mean_residual(data, baseline, axis)
     setup = axis_noise(baseline, axis)
     variance = setup["variance"]
     present = np.asarray(np.isfinite(values).all(axis=1)) & np.isfinite(variance)
     n = present.size
     scaled_given = scale_columns(given, n)
     setup |= {"step": float(data["end"][0] - data["begin"][0]), "present": present}
-    log_weight = baseline["grid_prior"].sel(axis=axis).values
+    log_weight = axis_values(baseline, "grid_prior", axis)
     safe = np.where(present[:, None], values, 0.0)
     evidence_nats, attempts = [], []
     for count in _DRIFT_WAVES:

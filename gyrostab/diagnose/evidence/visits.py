@@ -22,6 +22,7 @@ from gyrostab.diagnose.evidence.products import (
     mean_products,
     scale_columns,
 )
+from gyrostab.diagnose.reduce.schema import axis_values
 
 __all__ = ["Visits", "compare_visits", "visit_columns"]
 
@@ -73,7 +74,7 @@ def compare_visits(
     Both levels are equally likely to be that level. The share is that of each block, or (block,
     part) of its parts, on the upper level.
     """
-    y = mean - baseline["known_mean"].sel(axis=axis).values
+    y = mean - axis_values(baseline, "known_mean", axis)
     present = np.isfinite(y)
     parts = share.reshape(y.size, -1)
     levels = [
@@ -94,7 +95,7 @@ def compare_visits(
         **axis_noise(baseline, axis),
     )
     base_count = 1 + effect_columns.shape[1]
-    log_weight = baseline["grid_prior"].sel(axis=axis).values
+    log_weight = axis_values(baseline, "grid_prior", axis)
     same, step = _log_evidence(products, np.arange(base_count), base_count, 0.0, log_weight)
     first = base_count + np.cumsum([0, *(len(visits) for visits in levels)])
     free = [

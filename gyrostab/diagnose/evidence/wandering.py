@@ -8,6 +8,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.reduce.schema import axis_values
+
 __all__ = ["RandomProcesses", "block_mean_variance", "expected_processes", "with_walk"]
 
 Array = NDArray[np.float64]
@@ -20,18 +22,21 @@ class RandomProcesses(NamedTuple):
     time: Array  # (process,): their correlation times [s]
     walk: Array  # (block,): growth of the variance of random walks [degree2 hour-2 s-1]
 
+    def with_walk(self, walk: Array) -> RandomProcesses:
+        """Return the processes with another random walk."""
+        return self._replace(walk=self.walk + walk)
+
 
 def expected_processes(baseline: xr.Dataset, axis: str | int) -> RandomProcesses:
     """Return the random processes expected in the mean of an axis, by name or index."""
     if "wander_square" not in baseline:
         return RandomProcesses(np.empty(0), np.empty(0), np.zeros(baseline.sizes["block"]))
-    processes = baseline[["wander_square", "wander_time", "wander_walk"]]
-    processes = processes.isel(axis=axis) if isinstance(axis, int) else processes.sel(axis=axis)
-    active = processes["wander_square"].values > 0.0
+    square = axis_values(baseline, "wander_square", axis)
+    active = square > 0.0
     return RandomProcesses(
-        processes["wander_square"].values[active],
-        processes["wander_time"].values[active],
-        processes["wander_walk"].values,
+        square[active],
+        baseline.variables["wander_time"].values[active],
+        axis_values(baseline, "wander_walk", axis),
     )
 
 
@@ -41,7 +46,7 @@ def with_walk(baseline: xr.Dataset, axis: str, walk: Array) -> xr.Dataset:
     The walk (block,) is the growth of its variance [degree2 hour-2 s-1].
     """
     axes = baseline["axis"].values.tolist()
-    total = np.stack([expected_processes(baseline, row).walk for row in range(len(axes))])
+    total = np.stack([expected_processes(baseline, name).walk for name in axes])
     total[axes.index(axis)] += walk
     values: dict[str, tuple[tuple[str, ...], Array]] = {"wander_walk": (("axis", "block"), total)}
     if "wander_square" not in baseline:

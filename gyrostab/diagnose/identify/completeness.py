@@ -15,6 +15,7 @@ from gyrostab.diagnose.identify.identification import Identification, components
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import mean_mixture
+from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.noise import HOUR
 
 __all__ = ["excess_low_frequency_noise", "variance_fluctuation", "with_neighbouring_variants"]
@@ -59,8 +60,8 @@ def excess_low_frequency_noise(state: State, axis: str, folds: xr.DataArray) -> 
     evidence, strength = [], []
     span = state.blocks.sizes["block"] * float(state.blocks.attrs["block_s"])
     slow = (
-        state.baseline["grid_K"].sel(axis=axis).values ** 2 * span / HOUR
-        + state.baseline["grid_B"].sel(axis=axis).values ** 2
+        axis_values(state.baseline, "grid_K", axis) ** 2 * span / HOUR
+        + axis_values(state.baseline, "grid_B", axis) ** 2
     )
     for tier in ("free", "calibrated"):
         evidence.append(
@@ -121,13 +122,13 @@ def _power_levels(state: State, row: int, axis: str) -> tuple[Array, Array, Arra
 
     The level is relative to the expected one, less 1.
     """
-    shape = state.baseline["shape_alone"].sel(axis=axis).values
+    shape = axis_values(state.baseline, "shape_alone", axis)
     ratio = state.blocks["power"].values[row] / state.weight[row] - 1.0
     use = np.where(np.isfinite(shape) & np.isfinite(ratio), shape, 0.0)
     total = use.sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         level = (use * np.nan_to_num(ratio)).sum(axis=1) / total
-        variance = 1.0 / total + state.baseline["common"].sel(axis=axis).values
+        variance = 1.0 / total + axis_values(state.baseline, "common", axis)
         named = [
             (use * column / state.weight[row]).sum(axis=1) / total
             for column in state.given.get(("power", axis), [])

@@ -12,6 +12,7 @@ from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import Mixture, component_mixture, mean_mixture
 from gyrostab.diagnose.predict.windows import TIME_PARAMETER
+from gyrostab.diagnose.reduce.schema import axis_values
 
 __all__ = ["event_nats", "gradual_nats", "is_free_jump", "is_step", "scatter_nats"]
 
@@ -148,7 +149,7 @@ def _possible_variances(component: Component, state: State) -> list[Array]:
         for length in lengths
         for blocks_before, blocks_after in ((length, length), (0, length), (length, 0))
     }
-    usual = state.baseline["mean_variance"].sel(axis=axis).values
+    usual = axis_values(state.baseline, "mean_variance", axis)
     inside = [(block >= first) & (block < stop) for first, stop in sorted(spans)]
     return [
         usual,

@@ -11,6 +11,7 @@ from gyrostab.diagnose.evidence.telegraph import telegraph_evidence
 from gyrostab.diagnose.evidence.visits import compare_visits
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.statistics.telegraph import add_fast_switching, fast_switching_evidence
 
 __all__ = ["further_level_nats", "unequal_levels_nats"]
@@ -85,7 +86,7 @@ def _unequal_nats(component: Component, state: State) -> float:
 def _compare_course(share: Array, axis: str, given_columns: Sequence[Array], state: State) -> float:
     """Return the evidence of a course for levels that differ, at least 0 with few switches."""
     visits = compare_visits(
-        state.blocks["mean"].sel(axis=axis).values,
+        axis_values(state.blocks, "mean", axis),
         state.baseline,
         share,
         axis=axis,

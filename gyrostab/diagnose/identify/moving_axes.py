@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.identify.identification import Identification, components_of
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.progress import Stage, no_stage
 
@@ -128,7 +129,7 @@ def unexplained_motion(
         if axis in explained_axes or (
             columns
             and _is_explained(
-                blocks["mean"].sel(axis=axis).values,
+                axis_values(blocks, "mean", axis),
                 moving[row],
                 np.stack(columns, axis=1),
                 settings,

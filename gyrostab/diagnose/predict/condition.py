@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.evidence.held_out import noise_columns
 from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.linear_model import State, pair_rows
+from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
 __all__ = [
@@ -129,7 +130,7 @@ def drop_changed_tails(
     left_out = {"kurtosis": (unusual, np.nan), "outliers": (turns, 0)}
     return blocks.assign(
         {
-            name: blocks[name].where(xr.DataArray(~where, dims=("axis", "block")), replacement)
+            name: blocks[name].copy(data=np.where(where, replacement, blocks[name].values))
             for name, (where, replacement) in left_out.items()
             if name in blocks
         }
@@ -141,7 +142,7 @@ _ROUNDS = 4  # steps of Fisher scoring
 
 def _fit_powers(state: State, row: int, axis: str, named: Array) -> tuple[Array, Array]:
     """Fit the powers of an axis; return them and the sizes of the named columns."""
-    expected = state.baseline["spectrum"].sel(axis=axis).values
+    expected = axis_values(state.baseline, "spectrum", axis)
     level, precision = noise_columns(state.baseline, axis=axis)
     columns = np.concatenate([level * expected[..., None], named], axis=-1).reshape(
         expected.size, -1

@@ -11,6 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.predict.windows import make_windows
+from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.kernels.spectra.line_levels import local_level
 from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Prediction
@@ -102,8 +103,8 @@ def undo_filter(
     """
     frequency = blocks["line_frequency"].values
     full = _response_at(effects()[effect].example(**values), blocks, frequency)
-    weight = blocks["line_weight"].sel(axis=axis).values
-    power = blocks["line_power"].sel(axis=axis).values
+    weight = axis_values(blocks, "line_weight", axis)
+    power = axis_values(blocks, "line_power", axis)
     good = (weight > 0) & np.isfinite(power).all(axis=1)
     response = full
     if good.any():

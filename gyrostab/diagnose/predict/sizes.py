@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.evidence.products import mean_products
-from gyrostab.diagnose.evidence.wandering import expected_processes
+from gyrostab.diagnose.evidence.held_out import Tier, mean_residual, noise_weight
+from gyrostab.diagnose.evidence.products import axis_noise, mean_products
 from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
 
@@ -87,7 +86,7 @@ def mean_mixture(
     axis: str,
     columns: Sequence[Array],
     *,
-    tier: str = "free",
+    tier: Tier = "free",
     variance: Array | None = None,
 ) -> Mixture:
     """Compute the sizes of columns of the block means of an axis, over the grid of K and B.
@@ -103,27 +102,23 @@ def mean_mixture(
         White variance of the means instead of the baseline's [degree2 hour-2].
     """
     baseline = state.baseline
-    row = state.axes.index(axis)
-    y = (state.blocks["mean"] - baseline["known_mean"]).values[row]
+    y = mean_residual(state.blocks, baseline, axis)[:, 0]
     all_columns = [*columns, *state.given.get(("mean", axis), [])]
     stacked = np.stack(all_columns, axis=1) if all_columns else np.empty((y.size, 0))
     present = np.isfinite(y)
     size = np.abs(stacked - stacked.mean(axis=0)).max(axis=0)
     size = np.where(size > 0.0, size, 1.0)
-    grid: dict[str, Any] = {
-        "K": baseline["grid_K"].sel(axis=axis).values,
-        "B": baseline["grid_B"].sel(axis=axis).values,
-    }
+    noise = axis_noise(baseline, axis)
+    if variance is not None:
+        noise["variance"] = variance
     products = mean_products(
         np.where(present, y, 0.0)[:, None],
         stacked / size,
-        variance=baseline["mean_variance"].sel(axis=axis).values if variance is None else variance,
+        **noise,
         step=float(state.blocks.attrs["block_s"]),
         present=present,
-        wander=expected_processes(baseline, axis),
-        **grid,
     )
-    prior = baseline["grid_prior" if tier == "free" else "grid_calibrated"].sel(axis=axis).values
+    prior = noise_weight(baseline, axis, tier)
     own_count = len(columns)
     gram = products.gram + _RIDGE * np.eye(stacked.shape[1]) * (
         1.0 + np.trace(products.gram, axis1=1, axis2=2)[:, None, None]

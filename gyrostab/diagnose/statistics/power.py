@@ -25,6 +25,7 @@ from gyrostab.diagnose.predict.linear_model import (
     stack_designs,
     unspread_share,
 )
+from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.statistics.base import Region, Statistic, column_choices
 from gyrostab.diagnose.statistics.scores import (
     Array,
@@ -155,9 +156,9 @@ class Power(Statistic):
     ) -> LinearModel:
         """Build the model of the band powers of an axis."""
         axis = state.axes[row]
-        expected = state.baseline["spectrum"].sel(axis=axis).values
+        expected = axis_values(state.baseline, "spectrum", axis)
         values = records_last(data["power"].values, 3)[row] - expected[..., None]
-        weight = state.baseline["shape_alone"].sel(axis=axis).values / state.weight[row] ** 2
+        weight = axis_values(state.baseline, "shape_alone", axis) / state.weight[row] ** 2
         weight = np.where(state.masked[row][:, None], 0.0, weight)
         level, precision = noise_columns(state.baseline, axis=axis)
         level_columns = [level[..., number] * expected for number in range(level.shape[2])]
@@ -172,7 +173,7 @@ class Power(Statistic):
         )
         return with_independent_cells(
             LinearModel(values, weight, designs, given, given_precision),
-            state.baseline["common"].sel(axis=axis).values,
+            axis_values(state.baseline, "common", axis),
             state.weight[row],
         )
 

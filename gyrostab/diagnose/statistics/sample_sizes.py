@@ -11,6 +11,7 @@ from scipy.special import gammaincinv, ndtr, ndtri
 
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.reduce.outliers import outlier_limit
+from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import INTERVAL_TAILS, Settings
 from gyrostab.noise import NORMAL_95
 from gyrostab.units import HOUR
@@ -183,7 +184,7 @@ def _estimate_outliers(blocks: xr.Dataset, axis: str) -> tuple[float, float, flo
     those not seen is undetermined.
     """
     count, excess, samples = (
-        blocks[name].sel(axis=axis).values.astype(np.float64)
+        axis_values(blocks, name, axis).astype(np.float64)
         for name in ("peaks", "kurtosis", "samples")
     )
     good = (count > 0.0) & np.isfinite(excess) & (excess > 0.0)
@@ -197,7 +198,7 @@ def _estimate_outliers(blocks: xr.Dataset, axis: str) -> tuple[float, float, flo
     tails = np.minimum(excess[good] + 3.0, (1.0 - 1e-4) * max_excess)
     half, margin = tails - 3.0, max_excess - tails
     share = (half + np.sqrt(half**2 + margin * half)) / margin
-    variance = blocks["variance"].sel(axis=axis).values
+    variance = axis_values(blocks, "variance", axis)
     # most blocks may have spikes: the median of all is not that of the noise
     clean = (count == 0.0) & (variance > 0.0)
     is_enough = clean.sum() >= MIN_CLEAN_BLOCKS

@@ -18,6 +18,7 @@ from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.linear_model import State, cross_column, pair_rows
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.predict.windows import rebuild_variant
+from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import INTERVAL_TAILS
 from gyrostab.noise import NORMAL_95
 
@@ -165,7 +166,7 @@ def _max_factor(axis: str, variant: Variant, state: State) -> float:
     blocks = state.blocks
     row = next(number for number, pair in enumerate(pair_rows(blocks)) if axis in pair)
     design = cross_column(variant.design[0], row, blocks).real
-    power, shape = (blocks[name].sel(axis=axis).values for name in ("power", "shape"))
+    power, shape = (axis_values(blocks, name, axis) for name in ("power", "shape"))
     weight = (
         np.where(np.isfinite(power) & np.isfinite(shape), shape, 0.0)
         / state.weight[state.axes.index(axis)] ** 2

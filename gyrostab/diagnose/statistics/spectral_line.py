@@ -24,6 +24,7 @@ from gyrostab.diagnose.predict.condition import bands_at, free_covariance
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import Trial
 from gyrostab.diagnose.reduce.block_statistics import MIN_BLOCKS
+from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics.base import Region, SizeFit, Sizes, Statistic
 from gyrostab.diagnose.statistics.scores import (
@@ -331,8 +332,8 @@ def line_quality(blocks: xr.Dataset, baseline: xr.Dataset, axis: str, place: int
         return math.inf
     frequency = float(blocks["line_frequency"].values[place])
     band = int(np.abs(np.log(blocks["frequency"].values / frequency)).argmin())
-    power, shape = (blocks[name].sel(axis=axis).values[:, band] for name in ("power", "shape"))
-    noise = baseline["spectrum"].sel(axis=axis).values[:, band]
+    power, shape = (axis_values(blocks, name, axis)[:, band] for name in ("power", "shape"))
+    noise = axis_values(baseline, "spectrum", axis)[:, band]
     good = np.isfinite(power) & (shape > 0.0)
     if good.sum() < MIN_BLOCKS:
         return math.inf

@@ -31,6 +31,7 @@ from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State, power_column
 from gyrostab.diagnose.predict.search import Trial
 from gyrostab.diagnose.predict.sizes import component_mixture
+from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.statistics.base import SizeFit, Sizes
 from gyrostab.diagnose.statistics.mean import BlockMeanStatistic, condition_means
 
@@ -163,7 +164,7 @@ def _search_fast_switching(
         return None, switching.refuted and float(
             course.times[0].min()
         ) < state.settings.refuted_blocks
-    deviation = float(np.sqrt(np.nanmedian(state.baseline["mean_variance"].sel(axis=axis).values)))
+    deviation = float(np.sqrt(np.nanmedian(axis_values(state.baseline, "mean_variance", axis))))
     # in block means the share of a block on a level is known to half of one of its parts
     error = float(course.step[0]) / (2.0 * PARTS_PER_BLOCK)
     coarse = np.isfinite(evidence_nats) and error < state.settings.visible_sigma * deviation
@@ -215,7 +216,7 @@ def _with_free_levels(evidence: CandidateEvidence, trial: Trial) -> CandidateEvi
             continue
         inside = best[row].inside
         visits = compare_visits(
-            trial.data["mean"].sel(axis=axis).values,
+            axis_values(trial.data, "mean", axis),
             trial.state.baseline,
             inside if inside.size else best[row].design[0, 0],
             axis=axis,
