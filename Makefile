@@ -39,14 +39,13 @@ test: $(VENV)/.installed-test  ## install, and run the tests
 	$(BIN)/python $(PYTEST)
 
 test-diagnoses: $(VENV)/.installed-test  ## the whole diagnoses, the statistics and the reports in Chromium that make test leaves out
-	$(BIN)/python $(PYTEST) -m slow tests/diagnose tests/allan tests/correlate tests/pipelines tests/report \
-		tests/blindtest/test_prove.py
+	$(BIN)/python $(PYTEST) -m "slow and not full" tests
 
 test-install: $(VENV)/.installed-test  ## the README in a fresh checkout, and the wheel in a bare environment
-	$(BIN)/python -m pytest -n0 -m slow tests/packaging $(if $(ONLY),-k $(ONLY))
+	$(BIN)/python -m pytest -n0 -m install tests/packaging $(if $(ONLY),-k $(ONLY))
 
 test-full: $(VENV)/.installed-test  ## all tests: also whole diagnoses and calibrations, and more random examples
-	$(BIN)/python $(PYTEST) -m "slow or not slow" --hypothesis-profile full
+	$(BIN)/python $(PYTEST) -m "" --hypothesis-profile full
 
 $(VENV)-minimum/.installed: pyproject.toml tests/support/minimum_versions.py
 	test -x $(VENV)-minimum/bin/python || $(PYTHON) -m venv $(VENV)-minimum

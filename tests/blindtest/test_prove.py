@@ -257,7 +257,7 @@ def test_failed_diagnosis_is_reported_and_retried(small, tmp_path, monkeypatch):
     assert resumed.table.set_index("quantity").loc["detected, strength 1.5 or more", "value"] == 1.0
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_injections_are_committed_and_scored_separately(small, tmp_path, monkeypatch, recordings):
     real = recordings("mems-static-53min/ch104.csv.gz").parents[1]
     monkeypatch.setattr(core, "_CASES_PER_INJECTION", 1)

@@ -1,6 +1,6 @@
 """A small benchmark of every kind of case, and one of a random seed that is diagnosed as well.
 
-The random seed is printed; `GYROSTAB_PROVE_SEED=... python -m pytest -m slow
+The random seed is printed; `GYROSTAB_PROVE_SEED=... python -m pytest -m full
 tests/blindtest/test_prove_fresh.py` repeats the run.
 """
 
@@ -43,7 +43,7 @@ def plans_of_each_kind(number: int, *, seed: int) -> list[dict]:
     return [first[kind] for kind in KINDS][:number]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_each_kind_of_case_is_committed_and_scored(tmp_path, monkeypatch):
     """All cases get the same diagnosis, with two effects of vibration."""
     monkeypatch.setattr("gyrostab.blindtest.scenarios.plan.plan_cases", plans_of_each_kind)
@@ -56,7 +56,7 @@ def test_each_kind_of_case_is_committed_and_scored(tmp_path, monkeypatch):
     assert rows["kind"].value_counts()["triple"] == 3
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.timeout(1800)
 def test_random_cases_are_committed_diagnosed_and_scored(tmp_path, monkeypatch, capsys):
     seed = int(

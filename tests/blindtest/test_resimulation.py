@@ -169,7 +169,7 @@ EASIER_MODELS: list[tuple[dict[str, Any], dict[str, Any]]] = [
 
 @pytest.mark.parametrize(
     ("effect", "wrong"),
-    [*WRONG_MODELS, *(pytest.param(*pair, marks=pytest.mark.slow) for pair in EASIER_MODELS)],
+    [*WRONG_MODELS, *(pytest.param(*pair, marks=pytest.mark.full) for pair in EASIER_MODELS)],
     ids=lambda value: " ".join(str(value) for value in value.values()),
 )
 def test_wrong_model_loses_against_the_right_one(effect: dict[str, Any], wrong: dict[str, Any]):

@@ -329,7 +329,7 @@ def test_cycles_are_looked_for_seldom_and_afterwards_as_before(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "name", ["SIGINT", "SIGTERM", pytest.param("SIGHUP", marks=pytest.mark.slow)]
+    "name", ["SIGINT", "SIGTERM", pytest.param("SIGHUP", marks=pytest.mark.full)]
 )
 def test_a_real_interrupt_leaves_nothing_behind(tmp_path, name):
     path = write_log(tmp_path / "long.csv")

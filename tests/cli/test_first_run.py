@@ -47,7 +47,7 @@ print(hashlib.sha256(b"".join(part.tobytes() for part in found)).hexdigest())
 
 
 @pytest.mark.parametrize(
-    "code", [SOLVE, pytest.param(FIT, marks=pytest.mark.slow)], ids=["small", "large"]
+    "code", [SOLVE, pytest.param(FIT, marks=pytest.mark.full)], ids=["small", "large"]
 )
 def test_the_process_that_compiles_gets_the_same_bits_as_those_that_load(tmp_path, code) -> None:
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}

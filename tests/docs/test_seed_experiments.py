@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "seeds.md"
 
 
-SLOW = [pytest.mark.slow]
+SLOW = [pytest.mark.full]
 SCRIPT = load_script("docs/generate/seed_experiments.py")
 ERRATA = load_script("benchmarks/seed_errata.py")
 

@@ -18,7 +18,7 @@ SEED = 7
 COUNT = 40  # inputs of each format
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_every_seed_is_read() -> None:
     """The inputs are valid before the harness damages them."""
     wrong = []
@@ -31,7 +31,7 @@ def test_every_seed_is_read() -> None:
     assert not wrong, "\n".join(map(str, wrong))
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.timeout(900)
 def test_damaged_inputs_end_with_exit_code_0_or_2() -> None:
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
@@ -40,7 +40,7 @@ def test_damaged_inputs_end_with_exit_code_0_or_2() -> None:
     assert not failures, "\n".join(map(str, failures))
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_an_input_follows_from_its_number() -> None:
     assert make_input("netcdf4", SEED, 3) == make_input("netcdf4", SEED, 3)
 

@@ -441,7 +441,7 @@ print(few, through(files))
     not Path("/proc/self/status").exists(),
     reason="only Linux tells the peak of the memory this way",
 )
-@pytest.mark.slow
+@pytest.mark.full
 def test_memory_does_not_grow_with_the_number_of_files(tmp_path: Path) -> None:
     """Files of six chunks of 256 KiB, the last of each axis short, which overlap a little."""
     size, paths = 70_000, []

@@ -196,7 +196,7 @@ class TestWitsml:
         }
         assert ranges["temperature"] == 85.0
 
-    @pytest.mark.slow
+    @pytest.mark.full
     @pytest.mark.parametrize("speed", [None, 0.5])
     def test_standard_binding_reads_and_writes_the_same_elements(self, tmp_path, speed):
         """Names, order, types and required elements are those of the schema of WITSML 2.1."""

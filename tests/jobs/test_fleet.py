@@ -515,7 +515,7 @@ main(sys.argv[1:])
 """
 
 
-@pytest.mark.slow  # 570 requests of a server in Python
+@pytest.mark.full  # 570 requests of a server in Python
 def test_a_fleet_killed_while_it_writes_to_a_bucket_goes_on(s3_bucket, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for number in range(2):

@@ -416,7 +416,7 @@ def test_two_runs_of_one_output_at_once(log, tmp_path, capfd):
     assert call(log, "-o", output) == 0
 
 
-@pytest.mark.parametrize(("calls", "kills"), [(4, 2), pytest.param(16, 8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("calls", "kills"), [(4, 2), pytest.param(16, 8, marks=pytest.mark.full)])
 def test_killed_before_changes_of_the_disk_and_at_random(log, tmp_path, calls, kills):
     seed = random.SystemRandom().randrange(10**6)
     print(f"seed {seed}")

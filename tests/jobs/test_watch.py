@@ -143,7 +143,7 @@ def test_a_growing_file_gives_the_bits_of_a_run_over_the_whole(rows, whole, tmp_
     assert any("out of order" in note for note in recorder.notes)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_file_that_comes_late_changes_earlier_windows(rows, tmp_path):
     """The file with the middle of the record comes last, and after a restart."""
     folder = tmp_path / "in"
@@ -308,8 +308,8 @@ def test_the_page_serves_this_machine_only_and_data_as_data():
 @pytest.mark.parametrize(
     "number",
     [
-        pytest.param(signal.SIGINT, marks=pytest.mark.slow),
-        pytest.param(signal.SIGKILL, marks=pytest.mark.slow),
+        pytest.param(signal.SIGINT, marks=pytest.mark.full),
+        pytest.param(signal.SIGKILL, marks=pytest.mark.full),
     ],
 )
 def test_a_command_that_is_stopped_or_killed_is_continued(number, tmp_path):

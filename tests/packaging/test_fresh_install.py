@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
+pytestmark = [pytest.mark.install, pytest.mark.timeout(1200)]
 ROOT = Path(__file__).resolve().parents[2]
 TUTORIAL_CELL = re.compile(
     r"^```\{code-cell\} python\n(?::[^\n]*\n)*(.*?)^```$", re.MULTILINE | re.DOTALL

@@ -56,7 +56,7 @@ def assert_same_values(left, right) -> None:
         xr.testing.assert_equal(a, b)
 
 
-@pytest.mark.parametrize("stamps", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.parametrize("stamps", [pytest.param(True, marks=pytest.mark.full), False])
 def test_logs_and_products_in_memory_have_the_bits_of_local_ones(stamps, log, local):
     to_zarr(log, "memory://archive/log.zarr", stamps=stamps)
     opened = open_log("memory://archive/log.zarr")
@@ -74,7 +74,7 @@ def test_logs_and_products_in_memory_have_the_bits_of_local_ones(stamps, log, lo
     assert not list(Path().iterdir())  # the job folder is removed
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("bucket", ["s3_bucket", "gs_bucket"])
 def test_commands_read_and_write_a_bucket(bucket, request, log, local, capsys):
     bucket = request.getfixturevalue(bucket)

@@ -46,7 +46,7 @@ def named(table: dict, *, axes: str = "xyz", mean: float = 0.0, seed: int = 1) -
             {"name": "dead_zone", "width": 0.002, "axes": ["x"]}, {}, marks=pytest.mark.slow
         ),
         pytest.param(
-            {"name": "dead_zone", "width": 0.2, "edge": "jump"}, {}, marks=pytest.mark.slow
+            {"name": "dead_zone", "width": 0.2, "edge": "jump"}, {}, marks=pytest.mark.full
         ),
         ({"name": "dead_zone", "width": 0.2, "edge": "jump", "axes": ["x"]}, {"axes": "x"}),
         pytest.param(
@@ -55,7 +55,7 @@ def named(table: dict, *, axes: str = "xyz", mean: float = 0.0, seed: int = 1) -
         pytest.param(
             {"name": "held_samples", "per_hour": 60.0, "length": 0.4, "fill": "zero"},
             {},
-            marks=pytest.mark.slow,
+            marks=pytest.mark.full,
         ),
         ({"name": "held_samples", "per_hour": 60.0, "length": 0.4, "fill": "zero"}, {"axes": "x"}),
         ({"name": "clipping", "limit": 0.6, "axes": ["y"]}, {"axes": "y"}),
@@ -155,7 +155,7 @@ def test_axis_lost_early_keeps_blocks_with_anomalous_samples():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fill", ["repeat", "zero"])
+@pytest.mark.parametrize("fill", ["repeat", pytest.param("zero", marks=pytest.mark.full)])
 def test_number_and_length_of_held_samples_are_estimated(fill):
     """Held stretches: 40 of 6 samples, and 20 of 2."""
     rng = np.random.default_rng(8)
@@ -199,7 +199,7 @@ def test_frames_that_are_sent_twice_are_held_samples(number: int) -> None:
     ("number", "kind"),
     [
         (6, "normal"),
-        pytest.param(20, "normal", marks=pytest.mark.slow),
+        pytest.param(20, "normal", marks=pytest.mark.full),
         pytest.param(60, "normal", marks=pytest.mark.slow),
         pytest.param(6, "bits", marks=pytest.mark.slow),
         (20, "bits"),

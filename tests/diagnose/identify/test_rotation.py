@@ -149,7 +149,7 @@ def test_tails_of_blocks_in_which_an_axis_turns_do_not_count():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("error", [0.0, 2e-4])
+@pytest.mark.parametrize("error", [0.0, pytest.param(2e-4, marks=pytest.mark.full)])
 def test_whole_rotation_is_the_only_effect(error: float):
     diagnosis = diagnose(_log_whole_rotation(2, error=error), nulls=100)
     (effect,) = diagnosis.effects

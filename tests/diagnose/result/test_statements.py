@@ -41,7 +41,9 @@ def shaken_blocks(seed: int, *, band_hz: tuple[float, float] | None) -> xr.Datas
     return reduce_log(log, block="20s")
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize(
+    "seed", [1, *(pytest.param(seed, marks=pytest.mark.full) for seed in (2, 3))]
+)
 @pytest.mark.parametrize("band_hz", [None, (600.0, 725.0)])
 def test_only_known_frequencies_of_aliased_vibration_are_stated(
     seed: int, band_hz: tuple[float, float] | None
@@ -138,7 +140,7 @@ def test_coarse_grid_of_angles_is_stated_beside_what_is_not_explained() -> None:
     assert "counter of angles" in str(Diagnosis(made, surfaces(), model()))
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.full)])
 def test_coarse_angle_counter_is_recognised(seed: int) -> None:
     """Two values of the log: the counter advances by a step in some samples only."""
     rng = np.random.default_rng(seed)

@@ -42,10 +42,10 @@ def place(jitter, scatter, losses, unit, *, rate=100.0, rows=20_000, seed=0, **o
         ("normal", 0.3, "none", "us"),
         ("normal", 0.5, "none", "ms"),
         ("normal", 0.6, "single", "ns"),
-        pytest.param("normal", 0.6, "bursts", "us", marks=pytest.mark.slow),
+        pytest.param("normal", 0.6, "bursts", "us", marks=pytest.mark.full),
         ("normal", 0.5, "gap", "ms"),
         ("uniform", 0.3, "single", "us"),
-        pytest.param("uniform", 0.6, "bursts", "ms", marks=pytest.mark.slow),
+        pytest.param("uniform", 0.6, "bursts", "ms", marks=pytest.mark.full),
         ("sorted", 0.6, "single", "us"),
         ("latest", 0.5, "bursts", "us"),
         ("packets", 0.3, "none", "us"),
@@ -56,7 +56,7 @@ def place(jitter, scatter, losses, unit, *, rate=100.0, rows=20_000, seed=0, **o
         ("late", 0.3, "gap", "us"),
     ],
 )
-@pytest.mark.parametrize("rate", [pytest.param(100.0, marks=pytest.mark.slow), 99.7])
+@pytest.mark.parametrize("rate", [pytest.param(100.0, marks=pytest.mark.full), 99.7])
 def test_every_row_is_kept_and_every_loss_found(jitter, scatter, losses, unit, rate):
     log, true, given, samples = place(jitter, scatter, losses, unit, rate=rate)
     assert len(given) == len(samples)

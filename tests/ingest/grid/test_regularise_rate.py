@@ -242,8 +242,8 @@ def test_even_stamps_and_then_shared_ones(
 @pytest.mark.parametrize(
     "rates",
     [
-        pytest.param((10.0, 50.0), marks=pytest.mark.slow),
-        pytest.param((10.0, 1.0), marks=pytest.mark.slow),
+        pytest.param((10.0, 50.0), marks=pytest.mark.full),
+        pytest.param((10.0, 1.0), marks=pytest.mark.full),
         (100.0, 80.0),
     ],
 )

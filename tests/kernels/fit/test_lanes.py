@@ -26,7 +26,7 @@ np.savez(sys.argv[2], *found, places=lanes.PLACES)
 """
 
 
-@pytest.mark.slow  # compiles the fit
+@pytest.mark.full  # compiles the fit
 @pytest.mark.timeout(900)
 def test_plain_numba_gives_the_fit_of_the_vectors(tmp_path):
     rng = np.random.default_rng(3)
