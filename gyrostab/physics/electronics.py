@@ -280,7 +280,7 @@ class Clipping(Effect):
     """
 
     name: ClassVar[str] = "clipping"
-    short: ClassVar[str] = "missing tails"
+    short: ClassVar[str] = "samples limited to a range"
     plain: ClassVar[str] = "clipped extremes"
     next_measurement: ClassVar[str] = "widen the output range"
     stage: ClassVar[Stage] = "electronics"

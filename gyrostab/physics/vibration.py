@@ -216,7 +216,7 @@ class AliasedVibration(Effect):
     """
 
     name: ClassVar[str] = "aliased_vibration"
-    short: ClassVar[str] = "vibration above Nyquist folded down"
+    short: ClassVar[str] = "vibration above half of the sampling rate, aliased"
     plain: ClassVar[str] = "vibration aliased by the sampling"
     next_measurement: ClassVar[str] = (
         "log at a higher rate, or with an analogue filter: an aliased band moves or disappears"
