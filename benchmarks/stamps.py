@@ -62,8 +62,8 @@ def main() -> None:
                 measure(jitter, losses, scatter, unit, rows, seed)
                 for seed, (scatter, unit) in enumerate(cases)
             ]
-            kept, error, size, row_error = (list(column) for column in zip(*results, strict=True))
-            kept_shares += kept
+            shares, error, size, row_error = (list(column) for column in zip(*results, strict=True))
+            kept_shares += shares
             rate_errors += error
             cells.append(f"{max(size)}; {max(row_error)}")
         print(f"| {jitter} | {' | '.join(cells)} |", flush=True)
