@@ -127,13 +127,13 @@ VARIABLES: dict[str, dict[str, Any]] = {
     "fit_dof": _make_attrs("degrees of freedom of the misfit"),
     "fit_tau_min": _make_attrs("shortest averaging time of the fit", "s"),
     "filter_time_constant": _make_attrs(
-        "time constant of the first-order low-pass with the effect of the filter of the sensor on "
+        "time constant of the first-order low-pass that acts like the filter of the sensor on "
         "the averaging times of the fit, 0 without a filter",
         "s",
     ),
     "filter_white_error": _make_attrs(
-        "relative standard error of N by that of filter_time_constant, which the standard error of "
-        "N includes"
+        "relative standard error of N due to filter_time_constant, included in the standard "
+        "error of N"
     ),
 }
 

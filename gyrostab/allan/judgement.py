@@ -136,7 +136,7 @@ def _judge_sampling(product: xr.Dataset) -> str:
     return (
         f"N cannot be judged: from {min(changes)[:19].replace('T', ' ')} on the samples come at "
         f"another rate than {product.attrs['sampling_rate_hz']:.6g} Hz, so their times and "
-        "coefficients are wrong; split the log there and run the parts on their own."
+        "coefficients are wrong; split the log there and run the parts separately."
     )
 
 
@@ -256,9 +256,11 @@ def _judge_terms(product: xr.Dataset, absences: dict[tuple[str, str], list[str]]
         return f"All five terms are observed {where}{_list_absences(product, absences)}."
     if len(hidden) == len(LAWS):  # the terms do not describe the record, which has a sentence
         return f"No term is observed {where}."
-    text = f"{join_words(hidden)} {'is' if len(hidden) == 1 else 'are'} not observed {where}"
-    if observed_share.sel(term=hidden).any():
-        text += f" more often than by chance (in up to {100 * _FALSE_ALARMS:.0f} % of them)"
+    chance = f"no more often than by chance (in up to {100 * _FALSE_ALARMS:.0f} % of them)"
+    is_rare = bool(observed_share.sel(term=hidden).any())
+    text = f"{join_words(hidden)} {'is' if len(hidden) == 1 else 'are'} " + (
+        f"observed {where} {chance}" if is_rare else f"not observed {where}"
+    )
     white = float(product["N"].where(product["observable"].sel(term="N") == OBSERVED).median())
     if hidden == ["Q"]:
         return f"{text}: N hides it; a higher sampling rate would show it."

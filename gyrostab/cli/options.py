@@ -204,13 +204,13 @@ class Fitting:
     Parameters
     ----------
     terms
-        Noise terms to fit, letters of QNBKR.
+        Noise terms to fit, as letters: QNBKR, or a part such as NBK.
     fit_method
         gls fits variances by generalised least squares, with their covariance. adev fits
         deviations, as some papers do, for comparison.
     fit_from
-        Shortest averaging time to fit, or all; a longer one leaves out the effect of a spectral
-        line (default: all but those that a filter of the sensor shapes).
+        Shortest averaging time to fit, or all. Raise it to leave out a spectral line or motion at
+        short times (default: all times but those that a filter of the sensor shapes).
     fit_to
         Longest averaging time to fit (default: all).
     """

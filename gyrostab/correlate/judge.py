@@ -134,6 +134,7 @@ def format_p_value(p: float) -> str:
 
 def describe_coupling(entry: dict[str, Any], driver: str, series: str) -> str:
     """Describe the coupling of a series with a driver in one sentence."""
+    driver = f"the {driver}" if driver.startswith("rate of change") else driver
     reasons = [LIMITS[name].format(driver=driver) for name in LIMITS if name in entry["limits"]]
     verdict = VERDICTS[entry["verdict"]]
     if verdict == "cannot_tell":
@@ -147,7 +148,7 @@ def describe_coupling(entry: dict[str, Any], driver: str, series: str) -> str:
     units = entry["unit_label"]
     between = f"{entry['low']:.3g} to {entry['high']:.3g}"
     number = f"{entry['slope']:.3g} ({between}) {units}"
-    late = f" {entry['lag']:.6g} s later" if entry["lag"] else ""
+    late = f" after a lag of {entry['lag']:.6g} s" if entry["lag"] else ""
     start = series[0].upper() + series[1:]
     if np.isfinite(entry.get("partial", np.nan)):
         ends = f"{entry['partial_low']:.3g} to {entry['partial_high']:.3g}"
@@ -162,9 +163,9 @@ def describe_coupling(entry: dict[str, Any], driver: str, series: str) -> str:
             f"search{note}{tail}."
         )
     if verdict == "not_told_apart" and entry["p_adjusted"] >= 0.05:
-        late = f" {entry['lag_white']:.6g} s later" if entry["lag_white"] else ""
+        late = f" after a lag of {entry['lag_white']:.6g} s" if entry["lag_white"] else ""
         return (
-            f"{start} and {driver} change together{late}, by about {entry['slope_white']:.3g} "
+            f"{start} changes with {driver}{late}, by about {entry['slope_white']:.3g} "
             f"{units}, but {LIMITS['no_reversal'].format(driver=driver)}. Allowing for that, the "
             f"sensitivity may be anywhere from {between} {units}."
         )

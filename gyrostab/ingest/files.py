@@ -314,7 +314,7 @@ def read_log(
         if lost and "time" not in log.variables:
             raise FormatError(
                 f"{next(iter(lost.values()))}; the files have no time stamps, so the time of "
-                "those that follow it is not known: mend it"
+                "those that follow it is not known: repair it"
             )
         if spans:
             # regularise marks the gaps there

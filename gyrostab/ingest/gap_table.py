@@ -104,7 +104,7 @@ def describe_clock_change(jump: float) -> str:
     return (
         f"; as the stamps carry no offset from UTC, this {event} of daylight saving time: if so, "
         f"{effect}; log in UTC, or write the offset into the stamps (+02:00), or split the file "
-        "at this row and run the parts on their own"
+        "at this row and run the parts separately"
     )
 
 

@@ -83,8 +83,8 @@ def guess_unit(
             return named
     if angles:
         warnings.append(
-            "nothing says the unit of the angles; deg is an assumption, put the true one in its "
-            "place"
+            "the file does not state the unit of the angles; deg is an assumption, put the "
+            "true one in its place"
         )
         return "deg"
     counts = [

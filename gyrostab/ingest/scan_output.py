@@ -185,7 +185,7 @@ def print_inspection(inspected: InspectedFile) -> None:
     if inspected.row is not None:
         read = inspected.row
         lines.append(
-            f"read so: {_format_span(read['span_s'])} at {read['rate_hz']:.6g} Hz, axes "
+            f"read by this guess: {_format_span(read['span_s'])} at {read['rate_hz']:.6g} Hz, axes "
             f"{read['axes']}, {100 * read['missing_share']:.2f} % missing"
         )
     if inspected.error is not None and guess.axes:

@@ -306,13 +306,13 @@ def _inspect_job(job: _Job, *, resume: bool, overwrite: bool) -> _Progress:
     if earlier_job and has_work and not (resume or overwrite):
         raise ResumeError(
             _add_resume_advice(job, f"{job.target}: a run of it was begun and not finished")
-            + ", --overwrite starts anew"
+            + ", --overwrite starts again"
         )
     changes = describe_differences(earlier_job, job.fingerprint) if earlier_job else ""
     if resume and has_work and changes and not overwrite:
         raise ResumeError(
             f"{job.target}: the run that was begun cannot be continued, because {changes}; "
-            "put that back, or give --overwrite in place of --resume to start anew"
+            "put that back, or give --overwrite in place of --resume to start again"
         )
     is_continued = bool(resume and earlier_job and not changes)
     overwrite = overwrite or bool(earlier_job and is_continued and earlier_job["overwrite"])
@@ -489,6 +489,6 @@ def _write_product(job: _Job, blocks: Blocks, *, overwrite: bool, stage: Stage) 
         if 0.0 < share < 1.0:
             warnings.warn(
                 f"gyro axis {axis} is constant in {100 * share:.0f} % of the windows: "
-                "is the sensor stuck, or its column a filler?",
+                "check for a stuck sensor or a filler column",
                 stacklevel=2,
             )

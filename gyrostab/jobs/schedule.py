@@ -192,7 +192,7 @@ def _reach_scheduler(
 def _describe_loss(address: str, error: BaseException) -> str:
     reason = " ".join(str(error).split()) or type(error).__name__
     scheduler = f"the dask scheduler {address}".strip()
-    return f"{scheduler} has died or is out of reach ({reason}); start it again"
+    return f"{scheduler} has died or cannot be reached ({reason}); start it again"
 
 
 def _identity(value: Any) -> Any:
@@ -294,15 +294,15 @@ def _unpack_result(future: Future[Any]) -> Any:
         raise
     except BrokenProcessPool as error:
         raise WorkerError(
-            "a worker process has died: is the memory enough? Give fewer --workers"
+            "a worker process has died, perhaps for lack of memory; give fewer --workers"
         ) from error
     except CancelledError as error:
         raise WorkerError(_describe_loss("", error)) from error
     except Exception as error:
         if type(error).__name__ == "KilledWorker":
             raise WorkerError(
-                f"the workers died again and again on the same part ({error}); "
-                "is their memory enough?"
+                f"the workers died repeatedly on the same part ({error}), perhaps for "
+                "lack of memory"
             ) from error
         # not an error of the call, but of the connection
         if type(error).__module__.startswith("distributed."):

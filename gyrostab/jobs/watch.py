@@ -116,7 +116,7 @@ def watch(
         How long after its end a window waits for rows that come out of order, in the time of the
         stamps. A window into which rows fall later is computed again.
     idle : str, optional
-        Return when no row has come for so long. By default, only the end of the stream, or an
+        Return when no row has arrived for this long. By default, only the end of the stream, or an
         interruption, ends the function; the last windows are then written too.
     poll : float
         Time between two looks at the files [s].
@@ -265,7 +265,7 @@ class _View:
             return
         if not self.memory.files:
             if final:
-                raise FormatError("no row has come, so there is no product")
+                raise FormatError("no row was received, so there is no product")
             return
         begun = time.monotonic()
         try:

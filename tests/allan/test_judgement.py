@@ -76,7 +76,7 @@ def test_terms_observed_as_often_as_by_chance_count_as_unobserved():
     product["time"] = np.datetime64("2026-03-14", "ns") + np.arange(60) * np.timedelta64(10, "m")
     product["observable"].loc[{"term": "B", "time": product["time"][7]}] = OBSERVED
     text = judge_product(product)[1]
-    assert text.startswith("B is not observed in windows of 6s more often than by chance (in up to")
+    assert text.startswith("B is observed in windows of 6s no more often than by chance (in up to")
     product["observable"].loc[{"term": "B", "time": product["time"][7:9]}] = OBSERVED
     assert judge_product(product)[1].startswith("All five terms are observed")
 

@@ -487,7 +487,7 @@ def test_real_recordings(recordings, name, read, window, step, following, quiet)
         )
         assert "temperature never reverses" in statement
         assert (
-            "change together" in statement
+            " changes with " in statement
             or float(whole["p_value"].sel(variable="window_mean", axis=axis, driver="temperature"))
             < 0.05
         )

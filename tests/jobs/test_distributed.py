@@ -302,7 +302,7 @@ def test_a_worker_process_that_dies_is_explained():
 def test_a_part_that_kills_every_worker_is_explained(address):
     with (
         open_pool(address) as pool,
-        pytest.raises(WorkerError, match="died again and again on the same part"),
+        pytest.raises(WorkerError, match="died repeatedly on the same part"),
     ):
         list(run_calls(pool, [(os._exit, 3)]))
 

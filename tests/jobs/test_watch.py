@@ -270,7 +270,7 @@ def test_other_options_and_foreign_outputs_are_refused(tmp_path):
 
 
 def test_what_cannot_be_followed_is_said(tmp_path):
-    with pytest.raises(FormatError, match="no row has come"):
+    with pytest.raises(FormatError, match="no row was received"):
         follow(tmp_path / "nothing.csv", tmp_path / "a.zarr")
     short = tmp_path / "short.csv"
     short.write_text(HEADER + "".join(make_rows(500)))

@@ -29,8 +29,8 @@ _EXTRAS = (
 def doctor(*, common: Common = Common()) -> None:
     """Check the installation: versions, extras, compiled kernels and the NetCDF library.
 
-    Prints what a report of a fault should contain. Exit code 2 if a required package is missing or
-    too old.
+    Prints what a bug report should contain. Exit code 2 if a required package is missing or too
+    old.
 
     Example: gyrostab doctor
     """

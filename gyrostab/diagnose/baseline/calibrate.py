@@ -259,9 +259,9 @@ def _average_quiescent(blocks: xr.Dataset, chosen: NDArray[np.bool_], columns: A
         fit = average_blocks(power[row][use], shape[row][use], columns[row][use])
         if fit.power.size < 4:
             raise SchemaError(
-                f"axis {axis}: the quiet blocks hold spectra in {fit.power.size} bands, "
-                "too few to calibrate on; "
-                "name other quiet time, or diagnose a part of the record with fewer gaps"
+                f"axis {axis}: the quiescent blocks hold spectra in {fit.power.size} bands, "
+                "too few to calibrate on; give other stretches with --quiet, or diagnose a part "
+                "of the record with fewer gaps"
             )
         fits.append(_reduce_weights(fit, shape[row][use], shape_alone[row][use], common[row][use]))
     return fits

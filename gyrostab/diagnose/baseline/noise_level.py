@@ -50,8 +50,8 @@ def quiescent_level(
         good &= noise[row] > 0.0
         if not good.any():
             raise SchemaError(
-                f"axis {axis}: the quiet blocks hold no spectrum to calibrate the simulation on; "
-                "name other quiet time, or leave --quiet out to take the simulation as it is"
+                f"axis {axis}: the quiescent blocks hold no spectrum to calibrate the simulation "
+                "on; give other stretches with --quiet, or none, to take the simulation as it is"
             )
         separate_shape = np.where(good, shape_alone[row], 0.0).sum(axis=1)
         # see `common_variance`
@@ -98,7 +98,8 @@ def scale_axes(
         for axis, root in zip(blocks["axis"].values, np.sqrt(factor), strict=True)
     )
     warnings.warn(
-        f"the noise of the simulation is multiplied by {sizes}: its level in the quiet time given",
+        f"the noise of the simulation is multiplied by {sizes}: its level in the given quiescent "
+        "stretches",
         stacklevel=2,
     )
     scalings = zip(posteriors, factor.tolist(), error.tolist(), strict=True)

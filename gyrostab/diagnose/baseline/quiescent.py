@@ -25,7 +25,7 @@ __all__ = [
 
 Array = NDArray[np.float64]
 # Criterion of blocks that the user gave.
-GIVEN = "the time given as quiet"
+GIVEN = "the given quiescent stretches"
 #: Blocks over which the noise level is averaged. Design choice.
 LEVEL_SPANS = (1, 5, 15)
 _MIN_GIVEN_SAMPLES = 100  # as in the shortest default block; they give N to 7 %
@@ -246,12 +246,12 @@ def _is_usable(blocks: xr.Dataset, chosen: NDArray[np.bool_], better_count: int)
             if enough
             else f"{count * size} samples, and calibration needs {_MIN_GIVEN_SAMPLES}"
         )
-        lack += f"; it is ignored. Name {better_count * step:g} s or more, or give a shorter block"
+        lack += f"; it is ignored. Give {better_count * step:g} s or more, or give a shorter block"
         usable = False
     if count < better_count or not usable:
         warnings.warn(
-            f"the quiet time holds {count} whole block{'' if count == 1 else 's'} of {step:g} s: "
-            + lack,
+            f"the time given with --quiet holds {count} whole block{'' if count == 1 else 's'} "
+            f"of {step:g} s: {lack}",
             stacklevel=2,
         )
     return usable

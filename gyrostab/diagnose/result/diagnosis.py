@@ -103,8 +103,8 @@ class Diagnosis:
             limit["reason"] == COARSE_ANGLE_GRID for limit in self.content["not_found"].values()
         ):
             lines.append(
-                "- The values lie on a coarse quantization grid, and it is that of angles: the "
-                "rounding of a counter of angles may cause what is not explained."
+                "- The values lie on a coarse quantization grid of angles: the rounding of an "
+                "angle counter may cause what is not explained."
             )
         unexplained = set(self.content["unexplained"])
         regions = [region for region in self.mismatches if region["id"] in unexplained]

@@ -373,7 +373,7 @@ def _doubt_texts(named: Sequence[Mapping[str, Any]]) -> list[str]:
     ['A bias with temperature hysteresis is more probable than a bias that follows temperature
       (10 %).']
     >>> _doubt_texts([{"name": "dead_zone", "alternatives": [], "probability": 0.0}])
-    ['That it is a dead zone near zero rate has a probability of 0 % only.']
+    ['The probability that it is a dead zone near zero rate is only 0 %.']
     """
     texts = []
     for name in doubtful_names(named):
@@ -386,7 +386,7 @@ def _doubt_texts(named: Sequence[Mapping[str, Any]]) -> list[str]:
         texts.append(
             f"{others[0].upper()}{others[1:]} is more probable than {plain_name(name)} ({share})."
             if others
-            else f"That it is {plain_name(name)} has a probability of {share} only."
+            else f"The probability that it is {plain_name(name)} is only {share}."
         )
     return texts
 

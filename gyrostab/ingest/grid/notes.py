@@ -144,7 +144,7 @@ def describe_rate(
             f"{file}: from about {format_stamp(stamp)} (row {local}) the samples come at "
             f"{own_rate:.6g} Hz and not at {rate:.6g} Hz; "
             "by their stamps samples are missing or dropped there; split the log at that row and "
-            "run the parts on their own"
+            "run the parts separately"
         )
     return notes
 

@@ -184,7 +184,7 @@ def test_the_grid_contains_calibrated_and_much_slower_noise():
     assert np.exp(baseline["grid_prior"].values[0]).sum() == pytest.approx(1.0)
 
 
-@pytest.mark.filterwarnings("ignore:the quiet time")
+@pytest.mark.filterwarnings("ignore:the time given with --quiet")
 def test_the_grid_contains_all_noise_that_little_quiescent_time_allows():
     blocks = reduce_log(log({"N": 0.003}, duration="3h", rate=10.0))
     baseline = calibrate_noise(blocks, quiet=(0.0, 120.0))

@@ -210,7 +210,7 @@ def test_a_name_with_a_better_alternative_does_not_explain(
     text = summary(
         content() | {"verdict": verdict, "effects": [effect], "unexplained": [], "held_out": GOOD}
     )
-    doubt = "is more probable than" if alternatives else "has a probability of 49 % only"
+    doubt = "is more probable than" if alternatives else "is only 49 %"
     assert (doubt in text) == (verdict != "explained")
 
 

@@ -135,9 +135,9 @@ def test_coarse_grid_of_angles_is_stated_beside_what_is_not_explained() -> None:
     made["not_found"] = {
         "rate_quantization": {"upper_limit": None, "unit": None, "reason": COARSE_ANGLE_GRID}
     }
-    assert "counter of angles" not in str(Diagnosis(made, surfaces(), model()))
+    assert "angle counter" not in str(Diagnosis(made, surfaces(), model()))
     made["unexplained"] = [1]
-    assert "counter of angles" in str(Diagnosis(made, surfaces(), model()))
+    assert "angle counter" in str(Diagnosis(made, surfaces(), model()))
 
 
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.full)])
