@@ -189,10 +189,10 @@ def _explained_nats(component: Component, state: State, variant: Variant) -> flo
 
 
 def _describe_unseparated(name: str, other_names: Sequence[str]) -> str:
+    others = " and ".join(other_names)
     verb = "is" if len(other_names) == 1 else "are"
     return (
-        f"The record does not separate its {name} from its {' and '.join(other_names)}, which "
-        f"{verb} taken as 0."
+        f"The record does not separate the terms {name} and {others}; {others} {verb} taken as 0."
     )
 
 

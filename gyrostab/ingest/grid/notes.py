@@ -216,8 +216,8 @@ def describe_placement(
     twice = events[events[:, 0] == DUPLICATE]
     if len(twice):
         notes.append(
-            f"{where}: dropped as their sample is taken: {_count_of(len(twice), 'row')}, first "
-            f"{_name_row(raw, int(twice[:, 2].min()))}"
+            f"{where}: dropped, because another row holds their sample: "
+            f"{_count_of(len(twice), 'row')}, first {_name_row(raw, int(twice[:, 2].min()))}"
         )
     late = events[events[:, 0] == OUT_OF_ORDER]
     if len(late):

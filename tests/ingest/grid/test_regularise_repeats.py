@@ -55,7 +55,7 @@ def test_repeated_rows_are_duplicates(rows, block):
         .tolist()
     )
     assert any(
-        f"dropped as their sample is taken: {len(rows) - 6000} rows" in note
+        f"because another row holds their sample: {len(rows) - 6000} rows" in note
         for note in log.attrs["notes"]
     )
 
