@@ -204,7 +204,7 @@ class Fitting:
     Parameters
     ----------
     terms
-        Noise terms to fit, as letters: QNBKR, or a part such as NBK.
+        Noise terms to fit; NBK, for instance, leaves out Q and R.
     fit_method
         gls fits variances by generalised least squares, with their covariance. adev fits
         deviations, as some papers do, for comparison.
@@ -215,7 +215,7 @@ class Fitting:
         Longest averaging time to fit (default: all).
     """
 
-    terms: str = "QNBKR"
+    terms: Annotated[str, Parameter(metavar="LETTERS")] = "QNBKR"
     fit_method: Literal["gls", "adev"] = "gls"
     fit_from: Annotated[str | None, Parameter(metavar="DURATION")] = None
     fit_to: Annotated[str | None, Parameter(metavar="DURATION")] = None
