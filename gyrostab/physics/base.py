@@ -297,6 +297,6 @@ def driver_error(effect: Effect, channel: str, present: list[str]) -> SchemaErro
     name = effect.channel_names()[channel]
     return SchemaError(
         f"effect {effect.name!r} needs the channel {name!r} [{effect.channels[channel]}]; "
-        f"there are {', '.join(present) or 'no channels'}; add it to the environment "
+        f"the log has {', '.join(present) or 'no channels'}; add it to the environment "
         "or name another with driver = ..."
     )

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import pickle
+import re
+import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import cloudpickle
 import dask
@@ -25,6 +28,14 @@ from tests.support.simulated import BIASED, LOG, WORLD, every_channel, model
 
 # --------------------------------------------------------------------------------
 # logs
+
+
+def test_the_model_on_the_page_can_be_simulated():
+    page = Path(__file__).resolve().parents[2] / "docs" / "simulate.md"
+    (example,) = re.findall(r"^```toml\n(.*?)^```$", page.read_text("utf-8"), re.M | re.S)
+    log = simulate(tomllib.loads(example), duration="10s")
+    assert set(log.data_vars) >= {"rate", "vibration", "temperature"}
+    assert np.isfinite(log.rate.values).all()
 
 
 def test_simulated_log_has_the_schema_of_a_log():
@@ -162,7 +173,7 @@ def test_each_effect_without_its_channel_says_so():
         bare = replace(read_model({"noise": {"N": 0.01}}), effects=(kind.example(),))
         with pytest.raises(
             SchemaError,
-            match=f"effect '{name}' needs the channel '{needs[0]}'.*there are no channels",
+            match=f"effect '{name}' needs the channel '{needs[0]}'.*the log has no channels",
         ):
             simulate(bare, duration="10s", rate=10.0)
 
