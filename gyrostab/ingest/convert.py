@@ -100,7 +100,7 @@ def from_dataframe(
     rate: float | None = None,
     max_gap: str | float = "10D",
 ) -> xr.Dataset:
-    """Make a regular log of a pandas table with a time index.
+    """Make a regular log from a pandas table with a time index.
 
     Parameters
     ----------
@@ -288,7 +288,7 @@ def from_dataarray(
     rate: float | None = None,
     max_gap: str | float = "10D",
 ) -> xr.Dataset:
-    """Make a regular log of a DataArray.
+    """Make a regular log from a DataArray.
 
     Parameters
     ----------

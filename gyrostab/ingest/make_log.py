@@ -26,7 +26,7 @@ def make_log(
     kind: str = "rate",
     channels: Mapping[str, tuple[Any, str]] | None = None,
 ) -> xr.Dataset:
-    """Make a regular log of uniformly sampled values.
+    """Make a regular log from uniformly sampled values.
 
     Parameters
     ----------

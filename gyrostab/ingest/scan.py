@@ -49,7 +49,7 @@ COLUMNS = (
 
 
 def scan(paths: Sequence[str | Path] | str | Path, **reading: Any) -> pd.DataFrame:
-    r"""Summarise logs in a table, one row a file.
+    r"""Summarise logs in a table, one row per file.
 
     Each file is read separately and placed on a uniform time axis to count missing samples.
 
