@@ -290,9 +290,8 @@ def read_log(
     if regular and len(regular) < len(parts):
         raw = next(path for path in parts if path not in regular)
         raise OptionError(
-            f"{regular[0].name} is a regular log already and {raw.name} is not; make a regular "
-            "log of the latter and its like with "
-            "gyrostab ingest, and then join the regular logs"
+            f"{regular[0].name} is a regular log already and {raw.name} is not; convert the raw "
+            "logs with gyrostab ingest, and then read all of them together"
         )
     channels = [read_file(path, replace(options, channels_only=True, start=None)) for path in extra]
     spans = (
