@@ -32,7 +32,6 @@ from gyrostab.ingest.formats.text import matches as is_text_log
 from gyrostab.ingest.limits import check_declared
 from gyrostab.schema import SIGNAL_UNITS, check_log, check_product, check_surface
 from gyrostab.store.cf import find_kind, from_disk, to_disk
-from gyrostab.store.netcdf_compression import append_compressed, large_variables
 from gyrostab.store.output import find_foreign_item, find_sources, new_output
 from gyrostab.store.private import library_lock
 from gyrostab.store.read import open_stored
@@ -44,7 +43,7 @@ from gyrostab.store.write import (
     append_zarr,
     as_counts,
     chunk_samples,
-    long_variables,
+    large_variables,
 )
 
 __all__ = [
@@ -128,15 +127,12 @@ def to_netcdf(
     filters = _make_filters(compression)
 
     def write(packed: xr.Dataset) -> None:
-        log = _find_rate(packed) is not None
         encoding = _netcdf_encoding(packed, filters)
-        long = long_variables(packed) if log else large_variables(packed, encoding)
-        short_encoding = {name: options for name, options in encoding.items() if name not in long}
+        large = large_variables(packed)
+        short_encoding = {name: options for name, options in encoding.items() if name not in large}
         with new_output(path, overwrite=overwrite, inputs=sources) as temporary:
-            _begin_netcdf(packed.drop_vars(long), temporary, short_encoding)
-            (append_netcdf if log else append_compressed)(
-                temporary, long, encoding, progress=progress
-            )
+            _begin_netcdf(packed.drop_vars(large), temporary, short_encoding)
+            append_netcdf(temporary, large, encoding, progress=progress)
 
     _write_counts(stored, write)
     return Path(path)
@@ -279,9 +275,9 @@ def to_zarr(
     stored, sources = _encode_dataset(dataset, "to_zarr", stamps)
 
     def write(packed: xr.Dataset) -> None:
-        long = long_variables(packed) if _find_rate(packed) is not None else {}
+        large = large_variables(packed) if _find_rate(packed) is not None else {}
         encoding = plan_zarr(packed)
-        short_encoding = {name: options for name, options in encoding.items() if name not in long}
+        short_encoding = {name: options for name, options in encoding.items() if name not in large}
         lazy = {
             name: packed[name].variable
             for name in short_encoding
@@ -294,16 +290,16 @@ def to_zarr(
         with new_output(
             path, overwrite=overwrite, find_foreign=find_foreign_item, inputs=sources
         ) as temporary:
-            short_variables = packed.drop_vars(long).assign(aligned)
+            short_variables = packed.drop_vars(large).assign(aligned)
             short_variables.to_zarr(
                 temporary,
                 mode="w",
                 zarr_format=2,
-                consolidated=not long,
+                consolidated=not large,
                 encoding=short_encoding,
                 write_empty_chunks=True,
             )
-            append_zarr(temporary, long, encoding, progress=progress)
+            append_zarr(temporary, large, encoding, progress=progress)
 
     _write_counts(stored, write)
     return Path(path)

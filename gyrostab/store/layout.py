@@ -11,6 +11,7 @@ import errno
 import json
 import os
 import threading
+import zlib
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -30,6 +31,7 @@ __all__ = [
     "ChunkCache",
     "ChunkDamage",
     "decode_chunk",
+    "find_hdf5_codecs",
     "find_zarr_codecs",
     "has_known_filters",
     "is_readable",
@@ -195,7 +197,7 @@ def _read_hdf5_layout(path: Path, name: str, opened: str) -> _Hdf5Layout:
             variable = file[name]
             dtype, codecs, lengths = (
                 variable.dtype,
-                _find_hdf5_codecs(variable.id.get_create_plist()),
+                find_hdf5_codecs(variable.id.get_create_plist()),
                 variable.chunks or (),
             )
 
@@ -212,20 +214,23 @@ def _read_hdf5_layout(path: Path, name: str, opened: str) -> _Hdf5Layout:
     return _Hdf5Layout(dtype, codecs, places, damage)
 
 
-def _find_hdf5_codecs(plist: Any) -> tuple[tuple[int, Any], ...]:
-    """Find the codecs of the filters, in the order of reading, with their numbers."""
-    from numcodecs import Zlib, Zstd
-
-    known_codecs = {_DEFLATE: Zlib, _FLETCHER32: _Fletcher32, _ZSTD: Zstd}
+def find_hdf5_codecs(plist: Any) -> tuple[tuple[int, Any], ...]:
+    """Make the codecs of the filters, in the order of reading, with their numbers."""
     codecs: list[tuple[int, Any]] = []
     for number in reversed(range(plist.get_nfilters())):
         code, _, values, _ = plist.get_filter(number)
+        codec: Any = _UnknownFilter(code)
         if code == _SHUFFLE:
-            codecs.append((number, _Shuffle(values[0])))
-        elif code in known_codecs:
-            codecs.append((number, known_codecs[code]()))
-        else:
-            codecs.append((number, _UnknownFilter(code)))
+            codec = _Shuffle(values[0])
+        elif code == _DEFLATE:
+            codec = _Deflate(*values[:1])
+        elif code == _FLETCHER32:
+            codec = _Fletcher32()
+        elif code == _ZSTD:
+            from numcodecs import Zstd
+
+            codec = Zstd(*values[:1])
+        codecs.append((number, codec))
     return tuple(codecs)
 
 
@@ -238,10 +243,29 @@ def has_known_filters(plist: Any) -> bool:
 
 
 @dataclass(frozen=True)
+class _Deflate:
+    """The deflate filter."""
+
+    level: int = 4
+
+    def encode(self, data: Any) -> bytes:
+        """Compress the bytes."""
+        return zlib.compress(data, self.level)
+
+    def decode(self, data: Any) -> bytes:
+        """Decompress the bytes."""
+        return zlib.decompress(data)
+
+
+@dataclass(frozen=True)
 class _Shuffle:
     """The shuffle filter; a rest of bytes at the end, as of a checksum, stays unchanged."""
 
     width: int
+
+    def encode(self, data: NDArray[Any]) -> bytes:
+        """Bring together the bytes of each place within the numbers of an array."""
+        return data.reshape(-1, 1).view(np.uint8).T.tobytes()
 
     def decode(self, data: Any) -> Any:
         """Restore the order of the bytes."""
@@ -259,6 +283,12 @@ class _Shuffle:
 
 class _Fletcher32:
     """The checksum at the end of a chunk; numcodecs takes five times as long and holds the GIL."""
+
+    def encode(self, data: NDArray[Any]) -> NDArray[np.uint8]:
+        """Add the checksum to the bytes of an array."""
+        stored = data.reshape(-1).view(np.uint8)
+        checksum = fletcher32(stored).to_bytes(4, "little")
+        return np.concatenate([stored, np.frombuffer(checksum, np.uint8)])
 
     def decode(self, data: Any) -> NDArray[np.uint8]:
         """Verify the checksum and return the bytes before it."""

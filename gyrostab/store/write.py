@@ -1,13 +1,16 @@
-"""Writing the long variables of a log in chunks of one axis and about 20 minutes.
+"""Writing large variables chunk by chunk; those of a log in chunks of one axis and 20 minutes.
 
 Samples that the source had as integer counts are stored as counts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
-from itertools import chain
+from itertools import product
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +19,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.kernels.encoding.counts import to_counts
-from gyrostab.store.lazy import Converted, find_source, make_dask, read_into
+from gyrostab.store.layout import find_hdf5_codecs
+from gyrostab.store.lazy import Converted, find_source, make_dask, read_box
 from gyrostab.store.private import library_lock
 from gyrostab.store.threads import MAX_WORKERS, map_in_order
 
@@ -28,8 +32,7 @@ __all__ = [
     "as_counts",
     "chunk_samples",
     "common_packing",
-    "create_variables",
-    "long_variables",
+    "large_variables",
 ]
 
 CHUNK_SECONDS = 1200.0
@@ -37,6 +40,8 @@ CHUNK_SECONDS = 1200.0
 CHUNK_LIMITS = (2**16, 2**22)
 #: Size [bytes] of the doubles that are computed at a time while a lazy log is written.
 MAX_BATCH_BYTES = 2**26
+#: Values from which the chunks of a variable are compressed in several threads.
+_MIN_LARGE_VALUES = 2**15
 FILL_VALUES = {"int16": -32767, "int32": -2147483647}  # the defaults of NetCDF
 
 #: Function that is called with the share that is done.
@@ -129,17 +134,20 @@ def common_packing(encodings: Iterable[Mapping[Any, Any]]) -> dict[str, Any]:
     }
 
 
-def long_variables(stored: xr.Dataset) -> dict[str, xr.Variable]:
-    """Find the lazy variables along time, which are written in batches."""
-    lazy = {
+def large_variables(stored: xr.Dataset) -> dict[str, xr.Variable]:
+    """Find the numbers that are written chunk by chunk: lazy ones along time, and large data."""
+
+    def is_lazy(variable: xr.Variable) -> bool:
+        return variable.chunks is not None and str(variable.dims[-1]).startswith("time")
+
+    return {
         str(name): variable
         for name, variable in stored.variables.items()
-        if variable.chunks is not None and variable.size
-    }
-    return {
-        name: variable
-        for name, variable in lazy.items()
-        if str(variable.dims[-1]).startswith("time")
+        if variable.dtype.kind in "iuf"
+        and (
+            (is_lazy(variable) and variable.size)
+            or (name in stored.data_vars and variable.size >= _MIN_LARGE_VALUES)
+        )
     }
 
 
@@ -147,68 +155,91 @@ def _dim_names(variable: xr.Variable) -> list[str]:
     return [str(dim) for dim in variable.dims]
 
 
-def create_variables(
-    file: Any, variables: Mapping[str, xr.Variable], encoding: Mapping[Any, Mapping[str, Any]]
-) -> dict[str, Any]:
-    """Create variables and their dimensions in a NetCDF file; `encoding` as for xarray."""
-    created = {}
-    for name, variable in variables.items():
-        for dim, size in variable.sizes.items():
-            if dim not in file.dimensions:
-                file.createDimension(str(dim), size)
-        options = dict(encoding[name])
-        fill = variable.attrs.get("_FillValue", options.pop("_FillValue", None))
-        made = file.createVariable(
-            name, variable.dtype, _dim_names(variable), fill_value=fill, **options
-        )
-        made.setncatts({key: value for key, value in variable.attrs.items() if key != "_FillValue"})
-        made.set_auto_maskandscale(False)
-        created[name] = made
-    return created
-
-
 def append_netcdf(
     path: Path,
-    long: dict[str, xr.Variable],
-    encoding: dict[Any, dict[str, Any]],
+    large: Mapping[str, xr.Variable],
+    encoding: Mapping[Any, Mapping[str, Any]],
     *,
     progress: Progress | None = None,
 ) -> None:
-    """Add lazy variables to a NetCDF file; `encoding` as for xarray."""
+    """Add variables to a NetCDF file, with the filters of `encoding`, which is as for xarray.
+
+    The NetCDF library compresses one chunk after the other; here several threads do so, and the
+    chunks are those of the library.
+    """
+    import h5py
     import netCDF4
 
+    if not large:
+        return
     lock = library_lock()
     with lock:
-        file = netCDF4.Dataset(path, "a")
+        with netCDF4.Dataset(path, "a") as file:
+            for name, variable in large.items():
+                _create_variable(file, name, variable, encoding[name])
+        target = h5py.File(path, "r+")
+        datasets = {name: target[name].id for name in large}
+    creation = {name: dataset.get_create_plist() for name, dataset in datasets.items()}
+    codecs = {name: find_hdf5_codecs(plist) for name, plist in creation.items()}
+    fills = {
+        name: variable.attrs.get("_FillValue", encoding[name].get("_FillValue"))
+        for name, variable in large.items()
+    }
+
+    def compress(name: str, values: NDArray[Any]) -> Any:
+        fill = fills[name]
+        chunk = np.full(creation[name].get_chunk(), 0 if fill is None else fill, values.dtype)
+        inside = chunk[tuple(map(slice, values.shape))]
+        inside[...] = values
+        if fill is not None and values.dtype.kind == "f":
+            inside[np.isnan(values)] = fill
+        data: Any = chunk
+        for _, codec in reversed(codecs[name]):
+            data = codec.encode(data)
+        return data
+
+    def put(name: str, box: _Box, compressed: Any) -> None:
+        with lock:
+            datasets[name].write_direct_chunk(tuple(part.start for part in box), compressed)
+
     try:
+        chunks = {name: plist.get_chunk() for name, plist in creation.items()}
+        _copy_variables(large, chunks, compress, put, progress)
         with lock:
-            targets = create_variables(file, long, encoding)
-
-        def put(name: str, row: tuple[int, ...], part: slice, values: NDArray[Any]) -> None:
-            with lock:
-                targets[name][(*row, part)] = values
-
-        _copy_variables(
-            long, {name: encoding[name]["chunksizes"][-1] for name in long}, put, progress
-        )
+            target.flush()
     finally:
-        with lock:
-            file.close()
+        with lock, suppress(RuntimeError):  # of a full disk, after the error that says so
+            target.close()
+
+
+def _create_variable(
+    file: Any, name: str, variable: xr.Variable, encoding: Mapping[str, Any]
+) -> None:
+    """Create a variable and its dimensions in a NetCDF file."""
+    for dim, size in variable.sizes.items():
+        if dim not in file.dimensions:
+            file.createDimension(str(dim), size)
+    options = dict(encoding)
+    fill = variable.attrs.get("_FillValue", options.pop("_FillValue", None))
+    made = file.createVariable(
+        name, variable.dtype, _dim_names(variable), fill_value=fill, **options
+    )
+    made.setncatts({key: value for key, value in variable.attrs.items() if key != "_FillValue"})
 
 
 def append_zarr(
     path: Path,
-    long: dict[str, xr.Variable],
-    encoding: dict[Any, dict[str, Any]],
+    large: Mapping[str, xr.Variable],
+    encoding: Mapping[Any, Mapping[str, Any]],
     *,
     progress: Progress | None = None,
 ) -> None:
-    """Add lazy variables to a Zarr store, every chunk of them, and consolidate the metadata."""
+    """Add variables to a Zarr store, every chunk of them, and consolidate the metadata."""
     import zarr
 
     group = zarr.open_group(path, mode="r+", zarr_format=2)
     targets: dict[str, Any] = {}
-    for name, variable in long.items():
+    for name, variable in large.items():
         options = dict(encoding[name])
         fill = variable.attrs.get("_FillValue", options.pop("_FillValue", None))
         attrs = {key: value for key, value in variable.attrs.items() if key != "_FillValue"}
@@ -222,81 +253,81 @@ def append_zarr(
             **options,
         )
 
-    def put(name: str, row: tuple[int, ...], part: slice, values: NDArray[Any]) -> None:
-        targets[name][(*row, part)] = values
+    def put(name: str, box: _Box, values: NDArray[Any]) -> None:
+        targets[name][box] = values
 
-    _copy_variables(long, {name: encoding[name]["chunks"][-1] for name in long}, put, progress)
+    chunks = {name: encoding[name]["chunks"] for name in large}
+    _copy_variables(large, chunks, lambda _, values: values, put, progress)
     zarr.consolidate_metadata(path, zarr_format=2)
 
 
+#: A chunk, of the last one along a dimension only the part that lies within the variable.
+_Box = tuple[slice, ...]
+
+
 def _copy_variables(
-    long: dict[str, xr.Variable],
-    lengths: dict[str, int],
-    put: Callable[[str, tuple[int, ...], slice, NDArray[Any]], None],
+    large: Mapping[str, xr.Variable],
+    chunks: Mapping[str, tuple[int, ...]],
+    encode: Callable[[str, NDArray[Any]], Any],
+    put: Callable[[str, _Box, Any], None],
     progress: Progress | None,
 ) -> None:
-    """Read lazy variables in threads, in whole chunks, and write them in order meanwhile."""
+    """Read and encode chunks of variables in threads, and write them in order meanwhile."""
     import dask
     from dask.system import CPU_COUNT
 
-    direct = {name: v for name, v in long.items() if find_source(v.data) is not None}
-    computed = {name: v for name, v in long.items() if name not in direct}
-    segments = chain.from_iterable(_plan_batches(direct, lengths, 1))
+    def read(chunk: tuple[str, _Box, NDArray[Any] | None]) -> tuple[str, _Box, int, Any]:
+        name, box, values = chunk
+        values = read_box(large[name].data, box) if values is None else values
+        return name, box, values.size, encode(name, values)
+
+    done, total = 0, sum(variable.size for variable in large.values())
     workers = min(dask.config.get("num_workers", None) or CPU_COUNT, MAX_WORKERS)
-    batches = chain(
-        map_in_order(partial(_read_segment, direct), segments, workers=workers),
-        # dask walks a whole graph each time
-        map_in_order(
-            partial(_compute_batch, computed),
-            _plan_batches(computed, lengths, MAX_BATCH_BYTES),
-            workers=1,
-        ),
-    )
-    done, total = 0, sum(variable.size for variable in long.values())
-    for batch in batches:
-        for (name, row, begin, span), block in batch:
-            for at in range(0, span, lengths[name]):
-                piece = block[at : at + lengths[name]]
-                put(name, row, slice(begin + at, begin + at + piece.size), piece)
-            done += span
+    for name, box, size, encoded in map_in_order(
+        read, _list_chunks(large, chunks), workers=workers
+    ):
+        put(name, box, encoded)
+        done += size
         if progress is not None:
             progress(done / total)
 
 
-#: Name, row, first sample and number of samples of a part of a variable.
-_Segment = tuple[str, tuple[int, ...], int, int]
-_Batch = list[tuple[_Segment, NDArray[Any]]]
+def _list_chunks(
+    large: Mapping[str, xr.Variable], chunks: Mapping[str, tuple[int, ...]]
+) -> Iterator[tuple[str, _Box, NDArray[Any] | None]]:
+    """List all chunks in the order of time; dask computes those that only it can read.
+
+    It computes many at a time, as it walks a whole graph each time.
+    """
+    ordered: list[tuple[float, str, _Box]] = []
+    for name, variable in large.items():
+        starts = [range(0, *pair) for pair in zip(variable.shape, chunks[name], strict=True)]
+        for begin in product(*starts):
+            corner = zip(begin, chunks[name], variable.shape, strict=True)
+            box = tuple(slice(first, min(first + step, size)) for first, step, size in corner)
+            ordered.append((begin[-1] / variable.shape[-1], name, box))
+    ordered.sort(key=itemgetter(0))
+    batch: list[tuple[str, _Box]] = []
+    n_bytes = 0
+    for _, name, box in ordered:
+        data = large[name].data
+        if isinstance(data, np.ndarray) or find_source(data) is not None:
+            yield name, box, None
+            continue
+        batch.append((name, box))
+        n_bytes += 8 * math.prod(part.stop - part.start for part in box)
+        if n_bytes >= MAX_BATCH_BYTES:
+            yield from _compute_chunks(large, batch)
+            batch, n_bytes = [], 0
+    if batch:
+        yield from _compute_chunks(large, batch)
 
 
-def _read_segment(long: dict[str, xr.Variable], segment: _Segment) -> _Batch:
-    """Read a segment of a variable with a source, in the calling thread."""
-    name, row, begin, span = segment
-    values = np.empty(span, long[name].dtype)
-    read_into(long[name].data, row[0] if row else 0, begin, values)
-    return [(segment, values)]
-
-
-def _compute_batch(long: dict[str, xr.Variable], batch: list[_Segment]) -> _Batch:
+def _compute_chunks(
+    large: Mapping[str, xr.Variable], batch: Sequence[tuple[str, _Box]]
+) -> Iterator[tuple[str, _Box, NDArray[Any]]]:
     import dask
 
-    lazy = [long[name].data[(*row, slice(begin, begin + span))] for name, row, begin, span in batch]
-    return list(zip(batch, dask.compute(*lazy), strict=True))
-
-
-def _plan_batches(
-    long: dict[str, xr.Variable], lengths: dict[str, int], most_bytes: int
-) -> Iterator[list[_Segment]]:
-    """Plan batches of whole chunks of variables with the same chunks, each a list of segments."""
-    kinds = {name: (variable.dims[-1], lengths[name]) for name, variable in long.items()}
-    for kind in dict.fromkeys(kinds.values()):
-        rows = [
-            (name, row)
-            for name, variable in long.items()
-            if kinds[name] == kind
-            for row in np.ndindex(*variable.shape[:-1])
-        ]
-        name = rows[0][0]
-        span = lengths[name] * max(1, most_bytes // (8 * len(rows) * lengths[name]))
-        size = long[name].shape[-1]
-        for begin in range(0, size, span):
-            yield [(name, row, begin, min(span, size - begin)) for name, row in rows]
+    arrays = dask.compute(*(large[name].data[box] for name, box in batch))
+    for (name, box), values in zip(batch, arrays, strict=True):
+        yield name, box, values

@@ -32,7 +32,7 @@ from gyrostab.io.datasets import (
 )
 from gyrostab.noise import LAWS, TERMS, model_avar
 from gyrostab.schema import VARIABLES, attributes
-from gyrostab.store import netcdf_compression, read
+from gyrostab.store import read, write
 from gyrostab.time.grid import TimeGridIndex, grid_times, time_coordinate
 from gyrostab.units import INNER
 from tests.support import synthetic
@@ -437,9 +437,9 @@ def test_chunks_that_threads_compress_are_those_of_the_library(tmp_path, monkeyp
     product = synthetic.product()
     product["avar"][0, 1, 2] = np.nan
     monkeypatch.setattr(export, "CHUNK_VALUES", 50)  # several chunks, the last of them not full
-    monkeypatch.setattr(netcdf_compression, "_MIN_PARALLEL_VALUES", 10**9)
+    monkeypatch.setattr(write, "_MIN_LARGE_VALUES", 10**9)
     by_library = to_netcdf(product, tmp_path / "library.nc")
-    monkeypatch.setattr(netcdf_compression, "_MIN_PARALLEL_VALUES", 1)
+    monkeypatch.setattr(write, "_MIN_LARGE_VALUES", 1)
     by_threads = to_netcdf(
         product.chunk({"axis": 1, "time": 3}) if lazy else product, tmp_path / "threads.nc"
     )

@@ -20,7 +20,7 @@ from gyrostab.ingest.grid.place import Placement
 from gyrostab.io.datasets import open_log
 from gyrostab.jobs import checkpoint
 from gyrostab.jobs.run import load_log, run
-from gyrostab.store import netcdf_compression, write
+from gyrostab.store import write
 from gyrostab.store.lazy import (
     InMemory,
     can_read_directly,
@@ -187,8 +187,8 @@ def test_the_large_variables_of_a_large_product_are_written_without_dask(tmp_pat
         return read_box(array, box)
 
     monkeypatch.setattr(checkpoint, "_MAX_MEMORY_BYTES", 0)
-    monkeypatch.setattr(netcdf_compression, "read_box", watched)
-    monkeypatch.setattr(netcdf_compression, "_MIN_PARALLEL_VALUES", 1000)
+    monkeypatch.setattr(write, "read_box", watched)
+    monkeypatch.setattr(write, "_MIN_LARGE_VALUES", 1000)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         run(paths, tmp_path / "large.nc", windows=WINDOW)
