@@ -12,15 +12,14 @@ import numpy as np
 from gyrostab.diagnose.result.content import check_diagnosis
 from gyrostab.diagnose.result.diagnosis import Diagnosis
 from gyrostab.diagnose.result.families import group_families
+from gyrostab.diagnose.result.record_text import noise_texts, summary
 from gyrostab.diagnose.result.text import (
     chance_share,
     family_text,
     next_measurement,
-    noise_texts,
     plain_name,
     probability_text,
     rejection_text,
-    summary,
     without_chance,
 )
 from gyrostab.diagnose.statistics.wording import axes_text, length_text

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.components import are_lines, axes_of, sum_evidence
-from gyrostab.diagnose.predict.candidates import Candidate, Component
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import condition_on_components, refit_weights
 from gyrostab.diagnose.predict.linear_model import State, initial_state
+from gyrostab.diagnose.predict.windows import rebuild_variant
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
 __all__ = [
@@ -32,6 +33,7 @@ __all__ = [
     "make_identification",
     "remove_phase_locked",
     "with_axes_of",
+    "with_noise",
 ]
 
 Array = NDArray[np.float64]
@@ -317,3 +319,42 @@ def form_error(
             share = settings.spectrum_error_share if of_spectrum else settings.form_error_share
             error += share * component.evidence_nats if affected_candidates else 0.0
     return error
+
+
+def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identifications:
+    """Return the identifications with designs for another noise.
+
+    A share of N^2 is a share of the new one.
+    """
+    blocks = identifications.state.blocks
+    candidates: dict[int, Candidate] = {}  # by the identity of the old one
+    variants: dict[int, Variant] = {}
+    for component in components_of(identifications.identified):
+        old = component.candidate
+        if old.statistic.is_power and id(old) not in candidates:
+            made = tuple(
+                rebuild_variant(old, variant, blocks, baseline["coefficient"]) or variant
+                for variant in old.variants
+            )
+            candidates[id(old)] = replace(old, variants=made)
+            variants |= zip(map(id, old.variants), made, strict=True)
+
+    def renew(component: Component) -> Component:
+        if id(component.candidate) not in candidates:
+            return component
+        return replace(
+            component,
+            candidate=candidates[id(component.candidate)],
+            variant=variants[id(component.variant)],
+        )
+
+    return replace(
+        identifications,
+        identified=tuple(
+            replace(identification, components=tuple(map(renew, identification.components)))
+            for identification in identifications.identified
+        ),
+        candidates=tuple(
+            candidates.get(id(candidate), candidate) for candidate in identifications.candidates
+        ),
+    )

@@ -12,15 +12,12 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.result.families import group_families
+from gyrostab.diagnose.result.record_text import join_axes, joined_statements, noise_texts, summary
 from gyrostab.diagnose.result.text import (
     chance_share,
     family_text,
-    join_axes,
-    joined_statements,
     next_measurement,
-    noise_texts,
     probability_text,
-    summary,
     without_chance,
 )
 from gyrostab.diagnose.settings import Settings, stored_settings

@@ -18,13 +18,14 @@ from gyrostab.diagnose.estimate.conditioned_baseline import (
     predict_baseline,
 )
 from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_expected, fit_identifications
-from gyrostab.diagnose.estimate.recalibrate import recalibrate, refer_to_kept_noise, with_noise
+from gyrostab.diagnose.estimate.recalibrate import recalibrate, refer_to_kept_noise
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
 from gyrostab.diagnose.identify.identification import (
     Identification,
     Identifications,
     components_of,
     remove_phase_locked,
+    with_noise,
 )
 from gyrostab.diagnose.identify.jumps import is_step
 from gyrostab.diagnose.identify.switching import remove_telegraph_bias

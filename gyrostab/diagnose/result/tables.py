@@ -20,11 +20,7 @@ from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
 from gyrostab.diagnose.result.diagnosis import effect_table
 from gyrostab.diagnose.result.families import find_families, group_unrelated
 from gyrostab.diagnose.result.mismatch_tables import iso
-from gyrostab.diagnose.result.text import (
-    effect_statement,
-    span_text,
-    unsized_statement,
-)
+from gyrostab.diagnose.result.text import effect_statement, span_text, unsized_statement
 from gyrostab.diagnose.result.verdict import name_probability
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.noise import LAWS

@@ -15,11 +15,11 @@ from gyrostab.diagnose.baseline.calibrate import (
 )
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
-from gyrostab.diagnose.estimate.recalibrate import recalibrate, with_noise
+from gyrostab.diagnose.estimate.recalibrate import recalibrate
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.equivalents import settle_forms
-from gyrostab.diagnose.identify.identification import Identification
+from gyrostab.diagnose.identify.identification import Identification, with_noise
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 
 from gyrostab.diagnose.result.content import VERDICTS, Content, check_diagnosis
 from gyrostab.diagnose.result.diagnosis import Diagnosis, effect_table, model_text, plain
+from gyrostab.diagnose.result.record_text import summary
 from gyrostab.diagnose.result.text import (
     chance,
     clock,
@@ -26,7 +27,6 @@ from gyrostab.diagnose.result.text import (
     next_measurement,
     plain_name,
     rejection_text,
-    summary,
     unsized_statement,
 )
 from gyrostab.errors import FormatError, OutputError, SchemaError

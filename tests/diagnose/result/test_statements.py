@@ -15,8 +15,8 @@ from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.predict.channel_use import unused_channels
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result.diagnosis import Diagnosis
+from gyrostab.diagnose.result.record_text import summary
 from gyrostab.diagnose.result.tables import effect_tables
-from gyrostab.diagnose.result.text import summary
 from gyrostab.diagnose.statistics.wording import COARSE_ANGLE_GRID
 from gyrostab.ingest.make_log import make_log
 from gyrostab.physics.registry import make_effect
