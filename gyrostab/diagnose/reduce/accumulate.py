@@ -2,32 +2,27 @@
 
 from __future__ import annotations
 
-import math
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.reduce.log_blocks import BlockBatch, channel_at, numeric_channels
+from gyrostab.diagnose.reduce.log_blocks import BlockBatch, finite_range, numeric_channels
 from gyrostab.diagnose.reduce.outliers import (
     Peaks,
     find_peaks,
     simultaneous_samples,
     simultaneous_zeros,
 )
+from gyrostab.diagnose.reduce.rotation_orders import make_rotation_orders
 from gyrostab.diagnose.reduce.steady_sines import SineSearch
-from gyrostab.errors import UnitError
 from gyrostab.kernels.spectra import periodogram as kernel
 from gyrostab.kernels.spectra.outliers import HISTOGRAM
-from gyrostab.simulate.drivers import Source, make_source
-from gyrostab.time.grid import first_stamp, grid_times
-from gyrostab.units import INNER, parse_unit
+from gyrostab.time.grid import first_stamp
 
 __all__ = [
     "CHANNEL_PARTS",
-    "HARMONICS",
     "LAGGED_CHANNEL_PREFIXES",
     "RAMP_PHASE_BINS",
     "RECORD_PARTS",
@@ -39,8 +34,6 @@ Array = NDArray[np.float64]
 #: Parts of the record, each with its own line spectrum. Design choice: eight show whether a line
 #: persists or drifts.
 RECORD_PARTS = 8
-#: Multiples of the tool rotation that are measured.
-HARMONICS = (1, 2, 3)
 #: Bins of the ramp phase. Design choice.
 RAMP_PHASE_BINS = 40
 #: Parts of a block over which lagged channels are averaged. Design choice.
@@ -53,8 +46,6 @@ _MIN_SPECTRUM_SHARE = 0.25  # of a block that must be present for its spectrum; 
 # Samples of a frame that was sent twice. In a block of 8000 samples of 2^16 equally likely values,
 # chance repeats as many in their order with a probability of 8000^2 / 2 / 2^48 = 1e-7.
 _MIN_RESENT = 3
-_NEIGHBOUR_TURNS = (1, 5)  # range, turns per block from an order at which its noise is measured
-_MIN_TURNS_APART = 0.9  # turns per block from a line that was removed; just below one DFT bin
 _MIN_GAP_S = 1.0  # shorter gaps are not listed; design choice
 _GRID_BLOCKS = 64  # blocks of which samples are kept for the quantization grid; limits memory
 _GRID_SAMPLES_PER_AXIS = 2**16  # limits memory
@@ -114,17 +105,9 @@ class Accumulator:
         self.kept_samples: list[Array] = []
         self.gaps: list[tuple[int, int]] = []
         self.gap_begin: int | None = None
-        self.rotation_source, self.rotation_factor = _find_rotation_source(log)
-        self.rotation_carry: float | None = None
-        self.turns = 0.0
-        self.order = (
-            np.full((self.axes, block_count, len(HARMONICS)), np.nan + 0j)
-            if self.rotation_source
-            else None
-        )
-        self.order_level = np.full(self.order.shape, np.nan) if self.order is not None else None
+        self.rotation = make_rotation_orders(log, length, block_count, rate)
         self.ramp = self.channels.index("ramp") + self.axes if "ramp" in self.channels else None
-        self.ramp_range = _finite_range(log["ramp"].data) if self.ramp is not None else (0.0, 0.0)
+        self.ramp_range = finite_range(log["ramp"].data) if self.ramp is not None else (0.0, 0.0)
         if self.ramp_range[0] >= self.ramp_range[1]:
             self.ramp = None
         self.profile_sums = (
@@ -179,8 +162,9 @@ class Accumulator:
             for number in range(block_range.start, block_range.stop)
             if number % every == 0
         ]
-        if self.order is not None:
-            self._add_rotation_orders(block_range, centred[: self.axes])
+        if self.rotation is not None:
+            counts = self.counts[: self.axes, block_range, 0]
+            self.rotation.add(block_range, centred[: self.axes], counts, self.min_samples)
         if self.profile_sums is not None:
             phase = batch.values[self.ramp]
             self._count_ramp_turns(block_range, phase)
@@ -355,53 +339,6 @@ class Accumulator:
                     self.gaps.append((begin, first + int(place)))
                 self.gap_begin = None
 
-    def _add_rotation_orders(self, block_range: slice, centred: Array) -> None:
-        """Demodulate the axes at multiples of the tool rotation."""
-        assert self.rotation_source is not None
-        assert self.order is not None
-        assert self.order_level is not None
-        index = np.arange(block_range.start * self.length, block_range.stop * self.length)
-        rotation, self.rotation_carry = channel_at(
-            self.rotation_source, grid_times(self.start, self.rate, index), self.rotation_carry
-        )
-        inside = rotation * self.rotation_factor / (360.0 * self.rate)
-        edges = np.cumsum(np.concatenate([[self.turns], inside]))
-        self.turns = math.fmod(float(edges[-1]), 1.0)
-        turns = (edges[:-1] + inside / 2.0).reshape(centred.shape[1:])
-        often = np.diff(edges).reshape(turns.shape).sum(axis=-1)
-        counts = self.counts[: self.axes, block_range, 0]
-        enough = (np.abs(often) >= 1.0) & (counts >= self.min_samples)
-        wheels = [np.exp(-2j * math.pi * harmonic * turns) for harmonic in HARMONICS]
-        present, residual = centred != 0.0, centred  # missing samples count as zero
-        with np.errstate(invalid="ignore", divide="ignore"):
-            for number, wheel in enumerate(wheels):
-                value = 2.0 * np.einsum("abi,bi->ab", centred, wheel) / counts
-                self.order[:, block_range, number] = np.where(enough, value, np.nan)
-                residual = residual - np.where(
-                    present, (value[..., None] * np.conj(wheel)).real, 0.0
-                )
-            for number, wheel in enumerate(wheels):
-                level = _power_near_order(residual * wheel, often, HARMONICS[number]) / (
-                    counts * self.rate
-                )
-                self.order_level[:, block_range, number] = np.where(enough, level, np.nan)
-
-
-def _power_near_order(turned: NDArray[np.complex128], often: Array, harmonic: int) -> Array:
-    """Measure the mean power (axis, block) a few turns per block from a harmonic, NaN if unknown.
-
-    The samples (axis, block, sample) have no harmonics, and are demodulated by this one; the tool
-    turns so often (block,), negative if it turns back. Lines at which the block mean or a harmonic
-    was removed, and their mirror lines, do not count.
-    """
-    neighbours = np.concatenate([-np.arange(*_NEIGHBOUR_TURNS)[::-1], np.arange(*_NEIGHBOUR_TURNS)])
-    power = np.abs(np.fft.fft(turned, axis=-1)[..., neighbours]) ** 2
-    place = np.abs(harmonic * often[:, None] + neighbours)
-    removed = np.abs(often)[:, None, None] * np.array([0, *HARMONICS])
-    free = (np.abs(place[..., None] - removed) >= _MIN_TURNS_APART).all(axis=-1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray((power * free).sum(axis=-1) / free.sum(axis=-1))
-
 
 def _sum_parts(values: Array, parts: int) -> tuple[Array, Array]:
     """Return sums and numbers of the samples in equal parts of the blocks (block, sample)."""
@@ -424,30 +361,3 @@ def _neighbour_share(present: NDArray[np.bool_], weights: Array) -> Array:
         return np.asarray(
             (tapered[:, 1:] * tapered[:, :-1]).sum(axis=-1) / (tapered**2).sum(axis=-1)
         )
-
-
-def _find_rotation_source(log: xr.Dataset) -> tuple[Source | None, float]:
-    """Return the rotation rate of the tool and its factor to degree s-1; None if not in the log."""
-    name = "rotation_rate"
-    if any(name in names for names in numeric_channels(log)):
-        inner_unit = parse_unit(INNER[name])
-        try:
-            log_unit = parse_unit(str(log[name].attrs.get("units")))
-        except UnitError:
-            return None, 1.0
-        is_known = np.isfinite(_finite_range(log[name].data)).all()
-        if is_known and log_unit.quantity == inner_unit.quantity:
-            return make_source(log, name), log_unit.factor / inner_unit.factor
-    return None, 1.0
-
-
-def _finite_range(data: Any) -> tuple[float, float]:
-    """Return the smallest and largest number; infinite and in reverse order without numbers."""
-    import dask.array as da
-
-    array = da.asarray(data)
-    finite = da.isfinite(array)
-    low, high = da.compute(
-        da.where(finite, array, np.inf).min(), da.where(finite, array, -np.inf).max()
-    )
-    return float(low), float(high)

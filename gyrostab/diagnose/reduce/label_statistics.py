@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.reduce.accumulate import (
     CHANNEL_PARTS,
-    HARMONICS,
     LAGGED_CHANNEL_PREFIXES,
     RAMP_PHASE_BINS,
     Accumulator,
 )
 from gyrostab.diagnose.reduce.log_blocks import channel_means, numeric_channels
 from gyrostab.diagnose.reduce.outliers import count_outliers, quantization_step, zeros_beyond_chance
+from gyrostab.diagnose.reduce.rotation_orders import HARMONICS
 from gyrostab.diagnose.reduce.schema import COORDINATES, label_variables
 from gyrostab.diagnose.reduce.zero_bin import BINS, bin_widths, empty_zone
 from gyrostab.kernels.regression.smooth import smooth_curve
@@ -193,8 +193,8 @@ def _cross_spectra(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
 def _phase_locked_statistics(work: Accumulator) -> dict[str, Any]:
     """Return what is locked to the tool rotation and to the ramp phase."""
     arrays: dict[str, Any] = {}
-    if work.order is not None:
-        arrays |= {"order": work.order, "order_level": work.order_level}
+    if work.rotation is not None:
+        arrays |= {"order": work.rotation.order, "order_level": work.rotation.order_level}
     if work.profile_sums is not None:
         with np.errstate(invalid="ignore", divide="ignore"):
             arrays["profile"] = work.profile_sums / work.profile_counts
@@ -309,7 +309,7 @@ def _make_coordinates(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
     }
     if work.channels:
         arrays["reference"] = np.array(work.channels, dtype=object)
-    if work.order is not None:
+    if work.rotation is not None:
         arrays["harmonic"] = np.array(HARMONICS)
     if work.profile_sums is not None:
         arrays["phase"] = (np.arange(RAMP_PHASE_BINS) + 0.5) / RAMP_PHASE_BINS

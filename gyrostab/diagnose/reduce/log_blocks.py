@@ -20,6 +20,7 @@ __all__ = [
     "channel_at",
     "channel_means",
     "count_samples",
+    "finite_range",
     "numeric_channels",
     "read_batches",
 ]
@@ -184,3 +185,15 @@ def _interpolate_empty(
         means = means.copy()
         means[fill] = source.at(middle[fill], None, None)[0]
     return means
+
+
+def finite_range(data: Any) -> tuple[float, float]:
+    """Return the smallest and largest number; infinite and in reverse order without numbers."""
+    import dask.array as da
+
+    array = da.asarray(data)
+    finite = da.isfinite(array)
+    low, high = da.compute(
+        da.where(finite, array, np.inf).min(), da.where(finite, array, -np.inf).max()
+    )
+    return float(low), float(high)

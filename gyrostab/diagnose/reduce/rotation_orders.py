@@ -1,0 +1,106 @@
+"""Signals of the axes at multiples of the tool rotation, filled while a log is read."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.reduce.log_blocks import channel_at, finite_range, numeric_channels
+from gyrostab.errors import UnitError
+from gyrostab.simulate.drivers import Source, make_source
+from gyrostab.time.grid import first_stamp, grid_times
+from gyrostab.units import INNER, parse_unit
+
+__all__ = ["HARMONICS", "RotationOrders", "make_rotation_orders"]
+
+Array = NDArray[np.float64]
+#: Multiples of the tool rotation that are measured.
+HARMONICS = (1, 2, 3)
+_NEIGHBOUR_TURNS = (1, 5)  # range, turns per block from an order at which its noise is measured
+_MIN_TURNS_APART = 0.9  # turns per block from a line that was removed; just below one DFT bin
+
+
+class RotationOrders:
+    """The axes demodulated at multiples of the tool rotation, in order of time."""
+
+    def __init__(
+        self,
+        log: xr.Dataset,
+        source: Source,
+        factor: float,
+        length: int,
+        block_count: int,
+        rate: float,
+    ):
+        self.source, self.factor = source, factor  # rotation rate, and its factor to degree s-1
+        self.start, self.rate, self.length = first_stamp(log), rate, length
+        self.order = np.full((log.sizes["axis"], block_count, len(HARMONICS)), np.nan + 0j)
+        self.order_level = np.full(self.order.shape, np.nan)
+        self.carry: float | None = None
+        self.turns = 0.0
+
+    def add(
+        self, block_range: slice, centred: Array, counts: NDArray[np.int64], min_samples: float
+    ) -> None:
+        """Add blocks of the axes (axis, block, sample), zero where missing, and their samples."""
+        index = np.arange(block_range.start * self.length, block_range.stop * self.length)
+        rotation, self.carry = channel_at(
+            self.source, grid_times(self.start, self.rate, index), self.carry
+        )
+        inside = rotation * self.factor / (360.0 * self.rate)
+        edges = np.cumsum(np.concatenate([[self.turns], inside]))
+        self.turns = math.fmod(float(edges[-1]), 1.0)
+        turns = (edges[:-1] + inside / 2.0).reshape(centred.shape[1:])
+        often = np.diff(edges).reshape(turns.shape).sum(axis=-1)
+        enough = (np.abs(often) >= 1.0) & (counts >= min_samples)
+        wheels = [np.exp(-2j * math.pi * harmonic * turns) for harmonic in HARMONICS]
+        present, residual = centred != 0.0, centred  # missing samples count as zero
+        with np.errstate(invalid="ignore", divide="ignore"):
+            for number, wheel in enumerate(wheels):
+                value = 2.0 * np.einsum("abi,bi->ab", centred, wheel) / counts
+                self.order[:, block_range, number] = np.where(enough, value, np.nan)
+                residual = residual - np.where(
+                    present, (value[..., None] * np.conj(wheel)).real, 0.0
+                )
+            for number, wheel in enumerate(wheels):
+                level = _power_near_order(residual * wheel, often, HARMONICS[number]) / (
+                    counts * self.rate
+                )
+                self.order_level[:, block_range, number] = np.where(enough, level, np.nan)
+
+
+def make_rotation_orders(
+    log: xr.Dataset, length: int, block_count: int, rate: float
+) -> RotationOrders | None:
+    """Prepare the orders of the rotation of the tool; None if its rate is not known throughout."""
+    name = "rotation_rate"
+    if any(name in names for names in numeric_channels(log)):
+        inner_unit = parse_unit(INNER[name])
+        try:
+            log_unit = parse_unit(str(log[name].attrs.get("units")))
+        except UnitError:
+            return None
+        is_known = np.isfinite(finite_range(log[name].data)).all()
+        if is_known and log_unit.quantity == inner_unit.quantity:
+            factor = log_unit.factor / inner_unit.factor
+            return RotationOrders(log, make_source(log, name), factor, length, block_count, rate)
+    return None
+
+
+def _power_near_order(turned: NDArray[np.complex128], often: Array, harmonic: int) -> Array:
+    """Measure the mean power (axis, block) a few turns per block from a harmonic, NaN if unknown.
+
+    The samples (axis, block, sample) have no harmonics, and are demodulated by this one; the tool
+    turns so often (block,), negative if it turns back. Lines at which the block mean or a harmonic
+    was removed, and their mirror lines, do not count.
+    """
+    neighbours = np.concatenate([-np.arange(*_NEIGHBOUR_TURNS)[::-1], np.arange(*_NEIGHBOUR_TURNS)])
+    power = np.abs(np.fft.fft(turned, axis=-1)[..., neighbours]) ** 2
+    place = np.abs(harmonic * often[:, None] + neighbours)
+    removed = np.abs(often)[:, None, None] * np.array([0, *HARMONICS])
+    free = (np.abs(place[..., None] - removed) >= _MIN_TURNS_APART).all(axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray((power * free).sum(axis=-1) / free.sum(axis=-1))
