@@ -135,36 +135,18 @@ def write_blocks(
     stage: Stage,
     zarr: bool = False,
 ) -> xr.Dataset:
-    """Write all blocks as one file or Zarr store, in a fixed order: its bytes are reproducible.
-
-    The written dataset, which is returned, still reads from the blocks.
-    """
+    """Write all blocks as one file or Zarr store; return what it was written from."""
     import dask
 
     dataset = assemble([blocks[number] for number in sorted(blocks)]).assign_attrs(attrs)
-    variables = sum(variable.chunks is not None for variable in dataset.variables.values())
-    done = 0
+    n_lazy = sum(variable.chunks is not None for variable in dataset.variables.values())
 
-    def in_order(graph: Any, keys: Any, **options: Any) -> Any:
-        nonlocal done
-        tasks = graph if isinstance(graph, Mapping) else dict(graph.__dask_graph__())
-        if isinstance(keys, list):
-            results = []
-            for key in keys:
-                results.append(in_order(tasks, key))
-                done += 1
-                stage("writing", variables, min(done, variables), "variables")
-            return results
-        return dask.local.get_sync(dask.optimization.cull(tasks, [keys])[0], keys)
+    def tell(share: float) -> None:
+        stage("writing", n_lazy, int(share * n_lazy), "variables")
 
-    def share(written: float) -> None:
-        if variables:
-            finished = max(min(done, variables), int(written * variables))
-            stage("writing", variables, finished, "variables")
-
-    stage("writing", variables, 0, "variables")
-    with dask.config.set(scheduler=in_order):
-        (to_zarr if zarr else to_netcdf)(dataset, target, overwrite=overwrite, progress=share)
+    stage("writing", 0)
+    with dask.config.set(scheduler="synchronous"):  # which holds one chunk at a time
+        (to_zarr if zarr else to_netcdf)(dataset, target, overwrite=overwrite, progress=tell)
     return dataset
 
 
