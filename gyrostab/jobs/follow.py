@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import re
 import threading
 from collections.abc import Iterator
@@ -17,6 +16,7 @@ from gyrostab.ingest.columns.pieces import Spool
 from gyrostab.ingest.combine import move_to_disk
 from gyrostab.ingest.files import read_file
 from gyrostab.ingest.options import ReadOptions
+from gyrostab.store.output.inputs import match_files
 
 __all__ = ["FileMemory", "RowKeeper", "list_files"]
 
@@ -41,15 +41,8 @@ def list_files(source: str) -> dict[Path, FileState]:
 
     Hidden files and folders are left out.
     """
-    path = Path(source)
-    if path.is_dir():
-        paths = list(path.iterdir())
-    elif path.exists() or not glob.has_magic(source):
-        paths = [path]
-    else:
-        paths = [Path(name) for name in glob.glob(source, recursive=True)]
     states = {}
-    for item in sorted(paths):
+    for item in sorted(Path(source).iterdir() if Path(source).is_dir() else match_files(source)):
         if item.name.startswith(".") or not item.is_file():
             continue
         status = item.stat()
