@@ -11,18 +11,17 @@ C-Blosc, README_CHUNK_FORMAT.rst: header of a chunk.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
 from gyrostab.errors import FormatError
+from gyrostab.store.output.content import METADATA, read_json
 
 __all__ = ["check_blosc_chunks", "is_blosc_cut"]
 
 _HEADER_BYTES = 16
-_METADATA = (".zarray", ".zattrs", ".zgroup", ".zmetadata", "zarr.json")
 
 
 def is_blosc_cut(header: bytes, size: int) -> bool:
@@ -74,9 +73,7 @@ def _find_blosc_arrays(folder: Path) -> Iterator[Path]:
     consolidated = _read_consolidated(folder)
     for place, _, names in os.walk(folder):
         metadata = [consolidated.get(Path(place).relative_to(folder).as_posix())]
-        metadata += [
-            _read_json(Path(place, name)) for name in (".zarray", "zarr.json") if name in names
-        ]
+        metadata += [read_json(Path(place, name)) for name in {".zarray", "zarr.json"} & {*names}]
         if any(map(_uses_blosc, metadata)):
             yield Path(place)
 
@@ -85,19 +82,11 @@ def _read_consolidated(folder: Path) -> dict[str, Any]:
     """Return the consolidated metadata of the arrays in a store of format 2 or 3."""
     try:
         if (folder / ".zmetadata").exists():
-            entries = _read_json(folder / ".zmetadata")["metadata"]
+            entries = read_json(folder / ".zmetadata")["metadata"]
             return {name.removesuffix("/.zarray"): entry for name, entry in entries.items()}
-        return dict(_read_json(folder / "zarr.json")["consolidated_metadata"]["metadata"])
+        return dict(read_json(folder / "zarr.json")["consolidated_metadata"]["metadata"])
     except (LookupError, TypeError, ValueError, AttributeError):
         return {}
-
-
-def _read_json(path: Path) -> Any:
-    """Return the content of a file of metadata; None if the library refuses it."""
-    try:
-        return json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError):
-        return None
 
 
 def _uses_blosc(metadata: Any) -> bool:
@@ -112,4 +101,4 @@ def _uses_blosc(metadata: Any) -> bool:
 
 def _find_chunks(array: Path) -> Iterator[Path]:
     for place, _, names in os.walk(array):
-        yield from (Path(place, name) for name in names if name not in _METADATA)
+        yield from (Path(place, name) for name in names if name not in METADATA)

@@ -21,16 +21,16 @@ from typing import Any
 from gyrostab.errors import FormatError, GyrostabError, OptionError, OutputError
 
 __all__ = [
-    "describe_address", "fetch_file", "find_store", "find_url", "full_name", "has_content",
-    "has_file", "is_folder", "is_taken", "list_urls", "reaching", "read_bytes", "remove_address",
-    "remove_copies", "upload", "upload_file", "walk_address",
+    "ROOT_METADATA", "describe_address", "fetch_file", "find_store", "find_url", "full_name",
+    "has_content", "has_file", "is_folder", "is_taken", "list_urls", "reaching", "read_bytes",
+    "remove_address", "remove_copies", "upload", "upload_file", "walk_address",
 ]  # fmt: skip
 
 _URL = re.compile(r"([a-z][a-z0-9+.-]+):/+(.+)")  # a single letter is a drive of Windows
 #: Scheme -> the extra that installs its library.
 _EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs", "http": "http", "https": "http"}
 #: Names without which a store cannot be opened; they are uploaded last.
-_ROOT_METADATA = (".zgroup", ".zattrs", ".zmetadata", "zarr.json")
+ROOT_METADATA = (".zgroup", ".zattrs", ".zmetadata", "zarr.json")
 #: What libraries call size, time of change and checksum of an object.
 _CHANGES = {
     "size", "ETag", "etag", "md5Hash", "content_md5", "Content-MD5", "LastModified",
@@ -118,7 +118,7 @@ def is_taken(url: str) -> bool:
     with _open_filesystem(url, error=OutputError) as (filesystem, path):
         if filesystem.isfile(path):
             return True
-        return any(filesystem.exists(f"{path}/{name}") for name in _ROOT_METADATA)
+        return any(filesystem.exists(f"{path}/{name}") for name in ROOT_METADATA)
 
 
 def has_content(url: str) -> bool:
@@ -160,7 +160,7 @@ def find_store(url: str) -> str | None:
         When the library for it is missing.
     """
     with _open_filesystem(url) as (filesystem, path):
-        if any(filesystem.exists(f"{path}/{name}") for name in _ROOT_METADATA):
+        if any(filesystem.exists(f"{path}/{name}") for name in ROOT_METADATA):
             return url.rstrip("/")
         if not filesystem.exists(path):
             raise FileNotFoundError(url)
@@ -199,7 +199,7 @@ def walk_address(url: str) -> Iterator[tuple[str, dict[str, Any], list[str], boo
     with _open_filesystem(url) as (filesystem, path):
         filesystem.invalidate_cache()
         for place, folders, files in filesystem.walk(path, detail=True):
-            is_store = any(name in files for name in _ROOT_METADATA)
+            is_store = any(name in files for name in ROOT_METADATA)
             yield filesystem.unstrip_protocol(place), folders, sorted(files), is_store
 
 
@@ -213,7 +213,7 @@ def describe_address(url: str) -> dict[str, Any]:
     try:
         with _open_filesystem(url) as (filesystem, path):
             filesystem.invalidate_cache(path)
-            names = [path, *(f"{path}/{name}" for name in _ROOT_METADATA)]
+            names = [path, *(f"{path}/{name}" for name in ROOT_METADATA)]
             for name in names[1:] if filesystem.isdir(path) else names[:1]:
                 with contextlib.suppress(FileNotFoundError):
                     infos.append(filesystem.info(name))
@@ -303,7 +303,7 @@ def upload(url: str) -> Iterator[Path]:
         names = [item.relative_to(folder) for item in Path(folder).rglob("*") if item.is_file()]
         with _open_filesystem(url, error=OutputError) as (filesystem, path):
             for is_last in (False, True):
-                chosen = [n for n in names if (n.as_posix() in _ROOT_METADATA) == is_last]
+                chosen = [n for n in names if (n.as_posix() in ROOT_METADATA) == is_last]
                 filesystem.put(
                     [str(Path(folder, name)) for name in chosen],
                     [f"{path}/{name.as_posix()}" for name in chosen],

@@ -9,14 +9,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gyrostab.store.remote import read_bytes
+from gyrostab.store.remote import ROOT_METADATA, read_bytes
 
-__all__ = ["FindForeign", "find_foreign_item", "is_store", "read_json"]
+__all__ = ["METADATA", "FindForeign", "find_foreign_item", "is_store", "read_json"]
 
 #: Function that returns the name of an item of a folder that must not be removed, or None.
 FindForeign = Callable[[Path], str | None]
 
-_METADATA = {".zgroup", ".zarray", ".zattrs", ".zmetadata", "zarr.json"}
+#: Names of the metadata of Zarr stores.
+METADATA = {".zarray", *ROOT_METADATA}
 #: Keys of chunks of formats 2 and 3, ``1.0``, ``c.1.0``, or one level of ``c/1/0``, and chunks that
 #: a killed process left.
 _CHUNK = re.compile(r"(c|(c\.)?\d+(\.\d+)*)(\.[0-9a-f]{32}\.partial)?")
@@ -25,7 +26,7 @@ _CHUNK = re.compile(r"(c|(c\.)?\d+(\.\d+)*)(\.[0-9a-f]{32}\.partial)?")
 def read_json(path: Path) -> Any:
     """Read a JSON file, also at an address; None when it cannot be read."""
     try:
-        return json.loads(read_bytes(path).decode())
+        return json.loads(read_bytes(path))
     except (OSError, ValueError, RecursionError):
         return None
 
@@ -78,6 +79,6 @@ def _find_in_node(folder: str, node: str | None) -> str | None:
             foreign_item = _find_in_node(entry.path, inner_node)
             if foreign_item is not None:
                 return foreign_item
-        elif not entry.is_file() or not (is_chunk or entry.name in _METADATA):
+        elif not entry.is_file() or not (is_chunk or entry.name in METADATA):
             return entry.path
     return None
