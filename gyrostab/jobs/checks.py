@@ -13,11 +13,11 @@ __all__ = ["check_options"]
 
 def check_options(
     *,
-    reading: Mapping[str, Any],
-    windows: Mapping[str, Any],
+    reading: Mapping[str, Any] | None = None,
+    windows: Mapping[str, Any] | None = None,
     fitting: Mapping[str, Any] | None = None,
-) -> None:
-    """Check the options of a run as far as they do not depend on the log.
+) -> dict[str, Any]:
+    """Check the options of a run as far as they do not depend on the log; return them as dicts.
 
     Raises
     ------
@@ -27,9 +27,15 @@ def check_options(
     from gyrostab.allan.fit import check_fit_options
     from gyrostab.ingest.uniform import check_cut
 
-    check_cut(**reading)
-    check_windows(**windows)
-    check_fit_options(**(fitting or {}))
+    options = {
+        "reading": dict(reading or {}),
+        "windows": dict(windows or {}),
+        "fitting": dict(fitting or {}),
+    }
+    check_cut(**options["reading"])
+    check_windows(**options["windows"])
+    check_fit_options(**options["fitting"])
+    return options
 
 
 def check_windows(

@@ -57,8 +57,8 @@ from gyrostab.store.output import (
     check_output,
     protect_inputs,
     read_json,
-    replace_file,
     resolve_link,
+    write_text,
 )
 from gyrostab.store.read import open_stored
 from gyrostab.store.remote import (
@@ -78,6 +78,7 @@ __all__ = ["process_run", "run_fleet", "write_file_table"]
 _SAVE_SECONDS = 30.0
 _REQUESTS = 16  # to an object store at a time
 _MAX_NAMES = 3  # runs that an error message names
+_GROUP = {"zarr_format": 2}  # metadata of a Zarr group
 PLOTLY_FILE = "plotly.js"  # in the folder of the reports, which share it
 
 
@@ -181,12 +182,7 @@ def run_fleet(
         When the output or an option is wrong.
     """
     scheduler = check_scheduler(scheduler)
-    options = {
-        "reading": dict(reading or {}),
-        "windows": dict(windows or {}),
-        "fitting": dict(fitting or {}),
-    }
-    check_options(**options)
+    options = check_options(reading=reading, windows=windows, fitting=fitting)
     if url := find_url(output):
         _check_address(url, ".zarr", is_own=is_fleet(Path(output)))
     else:
@@ -258,24 +254,18 @@ def _begin_output(target: Path, *, reports: bool) -> None:
 
     if not find_url(target):
         target.mkdir(exist_ok=True)
-    _write_json(target / FLEET_MARK, {"schema": FLEET_SCHEMA})
+    write_text(target / FLEET_MARK, json.dumps({"schema": FLEET_SCHEMA}))
     if is_zarr(target):
-        _write_json(target / ".zgroup", {"zarr_format": 2})
+        write_text(target / ".zgroup", json.dumps(_GROUP))
     if reports:
         _make_folder(target / "reports")
-        with replace_file(target / "reports" / PLOTLY_FILE) as temporary:
-            temporary.write_text(plotly_script(), encoding="utf-8")
+        write_text(target / "reports" / PLOTLY_FILE, plotly_script())
 
 
 def _make_folder(folder: Path) -> None:
     """Make a folder, with those above it; an address needs none."""
     if not find_url(folder):
         folder.mkdir(parents=True, exist_ok=True)
-
-
-def _write_json(path: Path, content: Any) -> None:
-    with replace_file(path) as temporary:
-        temporary.write_text(json.dumps(content), encoding="utf-8")
 
 
 def _open_archive(paths: Sequence[str | Path], target: Path) -> tuple[Archive, pd.DataFrame | None]:
@@ -420,7 +410,7 @@ def _make_folders(target: Path, folder: Path) -> None:
         if group == target:
             break
         if not has_file(group / ".zgroup"):
-            _write_json(group / ".zgroup", {"zarr_format": 2})
+            write_text(group / ".zgroup", json.dumps(_GROUP))
 
 
 def _finish_run(path: Path, report: Path | None, plotly: str) -> dict[str, Any]:
@@ -448,9 +438,7 @@ def _write_overview(table: pd.DataFrame, target: Path) -> None:
 
 def _consolidate_metadata(target: Path, names: Sequence[str]) -> None:
     """Write the metadata of all groups in one file, from those that each group has."""
-    metadata: dict[str, Any] = {
-        ".zgroup": {"zarr_format": 2},
-    }
+    metadata: dict[str, Any] = {".zgroup": _GROUP}
     with ThreadPoolExecutor(_REQUESTS if find_url(target) else 1) as threads:
         contents = list(threads.map(lambda name: read_json(target / name / ".zmetadata"), names))
     for name, content in zip(names, contents, strict=True):
@@ -458,6 +446,7 @@ def _consolidate_metadata(target: Path, names: Sequence[str]) -> None:
             continue
         parts = name.split("/")
         for depth in range(1, len(parts)):
-            metadata["/".join([*parts[:depth], ".zgroup"])] = {"zarr_format": 2}
+            metadata["/".join([*parts[:depth], ".zgroup"])] = _GROUP
         metadata |= {f"{name}/{key}": value for key, value in content["metadata"].items()}
-    _write_json(target / ".zmetadata", {"zarr_consolidated_format": 1, "metadata": metadata})
+    content = {"zarr_consolidated_format": 1, "metadata": metadata}
+    write_text(target / ".zmetadata", json.dumps(content))

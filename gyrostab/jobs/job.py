@@ -24,10 +24,10 @@ from typing import Any
 import numpy as np
 
 from gyrostab.errors import OutputError, ResumeError
-from gyrostab.store.output import describe_file, is_leftover, remove_leftovers, replace_file
+from gyrostab.store.output import describe_file, is_leftover, remove_leftovers, write_text
 from gyrostab.store.output.content import read_json
 from gyrostab.store.remote import find_url, full_name
-from gyrostab.store.system import lock_file, read_at, write_at
+from gyrostab.store.system import lock_file, write_at
 
 __all__ = [
     "begin_job",
@@ -113,13 +113,19 @@ def describe_inputs(paths: Sequence[Path]) -> list[dict[str, Any]]:
 
 
 def make_fingerprint(paths: Sequence[Path], options: Mapping[str, Any]) -> dict[str, Any]:
-    """Collect all that a product depends on: inputs in order, options, versions and machine."""
+    """Collect all that a product depends on: inputs in order, options, versions and machine.
+
+    The options are those of `gyrostab.jobs.checks.check_options`; fitting is None without a fit.
+    """
+    plain = {**options["reading"], **options["windows"]}
+    plain |= {f"fit {name}": value for name, value in (options["fitting"] or {}).items()}
+    plain["fit"] = "left out" if options["fitting"] is None else None
     versions = {name: _find_version(name) for name in ("gyrostab", "numpy", "numba")}
     return {
         "inputs": describe_inputs(paths),
         "options": json.loads(
             json.dumps(
-                {name: value for name, value in options.items() if value is not None}, default=str
+                {name: value for name, value in plain.items() if value is not None}, default=str
             )
         ),
         "versions": {
@@ -266,9 +272,7 @@ def _open_lock(folder: Path) -> int:
 
 def _take_lock(handle: int, folder: Path) -> None:
     if not lock_file(handle):
-        text = memoryview(bytearray(100))
-        count = read_at(handle, text, 0)
-        owner = bytes(text[:count]).decode("ascii", "replace").strip() or "another process"
+        owner = (folder / "lock").read_text("ascii", "replace").strip() or "another process"
         raise ResumeError(
             f"{folder.name}: {owner} is making this product now; wait for it, or stop it first"
         )
@@ -297,16 +301,12 @@ def _hash_json(content: Any) -> str:
 def begin_job(folder: Path, fingerprint: Mapping[str, Any], *, parts: int, overwrite: bool) -> None:
     """Write inputs and options of a run, before its first block."""
     job = {"schema": _SCHEMA, "overwrite": overwrite, "parts": parts, **fingerprint}
-    with replace_file(folder / "job.json") as temporary:
-        temporary.write_text(
-            json.dumps({**job, "sha256": _hash_json(job)}, indent=1), encoding="utf-8"
-        )
+    write_text(folder / "job.json", json.dumps({**job, "sha256": _hash_json(job)}, indent=1))
 
 
 def write_store_checksum(folder: Path) -> None:
     """Write the checksum of the stored log in a job folder."""
-    with replace_file(folder / _STORE_CHECKSUM_FILE) as temporary:
-        temporary.write_text(_hash_tree(folder / "log.zarr"), encoding="ascii")
+    write_text(folder / _STORE_CHECKSUM_FILE, _hash_tree(folder / "log.zarr"))
 
 
 def remove_damage(folder: Path) -> None:

@@ -196,13 +196,9 @@ def run(
         When interrupted; the message says how much is done.
     """
     scheduler = check_scheduler(scheduler)
-    fitting = None if surface_only else dict(fitting or {})
-    options: dict[str, Any] = {
-        "reading": dict(reading or {}),
-        "windows": dict(windows or {}),
-        "fitting": fitting,
-    }
-    check_options(**options)
+    options = check_options(reading=reading, windows=windows, fitting=fitting)
+    if surface_only:
+        options["fitting"] = None
     with protect_inputs(paths), protect_inputs(options["reading"].get("channel", ())):
         zarr = zarr or Path(output).suffix.lower() == ".zarr"
         job = _describe_job(paths, resolve_link(output), options, zarr=zarr)
@@ -226,14 +222,6 @@ class _Job(NamedTuple):
     zarr: bool
 
 
-class _Progress(NamedTuple):
-    """State of an unfinished or complete run."""
-
-    complete: bool
-    fresh: bool
-    overwrite: bool
-
-
 def _run_job(
     job: _Job,
     paths: Sequence[str | Path],
@@ -247,13 +235,17 @@ def _run_job(
     blocks: Blocks = {}
     with lock_job(job.folder):
         try:
-            begun = _inspect_job(job, resume=resume, overwrite=overwrite)
-            if begun.complete:
+            if resume and _is_complete(job):
                 warnings.warn(f"{job.target} is complete already", stacklevel=2)
             else:
+                fresh, overwrite = _inspect_job(job, resume=resume, overwrite=overwrite)
                 with open_workers() as pool:
-                    _compute_missing(job, blocks, paths, begun=begun, pool=pool, stage=stage)
-                _write_product(job, blocks, overwrite=begun.overwrite, stage=stage)
+                    if fresh:
+                        clear_job(job.folder)
+                    _compute_missing(
+                        job, blocks, paths, overwrite=overwrite, pool=pool, stage=stage
+                    )
+                _write_product(job, blocks, overwrite=overwrite, stage=stage)
         except KeyboardInterrupt as stop:
             raise KeyboardInterrupt(_add_resume_advice(job, "interrupted")) from stop
         except GyrostabError as error:
@@ -285,24 +277,19 @@ def _describe_job(
 
     extra = options["reading"].get("channel", ())
     files = expand(paths) + (expand(extra) if extra else [])
-    plain = {
-        **options["reading"],
-        "channel": None,
-        **options["windows"],
-        **{f"fit {k}": v for k, v in (options["fitting"] or {}).items()},
-    }
     fingerprint = make_fingerprint(
-        files, {**plain, "fit": "left out" if options["fitting"] is None else None}
+        files, {**options, "reading": {**options["reading"], "channel": None}}
     )
     name = hash_fingerprint(fingerprint)
     return _Job(target, job_folder(target), files, fingerprint, name, options, zarr)
 
 
-def _inspect_job(job: _Job, *, resume: bool, overwrite: bool) -> _Progress:
-    """Find the state of a job, and refuse to destroy an output or to mix two jobs."""
+def _inspect_job(job: _Job, *, resume: bool, overwrite: bool) -> tuple[bool, bool]:
+    """Find whether a job begins anew, and may replace its output.
+
+    It refuses to destroy an output or to mix two jobs.
+    """
     earlier_job, has_work = read_job(job.folder), has_finished_work(job.folder)
-    if resume and _is_complete(job):
-        return _Progress(complete=True, fresh=False, overwrite=False)
     if earlier_job and has_work and not (resume or overwrite):
         raise ResumeError(
             _add_resume_advice(job, f"{job.target}: a run of it was begun and not finished")
@@ -323,7 +310,7 @@ def _inspect_job(job: _Job, *, resume: bool, overwrite: bool) -> _Progress:
             "give --overwrite to replace it, or another name with -o"
         )
     check_output(job.target, overwrite=overwrite, **_FORMS[job.zarr])
-    return _Progress(complete=False, fresh=not is_continued, overwrite=overwrite)
+    return not is_continued, overwrite
 
 
 def _is_complete(job: _Job) -> bool:
@@ -377,7 +364,7 @@ def _compute_missing(
     blocks: Blocks,
     paths: Sequence[str | Path],
     *,
-    begun: _Progress,
+    overwrite: bool,
     pool: Pool,
     stage: Stage,
 ) -> None:
@@ -388,20 +375,21 @@ def _compute_missing(
 
     reading, windows, fitting = (job.options[name] for name in ("reading", "windows", "fitting"))
     store = job.folder / "log.zarr"
-    if begun.fresh:
-        clear_job(job.folder)
     remove_damage(job.folder)
     remove_leftovers(job.target)
     if any(map(find_url, paths)):
         return_large_arrays()  # chunks arrive in new arrays, which no thread reuses
     stage("reading", 0)
-    on_file = partial(_show_file, stage)
-    log = load_log([store]) if store.exists() else load_log(paths, **reading, on_file=on_file)
+
+    def show_file(number: int, count: int, path: Path) -> None:
+        stage("reading", count, number - 1, "files")
+
+    log = load_log([store]) if store.exists() else load_log(paths, **reading, on_file=show_file)
     if "window" not in windows:
         windows = {**windows, "window": choose_window(log)}
         warnings.warn(f"the window is {windows['window']}; --window gives another", stacklevel=2)
     parts = davar_parts(log, **windows)
-    begin_job(job.folder, job.fingerprint, parts=len(parts), overwrite=begun.overwrite)
+    begin_job(job.folder, job.fingerprint, parts=len(parts), overwrite=overwrite)
     blocks.update(find_blocks(job.folder, parts, job=job.name))
     axis = windows.get("axis")
     total = log.sizes["time"] * (
@@ -446,10 +434,6 @@ def _compute_missing(
         check=partial(_check_inputs, job),
         advance=advance,
     )
-
-
-def _show_file(stage: Stage, number: int, count: int, path: Path) -> None:
-    stage("reading", count, number - 1, "files")
 
 
 def _check_inputs(job: _Job) -> None:

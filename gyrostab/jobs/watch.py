@@ -139,12 +139,8 @@ def watch(
     FormatError
         When no window could be computed until the end.
     """
-    options = {
-        "reading": dict(reading or {}),
-        "windows": {"window": "10min", **(windows or {})},
-        "fitting": dict(fitting or {}),
-    }
-    check_options(**options)
+    windows = {"window": "10min", **(windows or {})}
+    options = check_options(reading=reading, windows=windows, fitting=fitting)
     return_large_arrays()
     wait = duration_seconds(lateness, "--lateness") if lateness else 0.0
     quiet = duration_seconds(idle, "--idle") if idle else np.inf
@@ -215,17 +211,12 @@ def _continue_product(
         check_output(path, suffixes=[".zarr"], overwrite=overwrite)
         return None
     check_output(path, suffixes=[".zarr"], overwrite=True)
-    if changes := describe_differences(json.loads(old_options), _describe_options(options)):
+    if changes := describe_differences(json.loads(old_options), make_fingerprint([], options)):
         raise OutputError(
             f"output {str(path)!r} exists already, and {changes}; give the same options to "
             "continue it, --overwrite to replace it, or another name with -o"
         )
     return until
-
-
-def _describe_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    plain = {**options["reading"], **options["windows"]}
-    return make_fingerprint([], {**plain, **{f"fit {k}": v for k, v in options["fitting"].items()}})
 
 
 class _View:
@@ -348,7 +339,7 @@ class _View:
         same = [i < len(old) and old[i] == digest for i, digest in enumerate(digests)]
         if all(same) and len(old) == len(digests):
             return
-        attrs = {_OPTIONS: json.dumps(_describe_options(self.options))}
+        attrs = {_OPTIONS: json.dumps(make_fingerprint([], self.options))}
 
         def compute(parts: Sequence[slice]) -> Iterator[tuple[slice, xr.Dataset]]:
             for part in parts:

@@ -10,6 +10,7 @@ import pytest
 
 from gyrostab import make_log, to_zarr
 from gyrostab.errors import OutputError
+from gyrostab.jobs.checks import check_options
 from gyrostab.jobs.job import (
     begin_job,
     check_job_folder,
@@ -25,7 +26,12 @@ def flip(content: bytes, place: int, bit: int) -> bytes:
 
 
 def test_a_flipped_bit_in_the_description_of_a_run_is_noticed(tmp_path):
-    begin_job(tmp_path, make_fingerprint([tmp_path], {"window": "10min"}), parts=5, overwrite=False)
+    begin_job(
+        tmp_path,
+        make_fingerprint([tmp_path], check_options(windows={"window": "10min"})),
+        parts=5,
+        overwrite=False,
+    )
     path = tmp_path / "job.json"
     whole, before = path.read_bytes(), read_job(tmp_path)
     assert before["parts"] == 5

@@ -306,18 +306,21 @@ def test_changes_refuse_to_resume_and_say_what(log, tmp_path, after_two, monkeyp
 
 def test_a_zarr_store_with_a_changed_chunk_is_noticed(log, tmp_path):
     from gyrostab import to_zarr
+    from gyrostab.jobs.checks import check_options
     from gyrostab.jobs.job import describe_differences, make_fingerprint
 
     store = to_zarr(open_log(log), tmp_path / "run7.zarr")
-    before = make_fingerprint([store], {})
-    assert describe_differences(before, make_fingerprint([store], {})) == ""
+    before = make_fingerprint([store], check_options())
+    assert describe_differences(before, make_fingerprint([store], check_options())) == ""
     chunk = next(
         path for path in sorted((store / "rate").iterdir()) if not path.name.startswith(".")
     )
     while chunk.is_dir():
         chunk = next(chunk.iterdir())
     _touched(chunk)
-    assert "run7.zarr has changed" in describe_differences(before, make_fingerprint([store], {}))
+    assert "run7.zarr has changed" in describe_differences(
+        before, make_fingerprint([store], check_options())
+    )
 
 
 def test_an_input_that_vanishes_meanwhile(

@@ -18,8 +18,8 @@ from typing import Any
 
 from gyrostab.blindtest.generator.scenario import STREAM_LABELS
 from gyrostab.errors import FormatError, OptionError, OutputError, ResumeError
-from gyrostab.jobs import is_lock
-from gyrostab.store.output import check_target, is_leftover, read_json, replace_file
+from gyrostab.jobs.job import is_lock
+from gyrostab.store.output import check_target, is_leftover, read_json, write_text
 
 __all__ = [
     "FIRST_PUBLIC_SEED",
@@ -31,7 +31,6 @@ __all__ = [
     "read_sums",
     "write_json",
     "write_sums",
-    "write_text",
 ]
 
 #: Seeds below this one are for tuning; published runs use others.
@@ -55,15 +54,8 @@ _FILES = (
 )
 
 
-def write_text(path: Path, text: str) -> Path:
-    """Write a file that gets its name once it is complete."""
-    with replace_file(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-    return path
-
-
 def write_json(path: Path, content: Any) -> Path:
-    """Write JSON like `write_text`."""
+    """Write a JSON file that gets its name once it is complete."""
     return write_text(path, json.dumps(content, indent=1) + "\n")
 
 

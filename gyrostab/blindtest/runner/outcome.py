@@ -18,7 +18,7 @@ from gyrostab.blindtest.runner.figures import (
     draw_reliability,
     draw_roc,
 )
-from gyrostab.blindtest.runner.folder import FIRST_PUBLIC_SEED, write_text
+from gyrostab.blindtest.runner.folder import FIRST_PUBLIC_SEED
 from gyrostab.blindtest.scoring.curves import (
     by_effect,
     curves,
@@ -36,7 +36,7 @@ from gyrostab.blindtest.scoring.injections import injection_differences, injecti
 from gyrostab.blindtest.scoring.probability import calibration_curve, risk_coverage
 from gyrostab.blindtest.scoring.score import drawn_rows, first_rows, score_case
 from gyrostab.blindtest.scoring.table import list_missed, markdown
-from gyrostab.store.output import replace_file
+from gyrostab.store.output import replace_file, write_text
 
 __all__ = ["page_text", "score_rows", "write_outcome"]
 

@@ -14,6 +14,7 @@ from gyrostab.store.output.write import (
     new_output,
     remove_leftovers,
     replace_file,
+    write_text,
 )
 
 __all__ = [
@@ -32,4 +33,5 @@ __all__ = [
     "remove_leftovers",
     "replace_file",
     "resolve_link",
+    "write_text",
 ]

@@ -21,7 +21,14 @@ from gyrostab.store.output.inputs import check_unchanged
 from gyrostab.store.remote import find_url, upload, upload_file
 from gyrostab.store.system import exchange_paths, rename_new, sync_path
 
-__all__ = ["is_leftover", "new_folder", "new_output", "remove_leftovers", "replace_file"]
+__all__ = [
+    "is_leftover",
+    "new_folder",
+    "new_output",
+    "remove_leftovers",
+    "replace_file",
+    "write_text",
+]
 
 #: Number of checks, 20 ms apart, after which a removed folder counts as gone: on a busy machine, a
 #: thread may be delayed that long before it writes again.
@@ -119,6 +126,13 @@ def replace_file(path: Path) -> Iterator[Path]:
         _sync_tree(temporary)
         os.replace(temporary, path)
         sync_path(path.parent)
+
+
+def write_text(path: Path, text: str) -> Path:
+    """Write a text file like `replace_file`."""
+    with replace_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return path
 
 
 @contextlib.contextmanager
