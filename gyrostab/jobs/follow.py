@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Any
 
 import xarray as xr
 
@@ -16,9 +16,9 @@ from gyrostab.ingest.columns.pieces import Spool
 from gyrostab.ingest.combine import move_to_disk
 from gyrostab.ingest.files import read_file
 from gyrostab.ingest.options import ReadOptions
-from gyrostab.store.output.inputs import match_files
+from gyrostab.store.output.inputs import describe_file, match_files
 
-__all__ = ["FileMemory", "RowKeeper", "list_files"]
+__all__ = ["FileMemory", "FileStates", "RowKeeper", "list_files"]
 
 #: Files written this long [s] before the newest one, or later, may still grow.
 _GROWING_SECONDS = 60.0
@@ -26,53 +26,49 @@ _GROWING_SECONDS = 60.0
 _MAX_ROW_FILE_BYTES = 2**26
 _READ_BYTES = 2**16
 _DATA_ROW = re.compile(rb'\s*"?[-+.\d]')
-_ROW_FILE = "rows-{:06d}.csv"
+_ROW_FILE = "rows-{}.csv"
 
 
-class FileState(NamedTuple):
-    """Size [bytes] and time of change [ns] of a file."""
-
-    size: int
-    changed: int
+#: Files with their states, as from `describe_file`.
+FileStates = dict[Path, dict[str, Any]]
 
 
-def list_files(source: str) -> dict[Path, FileState]:
+def list_files(source: str) -> FileStates:
     """List the files of a folder, of a pattern, or a single file, with their states.
 
-    Hidden files and folders are left out.
+    Hidden files, empty files and folders are left out.
     """
-    states = {}
-    for item in sorted(Path(source).iterdir() if Path(source).is_dir() else match_files(source)):
-        if item.name.startswith(".") or not item.is_file():
-            continue
-        status = item.stat()
-        if status.st_size:
-            states[item] = FileState(status.st_size, status.st_mtime_ns)
-    return states
+    paths = Path(source).iterdir() if Path(source).is_dir() else match_files(source)
+    states = {
+        path: describe_file(path)
+        for path in sorted(paths)
+        if path.is_file() and not path.name.startswith(".")
+    }
+    return {path: state for path, state in states.items() if state["bytes"]}
 
 
 class FileMemory:
     """Reads files, and remembers those that have not changed since, on disk."""
 
     def __init__(self) -> None:
-        self.files: dict[Path, FileState] = {}
+        self.files: FileStates = {}
         self.ended = False  # whether no file grows any more
         self._spool = Spool()
-        self._kept: dict[Path, tuple[FileState, bool, xr.Dataset]] = {}
+        self._kept: dict[Path, tuple[dict[str, Any], bool, xr.Dataset]] = {}
 
     def is_growing(self, path: Path) -> bool:
         """Whether a file may still grow."""
-        newest = max(state.changed for state in self.files.values())
-        age = (newest - self.files[path].changed) / 1e9
+        newest = max(state["changed_ns"] for state in self.files.values())
+        age = (newest - self.files[path]["changed_ns"]) / 1e9
         return not self.ended and age < _GROWING_SECONDS
 
-    def update(self, files: dict[Path, FileState]) -> bool:
+    def update(self, files: FileStates) -> bool:
         """Take over a new list of files; return whether an earlier file was replaced or cut."""
         earlier_files, self.files = self.files, files
         for path in self._kept.keys() - files.keys():
             del self._kept[path]
         return any(
-            path not in files or files[path].size < state.size
+            path not in files or files[path]["bytes"] < state["bytes"]
             for path, state in earlier_files.items()
         )
 
@@ -104,62 +100,38 @@ class RowKeeper:
         self.folder, self.ended = folder, False
         self.error: Exception | None = None  # that ended the copying
         folder.mkdir(exist_ok=True)
-        self._files = sorted(folder.glob(_ROW_FILE.format(0).replace("000000", "*")))
-        self._thread = threading.Thread(target=self._copy_stream, args=(stream,), daemon=True)
-        self._thread.start()
+        self._files = sorted(folder.glob(_ROW_FILE.format("*")))
+        threading.Thread(target=self._copy_stream, args=(stream,), daemon=True).start()
 
     def _copy_stream(self, stream: Any) -> None:
+        read = getattr(stream, "read1", stream.read)
         try:
-            read = getattr(stream, "read1", stream.read)
-            for block in _split_blocks(iter(lambda: read(_READ_BYTES), b"")):
-                self._write_file(block)
+            piece = read(_READ_BYTES)
+            while piece:
+                piece = self._write_file(piece, read)
         except Exception as error:  # shown by the main thread
             self.error = error
         finally:
             self.ended = True
 
-    def _write_file(self, pieces: Iterator[bytes]) -> None:
-        """Write the pieces of one file as they come, with the header of the first file."""
-        first = next(pieces)
-        header = b""
-        if _DATA_ROW.match(first) and self._files:
-            header = _read_header(self._files[0])
-        path = self.folder / _ROW_FILE.format(len(self._files) + 1)
+    def _write_file(self, piece: bytes, read: Callable[[int], bytes]) -> bytes:
+        """Write rows to a new file as they come, until it is full; return what follows."""
+        has_header = not (_DATA_ROW.match(piece) and self._files)
+        header = b"" if has_header else _read_header(self._files[0])
+        path = self.folder / _ROW_FILE.format(f"{len(self._files) + 1:06d}")
+        size = 0
         with path.open("xb") as file:
             self._files.append(path)
-            file.write(header + first)
-            file.flush()
-            for piece in pieces:
-                file.write(piece)
+            file.write(header)
+            while piece:
+                end = piece.rfind(b"\n") + 1
+                if size + len(piece) > _MAX_ROW_FILE_BYTES and end:
+                    file.write(piece[:end])
+                    return piece[end:] or read(_READ_BYTES)
+                size += file.write(piece)
                 file.flush()
-
-
-def _split_blocks(pieces: Iterator[bytes]) -> Iterator[Iterator[bytes]]:
-    r"""Split a stream at line ends into the contents of files.
-
-    Examples
-    --------
-    >>> [b"".join(block) for block in _split_blocks(iter([b"a\n1", b"\n2\n"]))]
-    [b'a\n1\n2\n']
-    """
-    rest = b""
-
-    def take(first: bytes) -> Iterator[bytes]:
-        nonlocal rest
-        size, piece = 0, first
-        while piece:
-            cut = piece.rfind(b"\n") + 1
-            if size + len(piece) > _MAX_ROW_FILE_BYTES and cut:
-                yield piece[:cut]
-                rest = piece[cut:]
-                return
-            yield piece
-            size += len(piece)
-            piece = next(pieces, b"")
-
-    while first := rest or next(pieces, b""):
-        rest = b""
-        yield take(first)
+                piece = read(_READ_BYTES)
+        return b""
 
 
 def _read_header(path: Path) -> bytes:

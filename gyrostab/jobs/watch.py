@@ -31,7 +31,7 @@ from gyrostab.io.growing import LayoutError, write_windows
 from gyrostab.jobs.alarms import Alarm, check_alarms, describe_windows
 from gyrostab.jobs.checks import check_options
 from gyrostab.jobs.engine import compute_part, find_record_bands
-from gyrostab.jobs.follow import FileMemory, RowKeeper, list_files
+from gyrostab.jobs.follow import FileMemory, FileStates, RowKeeper, list_files
 from gyrostab.jobs.job import (
     describe_differences,
     job_folder,
@@ -244,7 +244,7 @@ class _View:
         self.notes: set[str] = set()
         self.is_new_data = False
 
-    def take_files(self, files: dict[Path, Any]) -> None:
+    def take_files(self, files: FileStates) -> None:
         """Take over a new list of files."""
         if self.memory.update(files):
             self.digests = []
@@ -272,7 +272,7 @@ class _View:
 
     def _is_due(self) -> bool:
         """Whether a new window may be complete: by the time of the last update, and by bytes."""
-        held = sum(state.size for state in self.memory.files.values())
+        held = sum(state["bytes"] for state in self.memory.files.values())
         needed = _DUE_SHARE * self.missing_samples * self.bytes / max(self.samples, 1)
         return time.monotonic() >= self.next_update and held >= self.bytes + needed
 
@@ -296,7 +296,7 @@ class _View:
 
     def _update_product(self, *, final: bool) -> None:
         log, windows = self._load_rows(), self.options["windows"]
-        self.bytes = sum(state.size for state in self.memory.files.values())
+        self.bytes = sum(state["bytes"] for state in self.memory.files.values())
         self.samples = log.sizes["time"]
         rate = float(log.attrs["sampling_rate_hz"])
         wait = 0 if final else round(self.lateness * rate)

@@ -8,6 +8,7 @@ import platform
 import signal
 import subprocess
 import sys
+import time
 import urllib.error
 import urllib.request
 from itertools import pairwise
@@ -20,6 +21,7 @@ from gyrostab.cli import main
 from gyrostab.errors import FormatError, OptionError, OutputError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.io.datasets import open_product, to_netcdf, to_zarr
+from gyrostab.jobs import follow as follow_module
 from gyrostab.jobs import watch as module
 from gyrostab.jobs.alarms import parse_alarm
 from gyrostab.jobs.live_page import LivePage
@@ -201,6 +203,21 @@ def test_lateness_delays_a_window_and_the_end_writes_it(tmp_path):
     run([source], tmp_path / "run.nc", windows=WINDOWS)
     assert_same_product(tmp_path / "live.zarr", tmp_path / "run.nc")
     assert len(recorder.windows) == 6
+
+
+@pytest.mark.parametrize("most", [5, 6, 11, 1000])
+def test_rows_of_a_stream_are_kept_in_files_of_whole_rows(tmp_path, monkeypatch, most):
+    monkeypatch.setattr(follow_module, "_MAX_ROW_FILE_BYTES", most)
+    monkeypatch.setattr(follow_module, "_READ_BYTES", 4)
+    text = b"t,a\n1,2\n3,4\n5,6\n7,8"
+    keeper = follow_module.RowKeeper(io.BytesIO(text), tmp_path / "rows")
+    while not keeper.ended:
+        time.sleep(0.001)
+    files = [path.read_bytes() for path in sorted((tmp_path / "rows").iterdir())]
+    assert len(files) == {5: 3, 6: 3, 11: 2, 1000: 1}[most]
+    assert b"".join([files[0], *(file.removeprefix(b"t,a\n") for file in files[1:])]) == text
+    assert all(file.startswith(b"t,a\n") for file in files)
+    assert keeper.error is None
 
 
 def test_alarms_are_said_once_when_they_begin_and_end(tmp_path):
