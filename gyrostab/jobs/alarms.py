@@ -56,11 +56,8 @@ class Alarm:
             (self.active.add if beyond else self.active.remove)(axis)
             where = f" of axis {axis}" if axis else ""
             unit = f" {self.unit}" if self.unit else ""
-            text = (
-                f"alarm {'begins' if beyond else 'ends'}: {self.name}{where} is {value:.4g}{unit} "
-                f"({self.text})"
-            )
             state = "begins" if beyond else "ends"
+            text = f"alarm {state}: {self.name}{where} is {value:.4g}{unit} ({self.text})"
             events.append({"time": str(window["time"]), "state": state, "text": text})
         return events
 

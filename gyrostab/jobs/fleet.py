@@ -105,8 +105,7 @@ def write_file_table(
     else:
         check_output(output, suffixes=[".parquet"], overwrite=overwrite or known_table is not None)
     archive = find_archive(paths)
-    files = [path for path in archive.files[:1] if not find_url(path)]
-    with _open_workers(scheduler, workers, files) as pool:
+    with _open_workers(scheduler, workers, archive.files[:1]) as pool:
         table = index_files(
             archive,
             reading=reading or {},
@@ -193,8 +192,7 @@ def run_fleet(
         try:
             _begin_output(target, reports=reports)
             archive, known_table = _open_archive(paths, target)
-            files = [path for path in (target, *archive.files[:1]) if not find_url(path)]
-            with _open_workers(scheduler, workers, files) as pool:
+            with _open_workers(scheduler, workers, [target, *archive.files[:1]]) as pool:
                 table = index_files(
                     archive, reading=options["reading"], known=known_table, pool=pool, stage=stage
                 )
@@ -237,11 +235,11 @@ def _check_address(url: str, suffix: str, *, is_own: bool) -> None:
 
 
 def _open_workers(
-    scheduler: str, workers: int | None, files: Sequence[Path]
+    scheduler: str, workers: int | None, paths: Sequence[Path]
 ) -> contextlib.AbstractContextManager[Pool]:
     """Open processes or a cluster; one thread, as the file libraries do not share a process."""
     count = 1 if scheduler == "threads" else workers
-    return open_pool(scheduler, workers=count, files=files)
+    return open_pool(scheduler, workers=count, files=[path for path in paths if not find_url(path)])
 
 
 def _find_foreign(folder: Path) -> str | None:

@@ -147,12 +147,7 @@ def _find_version(name: str) -> str:
 def hash_fingerprint(fingerprint: Mapping[str, Any]) -> str:
     """Hash a fingerprint; name, size and time of the inputs matter, but not their folder."""
     inputs = [{**item, "path": os.path.basename(item["path"])} for item in fingerprint["inputs"]]
-    return (
-        "sha256:"
-        + hashlib.sha256(
-            json.dumps({**fingerprint, "inputs": inputs}, sort_keys=True).encode()
-        ).hexdigest()
-    )
+    return "sha256:" + _hash_json({**fingerprint, "inputs": inputs})
 
 
 def describe_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:

@@ -85,13 +85,10 @@ def open_pool(
         remote = scheduler == "processes"
         executor = _start_processes(count) if remote else ThreadPoolExecutor(count)
         submit: Callable[..., Future[Any]] = executor.submit
+        if remote:
+            submit = partial(submit, _call_with_warnings)
         try:
-            yield Pool(
-                partial(submit, _call_with_warnings) if remote else submit,
-                lambda: count,
-                remote,
-                _identity,
-            )
+            yield Pool(submit, lambda: count, remote, _identity)
         finally:
             executor.shutdown(wait=True, cancel_futures=True)
     else:
@@ -103,11 +100,8 @@ def _start_processes(count: int) -> Any:
     import multiprocessing
     from concurrent.futures import ProcessPoolExecutor
 
-    return ProcessPoolExecutor(
-        count,
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_begin_process,
-    )
+    spawn = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(count, mp_context=spawn, initializer=_begin_process)
 
 
 def _begin_process() -> None:

@@ -58,11 +58,7 @@ def encode_attributes(attrs: dict[str, Any]) -> dict[str, Any]:
     for name, value in attrs.items():
         if isinstance(value, np.generic):
             attrs[name] = value = value.item()
-        if isinstance(value, str) or (
-            isinstance(value, int | float) and not isinstance(value, bool)
-        ):
-            continue
-        if not isinstance(value, np.ndarray):
+        if isinstance(value, bool) or not isinstance(value, str | int | float | np.ndarray):
             # in ASCII: Octave cannot list a file with other characters in a global attribute
             attrs[name] = json.dumps(value, default=str)
             coded.append(name)

@@ -15,7 +15,7 @@ import zlib
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -236,10 +236,8 @@ def find_hdf5_codecs(plist: Any) -> tuple[tuple[int, Any], ...]:
 
 def has_known_filters(plist: Any) -> bool:
     """Whether all filters in the creation property list of an HDF5 dataset are known."""
-    known_filters = (_DEFLATE, _SHUFFLE, _FLETCHER32, _ZSTD)
-    return all(
-        plist.get_filter(number)[0] in known_filters for number in range(plist.get_nfilters())
-    )
+    codes = {plist.get_filter(number)[0] for number in range(plist.get_nfilters())}
+    return codes <= {_DEFLATE, _SHUFFLE, _FLETCHER32, _ZSTD}
 
 
 @dataclass(frozen=True)

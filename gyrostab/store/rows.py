@@ -119,19 +119,16 @@ class ChunkedRows:
         for number in range(start // length, -(-stop // length)) if stop > start else ():
             first = number * length
             low, high = max(start, first), min(stop, first + length)
-            at: tuple[int, ...] = (number,)
-            inside: Any = slice(low - first, high - first)
+            at: list[int] = [number]
+            inside: list[Any] = [slice(low - first, high - first)]
             if len(self.shape) == 2:
                 across, offset = divmod(self.place, self.chunks[1 - self.along])
-                at, inside = (
-                    ((number, across), (inside, offset))
-                    if self.along == 0
-                    else ((across, number), (offset, inside))
-                )
+                at.insert(1 - self.along, across)
+                inside.insert(1 - self.along, offset)
             is_single_column = len(self.shape) == 1 or self.chunks[1 - self.along] == 1
             part = low > first or high < min(first + length, self.shape[self.along])
-            chunk = self._read_chunk(at, is_single_column=is_single_column, part=part)
-            out[low - start : high - start] = self.fill if chunk is None else chunk[inside]
+            chunk = self._read_chunk(tuple(at), is_single_column=is_single_column, part=part)
+            out[low - start : high - start] = self.fill if chunk is None else chunk[tuple(inside)]
         return out
 
     def _read_chunk(
@@ -197,13 +194,8 @@ def hdf5_rows(path: Path, variable: Any) -> Callable[[int, int], Rows] | None:
         return partial(EvenRows.of_array, path.absolute(), dtype, variable.id.get_offset(), stride)
     if plist.get_layout() != h5py.h5d.CHUNKED or not has_known_filters(plist):
         return None
-    if (
-        np.prod(
-            [-(-size // length) for size, length in zip(shape, variable.chunks, strict=True)],
-            dtype=float,
-        )
-        > _MAX_CHUNKS
-    ):
+    counts = [-(-size // length) for size, length in zip(shape, variable.chunks, strict=True)]
+    if math.prod(counts) > _MAX_CHUNKS:
         return None  # a table of their places would be larger than the chunks
     key = uuid.uuid4().hex
     load = partial(_load_hdf5, path.absolute(), variable.name, variable.chunks, key)

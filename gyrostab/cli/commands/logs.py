@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 from gyrostab.cli.frame import Logs, Output, app, show_stages
@@ -118,15 +119,6 @@ def ingest(
         def tell(share: float) -> None:
             stage("writing", samples, round(share * samples))
 
-        if zarr:
-            to_zarr(log, target, overwrite=common.overwrite, stamps=stamps, progress=tell)
-        else:
-            to_netcdf(
-                log,
-                target,
-                overwrite=common.overwrite,
-                compression=compression,
-                stamps=stamps,
-                progress=tell,
-            )
+        write = to_zarr if zarr else partial(to_netcdf, compression=compression)
+        write(log, target, overwrite=common.overwrite, stamps=stamps, progress=tell)
     print(target)

@@ -50,14 +50,9 @@ def report(
                     "--log is for the report of a product; a diagnosis holds what its report shows"
                 )
             write_diagnosis_report(open_diagnosis(product), target, overwrite=common.overwrite)
-            print(target)
-            return
-        write_report(
-            open_product(product),
-            target,
-            log=open_log(log) if log else None,
-            overwrite=common.overwrite,
-        )
+        else:
+            signal = open_log(log) if log else None
+            write_report(open_product(product), target, log=signal, overwrite=common.overwrite)
     print(target)
 
 
