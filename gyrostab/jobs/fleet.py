@@ -355,7 +355,7 @@ def _is_current(
 
 def _has_product(target: Path, name: str) -> bool:
     path = product_path(target, name)
-    return read_job_name(path) is not None if find_url(path) else path.exists()
+    return bool(read_job_name(path)) if find_url(path) else path.exists()
 
 
 def process_run(

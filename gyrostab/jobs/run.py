@@ -45,15 +45,14 @@ from gyrostab.jobs.job import (
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool
 from gyrostab.kernels.workspace import Workspaces
 from gyrostab.progress import Stage, no_stage
+from gyrostab.store.netcdf_log import read_attribute
 from gyrostab.store.output import (
     check_output,
     find_foreign_item,
     protect_inputs,
-    read_json,
     remove_leftovers,
     resolve_link,
 )
-from gyrostab.store.private import library_lock
 from gyrostab.store.remote import find_url
 from gyrostab.store.system import return_large_arrays
 
@@ -317,20 +316,9 @@ def _is_complete(job: _Job) -> bool:
     return read_job_name(job.target) == job.name
 
 
-def read_job_name(path: Path) -> str | None:
-    """Read the hash of the job that made a product; None for anything else."""
-    if find_url(path) or path.is_dir():
-        attributes = read_json(path / ".zattrs")
-        return attributes.get("gyrostab_job") if isinstance(attributes, dict) else None
-    if not path.is_file():
-        return None
-    import netCDF4
-
-    try:
-        with library_lock(), netCDF4.Dataset(path) as file:
-            return str(file.getncattr("gyrostab_job"))
-    except (OSError, AttributeError):
-        return None
+def read_job_name(path: Path) -> str:
+    """Read the hash of the job that made a product; empty for anything else."""
+    return read_attribute(path, "gyrostab_job")
 
 
 def _add_resume_advice(job: _Job, message: str) -> str:

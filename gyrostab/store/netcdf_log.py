@@ -25,13 +25,13 @@ from gyrostab.errors import FormatError
 from gyrostab.store.attributes import JSON_NAMES
 from gyrostab.store.hdf5_heaps import check_global_heaps
 from gyrostab.store.layout import has_known_filters
+from gyrostab.store.output.content import read_json
 from gyrostab.store.private import library_lock
+from gyrostab.store.remote import find_url
 from gyrostab.store.safe_names import ORIGINAL_NAME
 from gyrostab.store.times import GRID, follows_rule, parse_time_grids
 
-__all__ = ["StoredLog", "open_netcdf_log", "read_content"]
-
-_CONTENT = b"gyrostab_content"
+__all__ = ["StoredLog", "open_netcdf_log", "read_attribute"]
 
 #: Attributes of a variable that xarray moves to its encoding.
 _ENCODED = ("_FillValue", "scale_factor")
@@ -117,27 +117,21 @@ def open_netcdf_log(path: Path, *, brief: bool = False) -> StoredLog | None:
     )
 
 
-def read_content(path: Path) -> str:
-    """Read the attribute that says what gyrostab wrote; empty for other files and formats.
-
-    Raises
-    ------
-    OSError
-        When the file is damaged.
-    FormatError
-        When it is in a global heap that the library would not return from.
-    """
+def read_attribute(path: Path, name: str) -> str:
+    """Read an attribute that gyrostab wrote for a NetCDF file or Zarr store; empty without it."""
     from h5py import h5f
 
-    with library_lock():
-        if not h5f.is_hdf5(os.fsencode(path)):
-            return ""
-        attribute = _open_content(h5f.open(os.fsencode(path), h5f.ACC_RDONLY))
-        if attribute is None:
-            return ""
-        if _has_variable_length(attribute):
-            check_global_heaps(path)
-        return str(_read_value(attribute))
+    if find_url(path) or path.is_dir():
+        attributes = read_json(path / ".zattrs")
+        return str(attributes.get(name, "")) if isinstance(attributes, dict) else ""
+    try:
+        with library_lock():
+            attribute = _open_attribute(h5f.open(os.fsencode(path), h5f.ACC_RDONLY), name)
+            if attribute is not None and _has_variable_length(attribute):
+                check_global_heaps(path)
+            return "" if attribute is None else str(_read_value(attribute))
+    except Exception:  # whatever the library raises on damaged bytes and other formats
+        return ""
 
 
 def _open_file(path: Path) -> Any:
@@ -145,16 +139,16 @@ def _open_file(path: Path) -> Any:
     from h5py import h5f
 
     file = h5f.open(os.fsencode(path), h5f.ACC_RDONLY)
-    attribute = _open_content(file)
+    attribute = _open_attribute(file, "gyrostab_content")
     if attribute is None or _has_variable_length(attribute):
         return None  # text of variable length is in a heap that is not checked yet
     return file if _read_value(attribute) == "log" else None
 
 
-def _open_content(file: Any) -> Any:
+def _open_attribute(file: Any, name: str) -> Any:
     from h5py import h5a
 
-    return h5a.open(file, _CONTENT) if h5a.exists(file, _CONTENT) else None
+    return h5a.open(file, name.encode()) if h5a.exists(file, name.encode()) else None
 
 
 def _open_values(file: Any) -> dict[str, Any]:

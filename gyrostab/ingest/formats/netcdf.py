@@ -41,7 +41,7 @@ from gyrostab.store.attributes import decode_attributes
 from gyrostab.store.blosc_chunks import check_blosc_chunks
 from gyrostab.store.cf import from_disk
 from gyrostab.store.hdf5_heaps import check_global_heaps
-from gyrostab.store.netcdf_log import StoredLog, open_netcdf_log, read_content
+from gyrostab.store.netcdf_log import StoredLog, open_netcdf_log, read_attribute
 from gyrostab.store.read import open_stored
 from gyrostab.store.remote import find_url
 from gyrostab.store.safe_names import ORIGINAL_NAME
@@ -119,7 +119,7 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
     """Open a regular log, of gyrostab or with a stamp for each sample; None for other files."""
     if path.is_file():
         read_classic_header(path)  # before the library allocates what a damaged header asks for
-    content = _content_kind(path)
+    content = read_attribute(path, "gyrostab_content")
     if content == "log":
         return _open_own(path, options)
     if path.is_file():
@@ -222,16 +222,6 @@ def _read_labels(path: Path, labels: xr.DataArray) -> NDArray[np.str_]:
         if codes.size and codes.max() > sys.maxunicode:
             raise FormatError(f"{path.name}: the names of its axes are damaged; copy it again")
     return np.array([str(label) for label in values], dtype=str)
-
-
-def _content_kind(path: Path) -> str:
-    """Return the content that gyrostab wrote: log, surface or product; "" for other files."""
-    try:
-        if path.is_dir():
-            return str(json.loads((path / ".zattrs").read_bytes()).get("gyrostab_content", ""))
-        return read_content(path)
-    except Exception:  # whatever the libraries raise on damaged bytes
-        return ""
 
 
 def _open_own(path: Path, options: ReadOptions) -> xr.Dataset:
