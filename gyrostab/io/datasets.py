@@ -391,17 +391,9 @@ def open_dataset(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Da
 
     Parameters
     ----------
-    path : path-like
-        A NetCDF file or a Zarr directory.
     strict : bool
         What a chunk of a log does that turns out to be damaged or missing: raise `FormatError` as
         it is read, or become a gap, of which a warning tells the file, the axis and the times.
-
-    Returns
-    -------
-    xarray.Dataset
-        Product, surface or log: ``(axis, time, tau)``, units of `gyrostab.units.INNER`, a computed
-        time axis for a log, whose chunks are those on disk.
 
     Raises
     ------

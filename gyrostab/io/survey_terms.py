@@ -110,7 +110,7 @@ _KINDS = {
 
 
 def drift_rate(n: float, b: float, k: float, *, section: float, calibration: float) -> float:
-    """Standard deviation of the change of the bias from its calibration to the section after it.
+    """Standard deviation [deg/h] of the change of the bias from its calibration to the section.
 
     The white noise of the section itself is left out.
 
@@ -120,11 +120,6 @@ def drift_rate(n: float, b: float, k: float, *, section: float, calibration: flo
         Coefficients N [deg/sqrt(h)], B [deg/h] and K [deg/h^1.5].
     section, calibration : float
         Duration of the section, and of the time before it over which the bias was averaged [s].
-
-    Returns
-    -------
-    float
-        [deg/h].
 
     Examples
     --------

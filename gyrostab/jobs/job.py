@@ -17,13 +17,13 @@ import shutil
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gyrostab.errors import OutputError, ResumeError
+from gyrostab.store.attributes import find_version
 from gyrostab.store.output import describe_file, is_leftover, remove_leftovers, write_text
 from gyrostab.store.output.content import read_json
 from gyrostab.store.remote import find_url, full_name
@@ -120,7 +120,7 @@ def make_fingerprint(paths: Sequence[Path], options: Mapping[str, Any]) -> dict[
     plain = {**options["reading"], **options["windows"]}
     plain |= {f"fit {name}": value for name, value in (options["fitting"] or {}).items()}
     plain["fit"] = "left out" if options["fitting"] is None else None
-    versions = {name: _find_version(name) for name in ("gyrostab", "numpy", "numba")}
+    versions = {name: find_version(name) for name in ("gyrostab", "numpy", "numba")}
     return {
         "inputs": describe_inputs(paths),
         "options": json.loads(
@@ -135,13 +135,6 @@ def make_fingerprint(paths: Sequence[Path], options: Mapping[str, Any]) -> dict[
             "processor": platform.machine(),
         },
     }
-
-
-def _find_version(name: str) -> str:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return "unknown"
 
 
 def hash_fingerprint(fingerprint: Mapping[str, Any]) -> str:

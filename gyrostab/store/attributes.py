@@ -21,7 +21,10 @@ from gyrostab.store.safe_names import is_storable, make_name_storable
 from gyrostab.time.clock import time_of_day
 from gyrostab.units import ON_DISK, on_disk
 
-__all__ = ["JSON_NAMES", "decode_attributes", "encode_attributes", "make_global_attributes"]
+__all__ = [
+    "JSON_NAMES", "decode_attributes", "encode_attributes", "find_version",
+    "make_global_attributes",
+]  # fmt: skip
 
 _CONVENTIONS = "CF-1.11, ACDD-1.3"
 _TITLES = {
@@ -67,13 +70,17 @@ def encode_attributes(attrs: dict[str, Any]) -> dict[str, Any]:
     return attrs
 
 
+def find_version(package: str) -> str:
+    """Find the version of an installed package; ``unknown`` where it has no metadata."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "unknown"
+
+
 def make_global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[str, Any]:
     """Make the attributes of a file: those of the dataset, with title, history and version."""
-    now = time_of_day()
-    try:
-        version = metadata.version("gyrostab")
-    except metadata.PackageNotFoundError:
-        version = "unknown"
+    now, version = time_of_day(), find_version("gyrostab")
     attrs = dict(dataset.attrs)
     history = attrs.get("history", "")
     lines = [history] if isinstance(history, str) else [str(line) for line in history]

@@ -299,7 +299,7 @@ def test_changes_refuse_to_resume_and_say_what(log, tmp_path, after_two, monkeyp
     own.write_bytes(log.read_bytes())
     os.utime(own, ns=(stamp, stamp))
     with monkeypatch.context() as patch:
-        patch.setattr("gyrostab.jobs.job._find_version", lambda name: "9.9.9")
+        patch.setattr("gyrostab.jobs.job.find_version", lambda name: "9.9.9")
         refused(expected="gyrostab is 9.9.9, was ")
     assert call(own, "-o", output, "--resume") == 0
 
