@@ -1,1 +1,21 @@
 """The whole analysis in parts that survive a stop, in threads, in processes or on a cluster."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gyrostab.jobs.job import is_lock as is_lock
+    from gyrostab.jobs.job import lock_job as lock_job
+    from gyrostab.jobs.run import load_log as load_log
+
+__all__ = ["is_lock", "load_log", "lock_job"]
+
+_HOME = {"is_lock": "job", "load_log": "run", "lock_job": "job"}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

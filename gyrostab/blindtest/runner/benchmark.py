@@ -118,7 +118,7 @@ def prove(
     >>> proof = gyrostab.prove("proof", cases=20)  # doctest: +SKIP
     >>> print(proof.table)  # doctest: +SKIP
     """
-    from gyrostab.jobs.job import lock_job
+    from gyrostab.jobs import lock_job
     from gyrostab.progress import no_stage
 
     folder, stage, tell = resolve_link(directory), progress or no_stage, say or (lambda text: None)
