@@ -144,7 +144,10 @@ def write_blocks(
     def tell(share: float) -> None:
         stage("writing", n_lazy, int(share * n_lazy), "variables")
 
-    stage("writing", 0)
+    if zarr:
+        stage("writing", 0)  # follows the tasks of dask
+    else:
+        tell(0.0)
     with dask.config.set(scheduler="synchronous"):  # which holds one chunk at a time
         (to_zarr if zarr else to_netcdf)(dataset, target, overwrite=overwrite, progress=tell)
     return dataset

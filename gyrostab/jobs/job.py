@@ -249,21 +249,18 @@ def _open_lock(folder: Path) -> int:
         with contextlib.suppress(FileNotFoundError):
             handle = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o666)
             try:
-                _take_lock(handle, folder)
+                if not lock_file(handle):
+                    owner = (folder / "lock").read_text("ascii", "replace").strip()
+                    raise ResumeError(
+                        f"{folder.name}: {owner or 'another process'} is making this product now; "
+                        "wait for it, or stop it first"
+                    )
                 if not os.path.samestat(os.fstat(handle), os.stat(folder / "lock")):
                     raise FileNotFoundError
             except BaseException:
                 os.close(handle)
                 raise
             return handle
-
-
-def _take_lock(handle: int, folder: Path) -> None:
-    if not lock_file(handle):
-        owner = (folder / "lock").read_text("ascii", "replace").strip() or "another process"
-        raise ResumeError(
-            f"{folder.name}: {owner} is making this product now; wait for it, or stop it first"
-        )
 
 
 def _remove_lock(folder: Path) -> None:
