@@ -133,11 +133,12 @@ def read_chunk(
     FormatError
         When the file no longer exists, or may not be read.
     """
-    return (
-        _read_zarr_chunk(path / name, place, opened)
-        if zarr
-        else _read_hdf5_chunk(path, name, place, opened)
-    )
+    if zarr:
+        return _read_zarr_chunk(path / name, place, opened)
+    chunk = read_written_chunk(path, name, place, opened=opened)
+    if chunk is None:
+        raise ChunkDamage(f"is missing: {name} has no chunk {place}")
+    return chunk
 
 
 def read_written_chunk(
@@ -145,19 +146,10 @@ def read_written_chunk(
 ) -> NDArray[Any] | None:
     """Read one chunk of an HDF5 file as it is on disk; None if it was never written."""
     layout = _read_hdf5_layout(path, name, opened)
-    if place not in layout.places and not layout.damage:
-        return None
-    return _read_hdf5_chunk(path, name, place, opened)
-
-
-def _read_hdf5_chunk(path: Path, name: str, place: tuple[int, ...], opened: str) -> NDArray[Any]:
-    layout = _read_hdf5_layout(path, name, opened)
     if place not in layout.places:
-        raise ChunkDamage(
-            f"is damaged: {layout.damage}"
-            if layout.damage
-            else f"is missing: {name} has no chunk {place}"
-        )
+        if layout.damage:
+            raise ChunkDamage(f"is damaged: {layout.damage}")
+        return None
     begin, size, mask = layout.places[place]
     try:
         with path.open("rb") as file:
