@@ -11,13 +11,14 @@ C-Blosc, README_CHUNK_FORMAT.rst: header of a chunk.
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
 from gyrostab.errors import FormatError
-from gyrostab.store.output.content import METADATA, read_json
+from gyrostab.store.output.content import METADATA
 
 __all__ = ["check_blosc_chunks", "is_blosc_cut"]
 
@@ -73,7 +74,7 @@ def _find_blosc_arrays(folder: Path) -> Iterator[Path]:
     consolidated = _read_consolidated(folder)
     for place, _, names in os.walk(folder):
         metadata = [consolidated.get(Path(place).relative_to(folder).as_posix())]
-        metadata += [read_json(Path(place, name)) for name in {".zarray", "zarr.json"} & {*names}]
+        metadata += [_read_json(Path(place, name)) for name in {".zarray", "zarr.json"} & {*names}]
         if any(map(_uses_blosc, metadata)):
             yield Path(place)
 
@@ -82,11 +83,19 @@ def _read_consolidated(folder: Path) -> dict[str, Any]:
     """Return the consolidated metadata of the arrays in a store of format 2 or 3."""
     try:
         if (folder / ".zmetadata").exists():
-            entries = read_json(folder / ".zmetadata")["metadata"]
+            entries = _read_json(folder / ".zmetadata")["metadata"]
             return {name.removesuffix("/.zarray"): entry for name, entry in entries.items()}
-        return dict(read_json(folder / "zarr.json")["consolidated_metadata"]["metadata"])
+        return dict(_read_json(folder / "zarr.json")["consolidated_metadata"]["metadata"])
     except (LookupError, TypeError, ValueError, AttributeError):
         return {}
+
+
+def _read_json(path: Path) -> Any:
+    """Read JSON in any encoding that the library reads; None if it refuses it."""
+    try:
+        return json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return None
 
 
 def _uses_blosc(metadata: Any) -> bool:

@@ -26,7 +26,8 @@ _CHUNK = re.compile(r"(c|(c\.)?\d+(\.\d+)*)(\.[0-9a-f]{32}\.partial)?")
 def read_json(path: Path) -> Any:
     """Read a JSON file, also at an address; None when it cannot be read."""
     try:
-        return json.loads(read_bytes(path))
+        content = read_bytes(path)
+        return json.loads(content.decode(json.detect_encoding(content)))
     except (OSError, ValueError, RecursionError):
         return None
 
