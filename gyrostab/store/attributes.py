@@ -22,9 +22,12 @@ from gyrostab.time.clock import time_of_day
 from gyrostab.units import ON_DISK, on_disk
 
 __all__ = [
-    "JSON_NAMES", "decode_attributes", "encode_attributes", "find_version",
+    "JSON_NAMES",
+    "decode_attributes",
+    "encode_attributes",
+    "find_version",
     "make_global_attributes",
-]  # fmt: skip
+]
 
 _CONVENTIONS = "CF-1.11, ACDD-1.3"
 _TITLES = {
