@@ -20,14 +20,6 @@ class AgeingBias(Effect):
 
     ``b = s t + c log(1 + t / t_a)``, t since the start of the log
 
-    *DAVAR*: an apparent R of ``s + c / (t + t_a)``: constant for the linear part, falling as 1 / t
-    for the logarithmic one. *Window mean*: a straight line, or one that flattens. *Spectrum*:
-    lowest band only. *Axes*: independent sizes and signs.
-
-    Confused with temperature_bias (a slowly rising temperature looks the same until it reverses),
-    with a random walk (which reverses) and the slow part of warm_up (which restarts after each
-    power-on).
-
     References
     ----------
     No published sizes; estimates: below 0.01 deg/h in a day, logarithmic over the first days.
@@ -97,13 +89,6 @@ class AgeingNoise(Effect):
     """Angle random walk that grows with time.
 
     ``N^2(t) = N0^2 (1 + g (t / 1 h)^p)``, t since the start of the log, N0 of the model
-
-    *DAVAR*: the slope -1/2 rises slowly and monotonically, at all averaging times that N dominates.
-    *Window mean*: no effect. *Spectrum*: white, with a growing level. *Axes*: all alike when the
-    source ages, one when its coil does.
-
-    Confused with temperature_noise and light_power_noise where the temperature or the power trends
-    with time: a reversal of the temperature, or a record of the light power, separates them.
 
     References
     ----------

@@ -32,15 +32,6 @@ class SupplyBias(Effect):
     in equilibrium at the start: a regulator settles, and parts heated by load or light follow their
     power with a delay.
 
-    *DAVAR*: a discharging battery gives a slow drift (R), a switched load a step (apparent K),
-    ripple a bump at 0.371 / f or at its alias. *Window mean*: follows the channel, with the lag.
-    *Spectrum*: the line of the ripple. *Axes*: all follow the same channel with separate factors.
-
-    Confused with temperature_bias (temperature changes the voltage, or loads heat), ageing_bias (a
-    battery over days) and spectral_line: regress on voltage and temperature together; switched
-    loads separate them. With a lag, the exponential after a switched load separates it from a
-    random walk.
-
     References
     ----------
     IEEE Std 952-1997 (sensitivity to the supply). Sizes are estimates.
@@ -181,14 +172,6 @@ class GaussMarkov(Effect):
     ``b' = -b / T_c + q w``, w white, with the rms ``q sqrt(T_c / 2)``. Every sample is the exact
     mean over its interval.
 
-    *DAVAR*: ``(q T_c)^2 / tau [1 - T_c / (2 tau) (3 - 4 exp(-tau / T_c) + exp(-2 tau / T_c))]``:
-    slope +1/2 of sigma, a bump of 0.617 times the rms at 1.89 T_c, slope -1/2. *Window mean*:
-    wanders, and returns to zero. *Spectrum*: Lorentzian, flat below 1 / (2 pi T_c). *Axes*:
-    independent.
-
-    Confused with B and K together (no bump), and with telegraph, which has the same second-order
-    statistics: the distribution of short means is normal here, and bimodal there.
-
     References
     ----------
     IEEE Std 952-1997, annex C (exponentially correlated noise). Sizes are estimates.
@@ -260,14 +243,6 @@ class Clipping(Effect):
 
     ``out = min(max(w, c - l), c + l)``, before the logger averages; 0 means no limit.
 
-    *DAVAR*: unchanged while the rate is inside; too small at short times where noise reaches the
-    limit, and wrong for motion beyond it. *Window mean*: saturates at the limit, and is biased
-    towards the centre before it. *Spectrum*: odd harmonics of the clipped signal. *Axes*:
-    independent.
-
-    Confused with small noise and dead_zone (at the centre, not at the limits): the histogram ends
-    with many samples of one value, unless the logger averages after the limit.
-
     References
     ----------
     Lefevre 2014, The Fiber-Optic Gyroscope, 2nd ed. (dynamic range). The data sheet gives the
@@ -321,13 +296,6 @@ class ClockError(Effect):
     but loses up to half of its variance in samples between two others, so give the model an
     `oversampling`. Stamps of a fast clock are right at the start of the log, those of a slow one at
     its end (the first sample is held until its time), which keeps the effect causal.
-
-    *DAVAR*: noise unchanged; all frequencies shifted by e. *Window mean*: ``-e w``, proportional to
-    the rate. *Spectrum*: lines shifted by e. *Axes*: all alike. *Channels* with another clock: the
-    lag grows with time.
-
-    Confused with scale_factor, which is the same on one axis with rotation, but differs from axis
-    to axis and changes no lines and lags.
 
     References
     ----------

@@ -92,15 +92,6 @@ class BiasJump(Effect):
     rms `shock` at random times; and the step `step` at the time `at`. A shock acts on all axes with
     independent sizes.
 
-    *DAVAR*: ``D^2 tau / (3 (W - 2 tau))`` in the windows W across a jump D, at least 2 tau from
-    their ends: an apparent ``K = D / sqrt(W)``, absent in windows entirely before or after. *Window
-    mean*: a permanent step. *Spectrum*: unchanged between the jumps. *Axes*: at the same times,
-    with independent sizes and signs.
-
-    Confused with vibration_rectification (reverts when vibration ends), warm_up (decays), telegraph
-    (returns to the same level) and K (grows within windows as well): the jump coincides with a
-    restart or a shock and does not revert.
-
     References
     ----------
     Wang et al. 2016, Sensors (loss of power and vibration in one record). Sizes are estimates: 0.01
@@ -202,15 +193,6 @@ class Telegraph(Effect):
     ``b = 0`` or ``D``; the dwell times are exponential, with the means `low` (at 0) and `high` (at
     D).
 
-    *DAVAR*: that of a Gauss-Markov process with the variance ``D^2 p (1 - p)``, p = high / (low +
-    high), and the correlation time T_c of ``1 / T_c = 1 / low + 1 / high``: a bump at 1.89 T_c;
-    +1/2 before, -1/2 after it. *Window mean*: two levels, smeared where windows are longer than
-    T_c. *Spectrum*: Lorentzian. *Axes*: independent.
-
-    Confused with gauss_markov, which has the same second-order statistics: the histogram of short
-    means is bimodal (negative excess kurtosis), which needs some ten switches to show. bias_jump
-    does not return to the same level.
-
     References
     ----------
     Machlup 1954, J. Appl. Phys. 25, 341 (spectrum). Sizes are estimates: 0.01 to 0.3 deg/h, 10 to
@@ -307,13 +289,6 @@ class FringeHop(Effect):
     ``w_out = w + k lambda c / (L D)``, L the length and D the diameter of the coil, independent of
     the refractive index. A fringe hop by k = ``order`` occurs at the time `at`, or else at random
     times by plus or minus k, lasts for a time of mean `hold`, and ends at a restart.
-
-    *DAVAR*: ``D^2 tau / (3 (W - 2 tau))``, where the large D of a fringe hides all else in windows
-    across a step. *Window mean*: steps of one size, both signs. *Spectrum*: that of a few steps.
-    *Axes*: independent, with the size from each coil.
-
-    Confused with bias_jump (any size), clipping (saturates at the range) and bit errors (single
-    samples, powers of two): the size of the step always follows from the coil.
 
     References
     ----------

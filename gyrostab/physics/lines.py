@@ -38,15 +38,6 @@ class SpectralLine(Effect):
     2) w f^2 / (pi ((f^2 - f0^2)^2 + w^2 f^2))`` and w = f0 / Q. Every sample is the mean over its
     interval, so a line above half of the sampling rate is aliased with the factor sinc(f / fs).
 
-    *DAVAR*: ``A^2 sin^4(pi f tau) / (pi f tau)^2``: a bump of sigma = 0.725 A at tau = 0.371 / f,
-    then a comb that falls with 1 / tau; a resonance has the bump without the comb. *Window mean*:
-    no effect. *Spectrum*: a line, or a peak of width f0 / Q. *Axes*: one motion, with a factor for
-    each axis.
-
-    Confused with rotation_line and earth_rate (frequency follows the rotation), feedback_reset
-    (follows the gyro's rate) and aliased_vibration (depends on the sampling rate, and follows
-    vibration): check whether f changes with rotation, temperature or sampling rate.
-
     References
     ----------
     IEEE Std 952-1997, annex C (Allan variance of a sinusoid). Sizes are estimates: structures
@@ -143,14 +134,6 @@ class RotationLine(Effect):
     because the motion causes the lines. The phase is the integral of the channel, continued from
     sample to sample, and each sample is the mean over its interval, so a line is aliased where its
     frequency exceeds half of the sampling rate.
-
-    *DAVAR*: the bump of a sinusoid at 0.371 / (m f), smeared where f varies inside a window; it
-    moves to shorter times as the tool speeds up. *Window mean*: zero. *Spectrum*: a comb that
-    follows the rotation. *Axes*: phase-locked, with amplitude and phase of each axis.
-
-    Confused with earth_rate (15 deg/h at most, quadrature between the cross axes), g_sensitivity
-    and magnetic (proportional to their channels), and spectral_line (constant frequency): check
-    whether the frequency follows the rotation, and with which multiple.
 
     References
     ----------

@@ -33,14 +33,6 @@ class LoggerFilter(Effect):
     `instrument` takes the place of n: 1 for a filter at the rate of the log, 0 for a much faster
     instrument.
 
-    *DAVAR*: smaller at times below ``1 / cutoff`` or `length`, where sigma grows with tau like K or
-    R; unchanged at long times. Decimated without a filter: n times the white noise variance at all
-    times. *Window mean*: no effect. *Spectrum*: multiplied by ``sum_k |H(f + k fs)|^2``. *Axes*:
-    all alike.
-
-    Confused with a smaller N (compare long times), negative Q, held_samples, and a wrong sampling
-    rate (lines move): the spectrum up to 0.3 fs decides.
-
     References
     ----------
     Oppenheim and Schafer 2010, Discrete-Time Signal Processing, 3rd ed. (bilinear transform,
@@ -229,14 +221,6 @@ class RateQuantization(Effect):
     ``out = q round(w / q)``, or with ``mode = "floor"`` the value below, with ``"zero"`` the value
     towards zero.
 
-    *DAVAR*: ``q^2 / (12 k)`` more at k samples, white like N, where the noise of a sample exceeds
-    q / 2; with less noise, steps and dead bands: zero, or too much. *Window mean*: -q / 2 for
-    "floor", and q / 2 towards zero for "zero", where the value 0 covers two steps. *Spectrum*:
-    flat. *Axes*: independent.
-
-    Confused with N (which has no quantization grid) and Q, the quantization of an accumulated
-    angle, with slope -1: the differences of values are multiples of q.
-
     References
     ----------
     Widrow and Kollar 2008, Quantization Noise (q^2 / 12). Sizes: recordings of an ADIS16405 and a
@@ -294,13 +278,6 @@ class Spikes(Effect):
     At random times, independently on each axis: ``kind = "bit"`` flips one bit, any of `bits` with
     equal probability, of the count of `lsb` (two's complement); ``"outlier"`` adds a normal number
     of the rms `size`.
-
-    *DAVAR*: white, ``p E[d^2] / k`` more at k samples, p the probability per sample and d the
-    spike, dominated by the largest bits; windows with a spike differ clearly from others. *Window
-    mean*: shifted by d / n. *Spectrum*: flat. *Axes*: independent.
-
-    Confused with Q, N and real shocks (longer than a sample, seen by accelerometers): check the
-    kurtosis; bit errors are powers of two times the quantization step.
 
     References
     ----------
@@ -390,15 +367,6 @@ class HeldSamples(Effect):
     At random times, on all axes together, a geometric number of samples with the mean `length` (at
     least one) is replaced: by the last good one (``repeat``), by zero, or by as many samples just
     before (``frame``, a frame of telemetry that is sent twice).
-
-    *DAVAR*: ``repeat``: smaller at one sample, by the share of held ones; larger at long times,
-    where one sample counts several times: N^2 grows by the factor ``1 + 2 p m^2`` for m samples
-    with probability p, and by ``1 + 2 p m`` for a frame. ``zero``: pulses of the size of the rate.
-    *Window mean*: biased towards zero by "zero". *Spectrum*: less at the top, more below. *Axes*:
-    the same samples.
-
-    Confused with logger_filter and small noise (no runs), clipping (runs at the limit only) and
-    real gaps: check for runs of equal values, which noise does not produce.
 
     References
     ----------

@@ -48,14 +48,6 @@ class TemperatureNoise(Effect):
 
     ``N^2(T) = N0^2 (1 + c1 (T - T0) + c2 (T - T0)^2)``, N0 of the model; no less than 1 % of N0^2
 
-    *DAVAR*: the whole slope -1/2 shifts with the temperature without delay, equally on plateaus and
-    ramps. *Window mean*: no effect. *Spectrum*: white, with a level that follows T. *Axes*: all
-    alike where the source or the supply of the detectors is the cause.
-
-    Confused with ageing_noise and light_power_noise (T drifts with time, light is lost with T:
-    check whether the noise returns with the temperature, and which channel it follows) and
-    vibration_noise (drilling heats and shakes together).
-
     References
     ----------
     Li et al. 2013, Chin. J. Lasers 40, 0908004 (dynamic Allan variance of three gyros from -40 to
@@ -130,14 +122,6 @@ class LightPowerNoise(Effect):
     the source. The model's N applies at the nominal power P0, where the parameters are the shares
     of the first two terms; the rest is excess noise: ``N^2(P) = N0^2 (s_th (P0 / P)^2 + s_sh P0 / P
     + 1 - s_th - s_sh)``.
-
-    *DAVAR*: the whole slope -1/2 rises as light is lost, by the shares of detector and shot noise
-    at most; constant N at falling P means excess noise. *Window mean*: no effect. *Spectrum*:
-    white, with a level that follows P. *Axes*: all alike when the source ages, one when its coil or
-    a splice does.
-
-    Confused with temperature_noise (light is lost with temperature; the power decides),
-    ageing_noise (no record of P) and a gain of the logger (scales the rate and the earth's, too).
 
     References
     ----------
@@ -270,15 +254,7 @@ class VibrationNoise(_FollowsVibration):
     ``N^2(t) = N0^2 + s_N^2 g^2p``, ``Q^2(t) = Q0^2 + s_Q^2 g^2p``, g the rms acceleration in units
     of 1 g, p the exponent
 
-    *DAVAR*: a ridge during the vibration, over all averaging times for the white part, with slope
-    -1 at short ones for the other. *Window mean*: no effect. *Spectrum*: more white noise, and more
-    noise that grows with f^2. *Axes*: independent noise.
-
     For noise in a band, resonant or aliased, see aliased_vibration.
-
-    Confused with aliased_vibration (has band edges, and is one motion on all axes),
-    temperature_noise and light_power_noise (follow other channels; several levels of vibration
-    separate them), spikes (heavy tails) and vibration_random_walk (slope +1/2).
 
     References
     ----------
@@ -344,14 +320,6 @@ class VibrationRandomWalk(_FollowsVibration):
     """Rate random walk that grows under vibration.
 
     ``K^2(t) = K0^2 + s^2 g^2p``, g the rms acceleration in units of 1 g, p the exponent
-
-    *DAVAR*: slope +1/2 in every window inside the vibration, not only in those across its edges.
-    *Window mean*: wanders during vibration and keeps its last value afterwards. *Spectrum*:
-    1 / f^2. *Axes*: independent.
-
-    Confused with vibration_rectification and bias_jump: a step D in a window of W hours looks like
-    ``K = D / sqrt(W)``. Windows entirely inside the vibration decide, and the mean afterwards,
-    which reverts after rectification but not after a random walk.
 
     References
     ----------

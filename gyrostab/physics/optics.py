@@ -31,14 +31,6 @@ class DeadZone(Effect):
     the loop; faster components pass unchanged. Without a bandwidth every sample sticks
     independently, and noise above d removes the zone (dither).
 
-    *DAVAR*: too small at all times that the loop follows, while the rate is inside. *Window mean*:
-    flat at the centre, with slope one and an offset d on both sides. *Spectrum*: odd harmonics of a
-    rotation through zero; less noise inside. *Axes*: each depends on its rate, or on that of the
-    axis whose light leaks in.
-
-    Confused with rate_quantization (steps everywhere), held_samples (also far from zero) and small
-    noise: a slow sweep through zero, or turning the tool by 180 degrees, shows the dead zone.
-
     References
     ----------
     Cao et al. 2025, Opt. Commun. 596, 132504 (0.2 deg/h with one source for several axes, below
@@ -112,16 +104,6 @@ class FeedbackReset(Effect):
     averaged exactly over every sample, so fast resets are aliased correctly. The phase follows from
     the gyro's rate including noise, or with ``phase = "channel"`` from the channel `ramp`, read at
     the end of every sample.
-
-    *DAVAR*: a comb at the multiples of 1 / f_r, a bump at 0.371 / f_r, moving to shorter times as
-    the rate grows; at short times it hides N. *Window mean*: ``(kick + tail) f_r``, proportional to
-    the rate, like a scale factor of ``(kick + tail) D / (n lambda)``. *Spectrum*: an aliased comb
-    at the multiples of f_r, flat for the kick, f^-2 for tail and sawtooth. *Axes*: each depends on
-    its rate.
-
-    Confused with spectral_line (constant frequency), rotation_line (follows the tool), vibration
-    and Q: the frequency is proportional to the measured rate, and the error is concentrated at one
-    phase of the ramp.
 
     References
     ----------
@@ -390,14 +372,6 @@ class SharedSource(Effect):
     ``n_a = r_a n(t)``, with one n for all axes and r_a the angle random walk on axis a, with the
     sign of the modulation there; after a one-pole low-pass at `bandwidth`, if given. It adds to the
     model's N.
-
-    *DAVAR*: ``r_a^2 / tau`` more, indistinguishable from N on one axis; visible only in the
-    cross-axis Allan covariance, ``r_a r_b / tau`` at all times. *Window mean*: noise. *Spectrum*:
-    flat, like the coherence of the axes. *Axes*: ``r_a r_b``, lag zero.
-
-    Confused with misalignment and real_motion (coherent at some frequencies, and only in motion)
-    and common vibration (coherent with the accelerometers): the coherence is broadband without lag,
-    at rest as well.
 
     References
     ----------

@@ -33,14 +33,6 @@ class ScaleFactor(Effect):
 
     ``e = (S + S_T (T - T0)) w + A |w| + C w^3``
 
-    *DAVAR*: a scaled copy of w: ramps give R, steps a K, stick-slip a bump; no effect at constant
-    w. *Window mean*: follows w. *Spectrum*: that of w. *Axes*: the axis of rotation only; 100 ppm
-    of 180 r/min are 389 deg/h.
-
-    Confused with misalignment (on the other axes, proportional to the rate of another axis), and
-    clock_error (the same on all axes): the error changes sign with w, except for the asymmetry, and
-    the rotation must be known independently of the gyro (magnetometer, accelerometers).
-
     References
     ----------
     IEEE Std 952-1997 (scale factor errors); He et al. 2015, OECC (the temperature of the scale
@@ -142,14 +134,6 @@ class Misalignment(Effect):
     earth_rate), or with ``motion = "recorded"`` they are the rates of the recording that the log is
     simulated like. A diagnosis writes the latter: it compares the axes of a recording.
 
-    *DAVAR*: a copy of the other axis's motion, scaled: 1 mrad of 180 r/min is 3900 deg/h. *Window
-    mean*: follows the other axis. *Spectrum*: lines and motion of the other axis only. *Axes*:
-    coherent with the other gyro where there is true motion, not elsewhere.
-
-    Confused with scale_factor (own axis only), shared_source (broadband coherence also at rest) and
-    real_motion (accelerometers see it): the coherence must vanish at rest, and the factor must be
-    the same at all rates.
-
     References
     ----------
     IEEE Std 952-1997 (input axis misalignment). Sizes are estimates: 0.1 to 1 mrad.
@@ -230,14 +214,6 @@ class EarthRate(Effect):
     sin(off) (W_h cos(F + a) + W_r sin(F + a))``, with the toolface F = F0 + integral of the
     rotation rate, clockwise looking down the hole. Axes with names that end in x, y, z have 90, 90,
     0 degrees off and 0, 90, 0 around. Each sample is the mean over its interval.
-
-    *DAVAR*: ``A^2 sin^4(pi f tau) / (pi f tau)^2``, a bump of sigma at tau = 0.371 / f with A of at
-    most 15.04 deg/h, smeared where f varies; no effect at rest. *Window mean*: the constant part
-    along the tool; steps between toolfaces at rest. *Spectrum*: a line at the frequency of
-    rotation. *Axes*: quadrature between x and y, equal in size; no line on z.
-
-    Confused with g_sensitivity and magnetic (free amplitude, phase of gravity or field), and
-    rotation_line: here amplitude and phase follow from latitude, inclination and azimuth.
 
     References
     ----------
@@ -387,15 +363,6 @@ class RealMotion(Effect):
     dead_zone act on. The rotation of the tool is in the log without this effect where the channel
     ``rotation_rate`` names the axis in its attribute ``rotation_axis``; `spin` is its projection on
     another direction.
-
-    *DAVAR*: bump of the sway at 0.371 / f without a floor at long times; the rotation itself.
-    *Window mean*: the rotation; sway and tilt average to zero because the angle is bounded.
-    *Spectrum*: a peak of width f / Q; tilt has f^2 times that of the accelerations. *Axes*: one
-    motion in one direction, with coherence one and the signs of the direction.
-
-    Confused with vibration_rectification and vibration_noise (not one coherent rotation) and
-    shared_source (broadband, also at rest): accelerometers, and the fixed direction in space,
-    separate them.
 
     References
     ----------

@@ -25,14 +25,6 @@ class TemperatureBias(Effect):
 
     ``b = a1 (T - T0) + a2 (T - T0)^2 + a3 (T - T0)^3``
 
-    *DAVAR*: no effect at constant temperature, an apparent R of ``|a1 dT/dt|`` at the longest
-    averaging times while it changes. *Window mean*: follows the temperature, equally up and down.
-    *Spectrum*: that of the temperature. *Axes*: independent signed coefficients.
-
-    Confused with shupe (follows dT/dt: changes sign with the direction of the ramp), with
-    ageing_bias and random walk (do not return with the temperature) and with supply_bias (the
-    supply follows the temperature: regress on both).
-
     References
     ----------
     IEEE Std 952-1997 (temperature sensitivity of the bias). Sizes are estimates of what is left
@@ -97,17 +89,6 @@ class Shupe(Effect):
     against the inner one, during the heat flow. With a sensor that lags the surface by
     ``sensor_lag``, the surface temperature is ``T + sensor_lag dT/dt``; nearly cancelling layers
     have the same effect because they follow the second derivative.
-
-    *DAVAR*: no effect at a steady ramp because the bias is constant. Where a ramp of the rate v
-    begins or ends the bias changes by s v within the lag: K = s v / sqrt(W) in windows W much
-    longer than the lag, R of about s v / lag in short ones. *Window mean*: a plateau s v during the
-    ramp, then an exponential return; odd in the direction. *Spectrum*: f^2 times that of the
-    temperature, below the lag. *Axes*: independent size and sign for each coil.
-
-    Confused with temperature_bias (even: equal for rising and falling T), warm_up (starts with the
-    power, not with the outside temperature), thermal_hysteresis (persists on a plateau) and
-    thermal_gradient (a second sensor decides). A ramp up, a plateau and a ramp down separate them,
-    by regression on T and on dT/dt at several lags together.
 
     References
     ----------
@@ -266,15 +247,6 @@ class ThermalGradient(Effect):
 
     ``b = s (T1 - T2) + r h * d(T1 - T2)/dt``, h a lag
 
-    *DAVAR*: no effect at a steady gradient, R while it builds up, K-like in longer windows. *Window
-    mean*: follows the difference: zero on plateaus, a plateau at steady ramps, with the lag between
-    both sensors. *Spectrum*: that of the difference. *Axes*: often of opposite sign on axes mounted
-    in opposite directions.
-
-    Confused with shupe, which is equivalent where one of the temperatures follows the other with a
-    lag: only a second sensor, and heat from another side (electronics, circulation), separate them.
-    With one sensor both belong to the ambiguity set.
-
     References
     ----------
     Zhuo and Du, Shupe effect of fiber sensing coils in multidimensional thermal field (bias by the
@@ -362,14 +334,6 @@ class ThermalHysteresis(Effect):
 
     After a reversal, b changes from -a w (falling T) to a w (rising T) over the first 2 w, whatever
     the speed; at the start it is zero.
-
-    *DAVAR*: an apparent R of ``a dT/dt`` over the first 2 w after a reversal, no effect beyond; in
-    long windows a step of 2 a w. *Window mean*: a loop over T of the area ``2 a w (range - 2 w)``,
-    always in the same direction. *Spectrum*: that of slow steps. *Axes*: independent sizes and
-    signs.
-
-    Confused with shupe (decays on a plateau; hysteresis persists) and ageing_bias (does not close
-    in a cycle): hold the temperature, and run closed cycles at two speeds.
 
     References
     ----------

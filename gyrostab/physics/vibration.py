@@ -52,15 +52,6 @@ class GSensitivity(_Vector):
 
     ``b = G_x a_x + G_y a_y + G_z a_z`` for each axis that it acts on.
 
-    *DAVAR*: the bump of a sinusoid at 0.371 / f while the tool rotates with f; steps at changes of
-    the toolface (apparent K in the windows across them). *Window mean*: follows gravity in the
-    tool. *Spectrum*: a line at the frequency of rotation. *Axes*: all follow the same accelerations
-    with separate factors.
-
-    Confused with vibration_rectification (even in g, while g_sensitivity is odd: turn the tool
-    over), earth_rate (known amplitude, no free factor) and magnetic (phase of the magnetic field,
-    not of gravity).
-
     References
     ----------
     IEEE Std 952-1997 (acceleration-sensitive drift); Cordova 1998, US patent 5847829 (sensitivity
@@ -112,15 +103,6 @@ class VibrationRectification(Effect):
     """Bias that follows the square of the vibration.
 
     ``b = k2 g^2 + k4 g^4``, g the rms acceleration
-
-    *DAVAR*: a step D where vibration starts or stops, which gives ``D^2 tau / (3 (W - 2 tau))`` in
-    the windows W across it: an apparent ``K = D / sqrt(W)`` that is absent in windows entirely
-    inside. *Window mean*: steps with the vibration. *Spectrum*: that of ``g^2``. *Axes*:
-    independent factors; the sign does not depend on the direction of the vibration.
-
-    Confused with g_sensitivity (odd in g; two levels of vibration separate g from g^2), bias_jump
-    (does not revert when vibration ends), vibration_random_walk (also grows inside windows) and
-    real_motion (seen by accelerometers and by the other axes).
 
     References
     ----------
@@ -190,17 +172,6 @@ class AliasedVibration(Effect):
     have the density ``sum_k S(f + k fs) |H(f + k fs)|^2`` with H = 1 or sinc(f / fs). Where the
     instrument of the model samples faster than the log, fs is the rate of the instrument, and the
     filter of the logger follows.
-
-    *DAVAR*: point samples raise sigma at all averaging times, like N, where the band folds onto
-    zero frequency (the 700 to 800 Hz of Wang et al. 2016 at 400 Hz fills 0 to 100 Hz: 8 times at
-    2.5 ms, 19 times from 40 ms on with 50 deg/h and N = 0.0031); integrate and dump has its zeros
-    there and raises short times only, like Q (1.3, 1.4, 1.1 times at 2.5, 10, 40 ms). *Window
-    mean*: no effect. *Spectrum*: the aliased band. *Axes*: one rigid motion, with a factor for each
-    axis.
-
-    Confused with vibration_noise (flat, no cross-spectrum), with Q (independent of vibration) and
-    spikes (heavy tails). The edge of the aliased band, the coherence of the axes, and another
-    sampling rate, which moves the band, separate them.
 
     References
     ----------
@@ -352,14 +323,6 @@ class Magnetic(_Vector):
     """Bias that follows the magnetic field in the tool (Faraday effect in the coil).
 
     ``b = m_x B_x + m_y B_y + m_z B_z`` for each axis that it acts on, B in the frame of the tool.
-
-    *DAVAR*: the bump of a sinusoid at 0.371 / f while the tool rotates with f; steps where the tool
-    turns or passes casing. *Window mean*: follows the field. *Spectrum*: a line at the frequency of
-    rotation, with the phase of the field. *Axes*: all follow the same field with separate factors.
-
-    Confused with earth_rate (known amplitude, quadrature between the cross axes) and g_sensitivity
-    (phase of gravity): the angle between field and gravity in the tool separates them, best at two
-    places with different fields.
 
     References
     ----------

@@ -27,14 +27,6 @@ class WarmUp(Effect):
     one for a cold gyro; with a time constant of `cooling`, a short loss of power restores only a
     part: ``q = 1 - (1 - left) exp(-t_off / cooling)``.
 
-    *DAVAR*: an apparent R of ``(A / t_w) exp(-(t - t_on) / t_w)`` at long averaging times, a ridge
-    that fades after every restart, and a step across it. *Window mean*: an exponential after each.
-    *Spectrum*: lowest bands only. *Axes*: simultaneous, with independent sizes and signs.
-
-    Confused with shupe and temperature_bias (the gyro heats itself: an internal temperature shows
-    both), bias_jump (permanent) and a random walk (does not repeat): stack the data after restarts;
-    equally long breaks give the same curve.
-
     References
     ----------
     Lefevre 2014, The Fiber-Optic Gyroscope, 2nd ed. (thermal transients). Sizes are estimates: 0.01

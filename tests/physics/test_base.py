@@ -193,17 +193,9 @@ def test_missing_channel_is_named(kind):
 
 
 @with_each_effect
-def test_sizes_are_sourced_and_the_text_names_what_it_is_confused_with(kind):
-    for word in (
-        "*DAVAR*",
-        "*Window mean*",
-        "*Spectrum*",
-        "*Axes*",
-        "Confused with",
-        "References",
-        "Examples",
-    ):
-        assert word in " ".join(kind.__doc__.split())
+def test_sizes_are_sourced(kind):
+    for heading in ("References", "Examples"):
+        assert f"{heading}\n" in kind.__doc__
     assert all(item.source for item in kind.parameters())
 
 
