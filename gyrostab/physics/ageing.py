@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Stage, Windows, parameter
+from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Windows, parameter
 from gyrostab.units import DAY, HOUR
 
 __all__ = ["AgeingBias", "AgeingNoise"]
@@ -30,15 +30,14 @@ class AgeingBias(Effect):
     'The bias ages on axis x, by 0.005 deg/h/day.'
     """
 
-    name: ClassVar[str] = "ageing_bias"
-    short: ClassVar[str] = "bias trends with time"
-    plain: ClassVar[str] = "a bias trend in time"
-    next_measurement: ClassVar[str] = (
+    name = "ageing_bias"
+    short = "bias trends with time"
+    plain = "a bias trend in time"
+    next_measurement = (
         "reverse the temperature once: a trend in time continues, a bias that follows temperature "
         "returns"
     )
-    stage: ClassVar[Stage] = "rate"
-    size_parameters: ClassVar[tuple[str, ...]] = ("slope", "logarithmic")
+    size_parameters = ("slope", "logarithmic")
 
     slope: float = parameter(
         "deg/h/day", "growth of the bias in a day", default=0.0, typical=0.005, low=-1e4, high=1e4
@@ -103,13 +102,13 @@ class AgeingNoise(Effect):
     hour, as time to the power 1.
     """
 
-    name: ClassVar[str] = "ageing_noise"
-    short: ClassVar[str] = "N trends with time"
-    plain: ClassVar[str] = "white noise with a trend in time"
-    next_measurement: ClassVar[str] = "repeat the record at the same temperature some days later"
-    stage: ClassVar[Stage] = "noise"
-    terms: ClassVar[str] = "N"
-    size_parameters: ClassVar[tuple[str, ...]] = ("growth",)
+    name = "ageing_noise"
+    short = "N trends with time"
+    plain = "white noise with a trend in time"
+    next_measurement = "repeat the record at the same temperature some days later"
+    stage = "noise"
+    terms = "N"
+    size_parameters = ("growth",)
 
     growth: float = parameter(
         "1", "growth of N^2 in the first hour, as a share of it", typical=6e-4, low=0.0, high=1e3

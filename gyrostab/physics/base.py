@@ -8,7 +8,8 @@ automatically. See docs/physics/README.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
+from functools import cache
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -149,10 +150,11 @@ class Effect:
                 self.expand_to_axes(definition.name, self.axes)
 
     @classmethod
+    @cache
     def parameters(cls) -> tuple[Parameter, ...]:
         """List the parameters in the order of the class."""
         return tuple(
-            Parameter(name=item.name, **item.metadata["parameter"])
+            replace(item.metadata["parameter"], name=item.name)
             for item in fields(cls)
             if "parameter" in item.metadata
         )
@@ -160,11 +162,7 @@ class Effect:
     @classmethod
     def required(cls) -> tuple[str, ...]:
         """List the names of the parameters that a model must give."""
-        return tuple(
-            item.name
-            for item in fields(cls)
-            if item.default is MISSING and "parameter" in item.metadata
-        )
+        return tuple(item.name for item in cls.parameters() if item.default is None)
 
     @classmethod
     def example(cls, **values: Any) -> Self:

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from gyrostab.errors import OptionError
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
+from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
 from gyrostab.physics.phase import fold, line_density, lorentz_density, sine_means
 from gyrostab.units import HOUR, INNER
 
@@ -42,16 +42,15 @@ class SupplyBias(Effect):
     'The bias follows the supply on axis x, by 0.01 deg/h/V of voltage.'
     """
 
-    name: ClassVar[str] = "supply_bias"
-    short: ClassVar[str] = "bias follows supply voltage or light power"
-    plain: ClassVar[str] = "a bias that follows supply voltage or light power"
-    next_measurement: ClassVar[str] = "change the supply voltage in steps at a steady temperature"
-    stage: ClassVar[Stage] = "rate"
+    name = "supply_bias"
+    short = "bias follows supply voltage or light power"
+    plain = "a bias that follows supply voltage or light power"
+    next_measurement = "change the supply voltage in steps at a steady temperature"
     channels: ClassVar[Mapping[str, str]] = {
         "supply_voltage": INNER["voltage"],
         "light_power": INNER["power"],
     }
-    size_parameters: ClassVar[tuple[str, ...]] = ("voltage", "power", "ripple")
+    size_parameters = ("voltage", "power", "ripple")
 
     voltage: float = parameter(
         "deg/h/V", "bias per volt", default=0.0, typical=0.01, low=-1e4, high=1e4
@@ -182,14 +181,11 @@ class GaussMarkov(Effect):
     'The bias wanders by 0.05 deg/h rms on axis x, with a correlation time of 300 s.'
     """
 
-    name: ClassVar[str] = "gauss_markov"
-    short: ClassVar[str] = "exponentially correlated bias"
-    plain: ClassVar[str] = "a slowly wandering bias (Gauss-Markov process)"
-    next_measurement: ClassVar[str] = (
-        "record at rest for at least ten times the correlation time of the bias"
-    )
-    stage: ClassVar[Stage] = "rate"
-    size_parameters: ClassVar[tuple[str, ...]] = ("rms",)
+    name = "gauss_markov"
+    short = "exponentially correlated bias"
+    plain = "a slowly wandering bias (Gauss-Markov process)"
+    next_measurement = "record at rest for at least ten times the correlation time of the bias"
+    size_parameters = ("rms",)
 
     rms: tuple[float, ...] = parameter(
         "deg/h", "rms of the bias", typical=(0.05,), low=0.0, high=1e9, many=True
@@ -254,12 +250,12 @@ class Clipping(Effect):
     'The rate is clipped on axis z, beyond 3.6e+06 deg/h from 0 deg/h.'
     """
 
-    name: ClassVar[str] = "clipping"
-    short: ClassVar[str] = "samples limited to a range"
-    plain: ClassVar[str] = "clipped extremes"
-    next_measurement: ClassVar[str] = "widen the output range"
-    stage: ClassVar[Stage] = "electronics"
-    size_parameters: ClassVar[tuple[str, ...]] = ("limit",)
+    name = "clipping"
+    short = "samples limited to a range"
+    plain = "clipped extremes"
+    next_measurement = "widen the output range"
+    stage = "electronics"
+    size_parameters = ("limit",)
 
     limit: float = parameter(
         "deg/h", "largest distance from the centre; 0 for no limit", typical=5.0, low=0.0, high=1e12
@@ -308,12 +304,12 @@ class ClockError(Effect):
     'The clock of the samples is fast by 50 ppm on all axes.'
     """
 
-    name: ClassVar[str] = "clock_error"
-    short: ClassVar[str] = "wrong or drifting rate of time"
-    plain: ClassVar[str] = "an error of the clock"
-    next_measurement: ClassVar[str] = "log a second clock, or a known frequency such as the mains"
-    stage: ClassVar[Stage] = "sampling"
-    size_parameters: ClassVar[tuple[str, ...]] = ("error", "drift")
+    name = "clock_error"
+    short = "wrong or drifting rate of time"
+    plain = "an error of the clock"
+    next_measurement = "log a second clock, or a known frequency such as the mains"
+    stage = "sampling"
+    size_parameters = ("error", "drift")
 
     error: float = parameter(
         "ppm",

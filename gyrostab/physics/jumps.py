@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
+from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
 from gyrostab.physics.phase import lorentz_density
 from gyrostab.units import HOUR
 
@@ -103,15 +103,14 @@ class BiasJump(Effect):
     'The bias jumps on axis x: by 0.1 deg/h at 330 s.'
     """
 
-    name: ClassVar[str] = "bias_jump"
-    short: ClassVar[str] = "bias changes at restarts, shocks"
-    plain: ClassVar[str] = "a bias jump"
-    next_measurement: ClassVar[str] = (
+    name = "bias_jump"
+    short = "bias changes at restarts, shocks"
+    plain = "a bias jump"
+    next_measurement = (
         "switch the power off and on several times, with nothing else changed, and compare the "
         "bias before and after"
     )
-    stage: ClassVar[Stage] = "rate"
-    size_parameters: ClassVar[tuple[str, ...]] = ("restart", "shock", "step")
+    size_parameters = ("restart", "shock", "step")
 
     restart: float = parameter(
         "deg/h", "rms of the jump at every restart", default=0.0, typical=0.05, low=0.0, high=1e6
@@ -204,15 +203,14 @@ class Telegraph(Effect):
     'The bias switches by 0.1 deg/h on axis x, for 50 s up and 100 s down on average.'
     """
 
-    name: ClassVar[str] = "telegraph"
-    short: ClassVar[str] = "bias switches between levels"
-    plain: ClassVar[str] = "a bias that switches between two levels"
-    next_measurement: ClassVar[str] = (
+    name = "telegraph"
+    short = "bias switches between levels"
+    plain = "a bias that switches between two levels"
+    next_measurement = (
         "record until the bias has switched ten times: the histogram of the means then shows two "
         "levels"
     )
-    stage: ClassVar[Stage] = "rate"
-    size_parameters: ClassVar[tuple[str, ...]] = ("step",)
+    size_parameters = ("step",)
 
     step: tuple[float, ...] = parameter(
         "deg/h", "upper level over the lower", typical=(0.1,), low=-1e9, high=1e9, many=True
@@ -304,14 +302,12 @@ class FringeHop(Effect):
     'The rate steps by 1 fringe of 4.792e+06 deg/h on axis z, at 60 s.'
     """
 
-    name: ClassVar[str] = "fringe_hop"
-    short: ClassVar[str] = "steps of one fringe"
-    plain: ClassVar[str] = "steps of one fringe"
-    next_measurement: ClassVar[str] = (
-        "compare the size of the steps with the rate of one fringe of this coil"
-    )
-    stage: ClassVar[Stage] = "electronics"
-    size_parameters: ClassVar[tuple[str, ...]] = ("order",)
+    name = "fringe_hop"
+    short = "steps of one fringe"
+    plain = "steps of one fringe"
+    next_measurement = "compare the size of the steps with the rate of one fringe of this coil"
+    stage = "electronics"
+    size_parameters = ("order",)
 
     order: float = parameter(
         "1",

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
+from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
 from gyrostab.physics.phase import (
     TURN,
     fold,
@@ -49,15 +49,14 @@ class SpectralLine(Effect):
     'There is a steady line of 0.2 deg/h at 27 Hz on axis x.'
     """
 
-    name: ClassVar[str] = "spectral_line"
-    short: ClassVar[str] = "steady line, resonance"
-    plain: ClassVar[str] = "a steady spectral line or resonance"
-    next_measurement: ClassVar[str] = (
+    name = "spectral_line"
+    short = "steady line, resonance"
+    plain = "a steady spectral line or resonance"
+    next_measurement = (
         "change the sampling rate: an aliased line moves, a true one stays; change the rotation "
         "rate to see whether the line follows"
     )
-    stage: ClassVar[Stage] = "rate"
-    size_parameters: ClassVar[tuple[str, ...]] = ("amplitude",)
+    size_parameters = ("amplitude",)
 
     amplitude: tuple[float, ...] = parameter(
         "deg/h", "amplitude, sqrt(2) times the rms", typical=0.2, low=-1e6, high=1e6, many=True
@@ -146,15 +145,12 @@ class RotationLine(Effect):
     'There are 3 lines locked to rotation_rate on axis x, the first of 0.5 deg/h at 1 per turn.'
     """
 
-    name: ClassVar[str] = "rotation_line"
-    short: ClassVar[str] = "lines locked to tool rotation, pump or stick-slip"
-    plain: ClassVar[str] = "lines locked to the rotation of the tool"
-    next_measurement: ClassVar[str] = (
-        "repeat at another rotation rate: lines locked to the tool move with it"
-    )
-    stage: ClassVar[Stage] = "rate"
+    name = "rotation_line"
+    short = "lines locked to tool rotation, pump or stick-slip"
+    plain = "lines locked to the rotation of the tool"
+    next_measurement = "repeat at another rotation rate: lines locked to the tool move with it"
     channels: ClassVar[Mapping[str, str]] = {"rotation_rate": INNER["rotation_rate"]}
-    size_parameters: ClassVar[tuple[str, ...]] = ("amplitude",)
+    size_parameters = ("amplitude",)
 
     amplitude: tuple[float, ...] = parameter(
         "deg/h", "amplitude of the first line", typical=0.5, low=-1e6, high=1e6, many=True

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from gyrostab.errors import OptionError
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
+from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
 from gyrostab.units import HOUR
 
 __all__ = ["HeldSamples", "LoggerFilter", "RateQuantization", "Spikes"]
@@ -44,15 +44,15 @@ class LoggerFilter(Effect):
     'The logger filters on all axes: low-pass of order 4 at 80 Hz; its samples are means.'
     """
 
-    name: ClassVar[str] = "logger_filter"
-    short: ClassVar[str] = "low-pass, integrate-and-dump, decimation"
-    plain: ClassVar[str] = "a filter in the logger"
-    next_measurement: ClassVar[str] = (
+    name = "logger_filter"
+    short = "low-pass, integrate-and-dump, decimation"
+    plain = "a filter in the logger"
+    next_measurement = (
         "read the logger settings, or log at a higher rate: a filter leaves the long averaging "
         "times unchanged"
     )
-    stage: ClassVar[Stage] = "sampling"
-    size_parameters: ClassVar[tuple[str, ...]] = ("cutoff", "length", "pick")
+    stage = "sampling"
+    size_parameters = ("cutoff", "length", "pick")
 
     cutoff: float = parameter(
         "Hz", "half power of the low-pass; 0 for none", default=0.0, typical=2.0, low=0.0, high=1e6
@@ -232,12 +232,12 @@ class RateQuantization(Effect):
     'The rate is quantized in steps of 0.5 deg/h on all axes.'
     """
 
-    name: ClassVar[str] = "rate_quantization"
-    short: ClassVar[str] = "quantization grid of the rate"
-    plain: ClassVar[str] = "quantization of the output"
-    next_measurement: ClassVar[str] = "log with one more bit, or in counts"
-    stage: ClassVar[Stage] = "logger"
-    size_parameters: ClassVar[tuple[str, ...]] = ("step",)
+    name = "rate_quantization"
+    short = "quantization grid of the rate"
+    plain = "quantization of the output"
+    next_measurement = "log with one more bit, or in counts"
+    stage = "logger"
+    size_parameters = ("step",)
 
     step: float = parameter("deg/h", "distance between the values", typical=1.0, low=0.0, high=1e9)
     mode: str = parameter(
@@ -290,14 +290,12 @@ class Spikes(Effect):
      times per hour.'
     """
 
-    name: ClassVar[str] = "spikes"
-    short: ClassVar[str] = "bit errors, outliers"
-    plain: ClassVar[str] = "bit errors or outliers"
-    next_measurement: ClassVar[str] = (
-        "log the raw data words: bit errors change them by powers of two counts"
-    )
-    stage: ClassVar[Stage] = "logger"
-    size_parameters: ClassVar[tuple[str, ...]] = ("per_hour",)
+    name = "spikes"
+    short = "bit errors, outliers"
+    plain = "bit errors or outliers"
+    next_measurement = "log the raw data words: bit errors change them by powers of two counts"
+    stage = "logger"
+    size_parameters = ("per_hour",)
 
     per_hour: float = parameter(
         "1/h", "wrong samples of every axis", typical=60.0, low=0.0, high=1e8
@@ -379,12 +377,12 @@ class HeldSamples(Effect):
     average.
     """
 
-    name: ClassVar[str] = "held_samples"
-    short: ClassVar[str] = "repeated or zero-filled samples"
-    plain: ClassVar[str] = "repeated or zero-filled samples"
-    next_measurement: ClassVar[str] = "log a counter with each sample"
-    stage: ClassVar[Stage] = "logger"
-    size_parameters: ClassVar[tuple[str, ...]] = ("per_hour",)
+    name = "held_samples"
+    short = "repeated or zero-filled samples"
+    plain = "repeated or zero-filled samples"
+    next_measurement = "log a counter with each sample"
+    stage = "logger"
+    size_parameters = ("per_hour",)
 
     per_hour: float = parameter(
         "1/h", "losses, outside of a loss", typical=360.0, low=0.0, high=1e8

@@ -16,7 +16,7 @@ import numpy as np
 
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import HOUR, sampled_psd
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Stage, Windows, parameter
+from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Windows, parameter
 from gyrostab.units import INNER
 
 __all__ = ["LightPowerNoise", "TemperatureNoise", "VibrationNoise", "VibrationRandomWalk"]
@@ -60,17 +60,17 @@ class TemperatureNoise(Effect):
     value at 25 degC.
     """
 
-    name: ClassVar[str] = "temperature_noise"
-    short: ClassVar[str] = "N follows T"
-    plain: ClassVar[str] = "white noise that varies with temperature"
-    next_measurement: ClassVar[str] = (
+    name = "temperature_noise"
+    short = "N follows T"
+    plain = "white noise that varies with temperature"
+    next_measurement = (
         "return to the first temperature: noise that follows temperature returns too, noise that "
         "follows age does not"
     )
-    stage: ClassVar[Stage] = "noise"
-    terms: ClassVar[str] = "N"
+    stage = "noise"
+    terms = "N"
     channels: ClassVar[Mapping[str, str]] = {"temperature": INNER["temperature"]}
-    size_parameters: ClassVar[tuple[str, ...]] = ("linear", "quadratic")
+    size_parameters = ("linear", "quadratic")
 
     linear: float = parameter(
         "1/degC", "growth of N^2 per degree, as a share of it", typical=2e-3, low=-1.0, high=10.0
@@ -137,16 +137,14 @@ class LightPowerNoise(Effect):
     the detector and 0.1 shot noise.
     """
 
-    name: ClassVar[str] = "light_power_noise"
-    short: ClassVar[str] = "N follows light power"
-    plain: ClassVar[str] = "white noise that varies with light power"
-    next_measurement: ClassVar[str] = (
-        "change the light power in steps at a steady temperature, and log it"
-    )
-    stage: ClassVar[Stage] = "noise"
-    terms: ClassVar[str] = "N"
+    name = "light_power_noise"
+    short = "N follows light power"
+    plain = "white noise that varies with light power"
+    next_measurement = "change the light power in steps at a steady temperature, and log it"
+    stage = "noise"
+    terms = "N"
     channels: ClassVar[Mapping[str, str]] = {"light_power": INNER["power"]}
-    size_parameters: ClassVar[tuple[str, ...]] = ("thermal", "shot")
+    size_parameters = ("thermal", "shot")
 
     thermal: float = parameter(
         "1",
@@ -225,7 +223,7 @@ class LightPowerNoise(Effect):
 class _FollowsVibration(Effect):
     """Noise whose added variance grows with a power of the rms acceleration."""
 
-    stage: ClassVar[Stage] = "noise"
+    stage = "noise"
     channels: ClassVar[Mapping[str, str]] = {"vibration": INNER["acceleration"]}
 
     exponent: float = parameter(
@@ -269,15 +267,15 @@ class VibrationNoise(_FollowsVibration):
     'Vibration raises the noise on axis x: 0.02 deg/sqrt(h)/g of N, added in squares.'
     """
 
-    name: ClassVar[str] = "vibration_noise"
-    short: ClassVar[str] = "noise level follows vibration"
-    plain: ClassVar[str] = "noise that rises with vibration"
-    next_measurement: ClassVar[str] = (
+    name = "vibration_noise"
+    short = "noise level follows vibration"
+    plain = "noise that rises with vibration"
+    next_measurement = (
         "log an accelerometer at the full rate: its spectrum and its coherence with the gyro "
         "separate noise from motion"
     )
-    terms: ClassVar[str] = "QN"
-    size_parameters: ClassVar[tuple[str, ...]] = ("white", "quantization")
+    terms = "QN"
+    size_parameters = ("white", "quantization")
 
     white: float = parameter(
         "deg/sqrt(h)/g",
@@ -333,15 +331,15 @@ class VibrationRandomWalk(_FollowsVibration):
     'Vibration adds rate random walk on axis x: 0.5 deg/h^1.5/g of K, added in squares.'
     """
 
-    name: ClassVar[str] = "vibration_random_walk"
-    short: ClassVar[str] = "K follows vibration"
-    plain: ClassVar[str] = "a random walk that rises with vibration"
-    next_measurement: ClassVar[str] = (
+    name = "vibration_random_walk"
+    short = "K follows vibration"
+    plain = "a random walk that rises with vibration"
+    next_measurement = (
         "vibrate evenly for at least half an hour: a random walk keeps growing between the edges, "
         "a step does not"
     )
-    terms: ClassVar[str] = "K"
-    size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity",)
+    terms = "K"
+    size_parameters = ("sensitivity",)
 
     sensitivity: float = parameter(
         "deg/h^1.5/g", "added K, in squares, per rms g", typical=0.5, low=0.0, high=1e4

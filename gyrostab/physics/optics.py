@@ -11,7 +11,7 @@ import numpy as np
 
 from gyrostab.errors import OptionError
 from gyrostab.noise import sampled_psd
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
+from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
 from gyrostab.physics.phase import fold, line_density, lorentz_density
 from gyrostab.units import HOUR, INNER
 
@@ -42,12 +42,12 @@ class DeadZone(Effect):
     'The output sticks on axis x, while the rate is within 0.2 deg/h of 0 deg/h.'
     """
 
-    name: ClassVar[str] = "dead_zone"
-    short: ClassVar[str] = "output sticks near zero rate"
-    plain: ClassVar[str] = "a dead zone near zero rate"
-    next_measurement: ClassVar[str] = "add a slow known rotation that carries the rate through zero"
-    stage: ClassVar[Stage] = "sensor"
-    size_parameters: ClassVar[tuple[str, ...]] = ("width",)
+    name = "dead_zone"
+    short = "output sticks near zero rate"
+    plain = "a dead zone near zero rate"
+    next_measurement = "add a slow known rotation that carries the rate through zero"
+    stage = "sensor"
+    size_parameters = ("width",)
 
     width: float = parameter(
         "deg/h", "half of the zone", typical=0.2, low=0.0, high=1e6, source="Cao et al. 2025"
@@ -117,16 +117,16 @@ class FeedbackReset(Effect):
     'Every reset of the ramp leaves 11.5 nrad on axis z, one reset for 12.96 urad of rotation.'
     """
 
-    name: ClassVar[str] = "feedback_reset"
-    short: ClassVar[str] = "error tied to the phase or resets of the feedback ramp"
-    plain: ClassVar[str] = "an error of the feedback ramp"
-    next_measurement: ClassVar[str] = (
+    name = "feedback_reset"
+    short = "error tied to the phase or resets of the feedback ramp"
+    plain = "an error of the feedback ramp"
+    next_measurement = (
         "log the phase of the feedback ramp, and repeat at another rotation rate: lines of the "
         "ramp move with it"
     )
-    stage: ClassVar[Stage] = "electronics"
+    stage = "electronics"
     channels: ClassVar[Mapping[str, str]] = {"ramp": INNER["number"]}
-    size_parameters: ClassVar[tuple[str, ...]] = ("kick", "tail", "sawtooth")
+    size_parameters = ("kick", "tail", "sawtooth")
 
     kick: float = parameter(
         "nrad",
@@ -385,14 +385,11 @@ class SharedSource(Effect):
     'The light source adds the same noise on axes x, y and z, 0.002, 0.001 and -0.001 deg/sqrt(h).'
     """
 
-    name: ClassVar[str] = "shared_source"
-    short: ClassVar[str] = "broadband noise common to axes"
-    plain: ClassVar[str] = "noise common to the axes (shared light source)"
-    next_measurement: ClassVar[str] = (
-        "log the light power of the source, or run the axes on separate sources"
-    )
-    stage: ClassVar[Stage] = "rate"
-    size_parameters: ClassVar[tuple[str, ...]] = ("N",)
+    name = "shared_source"
+    short = "broadband noise common to axes"
+    plain = "noise common to the axes (shared light source)"
+    next_measurement = "log the light power of the source, or run the axes on separate sources"
+    size_parameters = ("N",)
 
     N: tuple[float, ...] = parameter(
         "deg/sqrt(h)",

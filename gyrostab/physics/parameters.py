@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,18 +17,18 @@ __all__ = ["Parameter", "parameter"]
 class Parameter:
     """Description of one parameter of an effect."""
 
-    name: str  # name in a model
     unit: str  # unit of the number, for instance "deg/h/degC"; "text" for a word
     meaning: str  # meaning in a few words
-    default: Any  # value if a model does not give it; None where it must be given
-    typical: Any  # published or estimated size, for documentation and tests
-    low: float  # allowed range, ends included
-    high: float
-    choices: tuple[str, ...]  # allowed words of a text parameter
-    many: bool  # whether it has one number per axis; see `Effect.expand_to_axes`
+    default: Any = None  # value if a model does not give it; None where it must be given
+    typical: Any = None  # published or estimated size, for documentation and tests
+    low: float = -math.inf  # allowed range, ends included
+    high: float = math.inf
+    choices: tuple[str, ...] = ()  # allowed words of a text parameter
+    many: bool = False  # whether it has one number per axis; see `Effect.expand_to_axes`
     #: What the value must be, "whole number" or "whole number of fringes"; empty for any number.
-    whole: str
-    source: str  # source of the typical size: author and year, or "estimate"
+    whole: str = ""
+    source: str = "estimate"  # source of the typical size: author and year, or "estimate"
+    name: str = ""  # name in a model, that of the field
 
     def check(self, value: Any, effect: str) -> Any:
         """Return `value` as a float, a tuple of floats or a word, or raise `OptionError`."""
@@ -58,30 +58,14 @@ class Parameter:
 
 
 def parameter(
-    unit: str,
-    meaning: str,
-    *,
-    default: Any = None,
-    typical: Any = None,
-    low: float = -math.inf,
-    high: float = math.inf,
-    choices: tuple[str, ...] = (),
-    many: bool = False,
-    whole: str = "",
-    source: str = "estimate",
+    unit: str, meaning: str, *, default: Any = None, typical: Any = None, **options: Any
 ) -> Any:
-    """Declare a field of an effect; see `Parameter`. Without a default a model must give it."""
-    properties = {
-        "unit": unit,
-        "meaning": meaning,
-        "typical": default if typical is None else typical,
-        "low": low,
-        "high": high,
-    }
-    properties |= {"choices": choices, "many": many, "source": source, "default": default}
-    properties |= {"whole": whole}
-    return (
-        field(metadata={"parameter": properties})
-        if default is None
-        else field(default=default, metadata={"parameter": properties})
+    """Declare a field of an effect; see `Parameter`. The typical size is the default if not given.
+
+    Without a default a model must give it.
+    """
+    typical = default if typical is None else typical
+    definition = Parameter(unit, meaning, default, typical, **options)
+    return field(
+        default=MISSING if default is None else default, metadata={"parameter": definition}
     )

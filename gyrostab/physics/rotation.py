@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
+from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
 from gyrostab.physics.phase import (
     TURN,
     fold,
@@ -45,19 +45,18 @@ class ScaleFactor(Effect):
     'The scale factor is wrong on axis z: linear 100 ppm.'
     """
 
-    name: ClassVar[str] = "scale_factor"
-    short: ClassVar[str] = "error proportional to (a function of) rotation rate"
-    plain: ClassVar[str] = "a scale-factor error"
-    next_measurement: ClassVar[str] = (
+    name = "scale_factor"
+    short = "error proportional to (a function of) rotation rate"
+    plain = "a scale-factor error"
+    next_measurement = (
         "rotate at two known rates in both directions: a scale-factor error is proportional to "
         "the rate"
     )
-    stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {
         "rotation_rate": INNER["rotation_rate"],
         "temperature": INNER["temperature"],
     }
-    size_parameters: ClassVar[tuple[str, ...]] = ("linear", "asymmetry", "cubic", "thermal")
+    size_parameters = ("linear", "asymmetry", "cubic", "thermal")
 
     linear: float = parameter(
         "ppm", "error of the scale factor", default=0.0, typical=50.0, low=-1e6, high=1e6
@@ -144,12 +143,11 @@ class Misalignment(Effect):
     'The rotation of other axes leaks in on axis x, by 0.5 mrad of z.'
     """
 
-    name: ClassVar[str] = "misalignment"
-    short: ClassVar[str] = "another axis's rate leaks in"
-    plain: ClassVar[str] = "rotation about another axis, coupled in by misalignment"
-    next_measurement: ClassVar[str] = "rotate about one axis at a time and read the others"
-    stage: ClassVar[Stage] = "rate"
-    size_parameters: ClassVar[tuple[str, ...]] = ("x", "y", "z")
+    name = "misalignment"
+    short = "another axis's rate leaks in"
+    plain = "rotation about another axis, coupled in by misalignment"
+    next_measurement = "rotate about one axis at a time and read the others"
+    size_parameters = ("x", "y", "z")
 
     x: float = parameter(
         "mrad", "misalignment angle towards axis x", default=0.0, typical=0.5, low=-1e3, high=1e3
@@ -227,15 +225,15 @@ class EarthRate(Effect):
     and -13.03 deg/h along it, on all axes.
     """
 
-    name: ClassVar[str] = "earth_rate"
-    short: ClassVar[str] = "earth rate modulated by tool rotation"
-    plain: ClassVar[str] = "earth rate, which varies with the toolface"
-    next_measurement: ClassVar[str] = (
+    name = "earth_rate"
+    short = "earth rate modulated by tool rotation"
+    plain = "earth rate, which varies with the toolface"
+    next_measurement = (
         "stop the rotation at four toolfaces 90 degrees apart: earth rate follows the toolface"
     )
-    stage: ClassVar[Stage] = "motion"
+    stage = "motion"
     channels: ClassVar[Mapping[str, str]] = {"rotation_rate": INNER["rotation_rate"]}
-    size_parameters: ClassVar[tuple[str, ...]] = ("rate",)
+    size_parameters = ("rate",)
 
     latitude: float = parameter(
         "deg", "latitude, north positive", typical=45.0, low=-90.0, high=90.0
@@ -375,18 +373,18 @@ class RealMotion(Effect):
     'The tool really rotates on axes x, y and z, with shares 1, 0.5 and 0: sway 9 deg/h at 0.3 Hz.'
     """
 
-    name: ClassVar[str] = "real_motion"
-    short: ClassVar[str] = "rotation that is not an error"
-    plain: ClassVar[str] = "real rotation of the tool, not a sensor error"
-    next_measurement: ClassVar[str] = (
+    name = "real_motion"
+    short = "rotation that is not an error"
+    plain = "real rotation of the tool, not a sensor error"
+    next_measurement = (
         "log accelerometers and a second gyro on the same mount: real motion shows in all of "
         "them, a sensor error in one"
     )
-    stage: ClassVar[Stage] = "motion"
+    stage = "motion"
     channels: ClassVar[Mapping[str, str]] = {
         "rotation_rate": INNER["rotation_rate"]
     } | dict.fromkeys(("accel_x", "accel_y", "accel_z"), INNER["acceleration"])
-    size_parameters: ClassVar[tuple[str, ...]] = ("sway", "spin", "x", "y", "z")
+    size_parameters = ("sway", "spin", "x", "y", "z")
 
     direction: tuple[float, ...] = parameter(
         "1", "share of each axis", default=(1.0,), low=-1.0, high=1.0, many=True

@@ -10,7 +10,7 @@ import numpy as np
 
 from gyrostab.errors import OptionError
 from gyrostab.noise import NORMAL_95
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Stage, Windows, parameter
+from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Windows, parameter
 from gyrostab.units import HOUR, INNER
 
 __all__ = ["Shupe", "TemperatureBias", "ThermalGradient", "ThermalHysteresis"]
@@ -37,16 +37,15 @@ class TemperatureBias(Effect):
     'The bias follows the temperature on axis x, by 0.002 deg/h/degC around 25 degC.'
     """
 
-    name: ClassVar[str] = "temperature_bias"
-    short: ClassVar[str] = "bias follows T"
-    plain: ClassVar[str] = "a bias that follows temperature"
-    next_measurement: ClassVar[str] = (
+    name = "temperature_bias"
+    short = "bias follows T"
+    plain = "a bias that follows temperature"
+    next_measurement = (
         "heat and cool once with a hold at each end: a bias that follows temperature stays during "
         "the hold and returns later"
     )
-    stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {"temperature": INNER["temperature"]}
-    size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity", "quadratic", "cubic")
+    size_parameters = ("sensitivity", "quadratic", "cubic")
 
     sensitivity: float = parameter(
         "deg/h/degC", "bias per degree", typical=1e-3, low=-10.0, high=10.0
@@ -106,16 +105,15 @@ class Shupe(Effect):
     a lag of 265 s.
     """
 
-    name: ClassVar[str] = "shupe"
-    short: ClassVar[str] = "bias follows (lagged) dT/dt"
-    plain: ClassVar[str] = "a bias that follows the rate of change of temperature (Shupe effect)"
-    next_measurement: ClassVar[str] = (
+    name = "shupe"
+    short = "bias follows (lagged) dT/dt"
+    plain = "a bias that follows the rate of change of temperature (Shupe effect)"
+    next_measurement = (
         "hold the temperature after a ramp: a Shupe bias decays, and changes sign when the ramp "
         "is reversed"
     )
-    stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {"temperature": INNER["temperature"]}
-    size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity", "transient")
+    size_parameters = ("sensitivity", "transient")
 
     sensitivity: float = parameter(
         "deg/h/(degC/min)",
@@ -260,15 +258,14 @@ class ThermalGradient(Effect):
     The bias follows the difference of temperature and temperature_2 on axis x, by 0.05 deg/h/degC.
     """
 
-    name: ClassVar[str] = "thermal_gradient"
-    short: ClassVar[str] = "bias follows a difference of two temperatures"
-    plain: ClassVar[str] = "a bias that follows a temperature difference"
-    next_measurement: ClassVar[str] = "log a second temperature at the other end of the coil"
-    stage: ClassVar[Stage] = "rate"
+    name = "thermal_gradient"
+    short = "bias follows a difference of two temperatures"
+    plain = "a bias that follows a temperature difference"
+    next_measurement = "log a second temperature at the other end of the coil"
     channels: ClassVar[Mapping[str, str]] = dict.fromkeys(
         ("temperature", "temperature_2"), INNER["temperature"]
     )
-    size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity", "change")
+    size_parameters = ("sensitivity", "change")
 
     sensitivity: float = parameter(
         "deg/h/degC", "bias per difference", default=0.0, typical=0.05, low=-1e3, high=1e3
@@ -347,16 +344,15 @@ class ThermalHysteresis(Effect):
     degC to each side.
     """
 
-    name: ClassVar[str] = "thermal_hysteresis"
-    short: ClassVar[str] = "bias depends on the history of T"
-    plain: ClassVar[str] = "a bias with temperature hysteresis"
-    next_measurement: ClassVar[str] = (
+    name = "thermal_hysteresis"
+    short = "bias depends on the history of T"
+    plain = "a bias with temperature hysteresis"
+    next_measurement = (
         "run a closed temperature cycle twice: with hysteresis heating and cooling differ, and "
         "the loop repeats"
     )
-    stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {"temperature": INNER["temperature"]}
-    size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity",)
+    size_parameters = ("sensitivity",)
 
     sensitivity: float = parameter(
         "deg/h/degC", "bias per degree in the dead band", typical=3e-4, low=-10.0, high=10.0

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from gyrostab.errors import OptionError
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
+from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
 from gyrostab.units import INNER
 
 __all__ = ["AliasedVibration", "GSensitivity", "Magnetic", "VibrationRectification"]
@@ -64,18 +64,17 @@ class GSensitivity(_Vector):
     'The bias follows the acceleration on axis z, by 0.01 deg/h/g along x.'
     """
 
-    name: ClassVar[str] = "g_sensitivity"
-    short: ClassVar[str] = "bias follows acceleration"
-    plain: ClassVar[str] = "a bias that follows acceleration"
-    next_measurement: ClassVar[str] = (
+    name = "g_sensitivity"
+    short = "bias follows acceleration"
+    plain = "a bias that follows acceleration"
+    next_measurement = (
         "turn the tool over at rest: g-sensitivity changes sign with gravity, rectification does "
         "not"
     )
-    stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = dict.fromkeys(
         ("accel_x", "accel_y", "accel_z"), INNER["acceleration"]
     )
-    size_parameters: ClassVar[tuple[str, ...]] = ("x", "y", "z")
+    size_parameters = ("x", "y", "z")
 
     x: float = parameter(
         "deg/h/g", "bias per g along x", default=0.0, typical=1e-3, low=-10.0, high=10.0
@@ -117,16 +116,15 @@ class VibrationRectification(Effect):
     vibration.
     """
 
-    name: ClassVar[str] = "vibration_rectification"
-    short: ClassVar[str] = "bias follows g_rms squared"
-    plain: ClassVar[str] = "a bias caused by vibration (vibration rectification)"
-    next_measurement: ClassVar[str] = (
+    name = "vibration_rectification"
+    short = "bias follows g_rms squared"
+    plain = "a bias caused by vibration (vibration rectification)"
+    next_measurement = (
         "repeat at twice the vibration: rectification grows fourfold, g-sensitivity twofold; then "
         "turn the tool over: g-sensitivity changes sign"
     )
-    stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {"vibration": INNER["acceleration"]}
-    size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity", "quartic")
+    size_parameters = ("sensitivity", "quartic")
 
     sensitivity: float = parameter(
         "deg/h/g^2",
@@ -186,15 +184,14 @@ class AliasedVibration(Effect):
     each sample is a point of it.
     """
 
-    name: ClassVar[str] = "aliased_vibration"
-    short: ClassVar[str] = "vibration above half of the sampling rate, aliased"
-    plain: ClassVar[str] = "vibration aliased by the sampling"
-    next_measurement: ClassVar[str] = (
+    name = "aliased_vibration"
+    short = "vibration above half of the sampling rate, aliased"
+    plain = "vibration aliased by the sampling"
+    next_measurement = (
         "log at a higher rate, or with an analogue filter: an aliased band moves or disappears"
     )
-    stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {"vibration": INNER["acceleration"]}
-    size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity",)
+    size_parameters = ("sensitivity",)
 
     sensitivity: tuple[float, ...] = parameter(
         "deg/h/g", "rms rate in the band per rms g", typical=3.7, low=-1e6, high=1e6, many=True
@@ -336,17 +333,16 @@ class Magnetic(_Vector):
     'The bias follows the magnetic field on axis z, by 0.002 deg/h/uT along x.'
     """
 
-    name: ClassVar[str] = "magnetic"
-    short: ClassVar[str] = "bias follows the magnetic field"
-    plain: ClassVar[str] = "a bias that follows the magnetic field"
-    next_measurement: ClassVar[str] = (
+    name = "magnetic"
+    short = "bias follows the magnetic field"
+    plain = "a bias that follows the magnetic field"
+    next_measurement = (
         "turn a magnet, or turn the tool in the earth's field, and log a magnetometer"
     )
-    stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = dict.fromkeys(
         ("mag_x", "mag_y", "mag_z"), INNER["magnetic"]
     )
-    size_parameters: ClassVar[tuple[str, ...]] = ("x", "y", "z")
+    size_parameters = ("x", "y", "z")
 
     x: float = parameter(
         "deg/h/uT", "bias per microtesla along x", default=0.0, typical=1e-3, low=-10.0, high=10.0

@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
+from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
 from gyrostab.units import HOUR
 
 __all__ = ["WarmUp"]
@@ -40,14 +40,13 @@ class WarmUp(Effect):
      constant of 600 s.'
     """
 
-    name: ClassVar[str] = "warm_up"
-    short: ClassVar[str] = "exponential bias after every power-on"
-    plain: ClassVar[str] = "warm-up after power-on"
-    next_measurement: ClassVar[str] = (
+    name = "warm_up"
+    short = "exponential bias after every power-on"
+    plain = "warm-up after power-on"
+    next_measurement = (
         "switch off and on again at a steady outside temperature: warm-up repeats after every start"
     )
-    stage: ClassVar[Stage] = "rate"
-    size_parameters: ClassVar[tuple[str, ...]] = ("amplitude", "slow_amplitude")
+    size_parameters = ("amplitude", "slow_amplitude")
 
     amplitude: float = parameter(
         "deg/h", "bias of a cold gyro at power-on", typical=0.1, low=-1e4, high=1e4
