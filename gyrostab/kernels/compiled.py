@@ -11,7 +11,7 @@ from typing import Any
 
 from numba import njit
 
-__all__ = ["INNER", "KERNEL"]
+__all__ = ["INNER", "KERNEL", "REORDER"]
 
 
 def _has_cache() -> bool:
@@ -41,3 +41,6 @@ KERNEL: dict[str, Any] = {
 #: A separate copy, which only the process that compiles it would call, may add in another order
 #: than the inlined ones: the last digits of a first run would differ.
 INNER: dict[str, Any] = {**KERNEL, "cache": False, "no_cpython_wrapper": True, "forceinline": True}
+#: Fast-math flags that let the compiler add in another order, which it needs for vector code; the
+#: order is the same on every call. NaN and infinity keep their meaning.
+REORDER = {"reassoc", "contract", "nsz"}

@@ -19,12 +19,10 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from gyrostab.kernels.allan.blocks import windows_from_blocks
-from gyrostab.kernels.compiled import INNER
+from gyrostab.kernels.compiled import INNER, REORDER
 
 __all__ = ["cluster_cells", "cluster_factor", "cluster_strides", "integrate_places", "pack_mask"]
 
-# Reassociation lets the inner loop run on vectors; NaN and infinity keep their meaning.
-_FAST = {"reassoc", "contract", "nsz", "arcp"}
 # First terms of the pairs that are summed for the degrees of freedom, at most; where there are
 # more, sections of so many.
 _TERMS = 384
@@ -252,7 +250,7 @@ def _fill_grid(mask, begin, grid, k, places):  # type: ignore[no-untyped-def]
         places[5, i] = 1.0 / (places[3, i] * places[4, i]) if used else 0.0
 
 
-@njit(fastmath=_FAST, **INNER)
+@njit(fastmath=REORDER, **INNER)
 def _sum_overlapping(places, i, first, stop):  # type: ignore[no-untyped-def]
     """Sum weight times squared covariance with term i, over terms less than k after term i.
 
@@ -274,7 +272,7 @@ def _sum_overlapping(places, i, first, stop):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(fastmath=_FAST, **INNER)
+@njit(fastmath=REORDER, **INNER)
 def _sum_touching(places, i, first, stop):  # type: ignore[no-untyped-def]
     """Sum the same for terms k to 2k after term i, which overlap only its second cluster."""
     a2, n1 = places[2, i], places[3, i]

@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gyrostab.kernels.allan.plain_sums import LANES, MAX_LAGS
-from gyrostab.kernels.compiled import INNER, KERNEL
+from gyrostab.kernels.compiled import INNER, KERNEL, REORDER
 
 __all__ = [
     "TILE",
@@ -27,8 +27,6 @@ __all__ = [
     "thin_pyramid",
 ]
 
-# Reassociation lets the inner loop run on vectors; NaN and infinity keep their meaning.
-_FAST = {"reassoc", "contract", "nsz", "arcp"}
 #: Samples that are integrated, measured and thinned while they are in the cache.
 TILE = 4096
 # Samples that are looked at one by one where some of them are missing.
@@ -52,7 +50,7 @@ def first_present(x: NDArray[np.generic]) -> float:
     return np.nan
 
 
-@njit(fastmath=_FAST, **INNER)
+@njit(fastmath=REORDER, **INNER)
 def _sum_samples(x, base):  # type: ignore[no-untyped-def]
     total = 0.0
     for i in range(x.size):

@@ -9,12 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from gyrostab.kernels.compiled import INNER, KERNEL
+from gyrostab.kernels.compiled import INNER, KERNEL, REORDER
 
 __all__ = ["single_blocks", "valid_intervals"]
-
-# Reassociation lets the inner loop run on vectors; NaN and infinity keep their meaning.
-_FAST = {"reassoc", "contract", "nsz", "arcp"}
 
 
 @njit(**INNER)
@@ -64,7 +61,7 @@ def valid_intervals(starts, stops, k, span, points):  # type: ignore[no-untyped-
     return begin, end
 
 
-@njit(fastmath=_FAST, **INNER)
+@njit(fastmath=REORDER, **INNER)
 def _sum_squares(theta, a, b, k, order):  # type: ignore[no-untyped-def]
     """Sum of squared second or third differences over ``a <= m < b``."""
     # Three slices: with theta[m + k] the signed index costs a wraparound test that blocks
@@ -97,25 +94,16 @@ def _differences_two(high, low, a, b, k, out):  # type: ignore[no-untyped-def]
 @njit(**INNER)
 def _third_differences_two(high, low, a, b, k, out):  # type: ignore[no-untyped-def]
     """Compute third differences of an angle held as two doubles, without reassociation."""
-    h0, h1, h2, h3 = (
-        high[a:b],
-        high[a + k : b + k],
-        high[a + 2 * k : b + 2 * k],
-        high[a + 3 * k : b + 3 * k],
-    )
-    l0, l1, l2, l3 = (
-        low[a:b],
-        low[a + k : b + k],
-        low[a + 2 * k : b + 2 * k],
-        low[a + 3 * k : b + 3 * k],
-    )
+    h0, h1, h2 = high[a:b], high[a + k : b + k], high[a + 2 * k : b + 2 * k]
+    l0, l1, l2 = low[a:b], low[a + k : b + k], low[a + 2 * k : b + 2 * k]
+    h3, l3 = high[a + 3 * k : b + 3 * k], low[a + 3 * k : b + 3 * k]
     for i in range(h0.size):
         middle = h2[i] - h1[i]
         high_part = ((h3[i] - h2[i]) - middle) - (middle - (h1[i] - h0[i]))
         out[i] = high_part + ((l3[i] - l0[i]) - 3.0 * (l2[i] - l1[i]))
 
 
-@njit(fastmath=_FAST, **INNER)
+@njit(fastmath=REORDER, **INNER)
 def _square_sum(values):  # type: ignore[no-untyped-def]
     """Sum of squares."""
     total = 0.0
@@ -140,20 +128,22 @@ def _energy_two(high, low, a, b, k, order):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _add_part(high, low, begin, end, first_interval, a, b, k, shift, order, sums, counts):  # type: ignore[no-untyped-def]
-    """Add the valid terms in ``a <= m < b``; `first_interval` is the first that ends after a."""
+def _sum_part(high, low, begin, end, first_interval, a, b, k, shift, order):  # type: ignore[no-untyped-def]
+    """Sum and count the valid terms in ``a <= m < b``; `first_interval` ends first after a."""
     up = (1 << shift) - 1
+    total, count = 0.0, 0
     for v in range(first_interval, begin.size):
         if begin[v] >= b:
             break
         first = (max(begin[v], a) + up) >> shift
         last = (min(end[v], b) + up) >> shift
         if last > first:
-            counts[0] += last - first
+            count += last - first
             if low.size > 0:
-                sums[0] += _energy_two(high, low, first, last, k >> shift, order)
+                total += _energy_two(high, low, first, last, k >> shift, order)
             else:
-                sums[0] += _sum_squares(high, first, last, k >> shift, order)
+                total += _sum_squares(high, first, last, k >> shift, order)
+    return total, count
 
 
 @njit(**KERNEL)
@@ -165,46 +155,19 @@ def single_blocks(  # type: ignore[no-untyped-def]
 
     `order` is that of the differences; `spans` (n_tau,) and `points` as for `valid_intervals`.
     """
-    n_blocks = n_windows + whole_blocks[0]
-    heads, tails = np.zeros((n_blocks, ks.size)), np.zeros((n_blocks, ks.size))
-    head_counts, tail_counts = np.zeros((n_blocks, ks.size)), np.zeros((n_blocks, ks.size))
+    out = np.zeros((4, n_windows + whole_blocks[0], ks.size))
     for i in range(ks.size):
         begin, end = valid_intervals(starts, stops, ks[i], spans[i], points)
         theta, remainder = high[places[i] :], low[places[i] :]
         last = n_windows + whole_blocks[i] - 1
         first_interval = 0
         for block in range(last + 1):
-            a = block * step
-            b = a + head_lengths[i]
-            while first_interval < end.size and end[first_interval] <= a:
+            edges = (block * step, block * step + head_lengths[i], (block + 1) * step)
+            while first_interval < end.size and end[first_interval] <= edges[0]:
                 first_interval += 1
-            _add_part(
-                theta,
-                remainder,
-                begin,
-                end,
-                first_interval,
-                a,
-                b,
-                ks[i],
-                shifts[i],
-                order,
-                heads[block, i : i + 1],
-                head_counts[block, i : i + 1],
-            )
-            if whole_blocks[i] > 0 and block < last:
-                _add_part(
-                    theta,
-                    remainder,
-                    begin,
-                    end,
-                    first_interval,
-                    b,
-                    a + step,
-                    ks[i],
-                    shifts[i],
-                    order,
-                    tails[block, i : i + 1],
-                    tail_counts[block, i : i + 1],
-                )
-    return heads, tails, head_counts, tail_counts
+            for half in range(2 if whole_blocks[i] > 0 and block < last else 1):
+                out[half, block, i], out[2 + half, block, i] = _sum_part(
+                    theta, remainder, begin, end, first_interval, edges[half], edges[half + 1],
+                    ks[i], shifts[i], order,
+                )  # fmt: skip
+    return out

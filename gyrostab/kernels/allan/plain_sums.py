@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from numba import njit
 
-from gyrostab.kernels.compiled import KERNEL
+from gyrostab.kernels.compiled import KERNEL, REORDER
 
 __all__ = ["CONSECUTIVE_LAGS", "LANES", "MAX_LAGS", "split_sums"]
 
@@ -18,7 +18,7 @@ LANES = 8
 MAX_LAGS, CONSECUTIVE_LAGS = 4, 8
 
 
-@njit(fastmath={"reassoc", "contract", "nsz"}, **KERNEL)
+@njit(fastmath=REORDER, **KERNEL)
 def split_sums(theta, first, count, lags, at, splits, sizes, heads, tails, place):  # type: ignore[no-untyped-def]
     """Add squared second differences in two parts, as `split_sums` of `vectors`."""
     for q in range(count):

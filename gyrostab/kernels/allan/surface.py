@@ -175,33 +175,31 @@ def _bridge_gaps(theta, starts, stops, window, step, ks, strides, poor, cells): 
                 cells[8, j, i] = bridged[j, 6]
 
 
-class _Present(NamedTuple):
-    """Runs of present samples, and what is taken from each rate."""
+class _Work(NamedTuple):
+    """Samples of a unit of work: windows, runs of present samples, what is taken from each rate."""
 
+    x: NDArray[np.generic]
+    unit: Unit
+    space: Workspace
+    n_windows: int
     starts: Integers
     stops: Integers
     offset: float
 
 
-def _line_removed(x: NDArray[np.generic], starts: Integers, stops: Integers) -> Floats:
+def _line_removed(work: _Work) -> Floats:
     """Angle less the line through its first and last present points, zero where it is missing."""
-    first, last = starts[0], stops[-1] - 1
-    values = np.asarray(x, dtype=np.float64)
+    first, last = work.starts[0], work.stops[-1] - 1
+    values = np.asarray(work.x, dtype=np.float64)
     line = values[first] + (values[last] - values[first]) / max(last - first, 1) * (
         np.arange(values.size) - first
     )
     return np.where(np.isfinite(values), values - line, 0.0)
 
 
-def _strict_sums(
-    x: NDArray[np.generic],
-    unit: Unit,
-    present: _Present,
-    n_windows: int,
-    gaps: bool,
-    space: Workspace,
-) -> tuple[Floats, Floats]:
+def _strict_sums(work: _Work, gaps: bool) -> tuple[Floats, Floats]:
     """Sum squared second differences of every window and factor, and count terms if any miss."""
+    unit, space, n_windows = work.unit, work.space, work.n_windows
     lengths = unit.lengths
     whole_blocks = lengths // unit.step
     head_lengths = lengths - whole_blocks * unit.step
@@ -209,23 +207,16 @@ def _strict_sums(
     add = _angle_blocks if unit.angle else _rate_blocks
     if unit.order == 3:
         add = _third_blocks
-    add(x, unit, present, (head_lengths, whole_blocks, n_windows), blocks, space)
+    add(work, (head_lengths, whole_blocks, n_windows), blocks)
     sums = space.array("sums", len(blocks) // 2, n_windows, unit.ks.size)
     for heads_and_tails, out in zip((blocks[:2], blocks[2:]), sums, strict=False):
         windows_from_blocks(*heads_and_tails, whole_blocks, out)
     return sums[0], sums[1] if gaps else np.empty((0, 0))
 
 
-def _rate_blocks(
-    x: NDArray[np.generic],
-    unit: Unit,
-    present: _Present,
-    cut: tuple[Any, ...],
-    blocks: Floats,
-    space: Workspace,
-) -> None:
+def _rate_blocks(work: _Work, cut: tuple[Any, ...], blocks: Floats) -> None:
     """Sum heads and tails of rates, with an angle of two doubles where needed."""
-    starts, stops, offset = present
+    x, unit, space, _, starts, stops, offset = work
     ks, shifts = unit.ks, unit.shifts
     points = held_points(x.size + 1, unit.step, ks, shifts)
     places, size = pyramid_places(points, ks, shifts)
@@ -241,61 +232,33 @@ def _rate_blocks(
     integrate_two(x, offset, starts, stops, high[: x.size + 1], low[: x.size + 1])
     for part in (high, low):
         thin_pyramid(part, x.size + 1, int(shifts[-1]), 0, x.size + 1)
-    blocks[:] = single_blocks(
-        high, low, places, starts, stops, 2, unit.spans, unit.points, unit.step, ks, shifts, *cut
-    )[: len(blocks)]
+    _sum_intervals(work, high, low, places, cut, blocks)
 
 
-def _angle_of(
-    x: NDArray[np.generic], present: _Present, windows: Integers, unit: Unit, space: Workspace
-) -> Floats:
+def _angle_of(work: _Work, windows: Integers) -> Floats:
     """Take the angles (n + 1,) of some windows and the block behind each, each from zero on."""
-    angle = space.array("angle", x.size + 1)
+    x, unit = work.x, work.unit
+    angle = work.space.array("angle", x.size + 1)
     begins, ends = windows * unit.step, np.minimum((windows + 1) * unit.step + unit.window, x.size)
     apart = np.flatnonzero(begins[1:] > ends[:-1])
     for first, last in zip(begins[np.r_[0, apart + 1]], ends[np.r_[apart, -1]], strict=True):
-        starts, stops = (np.clip(edges, first, last) - first for edges in present[:2])
-        is_inside = starts < stops
-        integrate(
-            x[first:last],
-            present.offset,
-            starts[is_inside],
-            stops[is_inside],
-            angle[first : last + 1],
-        )
+        starts, stops = (np.clip(edges, first, last) - first for edges in (work.starts, work.stops))
+        inside = starts < stops
+        part = angle[first : last + 1]
+        integrate(x[first:last], work.offset, starts[inside], stops[inside], part)
     return angle
 
 
-def _angle_blocks(
-    x: NDArray[np.generic],
-    unit: Unit,
-    present: _Present,
-    cut: tuple[Any, ...],
-    blocks: Floats,
-    space: Workspace,
-) -> None:
+def _angle_blocks(work: _Work, cut: tuple[Any, ...], blocks: Floats) -> None:
     """Heads and tails of angles, which are all there already."""
-    starts, stops, _ = present
+    x, unit, space, _, starts, stops, _ = work
     ks, shifts = unit.ks, unit.shifts
     places, size = pyramid_places(x.size, ks, shifts)
     flat = space.array("angle", size)
-    flat[: x.size] = _line_removed(x, starts, stops)
+    flat[: x.size] = _line_removed(work)
     thin_pyramid(flat, x.size, int(shifts[-1]), 0, x.size)
     if starts.size > 1:
-        blocks[:] = single_blocks(
-            flat,
-            flat[:0],
-            places,
-            starts,
-            stops,
-            2,
-            unit.spans,
-            unit.points,
-            unit.step,
-            ks,
-            shifts,
-            *cut,
-        )[: len(blocks)]
+        _sum_intervals(work, flat, flat[:0], places, cut, blocks)
     else:
         order = (ks, shifts, group_factors(ks, shifts))
         grouped_blocks(
@@ -303,23 +266,16 @@ def _angle_blocks(
         )
 
 
-def _third_blocks(
-    x: NDArray[np.generic],
-    unit: Unit,
-    present: _Present,
-    cut: tuple[Any, ...],
-    blocks: Floats,
-    space: Workspace,
-) -> None:
+def _third_blocks(work: _Work, cut: tuple[Any, ...], blocks: Floats) -> None:
     """Heads and tails of third differences; the sum of the angle is held as two doubles."""
-    starts, stops, offset = present
+    x, unit, space, _, starts, stops, offset = work
     ks, shifts, summed = unit.ks, unit.shifts, VARIANCES[unit.variance].summed
     angles = x.size if unit.angle else x.size + 1
     places, size = pyramid_places(angles + summed, ks, shifts)
     high, low = space.array("angle", size), space.array("rest of the angle", size)
     precise = summed
     if unit.angle:
-        high[:angles], low[:angles] = _line_removed(x, starts, stops), 0.0
+        high[:angles], low[:angles] = _line_removed(work), 0.0
     else:
         largest = integrate(x, offset, starts, stops, high[:angles])
         precise = summed or needs_two_doubles(largest, x)
@@ -330,10 +286,18 @@ def _third_blocks(
         sum_two(high[: angles + 1], low[: angles + 1])
     for part in (high, low) if precise else (high,):
         thin_pyramid(part, angles + summed, int(shifts[-1]), 0, angles + summed)
+    _sum_intervals(work, high, low if precise else low[:0], places, cut, blocks)
+
+
+def _sum_intervals(
+    work: _Work, high: Floats, low: Floats, places: Integers, cut: tuple[Any, ...], blocks: Floats
+) -> None:
+    """Sum heads and tails interval by interval, with `low` as the remainder of the angle `high`."""
+    unit = work.unit
     spans = unit.spans + unit.angle  # of angles instead of samples
-    order = (unit.order, spans, unit.points, unit.step, ks, shifts)
-    low = low if precise else low[:0]
-    blocks[:] = single_blocks(high, low, places, starts, stops, *order, *cut)[: len(blocks)]
+    order = (unit.order, spans, unit.points, unit.step, unit.ks, unit.shifts)
+    sums = single_blocks(high, low, places, work.starts, work.stops, *order, *cut)
+    blocks[:] = sums[: len(blocks)]
 
 
 def convert_to_native(x: NDArray[np.generic]) -> NDArray[np.floating[Any]]:
@@ -379,13 +343,13 @@ def surface_unit(
     offset = (
         float(np.rint(mean)) if counts_only else mean
     )  # integers less an integer: every sum is exact
-    present = _Present(starts, stops, offset)
-    sums, counts = _strict_sums(x, unit, present, n_windows, gaps, space)
+    work = _Work(x, unit, space, n_windows, starts, stops, offset)
+    sums, counts = _strict_sums(work, gaps)
     full = full_counts(unit.lengths, unit.step, n_windows, unit.shifts)
     scale = VARIANCES[unit.variance].divisors(unit.ks) * (unit.interval if unit.angle else 1.0) ** 2
     if gaps:
         full = np.ascontiguousarray(np.broadcast_to(full, counts.shape))
-        return _cells_with_gaps(x, unit, present, sums / scale, counts, full, space), means
+        return _cells_with_gaps(work, sums / scale, counts, full), means
     ones = np.ones((1, unit.ks.size))
     other_fields = ones, STRICT * ones, ones, ones, ones, np.nan * ones
     return Cells(sums / (scale * full), full, ones, *other_fields), means
@@ -399,17 +363,9 @@ def _empty_cells(n_windows: int, n_tau: int) -> tuple[Cells, Floats]:
     return Cells(avar, zero, zero, zero, NONE + zero, none, none, none, none), means
 
 
-def _cells_with_gaps(
-    x: NDArray[np.generic],
-    unit: Unit,
-    present: _Present,
-    sums: Floats,
-    counts: Floats,
-    full: Floats,
-    space: Workspace,
-) -> Cells:
+def _cells_with_gaps(work: _Work, sums: Floats, counts: Floats, full: Floats) -> Cells:
     """Compute the cells from the scaled sums of squares in unbroken runs, and their counts."""
-    starts, stops, _ = present
+    unit, starts, stops = work.unit, work.starts, work.stops
     cells = np.ones((len(Cells._fields), *counts.shape))
     with np.errstate(invalid="ignore", divide="ignore"):
         np.divide(sums, full if unit.zero_fill else counts, out=cells[0])
@@ -419,12 +375,12 @@ def _cells_with_gaps(
         starts, stops, unit.angle, unit.window, unit.step, unit.ks, unit.shifts, *order, counts,
         full, cells,
     )  # fmt: skip
-    cells[8] = _find_slopes(x, unit, present, counts < full, space)
+    cells[8] = _find_slopes(work, counts < full)
     poor = counts < unit.min_strict * full
     bridge = unit.order == 2 and not unit.zero_fill and not unit.angle
     if bridge and poor.any():
         strides = cluster_strides(unit.window, unit.ks, unit.shifts)
-        angle = _angle_of(x, present, np.flatnonzero(poor.any(axis=1)), unit, space)
+        angle = _angle_of(work, np.flatnonzero(poor.any(axis=1)))
         _bridge_gaps(angle, starts, stops, unit.window, unit.step, unit.ks, strides, poor, cells)
     if not unit.zero_fill:
         blank = ~(cells[2] >= unit.min_coverage)
@@ -435,23 +391,17 @@ def _cells_with_gaps(
     return Cells(*cells)
 
 
-def _find_slopes(
-    x: NDArray[np.generic],
-    unit: Unit,
-    present: _Present,
-    with_gaps: NDArray[np.bool_],
-    space: Workspace,
-) -> Floats:
+def _find_slopes(work: _Work, with_gaps: NDArray[np.bool_]) -> Floats:
     """Find the slope of the rate that the second differences of windows with gaps show."""
+    x, unit, space, n_windows, starts, stops, offset = work
     if unit.order == 3 or unit.zero_fill:
         return np.full(with_gaps.shape, np.nan)
-    starts, stops, offset = present
     if unit.angle:
-        angle = _line_removed(x, starts, stops)
+        angle = _line_removed(work)
     else:
         angle = space.array("angle", x.size + 1)
         integrate(x, offset, starts, stops, angle)
-    places = starts, stops, unit.window, unit.step, len(with_gaps)
+    places = starts, stops, unit.window, unit.step, n_windows
     slopes = difference_slopes(angle, *places, unit.ks, unit.points)
     return np.where(with_gaps, slopes, np.nan)
 

@@ -22,8 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from gyrostab.kernels.compiled import INNER, KERNEL
-from gyrostab.kernels.regression.nonnegative import REORDER
+from gyrostab.kernels.compiled import INNER, KERNEL, REORDER
 
 __all__ = ["STOCHASTIC", "diagonal_products", "product_tables"]
 

@@ -10,11 +10,7 @@ from numba import njit
 
 from gyrostab.kernels.compiled import INNER, KERNEL
 
-__all__ = ["REORDER", "solve_nonnegative"]
-
-#: Lets the compiler add in another order, which it needs for vector code; the order is the same on
-#: every call.
-REORDER = {"reassoc", "contract", "nsz"}
+__all__ = ["solve_nonnegative"]
 
 
 @njit(**INNER)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from gyrostab.kernels.compiled import INNER, KERNEL
-from gyrostab.kernels.regression.nonnegative import REORDER
+from gyrostab.kernels.compiled import INNER, KERNEL, REORDER
 
 __all__ = ["window_trend"]
 
