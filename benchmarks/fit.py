@@ -25,6 +25,7 @@ from gyrostab import davar, fit_noise, make_log
 from gyrostab.allan import fit, window_fit
 from gyrostab.kernels.fit.covariance import diagonal_products
 from gyrostab.kernels.fit.least_squares import cell_freedoms, combine_diagonal, identify_noise
+from gyrostab.kernels.fit.mixture import Curves
 from tests.support.noise_records import lose, quantization, random_walk, white
 
 RATE, SAMPLES = 400.0, 6_000_000
@@ -73,8 +74,8 @@ def measure(x: np.ndarray, taus: int, repeats: int) -> tuple[int, list[float]]:
         max(whole - block, 0.0),
         best(
             lambda: cell_freedoms(
-                identify_noise(*flat, *noise_tables),
-                *flat,
+                identify_noise(Curves(*flat), *noise_tables),
+                Curves(*flat),
                 tables.columns,
                 tables.to_samples,
                 diagonal,

@@ -28,6 +28,7 @@ from gyrostab.kernels.allan.surface import (
 from gyrostab.kernels.allan.trend import window_trends
 from gyrostab.kernels.fit.covariance import diagonal_products
 from gyrostab.kernels.fit.least_squares import cell_freedoms, combine_diagonal, identify_noise
+from gyrostab.kernels.fit.mixture import Curves
 from gyrostab.kernels.fit.third_differences import third_diagonals
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.noise import HOUR, sample_squares
@@ -196,10 +197,10 @@ def tabulate_noise(
 def estimate_freedoms(cells: Cells, tables: NoiseTables) -> Floats:
     """Compute the degrees of freedom of cells (n_windows, n_tau) from a quick fit of the noise."""
     chosen, columns, weight, to_samples, diagonal = tables
-    fields = (cells.avar, *cells[5:8], cells.gap_factor)
-    few = [np.ascontiguousarray(field[:, chosen]) for field in fields]
-    squares = identify_noise(*few, columns[chosen], weight[chosen], to_samples)
-    return np.asarray(cell_freedoms(squares, *fields, columns, to_samples, diagonal))
+    fields = Curves(cells.avar, *cells[5:8], cells.gap_factor)
+    few = Curves(*(np.ascontiguousarray(field[:, chosen]) for field in fields))
+    squares = identify_noise(few, columns[chosen], weight[chosen], to_samples)
+    return np.asarray(cell_freedoms(squares, fields, columns, to_samples, diagonal))
 
 
 def run_units(data: Any, plan: Plan) -> tuple[Any, Any]:

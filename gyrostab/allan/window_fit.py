@@ -15,6 +15,7 @@ from gyrostab.kernels.compile_ahead import await_compilation
 from gyrostab.kernels.fit.covariance import STOCHASTIC, product_tables
 from gyrostab.kernels.fit.least_squares import FIT_FIELDS, combine_diagonal, fit_windows
 from gyrostab.kernels.fit.limits import cell_limits, estimate_bounds
+from gyrostab.kernels.fit.mixture import Curves
 from gyrostab.kernels.fit.third_differences import third_tables
 from gyrostab.kernels.fit.trend import detrend_tables
 from gyrostab.noise import HOUR, NORMAL_95, TERMS, sample_squares
@@ -184,18 +185,8 @@ def run_kernel(
         trends = np.nan_to_num(trends)
     noise = allowed if allowed & 15 else allowed | 1 << TERMS.index("N")  # for a ramp alone
     await_compilation()
-    result, misfit, dof = fit_windows(
-        *flat,
-        trends,
-        tables.columns,
-        tables.to_samples,
-        pairs,
-        ramps,
-        tables.diagonal,
-        tables.weight,
-        noise,
-        NORMAL_95,
-    )
+    shared = (tables.columns, tables.to_samples, pairs, ramps, tables.diagonal, tables.weight)
+    result, misfit, dof = fit_windows(Curves(*flat), trends, *shared, noise, NORMAL_95)
     result[..., [not allowed >> a & 1 for a in range(len(TERMS))]] = np.nan
     return result, misfit, dof
 
@@ -287,17 +278,5 @@ def _limit_of_curve(
     """
     span = np.array([np.inf, *[_LIMIT_SPAN] * (len(TERMS) - 1)])
     own_dof = np.vstack([tables.own_dof[:STOCHASTIC], tables.own_dof[:STOCHASTIC].min(axis=0)])
-    square = np.ascontiguousarray(square)
-    return np.asarray(
-        cell_limits(
-            *flat,
-            square,
-            dof,
-            tables.columns,
-            own_dof,
-            tables.ks,
-            span,
-            _MAX_FREEDOM,
-            *tables.quantile,
-        )
-    )
+    shared = (tables.columns, own_dof, tables.ks, span, _MAX_FREEDOM, tables.quantile)
+    return np.asarray(cell_limits(Curves(*flat), np.ascontiguousarray(square), dof, *shared))

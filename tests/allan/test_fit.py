@@ -24,6 +24,7 @@ from gyrostab.kernels.allan.pairs import white_pair_sum
 from gyrostab.kernels.fit.covariance import product_tables
 from gyrostab.kernels.fit.least_squares import FIT_FIELDS
 from gyrostab.kernels.fit.limits import cell_limits, chi_square_quantile, estimate_bounds
+from gyrostab.kernels.fit.mixture import Curves
 from gyrostab.kernels.regression.nonnegative import solve_nonnegative
 from gyrostab.noise import LAWS, NORMAL_95, TERMS, model_avar
 from gyrostab.schema import OBSERVABLE
@@ -589,15 +590,15 @@ def quantile_curve():
 
 
 @njit
-def _interpolate_quantile(freedom, start, step, curve):
-    return chi_square_quantile(freedom, start, step, curve)
+def _interpolate_quantile(freedom, quantile):
+    return chi_square_quantile(freedom, quantile)
 
 
 @given(st.floats(-4.0, 12.3))
 def test_interpolated_quantile_is_that_of_scipy(quantile_curve, exponent):
     freedom = 10.0**exponent
     expected = chi2.ppf(0.05, freedom) / freedom
-    got = _interpolate_quantile(freedom, *quantile_curve)
+    got = _interpolate_quantile(freedom, quantile_curve)
     np.testing.assert_allclose(got, expected, rtol=1e-8, atol=1e-250)
 
 
@@ -621,21 +622,8 @@ def test_limit_of_a_cell_is_the_smallest_of_all_cells(quantile_curve, decades):
     avar = model * rng.chisquare(dof) / dof
     avar[rng.random((40, 25)) < 0.1] = np.nan
     span = np.array([np.inf, *[decades] * 4])
-    got = cell_limits(
-        avar,
-        white,
-        quantization,
-        ramp,
-        factor,
-        squares,
-        dof,
-        columns,
-        own,
-        ks,
-        span,
-        1e6,
-        *quantile_curve,
-    )
+    curves = Curves(avar, white, quantization, ramp, factor)
+    got = cell_limits(curves, squares, dof, columns, own, ks, span, 1e6, quantile_curve)
     freedom = np.minimum(own.T * factor[..., None], 1e6)
     freedom[..., 4] = np.minimum(freedom[..., 4], dof)
     reach = 1.0 / (chi2.ppf(0.05, freedom) / freedom * part)

@@ -27,6 +27,7 @@ FIT = """
 import hashlib
 import numpy as np
 from gyrostab.kernels.fit.least_squares import fit_windows
+from gyrostab.kernels.fit.mixture import Curves
 
 n, windows, rng = 24, 60, np.random.default_rng(1)
 tau = np.geomspace(1.0, 1e3, n)
@@ -36,9 +37,9 @@ whole = np.ones((windows, n))
 near = 0.6 ** np.abs(np.subtract.outer(np.arange(n), np.arange(n))) / 20.0
 pairs, ramps = np.tile(near, (4, 4, 1, 1)), np.tile(near / 2.0, (4, 1, 1))
 avar = rng.gamma(8.0, truth / 8.0, (windows, n))
-trend, diagonal = np.zeros((windows, 5)), np.full((n, 14), 0.05)
+trend, diagonal = np.zeros((windows, 6)), np.full((n, 14), 0.05)
 found = fit_windows(
-    avar, whole, whole, whole, whole, trend, columns, np.ones(5), pairs, ramps, diagonal,
+    Curves(avar, whole, whole, whole, whole), trend, columns, np.ones(5), pairs, ramps, diagonal,
     np.full(n, 20.0), 31, 1.96,
 )
 assert np.isfinite(found[0]).any()

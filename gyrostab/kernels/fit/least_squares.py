@@ -167,15 +167,13 @@ def combine_diagonal(pairs, ramps):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def identify_noise(avar, white, quantization, ramp, factor, columns, weight, to_samples):  # type: ignore[no-untyped-def]
+def identify_noise(curves, columns, weight, to_samples):  # type: ignore[no-untyped-def]
     """Fit the noise of each window quickly, with a diagonal covariance.
 
     Parameters
     ----------
-    avar : float64 (n_windows, n_tau)
-        Allan variance.
-    white, quantization, ramp, factor : float64 (n_windows, n_tau) or (1, n_tau)
-        What the gaps do to it.
+    curves : Curves
+        Allan variances.
     columns : float64 (n_tau, 5)
         Allan variance per squared coefficient.
     weight : float64 (n_tau,)
@@ -188,16 +186,14 @@ def identify_noise(avar, white, quantization, ramp, factor, columns, weight, to_
     float64 (n_windows, 5)
         Squared coefficients.
     """
-    n_windows, n_tau = avar.shape
+    n_windows, n_tau = curves.avar.shape
     out = np.empty((n_windows, 5))
     cells, fit = _make_cells(n_tau), _Fit(eights(5), eights(5), eights(5), eights(4))
     normal, right, scratch = eights(25), eights(5), eights(75)
     trend, valid = np.zeros((n_windows, 6)), np.empty(PLACES, np.int64)
     allowed = np.int64(31 if columns[0, 4] > 0.0 else 15)  # some variances do not see a ramp
     for start in range(0, n_windows, PLACES):
-        _observe_eight(
-            start, avar, white, quantization, ramp, factor, columns, to_samples, cells, trend, valid
-        )
+        _observe_eight(start, curves, columns, to_samples, cells, trend, valid)
         _fit_diagonal(cells, weight, allowed, normal, right, fit, scratch)
         for w in range(start, min(start + PLACES, n_windows)):
             for a in range(5):
@@ -206,16 +202,14 @@ def identify_noise(avar, white, quantization, ramp, factor, columns, weight, to_
 
 
 @njit(**KERNEL)
-def cell_freedoms(  # type: ignore[no-untyped-def]
-    squares, avar, white, quantization, ramp, factor, columns, to_samples, diagonal
-):
+def cell_freedoms(squares, curves, columns, to_samples, diagonal):  # type: ignore[no-untyped-def]
     """Compute the degrees of freedom of each cell from the squared coefficients of its window.
 
     Parameters
     ----------
     squares : float64 (n_windows, 5)
         Squared coefficients.
-    avar, white, quantization, ramp, factor, columns, to_samples
+    curves, columns, to_samples
         As for `identify_noise`.
     diagonal : float64 (n_tau, 14)
         Result of `combine_diagonal`.
@@ -225,14 +219,12 @@ def cell_freedoms(  # type: ignore[no-untyped-def]
     float64 (n_windows, n_tau)
         NaN without a variance above zero.
     """
+    avar = curves.avar
     n_windows, n_tau = avar.shape
     out = np.empty(avar.shape)
-    if white.shape[0] == n_windows:
+    if curves.white.shape[0] == n_windows:
         for w in range(n_windows):
-            degrees_of_freedom(
-                squares[w], avar[w], white[w], quantization[w], ramp[w], factor[w], columns,
-                to_samples, diagonal, out[w],
-            )  # fmt: skip
+            degrees_of_freedom(squares[w], curves, w, columns, to_samples, diagonal, out[w])
     else:
         eight_squares, lanes, columns, diagonal = (
             eights(5),
@@ -249,7 +241,7 @@ def cell_freedoms(  # type: ignore[no-untyped-def]
                 eight_squares, columns, to_samples, diagonal, lanes, out[start : start + count]
             )
     for w in range(n_windows):
-        shares = factor[min(w, factor.shape[0] - 1)]
+        shares = curves.factor[min(w, curves.factor.shape[0] - 1)]
         for i in range(n_tau):
             if not (avar[w, i] > 0.0 and avar[w, i] < np.inf and shares[i] > 0.0):
                 out[w, i] = np.nan
@@ -257,28 +249,14 @@ def cell_freedoms(  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _observe_eight(  # type: ignore[no-untyped-def]
-    start, avar, white, quantization, ramp, factor, columns, to_samples, cells, trend, valid
-):
+def _observe_eight(start, curves, columns, to_samples, cells, trend, valid):  # type: ignore[no-untyped-def]
     """Describe the windows from number `start` on, and count their valid cells in `valid`."""
     for place in range(PLACES):
-        w = min(start + place, avar.shape[0] - 1)
-        end = avar.shape[1] if start + place < avar.shape[0] else 0
+        w = min(start + place, curves.avar.shape[0] - 1)
+        size = curves.avar.shape[1] if start + place < curves.avar.shape[0] else 0
         for row in range(5):
             cells.trend[row, place] = trend[w, row]
-        valid[place] = observe(
-            avar[w, :end],
-            white[min(w, white.shape[0] - 1)],
-            quantization[min(w, white.shape[0] - 1)],
-            ramp[min(w, white.shape[0] - 1)],
-            factor[min(w, white.shape[0] - 1)],
-            trend[w, 4],
-            trend[w],
-            columns,
-            to_samples,
-            place,
-            cells,
-        )
+        valid[place] = observe(curves, w, size, trend[w], columns, to_samples, place, cells)
 
 
 @njit(**INNER)
@@ -432,27 +410,14 @@ def _average_window(allowed, place, low_sigma, fit, cells, room, submodels, star
 
 @njit(**KERNEL)
 def fit_windows(  # type: ignore[no-untyped-def]
-    avar,
-    white,
-    quantization,
-    ramp,
-    gap_factor,
-    trend,
-    columns,
-    to_samples,
-    pairs,
-    ramps,
-    diagonal,
-    weight,
-    allowed,
-    low_sigma,
+    curves, trend, columns, to_samples, pairs, ramps, diagonal, weight, allowed, low_sigma
 ):
     """Fit every window.
 
     Parameters
     ----------
-    avar, white, quantization, ramp, gap_factor : float64 (n_windows, n_tau)
-        Cells [degree2 hour-2], NaN where missing, and their responses to the gaps.
+    curves : Curves
+        Cells [degree2 hour-2], all with the shape (n_windows, n_tau).
     trend : float64 (n_windows, 6)
         Variance of the trend of the window per squared coefficient of Q, N, B and K, and the
         squared trend [degree2 hour-4]; zeros if a ramp is not fitted. Last, 0 where the product of
@@ -481,7 +446,7 @@ def fit_windows(  # type: ignore[no-untyped-def]
     dof : float64 (n_windows, n_tau)
         Equivalent degrees of freedom of the cells under the averaged noise.
     """
-    n_windows, n_tau = avar.shape
+    n_windows, n_tau = curves.avar.shape
     size = (n_tau + 3) // 4 * 4
     tables = np.zeros(size * size * PRODUCTS)
     combine_products(pairs, ramps, size, tables)
@@ -497,19 +462,7 @@ def fit_windows(  # type: ignore[no-untyped-def]
     submodels, start, form = make_submodels(), np.empty(4), np.empty(10)
     stochastic = allowed & 15
     for first in range(0, n_windows, PLACES):
-        _observe_eight(
-            first,
-            avar,
-            white,
-            quantization,
-            ramp,
-            gap_factor,
-            columns,
-            to_samples,
-            cells,
-            trend,
-            valid,
-        )
+        _observe_eight(first, curves, columns, to_samples, cells, trend, valid)
         root_units(cells.responses, room.units)
         _fit_diagonal(cells, weight, stochastic, room.normal, room.right, fit, room.scratch)
         _refit_windows(stochastic, cells, fit, room, tables)
@@ -528,16 +481,5 @@ def fit_windows(  # type: ignore[no-untyped-def]
             )
             for a in range(5):
                 squares[a] = result[w, 0, a] if result[w, 0, a] > 0.0 else 0.0
-            degrees_of_freedom(
-                squares,
-                avar[w],
-                white[w],
-                quantization[w],
-                ramp[w],
-                gap_factor[w],
-                columns,
-                to_samples,
-                diagonal,
-                dof[w],
-            )
+            degrees_of_freedom(squares, curves, w, columns, to_samples, diagonal, dof[w])
     return result, misfit, dof

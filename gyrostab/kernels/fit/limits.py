@@ -89,12 +89,13 @@ def estimate_bounds(estimate, null, linear, square, scores):  # type: ignore[no-
 
 
 @njit(**INNER)
-def chi_square_quantile(freedom, start, step, curve):  # type: ignore[no-untyped-def]
+def chi_square_quantile(freedom, quantile):  # type: ignore[no-untyped-def]
     """Interpolate the quantile of chi-square over its degrees of freedom nu, by a cubic.
 
-    `curve` has ``nu ln q(nu)``, which is smooth from few degrees of freedom to many, at steps of
-    `step` in ln nu from `start` on; nu must not be above the last node but two.
+    `quantile` has the first ln nu, the step of ln nu, and ``nu ln q(nu)``, which is smooth from few
+    degrees of freedom to many; nu must not be above the last node but two.
     """
+    start, step, curve = quantile
     if not freedom > 0.0:
         return 0.0
     position = (np.log(freedom) - start) / step
@@ -125,38 +126,20 @@ def _predict_cell(columns, white, quantization, ramp, squares, per_square):  # t
 
 
 @njit(**INNER)
-def _cell_quantile(a, full_quantile, own_dof, share, dof, max_freedom, start, step, curve):  # type: ignore[no-untyped-def]
+def _cell_quantile(a, full_quantile, own_dof, share, dof, max_freedom, quantile):  # type: ignore[no-untyped-def]
     """Find the quantile of a cell with term `a` alone; `full_quantile` without gaps.
 
     For a ramp, the degrees of freedom of the cell are used.
     """
     if a == 4:
-        return chi_square_quantile(min(own_dof, max_freedom, dof), start, step, curve)
-    return (
-        full_quantile
-        if share == 1.0
-        else chi_square_quantile(min(own_dof, max_freedom), start, step, curve)
-    )
+        return chi_square_quantile(min(own_dof, max_freedom, dof), quantile)
+    if share == 1.0:
+        return full_quantile
+    return chi_square_quantile(min(own_dof, max_freedom), quantile)
 
 
 @njit(**KERNEL)
-def cell_limits(  # type: ignore[no-untyped-def]
-    avar,
-    white,
-    quantization,
-    ramp,
-    factor,
-    squares,
-    dof,
-    columns,
-    own_dof,
-    ks,
-    span,
-    max_freedom,
-    start,
-    step,
-    curve,
-):
+def cell_limits(curves, squares, dof, columns, own_dof, ks, span, max_freedom, quantile):  # type: ignore[no-untyped-def]
     """Find the upper limit of each squared coefficient from one cell, at least its own part.
 
     The cell is the one with the lowest limit under the fitted model, so that its scatter does not
@@ -164,10 +147,12 @@ def cell_limits(  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    avar, white, quantization, ramp, factor, dof : float64 (n_windows, n_tau)
-        Cells, their responses to gaps, and their degrees of freedom under the fitted noise.
+    curves : Curves
+        Cells, all with the shape (n_windows, n_tau).
     squares : float64 (n_windows, 5)
         Fitted squared coefficients; NaN counts as zero.
+    dof : float64 (n_windows, n_tau)
+        Degrees of freedom of the cells under the fitted noise.
     columns : float64 (n_tau, 5)
         Allan variance per squared coefficient.
     own_dof : float64 (5, n_tau)
@@ -180,7 +165,7 @@ def cell_limits(  # type: ignore[no-untyped-def]
         times its own.
     max_freedom : float
         Degrees of freedom are not taken above this.
-    start, step, curve
+    quantile : tuple
         As in `chi_square_quantile`.
 
     Returns
@@ -188,14 +173,13 @@ def cell_limits(  # type: ignore[no-untyped-def]
     float64 (n_windows, 5)
         Infinite where no cell gives a limit.
     """
+    avar, white, quantization, ramp, factor = curves
     n_windows, n_tau = avar.shape
     out = np.full((n_windows, 5), np.inf)
     full_quantiles, per_square, lowest = np.empty((n_tau, 5)), np.empty(5), np.empty(5)
     for i in range(n_tau):
         for a in range(5):
-            full_quantiles[i, a] = chi_square_quantile(
-                min(own_dof[a, i], max_freedom), start, step, curve
-            )
+            full_quantiles[i, a] = chi_square_quantile(min(own_dof[a, i], max_freedom), quantile)
     for w in range(n_windows):
         lowest[:] = np.inf
         last = n_tau - 1
@@ -216,18 +200,11 @@ def cell_limits(  # type: ignore[no-untyped-def]
                 )  # fewer degrees of freedom have a lower quantile
                 if model >= lowest[a] * best * per_square[a]:
                     continue
-                quantile = _cell_quantile(
-                    a,
-                    full_quantiles[i, a],
-                    own_dof[a, i] * share,
-                    share,
-                    dof[w, i],
-                    max_freedom,
-                    start,
-                    step,
-                    curve,
-                )
-                reach = 1.0 / (quantile * per_square[a]) if quantile > 0.0 else np.inf
+                lowest_share = _cell_quantile(
+                    a, full_quantiles[i, a], own_dof[a, i] * share, share, dof[w, i], max_freedom,
+                    quantile,
+                )  # fmt: skip
+                reach = 1.0 / (lowest_share * per_square[a]) if lowest_share > 0.0 else np.inf
                 if model * reach < lowest[a]:
                     lowest[a] = model * reach
                     out[w, a] = avar[w, i] * reach

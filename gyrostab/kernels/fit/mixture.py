@@ -7,8 +7,11 @@ every window has the same shape.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER
 from gyrostab.kernels.fit.lanes import number, put, root, take, where_above
@@ -17,6 +20,7 @@ __all__ = [
     "DATA",
     "PRODUCTS",
     "WIDTH",
+    "Curves",
     "combine_products",
     "compress_products",
     "covariance_rows",
@@ -45,6 +49,20 @@ _TABLE = (
 )
 
 
+class Curves(NamedTuple):
+    """Allan variances (n_windows, n_tau), NaN where missing, and what the gaps do to them.
+
+    Responses of N, Q and R, and the share of degrees of freedom left: (n_windows, n_tau), or
+    (1, n_tau) where all windows have the same.
+    """
+
+    avar: NDArray[np.float64]
+    white: NDArray[np.float64]
+    quantization: NDArray[np.float64]
+    ramp: NDArray[np.float64]
+    factor: NDArray[np.float64]
+
+
 @njit(**INNER)
 def combine_products(pairs, ramps, n, tables):  # type: ignore[no-untyped-def]
     """Combine the products of terms for the upper triangle of cells, flat (n, n, `PRODUCTS`)."""
@@ -60,39 +78,30 @@ def combine_products(pairs, ramps, n, tables):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def observe(  # type: ignore[no-untyped-def]
-    avar,
-    white,
-    quantization,
-    ramp,
-    factor,
-    trend_square,
-    trend,
-    columns,
-    to_samples,
-    place,
-    cells,
-):
-    """Describe the cells of a window in one place; returns how many are valid.
+def observe(curves, w, size, trend, columns, to_samples, place, cells):  # type: ignore[no-untyped-def]
+    """Describe the first `size` cells of window w in one place; returns how many are valid.
 
     Design matrix and data, both less the part of the squared trend of the window, go to
     ``cells.system`` (row ``6 cell + column``). `trend` is the variance of the trend per squared
-    coefficient (0 to 3), and 0 if the product of ramp and noise is removed from the cells, else 1
-    (5). What a unit of each squared coefficient is in sample units, as the cell sees it
-    through the gaps, goes to ``cells.responses`` (``6 cell + row``), the Allan variance to
-    ``cells.avar``, the reciprocal of `factor` to ``cells.inverse``. What the gaps add to
-    quantization noise comes from the ends of many runs spread over each cluster, so it scatters
+    coefficient (0 to 3), the squared trend (4), and 0 if the product of ramp and noise is removed
+    from the cells, else 1 (5). What a unit of each squared coefficient is in sample units, as the
+    cell sees it through the gaps, goes to ``cells.responses`` (``6 cell + row``), the Allan
+    variance to ``cells.avar``, the reciprocal of `factor` to ``cells.inverse``. What the gaps add
+    to quantization noise comes from the ends of many runs spread over each cluster, so it scatters
     like white noise and is counted there (row 2), the most of it in ``cells.excess``.
     """
     system, responses = cells.system, cells.responses
+    row = min(w, curves.white.shape[0] - 1)
+    avar, white, quantization = curves.avar[w, :size], curves.white[row], curves.quantization[row]
+    ramp, factor = curves.ramp[row], curves.factor[row]
     n = 0
     cells.excess[0, place] = 0.0
     for i in range(cells.inverse.shape[0]):
         is_valid = i < avar.size and np.isfinite(avar[i]) and avar[i] > 0.0 and factor[i] > 0.0
         cells.inverse[i, place] = 1.0
         cells.avar[i, place] = 0.0
-        for row in range(WIDTH * i, WIDTH * i + WIDTH):
-            system[row, place] = responses[row, place] = 0.0
+        for column in range(WIDTH * i, WIDTH * i + WIDTH):
+            system[column, place] = responses[column, place] = 0.0
         if not is_valid:
             continue
         at = WIDTH * i
@@ -103,7 +112,7 @@ def observe(  # type: ignore[no-untyped-def]
         system[at + 4, place] *= ramp[i]
         for a in range(4):
             system[at + a, place] -= system[at + 4, place] * trend[a]
-        system[at + DATA, place] = avar[i] - system[at + 4, place] * trend_square
+        system[at + DATA, place] = avar[i] - system[at + 4, place] * trend[4]
         cells.avar[i, place] = avar[i]
         responses[at, place] = min(quantization[i], 1.0) * to_samples[0]
         responses[at + 1, place] = white[i] * to_samples[1]
@@ -283,10 +292,10 @@ def compress_products(rows, units, responses, inverse, tables, roots, scaled, ha
 
 
 @njit(**INNER)
-def degrees_of_freedom(  # type: ignore[no-untyped-def]
-    squares, avar, white, quantization, ramp, factor, columns, to_samples, diagonal, out
-):
-    """Compute the degrees of freedom of each finite cell, ``2 mean^2 / variance``."""
+def degrees_of_freedom(squares, curves, w, columns, to_samples, diagonal, out):  # type: ignore[no-untyped-def]
+    """Compute the degrees of freedom of each finite cell of window w, ``2 mean^2 / variance``."""
+    avar, white, quantization = curves.avar[w], curves.white[w], curves.quantization[w]
+    ramp, factor = curves.ramp[w], curves.factor[w]
     amounts = np.empty(5)
     for i in range(avar.size):
         if not np.isfinite(avar[i]):

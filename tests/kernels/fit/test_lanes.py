@@ -12,6 +12,7 @@ import pytest
 from gyrostab.kernels.fit import lanes
 from gyrostab.kernels.fit.covariance import product_tables
 from gyrostab.kernels.fit.least_squares import combine_diagonal, fit_windows
+from gyrostab.kernels.fit.mixture import Curves
 from gyrostab.noise import avar_columns, sample_squares
 
 FIT = """
@@ -20,8 +21,9 @@ sys.modules["gyrostab.kernels.fit.eights"] = None
 import numpy as np
 from gyrostab.kernels.fit import lanes
 from gyrostab.kernels.fit.least_squares import fit_windows
-given = np.load(sys.argv[1])
-found = fit_windows(*[given[f"arr_{i}"] for i in range(12)], 31, 1.96)
+from gyrostab.kernels.fit.mixture import Curves
+given = [np.load(sys.argv[1])[f"arr_{i}"] for i in range(12)]
+found = fit_windows(Curves(*given[:5]), *given[5:], 31, 1.96)
 np.savez(sys.argv[2], *found, places=lanes.PLACES)
 """
 
@@ -40,7 +42,7 @@ def test_plain_numba_gives_the_fit_of_the_vectors(tmp_path):
     diagonal = combine_diagonal(
         np.einsum("abii->abi", pairs).copy(), np.einsum("aii->ai", ramps).copy()
     )
-    trend = rng.uniform(0.0, 1e-3, (11, 5))
+    trend = rng.uniform(0.0, 1e-3, (11, 6))
     squares = sample_squares(rate)
     given = [avar, *gaps, trend, columns, squares, pairs, ramps, diagonal, freedom]
     np.savez(tmp_path / "given.npz", *given)
@@ -51,7 +53,7 @@ def test_plain_numba_gives_the_fit_of_the_vectors(tmp_path):
     )
     plain = np.load(tmp_path / "found.npz")
     assert (lanes.PLACES, int(plain["places"])) == (8, 1)
-    for number, expected in enumerate(fit_windows(*given, 31, 1.96)):
+    for number, expected in enumerate(fit_windows(Curves(*given[:5]), *given[5:], 31, 1.96)):
         assert np.isfinite(expected).any()
         largest = np.nanmax(abs(expected), axis=0)
         np.testing.assert_allclose(
