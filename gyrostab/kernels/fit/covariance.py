@@ -188,34 +188,28 @@ def _sum_pairs(window, k1, k2, thin, logarithm, differences, products, means):  
 
 
 @njit(**KERNEL)
-def _fill_tables(window, ks, shifts, logarithm):  # type: ignore[no-untyped-def]
+def _fill_tables(window, ks, shifts, diagonal, logarithm):  # type: ignore[no-untyped-def]
+    """Fill `product_tables`, or only the diagonals (4, 4, n_tau, 1) and (4, n_tau, 1)."""
     n_tau = ks.size
-    products = np.zeros((STOCHASTIC, STOCHASTIC, n_tau, n_tau))
-    means = np.zeros((STOCHASTIC, n_tau, n_tau))
-    pair_products = np.empty((STOCHASTIC, STOCHASTIC))
-    mean = np.empty(STOCHASTIC)
+    width = 1 if diagonal else n_tau
+    products = np.zeros((STOCHASTIC, STOCHASTIC, n_tau, width))
+    means = np.zeros((STOCHASTIC, n_tau, width))
+    pair_products, mean = np.empty((STOCHASTIC, STOCHASTIC)), np.empty(STOCHASTIC)
     widest = 2 * ks[-1] + min(4 * ks[-1], window) + 1
-    differences = np.empty((3, 2 * widest + 1))
+    room = np.empty((3, 0 if diagonal else 2 * widest + 1))
     for i in range(n_tau):
-        if ks[i] < 2 * _LAG_STEPS:
+        differences = room if ks[i] < 2 * _LAG_STEPS else room[:, :0].copy()
+        if differences.size:
             _difference_covariances(ks[i], logarithm, differences)
-        else:
-            differences = np.empty((3, 0))
-        for j in range(i, n_tau):
-            _sum_pairs(
-                window,
-                ks[i],
-                ks[j],
-                1 << min(shifts[i], shifts[j]),
-                logarithm,
-                differences,
-                pair_products,
-                mean,
-            )
+        for j in range(i, i + 1 if diagonal else n_tau):
+            thin = 1 << min(shifts[i], shifts[j])
+            _sum_pairs(window, ks[i], ks[j], thin, logarithm, differences, pair_products, mean)
+            row, column = (i, 0) if diagonal else (j, i)
             for a in range(STOCHASTIC):
-                means[a, i, j] = means[a, j, i] = mean[a]
+                means[a, i, 0 if diagonal else j] = means[a, row, column] = mean[a]
                 for b in range(STOCHASTIC):
-                    products[a, b, i, j] = products[a, b, j, i] = pair_products[a, b]
+                    value = pair_products[a, b]
+                    products[a, b, i, 0 if diagonal else j] = products[a, b, row, column] = value
     return products, means
 
 
@@ -242,35 +236,16 @@ def product_tables(
         ``D[a]``, such that a rate that grows by rho per sample adds ``rho^2 sum_a s[a] D[a]``.
     """
     factors = np.asarray(ks, dtype=np.float64)
-    products, means = _fill_tables(window, np.asarray(ks), np.asarray(shifts), _log_lags(window))
+    products, means = _fill_tables(window, ks, shifts, False, _log_lags(window))
     return np.asarray(2.0 * products), np.asarray(2.0 * factors[:, None] * factors[None, :] * means)
-
-
-@njit(**KERNEL)
-def _fill_diagonals(window, ks, shifts, logarithm):  # type: ignore[no-untyped-def]
-    products = np.zeros((STOCHASTIC, STOCHASTIC, ks.size))
-    means = np.zeros((STOCHASTIC, ks.size))
-    pair_products = np.empty((STOCHASTIC, STOCHASTIC))
-    mean = np.empty(STOCHASTIC)
-    for i in range(ks.size):
-        _sum_pairs(
-            window, ks[i], ks[i], 1 << shifts[i], logarithm, np.empty((3, 0)), pair_products, mean
-        )
-        for a in range(STOCHASTIC):
-            means[a, i] = mean[a]
-            for b in range(STOCHASTIC):
-                products[a, b, i] = pair_products[a, b]
-    return products, means
 
 
 def diagonal_products(
     window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Compute only the diagonals of `product_tables`: (4, 4, n_tau) and (4, n_tau)."""
-    products, means = _fill_diagonals(window, np.asarray(ks), np.asarray(shifts), _log_lags(window))
-    return np.asarray(2.0 * products), np.asarray(
-        2.0 * np.asarray(ks, dtype=np.float64) ** 2 * means
-    )
+    products, means = _fill_tables(window, ks, shifts, True, _log_lags(window))
+    return 2.0 * products[..., 0], 2.0 * ks.astype(np.float64) ** 2 * means[..., 0]
 
 
 def _log_lags(window: int) -> NDArray[np.float64]:
