@@ -11,7 +11,7 @@ import numpy as np
 
 from gyrostab.errors import OptionError
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
-from gyrostab.physics.phase import fold, line_density, lorentz_density, sine_means
+from gyrostab.physics.phase import lorentz_density, sine_means, steady_line
 from gyrostab.units import HOUR, INNER
 
 __all__ = ["Clipping", "ClockError", "GaussMarkov", "SupplyBias"]
@@ -136,14 +136,8 @@ class SupplyBias(Effect):
             mean["power"] = (
                 self._average_channel(windows, "light_power") * 1e6 - self.reference_power
             )
-        place = np.full(windows.begin.size, float(fold(self.frequency, windows.rate)))
-        power = 0.5 * np.sinc(self.frequency / windows.rate) ** 2
-        return Prediction(
-            mean=mean,
-            spectrum={"ripple": line_density(windows, place, power)},
-            coherent=True,
-            line=place,
-        )
+        place, spectrum = steady_line(windows, self.frequency)
+        return Prediction(mean=mean, spectrum={"ripple": spectrum}, coherent=True, line=place)
 
     def _average_channel(self, windows: Windows, name: str) -> Array:
         """Average a lagged channel over the windows."""

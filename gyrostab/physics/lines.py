@@ -12,10 +12,11 @@ import numpy as np
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
 from gyrostab.physics.phase import (
     TURN,
+    comb_density,
     fold,
-    line_density,
     resonance_density,
     sine_means,
+    steady_line,
     turn_means,
     turns_of_samples,
     turns_of_windows,
@@ -80,10 +81,9 @@ class SpectralLine(Effect):
             if self.phase:
                 return np.radians(self.expand_to_axes("phase", setup.axes))
             return np.full(len(setup.axes), rng.uniform(0.0, 2.0 * math.pi))
-        from gyrostab.kernels.random.coloured import draw_state, oscillator
+        from gyrostab.kernels.random.coloured import begin_process, oscillator
 
-        reading = oscillator(self.frequency, self.quality, setup.rate)
-        return reading, rng, draw_state(reading, rng.standard_normal(2))
+        return begin_process(oscillator(self.frequency, self.quality, setup.rate), rng)
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         amplitude = self.expand_to_axes("amplitude", chunk.setup.axes)[:, None]
@@ -91,11 +91,8 @@ class SpectralLine(Effect):
             return amplitude * sine_means(chunk, self.frequency, state[:, None]), state
         from gyrostab.kernels.random.coloured import read_process
 
-        reading, rng, position = state
-        values, position = read_process(
-            reading.step, reading.read, reading.kick, rng.standard_normal((chunk.size, 3)), position
-        )
-        return amplitude / math.sqrt(2.0) * values, (reading, rng, position)
+        values, state = read_process(state, chunk.size)
+        return amplitude / math.sqrt(2.0) * values, state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """List one frequency per band, and qualities of a resonance."""
@@ -104,15 +101,9 @@ class SpectralLine(Effect):
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict a spectrum of one process on all axes, and the frequency of the line."""
-        place = np.full(windows.begin.shape, float(fold(self.frequency, windows.rate)))
-        if math.isinf(self.quality):
-            power = 0.5 * np.sinc(self.frequency / windows.rate) ** 2
-            return Prediction(
-                spectrum={"amplitude": line_density(windows, place, power)},
-                coherent=True,
-                line=place,
-            )
-        spectrum = 0.5 * resonance_density(windows, self.frequency, self.quality)
+        place, spectrum = steady_line(windows, self.frequency)
+        if not math.isinf(self.quality):
+            spectrum = 0.5 * resonance_density(windows, self.frequency, self.quality)
         return Prediction(spectrum={"amplitude": spectrum}, coherent=True, line=place)
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
@@ -203,10 +194,7 @@ class RotationLine(Effect):
         cycles = k * np.abs(rotation) / TURN
         place = fold(cycles, windows.rate)
         power = 0.5 * (k**-self.rolloff * np.sinc(cycles / windows.rate)) ** 2
-        comb = sum(
-            (line_density(windows, f, weight) for f, weight in zip(place, power, strict=True)),
-            np.zeros(()),
-        )
+        comb = comb_density(windows, place, power)
         order = {"amplitude": np.ones((len(windows.axes), 3), np.complex128)}
         return Prediction(
             mean={"amplitude": mean}, spectrum={"amplitude": comb}, line=place, order=order

@@ -12,7 +12,7 @@ import numpy as np
 from gyrostab.errors import OptionError
 from gyrostab.noise import sampled_psd
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
-from gyrostab.physics.phase import fold, line_density, lorentz_density
+from gyrostab.physics.phase import comb_density, fold, lorentz_density
 from gyrostab.units import HOUR, INNER
 
 __all__ = ["DeadZone", "FeedbackReset", "SharedSource"]
@@ -280,11 +280,7 @@ class FeedbackReset(Effect):
         tail = kick / (1.0 + (2.0 * np.pi * cycles * self.decay) ** 2)
         power = {"kick": kick, "tail": tail, "sawtooth": response / (np.pi * number) ** 2}
         spectrum = {
-            name: sum(
-                (line_density(windows, *line) for line in zip(place, strength, strict=True)),
-                np.zeros(()),
-            )
-            for name, strength in power.items()
+            name: comb_density(windows, place, strength) for name, strength in power.items()
         }
         return Prediction(
             mean={"kick": resets, "tail": resets},

@@ -10,11 +10,13 @@ from gyrostab.physics.base import Array, Chunk, Windows
 
 __all__ = [
     "TURN",
+    "comb_density",
     "fold",
     "line_density",
     "lorentz_density",
     "resonance_density",
     "sine_means",
+    "steady_line",
     "turn_means",
     "turns_of_samples",
     "turns_of_windows",
@@ -110,6 +112,18 @@ def line_density(windows: Windows, frequency: Array | float, power: Array | floa
     hit = (where >= edges[:-1]) & (where < edges[1:])
     strength = np.broadcast_to(np.asarray(power, np.float64), windows.begin.shape)[:, None]
     return hit * strength / (2.0 * np.diff(edges))
+
+
+def comb_density(windows: Windows, frequencies: Array, powers: Array) -> Array:
+    """Sum the `line_density` of several lines, one in each row."""
+    lines = zip(frequencies, powers, strict=True)
+    return sum((line_density(windows, *line) for line in lines), np.zeros(()))
+
+
+def steady_line(windows: Windows, frequency: float) -> tuple[Array, Array]:
+    """Compute aliased frequency [Hz] and density of a sinusoid of unit amplitude in the windows."""
+    place = np.full(windows.begin.size, float(fold(frequency, windows.rate)))
+    return place, line_density(windows, place, 0.5 * np.sinc(frequency / windows.rate) ** 2)
 
 
 def resonance_density(windows: Windows, frequency: float, quality: float) -> Array:

@@ -416,18 +416,15 @@ class RealMotion(Effect):
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """Draw the stationary state of the oscillator; the tilt starts at zero."""
-        from gyrostab.kernels.random.coloured import draw_state, oscillator
+        from gyrostab.kernels.random.coloured import begin_process, oscillator
 
-        reading = oscillator(self.frequency, self.quality, setup.rate)
-        return reading, rng, draw_state(reading, rng.standard_normal(2)), None
+        return begin_process(oscillator(self.frequency, self.quality, setup.rate), rng), None
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         from gyrostab.kernels.random.coloured import read_process
 
-        reading, rng, position, tilt = state
-        motion, position = read_process(
-            reading.step, reading.read, reading.kick, rng.standard_normal((chunk.size, 3)), position
-        )
+        process, tilt = state
+        motion, process = read_process(process, chunk.size)
         motion = self.sway * motion
         if self.spin:
             motion += self.spin * HOUR * chunk.drivers["rotation_rate"]
@@ -441,12 +438,8 @@ class RealMotion(Effect):
                 chunk.rate * HOUR
             )
             tilt = float(angle[-1])
-        return self.expand_to_axes("direction", chunk.setup.axes)[:, None] * motion, (
-            reading,
-            rng,
-            position,
-            tilt,
-        )
+        direction = self.expand_to_axes("direction", chunk.setup.axes)[:, None]
+        return direction * motion, (process, tilt)
 
     def _tilt_degrees(self, name: str) -> float:
         """Convert a tilt per acceleration to [degree g-1]."""

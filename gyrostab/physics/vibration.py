@@ -230,36 +230,17 @@ class AliasedVibration(Effect):
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """Draw the stationary state of the process."""
-        from gyrostab.kernels.random.coloured import band, draw_state
+        from gyrostab.kernels.random.coloured import band, begin_process
 
-        average = self.sampling == "average"
-        reading = band(
-            self.low,
-            self.high,
-            setup.rate,
-            resonance=self.resonance,
-            quality=self.quality,
-            average=average,
-        )
-        return (
-            reading,
-            rng,
-            draw_state(reading, rng.standard_normal(reading.read.size)),
-            self.expand_to_axes("sensitivity", setup.axes),
-        )
+        average, mount = self.sampling == "average", (self.resonance, self.quality)
+        return begin_process(band(self.low, self.high, setup.rate, *mount, average=average), rng)
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         from gyrostab.kernels.random.coloured import read_process
 
-        reading, rng, position, sensitivity = state
-        normal = rng.standard_normal((chunk.size, position.size + 1))
-        values, position = read_process(reading.step, reading.read, reading.kick, normal, position)
-        return sensitivity[:, None] * (chunk.drivers["vibration"] * values), (
-            reading,
-            rng,
-            position,
-            sensitivity,
-        )
+        values, state = read_process(state, chunk.size)
+        sensitivity = self.expand_to_axes("sensitivity", chunk.setup.axes)
+        return sensitivity[:, None] * (chunk.drivers["vibration"] * values), state
 
     def points(self, windows: Windows) -> list[Mapping[str, float | str]]:
         """List point samples and averages of the band of the vibration channel, if known."""
@@ -278,7 +259,7 @@ class AliasedVibration(Effect):
         from gyrostab.kernels.random.coloured import band_psd, folded_psd
 
         def density(f: Array) -> Array:
-            return band_psd(f, self.low, self.high, resonance=self.resonance, quality=self.quality)
+            return band_psd(f, self.low, self.high, self.resonance, self.quality)
 
         average = self.sampling == "average"
         return folded_psd(density, frequency, rate, 3.0 * self.high, average=average)

@@ -25,10 +25,11 @@ from gyrostab.kernels.compiled import KERNEL
 
 __all__ = [
     "ORDER",
+    "Process",
     "Reading",
     "band",
     "band_psd",
-    "draw_state",
+    "begin_process",
     "folded_psd",
     "oscillator",
     "oscillator_psd",
@@ -148,9 +149,9 @@ def band(
     low: float,
     high: float,
     rate: float,
-    *,
     resonance: float = 0.0,
     quality: float = 1.0,
+    *,
     average: bool = False,
 ) -> Reading:
     """Describe noise of unit variance in a band, with an optional mount.
@@ -178,31 +179,34 @@ def band(
     return _make_reading(a, covariance / power, c, rate, average=average)
 
 
-def draw_state(reading: Reading, normal: Array) -> Array:
-    """Draw a state of the stationary process from standard normal numbers, one per state."""
-    return np.asarray(reading.spread @ normal)
+class Process(NamedTuple):
+    """A process at one sample: its reading, random numbers, and state (d,)."""
+
+    reading: Reading
+    rng: np.random.Generator
+    position: Array
+
+
+def begin_process(reading: Reading, rng: np.random.Generator) -> Process:
+    """Draw a state of the stationary process."""
+    return Process(reading, rng, reading.spread @ rng.standard_normal(reading.read.size))
+
+
+def read_process(process: Process, size: int) -> tuple[Array, Process]:
+    """Read the process at the next `size` samples; return also what follows them."""
+    reading, rng, position = process
+    normal = rng.standard_normal((size, position.size + 1))
+    values, position = _read_samples(reading.step, reading.read, reading.kick, normal, position)
+    return values, process._replace(position=position)
 
 
 @njit(**KERNEL)
-def read_process(
+def _read_samples(
     step: Array, read: Array, kick: Array, normal: Array, position: Array
 ) -> tuple[Array, Array]:
-    """Read the process at the samples.
+    """Read the process at the samples: the values (n,), and the state (d,) after the last.
 
-    Parameters
-    ----------
-    step, read, kick : ndarray
-        From `Reading`.
-    normal : ndarray, shape (n, d + 1)
-        Standard normal numbers.
-    position : ndarray, shape (d,)
-        State at the first sample.
-
-    Returns
-    -------
-    values : ndarray, shape (n,)
-    position : ndarray, shape (d,)
-        State after the last sample.
+    `normal` holds standard normal numbers (n, d + 1).
     """
     n, d = normal.shape[0], position.size
     values = np.empty(n)
@@ -236,7 +240,7 @@ def oscillator_psd(f: Array, frequency: float, quality: float) -> Array:
 
 
 def band_psd(
-    f: Array, low: float, high: float, *, resonance: float = 0.0, quality: float = 1.0
+    f: Array, low: float, high: float, resonance: float = 0.0, quality: float = 1.0
 ) -> Array:
     """Compute the two-sided density [Hz-1] of `band` in continuous time."""
     x = (f**2 - low * high) / ((high - low) * np.maximum(np.abs(f), 1e-9 * low))
