@@ -145,12 +145,8 @@ def _compare_channels(
 ) -> tuple[dict[tuple[str, str], dict[str, float]], dict[tuple[str, str], list[str]]]:
     """Compare the windows where a channel is high with those where it is low.
 
-    Returns
-    -------
-    changes : dict
-        By channel and term: the ratio of the medians of each axis on which they differ.
-    absences : dict
-        By term and state of a channel: the axes on which the term is observed only in this state.
+    Returns, by channel and term, the ratio of the medians of each axis on which they differ; and,
+    by term and state of a channel, the axes on which only that state shows the term.
     """
     changes: dict[tuple[str, str], dict[str, float]] = defaultdict(dict)
     absences: dict[tuple[str, str], list[str]] = defaultdict(list)

@@ -115,6 +115,7 @@ def simulate(
     made = model if isinstance(model, Model) else read_model(model)
     like = None if like is None else as_log(like)
     frame = _make_frame(made, duration=duration, rate=rate, start=start, seed=seed, like=like)
+    _check_axes(made, frame)
     if chunk is not None and chunk < 1:
         raise OptionError(f"chunk={chunk!r}: give at least 1 sample")
     environment = _make_world(made, frame, like, environment)
@@ -176,17 +177,8 @@ def _make_frame(
                 f"leave out {extra[0]} or like"
             )
         axes = tuple(str(axis) for axis in like["axis"].values)
-        return _check_model(
-            model,
-            _Frame(
-                float(like.attrs["sampling_rate_hz"]),
-                like.sizes["time"],
-                first_stamp(like),
-                chosen,
-                axes,
-                factor,
-            ),
-        )
+        like_rate, size = float(like.attrs["sampling_rate_hz"]), like.sizes["time"]
+        return _Frame(like_rate, size, first_stamp(like), chosen, axes, factor)
     hertz = model.log.get("rate") if rate is None else rate
     length = model.log.get("duration") if duration is None else duration
     for name, value, example in (("rate", hertz, "100 (Hz)"), ("duration", length, "1h")):
@@ -210,12 +202,11 @@ def _make_frame(
             f"{model.source}: a duration of {length} is shorter than one sample at {hertz:g} Hz"
         )
     begin = stamp_ns(start if start is not None else model.log.get("start", "1970-01-01"))
-    return _check_model(
-        model, _Frame(float(hertz), size, begin, chosen, model.axes or ("x", "y", "z"), factor)
-    )
+    return _Frame(float(hertz), size, begin, chosen, model.axes or ("x", "y", "z"), factor)
 
 
-def _check_model(model: Model, frame: _Frame) -> _Frame:
+def _check_axes(model: Model, frame: _Frame) -> None:
+    """Check that the log has the axes that a model names."""
     named = [axis for axis in model.noise if axis] + [
         axis for effect in model.effects for axis in effect.axes
     ]
@@ -225,7 +216,6 @@ def _check_model(model: Model, frame: _Frame) -> _Frame:
                 f"{model.source}: there is no axis {axis!r} in this log; "
                 f"it has {', '.join(frame.axes)}"
             )
-    return frame
 
 
 def _make_world(
@@ -260,12 +250,7 @@ def _gap_table(environment: xr.Dataset, frame: _Frame) -> NDArray[np.int64]:
         return np.empty((0, 5), np.int64)
     first, end = (
         np.ceil(
-            grid_index(
-                frame.start,
-                frame.rate,
-                to_nanoseconds(environment[name].values),
-            )
-            - 1e-3
+            grid_index(frame.start, frame.rate, to_nanoseconds(environment[name].values)) - 1e-3
         )
         for name in ("gap_start", "gap_end")
     )

@@ -59,19 +59,8 @@ class Source:
     ) -> tuple[Array, float | None]:
         """Interpolate at increasing `instants` [ns since 1970].
 
-        Parameters
-        ----------
-        instants : ndarray of int64
-            Where.
-        part : (Stretch, ndarray), optional
-            The values of a long channel that `stretch` asked for.
-        carry : float, optional
-            What the call for the instants just before gave back.
-
-        Returns
-        -------
-        values : ndarray
-        carry : float or None
+        For a long channel, `part` is what `stretch` asked for, with its values. `carry` is what the
+        call for the instants just before returned in addition to its values.
         """
         if self.stamps is not None:
             return self._interpolate_between(instants), None

@@ -35,16 +35,7 @@ _TO_DIFFERENCE = 0.8560
 def _measure_noise(x: NDArray[Any], places: NDArray[np.int64]) -> NDArray[np.float64]:
     """Estimate the standard deviation of first differences from second differences; 0 without.
 
-    Parameters
-    ----------
-    x : ndarray, shape (n_samples,)
-        Samples.
-    places : ndarray of int64, shape (n, m)
-        Numbers of samples; the first `_MEDIAN_OF` with a second difference are used.
-
-    Returns
-    -------
-    ndarray of float64, shape (n,)
+    In each row of `places` (n, m), the first `_MEDIAN_OF` with a second difference are used.
     """
     inside = (places >= 1) & (places < x.size - 1)
     place = np.where(inside, places, 1)

@@ -22,7 +22,6 @@ __all__ = [
     "flicker_times",
     "ornstein_uhlenbeck",
     "ornstein_uhlenbeck_means",
-    "running_sum",
     "sinusoid_means",
 ]
 
@@ -33,18 +32,6 @@ Array = NDArray[np.float64]
 RATIO = 5.0
 #: Shorter correlation times than this share of a sample are white noise to the samples.
 SHORTEST = 1.0 / 12.0
-
-
-def running_sum(steps: Array, carry: float) -> tuple[Array, float]:
-    """Compute the cumulative sum of `steps` after `carry`, and the last sum.
-
-    Examples
-    --------
-    >>> running_sum(np.array([1.0, 2.0]), 10.0)
-    (array([11., 13.]), 13.0)
-    """
-    total = np.cumsum(np.concatenate([[carry], steps]))
-    return total[1:], float(total[-1])
 
 
 def brownian_means(steps: Array, inner: Array, carry: float) -> tuple[Array, float]:
@@ -68,8 +55,8 @@ def brownian_means(steps: Array, inner: Array, carry: float) -> tuple[Array, flo
     carry : float
         Position at the end of the last sample.
     """
-    end, last = running_sum(steps, carry)
-    return end - steps / 2.0 + inner / math.sqrt(12.0), last
+    position = np.cumsum(np.concatenate([[carry], steps]))
+    return position[1:] - steps / 2.0 + inner / math.sqrt(12.0), float(position[-1])
 
 
 @njit(**KERNEL)

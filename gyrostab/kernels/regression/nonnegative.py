@@ -27,16 +27,7 @@ def _list_members(subset, members):  # type: ignore[no-untyped-def]
 def _solve_subset(normal, right, subset, solution, work, members):  # type: ignore[no-untyped-def]
     """Solve the normal equations for the terms in the bit set `subset`; False if singular.
 
-    Parameters
-    ----------
-    normal : float64 (n, n); right : float64 (n,)
-        Normal equations.
-    subset : int
-        Bit set of the terms.
-    solution : float64 (n,)
-        Overwritten, with zero for the terms outside `subset`.
-    work : float64 (n, n); members : int64 (n,)
-        Scratch.
+    `solution` is zero for the other terms; `work` (n, n) and `members` (n,) are scratch.
     """
     n = _list_members(subset, members)
     solution[:] = 0.0
