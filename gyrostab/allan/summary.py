@@ -278,7 +278,13 @@ def _share_text(share: float) -> str:
 
 
 def _count_windows(affected: NDArray[np.bool_]) -> str:
-    """Return the number of affected windows in words."""
+    """Return the number of affected windows in words.
+
+    Examples
+    --------
+    >>> _count_windows(np.array([True, False])), _count_windows(np.array([True, True]))
+    ('1 window', '2 windows')
+    """
     count = int(np.count_nonzero(affected))
     return f"{count} window{'s' * (count > 1)}"
 
