@@ -12,7 +12,7 @@ from gyrostab.physics.base import STAGES, Effect, Prediction, Windows
 from gyrostab.physics.registry import effect_table, effects, make_effect
 from gyrostab.simulate import simulate
 from gyrostab.units import INNER
-from tests.support.effect_bench import random_cuts, run, same_whatever_the_cuts
+from tests.support.effect_bench import build_effect, random_cuts, run, same_whatever_the_cuts
 
 EFFECTS = list(effects().values())
 SIZE, RATE = 3000, 10.0
@@ -237,7 +237,7 @@ def test_a_wrong_table_is_explained(table, words):
 
 
 def test_a_driver_may_name_the_needed_channels_alone():
-    effect = make_effect({"name": "supply_bias", "power": 1e-3, "driver": "laser_power"})
+    effect = build_effect("supply_bias", power=1e-3, driver="laser_power")
     assert effect.channel_names() == {
         "supply_voltage": "supply_voltage",
         "light_power": "laser_power",
@@ -246,8 +246,8 @@ def test_a_driver_may_name_the_needed_channels_alone():
 
 
 def test_units_are_converted():
-    assert make_effect(
-        {"name": "temperature_bias", "sensitivity": "0.1 deg/h/degC", "reference": "300 K"}
+    assert build_effect(
+        "temperature_bias", sensitivity="0.1 deg/h/degC", reference="300 K"
     ).reference == pytest.approx(26.85)
 
 

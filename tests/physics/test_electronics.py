@@ -18,6 +18,7 @@ from gyrostab.simulate import simulate
 from tests.support.effect_bench import (
     avar,
     band_powers,
+    build_effect,
     random_cuts,
     run,
     said_density,
@@ -34,16 +35,16 @@ NRAD_PER_S = math.degrees(1e-9) * 3600.0  # deg/h
 
 def test_dead_zone_removes_rates_near_zero():
     signal = np.array([[-0.5, -0.2, -0.05, 0.0, 0.15, 0.5]])
-    rates = run(make_effect({"name": "dead_zone", "width": 0.2}), size=6, axes="x", signal=signal)
+    rates = run(build_effect("dead_zone", width=0.2), size=6, axes="x", signal=signal)
     np.testing.assert_allclose(rates, [[-0.3, 0.0, 0.0, 0.0, 0.0, 0.3]], atol=1e-15)
     jump = run(
-        make_effect({"name": "dead_zone", "width": 0.2, "edge": "jump", "centre": 0.1}),
+        build_effect("dead_zone", width=0.2, edge="jump", centre=0.1),
         size=6,
         axes="x",
         signal=signal,
     )
     np.testing.assert_allclose(jump, [[-0.5, -0.2, 0.1, 0.1, 0.1, 0.5]], atol=1e-15)
-    prediction = make_effect({"name": "dead_zone", "width": 0.2}).explain(
+    prediction = build_effect("dead_zone", width=0.2).explain(
         windows_of(30, 1.0, 10.0, own={"x": np.array([-3.0, 0.0, 3.0])})
     )
     np.testing.assert_array_equal(prediction.mean["width"], [[1.0, 0.0, -1.0]])
@@ -52,10 +53,10 @@ def test_dead_zone_removes_rates_near_zero():
 def test_noise_dithers_a_dead_zone_unless_the_loop_is_slow():
     noise = np.random.default_rng(2).normal(0.0, 2.0, (1, 40_000))
     options = {"size": 40_000, "rate": 100.0, "axes": "x", "signal": noise + 0.1}
-    each_sample = run(make_effect({"name": "dead_zone", "width": 0.2}), **options)
+    each_sample = run(build_effect("dead_zone", width=0.2), **options)
     lost = 0.1 * (2 * norm.cdf(0.2 / 2.0) - 1)  # of a mean far inside of the noise
     assert (noise + 0.1).mean() - each_sample.mean() == pytest.approx(lost, rel=0.15)
-    slow = run(make_effect({"name": "dead_zone", "width": 0.2, "bandwidth": 0.01}), **options)
+    slow = run(build_effect("dead_zone", width=0.2, bandwidth=0.01), **options)
     assert abs(slow.mean()) < 0.2 * 0.1
     assert slow.std() == pytest.approx(noise.std(), rel=0.01)
 
@@ -66,7 +67,7 @@ def test_a_sweep_through_a_dead_zone_has_odd_harmonics():
         np.abs(
             np.fft.rfft(
                 run(
-                    make_effect({"name": "dead_zone", "width": 0.3}),
+                    build_effect("dead_zone", width=0.3),
                     size=4000,
                     axes="x",
                     signal=wave,
@@ -100,7 +101,7 @@ def reset_truth(effect, w, rate, size, fine=400):
 
 @pytest.mark.parametrize("part", [{"kick": 12.0}, {"tail": 18.0, "decay": 0.03}, {"sawtooth": 0.5}])
 def test_resets_add_their_angles_in_both_directions(part):
-    effect = make_effect({"name": "feedback_reset", "diameter": 0.2, **part})
+    effect = build_effect("feedback_reset", diameter=0.2, **part)
     turn = effect.turn * NRAD_PER_S
     assert effect.turn == pytest.approx(1.45 * 1550e-9 / 0.2 * 1e9)
     t = np.arange(300) / 50.0
@@ -114,9 +115,7 @@ def test_resets_add_their_angles_in_both_directions(part):
 
 
 def test_resets_faster_than_samples_are_a_scale_factor():
-    effect = make_effect(
-        {"name": "feedback_reset", "kick": 5.0, "tail": 8.0, "decay": 0.001, "sawtooth": 1.0}
-    )
+    effect = build_effect("feedback_reset", kick=5.0, tail=8.0, decay=0.001, sawtooth=1.0)
     w = 1e6 * effect.turn * NRAD_PER_S  # a million resets in a second
     error = run(effect, size=2000, rate=100.0, axes="x", signal=w)[0] - w
     np.testing.assert_allclose(error[5:], w * 13.0 / effect.turn, rtol=1e-4)
@@ -127,7 +126,7 @@ def test_resets_faster_than_samples_are_a_scale_factor():
 
 
 def test_comb_of_resets_follows_the_rate():
-    effect = make_effect({"name": "feedback_reset", "sawtooth": 0.4, "kick": 3.0})
+    effect = build_effect("feedback_reset", sawtooth=0.4, kick=3.0)
     places = []
     for w in (10.0, 25.0):
         rates = run(effect, size=20_000, rate=100.0, axes="x", signal=w)[0]
@@ -149,7 +148,7 @@ def test_comb_of_resets_follows_the_rate():
 
 def test_comb_has_the_predicted_power():
     for part in ({"kick": 3.0}, {"tail": 3.0}, {"sawtooth": 0.4}):
-        effect = make_effect({"name": "feedback_reset", **part})
+        effect = build_effect("feedback_reset", **part)
         rates = run(effect, size=60_000, rate=100.0, axes="x", signal=11.15)[0]
         f = np.fft.rfftfreq(rates.size, 0.01)
         power = 2 * np.abs(np.fft.rfft(rates)) ** 2 / rates.size**2
@@ -172,15 +171,8 @@ def test_resets_of_a_real_gyro_match_the_model(recordings):
     with gzip.open(recordings("fog-blueseis-ramp/fog_ramp.csv.gz"), "rt") as file:
         columns = np.loadtxt(file, delimiter=",", skiprows=1)
     measured, ramp = columns[:, 1] * NRAD_PER_S, columns[:, 2]
-    effect = make_effect(
-        {
-            "name": "feedback_reset",
-            "kick": 11.5,
-            "tail": 18,
-            "decay": 0.012,
-            "phase": "channel",
-            "full": -32768,
-        }
+    effect = build_effect(
+        "feedback_reset", kick=11.5, tail=18, decay=0.012, phase="channel", full=-32768
     )
     assert effect.needs() == ("ramp",)
     model = run(effect, size=ramp.size, rate=200.0, axes="z", drivers={"ramp": ramp})[0]
@@ -190,14 +182,8 @@ def test_resets_of_a_real_gyro_match_the_model(recordings):
     assert (11.5 + 18) * turns * NRAD_PER_S == pytest.approx(model.mean(), rel=0.01)
     parts = []
     for name in ("kick", "tail"):
-        unit_effect = make_effect(
-            {
-                "name": "feedback_reset",
-                name: 1.0,
-                "decay": 0.012,
-                "phase": "channel",
-                "full": -32768,
-            }
+        unit_effect = build_effect(
+            "feedback_reset", **{name: 1.0}, decay=0.012, phase="channel", full=-32768
         )
         parts.append(
             run(unit_effect, size=ramp.size, rate=200.0, axes="z", drivers={"ramp": ramp})[0]
@@ -234,8 +220,8 @@ def test_profile_over_the_ramp_is_the_generated_one(decay, direction, full, othe
     bins, turns = 16, direction * 0.0137 * np.arange(1, 60_001)
     phase = turns % 1.0 if full > 0.0 else 1.0 - turns % 1.0
     for part in ("kick", "tail", "sawtooth"):
-        effect = make_effect(
-            {"name": "feedback_reset", part: 3.0, "decay": decay, "phase": "channel", "full": full}
+        effect = build_effect(
+            "feedback_reset", **{part: 3.0}, decay=decay, phase="channel", full=full
         )
         rate = direction * 0.0137 * 100.0 * effect.turn * NRAD_PER_S
         drivers = {"ramp": phase * abs(full)}
@@ -350,21 +336,13 @@ def test_window_means_match_the_prediction(table):
 
 def test_random_processes_start_in_their_stationary_state():
     many = [f"a{number}" for number in range(2500)]
-    first = run(
-        make_effect({"name": "telegraph", "step": 1.0, "low": 300, "high": 100}), size=1, axes=many
-    )
+    first = run(build_effect("telegraph", step=1.0, low=300, high=100), size=1, axes=many)
     assert (first > 0.5).mean() == pytest.approx(0.25, abs=0.03)
-    first = run(
-        make_effect({"name": "gauss_markov", "rms": 2.0, "correlation_time": 50}), size=1, axes=many
-    )
+    first = run(build_effect("gauss_markov", rms=2.0, correlation_time=50), size=1, axes=many)
     assert first.std() == pytest.approx(2.0, rel=0.05)
-    steady = run(
-        make_effect({"name": "dead_zone", "width": 0.3, "bandwidth": 0.05}), size=3, signal=2.0
-    )
+    steady = run(build_effect("dead_zone", width=0.3, bandwidth=0.05), size=3, signal=2.0)
     np.testing.assert_allclose(steady, 1.7, rtol=1e-12)
-    stuck = run(
-        make_effect({"name": "dead_zone", "width": 0.3, "bandwidth": 0.05}), size=3, signal=0.25
-    )
+    stuck = run(build_effect("dead_zone", width=0.3, bandwidth=0.05), size=3, signal=0.25)
     np.testing.assert_allclose(stuck, 0.0, atol=1e-15)
 
 

@@ -17,7 +17,7 @@ from gyrostab.physics.base import Windows
 from gyrostab.physics.jumps import step_means
 from gyrostab.physics.registry import make_effect
 from gyrostab.simulate import simulate
-from tests.support.effect_bench import avar, run, windows_of
+from tests.support.effect_bench import avar, build_effect, run, windows_of
 
 
 @given(st.lists(st.floats(0.0, 20.0), max_size=12), st.integers(0, 12))
@@ -57,7 +57,7 @@ def test_jump_has_the_allan_variance_of_a_step():
 def test_jumps_come_at_restarts_and_shocks_only():
     restarts = np.arange(1, 1000)[:, None] * 10 + np.array([0, 3])
     rates = run(
-        make_effect({"name": "bias_jump", "restart": 0.2}),
+        build_effect("bias_jump", restart=0.2),
         size=10_000,
         restarts=restarts,
         gaps=restarts,
@@ -68,7 +68,7 @@ def test_jumps_come_at_restarts_and_shocks_only():
     assert sizes.std() == pytest.approx(0.2, rel=0.04)
     assert abs(np.corrcoef(sizes)[0, 1]) < 0.12
     shocks = run(
-        make_effect({"name": "bias_jump", "shock": 0.5, "shocks_per_hour": 3600}),
+        build_effect("bias_jump", shock=0.5, shocks_per_hour=3600),
         size=20_000,
         rate=50.0,
     )
@@ -80,7 +80,7 @@ def test_jumps_come_at_restarts_and_shocks_only():
     np.testing.assert_array_equal(times, np.flatnonzero(moved[1]))
     assert np.square(shocks[:, -1]).sum() > 0
     assert (
-        make_effect({"name": "bias_jump", "shock": 0.5, "shocks_per_hour": 3})
+        build_effect("bias_jump", shock=0.5, shocks_per_hour=3)
         .say()
         .endswith("by 0.5 deg/h rms at shocks, 3 per hour.")
     )
@@ -93,7 +93,7 @@ def gauss_markov_avar(rms, time, tau):
 
 
 def test_gauss_markov_has_the_allan_variance_of_the_standard():
-    effect = make_effect({"name": "gauss_markov", "rms": [0.05, 0.1, 0.0], "correlation_time": 20})
+    effect = build_effect("gauss_markov", rms=[0.05, 0.1, 0.0], correlation_time=20)
     rates = run(effect, size=400_000, rate=5.0)
     taus = np.array([0.2, 2.0, 10.0, 37.8, 100.0])
     variance = avar(rates, 5.0, taus)
@@ -108,7 +108,7 @@ def test_gauss_markov_has_the_allan_variance_of_the_standard():
 
 
 def test_telegraph_equals_gauss_markov_to_second_order_with_two_levels():
-    effect = make_effect({"name": "telegraph", "step": 0.2, "low": 60, "high": 30})
+    effect = build_effect("telegraph", step=0.2, low=60, high=30)
     rates = run(effect, size=400_000, rate=5.0)
     assert effect.correlation_time == pytest.approx(20.0)
     share = 1 / 3
@@ -158,13 +158,13 @@ def test_fringe_step_has_its_size_and_ends_at_power_loss():
 
 
 def test_supply_bias_follows_both_channels_and_ripple_folds():
-    effect = make_effect({"name": "supply_bias", "voltage": 0.02, "power": -0.003, "axes": ["x"]})
+    effect = build_effect("supply_bias", voltage=0.02, power=-0.003, axes=["x"])
     assert effect.needs() == ("supply_voltage", "light_power")
     bias = run(
         effect, size=2, drivers={"supply_voltage": [25.0, 20.0], "light_power": [110e-6, 100e-6]}
     )
     np.testing.assert_allclose(bias, [[0.02 - 0.03, -0.08]], rtol=1e-9)
-    ripple = make_effect({"name": "supply_bias", "ripple": 0.4, "frequency": 63.0})
+    ripple = build_effect("supply_bias", ripple=0.4, frequency=63.0)
     assert ripple.needs() == ()
     rates = run(ripple, size=2000, rate=50.0)[0]
     spectrum = np.abs(np.fft.rfft(rates)) / 1000
@@ -181,15 +181,8 @@ def test_supply_bias_follows_both_channels_and_ripple_folds():
 
 
 def slow_supply(lag):
-    return make_effect(
-        {
-            "name": "supply_bias",
-            "voltage": 0.02,
-            "power": -0.003,
-            "lag": lag,
-            "reference_power": 0.0,
-            "axes": ["x"],
-        }
+    return build_effect(
+        "supply_bias", voltage=0.02, power=-0.003, lag=lag, reference_power=0.0, axes=["x"]
     )
 
 
@@ -255,7 +248,7 @@ def test_a_supply_without_lag_is_the_limit_of_short_ones():
 
 
 def test_a_slow_supply_says_its_lag():
-    sentence = make_effect({"name": "supply_bias", "voltage": 0.02, "lag": 40.0}).say({"lag": 5.0})
+    sentence = build_effect("supply_bias", voltage=0.02, lag=40.0).say({"lag": 5.0})
     assert (
         sentence == "The bias follows the supply on all axes, by 0.02 deg/h/V of voltage, "
         "with a lag of 40 ± 5 s."

@@ -14,7 +14,7 @@ from gyrostab.physics.phase import fold
 from gyrostab.physics.registry import make_effect
 from gyrostab.simulate import environment as env
 from gyrostab.simulate import simulate
-from tests.support.effect_bench import allan_of_density, run, sigma
+from tests.support.effect_bench import allan_of_density, build_effect, run, sigma
 
 
 def sinusoid_avar(amplitude, f, tau):
@@ -23,13 +23,8 @@ def sinusoid_avar(amplitude, f, tau):
 
 
 def test_a_steady_line_has_the_allan_variance_of_a_sinusoid():
-    effect = make_effect(
-        {
-            "name": "spectral_line",
-            "amplitude": [0.2, -0.1, 0.0],
-            "frequency": 0.53,
-            "phase": [30, 0, 0],
-        }
+    effect = build_effect(
+        "spectral_line", amplitude=[0.2, -0.1, 0.0], frequency=0.53, phase=[30, 0, 0]
     )
     rates = run(effect, size=40_000, rate=20.0)
     taus = np.array([0.05, 0.25, 0.7, 1.0, 2.3, 5.0])
@@ -53,7 +48,7 @@ def test_a_steady_line_has_the_allan_variance_of_a_sinusoid():
 
 
 def test_a_line_above_nyquist_folds_with_the_response_of_the_mean():
-    effect = make_effect({"name": "spectral_line", "amplitude": 1.0, "frequency": 27.0})
+    effect = build_effect("spectral_line", amplitude=1.0, frequency=27.0)
     rates = run(effect, size=4000, rate=20.0)[0]
     spectrum = np.abs(np.fft.rfft(rates)) / 2000
     f = np.fft.rfftfreq(4000, 1 / 20.0)
@@ -63,14 +58,8 @@ def test_a_line_above_nyquist_folds_with_the_response_of_the_mean():
 
 
 def test_a_resonance_has_the_allan_variance_of_its_density_and_one_motion():
-    effect = make_effect(
-        {
-            "name": "spectral_line",
-            "amplitude": [0.2, -0.4],
-            "axes": ["x", "z"],
-            "frequency": 3.0,
-            "quality": 10,
-        }
+    effect = build_effect(
+        "spectral_line", amplitude=[0.2, -0.4], axes=["x", "z"], frequency=3.0, quality=10
     )
     x, z = run(effect, size=200_000, rate=20.0)
     np.testing.assert_allclose(z, -2.0 * x, rtol=1e-12)
@@ -101,15 +90,13 @@ def test_lines_lock_to_a_changing_rotation():
     fast, factor = 50 * 64, 64
     speed = 90.0 + 6.0 * (np.arange(60 * fast) // factor) / 50  # held inside each sample
     turns = np.concatenate([[0.0], np.cumsum(speed)[:-1]]) / fast / 360.0 + speed / fast / 720.0
-    effect = make_effect(
-        {
-            "name": "rotation_line",
-            "amplitude": [0.5, 1.0],
-            "axes": ["x", "y"],
-            "order": 2,
-            "harmonics": 3,
-            "phase": [0.0, 90.0],
-        }
+    effect = build_effect(
+        "rotation_line",
+        amplitude=[0.5, 1.0],
+        axes=["x", "y"],
+        order=2,
+        harmonics=3,
+        phase=[0.0, 90.0],
     )
     rates = run(effect, size=3000, rate=50.0, drivers={"rotation_rate": speed[::factor]})
     for row, (amplitude, phase) in enumerate(((0.5, 0.0), (1.0, math.pi / 2))):
@@ -121,7 +108,7 @@ def test_lines_need_rotation():
     """The channel has noise at rest, about a turn in half an hour."""
     rest = 0.2 * np.random.default_rng(2).standard_normal(1000)
     speed = np.concatenate([rest, np.full(1000, 90.0), rest])
-    effect = make_effect({"name": "rotation_line", "amplitude": [0.5], "axes": ["x"]})
+    effect = build_effect("rotation_line", amplitude=[0.5], axes=["x"])
     (rates,) = run(effect, size=3000, rate=50.0, drivers={"rotation_rate": speed})
     assert not rates[:1000].any()
     assert not rates[2000:].any()
@@ -130,7 +117,7 @@ def test_lines_need_rotation():
 
 def test_fractional_number_of_lines_is_refused():
     with pytest.raises(OptionError, match=r"'harmonics': 2\.5 is not a whole number of lines"):
-        make_effect({"name": "rotation_line", "amplitude": 1, "harmonics": 2.5})
+        build_effect("rotation_line", amplitude=1, harmonics=2.5)
 
 
 def test_a_pump_is_another_channel():

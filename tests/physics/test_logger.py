@@ -14,14 +14,14 @@ from gyrostab.errors import OptionError
 from gyrostab.physics.base import Setup
 from gyrostab.physics.registry import make_effect
 from gyrostab.simulate import simulate
-from tests.support.effect_bench import avar, band_powers, run, windows_of
+from tests.support.effect_bench import avar, band_powers, build_effect, run, windows_of
 
 # --------------------------------------------------------------------------------
 # logger
 
 
 def test_a_low_pass_has_the_response_of_its_design():
-    effect = make_effect({"name": "logger_filter", "cutoff": 12.0, "order": 3})
+    effect = build_effect("logger_filter", cutoff=12.0, order=3)
     signal = np.random.default_rng(1).normal(size=(3, 100_000))
     edges = np.array([0.5, 4.0, 8.0, 12.0, 16.0, 20.0, 30.0, 45.0])
     response_measured = band_powers(
@@ -38,7 +38,7 @@ def test_a_low_pass_has_the_response_of_its_design():
 def test_moving_average_reduces_noise_at_short_times_only():
     noise = np.random.default_rng(6).normal(size=(1, 200_000))
     done = run(
-        make_effect({"name": "logger_filter", "length": 0.08}),
+        build_effect("logger_filter", length=0.08),
         size=200_000,
         rate=100.0,
         axes="x",
@@ -111,17 +111,17 @@ def test_impossible_filter_is_refused():
         OptionError,
         match="a cutoff of 5 Hz is not below half of the instrument's 10 Hz; raise oversampling",
     ):
-        make_effect({"name": "logger_filter", "cutoff": 5}).begin(setup, rng)
+        build_effect("logger_filter", cutoff=5).begin(setup, rng)
     with pytest.raises(OptionError, match="20000 samples of the instrument; give at most 10000"):
-        make_effect({"name": "logger_filter", "length": 2000}).begin(setup, rng)
+        build_effect("logger_filter", length=2000).begin(setup, rng)
     with pytest.raises(OptionError, match=r"'order': 2\.5 is not a whole number"):
-        make_effect({"name": "logger_filter", "cutoff": 1, "order": 2.5})
+        build_effect("logger_filter", cutoff=1, order=2.5)
 
 
 def test_quantization_adds_a_twelfth_of_its_square_or_hides_all():
     signal = np.random.default_rng(7).normal(0.3, 1.0, (1, 100_000))
     done = run(
-        make_effect({"name": "rate_quantization", "step": 2.0}),
+        build_effect("rate_quantization", step=2.0),
         size=100_000,
         axes="x",
         signal=signal,
@@ -130,20 +130,20 @@ def test_quantization_adds_a_twelfth_of_its_square_or_hides_all():
     added = avar(done - signal, 10.0, [0.1, 1.0, 10.0])[0]
     np.testing.assert_allclose(added[:2], [4 / 12, 4 / 120], rtol=0.06)
     assert not run(
-        make_effect({"name": "rate_quantization", "step": 20.0}),
+        build_effect("rate_quantization", step=20.0),
         size=100_000,
         axes="x",
         signal=signal,
     ).any()
     below = run(
-        make_effect({"name": "rate_quantization", "step": 2.0, "mode": "floor"}),
+        build_effect("rate_quantization", step=2.0, mode="floor"),
         size=100_000,
         axes="x",
         signal=signal,
     )
     assert (below - signal).mean() == pytest.approx(-1.0, abs=0.02)
     assert (
-        make_effect({"name": "rate_quantization", "step": 2.0, "mode": "floor"})
+        build_effect("rate_quantization", step=2.0, mode="floor")
         .explain(windows_of(9, 1.0, 3.0))
         .mean["step"][0]
         == -0.5
@@ -157,7 +157,7 @@ def test_real_gyro_has_a_quantization_grid(recordings):
         )
     for step, stands in ((36.0, True), (72.0, False)):
         done = run(
-            make_effect({"name": "rate_quantization", "step": step}),
+            build_effect("rate_quantization", step=step),
             size=5000,
             rate=100.0,
             signal=measured,
@@ -167,7 +167,7 @@ def test_real_gyro_has_a_quantization_grid(recordings):
 
 def test_bit_errors_are_bits():
     counts = np.random.default_rng(8).integers(-100, 100, (2, 50_000)).astype(float)
-    effect = make_effect({"name": "spikes", "per_hour": 3600, "lsb": 0.25, "bits": 8})
+    effect = build_effect("spikes", per_hour=3600, lsb=0.25, bits=8)
     done = run(effect, size=50_000, rate=20.0, axes="xy", signal=counts * 0.25) / 0.25
     wrong = done != counts
     assert wrong.sum() == pytest.approx(2 * 2500, rel=0.06)
@@ -185,8 +185,8 @@ def test_bit_errors_are_bits():
 
 def test_held_samples_are_runs_that_raise_n_at_long_times():
     noise = np.random.default_rng(9).normal(size=(2, 400_000))
-    effect = make_effect(
-        {"name": "held_samples", "per_hour": 720, "length": 0.4}
+    effect = build_effect(
+        "held_samples", per_hour=720, length=0.4
     )  # at 10 Hz: every 50 samples, for 4
     done = run(effect, size=400_000, axes="xy", signal=noise)
     same = np.diff(done, axis=1) == 0
@@ -207,7 +207,7 @@ def test_held_samples_are_runs_that_raise_n_at_long_times():
 
 
 def test_zero_filled_samples_bias_the_mean():
-    effect = make_effect({"name": "held_samples", "per_hour": 720, "length": 0.4, "fill": "zero"})
+    effect = build_effect("held_samples", per_hour=720, length=0.4, fill="zero")
     done = run(effect, size=200_000, axes="x", signal=15.0)
     assert set(np.unique(done)) == {0.0, 15.0}
     assert done.mean() == pytest.approx(15 * (1 - 4 / 54), rel=0.01)
@@ -218,7 +218,7 @@ def test_zero_filled_samples_bias_the_mean():
 def test_clipping_cuts_the_tails():
     noise = np.random.default_rng(10).normal(2.0, 1.0, (1, 200_000))
     done = run(
-        make_effect({"name": "clipping", "limit": 1.5, "centre": 2.0}),
+        build_effect("clipping", limit=1.5, centre=2.0),
         size=200_000,
         axes="x",
         signal=noise,
@@ -235,7 +235,7 @@ def test_clipping_cuts_the_tails():
 
 
 def test_a_fast_clock_reads_too_little_on_all_axes():
-    effect = make_effect({"name": "clock_error", "error": 100})
+    effect = build_effect("clock_error", error=100)
     w = np.array([[3.888e6], [-1e6], [0.0]])
     done = run(effect, size=1000, signal=w)
     np.testing.assert_allclose(
@@ -246,9 +246,7 @@ def test_a_fast_clock_reads_too_little_on_all_axes():
         "error"
     ]
     np.testing.assert_allclose(100 * prediction[:, 0], -1e-4 * w[:, 0])
-    rated = run(
-        make_effect({"name": "clock_error", "error": 100, "output": "rate"}), size=1000, signal=w
-    )
+    rated = run(build_effect("clock_error", error=100, output="rate"), size=1000, signal=w)
     np.testing.assert_allclose(rated - w, 0.0, atol=1e-9)
 
 
@@ -261,15 +259,7 @@ def test_log_holds_the_signal_at_the_time_of_the_clock(error, drift, reading):
         return 50.0 * np.sin(2 * np.pi * t / 60.0) + 0.2 * t
 
     rate, size = 100.0, 180_000  # half an hour
-    effect = make_effect(
-        {
-            "name": "clock_error",
-            "error": error,
-            "drift": drift,
-            "output": "rate",
-            "reading": reading,
-        }
-    )
+    effect = build_effect("clock_error", error=error, drift=drift, output="rate", reading=reading)
     t = np.arange(size) / rate
     done = run(effect, size=size, rate=rate, axes="x", signal=motion(t))[0]
     ahead = (error * t + drift * t**2 / 7200) * 1e-6
@@ -286,7 +276,7 @@ def test_clock_error_shifts_a_line():
     wave = np.sin(2 * np.pi * 7.0 * np.arange(100_000) / 100.0)
     for error in (5000, -5000):
         done = run(
-            make_effect({"name": "clock_error", "error": error}),
+            build_effect("clock_error", error=error),
             size=100_000,
             rate=100.0,
             axes="x",
@@ -301,13 +291,13 @@ def test_clock_error_shifts_a_line():
 def test_samples_are_skipped_or_repeated_at_the_rate_of_the_error():
     count = np.arange(40_000.0)
     fast = run(
-        make_effect({"name": "clock_error", "error": 1000, "output": "rate"}),
+        build_effect("clock_error", error=1000, output="rate"),
         size=40_000,
         axes="x",
         signal=count,
     )[0]
     slow = run(
-        make_effect({"name": "clock_error", "error": -1000, "output": "rate"}),
+        build_effect("clock_error", error=-1000, output="rate"),
         size=40_000,
         axes="x",
         signal=count,
@@ -321,7 +311,7 @@ def test_clock_error_keeps_white_noise():
     noise = np.random.default_rng(11).normal(size=(3, 200_000))
     for reading, share in (("latest", 0.0), ("average", 1.0)):
         done = run(
-            make_effect({"name": "clock_error", "error": 300, "reading": reading}),
+            build_effect("clock_error", error=300, reading=reading),
             size=200_000,
             signal=noise,
         )
@@ -337,16 +327,16 @@ def test_large_clock_error_is_refused():
     setup = Setup(rate=400.0, size=400 * 3600 * 200, start=0, axes=("x",))
     rng = np.random.default_rng(1)
     with pytest.raises(OptionError, match="slip reaches 28800003 samples; make the log shorter"):
-        make_effect({"name": "clock_error", "error": 1e5}).begin(setup, rng)
+        build_effect("clock_error", error=1e5).begin(setup, rng)
     with pytest.raises(OptionError, match="error reaches 210 %"):
-        make_effect({"name": "clock_error", "error": 1e5, "drift": 1e4}).begin(setup, rng)
-    assert make_effect({"name": "clock_error", "error": -50, "drift": 1}).say() == (
+        build_effect("clock_error", error=1e5, drift=1e4).begin(setup, rng)
+    assert build_effect("clock_error", error=-50, drift=1).say() == (
         "The clock of the samples is slow by 50 ppm, growing by 1 ppm/h, on all axes."
     )
 
 
 def test_a_frame_sent_twice_repeats_the_samples_before_it():
-    effect = make_effect({"name": "held_samples", "per_hour": 60.0, "length": 0.6, "fill": "frame"})
+    effect = build_effect("held_samples", per_hour=60.0, length=0.6, fill="frame")
     size = 200_000
     numbers = np.tile(np.arange(float(size)), (2, 1))
     sent = run(effect, size=size, rate=10.0, axes="xy", signal=numbers)

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.random.coloured import oscillator_psd
-from gyrostab.physics.registry import make_effect
 from gyrostab.simulate import simulate
-from tests.support.effect_bench import allan_of_density, run, sigma
+from tests.support.effect_bench import allan_of_density, build_effect, run, sigma
 
 # --------------------------------------------------------------------------------
 # rotation
@@ -22,14 +21,14 @@ from tests.support.effect_bench import allan_of_density, run, sigma
 def test_scale_factor_errors_are_those_of_the_catalogue():
     speed = 6 * 180.0  # 180 r/min in deg/s
     error = run(
-        make_effect({"name": "scale_factor", "linear": 100}),
+        build_effect("scale_factor", linear=100),
         size=1,
         drivers={"rotation_rate": speed},
     )
     np.testing.assert_allclose(error, 388.8, rtol=1e-12)
     drivers = {"rotation_rate": [speed, -speed], "temperature": [35.0, 35.0]}
     linear, lopsided, cubic, thermal = (
-        run(make_effect({"name": "scale_factor", **table}), size=2, drivers=drivers)[0]
+        run(build_effect("scale_factor", **table), size=2, drivers=drivers)[0]
         for table in ({"linear": 1}, {"asymmetry": 1}, {"cubic": 1e-6}, {"thermal": 0.1})
     )
     np.testing.assert_allclose(linear, [3.888, -3.888], rtol=1e-12)
@@ -58,14 +57,14 @@ def test_a_ramp_of_rotation_is_a_rate_ramp_through_the_scale_factor():
 
 
 def test_scale_factor_of_the_true_rate_needs_no_channel():
-    effect = make_effect({"name": "scale_factor", "linear": 1000, "rotation": "true"})
+    effect = build_effect("scale_factor", linear=1000, rotation="true")
     assert effect.needs() == ()
     error = run(effect, size=2, true={"x": 15.0, "z": [1.0, -1.0]})
     np.testing.assert_allclose(error, [[0.015, 0.015], [0, 0], [0.001, -0.001]], rtol=1e-12)
 
 
 def test_misalignment_leaks_the_true_rate_of_other_axes_only():
-    effect = make_effect({"name": "misalignment", "z": 0.5, "y": -1.0})
+    effect = build_effect("misalignment", z=0.5, y=-1.0)
     error = run(effect, size=2, true={"x": 7.0, "y": [100.0, 0.0], "z": [2000.0, 1000.0]})
     np.testing.assert_allclose(error, [[1.0 - 0.1, 0.5], [1.0, 0.5], [-0.1, 0.0]], rtol=1e-12)
     with pytest.raises(
@@ -121,14 +120,8 @@ def tool_axes(inclination, azimuth, toolface):
 
 @given(st.floats(-90, 90), st.floats(0, 180), st.floats(-360, 360), st.floats(-360, 360))
 def test_earth_rate_at_rest_is_the_rotated_vector(latitude, inclination, azimuth, toolface):
-    effect = make_effect(
-        {
-            "name": "earth_rate",
-            "latitude": latitude,
-            "inclination": inclination,
-            "azimuth": azimuth,
-            "toolface": toolface,
-        }
+    effect = build_effect(
+        "earth_rate", latitude=latitude, inclination=inclination, azimuth=azimuth, toolface=toolface
     )
     rates = run(effect, size=2, drivers={"rotation_rate": 0.0})[:, 1]
     lat = math.radians(latitude)
@@ -138,7 +131,7 @@ def test_earth_rate_at_rest_is_the_rotated_vector(latitude, inclination, azimuth
 
 
 def test_earth_rate_during_rotation_is_a_line_in_quadrature():
-    effect = make_effect({"name": "earth_rate", "latitude": 50, "inclination": 40, "azimuth": 110})
+    effect = build_effect("earth_rate", latitude=50, inclination=40, azimuth=110)
     rate, speed, size = 20.0, 90.0, 20_000
     x, y, z = run(effect, size=size, rate=rate, drivers={"rotation_rate": speed})
     along, high, right = effect.components()
@@ -181,17 +174,15 @@ def test_axes_of_other_names_need_directions():
         OptionError, match="axis 'north' is not x, y or z; give its direction with off and around"
     ):
         run(
-            make_effect({"name": "earth_rate", "latitude": 45}),
+            build_effect("earth_rate", latitude=45),
             size=2,
             axes=("north",),
             drivers={"rotation_rate": 0.0},
         )
-    across = make_effect({"name": "earth_rate", "latitude": 30, "around": [0, 180]})
+    across = build_effect("earth_rate", latitude=30, around=[0, 180])
     rates = run(across, size=1, axes=("a", "b"), drivers={"rotation_rate": 0.0})[:, 0]
     np.testing.assert_allclose(rates, 15.041067 * np.array([0.8660254, -0.8660254]), rtol=1e-6)
-    effect = make_effect(
-        {"name": "earth_rate", "latitude": 30, "off": [90, 0, 45], "around": [0, 0, 0]}
-    )
+    effect = build_effect("earth_rate", latitude=30, off=[90, 0, 45], around=[0, 0, 0])
     rates = run(effect, size=1, axes=("a", "b", "c"), drivers={"rotation_rate": 0.0})[:, 0]
     np.testing.assert_allclose(
         rates, 15.041067 * np.array([0.8660254, -0.5, (0.8660254 - 0.5) / math.sqrt(2)]), rtol=1e-6
@@ -203,14 +194,8 @@ def test_axes_of_other_names_need_directions():
 
 
 def test_sway_is_one_motion_in_its_direction_with_no_floor():
-    effect = make_effect(
-        {
-            "name": "real_motion",
-            "sway": 10,
-            "frequency": 0.5,
-            "quality": 5,
-            "direction": [0.6, -0.8, 0.0],
-        }
+    effect = build_effect(
+        "real_motion", sway=10, frequency=0.5, quality=5, direction=[0.6, -0.8, 0.0]
     )
     x, y, z = run(effect, size=200_000, rate=10.0)
     np.testing.assert_allclose(y, -0.8 / 0.6 * x, rtol=1e-9)
@@ -225,9 +210,7 @@ def test_sway_is_one_motion_in_its_direction_with_no_floor():
 
 
 def test_tilt_follows_the_change_of_acceleration():
-    effect = make_effect(
-        {"name": "real_motion", "x": 2.0, "y": -1.0, "direction": 1.0, "axes": ["y"]}
-    )
+    effect = build_effect("real_motion", x=2.0, y=-1.0, direction=1.0, axes=["y"])
     accel = {"accel_x": [0.5, 0.5, 1.5, 1.0], "accel_y": [0.0, 0.0, 0.0, 1.0]}
     rates = run(effect, size=4, rate=10.0, drivers=accel)[0]
     angle = np.radians(np.cumsum(rates) / 10.0 / 3600) * 1e3  # mrad
@@ -251,7 +234,7 @@ def test_motion_is_true_and_leaks_through_misalignment():
 
 
 def test_spin_is_a_share_of_the_rotation():
-    effect = make_effect({"name": "real_motion", "spin": 0.5, "direction": [0.0, 0.0, 1.0]})
+    effect = build_effect("real_motion", spin=0.5, direction=[0.0, 0.0, 1.0])
     assert effect.needs() == ("rotation_rate",)
     np.testing.assert_allclose(
         run(effect, size=2, drivers={"rotation_rate": 2.0})[2], 3600.0, rtol=1e-12

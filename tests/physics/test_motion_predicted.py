@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from gyrostab.physics.base import Windows
 from gyrostab.physics.registry import make_effect
-from tests.support.effect_bench import random_cuts, run, same_whatever_the_cuts
+from tests.support.effect_bench import build_effect, random_cuts, run, same_whatever_the_cuts
 
 
 def windows_of(rates, rate, length, drivers, own=None, frequency=None):
@@ -82,9 +82,7 @@ def test_window_means_are_the_design_times_the_parameters(table):
 
 
 def test_tilt_leaves_the_slope_of_the_acceleration_in_the_means():
-    effect = make_effect(
-        {"name": "real_motion", "x": 0.5, "z": -0.2, "direction": [1.0, -0.5, 0.2]}
-    )
+    effect = build_effect("real_motion", x=0.5, z=-0.2, direction=[1.0, -0.5, 0.2])
     rates = run(effect, size=4000, rate=10.0, drivers=DRIVERS)
     windows, means = windows_of(rates, 10.0, 100, DRIVERS)
     design = effect.explain(windows).mean

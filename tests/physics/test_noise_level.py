@@ -12,7 +12,7 @@ from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import LAWS
 from gyrostab.physics.registry import effects, make_effect
 from gyrostab.simulate import simulate
-from tests.support.effect_bench import avar, run, steady
+from tests.support.effect_bench import avar, build_effect, run, steady
 
 HOUR = 3600.0
 
@@ -63,7 +63,7 @@ def test_invalid_light_power_is_refused():
         OptionError,
         match=r"thermal \+ shot are 1.2 of N\^2; give shares with a sum of 1 or less",
     ):
-        make_effect({"name": "light_power_noise", "thermal": 0.7, "shot": 0.5})
+        build_effect("light_power_noise", thermal=0.7, shot=0.5)
     dark = {"name": "light_power_noise", "thermal": 0.5, "driver": "pd"}
     with pytest.raises(
         SchemaError, match=r"the channel 'pd' is 0 W 0.2 s after the start; it must be above 0"

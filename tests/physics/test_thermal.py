@@ -20,7 +20,7 @@ from gyrostab.noise import LAWS
 from gyrostab.physics.registry import effects, make_effect
 from gyrostab.simulate import environment as env
 from gyrostab.simulate import simulate
-from tests.support.effect_bench import avar, run
+from tests.support.effect_bench import avar, build_effect, run
 
 HOUR = 3600.0
 
@@ -61,7 +61,7 @@ def test_shupe_matches_heat_conduction_through_a_winding():
     surface = ramp_record(rate, begin=100, end=1300, total=2500, speed=1.5)
     outer, inner = heated_slab(surface, 1.0 / rate, lag)
     truth = 0.2 * np.gradient((outer + inner) / 2) * 60 + 0.3 * np.gradient(outer - inner) * 60
-    effect = make_effect({"name": "shupe", "sensitivity": 0.2, "transient": 0.3, "modes": 12})
+    effect = build_effect("shupe", sensitivity=0.2, transient=0.3, modes=12)
     bias = run(effect, size=surface.size, rate=rate, drivers={"temperature": surface})[1]
     away = np.min([np.abs(np.arange(2500) - edge) for edge in (100, 1300)], axis=0) > 5
     np.testing.assert_allclose(bias[away], truth[away], atol=0.004)
@@ -91,7 +91,7 @@ def test_lag_follows_from_thickness_and_diffusivity():
 
 
 def test_one_mode_of_shupe_is_a_simple_lag():
-    effect = make_effect({"name": "shupe", "sensitivity": 0.4, "modes": 1, "lag": 60})
+    effect = build_effect("shupe", sensitivity=0.4, modes=1, lag=60)
     for rate in (1.0, 10.0, 100.0):
         warm = ramp_record(rate, begin=50, end=250, total=400, speed=2.0)
         bias = run(effect, size=warm.size, rate=rate, drivers={"temperature": warm})[0]
@@ -174,9 +174,7 @@ def test_sensor_lag_is_corrected_on_a_step():
     rate, lag, late, step = 20.0, 60.0, 40.0, 5.0
     t = np.arange(12_000) / rate
     reading = 20.0 - step * np.expm1(-np.maximum(t - 100.0, 0.0) / late)
-    effect = make_effect(
-        {"name": "shupe", "sensitivity": 0.4, "modes": 1, "lag": lag, "sensor_lag": late}
-    )
+    effect = build_effect("shupe", sensitivity=0.4, modes=1, lag=lag, sensor_lag=late)
     bias = run(effect, size=t.size, rate=rate, drivers={"temperature": reading})[0]
     expected = 0.4 * 60.0 * step / lag * np.exp(-(t - 100.0) / lag) * (t > 100.0)
     away = np.abs(t - 100.0) > 0.2
@@ -185,13 +183,13 @@ def test_sensor_lag_is_corrected_on_a_step():
 
 def test_shupe_refuses_invalid_modes():
     with pytest.raises(OptionError, match=r"'modes': 2\.5 is not a whole number of modes"):
-        make_effect({"name": "shupe", "sensitivity": 1, "modes": 2.5})
+        build_effect("shupe", sensitivity=1, modes=2.5)
     with pytest.raises(OptionError, match="transient needs at least 2 modes"):
-        make_effect({"name": "shupe", "sensitivity": 1, "transient": 1, "modes": 1})
+        build_effect("shupe", sensitivity=1, transient=1, modes=1)
 
 
 def test_long_plateau_leaves_exactly_zero():
-    effect = make_effect({"name": "shupe", "sensitivity": 1.0, "lag": 0.5})
+    effect = build_effect("shupe", sensitivity=1.0, lag=0.5)
     warm = np.concatenate([[20.0], np.full(20_000, 30.0)])
     bias = run(effect, size=warm.size, rate=10.0, drivers={"temperature": warm})[0]
     assert bias[1] > 1
@@ -240,13 +238,13 @@ def test_gradient_is_the_difference_of_two_sensors_and_its_change():
     t = np.arange(6000) / 10.0
     drivers = {"temperature": 50 + t / 30, "temperature_2": 48 - t / 60}
     still = run(
-        make_effect({"name": "thermal_gradient", "sensitivity": -0.05}),
+        build_effect("thermal_gradient", sensitivity=-0.05),
         size=t.size,
         drivers=drivers,
     )[0]
     np.testing.assert_allclose(still, -0.05 * (2 + t / 20), rtol=1e-12)
     moving = run(
-        make_effect({"name": "thermal_gradient", "change": 0.1, "lag": 20}),
+        build_effect("thermal_gradient", change=0.1, lag=20),
         size=t.size,
         drivers=drivers,
     )[2]
@@ -281,9 +279,7 @@ def test_gradient_takes_channels_of_any_name_and_is_a_ramp_while_it_builds_up():
 
 
 def test_warm_up_is_an_exponential_averaged_over_each_sample():
-    effect = make_effect(
-        {"name": "warm_up", "amplitude": 0.3, "time": 7, "slow_amplitude": -0.1, "slow_time": 50}
-    )
+    effect = build_effect("warm_up", amplitude=0.3, time=7, slow_amplitude=-0.1, slow_time=50)
     bias = run(effect, size=40, rate=0.5)[1]
     for i in (0, 1, 7, 39):
         truth = (
@@ -294,7 +290,7 @@ def test_warm_up_is_an_exponential_averaged_over_each_sample():
 
 
 def test_warm_up_restarts_after_restarts_and_long_gaps():
-    effect = make_effect({"name": "warm_up", "amplitude": 1.0, "time": 100})
+    effect = build_effect("warm_up", amplitude=1.0, time=100)
     tables = {"gaps": np.array([[2000, 2100], [4000, 4600]]), "restarts": np.array([[4000, 4600]])}
     bias = run(effect, size=8000, **tables)[0]
     first = run(effect, size=4000)[0]
@@ -310,7 +306,7 @@ def test_warm_up_restarts_after_restarts_and_long_gaps():
 
 
 def test_short_power_loss_restores_only_a_part():
-    effect = make_effect({"name": "warm_up", "amplitude": 1.0, "time": 100, "cooling": 300})
+    effect = build_effect("warm_up", amplitude=1.0, time=100, cooling=300)
     bias = run(effect, size=9000, restarts=np.array([[5000, 5600], [7000, 7030]]))[0]
     mean = -math.expm1(-1e-3) / 1e-3
     first = 1 - (1 - math.exp(-5)) * math.exp(-60 / 300)
@@ -345,7 +341,7 @@ def test_warm_up_looks_like_a_rate_ramp_that_fades_after_every_restart():
 
 
 def test_hysteresis_opens_a_loop_of_known_area():
-    effect = make_effect({"name": "thermal_hysteresis", "sensitivity": 0.002, "width": 4})
+    effect = build_effect("thermal_hysteresis", sensitivity=0.002, width=4)
     way = np.concatenate([np.linspace(-40, 60, 1001), np.linspace(60, -40, 1001)[1:]])
     temperature = np.tile(way[:-1], 3)
     bias = run(effect, size=temperature.size, drivers={"temperature": temperature})[0]
@@ -365,13 +361,13 @@ def test_hysteresis_opens_a_loop_of_known_area():
 def test_hysteresis_persists_on_a_plateau_where_shupe_decays():
     world = ramp_record(1.0, begin=0, end=1800, total=9000, speed=1.0)
     play_left = run(
-        make_effect({"name": "thermal_hysteresis", "sensitivity": 0.01}),
+        build_effect("thermal_hysteresis", sensitivity=0.01),
         size=9000,
         rate=1.0,
         drivers={"temperature": world},
     )
     lag_left = run(
-        make_effect({"name": "shupe", "sensitivity": 0.03}),
+        build_effect("shupe", sensitivity=0.03),
         size=9000,
         rate=1.0,
         drivers={"temperature": world},
@@ -413,9 +409,9 @@ def test_a_bias_that_ages_steadily_is_a_rate_ramp():
 
 
 def test_a_bias_that_settles_is_a_logarithm():
-    effect = make_effect({"name": "ageing_bias", "logarithmic": 0.3, "time": 2})
+    effect = build_effect("ageing_bias", logarithmic=0.3, time=2)
     bias = run(effect, size=361, rate=1 / 60)[0]
     np.testing.assert_allclose(
         bias[[119, 359]], 0.3 * np.log([1 + (119.5 / 60) / 2, 1 + (359.5 / 60) / 2]), rtol=1e-9
     )
-    assert make_effect({"name": "ageing_bias", "logarithmic": 0.3, "time": "1 d"}).time == 24.0
+    assert build_effect("ageing_bias", logarithmic=0.3, time="1 d").time == 24.0

@@ -17,6 +17,7 @@ from gyrostab.physics.registry import effects, make_effect
 from gyrostab.simulate import simulate
 from tests.support.effect_bench import (
     allan_of_samples,
+    build_effect,
     random_cuts,
     run,
     same_whatever_the_cuts,
@@ -153,7 +154,7 @@ def test_predicted_levels_are_the_generated_ones(name, parameter):
     ],
 )
 def test_predicted_spectra_have_the_allan_variance_of_the_law(name, parameter, law):
-    effect = make_effect({"name": name, parameter: 1.0, "exponent": 1.5})
+    effect = build_effect(name, **{parameter: 1.0}, exponent=1.5)
 
     def density(f):
         windows = Windows(

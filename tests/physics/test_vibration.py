@@ -12,9 +12,9 @@ from gyrostab.allan.davar import davar
 from gyrostab.errors import OptionError
 from gyrostab.kernels.random.coloured import band, band_psd, folded_psd, oscillator, oscillator_psd
 from gyrostab.physics.base import Windows
-from gyrostab.physics.registry import effects, make_effect
+from gyrostab.physics.registry import effects
 from gyrostab.simulate import simulate
-from tests.support.effect_bench import allan_of_samples, run, sigma
+from tests.support.effect_bench import allan_of_samples, build_effect, run, sigma
 
 # --------------------------------------------------------------------------------
 # processes in continuous time
@@ -111,7 +111,7 @@ def vibrating(**effect):
 )
 def test_a_band_on_a_multiple_of_the_sampling_rate_looks_like_n_or_q(sampling, taus, times):
     quiet, loud = vibrating(sampling=sampling)
-    effect = make_effect({"name": "aliased_vibration", "sensitivity": 1, "sampling": sampling})
+    effect = build_effect("aliased_vibration", sensitivity=1, sampling=sampling)
     f = np.linspace(1e-3, 200, 20_001)
     windows = Windows(
         np.zeros(1), np.ones(1), f, 400.0, ("x",), drivers={"vibration": np.full(1, 50.0)}
@@ -131,14 +131,8 @@ def test_a_band_on_a_multiple_of_the_sampling_rate_looks_like_n_or_q(sampling, t
 
 
 def test_band_is_aliased_to_the_expected_frequencies():
-    effect = make_effect(
-        {
-            "name": "aliased_vibration",
-            "sensitivity": [1.0, -0.5],
-            "axes": ["x", "y"],
-            "low": 700,
-            "high": 800,
-        }
+    effect = build_effect(
+        "aliased_vibration", sensitivity=[1.0, -0.5], axes=["x", "y"], low=700, high=800
     )
     x, y = run(effect, size=2**17, rate=400.0, drivers={"vibration": 2.0})
     np.testing.assert_allclose(y, -0.5 * x, rtol=1e-12)
@@ -185,7 +179,7 @@ def test_a_faster_instrument_and_a_mean_make_integrate_and_dump():
 
 def test_an_empty_band_is_refused():
     with pytest.raises(OptionError, match="from low = 800 to high = 700 Hz is empty"):
-        make_effect({"name": "aliased_vibration", "sensitivity": 1, "low": 800, "high": 700})
+        build_effect("aliased_vibration", sensitivity=1, low=800, high=700)
 
 
 def test_rectified_vibration_steps_the_mean_and_looks_like_k_at_its_edges_only():
@@ -230,19 +224,17 @@ def test_rectified_vibration_steps_the_mean_and_looks_like_k_at_its_edges_only()
 
 
 def test_vibration_rectification_is_even_and_acceleration_odd():
-    rectified = make_effect(
-        {"name": "vibration_rectification", "sensitivity": 2e-3, "quartic": 1e-5}
-    )
+    rectified = build_effect("vibration_rectification", sensitivity=2e-3, quartic=1e-5)
     np.testing.assert_allclose(
         run(rectified, size=2, drivers={"vibration": [-10.0, 10.0]})[0], 0.2 + 0.1, rtol=1e-12
     )
-    odd = make_effect({"name": "g_sensitivity", "x": 0.01, "y": -0.02, "z": 0.5})
+    odd = build_effect("g_sensitivity", x=0.01, y=-0.02, z=0.5)
     drivers = {"accel_x": [1.0, -1.0], "accel_y": [0.5, -0.5], "accel_z": [0.1, -0.1]}
     np.testing.assert_allclose(run(odd, size=2, drivers=drivers)[2], [0.05, -0.05], rtol=1e-12)
 
 
 def test_magnetic_bias_is_its_scalar_product_and_needs_only_what_it_uses():
-    effect = make_effect({"name": "magnetic", "y": 0.002, "z": -0.01, "axes": ["z"]})
+    effect = build_effect("magnetic", y=0.002, z=-0.01, axes=["z"])
     assert effect.needs() == ("mag_y", "mag_z")
     np.testing.assert_allclose(
         run(effect, size=2, drivers={"mag_y": [50, 0], "mag_z": [0, 20]}), [[0.1, -0.2]], rtol=1e-12

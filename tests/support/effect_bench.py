@@ -14,6 +14,12 @@ from numpy.typing import NDArray
 from gyrostab.allan.davar import davar
 from gyrostab.ingest.make_log import make_log
 from gyrostab.physics.base import Chunk, Effect, Setup, Windows
+from gyrostab.physics.registry import make_effect
+
+
+def build_effect(name: str, **parameters: Any) -> Effect:
+    """Make an effect as from its table in a model."""
+    return make_effect({"name": name, **parameters})
 
 
 def run(
