@@ -23,7 +23,7 @@ from page import machine, renew
 
 from gyrostab import davar, fit_noise, make_log
 from gyrostab.allan import fit, window_fit
-from gyrostab.kernels.fit.covariance import diagonal_products
+from gyrostab.kernels.fit.covariance import product_tables
 from gyrostab.kernels.fit.least_squares import cell_freedoms, combine_diagonal, identify_noise
 from gyrostab.kernels.fit.mixture import Curves
 from tests.support.noise_records import lose, quantization, random_walk, white
@@ -62,7 +62,7 @@ def measure(x: np.ndarray, taus: int, repeats: int) -> tuple[int, list[float]]:
     shifts = np.zeros_like(ks)
     tables = window_fit.fit_tables(tuple(ks.tolist()), tuple(shifts.tolist()), rate, window)
     noise_tables = (tables.columns, tables.weight, tables.to_samples)
-    diagonal = combine_diagonal(*diagonal_products(window, ks, shifts))
+    diagonal = combine_diagonal(*product_tables(window, ks, shifts, diagonal=True))
     whole = best(lambda: fit_noise(surface), repeats)
     kernel = best(lambda: window_fit.run_kernel(flat, *trends, tables, 31), repeats)
     options = {"white_error": np.zeros(trends[0].size), "allowed": 31, "observed_only": True}

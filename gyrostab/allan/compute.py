@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.allan.plan import Plan, last_sample, thin_factors, units_of_work
-from gyrostab.allan.variance import variance_columns, white_freedoms
+from gyrostab.allan.variance import covariance_tables, variance_columns, white_freedoms
 from gyrostab.errors import OptionError
 from gyrostab.kernels.allan.gap_edges import gap_edge_ratio
 from gyrostab.kernels.allan.outlier_count import count_outliers
@@ -26,10 +26,8 @@ from gyrostab.kernels.allan.surface import (
     window_means,
 )
 from gyrostab.kernels.allan.trend import window_trends
-from gyrostab.kernels.fit.covariance import diagonal_products
 from gyrostab.kernels.fit.least_squares import cell_freedoms, combine_diagonal, identify_noise
 from gyrostab.kernels.fit.mixture import Curves
-from gyrostab.kernels.fit.third_differences import third_diagonals
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.noise import HOUR, sample_squares
 from gyrostab.store.lazy import find_source, keep_sources, read_into, read_slice
@@ -185,10 +183,7 @@ def tabulate_noise(
     """Make the tables for the degrees of freedom, once for all parts of a log."""
     ks, shifts = np.array(factors, dtype=np.int64), np.array(thinning, dtype=np.int64)
     columns = variance_columns(variance, ks, rate)
-    if variance == "avar":
-        pairs, ramps = diagonal_products(window, ks, shifts)
-    else:
-        pairs, ramps = third_diagonals(variance, window, ks, shifts)
+    pairs, ramps = covariance_tables(variance, window, ks, shifts, diagonal=True)
     weight = white_freedoms(variance, window, ks, pairs)
     diagonal = combine_diagonal(pairs, ramps)
     return NoiseTables(thin_factors(ks), columns, weight, sample_squares(rate), diagonal)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL, REORDER
 
-__all__ = ["STOCHASTIC", "diagonal_products", "product_tables"]
+__all__ = ["STOCHASTIC", "product_tables"]
 
 #: Number of stochastic terms: quantization, angle random walk, bias instability, rate random walk.
 STOCHASTIC = 4
@@ -214,7 +214,7 @@ def _fill_tables(window, ks, shifts, diagonal, logarithm):  # type: ignore[no-un
 
 
 def product_tables(
-    window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
+    window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64], *, diagonal: bool = False
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Tabulate the covariance of Allan variances per product of squares, and with a ramp.
 
@@ -226,6 +226,8 @@ def product_tables(
         Averaging factors, rising, at most ``window // 2``.
     shifts : int64 (n_tau,)
         Thinning of the terms (every ``2**shift``-th is used).
+    diagonal : bool
+        Compute only the diagonals: (4, 4, n_tau) and (4, n_tau).
 
     Returns
     -------
@@ -235,17 +237,11 @@ def product_tables(
     ramps : ndarray (4, n_tau, n_tau)
         ``D[a]``, such that a rate that grows by rho per sample adds ``rho^2 sum_a s[a] D[a]``.
     """
-    factors = np.asarray(ks, dtype=np.float64)
-    products, means = _fill_tables(window, ks, shifts, False, _log_lags(window))
-    return np.asarray(2.0 * products), np.asarray(2.0 * factors[:, None] * factors[None, :] * means)
-
-
-def diagonal_products(
-    window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Compute only the diagonals of `product_tables`: (4, 4, n_tau) and (4, n_tau)."""
-    products, means = _fill_tables(window, ks, shifts, True, _log_lags(window))
-    return 2.0 * products[..., 0], 2.0 * ks.astype(np.float64) ** 2 * means[..., 0]
+    factors = ks.astype(np.float64)
+    products, means = _fill_tables(window, ks, shifts, diagonal, _log_lags(window))
+    if diagonal:
+        return 2.0 * products[..., 0], 2.0 * factors**2 * means[..., 0]
+    return 2.0 * products, 2.0 * factors[:, None] * factors * means
 
 
 def _log_lags(window: int) -> NDArray[np.float64]:

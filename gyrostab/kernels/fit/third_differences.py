@@ -22,7 +22,7 @@ from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.compiled import INNER, KERNEL
 from gyrostab.kernels.fit.covariance import STOCHASTIC
 
-__all__ = ["third_columns", "third_diagonals", "third_tables"]
+__all__ = ["third_columns", "third_tables"]
 
 #: Lags are taken in steps of this share of the shorter factor.
 _LAG_STEPS = 32
@@ -136,44 +136,31 @@ def _fill_tables(window, ks, shifts, summed, diagonal, table):  # type: ignore[n
     return products, means
 
 
-def _tabulate_covariance(
+def third_tables(
     variance: str,
     window: int,
     ks: NDArray[np.int64],
     shifts: NDArray[np.int64],
     *,
-    diagonal: bool,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    summed = VARIANCES[variance].summed
-    lags = 3 * int(ks[-1]) + 6 * int(ks[-1]) + window + 8
-    table = _autocovariances(lags, summed=summed)
-    products, means = _fill_tables(window, ks, shifts, summed, diagonal, table)
-    factors = ks.astype(np.float64)
-    ramp_response = 1.0 if summed else 0.0  # a third difference of the angle does not see a ramp
-    other_factors = factors[:, None] if diagonal else factors[None, :]
-    return 2.0 * products, 2.0 * ramp_response * factors[:, None] * other_factors * means
-
-
-def third_tables(
-    variance: str, window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
+    diagonal: bool = False,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Tabulate the covariance of a variance as `gyrostab.kernels.fit.covariance.product_tables`.
 
     Parameters
     ----------
     variance : {"hadamard", "modified"}
-    window, ks, shifts
+    window, ks, shifts, diagonal
         As for `product_tables`; averaging factors are at most ``(window + 1) // 3``.
     """
-    return _tabulate_covariance(variance, window, ks, shifts, diagonal=False)
-
-
-def third_diagonals(
-    variance: str, window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Compute only the diagonals of `third_tables`: (4, 4, n_tau) and (4, n_tau)."""
-    products, means = _tabulate_covariance(variance, window, ks, shifts, diagonal=True)
-    return products[..., 0], means[..., 0]
+    summed = VARIANCES[variance].summed
+    table = _autocovariances(9 * int(ks[-1]) + window + 8, summed=summed)
+    products, means = _fill_tables(window, ks, shifts, summed, diagonal, table)
+    factors = ks.astype(np.float64)
+    ramp_response = 1.0 if summed else 0.0  # a third difference of the angle does not see a ramp
+    other_factors = factors[:, None] if diagonal else factors[None, :]
+    pairs = 2.0 * products
+    ramps = 2.0 * ramp_response * factors[:, None] * other_factors * means
+    return (pairs[..., 0], ramps[..., 0]) if diagonal else (pairs, ramps)
 
 
 def third_columns(variance: str, ks: NDArray[np.int64]) -> NDArray[np.float64]:
