@@ -124,6 +124,11 @@ class ScaleFactor(Effect):
         return f"The scale factor is wrong {self.on_axes()}: {', '.join(terms) or 'by nothing'}."
 
 
+def _declare_angle(axis: str) -> Any:
+    meaning = f"misalignment angle towards axis {axis}"
+    return parameter("mrad", meaning, default=0.0, typical=0.5, low=-1e3, high=1e3)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Misalignment(Effect):
     """Leak of the true rate of other axes by misalignment angles.
@@ -149,15 +154,9 @@ class Misalignment(Effect):
     next_measurement = "rotate about one axis at a time and read the others"
     size_parameters = ("x", "y", "z")
 
-    x: float = parameter(
-        "mrad", "misalignment angle towards axis x", default=0.0, typical=0.5, low=-1e3, high=1e3
-    )
-    y: float = parameter(
-        "mrad", "misalignment angle towards axis y", default=0.0, typical=0.5, low=-1e3, high=1e3
-    )
-    z: float = parameter(
-        "mrad", "misalignment angle towards axis z", default=0.0, typical=0.5, low=-1e3, high=1e3
-    )
+    x: float = _declare_angle("x")
+    y: float = _declare_angle("y")
+    z: float = _declare_angle("z")
     motion: str = parameter(
         "text",
         "rates of the other axes: the true ones of the model, or those of the recording",
@@ -431,7 +430,10 @@ class RealMotion(Effect):
         bent = [name for name in "xyz" if getattr(self, name)]
         if bent:
             angle = sum(
-                (self._tilt_degrees(name) * chunk.drivers[f"accel_{name}"] for name in bent),
+                (
+                    math.degrees(getattr(self, name) * _MRAD) * chunk.drivers[f"accel_{name}"]
+                    for name in bent
+                ),
                 np.zeros(chunk.size),
             )
             motion += np.diff(angle, prepend=angle[0] if tilt is None else tilt) * (
@@ -440,10 +442,6 @@ class RealMotion(Effect):
             tilt = float(angle[-1])
         direction = self.expand_to_axes("direction", chunk.setup.axes)[:, None]
         return direction * motion, (process, tilt)
-
-    def _tilt_degrees(self, name: str) -> float:
-        """Convert a tilt per acceleration to [degree g-1]."""
-        return math.degrees(getattr(self, name) * _MRAD)
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """List frequencies and qualities of the sway."""

@@ -18,6 +18,10 @@ _MIN_EDGE_HZ = 0.01
 _FOLDED_POINTS = 1001  # of the spectrum of the samples, from which a sentence takes the band
 
 
+def _declare_sensitivity(unit: str, meaning: str) -> Any:
+    return parameter(unit, meaning, default=0.0, typical=1e-3, low=-10.0, high=10.0)
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Vector(Effect):
     """Bias that is the scalar product of a vector channel with the parameters x, y, z."""
@@ -76,15 +80,9 @@ class GSensitivity(_Vector):
     )
     size_parameters = ("x", "y", "z")
 
-    x: float = parameter(
-        "deg/h/g", "bias per g along x", default=0.0, typical=1e-3, low=-10.0, high=10.0
-    )
-    y: float = parameter(
-        "deg/h/g", "bias per g along y", default=0.0, typical=1e-3, low=-10.0, high=10.0
-    )
-    z: float = parameter(
-        "deg/h/g", "bias per g along z", default=0.0, typical=1e-3, low=-10.0, high=10.0
-    )
+    x: float = _declare_sensitivity("deg/h/g", "bias per g along x")
+    y: float = _declare_sensitivity("deg/h/g", "bias per g along y")
+    z: float = _declare_sensitivity("deg/h/g", "bias per g along z")
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict window means from the present components, and a flat transfer function."""
@@ -325,15 +323,9 @@ class Magnetic(_Vector):
     )
     size_parameters = ("x", "y", "z")
 
-    x: float = parameter(
-        "deg/h/uT", "bias per microtesla along x", default=0.0, typical=1e-3, low=-10.0, high=10.0
-    )
-    y: float = parameter(
-        "deg/h/uT", "bias per microtesla along y", default=0.0, typical=1e-3, low=-10.0, high=10.0
-    )
-    z: float = parameter(
-        "deg/h/uT", "bias per microtesla along z", default=0.0, typical=1e-3, low=-10.0, high=10.0
-    )
+    x: float = _declare_sensitivity("deg/h/uT", "bias per microtesla along x")
+    y: float = _declare_sensitivity("deg/h/uT", "bias per microtesla along y")
+    z: float = _declare_sensitivity("deg/h/uT", "bias per microtesla along z")
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         return f"The bias follows the magnetic field {self.on_axes()}, by {self.parts(errors)}."
