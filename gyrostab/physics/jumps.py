@@ -60,17 +60,15 @@ class _Stepping:
     next: float
 
 
-def _run_process(
-    process: _Stepping, end: float, step: Callable[[_Stepping], None]
-) -> tuple[list[float], list[Any]]:
-    """Run a process up to sample `end`; `step` changes its level and sets its next step."""
+def _average_process(process: _Stepping, chunk: Chunk, step: Callable[[_Stepping], None]) -> Array:
+    """Average a process over each sample; `step` changes its level and sets its next step."""
     positions: list[float] = []
     levels = [process.level]
-    while process.next < end:
+    while process.next < chunk.first + chunk.size:
         positions.append(process.next)
         step(process)
         levels.append(process.level)
-    return positions, levels
+    return step_means(positions, levels, chunk.first, chunk.size)
 
 
 def _draw_wait(rng: np.random.Generator, mean: float) -> float:
@@ -157,9 +155,7 @@ class BiasJump(Effect):
             process.next += _draw_wait(process.rng, mean)
 
         listed_jumps = step_means(places, levels, chunk.first, chunk.size)
-        return listed_jumps + step_means(
-            *_run_process(process, chunk.first + chunk.size, jump), chunk.first, chunk.size
-        ), state
+        return listed_jumps + _average_process(process, chunk, jump), state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """List times of the jump: returns of power, and edges and centres of the windows."""
@@ -244,10 +240,7 @@ class Telegraph(Effect):
                 process.rng, (self.high if process.level else self.low) * chunk.rate
             )
 
-        end = chunk.first + chunk.size
-        unit = np.stack(
-            [step_means(*_run_process(row, end, switch), chunk.first, chunk.size) for row in state]
-        )
+        unit = np.stack([_average_process(row, chunk, switch) for row in state])
         return self.expand_to_axes("step", chunk.setup.axes)[:, None] * unit, state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
@@ -374,10 +367,7 @@ class FringeHop(Effect):
                 float(later[0]) if later.size else math.inf,
             )
 
-        end = chunk.first + chunk.size
-        fringes = np.stack(
-            [step_means(*_run_process(row, end, switch), chunk.first, chunk.size) for row in state]
-        )
+        fringes = np.stack([_average_process(row, chunk, switch) for row in state])
         return chunk.signal + self.order * self.fringe * fringes, state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:

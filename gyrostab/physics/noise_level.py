@@ -199,13 +199,9 @@ class LightPowerNoise(Effect):
                 "after the start; it must be above 0: correct the channel, or leave its bad "
                 "values out"
             )
-        return {
-            "N": chunk.level["N"] + chunk.setup.noise["N"][:, None] ** 2 * self._added_share(power)
-        }, state
-
-    def _added_share(self, power: Array) -> Array:
         loss = self.nominal / power
-        return self.thermal * (loss**2 - 1.0) + self.shot * (loss - 1.0)
+        share = self.thermal * (loss**2 - 1.0) + self.shot * (loss - 1.0)
+        return {"N": chunk.level["N"] + chunk.setup.noise["N"][:, None] ** 2 * share}, state
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict the growth of N^2 in every window."""

@@ -213,38 +213,33 @@ def simulate_p_values(
 
 def calibrated(p: float, chance: Array) -> float:
     """Find the share of simulated noise with at most this p-value; small ones by a power law."""
-    p, sample = max(p, 1e-300), np.sort(chance)
-    edge, share, power = _lower_tail(sample)
-    if p < edge:
-        return float(share * (p / edge) ** power)
-    return float(
-        np.interp(
-            p, np.append(sample, 1.0), np.append((np.arange(sample.size) + 1.0) / sample.size, 1.0)
-        )
-    )
+    p = max(p, 1e-300)
+    values, shares, edge, power = _describe_chance(chance)
+    if p < edge[0]:
+        return float(edge[1] * (p / edge[0]) ** power)
+    return float(np.interp(p, values, shares))
 
 
 def uncalibrated(share: float, chance: Array) -> float:
     """Find the p-value below which this share of simulated noise lies: inverse of `calibrated`."""
+    values, shares, edge, power = _describe_chance(chance)
+    if share < edge[1]:
+        return float(edge[0] * (share / edge[1]) ** (1.0 / power))
+    return float(np.interp(share, shares, values))
+
+
+def _describe_chance(chance: Array) -> tuple[Array, Array, tuple[float, float], float]:
+    """Sort simulated p-values, with the share up to each, and fit the law of still smaller ones.
+
+    The lower tail has the start and share that are returned, and Hill's exponent.
+    """
     sample = np.sort(chance)
-    edge, edge_share, power = _lower_tail(sample)
-    if share < edge_share:
-        return float(edge * (share / edge_share) ** (1.0 / power))
-    return float(
-        np.interp(
-            share,
-            np.append((np.arange(sample.size) + 1.0) / sample.size, 1.0),
-            np.append(sample, 1.0),
-        )
-    )
-
-
-def _lower_tail(sample: Array) -> tuple[float, float, float]:
-    """Fit the lower tail of a sorted sample: its start, the share below, and Hill's exponent."""
     count = min(_TAIL, sample.size // 2)
     edge = float(np.maximum(sample[count - 1], 1e-300))
     spread = float(np.mean(np.log(edge / np.maximum(sample[:count], 1e-300))))
-    return edge, count / sample.size, min(1.0 / max(spread, 1e-9), _STEEPEST)
+    values = np.append(sample, 1.0)
+    shares = np.append((np.arange(sample.size) + 1.0) / sample.size, 1.0)
+    return values, shares, (edge, count / sample.size), min(1.0 / max(spread, 1e-9), _STEEPEST)
 
 
 def slope_interval(
