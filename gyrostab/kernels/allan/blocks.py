@@ -16,6 +16,8 @@ Missing samples never enter the loops: valid terms are intervals between gaps.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -29,12 +31,30 @@ try:
 except ImportError:  # without llvmlite, or where numba has moved what the vectors are built with
     from gyrostab.kernels.allan.plain_sums import split_sums
 
-__all__ = ["full_counts", "group_factors", "grouped_blocks", "held_points", "windows_from_blocks"]
+__all__ = [
+    "Cut",
+    "full_counts",
+    "group_factors",
+    "grouped_blocks",
+    "held_points",
+    "windows_from_blocks",
+]
 
 # Points that a group of averaging factors goes through before the next one does: so few that they
 # stay in the second-level cache, so many
 # that the processor can foresee where the loops of short blocks end.
 _STRETCH_POINTS = 65536
+
+
+class Cut(NamedTuple):
+    """How windows and their terms are cut into blocks."""
+
+    step: int  # samples of a block
+    ks: NDArray[np.int64]  # (n_tau,): averaging factors
+    shifts: NDArray[np.int64]  # (n_tau,): every ``2**shift``-th term is used
+    head_lengths: NDArray[np.int64]  # (n_tau,): terms of a head
+    whole_blocks: NDArray[np.int64]  # (n_tau,): blocks of a window, not rising
+    n_windows: int  # windows: there are ``n_windows + whole_blocks[0]`` blocks
 
 
 def group_factors(ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -60,23 +80,9 @@ def group_factors(ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[n
 
 
 @njit(**INNER)
-def _limit_terms(  # type: ignore[no-untyped-def]
-    i,
-    count,
-    first,
-    high,
-    stop,
-    step,
-    block,
-    n_windows,
-    ks,
-    shifts,
-    head_lengths,
-    whole_blocks,
-    splits,
-    sizes,
-):
+def _limit_terms(i, count, first, high, stop, block, cut, splits, sizes):  # type: ignore[no-untyped-def]
     """Count the terms of head, and of head and tail, of `count` factors from number i on."""
+    step, ks, shifts, head_lengths, whole_blocks, n_windows = cut
     shift = shifts[i]
     up = (1 << shift) - 1
     a = block * step
@@ -94,15 +100,15 @@ def _limit_terms(  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _add_stretch(  # type: ignore[no-untyped-def]
-    flat, places, base, starts, stops, step, begin, end, tile, ks, shifts, lags, groups,
-    head_lengths, whole_blocks, n_windows,
-    first_runs, splits, sizes, out,
+    flat, places, base, starts, stops, begin, end, tile, cut, lags, groups, first_runs, splits,
+    sizes, out,
 ):  # fmt: skip
     """Add the terms of the blocks from `begin` to `end`, from sample `tile` of each block on.
 
     At most `_STRETCH_POINTS` samples of each block are used; `first_runs` holds the first runs in
     reach.
     """
+    step, ks, shifts = cut.step, cut.ks, cut.shifts
     heads, tails = out[0].reshape(-1), out[1].reshape(-1)
     # No slice of an array and no new array in these loops: each costs as much as a hundred terms.
     for g in range(groups.size - 1):
@@ -118,35 +124,9 @@ def _add_stretch(  # type: ignore[no-untyped-def]
                 if starts[r] >= high:
                     break
                 first = (max(low, starts[r]) + (1 << shift) - 1) >> shift
-                if _limit_terms(
-                    i,
-                    count,
-                    first,
-                    high,
-                    stops[r],
-                    step,
-                    block,
-                    n_windows,
-                    ks,
-                    shifts,
-                    head_lengths,
-                    whole_blocks,
-                    splits,
-                    sizes,
-                ):
-                    place = places[i] + first - (base >> shift)
-                    split_sums(
-                        flat,
-                        place,
-                        count,
-                        lags,
-                        i,
-                        splits,
-                        sizes,
-                        heads,
-                        tails,
-                        block * ks.size + i,
-                    )
+                if _limit_terms(i, count, first, high, stops[r], block, cut, splits, sizes):
+                    place, row = places[i] + first - (base >> shift), block * ks.size + i
+                    split_sums(flat, place, count, lags, i, splits, sizes, heads, tails, row)
                     if out.shape[0] > 2:
                         for q in range(count):
                             out[2, block, i + q] += splits[q]
@@ -174,10 +154,7 @@ def held_points(n_points: int, step: int, ks: NDArray[np.int64], shifts: NDArray
 
 
 @njit(**KERNEL)
-def grouped_blocks(  # type: ignore[no-untyped-def]
-    x, offset, flat, capacity, places, starts, stops, step, ks, shifts, groups, head_lengths,
-    whole_blocks, n_windows, out
-):  # fmt: skip
+def grouped_blocks(x, offset, flat, capacity, places, starts, stops, cut, groups, out):  # type: ignore[no-untyped-def]
     """Sum heads and tails of every block and averaging factor, and count their terms.
 
     The angle is integrated as the blocks need it, and only as much of it is held as fits in the
@@ -194,10 +171,10 @@ def grouped_blocks(  # type: ignore[no-untyped-def]
         `pyramid_places`); start of the level of each averaging factor.
     starts, stops : int64 (n_runs,)
         Runs of present points of the angle, one more each than of present rates.
-    step, ks, shifts, groups, head_lengths, whole_blocks, n_windows
-        Samples of a block; averaging factors, their thinning (`flat` holds the angle thinned by
-        ``2**shifts[i]``) and groups; terms of a head; blocks of a window, not rising; windows:
-        there are ``n_windows + whole_blocks[0]`` blocks.
+    cut : Cut
+        Blocks; `flat` holds the angle thinned by ``2**shift``.
+    groups : int64 (n_groups + 1,)
+        Result of `group_factors`.
     out : float64 (2 or 4, n_blocks, n_tau)
         Overwritten.
 
@@ -206,7 +183,7 @@ def grouped_blocks(  # type: ignore[no-untyped-def]
     float
         Largest magnitude of the angle that was integrated.
     """
-    n_blocks = out.shape[1]
+    n_blocks, step, ks, shifts = out.shape[1], cut.step, cut.ks, cut.shifts
     first_runs, ends = np.zeros(groups.size, np.int64), stops - 1
     lags = ks >> shifts
     splits, sizes = np.empty(CONSECUTIVE_LAGS, np.int64), np.empty(CONSECUTIVE_LAGS, np.int64)
@@ -235,9 +212,8 @@ def grouped_blocks(  # type: ignore[no-untyped-def]
                 thin_pyramid(flat, capacity, levels, done + 1 - base, b + 1 - base)
                 done = b
             _add_stretch(
-                flat, places, base, starts, stops, step, begin, end, tile, ks, shifts, lags,
-                groups, head_lengths, whole_blocks, n_windows,
-                first_runs, splits, sizes, out,
+                flat, places, base, starts, stops, begin, end, tile, cut, lags, groups, first_runs,
+                splits, sizes, out,
             )  # fmt: skip
     return largest
 

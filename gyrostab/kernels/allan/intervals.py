@@ -147,14 +147,12 @@ def _sum_part(high, low, begin, end, first_interval, a, b, k, shift, order):  # 
 
 
 @njit(**KERNEL)
-def single_blocks(  # type: ignore[no-untyped-def]
-    high, low, places, starts, stops, order, spans, points, step, ks, shifts, head_lengths,
-    whole_blocks, n_windows
-):  # fmt: skip
+def single_blocks(high, low, places, starts, stops, order, spans, points, cut):  # type: ignore[no-untyped-def]
     """Sum heads and tails as `grouped_blocks`; `low` is the remainder of `high`, or empty.
 
     `order` is that of the differences; `spans` (n_tau,) and `points` as for `valid_intervals`.
     """
+    step, ks, shifts, head_lengths, whole_blocks, n_windows = cut
     out = np.zeros((4, n_windows + whole_blocks[0], ks.size))
     for i in range(ks.size):
         begin, end = valid_intervals(starts, stops, ks[i], spans[i], points)

@@ -9,6 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gyrostab.kernels.allan.blocks import (
+    Cut,
     full_counts,
     group_factors,
     grouped_blocks,
@@ -207,24 +208,23 @@ def _strict_sums(work: _Work, gaps: bool) -> tuple[Floats, Floats]:
     add = _angle_blocks if unit.angle else _rate_blocks
     if unit.order == 3:
         add = _third_blocks
-    add(work, (head_lengths, whole_blocks, n_windows), blocks)
+    add(work, Cut(unit.step, unit.ks, unit.shifts, head_lengths, whole_blocks, n_windows), blocks)
     sums = space.array("sums", len(blocks) // 2, n_windows, unit.ks.size)
     for heads_and_tails, out in zip((blocks[:2], blocks[2:]), sums, strict=False):
         windows_from_blocks(*heads_and_tails, whole_blocks, out)
     return sums[0], sums[1] if gaps else np.empty((0, 0))
 
 
-def _rate_blocks(work: _Work, cut: tuple[Any, ...], blocks: Floats) -> None:
+def _rate_blocks(work: _Work, cut: Cut, blocks: Floats) -> None:
     """Sum heads and tails of rates, with an angle of two doubles where needed."""
     x, unit, space, _, starts, stops, offset = work
     ks, shifts = unit.ks, unit.shifts
     points = held_points(x.size + 1, unit.step, ks, shifts)
     places, size = pyramid_places(points, ks, shifts)
     flat = space.array("angle", size)
-    runs, order = (starts, stops + 1), (ks, shifts, group_factors(ks, shifts))
-    largest = grouped_blocks(
-        x, offset, flat, points, places, *runs, unit.step, *order, *cut, blocks
-    )
+    groups = group_factors(ks, shifts)
+    runs = (starts, stops + 1)
+    largest = grouped_blocks(x, offset, flat, points, places, *runs, cut, groups, blocks)
     if not needs_two_doubles(largest, x):
         return
     places, size = pyramid_places(x.size + 1, ks, shifts)
@@ -249,7 +249,7 @@ def _angle_of(work: _Work, windows: Integers) -> Floats:
     return angle
 
 
-def _angle_blocks(work: _Work, cut: tuple[Any, ...], blocks: Floats) -> None:
+def _angle_blocks(work: _Work, cut: Cut, blocks: Floats) -> None:
     """Heads and tails of angles, which are all there already."""
     x, unit, space, _, starts, stops, _ = work
     ks, shifts = unit.ks, unit.shifts
@@ -260,13 +260,11 @@ def _angle_blocks(work: _Work, cut: tuple[Any, ...], blocks: Floats) -> None:
     if starts.size > 1:
         _sum_intervals(work, flat, flat[:0], places, cut, blocks)
     else:
-        order = (ks, shifts, group_factors(ks, shifts))
-        grouped_blocks(
-            np.empty(0), 0.0, flat, x.size, places, starts, stops, unit.step, *order, *cut, blocks
-        )
+        groups = group_factors(ks, shifts)
+        grouped_blocks(np.empty(0), 0.0, flat, x.size, places, starts, stops, cut, groups, blocks)
 
 
-def _third_blocks(work: _Work, cut: tuple[Any, ...], blocks: Floats) -> None:
+def _third_blocks(work: _Work, cut: Cut, blocks: Floats) -> None:
     """Heads and tails of third differences; the sum of the angle is held as two doubles."""
     x, unit, space, _, starts, stops, offset = work
     ks, shifts, summed = unit.ks, unit.shifts, VARIANCES[unit.variance].summed
@@ -290,13 +288,13 @@ def _third_blocks(work: _Work, cut: tuple[Any, ...], blocks: Floats) -> None:
 
 
 def _sum_intervals(
-    work: _Work, high: Floats, low: Floats, places: Integers, cut: tuple[Any, ...], blocks: Floats
+    work: _Work, high: Floats, low: Floats, places: Integers, cut: Cut, blocks: Floats
 ) -> None:
     """Sum heads and tails interval by interval, with `low` as the remainder of the angle `high`."""
     unit = work.unit
     spans = unit.spans + unit.angle  # of angles instead of samples
-    order = (unit.order, spans, unit.points, unit.step, unit.ks, unit.shifts)
-    sums = single_blocks(high, low, places, work.starts, work.stops, *order, *cut)
+    terms = (unit.order, spans, unit.points)
+    sums = single_blocks(high, low, places, work.starts, work.stops, *terms, cut)
     blocks[:] = sums[: len(blocks)]
 
 
