@@ -8,10 +8,11 @@ here for eight that differ in their sets.
 
 from __future__ import annotations
 
+import numpy as np
 from numba import njit
 
 from gyrostab.kernels.compiled import INNER
-from gyrostab.kernels.fit.lanes import PLACES, put, root, take, where_above
+from gyrostab.kernels.fit.lanes import PLACES, put, root, take, take_four, where_above
 
 __all__ = [
     "back_substitute",
@@ -60,33 +61,12 @@ def eliminate(system, n, width, ok):  # type: ignore[no-untyped-def]
     for k in range(0, n, 4):
         for p in range(k, k + 4):
             _finish_pivot(system, width, p, k + 4, ok)
-        first, second, third, fourth = (
-            width * k,
-            width * k + width,
-            width * (k + 2),
-            width * (k + 3),
-        )
         for i in range(k + 4, n, 2):
-            a, b, c, d = (
-                take(system, first + i),
-                take(system, second + i),
-                take(system, third + i),
-                take(system, fourth + i),
-            )
-            next_column, above, below = i + 1, width * i, width * i + width
-            e, f, g, h = (
-                take(system, first + next_column),
-                take(system, second + next_column),
-                take(system, third + next_column),
-                take(system, fourth + next_column),
-            )
+            above, below = width * i, width * i + width
+            a, b, c, d = take_four(system, width * k + i, width)
+            e, f, g, h = take_four(system, width * k + i + 1, width)
             for j in range(i, width):
-                s, t, u, v = (
-                    take(system, first + j),
-                    take(system, second + j),
-                    take(system, third + j),
-                    take(system, fourth + j),
-                )
+                s, t, u, v = take_four(system, width * k + j, width)
                 put(system, above + j, take(system, above + j) - a * s - b * t - c * u - d * v)
                 put(system, below + j, take(system, below + j) - e * s - f * t - g * u - h * v)
 
@@ -97,13 +77,8 @@ def back_substitute(system, n, width):  # type: ignore[no-untyped-def]
     for i in range(n - 1, -1, -1):
         at = width * i
         target = at + n
-        a, b, c, d, e = (
-            take(system, target),
-            take(system, target + 1),
-            take(system, target + 2),
-            take(system, target + 3),
-            take(system, target + 4),
-        )
+        a, b, c, d = take_four(system, target, np.int64(1))
+        e = take(system, target + 4)
         for j in range(i + 1, n):
             share, right = take(system, at + j), width * j + n
             a = a - share * take(system, right)

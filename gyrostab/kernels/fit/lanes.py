@@ -9,7 +9,7 @@ from numba import njit
 
 from gyrostab.kernels.compiled import INNER
 
-__all__ = ["PLACES", "eights", "number", "put", "root", "take", "where_above"]
+__all__ = ["PLACES", "eights", "number", "put", "root", "take", "take_four", "where_above"]
 
 try:
     from gyrostab.kernels.fit.eights import PLACES, eights, number, put, root, take, where_above
@@ -45,3 +45,14 @@ except (ImportError, AttributeError):  # numba or llvmlite has moved what the ve
     def where_above(x, y, yes, no):  # type: ignore[no-untyped-def]
         """`yes` where ``x > y``, otherwise `no`, also where x or y is NaN."""
         return yes if x > y else no
+
+
+@njit(**INNER)
+def take_four(array, index, apart):  # type: ignore[no-untyped-def]
+    """Take the numbers `index`, ``index + apart`` and so on of an array of `eights`."""
+    return (
+        take(array, index),
+        take(array, index + apart),
+        take(array, index + 2 * apart),
+        take(array, index + 3 * apart),
+    )

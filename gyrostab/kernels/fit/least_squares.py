@@ -380,17 +380,7 @@ def _reduce_windows(cells, room, tables):  # type: ignore[no-untyped-def]
     for i in range(n):
         for a in range(4):
             put(room.rows, 4 * i + a, take(room.whole, (n + WIDTH) * i + n + a))
-    compress_products(
-        room.rows,
-        room.units,
-        cells.responses,
-        cells.inverse,
-        tables,
-        room.factors,
-        room.scaled,
-        _has_positive(cells.excess, np.int64(0)),
-        room.products,
-    )
+    compress_products(cells, room, tables, _has_positive(cells.excess, np.int64(0)))
 
 
 @njit(**INNER)

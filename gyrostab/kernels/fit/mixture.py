@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER
-from gyrostab.kernels.fit.lanes import number, put, root, take, where_above
+from gyrostab.kernels.fit.lanes import number, put, root, take, take_four, where_above
 
 __all__ = [
     "DATA",
@@ -223,12 +223,7 @@ def _add_products(rows, first, second, inverse, tables, table, factor, scaled, o
             put(scaled, 4 * i + c, take(rows, 4 * i + c) * root_product)
     for i in range(n):
         diagonal = 0.5 * number(tables, PRODUCTS * (i * n + i) + table) * take(inverse, i)
-        s0, s1, s2, s3 = (
-            take(scaled, 4 * i),
-            take(scaled, 4 * i + 1),
-            take(scaled, 4 * i + 2),
-            take(scaled, 4 * i + 3),
-        )
+        s0, s1, s2, s3 = take_four(scaled, 4 * i, np.int64(1))
         a0, a1, a2, a3 = diagonal * s0, diagonal * s1, diagonal * s2, diagonal * s3
         for j in range(i + 1, n):
             share = number(tables, PRODUCTS * (i * n + j) + table) * _find_share(inverse, i, j)
@@ -250,24 +245,21 @@ def _add_products(rows, first, second, inverse, tables, table, factor, scaled, o
 
 
 @njit(**INNER)
-def compress_products(rows, units, responses, inverse, tables, roots, scaled, has_excess, out):  # type: ignore[no-untyped-def]
+def compress_products(cells, room, tables, has_excess):  # type: ignore[no-untyped-def]
     """Compute ``A C_ab A^T`` for every product (a, b) of terms of the covariance C of the cells.
 
-    Parameters
-    ----------
-    rows : eights (4 * n,)
-        A, four weighted sums of the cells (row ``4 cell + row``).
-    units : eights (5 * n,)
-        `root_units`.
-    responses, inverse, tables
-        As elsewhere.
-    roots, scaled : eights (6 * n,), eights (4 * n,)
-        Scratch.
-    has_excess : bool
-        Whether gaps add to quantization noise what counts as white, see `observe`.
-    out : eights (10 * `PRODUCTS`,)
-        Overwritten; row ``10 product + entry``, entries in the order of the upper triangle.
+    A has four weighted sums of the cells (``room.rows``, row ``4 cell + row``). The result goes to
+    ``room.products`` (row ``10 product + entry``, entries in the order of the upper triangle).
+    `has_excess`: gaps add to quantization noise what counts as white, see `observe`.
     """
+    rows, units, roots, scaled, out = (
+        room.rows,
+        room.units,
+        room.factors,
+        room.scaled,
+        room.products,
+    )
+    responses, inverse = cells.responses, cells.inverse
     n = inverse.shape[0]
     for i in range(n):
         for a in range(5):
@@ -324,13 +316,8 @@ def whole_degrees_of_freedom(squares, columns, to_samples, diagonal, freedom, ou
     `squares` holds their squared coefficients (row ``term``), `freedom` is scratch; tables are
     flat.
     """
-    s0, s1, s2, s3, s4 = (
-        take(squares, 0),
-        take(squares, 1),
-        take(squares, 2),
-        take(squares, 3),
-        take(squares, 4),
-    )
+    s0, s1, s2, s3 = take_four(squares, np.int64(0), np.int64(1))
+    s4 = take(squares, 4)
     a0, a1, a2, a3, a4 = (
         s0 * number(to_samples, 0),
         s1 * number(to_samples, 1),
