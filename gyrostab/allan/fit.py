@@ -379,10 +379,8 @@ def _fit_inputs(
     exceeds ``b^2 tau^2 / 2`` is removed here.
     """
     try:
-        rate, window = (
-            float(surface.attrs["sampling_rate_hz"]),
-            int(surface.attrs["window_samples"]),
-        )
+        rate = float(surface.attrs["sampling_rate_hz"])
+        window = int(surface.attrs["window_samples"])
     except KeyError as missing:
         raise SchemaError(
             f"the surface lacks the attribute {missing}; it is not what gyrostab.davar writes"

@@ -56,10 +56,8 @@ def is_described(chi2: Any, dof: Any) -> Any:
     >>> is_described([20.0, 900.0, np.nan], [16.0, 16.0, 0.0])
     array([ True, False,  True])
     """
-    chi2, dof = (
-        np.nan_to_num(np.asarray(chi2, np.float64)),
-        np.nan_to_num(np.asarray(dof, np.float64)),
-    )
+    chi2 = np.nan_to_num(np.asarray(chi2, np.float64))
+    dof = np.nan_to_num(np.asarray(dof, np.float64))
     return ~((dof > 0) & (gammaincc(np.maximum(dof, 1.0) / 2.0, chi2 / 2.0) < _MISFIT_PROBABILITY))
 
 

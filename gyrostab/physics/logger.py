@@ -470,9 +470,7 @@ class HeldSamples(Effect):
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         filling = {"repeat": "earlier ones", "zero": "zero", "frame": "the frame before"}[self.fill]
-        often, length = (
-            self.quantity("per_hour", errors).removesuffix(" 1/h"),
-            self.quantity("length", errors),
-        )
+        often = self.quantity("per_hour", errors).removesuffix(" 1/h")
+        length = self.quantity("length", errors)
         times = f"{often} times per hour for {length} on average"
         return f"Samples are lost and filled with {filling} {self.on_axes()}, {times}."

@@ -109,10 +109,8 @@ def _frame_mismatches(
         min_width = MIN_FRAME_SHARE * (right - left)
         if end - begin < min_width:
             begin, end = (begin + end - min_width) / 2.0, (begin + end + min_width) / 2.0
-        low, high = (
-            max(region["tau_min_s"] / 1.3, low_edge),
-            min(region["tau_max_s"] * 1.3, high_edge),
-        )
+        low = max(region["tau_min_s"] / 1.3, low_edge)
+        high = min(region["tau_max_s"] * 1.3, high_edge)
         if high <= low:
             continue
         style = {
@@ -287,10 +285,8 @@ def plot_means(
             label="recording, windows",
         )
         for case in ("before", "after"):
-            mean, error = (
-                part["mean"].sel(case=case).values,
-                part["mean_stderr"].sel(case=case).values,
-            )
+            mean = part["mean"].sel(case=case).values
+            error = part["mean_stderr"].sel(case=case).values
             panel.plot(time, mean, **_STYLES[case], label=f"{_TITLES[case].lower()}, 95 %")
             panel.fill_between(
                 time,

@@ -93,10 +93,8 @@ class Source:
         low = max(0, int(np.searchsorted(stamps, instants[0], side="right")) - 1)
         high = int(np.searchsorted(stamps, instants[-1], side="left")) + 1
         origin = stamps[low]
-        at, knots = (
-            (instants - origin).astype(np.float64),
-            (stamps[low:high] - origin).astype(np.float64),
-        )
+        at = (instants - origin).astype(np.float64)
+        knots = (stamps[low:high] - origin).astype(np.float64)
         return np.asarray(np.interp(at, knots, self.values[low:high]))
 
 

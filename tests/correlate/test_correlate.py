@@ -222,10 +222,8 @@ def test_intervals_have_their_coverage_and_agree_with_the_p_values(noises, heat,
             gap=gap,
         )
         correlation = gyrostab.correlate(product, max_lag=0)
-        low, high = (
-            correlation["window_mean_per_temperature_low"].values,
-            correlation["window_mean_per_temperature_high"].values,
-        )
+        low = correlation["window_mean_per_temperature_low"].values
+        high = correlation["window_mean_per_temperature_high"].values
         hold += list((low < [0.5, 0, 0]) & (high > [0.5, 0, 0]))
         p = correlation["p_value"].sel(variable="window_mean", driver="temperature").values
         np.testing.assert_array_equal((low > 0) | (high < 0), p < 0.05)

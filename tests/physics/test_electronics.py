@@ -158,10 +158,8 @@ def test_comb_has_the_predicted_power():
         prediction = effect.explain(
             windows_of(60_000, 100.0, 600.0, bands, own={"x": np.full(1, 11.15)})
         )
-        (name, size), width = (
-            next(iter(part.items())),
-            line * (math.sqrt(1.05) - 1 / math.sqrt(1.05)),
-        )
+        (name, size) = next(iter(part.items()))
+        width = line * (math.sqrt(1.05) - 1 / math.sqrt(1.05))
         assert power[is_near_line].sum() == pytest.approx(
             2 * width * size**2 * prediction.spectrum[name][0, 1], rel=0.02
         )
@@ -486,9 +484,7 @@ def test_a_chain_of_the_electronics_is_the_same_in_any_blocks():
         "effect": effects,
         "log": {"rate": 50, "duration": "40s", "oversampling": 4},
     }
-    whole, blocks = (
-        simulate(model, seed=9).rate.values,
-        simulate(model, seed=9, chunk=173).rate.values,
-    )
+    whole = simulate(model, seed=9).rate.values
+    blocks = simulate(model, seed=9, chunk=173).rate.values
     np.testing.assert_array_equal(blocks, whole)
     assert np.isfinite(whole).all()

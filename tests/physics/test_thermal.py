@@ -346,10 +346,8 @@ def test_hysteresis_opens_a_loop_of_known_area():
     temperature = np.tile(way[:-1], 3)
     bias = run(effect, size=temperature.size, drivers={"temperature": temperature})[0]
     period = way.size - 1
-    last_t, last_b = (
-        np.append(temperature[-period:], -40.0),
-        np.append(bias[-period:], bias[-period]),
-    )
+    last_t = np.append(temperature[-period:], -40.0)
+    last_b = np.append(bias[-period:], bias[-period])
     assert abs(np.trapezoid(last_b, last_t)) == pytest.approx(
         2 * 0.002 * 4 * (100 - 2 * 4), rel=1e-6
     )

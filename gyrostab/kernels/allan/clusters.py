@@ -128,11 +128,9 @@ def _add_pairs(theta, places, mask, a, b, k, stride, row):  # type: ignore[no-un
     count = 0
     for m in range((a + stride - 1) // stride * stride, b, stride):
         row0, row1, row2 = np.uint64(m >> 6), np.uint64((m + k) >> 6), np.uint64((m + 2 * k) >> 6)
-        low0, low1, low2 = (
-            (bit << (m & 63)) - bit,
-            (bit << ((m + k) & 63)) - bit,
-            (bit << ((m + 2 * k) & 63)) - bit,
-        )
+        low0 = (bit << (m & 63)) - bit
+        low1 = (bit << ((m + k) & 63)) - bit
+        low2 = (bit << ((m + 2 * k) & 63)) - bit
         middle = mask[row1, 2] + _count_ones(mask[row1, 0] & low1)
         n1 = middle - mask[row0, 2] - _count_ones(mask[row0, 0] & low0)
         n2 = mask[row2, 2] + _count_ones(mask[row2, 0] & low2) - middle
@@ -147,17 +145,13 @@ def _add_pairs(theta, places, mask, a, b, k, stride, row):  # type: ignore[no-un
             before, behind = places[at1] - places[at0], places[at2] - places[at1]
         else:
             place1 = _places_before(mask, row1, low1)
-            before, behind = (
-                float(place1 - _places_before(mask, row0, low0)),
-                float(_places_before(mask, row2, low2) - place1),
-            )
+            before = float(place1 - _places_before(mask, row0, low0))
+            behind = float(_places_before(mask, row2, low2) - place1)
         apart = behind * f1 - before * f2  # and that of their centres
         # a run that a cluster cuts counts in both
         runs = mask[row1, 3] + _count_ones(mask[row1, 1] & low1)
-        cut0, cut1 = (
-            mask[row0, 0] & ~mask[row0, 1] & (low0 + bit) != 0,
-            mask[row1, 0] & ~mask[row1, 1] & (low1 + bit) != 0,
-        )
+        cut0 = mask[row0, 0] & ~mask[row0, 1] & (low0 + bit) != 0
+        cut1 = mask[row1, 0] & ~mask[row1, 1] & (low1 + bit) != 0
         r1 = runs - mask[row0, 3] - _count_ones(mask[row0, 1] & low0) + cut0
         r2 = mask[row2, 3] + _count_ones(mask[row2, 1] & low2) - runs + cut1
         inverse = 1.0 / (f1 * f2)
@@ -258,12 +252,10 @@ def _sum_overlapping(places, i, first, stop):  # type: ignore[no-untyped-def]
     clusters share samples.
     """
     a1, a2, n1, n2 = places[1, i], places[2, i], places[3, i], places[4, i]
-    b0, b1, p1, p2 = (
-        places[0, first:stop],
-        places[1, first:stop],
-        places[3, first:stop],
-        places[4, first:stop],
-    )
+    b0 = places[0, first:stop]
+    b1 = places[1, first:stop]
+    p1 = places[3, first:stop]
+    p2 = places[4, first:stop]
     inverse = places[5, first:stop]
     total = 0.0
     for j in range(inverse.size):

@@ -97,10 +97,8 @@ def _find_runs(x, step, finite_counts, starts, stops):  # type: ignore[no-untype
     run = 0
     inside = False
     for block in range(finite_counts.size):
-        first, last = (
-            block * step,
-            min((block + 1) * step, x.size) if block + 1 < finite_counts.size else x.size,
-        )
+        first = block * step
+        last = min((block + 1) * step, x.size) if block + 1 < finite_counts.size else x.size
         if inside and finite_counts[block] == last - first:
             continue
         for a in range(first, last, _STRIP):

@@ -190,14 +190,10 @@ def _emit_loop(
         builder.store(nothing, place)
     position = cgutils.alloca_once(builder, _INDEX)
     builder.store(ir.Constant(_INDEX, 0), position)
-    first_split, last_split = (
-        _select_extreme(builder, splits, "<"),
-        _select_extreme(builder, splits, ">"),
-    )
-    first_size, last_size = (
-        _select_extreme(builder, sizes, "<"),
-        _select_extreme(builder, sizes, ">"),
-    )
+    first_split = _select_extreme(builder, splits, "<")
+    last_split = _select_extreme(builder, splits, ">")
+    first_size = _select_extreme(builder, sizes, "<")
+    last_size = _select_extreme(builder, sizes, ">")
     wide_splits, wide_sizes = (
         [_spread_value(builder, value) for value in values] for values in (splits, sizes)
     )

@@ -59,12 +59,10 @@ def pack_counts(values, step, divisor, counts):  # type: ignore[no-untyped-def]
         Whether the others are whole numbers.
     """
     n, scale = values.size, divisor / step
-    missing, smallest, largest, all_whole = (
-        np.int64(0),
-        np.int32(2147483647),
-        np.int32(-2147483647),
-        True,
-    )
+    missing = np.int64(0)
+    smallest = np.int32(2147483647)
+    largest = np.int32(-2147483647)
+    all_whole = True
     for begin in range(0, n, _STRETCH):
         off, absent, odd = np.int64(0), np.int64(0), np.int64(0)
         for i in range(begin, min(begin + _STRETCH, n)):

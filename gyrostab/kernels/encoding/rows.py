@@ -243,10 +243,8 @@ def _count_of_time(text, at, size, point, digits):  # type: ignore[no-untyped-de
 @njit(**INNER)
 def _read_pair(text, at):  # type: ignore[no-untyped-def]
     """Read a number of two digits; above 99 if invalid."""
-    tens, ones = (
-        np.uint8(text[at] - np.uint8(_ZERO)),
-        np.uint8(text[at + 1] - np.uint8(_ZERO)),
-    )
+    tens = np.uint8(text[at] - np.uint8(_ZERO))
+    ones = np.uint8(text[at + 1] - np.uint8(_ZERO))
     return np.int64(10 * tens + ones) if tens < 10 and ones < 10 else np.int64(1000)
 
 

@@ -226,12 +226,9 @@ def cell_freedoms(squares, curves, columns, to_samples, diagonal):  # type: igno
         for w in range(n_windows):
             degrees_of_freedom(squares[w], curves, w, columns, to_samples, diagonal, out[w])
     else:
-        eight_squares, lanes, columns, diagonal = (
-            eights(5),
-            eights(1),
-            columns.ravel(),
-            diagonal.ravel(),
-        )
+        eight_squares, lanes = eights(5), eights(1)
+        columns = columns.ravel()
+        diagonal = diagonal.ravel()
         for start in range(0, n_windows, PLACES):
             count = min(PLACES, n_windows - start)
             for place in range(count):
@@ -309,14 +306,8 @@ def _normal_equations(augmented, n, normal, right):  # type: ignore[no-untyped-d
 @njit(**INNER)
 def _refit_windows(allowed, cells, fit, room, tables):  # type: ignore[no-untyped-def]
     """Refit until the covariance is that of the fitted noise; converged fits keep their numbers."""
-    squares, terms, basis, state, trial, tried = (
-        fit.squares,
-        fit.terms,
-        fit.basis,
-        fit.state,
-        eights(5),
-        eights(5),
-    )
+    squares, terms, basis, state = fit
+    trial, tried = eights(5), eights(5)
     n = cells.inverse.shape[0]
     put(state, 0, 1.0)
     put(state, 1, 0.0)
@@ -443,11 +434,9 @@ def fit_windows(  # type: ignore[no-untyped-def]
     result = np.full((n_windows, len(FIT_FIELDS), 5), np.nan)
     misfit = np.full((n_windows, 2), np.nan)
     dof = np.full((n_windows, n_tau), np.nan)
-    cells, fit, room = (
-        _make_cells(size),
-        _Fit(eights(5), eights(5), eights(5), eights(4)),
-        _make_room(size),
-    )
+    cells = _make_cells(size)
+    fit = _Fit(eights(5), eights(5), eights(5), eights(4))
+    room = _make_room(size)
     chi2, valid, squares = eights(1), np.empty(PLACES, np.int64), np.empty(5)
     submodels, start, form = make_submodels(), np.empty(4), np.empty(10)
     stochastic = allowed & 15

@@ -140,12 +140,10 @@ def root_units(responses, units):  # type: ignore[no-untyped-def]
 def root_squares(squares, responses, units, roots):  # type: ignore[no-untyped-def]
     """Compute the roots of the squared coefficients in sample units: row ``5 cell + term``."""
     s0, s1 = take(squares, 0), take(squares, 1)
-    r0, r2, r3, r4 = (
-        root(s0),
-        root(take(squares, 2)),
-        root(take(squares, 3)),
-        root(take(squares, 4)),
-    )
+    r0 = root(s0)
+    r2 = root(take(squares, 2))
+    r3 = root(take(squares, 3))
+    r4 = root(take(squares, 4))
     for i in range(responses.shape[0] // 6):
         put(roots, 5 * i, r0 * take(units, 5 * i))
         put(
@@ -252,14 +250,8 @@ def compress_products(cells, room, tables, has_excess):  # type: ignore[no-untyp
     ``room.products`` (row ``10 product + entry``, entries in the order of the upper triangle).
     `has_excess`: gaps add to quantization noise what counts as white, see `observe`.
     """
-    rows, units, roots, scaled, out = (
-        room.rows,
-        room.units,
-        room.factors,
-        room.scaled,
-        room.products,
-    )
-    responses, inverse = cells.responses, cells.inverse
+    rows, units, roots, scaled = room.rows, room.units, room.factors, room.scaled
+    responses, inverse, out = cells.responses, cells.inverse, room.products
     n = inverse.shape[0]
     for i in range(n):
         for a in range(5):
@@ -318,13 +310,11 @@ def whole_degrees_of_freedom(squares, columns, to_samples, diagonal, freedom, ou
     """
     s0, s1, s2, s3 = take_four(squares, np.int64(0), np.int64(1))
     s4 = take(squares, 4)
-    a0, a1, a2, a3, a4 = (
-        s0 * number(to_samples, 0),
-        s1 * number(to_samples, 1),
-        s2 * number(to_samples, 2),
-        s3 * number(to_samples, 3),
-        s4 * number(to_samples, 4),
-    )
+    a0 = s0 * number(to_samples, 0)
+    a1 = s1 * number(to_samples, 1)
+    a2 = s2 * number(to_samples, 2)
+    a3 = s3 * number(to_samples, 3)
+    a4 = s4 * number(to_samples, 4)
     for i in range(out.shape[1]):
         mean = (
             s0 * number(columns, 5 * i)

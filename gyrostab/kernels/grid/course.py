@@ -107,10 +107,8 @@ def _extend_hypothesis(new, size, old, h, position, following, sigma, gain, hold
     off = position - level - phase
     step = gain * off if weight * off * off < _OUTLIER_NATS else 0.0
     size = _keep_hypothesis(new, size, level, phase + step, cost + _stamp_nats(off, weight), h)
-    low, jump = (
-        np.rint(off - _REACH_SIGMA * sigma),
-        min(np.rint(off + _REACH_SIGMA * sigma), max_lost),
-    )
+    low = np.rint(off - _REACH_SIGMA * sigma)
+    jump = min(np.rint(off + _REACH_SIGMA * sigma), max_lost)
     while jump >= low:  # a loss whose end this row may be, or a row too many
         if jump > 0.0 or (jump < 0.0 and jump == np.rint(off)):
             residual = off - jump

@@ -164,11 +164,9 @@ def piece_sums(stamps, count, piece, period):  # type: ignore[no-untyped-def]
             residuals += (
                 stamps[i] - stamp0 - mean_stamp - slope * (count[i] - count0 - mean_count)
             ) ** 2
-        table[row, 0], table[row, 1], table[row, 2] = (
-            size,
-            mean_count + count0,
-            mean_stamp + (stamp0 - stamps[0]),
-        )
+        table[row, 0] = size
+        table[row, 1] = mean_count + count0
+        table[row, 2] = mean_stamp + (stamp0 - stamps[0])
         table[row, 3], table[row, 4], table[row, 5] = squares, products, residuals
         begin = end
     return table
@@ -356,13 +354,11 @@ def _add_run(runs, n, sample, row, length):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _note_event(events, n, cause, sample, row, before, stamp):  # type: ignore[no-untyped-def]
-    events[n, 0], events[n, 1], events[n, 2], events[n, 3], events[n, 4] = (
-        cause,
-        sample,
-        row,
-        before,
-        stamp,
-    )
+    events[n, 0] = cause
+    events[n, 1] = sample
+    events[n, 2] = row
+    events[n, 3] = before
+    events[n, 4] = stamp
     return n + 1
 
 
@@ -445,12 +441,10 @@ def _place_rows(rows, stamps, n, period, hold, max_gap, state, ring, runs, event
                 stamp,
             )
         if verdict >= STEP:
-            state[_GRID0], state[_STAMP0], state[_LATEST], state[_PHASE] = (
-                target,
-                _estimate_origin(stamps, j, period),
-                stamp,
-                0,
-            )
+            state[_GRID0] = target
+            state[_STAMP0] = _estimate_origin(stamps, j, period)
+            state[_LATEST] = stamp
+            state[_PHASE] = 0
         elif verdict == OUT_OF_ORDER and _is_free(ring, state, target):
             ring[target % len(ring)] = True
             n_runs = _add_run(runs, n_runs, target, row, np.int64(1))
@@ -509,10 +503,8 @@ def place(
     events : ndarray of int64, shape (n_events, 5)
         Cause, sample, row, stamp before [ns], stamp [ns].
     """
-    runs, events = (
-        np.empty((2 * n + 2, 3), dtype=np.int64),
-        np.empty((2 * n + 2, 5), dtype=np.int64),
-    )
+    runs = np.empty((2 * n + 2, 3), dtype=np.int64)
+    events = np.empty((2 * n + 2, 5), dtype=np.int64)
     n_runs, n_events = _place_rows(
         rows, stamps, n, period, hold, max_gap, state, ring, runs, events
     )

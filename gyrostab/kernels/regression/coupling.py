@@ -138,10 +138,8 @@ def fit_lags(laws: Laws, series: Array, driver: Array) -> LagFit:
     """
     n = series.shape[0]
     flat = laws.whiten.reshape(-1, n)  # one large product is faster than one for each law
-    y, x = (
-        (flat @ series).reshape(-1, n, series.shape[1]),
-        (flat @ driver).reshape(-1, n, driver.shape[1]),
-    )
+    y = (flat @ series).reshape(-1, n, series.shape[1])
+    x = (flat @ driver).reshape(-1, n, driver.shape[1])
     xx = np.maximum((x * x).sum(axis=1), 1e-30)[:, None, :]
     yy = (y * y).sum(axis=1)[:, :, None]
     xy = np.swapaxes(y, 1, 2) @ x

@@ -54,10 +54,8 @@ def level_tables(low: Array, high: Array, parts: int) -> tuple[Array, Array]:
     for _ in range(parts):
         stepped = low_end.copy()
         stepped[1] += low_end[0]
-        low_end, moved = (
-            low_end * to_low[0] + high_end * to_low[1],
-            stepped * to_high[0] + high_end * to_high[1],
-        )
+        low_end = low_end * to_low[0] + high_end * to_low[1]
+        moved = stepped * to_high[0] + high_end * to_high[1]
         high_end[..., 1:] = moved[..., :-1]
         high_end[..., 0] = 0.0
     chance, rises = np.stack([low_end, high_end], axis=3)

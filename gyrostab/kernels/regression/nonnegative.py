@@ -86,13 +86,11 @@ def solve_nonnegative(normal, right, allowed, solution, guess):  # type: ignore[
     """
     n = right.size
     room, members = np.empty((2 * n + 3, n)), np.empty(n, np.int64)
-    scaled, work, scale, scaled_right, trial = (
-        room[:n],
-        room[n : 2 * n],
-        room[2 * n],
-        room[2 * n + 1],
-        room[2 * n + 2],
-    )
+    scaled = room[:n]
+    work = room[n : 2 * n]
+    scale = room[2 * n]
+    scaled_right = room[2 * n + 1]
+    trial = room[2 * n + 2]
     for i in range(n):
         scale[i] = 1.0 / np.sqrt(normal[i, i]) if normal[i, i] > 0.0 else 0.0
     for i in range(n):

@@ -179,24 +179,18 @@ def block_samples(x, centred, moments, counts):  # type: ignore[no-untyped-def]
             if i > 0 and value == row[i - 1] and value != 0.0:
                 lows_again += value == low
                 highs_again += value == high
-        counts[b, 0], counts[b, 1], counts[b, 2], counts[b, 3], counts[b, 4] = (
-            present,
-            zeros,
-            repeats,
-            lows,
-            highs,
-        )
-        counts[b, 5], counts[b, 6], counts[b, 7], counts[b, 8] = (
-            lows_again,
-            highs_again,
-            runs,
-            zero_runs,
-        )
-        moments[b, 0], moments[b, 1], moments[b, 2] = (
-            mean,
-            second / max(present, 1),
-            fourth / max(present, 1),
-        )
+        counts[b, 0] = present
+        counts[b, 1] = zeros
+        counts[b, 2] = repeats
+        counts[b, 3] = lows
+        counts[b, 4] = highs
+        counts[b, 5] = lows_again
+        counts[b, 6] = highs_again
+        counts[b, 7] = runs
+        counts[b, 8] = zero_runs
+        moments[b, 0] = mean
+        moments[b, 1] = second / max(present, 1)
+        moments[b, 2] = fourth / max(present, 1)
         moments[b, 3], moments[b, 4] = low, high
         if present == 0:
             moments[b, :] = np.nan

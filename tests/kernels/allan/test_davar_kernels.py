@@ -20,11 +20,9 @@ class TestKernels:
         rng = np.random.default_rng(seed)
         if in_a_row:
             count = CONSECUTIVE_LAGS if count > 2 else 4
-        sizes, first, place = (
-            rng.integers(0, longest, count),
-            int(rng.integers(0, 9)),
-            int(rng.integers(0, 3)),
-        )
+        sizes = rng.integers(0, longest, count)
+        first = int(rng.integers(0, 9))
+        place = int(rng.integers(0, 3))
         lags = (
             rng.integers(1, 40) + np.arange(-2, count)
             if in_a_row

@@ -103,10 +103,8 @@ def test_nonnegative_solutions_equal_scipy_from_any_first_trial(allowed):
             data = data / 10 + (design / abs(design).max(axis=1, keepdims=True)) @ rng.uniform(
                 0.5, 1.0, 5
             )
-        normal, right = (
-            np.einsum("pni,pnj->pij", design, design),
-            np.einsum("pni,pn->pi", design, data),
-        )
+        normal = np.einsum("pni,pnj->pij", design, design)
+        right = np.einsum("pni,pn->pi", design, data)
         guess = rng.integers(0, 2, (8, 5)) * np.isin(np.arange(5), members)
         squares, terms = nonnegative_eight(normal, right, allowed, guess.astype(float))
         for place in range(8):

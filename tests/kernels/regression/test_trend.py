@@ -34,10 +34,8 @@ def test_means_and_slopes_agree_with_extended_precision(offset):
 
 
 def test_windows_without_mean_or_slope():
-    values, seconds = (
-        np.array([np.nan, np.inf, 3.0, np.nan, 5.0]),
-        np.array([0.0, 1.0, 2.0, 3.0, 2.0]),
-    )
+    values = np.array([np.nan, np.inf, 3.0, np.nan, 5.0])
+    seconds = np.array([0.0, 1.0, 2.0, 3.0, 2.0])
     first, last = np.array([0, 1, 2, 3, 4]), np.array([2, 3, 5, 3, 5])
     got = window_trend(values, seconds, first, last)
     np.testing.assert_array_equal(got, [[np.nan, 3.0, 4.0, np.nan, 5.0], [np.nan] * 5])
