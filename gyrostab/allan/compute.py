@@ -97,9 +97,8 @@ def compute_unit(
 ) -> tuple[list[Floats], Floats]:
     """Compute one unit: the fields of the cells, see `Cells`, and plane fields (6, n_windows)."""
     cells, means = surface_unit(x, unit, space)
-    scale = (
-        HOUR if unit.angle else 1.0
-    )  # angles are in degree, so their slopes in degree per second
+    # angles are in degree, so their slopes in degree per second
+    scale = HOUR if unit.angle else 1.0
     if unit.angle:
         cells.avar[:] *= scale**2
     means[0] *= scale

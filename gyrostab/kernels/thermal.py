@@ -297,9 +297,8 @@ def mean_dead_band_distance(
     array([ 2.19, -1.25])
     """
     at, line = _polygon_corners(value_times, values, begin, end)
-    corner = (
-        np.arange(8 * (at.size - 1) + 1) / 8.0
-    )  # the slider starts and stops between the corners of the polygon
+    # the slider starts and stops between the corners of the polygon
+    corner = np.arange(8 * (at.size - 1) + 1) / 8.0
     at, line = (
         np.interp(corner, np.arange(at.size), at),
         np.interp(corner, np.arange(at.size), line),

@@ -232,9 +232,8 @@ def _merge_windows(
         weighted = np.logical_or.reduceat(part["estimator"].values == _WEIGHTED, edges, axis=0)
         number = np.add.reduceat(np.isfinite(avar).astype(float), edges, axis=0)
         total = np.add.reduceat(np.nan_to_num(avar, nan=0.0), edges, axis=0)
-        has_mean = (number > 0) & (
-            total >= 0.0
-        )  # the published recursion drifts below zero where there is almost no noise
+        # the published recursion drifts below zero where there is almost no noise
+        has_mean = (number > 0) & (total >= 0.0)
         mean = np.divide(total, number, out=np.full_like(total, np.nan), where=has_mean)
         cells.append((np.sqrt(mean), weighted & np.isfinite(mean)))
     return cells, merged

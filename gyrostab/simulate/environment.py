@@ -335,9 +335,8 @@ def supply(
 
     def voltage(t: Array) -> Array:
         used = np.clip(t / end, 0.0, 1.0)
-        level = full - (full - empty) * (
-            0.5 * used**2 + 0.5 * used**8
-        )  # a plateau that sags, then the end
+        # a plateau that sags, then the end
+        level = full - (full - empty) * (0.5 * used**2 + 0.5 * used**8)
         for begin, until, drop in table:
             level = level - drop * ((t >= begin) & (t < until))
         return np.asarray(level)

@@ -737,7 +737,6 @@ def test_strong_ramp_fits_in_windows_with_gaps(block):
     ]
     assert fails[0] <= 0.02
     assert block == 5 or fails[1] > 0.15
-    old = surface.drop_vars(
-        "ramp_response"
-    )  # as a version wrote it that took the response of a ramp as 1
+    # as a version wrote it that took the response of a ramp as 1
+    old = surface.drop_vars("ramp_response")
     xr.testing.assert_equal(fit_noise(old), fit_noise(bare).drop_vars("ramp_response"))

@@ -277,9 +277,8 @@ def test_autocorrelation_lowers_the_effective_samples():
     few = gyrostab.correlate(coupled.product(noises="walk", terms=False), max_lag=0)[
         "effective_samples"
     ].sel(driver="temperature")
-    assert (
-        20 < float(many.median()) <= 60
-    )  # 108 windows that overlap by half, in blocks of a window
+    # 108 windows that overlap by half, in blocks of a window
+    assert 20 < float(many.median()) <= 60
     assert float(few.median()) < 20
 
 

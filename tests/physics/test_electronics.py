@@ -105,9 +105,8 @@ def test_resets_add_their_angles_in_both_directions(part):
     turn = effect.turn * NRAD_PER_S
     assert effect.turn == pytest.approx(1.45 * 1550e-9 / 0.2 * 1e9)
     t = np.arange(300) / 50.0
-    w = turn * (
-        9.3 * np.cos(2 * np.pi * t / 4.1) + 1.7
-    )  # up to eleven resets in a second, forth and back
+    # up to eleven resets in a second, forth and back
+    w = turn * (9.3 * np.cos(2 * np.pi * t / 4.1) + 1.7)
     error = run(effect, size=300, rate=50.0, axes="x", signal=w)[0] - w
     truth = reset_truth(effect, w, 50.0, 300)
     np.testing.assert_allclose(error, truth, atol=0.012 * np.abs(truth).max())
@@ -191,9 +190,8 @@ def test_resets_of_a_real_gyro_match_the_model(recordings):
     assert kick == pytest.approx(11.5, rel=0.06)
     assert tail == pytest.approx(18.0, rel=0.08)
     before, after = avar([measured, measured - model], 200.0, [0.005, 0.02, 0.1, 1.0])
-    np.testing.assert_allclose(
-        (after / before)[:2], [0.69, 0.18], rtol=0.05
-    )  # the rest of the first is noise of its own
+    # the rest of the first is noise of its own
+    np.testing.assert_allclose((after / before)[:2], [0.69, 0.18], rtol=0.05)
 
     def by_phase(rates):
         return np.array(
@@ -277,9 +275,8 @@ def test_shared_noise_shows_in_the_cross_axis_covariance_only():
         own[:, :2], np.tile([[0.005**2 + r**2] for r in (0.004, 0.003, 0)], (1, 2)), rtol=0.04
     )
     plus, minus = avar([x + y, x - y], 20.0, taus) * taus / 3600
-    np.testing.assert_allclose(
-        (plus - minus)[:2] / 4, 0.004 * -0.003, rtol=0.12
-    )  # negative: the modulation of y is turned
+    # negative: the modulation of y is turned
+    np.testing.assert_allclose((plus - minus)[:2] / 4, 0.004 * -0.003, rtol=0.12)
     plus, minus = avar([x + z, x - z], 20.0, taus) * taus / 3600
     assert np.all(np.abs(plus - minus)[:2] / 4 < 0.1 * 0.004 * 0.003)
     assert make_effect(effect).explain(windows_of(100, 20.0, 1.0)).coherent

@@ -74,9 +74,8 @@ def test_jumps_come_at_restarts_and_shocks_only():
     )
     moved = np.diff(shocks, axis=1)
     times = np.flatnonzero(moved[0])
-    assert times.size == pytest.approx(
-        2 * 400, rel=0.1
-    )  # a jump inside of a sample shows in two differences
+    # a jump inside of a sample shows in two differences
+    assert times.size == pytest.approx(2 * 400, rel=0.1)
     np.testing.assert_array_equal(times, np.flatnonzero(moved[1]))
     assert np.square(shocks[:, -1]).sum() > 0
     assert (

@@ -48,9 +48,8 @@ def test_moving_average_reduces_noise_at_short_times_only():
         done[0, 7:], np.convolve(noise[0], np.full(8, 1 / 8), "valid"), rtol=1e-9, atol=1e-12
     )
     ratio = avar(done, 100.0, [0.01, 0.08, 4.0])[0] / avar(noise, 100.0, [0.01, 0.08, 4.0])[0]
-    np.testing.assert_allclose(
-        ratio[0], 1 / 64, rtol=0.03
-    )  # difference of neighbours: 2 / 64 instead of 2
+    # difference of neighbours: 2 / 64 instead of 2
+    np.testing.assert_allclose(ratio[0], 1 / 64, rtol=0.03)
     weights = np.convolve(np.repeat([1.0, -1.0], 8), np.full(8, 1 / 8))
     assert ratio[1] == pytest.approx((weights**2).sum() / 16, rel=0.03)
     assert ratio[2] == pytest.approx(1.0, abs=0.03)
@@ -73,9 +72,8 @@ def test_point_sampling_aliases_and_averaging_does_not():
     f = np.fft.rfftfreq(folded.size, 0.05)
     spectrum = np.abs(np.fft.rfft(folded)) / folded.size * 2
     assert f[spectrum.argmax()] == pytest.approx(7.0)  # 53 - 3 * 20
-    assert spectrum.max() == pytest.approx(
-        np.sinc(53 / 160), rel=1e-3
-    )  # the instrument averages over a 160th of a second
+    # the instrument averages over a 160th of a second
+    assert spectrum.max() == pytest.approx(np.sinc(53 / 160), rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -185,9 +183,8 @@ def test_bit_errors_are_bits():
 
 def test_held_samples_are_runs_that_raise_n_at_long_times():
     noise = np.random.default_rng(9).normal(size=(2, 400_000))
-    effect = build_effect(
-        "held_samples", per_hour=720, length=0.4
-    )  # at 10 Hz: every 50 samples, for 4
+    # at 10 Hz: every 50 samples, for 4
+    effect = build_effect("held_samples", per_hour=720, length=0.4)
     done = run(effect, size=400_000, axes="xy", signal=noise)
     same = np.diff(done, axis=1) == 0
     np.testing.assert_array_equal(same[0], same[1])
@@ -197,9 +194,8 @@ def test_held_samples_are_runs_that_raise_n_at_long_times():
     assert same[0].sum() / starts == pytest.approx(4.0, rel=0.05)
     ratio = (avar(done, 10.0, [0.1, 20.0]) / avar(noise, 10.0, [0.1, 20.0])).mean(axis=0)
     assert ratio[0] == pytest.approx(1 - share, rel=0.02)
-    exact = (1 + 0.02 * (2 * 4 + 28)) / (
-        1 + 0.02 * 4
-    )  # E[(1 + h)^2] / E[1 + h], h geometric of mean 4 with the chance 1/50
+    # E[(1 + h)^2] / E[1 + h], h geometric of mean 4 with the chance 1/50
+    exact = (1 + 0.02 * (2 * 4 + 28)) / (1 + 0.02 * 4)
     assert ratio[1] == pytest.approx(exact, rel=0.08)
     growth = effect.explain(windows_of(1000, 10.0, 10.0)).level[("N", "per_hour")][0]
     assert 720 * growth == pytest.approx(2 * 0.02 * 16, rel=1e-9)
@@ -238,9 +234,8 @@ def test_a_fast_clock_reads_too_little_on_all_axes():
     effect = build_effect("clock_error", error=100)
     w = np.array([[3.888e6], [-1e6], [0.0]])
     done = run(effect, size=1000, signal=w)
-    np.testing.assert_allclose(
-        done - w, -1e-4 * np.broadcast_to(w, done.shape), rtol=1e-9
-    )  # 100 ppm of 180 r/min: 388.8 deg/h
+    # 100 ppm of 180 r/min: 388.8 deg/h
+    np.testing.assert_allclose(done - w, -1e-4 * np.broadcast_to(w, done.shape), rtol=1e-9)
     own = {axis: np.full(10, value) for axis, value in zip("xyz", w[:, 0], strict=True)}
     prediction = effect.explain(windows_of(1000, 10.0, 10.0, axes=("x", "y", "z"), own=own)).mean[
         "error"

@@ -174,20 +174,17 @@ def test_random_walk_persists_where_rectification_reverts():
     taus = [0.02, 0.1, 1.0]
     inside = davar(walk, window="200s", step="50s", taus=taus)
     law = LAWS["K"].avar(inside.tau.values, 2.0 * 4.0)
-    np.testing.assert_allclose(
-        inside.avar.values[:, 7, :2], np.tile(law[:2], (2, 1)), rtol=0.1
-    )  # 350 to 550 s
+    # 350 to 550 s
+    np.testing.assert_allclose(inside.avar.values[:, 7, :2], np.tile(law[:2], (2, 1)), rtol=0.1)
     np.testing.assert_allclose(inside.avar.values[:, 7, 2], law[2], rtol=0.35)
     assert np.all(inside.avar.values[:, [0, 2, 12, 14]] < 1e-12)
     other = davar(step, window="200s", step="50s", taus=taus)
     assert np.all(other.avar.values[:, 7] < 1e-12)
     tau = other.tau.values
-    edge = (
-        0.8**2 * tau / (3 * (200 - 2 * tau)) * (1 + 0.5 / (tau * 50) ** 2)
-    )  # a step between two samples is sharper than one of a walk
-    np.testing.assert_allclose(
-        other.avar.values[:, 3], np.tile(edge, (2, 1)), rtol=1e-3
-    )  # 150 to 350 s
+    # a step between two samples is sharper than one of a walk
+    edge = 0.8**2 * tau / (3 * (200 - 2 * tau)) * (1 + 0.5 / (tau * 50) ** 2)
+    # 150 to 350 s
+    np.testing.assert_allclose(other.avar.values[:, 3], np.tile(edge, (2, 1)), rtol=1e-3)
     assert math.sqrt(3 * other.avar.values[0, 3, 2] / tau[2] * HOUR) == pytest.approx(3.4, rel=0.01)
     ends = walk.rate.values[:, -1]
     assert np.all(ends == walk.rate.values[:, 31_000])

@@ -66,9 +66,8 @@ def test_shupe_matches_heat_conduction_through_a_winding():
     away = np.min([np.abs(np.arange(2500) - edge) for edge in (100, 1300)], axis=0) > 5
     np.testing.assert_allclose(bias[away], truth[away], atol=0.004)
     assert abs(truth).max() > 0.25
-    assert bias[1290] == pytest.approx(
-        0.2 * 1.5, rel=0.03
-    )  # the plateau, where the halves climb alike
+    # the plateau, where the halves climb alike
+    assert bias[1290] == pytest.approx(0.2 * 1.5, rel=0.03)
     late = bias[1700:2300]  # only the slowest mode is left
     assert -1.0 / np.polyfit(np.arange(late.size), np.log(abs(late)), 1)[0] == pytest.approx(
         lag, rel=1e-3
@@ -400,9 +399,8 @@ def test_a_bias_that_ages_steadily_is_a_rate_ramp():
     log = simulate({"effect": [effect], "noise": {}, "log": {"rate": 1, "duration": "2h"}})
     taus = np.array([1.0, 60.0, 600.0])
     variance = avar(log.rate.sel(axis="x").values, 1.0, taus)[0]
-    np.testing.assert_allclose(
-        variance, LAWS["R"].avar(taus, 1.0), rtol=1e-6
-    )  # 24 deg/h/day are 1 deg/h^2
+    # 24 deg/h/day are 1 deg/h^2
+    np.testing.assert_allclose(variance, LAWS["R"].avar(taus, 1.0), rtol=1e-6)
     assert float(log.rate.sel(axis="x")[-1]) == pytest.approx(2.0, abs=3e-4)
 
 

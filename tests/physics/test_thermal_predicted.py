@@ -106,12 +106,10 @@ def test_predicted_window_means_are_the_generated_ones(table):
     if table["name"] not in ("warm_up",):  # the windows' mean temperature has no holes here
         means = np.array([bias[row].mean() for row in rows])
         good[:] = True
-    good[0] = (
-        table["name"] == "warm_up"
-    )  # what happened before the middle of the first window is not known to the prediction
-    good[-1] = (
-        "sensor_lag" not in table
-    )  # nor how the change goes on after the middle of the last one
+    # what happened before the middle of the first window is not known to the prediction
+    good[0] = table["name"] == "warm_up"
+    # nor how the change goes on after the middle of the last one
+    good[-1] = "sensor_lag" not in table
     spread = np.ptp(means[good])
     assert spread > 0
     np.testing.assert_allclose(

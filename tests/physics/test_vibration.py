@@ -140,9 +140,8 @@ def test_band_is_aliased_to_the_expected_frequencies():
     power = np.abs(np.fft.rfft(x)) ** 2
     f = np.fft.rfftfreq(x.size, 1 / 400.0)
     assert power[(f > 2) & (f < 97)].sum() / power.sum() > 0.93
-    slower, _ = run(
-        effect, size=2**17, rate=500.0, drivers={"vibration": 2.0}
-    )  # now it lies at 200 to 250 Hz
+    # now it lies at 200 to 250 Hz
+    slower, _ = run(effect, size=2**17, rate=500.0, drivers={"vibration": 2.0})
     power = np.abs(np.fft.rfft(slower)) ** 2
     f = np.fft.rfftfreq(slower.size, 1 / 500.0)
     assert power[f > 195].sum() / power.sum() > 0.95
@@ -169,12 +168,10 @@ def test_a_faster_instrument_and_a_mean_make_integrate_and_dump():
     np.testing.assert_allclose(
         sigma(fast.rate.values, 400, taus), sigma(slow.rate.values, 400, taus), rtol=0.05
     )
-    inside = np.sqrt(
-        np.mean(np.sinc(np.linspace(700.0, 800.0, 1001) / 400.0) ** 2)
-    )  # of the mean over a sample, in the default band
-    assert fast.rate.values.std() == pytest.approx(
-        50.0 * inside, rel=0.06
-    )  # 3.74; seeds scatter by 2 %
+    # of the mean over a sample, in the default band
+    inside = np.sqrt(np.mean(np.sinc(np.linspace(700.0, 800.0, 1001) / 400.0) ** 2))
+    # 3.74; seeds scatter by 2 %
+    assert fast.rate.values.std() == pytest.approx(50.0 * inside, rel=0.06)
 
 
 def test_an_empty_band_is_refused():
@@ -207,9 +204,8 @@ def test_rectified_vibration_steps_the_mean_and_looks_like_k_at_its_edges_only()
     assert not np.any(log.rate.sel(axis=["y", "z"]).values)
     surface = davar(log, window="200s", step="50s", taus=[1.0, 5.0, 20.0])
     step, tau, length = 0.1, surface.tau.values, 200.0
-    across = (
-        surface.sel(axis="x").isel(time=slice(3, 6)).avar.values
-    )  # 150..350, 200..400, 250..450: the edge is 50 s inside or more
+    # 150..350, 200..400, 250..450: the edge is 50 s inside or more
+    across = surface.sel(axis="x").isel(time=slice(3, 6)).avar.values
     np.testing.assert_allclose(
         across, np.tile(step**2 * tau / (3 * (length - 2 * tau)), (3, 1)), rtol=0.02
     )

@@ -224,9 +224,8 @@ def test_values_limits_and_unobservable_spans_of_the_coefficients(windows):
         for line in figure.axes[0].lines
         if line.get_linestyle() == "None" and line.get_marker() == "s"
     ]
-    assert (
-        windows == 40 or lone
-    )  # Q is observed in every other window only: its points stand alone and are still drawn
+    # Q is observed in every other window only: its points stand alone and are still drawn
+    assert windows == 40 or lone
 
 
 def test_standard_errors_are_drawn(product):

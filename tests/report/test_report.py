@@ -67,9 +67,8 @@ def page(tmp_path_factory) -> _Page:
 
 def test_page_is_self_contained(page):
     assert all(link.startswith("data:image/png;base64,") for link in page.links)
-    assert (
-        len(page.images) == 7
-    )  # signal, coefficients, two maps, one window for each of three axes
+    # signal, coefficients, two maps, one window for each of three axes
+    assert len(page.images) == 7
     for image in page.images:
         assert base64.b64decode(image.split(",")[1]).startswith(b"\x89PNG")
 

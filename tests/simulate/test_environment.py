@@ -43,9 +43,8 @@ def test_trip_reaches_the_rock_and_circulation_cools_it():
     assert down.temperature.values[89999] == pytest.approx(105.0, abs=0.01)
     assert down.temperature.values[-1] == pytest.approx(15 + 0.6 * 90, abs=0.01)
     middle = down.temperature.values[18000:30000]
-    np.testing.assert_allclose(
-        np.diff(middle) * 60, 300 * 0.03 / 60, rtol=1e-6
-    )  # 300 m/h: 0.15 degC/min
+    # 300 m/h: 0.15 degC/min
+    np.testing.assert_allclose(np.diff(middle) * 60, 300 * 0.03 / 60, rtol=1e-6)
 
 
 @pytest.mark.parametrize("stick_slip", [0.0, 1.0])

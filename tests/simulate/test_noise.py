@@ -216,9 +216,8 @@ def test_axes_and_seeds_are_independent(size):
             for axis in "xyz"
         ]
     )
-    correlation = np.corrcoef(np.diff(made)) - np.eye(
-        6
-    )  # differences, for what wanders is never far from correlated
+    # differences, for what wanders is never far from correlated
+    correlation = np.corrcoef(np.diff(made)) - np.eye(6)
     assert np.abs(correlation).max() < 6.0 / np.sqrt(40_000)
 
 

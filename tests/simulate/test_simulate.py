@@ -308,9 +308,8 @@ def test_blocks_in_any_order_from_any_thread_are_those_of_the_whole():
 
 
 def test_a_copy_in_another_process_gives_the_same(monkeypatch):
-    monkeypatch.setattr(
-        drivers, "SHORT", 100
-    )  # channels that are read stretch by stretch travel too
+    # channels that are read stretch by stretch travel too
+    monkeypatch.setattr(drivers, "SHORT", 100)
     log = simulate(model(), seed=2, chunk=300)
     late = log.rate.data[:, 1500:].compute()
     copy = cloudpickle.loads(cloudpickle.dumps(log.rate.data))

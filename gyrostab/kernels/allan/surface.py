@@ -338,9 +338,8 @@ def surface_unit(
         if gaps
         else (np.zeros(1, np.int64), np.full(1, x.size))
     )
-    offset = (
-        float(np.rint(mean)) if counts_only else mean
-    )  # integers less an integer: every sum is exact
+    # integers less an integer: every sum is exact
+    offset = float(np.rint(mean)) if counts_only else mean
     work = _Work(x, unit, space, n_windows, starts, stops, offset)
     sums, counts = _strict_sums(work, gaps)
     full = full_counts(unit.lengths, unit.step, n_windows, unit.shifts)
@@ -415,9 +414,8 @@ def _average_windows(
     if unit.angle:
         return _angle_means(x, unit, n_windows), np.nan, np.array([float(np.isfinite(x).sum())])
     base = first_present(x)
-    heads, tails = block_sums(
-        x, base, unit.window, unit.step, n_windows
-    )  # less the first sample: small on a tool that turns
+    # less the first sample: small on a tool that turns
+    heads, tails = block_sums(x, base, unit.window, unit.step, n_windows)
     total, present = heads.sum(axis=0) + tails.sum(axis=0)
     windows = np.empty((n_windows, 2))
     windows_from_blocks(heads, tails, np.full(2, unit.window // unit.step), windows)

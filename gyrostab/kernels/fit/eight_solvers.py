@@ -125,9 +125,8 @@ def solve_terms(scaled, right, terms, solution, work):  # type: ignore[no-untype
         _TERMS
     ):  # Cholesky factor, its diagonal inverted, and forward solution, row by row
         member = take(terms, i)
-        pivot = take(scaled, 6 * i) * (1.0 + 1e-12) * member + (
-            1.0 - member
-        )  # a term outside the set stands alone
+        # a term outside the set stands alone
+        pivot = take(scaled, 6 * i) * (1.0 + 1e-12) * member + (1.0 - member)
         total = take(right, i) * member
         for j in range(i):
             share = take(scaled, 5 * i + j) * member * take(terms, j)

@@ -195,9 +195,8 @@ def cell_limits(curves, squares, dof, columns, own_dof, ks, span, max_freedom, q
             for a in range(5):
                 if ks[i] * span[a] < ks[last]:
                     continue
-                best = (
-                    full_quantiles[i, a] if share <= 1.0 else 1.0
-                )  # fewer degrees of freedom have a lower quantile
+                # fewer degrees of freedom have a lower quantile
+                best = full_quantiles[i, a] if share <= 1.0 else 1.0
                 if model >= lowest[a] * best * per_square[a]:
                     continue
                 lowest_share = _cell_quantile(

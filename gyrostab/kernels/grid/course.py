@@ -116,9 +116,8 @@ def _extend_hypothesis(new, size, old, h, position, following, sigma, gain, hold
             size = _keep_hypothesis(new, size, level + jump, phase + gain * residual, dear, h)
         jump -= 1.0
     ahead = np.rint(following - level - phase)
-    if (
-        1.0 <= ahead <= max_lost and abs(ahead - off) > _REACH_SIGMA * sigma + 0.5
-    ):  # a loss of which the next row shows the end
+    # a loss of which the next row shows the end
+    if 1.0 <= ahead <= max_lost and abs(ahead - off) > _REACH_SIGMA * sigma + 0.5:
         dear = cost + _switch_nats(ahead) + _stamp_nats(off - ahead, weight)
         size = _keep_hypothesis(new, size, level + ahead, phase, dear, h)
     return size

@@ -109,9 +109,8 @@ def track(stamps, period, gain, longest):  # type: ignore[no-untyped-def]
             phase = 0.0
             continue
         moved = step + phase
-        if (
-            low < moved < high
-        ):  # nearly always one sample; the next stamp shows it without a division
+        # nearly always one sample; the next stamp shows it without a division
+        if low < moved < high:
             count[i] = count[i - 1] + 1
             phase = (1.0 - gain) * (moved - period)
             continue

@@ -107,9 +107,8 @@ def _mean_moments(samples: Array) -> tuple[Array, Array, Array]:
     weight = np.tanh(a / 2.0) / a
     with np.errstate(over="ignore"):
         exact = 2.0 * (a - decay) / a**2 - 2.0 * weight * decay / a
-    rest_variance = np.where(
-        a < 0.01, a / 6.0 - a**3 / 60.0, exact
-    )  # the difference loses its digits where the process is slow
+    # the difference loses its digits where the process is slow
+    rest_variance = np.where(a < 0.01, a / 6.0 - a**3 / 60.0, exact)
     return decay, weight, rest_variance
 
 

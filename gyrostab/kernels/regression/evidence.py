@@ -72,15 +72,13 @@ def mixed_evidence(base: Array, rotated: Array, eigenvalues: Array, widths: Arra
     -------
     ndarray, shape (design, record)
     """
-    spread = (
-        1.0 + widths[:, None, None] * eigenvalues.transpose(0, 2, 1)[:, None]
-    )  # (design, width, p, grid)
+    # (design, width, p, grid)
+    spread = 1.0 + widths[:, None, None] * eigenvalues.transpose(0, 2, 1)[:, None]
     share = 0.5 * widths[:, None, None] / spread
     constant = -np.log(widths.size) - 0.5 * np.log(spread).sum(axis=2)
     terms, best = _mixture_terms(base, rotated, constant, share)
-    return np.asarray(
-        best + np.log(np.exp(terms, out=terms).sum(axis=2))
-    )  # numpy takes many exponentials at once
+    # numpy takes many exponentials at once
+    return np.asarray(best + np.log(np.exp(terms, out=terms).sum(axis=2)))
 
 
 @njit(**KERNEL)

@@ -47,9 +47,8 @@ def sample_covariance(size: int, rate: float) -> Array:
     inner = np.log(np.maximum(lag, 1.0)) * lag**2
     distance = np.maximum(lag[:-1], 1.0)
     out[2] = _second_difference(0.75 * lag**2 - 0.5 * inner) / math.pi
-    series = (
-        -(np.log(distance) - 1.0 / (12.0 * distance**2)) / math.pi
-    )  # of the second difference, which loses its digits far out
+    # of the second difference, which loses its digits far out
+    series = -(np.log(distance) - 1.0 / (12.0 * distance**2)) / math.pi
     out[2] = np.where(lag[:-1] > 1000.0, series, out[2])
     out[3] = np.where(lag[:-1] > 0.0, -lag[:-1] / 2.0, -1.0 / 6.0) / rate
     return out

@@ -300,9 +300,8 @@ def band_covariance(size: int) -> Array:
     expected, mask, squared = (
         part[0] for part in gap_spectra(np.ones((1, size), np.bool_), taper(size))
     )
-    squared = np.concatenate(
-        [squared, squared[1 : (size + 1) // 2][::-1].conj()]
-    )  # of all frequencies
+    # of all frequencies
+    squared = np.concatenate([squared, squared[1 : (size + 1) // 2][::-1].conj()])
     band = np.searchsorted(edges, np.arange(1, n + 1), side="right") - 1
     out = np.zeros((edges.size - 1, edges.size - 1))
     for apart in range(1, min(_APART, n)):

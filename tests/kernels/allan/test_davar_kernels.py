@@ -30,9 +30,8 @@ class TestKernels:
         )
         splits = rng.integers(0, sizes + 1)
         used = lags[2:]
-        theta = np.full(
-            first + longest + 2 * used.max() + 2 * LANES, np.nan
-        )  # elements that no term needs may have any value
+        # elements that no term needs may have any value
+        theta = np.full(first + longest + 2 * used.max() + 2 * LANES, np.nan)
         end = first + (sizes + 2 * used).max()
         theta[first:end] = rng.standard_normal(end - first)
         heads, tails = np.full((2, count + 4), 7.0)

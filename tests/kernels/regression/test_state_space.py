@@ -32,9 +32,8 @@ def relaxation_covariance(edges: np.ndarray, time: float) -> np.ndarray:
 
 def dense(columns, variance, step, present, K2, ou_variance, ou_time):
     edges = np.concatenate([[0.0], np.cumsum(step)])
-    V = np.diag(variance) + walk_covariance(
-        np.concatenate([[0.0], np.cumsum(K2 * step)])
-    )  # it walks by its own clock
+    # it walks by its own clock
+    V = np.diag(variance) + walk_covariance(np.concatenate([[0.0], np.cumsum(K2 * step)]))
     for v, time in zip(ou_variance, ou_time, strict=True):
         V = V + v * relaxation_covariance(edges, time)
     V, X, constant = V[np.ix_(present, present)], columns[present], np.ones(present.sum())

@@ -18,9 +18,8 @@ def test_covariance_in_white_noise_is_that_of_simulated_windows():
     mean = average_windows(np.repeat(np.arange(3), 4))
     white = white_covariance(mean, np.arange(12) * 30.0, 60.0, np.ones(12))
     blocks = windows @ mean.toarray().T
-    np.testing.assert_allclose(
-        np.cov(blocks.T) * 2, white, atol=0.02
-    )  # a full window of two cells has variance 1/2
+    # a full window of two cells has variance 1/2
+    np.testing.assert_allclose(np.cov(blocks.T) * 2, white, atol=0.02)
 
 
 @pytest.mark.parametrize("memory", [15.0, 100.0, 5000.0])
