@@ -227,11 +227,9 @@ def format_product(product: xr.Dataset) -> str:
     ]
     rows = [("axis", "term", "median", "5 % to 95 %", "unit", "observed in")]
     for term in summarise_terms(product):
-        spread = (
-            f"{_number_text(term.low)} to {_number_text(term.high)}"
-            if term.status == "observed"
-            else ""
-        )
+        spread = ""
+        if term.status == "observed":
+            spread = f"{_number_text(term.low)} to {_number_text(term.high)}"
         sign = "< " if term.status == "upper_limit_only" else ""
         rows.append(
             (
@@ -341,11 +339,9 @@ def _describe_outliers(product: xr.Dataset) -> list[str]:
         for axis, counts in worst.items()
         if counts.size and counts.max() > 0
     ]
-    return (
-        [f"Outliers, single samples far from both neighbours: {', '.join(affected)}."]
-        if affected
-        else []
-    )
+    if affected:
+        return [f"Outliers, single samples far from both neighbours: {', '.join(affected)}."]
+    return []
 
 
 def _describe_losses(product: xr.Dataset) -> list[str]:

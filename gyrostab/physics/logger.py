@@ -197,11 +197,9 @@ class LoggerFilter(Effect):
         return np.asarray(response.sum(axis=-1))
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        parts = (
-            [f"low-pass of order {int(self.order)} at {self.quantity('cutoff', errors)}"]
-            if self.cutoff
-            else []
-        )
+        parts = []
+        if self.cutoff:
+            parts = [f"low-pass of order {int(self.order)} at {self.quantity('cutoff', errors)}"]
         parts += [f"average over {self.quantity('length', errors)}"] if self.length else []
         sampling = (
             "filtered at the rate of the log"

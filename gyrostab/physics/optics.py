@@ -325,11 +325,8 @@ class FeedbackReset(Effect):
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         parts = [self.quantity("kick", errors)] if self.kick else []
-        parts += (
-            [f"{self.quantity('tail', errors)} within {self.quantity('decay', errors)}"]
-            if self.tail
-            else []
-        )
+        if self.tail:
+            parts += [f"{self.quantity('tail', errors)} within {self.quantity('decay', errors)}"]
         also = f", and a sawtooth of {self.quantity('sawtooth', errors)}" if self.sawtooth else ""
         size = " and ".join(parts) or "nothing"
         turn = f"one reset for {self.turn / 1e3:.4g} urad of rotation"

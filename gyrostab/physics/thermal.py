@@ -205,17 +205,11 @@ class Shupe(Effect):
         terms = (
             [self.quantity("sensitivity", errors)] if self.sensitivity or not self.transient else []
         )
-        terms += (
-            [f"{self.quantity('transient', errors)} while heat passes through the winding"]
-            if self.transient
-            else []
-        )
+        if self.transient:
+            terms += [f"{self.quantity('transient', errors)} while heat passes through the winding"]
         size = f"{' and '.join(terms)} {_with_lag(self, errors)}"
-        size += (
-            f", measured by a sensor that lags by {self.quantity('sensor_lag', errors)}"
-            if self.sensor_lag
-            else ""
-        )
+        if self.sensor_lag:
+            size += f", measured by a sensor that lags by {self.quantity('sensor_lag', errors)}"
         return (
             f"The bias follows the rate of change of the temperature {self.on_axes()}, by {size}."
         )
@@ -225,11 +219,9 @@ def _with_lag(effect: Shupe | ThermalGradient, errors: Mapping[str, float] | Non
     """Describe the lag, or its upper limit."""
     if effect.lag > _NO_LAG_S:
         return f"with a lag of {effect.quantity('lag', errors)}"
-    return (
-        f"with a lag of {NORMAL_95 * errors['lag']:.2g} s at most"
-        if errors and "lag" in errors
-        else "without a lag"
-    )
+    if errors and "lag" in errors:
+        return f"with a lag of {NORMAL_95 * errors['lag']:.2g} s at most"
+    return "without a lag"
 
 
 def _average_changes(windows: Windows, at: Array, values: Array, lag: float) -> Array:

@@ -263,11 +263,9 @@ class AliasedVibration(Effect):
         return folded_psd(density, frequency, rate, 3.0 * self.high, average=average)
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        mount = (
-            f", behind a mount with a resonance at {self.quantity('resonance', errors)}"
-            if self.resonance
-            else ""
-        )
+        mount = ""
+        if self.resonance:
+            mount = f", behind a mount with a resonance at {self.quantity('resonance', errors)}"
         sampling = "a point of it" if self.sampling == "point" else "its mean over the interval"
         size = self.quantity("sensitivity", errors)
         band = f"{self.low:.4g} to {self.high:.4g} Hz"

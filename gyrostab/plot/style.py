@@ -160,11 +160,9 @@ def log_edges(values: NDArray[Any]) -> NDArray[Any]:
 def window_text(product: xr.Dataset) -> str:
     """Describe window and step for a title; empty if the attributes are missing."""
     window, step = product.attrs.get("window_s"), product.attrs.get("step_s")
-    return (
-        ""
-        if window is None or step is None
-        else f"windows of {duration(float(window))} every {duration(float(step))}"
-    )
+    if window is None or step is None:
+        return ""
+    return f"windows of {duration(float(window))} every {duration(float(step))}"
 
 
 def axis_names(dataset: xr.Dataset, axis: str | None = None) -> list[str]:

@@ -333,11 +333,9 @@ def _make_plan(
         factors = _convert_units(effect, environment, present)
         steps.append(Step(effect, setup, rows, factors, _choose_sources(effect, measured)))
     needed = {name for step in steps for name in step.sources.values()}
-    turning = (
-        str(environment["rotation_rate"].attrs.get("rotation_axis", ""))
-        if "rotation_rate" in present
-        else ""
-    )
+    turning = ""
+    if "rotation_rate" in present:
+        turning = str(environment["rotation_rate"].attrs.get("rotation_axis", ""))
     if turning and turning not in frame.axes:
         raise OptionError(
             f"{model.source}: the tool rotates about the axis {turning!r}, which the log "
