@@ -11,6 +11,7 @@ every product variable; the stages and the export all read it.
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ __all__ = [
     "SIGNAL_UNITS",
     "VARIABLES",
     "attributes",
+    "check_coefficients",
     "check_log",
     "check_product",
     "check_raw",
@@ -230,8 +232,25 @@ def _require_variables(dataset: xr.Dataset, kind: str, dims: dict[str, tuple[str
         if (has := dataset.variables[name].dims) != expected:
             raise SchemaError(
                 f"{kind}: variable {name!r} has dimensions {has}, expected {expected}; "
-                "transpose or rename them"
+                f"{_advise_dimensions(has, expected)}"
             )
+
+
+def _advise_dimensions(has: tuple[Hashable, ...], expected: tuple[str, ...]) -> str:
+    """Advise what gives a variable the expected dimensions."""
+    lost = [name for name in expected if name not in has]
+    extra = [name for name in has if name not in expected]
+    if not lost and not extra:
+        order = ", ".join(map(repr, expected))
+        return f"call .transpose({order}, ...), or open a file with engine='gyrostab'"
+    if not extra:
+        return f"keep the dimension {lost[0]!r}, also to select one: .isel({lost[0]}=[0])"
+    if not lost:
+        return (
+            f"if datasets were concatenated along {extra[0]!r}, give xarray.concat "
+            "data_vars='minimal'"
+        )
+    return f"rename {extra[0]!r} to {lost[0]!r}"
 
 
 #: What a message calls a dataset -> the function that makes one.
@@ -307,7 +326,23 @@ def check_surface(surface: xr.Dataset) -> None:
             f"variable 'avar' has units {units!r}, expected {expected!r}; "
             "give the surface as gyrostab.davar made it"
         )
+    _check_labels(surface, "surface")
     _check_tau(surface)
+
+
+def _check_labels(dataset: xr.Dataset, kind: str) -> None:
+    """Windows have dates and times, and axes have names."""
+    for name, kinds, holds, example in (
+        ("time", "M", "dates and times", "times of datetime64"),
+        ("axis", "OTU", "names", "['x', 'y', 'z']"),
+    ):
+        labels = dataset[name].values
+        if labels.dtype.kind not in kinds or bool(dataset[name].isnull().any()):
+            shown = ", ".join(str(label) for label in labels[:3])
+            raise SchemaError(
+                f"{name!r} of the {kind} holds {shown}{', ...' if labels.size > 3 else ''}, not "
+                f"{holds}; give them with .assign_coords({name}=...), {example}"
+            )
 
 
 def _check_tau(surface: xr.Dataset) -> None:
@@ -340,11 +375,25 @@ def _check_tau(surface: xr.Dataset) -> None:
         )
 
 
+def check_coefficients(product: xr.Dataset) -> None:
+    """Raise `SchemaError` unless `product` holds the coefficients of every axis and window."""
+    _require_variables(product, "product", {"axis": ("axis",), "time": ("time",)})
+    for name in (f"{term}{end}" for term in TERMS for end in ("", "_stderr", "_upper")):
+        _require_variables(product, "product", {name: ("axis", "time")})
+    _require_variables(product, "product", {"observable": ("axis", "time", "term")})
+    terms = [str(term) for term in product["term"].values]
+    if terms != list(TERMS):
+        raise SchemaError(
+            f"'term' of the product holds {', '.join(terms)}, expected {', '.join(TERMS)}; "
+            "give the product with all terms"
+        )
+    _check_labels(product, "product")
+
+
 def check_product(product: xr.Dataset) -> None:
     """Raise `SchemaError` unless `product` is what `gyrostab.fit_noise` returns."""
     check_surface(product)
-    _require_variables(
-        product,
-        "product",
-        {**dict.fromkeys(TERMS, ("axis", "time")), "observable": ("axis", "time", "term")},
-    )
+    check_coefficients(product)
+    for name in ("fit_tau_min", "filter_time_constant", "filter_white_error"):
+        if name in product:
+            _require_variables(product, "product", {name: ("axis",)})

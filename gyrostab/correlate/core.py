@@ -14,7 +14,7 @@ from gyrostab.correlate.dataset import assemble
 from gyrostab.correlate.drivers import Driver, align_drivers, other_channels
 from gyrostab.correlate.fit import SIGNIFICANCE, fit_driver, fit_partial_effects, make_blocks
 from gyrostab.correlate.judge import VERDICTS, describe_coupling, slope_label
-from gyrostab.errors import OptionError
+from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import TERMS
 from gyrostab.schema import OBSERVED, check_product
 from gyrostab.time.durations import duration_seconds
@@ -85,6 +85,7 @@ def correlate(
     >>> result["window_mean_per_temperature"].sel(axis="x")          # doctest: +SKIP
     """
     check_product(product)
+    _check_windows(product)
     if not 0.5 <= level < 1.0:
         raise OptionError(
             f"level {level:g}: the level of an interval lies between 0.5 and 1, for instance 0.95"
@@ -125,6 +126,22 @@ def correlate(
         series_name = f"{names[v].replace('_', ' ')} of axis {product['axis'].values[a]}"
         entry["statement"] = describe_coupling(entry, drivers[d].label, series_name)
     return assemble(product, names, drivers, entries, level=level, longest=float(lags[-1] * step))
+
+
+def _check_windows(product: xr.Dataset) -> None:
+    """Raise `SchemaError` unless the product has windows, in the order of time, with bounds."""
+    if "time_bounds" not in product.variables or not product.sizes["time"]:
+        raise SchemaError(
+            "the product has no 'time_bounds', which hold start and end of each window; give it as "
+            "gyrostab.fit_noise or gyrostab.open_product returns it"
+            if product.sizes["time"]
+            else "the product has no window"
+        )
+    if (np.diff(product["time"].values) <= np.timedelta64(0)).any():
+        raise SchemaError(
+            "the windows of the product are not in the order of time, or occur twice; call "
+            ".sortby('time').drop_duplicates('time')"
+        )
 
 
 def _select_variables(product: xr.Dataset, variables: str | Sequence[str] | None) -> list[str]:

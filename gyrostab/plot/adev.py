@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.allan.variance import surface_columns, variance_name
-from gyrostab.errors import OptionError
+from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import (
     COLOURS,
@@ -21,6 +21,7 @@ from gyrostab.plot.style import (
     is_narrow,
     label_log_axis,
     new_figure,
+    require_coefficients,
     stack_panels,
     title_figure,
     unit_symbol,
@@ -65,6 +66,8 @@ def plot_adev(
         If `product` is not a surface or has no such axis, or `when` is outside the record.
     """
     check_surface(product)
+    if "observable" in product:
+        require_coefficients(product)
     (name,) = axis_names(product, axis)
     windows = (
         product.sel(axis=[name]).isel(time=[_select_window(product.sel(axis=name), when)]).compute()
@@ -152,6 +155,8 @@ def band(avar: Any, edf: Any) -> tuple[NDArray[Any], NDArray[Any]]:
 
 def _select_window(part: xr.Dataset, when: Any) -> int:
     time = part["time"].values.astype("datetime64[ns]")
+    if not time.size:
+        raise SchemaError("there is no window to draw: the time axis is empty")
     if when is None:
         coverage = part["window_coverage"].values
         best = (

@@ -14,6 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError, SchemaError
+from gyrostab.schema import check_coefficients
 from gyrostab.time.durations import format_duration
 from gyrostab.units import DAY, HOUR, INNER
 
@@ -421,3 +422,4 @@ def require_coefficients(product: xr.Dataset) -> None:
             "this surface holds no coefficients yet; call gyrostab.fit_noise (or 'gyrostab fit') "
             "first"
         )
+    check_coefficients(product.transpose("axis", "time", ..., missing_dims="ignore"))

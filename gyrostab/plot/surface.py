@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.allan.variance import variance_name
-from gyrostab.errors import OptionError
+from gyrostab.errors import OptionError, SchemaError
 from gyrostab.plot.style import (
     INCH_MM,
     PAGE_MM,
@@ -281,6 +281,8 @@ def _colour_bar(figure: Figure, mesh: Any, label: str, *, relative: bool) -> Non
 def find_time_edges(time: NDArray[Any], merged: int = 1, step: Any = None) -> NDArray[Any]:
     """Find the edges of the columns, half-way between window centres."""
     stamps = to_nanoseconds(time)
+    if not stamps.size:
+        raise SchemaError("there is no window to draw: the time axis is empty")
     half = (
         int(float(step) * 5e8)
         if step is not None

@@ -98,7 +98,12 @@ def product(
     for term in TERMS:
         kind = "flicker" if noises == "flicker" else "white"
         level = 0.01 * np.stack([1 + 0.1 * pair(noise(kind, cells, rng)) for _ in axes])
-        made[term] = (("axis", "time"), level, attributes(term))
+        for name, value in (
+            (term, level),
+            (f"{term}_stderr", 0.1 * level),
+            (f"{term}_upper", level),
+        ):
+            made[name] = (("axis", "time"), value, attributes(name))
     flags = np.zeros((*shape, len(TERMS)), np.int8)
     if terms:
         flags[..., [1, 2]] = 2

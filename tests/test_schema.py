@@ -1,0 +1,95 @@
+"""What the checks of a surface and a product refuse, and what their messages advise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import gyrostab
+from gyrostab.errors import SchemaError
+from gyrostab.schema import check_product
+from tests.support import synthetic
+
+
+@pytest.fixture(scope="module")
+def product() -> xr.Dataset:
+    return synthetic.product(windows=12)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda p: p.sel(axis="x"), r"keep the dimension 'axis'.*\.isel\(axis=\[0\]\)"),
+        (
+            lambda p: p.transpose("axis", "tau", "time", ...),
+            r"\.transpose\('axis', 'time', 'tau', \.\.\.\).*engine='gyrostab'",
+        ),
+        (lambda p: p.rename(axis="sensor"), "rename 'sensor' to 'axis'"),
+        (lambda p: p.drop_vars("Q_upper"), "no variable 'Q_upper'"),
+        (lambda p: p.sel(term=["N", "B"]), "'term' of the product holds N, B, expected Q, N"),
+        (lambda p: p.assign_coords(axis=[1, 2, 3]), r"'axis' of the .* holds 1, 2, 3, not names"),
+        (lambda p: p.assign_coords(time=np.arange(12)), "'time' of the .* not dates and times"),
+        (
+            lambda p: p.assign_coords(time=p.time.where(p.time != p.time[3])),
+            "'time' of the .* not dates and times",
+        ),
+        (
+            lambda p: p.assign(fit_tau_min=p.N.drop_attrs()),
+            "concatenated along 'time'.*data_vars='minimal'",
+        ),
+    ],
+)
+def test_what_is_not_a_product_is_refused_with_advice(
+    product: xr.Dataset, change: Callable[[xr.Dataset], xr.Dataset], words: str
+) -> None:
+    with pytest.raises(SchemaError, match=words):
+        check_product(change(product))
+
+
+def test_the_advice_to_transpose_makes_a_product_of_a_file_that_plain_xarray_opened(
+    product: xr.Dataset,
+) -> None:
+    stored = product.transpose("axis", "term", "tau", "time", ...)
+    check_product(stored.transpose("axis", "time", "tau", ...))
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [gyrostab.plot_coefficients, lambda product: gyrostab.plot_adev(product, "x")],
+    ids=["coefficients", "adev"],
+)
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda p: p.rename(N="n"), "no variable 'N'"),
+        (lambda p: p.drop_vars("K_upper"), "no variable 'K_upper'"),
+        (lambda p: p.isel(time=slice(0, 0)), "no window"),
+    ],
+)
+def test_figures_refuse_products_without_what_they_draw(
+    product: xr.Dataset,
+    draw: Callable[[xr.Dataset], object],
+    change: Callable[[xr.Dataset], xr.Dataset],
+    words: str,
+) -> None:
+    with pytest.raises(SchemaError, match=words):
+        draw(change(product))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda p: p.isel(time=slice(None, None, -1)), r"not in the order of time.*sortby\('time'"),
+        (lambda p: p.isel(time=[0, 0, 1, 2]), "occur twice"),
+        (lambda p: p.isel(time=slice(0, 0)), "has no window"),
+        (lambda p: p.drop_vars("time_bounds"), "no 'time_bounds'"),
+    ],
+)
+def test_correlation_needs_windows_in_the_order_of_time(
+    product: xr.Dataset, change: Callable[[xr.Dataset], xr.Dataset], words: str
+) -> None:
+    with pytest.raises(SchemaError, match=words):
+        gyrostab.correlate(change(product))
