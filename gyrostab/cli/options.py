@@ -12,7 +12,7 @@ from cyclopts.validators import Number
 
 from gyrostab.errors import OptionError
 from gyrostab.ingest.limits import check_limits
-from gyrostab.store.toml import parse_toml
+from gyrostab.store.toml import parse_toml, read_toml_text
 
 __all__ = [
     "ChannelFile",
@@ -341,7 +341,7 @@ _PAIR_EXAMPLES = {"--map": "wx=gyro_x", "--unit": "gyro=deg/s", "--limit": "colu
 def read_toml(path: Path) -> dict[str, Any]:
     """Read a TOML file of options."""
     try:
-        return parse_toml(path.read_text(encoding="utf-8"))
+        return parse_toml(read_toml_text(path))
     except OSError as error:
         raise OptionError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, RecursionError) as error:

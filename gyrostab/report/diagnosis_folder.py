@@ -16,6 +16,7 @@ from gyrostab.io.datasets import open_dataset, to_netcdf
 from gyrostab.report import write_diagnosis_report
 from gyrostab.store.output import new_output
 from gyrostab.store.output.content import read_json
+from gyrostab.store.toml import read_toml_text
 
 __all__ = ["FILES", "find_foreign_file", "open_diagnosis", "write_diagnosis"]
 
@@ -131,7 +132,7 @@ def open_diagnosis(directory: str | os.PathLike[str]) -> Diagnosis:
     try:
         content = json.loads((directory / "diagnosis.json").read_text(encoding="utf-8"))
         check_diagnosis(content)
-        model = tomllib.loads((directory / "model.toml").read_text(encoding="utf-8"))
+        model = tomllib.loads(read_toml_text(directory / "model.toml"))
     except OSError as error:
         raise FormatError(
             f"{error.filename}: cannot be read ({error.strerror}); "

@@ -17,7 +17,7 @@ from gyrostab.physics.base import Effect
 from gyrostab.physics.registry import amount, close_to, is_number, make_effect
 from gyrostab.simulate import environment, losses
 from gyrostab.simulate.noise import FLICKER_LOW
-from gyrostab.store.toml import parse_toml
+from gyrostab.store.toml import parse_toml, read_toml_text
 
 __all__ = ["PROFILES", "Model", "read_model"]
 
@@ -133,7 +133,7 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
     else:
         where, path = str(model), Path(model)
         try:
-            text = path.read_text(encoding="utf-8")
+            text = read_toml_text(path)
             tables = parse_toml(text)
         except OSError as error:
             raise FormatError(f"{path}: cannot be read ({error.strerror})") from error

@@ -3,9 +3,26 @@
 from __future__ import annotations
 
 import tomllib
+from pathlib import Path
 from typing import Any
 
-__all__ = ["parse_toml"]
+__all__ = ["parse_toml", "read_toml_text"]
+
+
+def read_toml_text(path: Path) -> str:
+    """Read the text of a TOML file: UTF-8, also with the byte order mark that some editors write.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be read.
+    ValueError
+        If it is not text in UTF-8.
+    """
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError("it is not text in UTF-8; save it as UTF-8") from error
 
 
 def parse_toml(text: str) -> dict[str, Any]:

@@ -30,7 +30,7 @@ import numpy as np
 
 from gyrostab.errors import OptionError
 from gyrostab.ingest.formats.messages import CRC_BYTES, find_messages
-from gyrostab.store.toml import parse_toml
+from gyrostab.store.toml import parse_toml, read_toml_text
 
 __all__ = ["Field", "Layout", "find_layout", "layout_path"]
 
@@ -92,7 +92,7 @@ def find_layout(path: Path) -> Layout:
     if place is None:
         return _find_known(path, places[0].name)
     try:
-        content = parse_toml(place.read_text(encoding="utf-8"))
+        content = parse_toml(read_toml_text(place))
     except (ValueError, RecursionError) as error:
         raise OptionError(
             f"{place.name}: this layout is not valid TOML ({error}); correct it"
