@@ -25,6 +25,7 @@ __all__ = [
     "ESTIMATORS",
     "GAP_CAUSES",
     "OBSERVABLE",
+    "RESERVED_NAMES",
     "SIGNAL_LONG_NAMES",
     "SIGNAL_UNITS",
     "VARIABLES",
@@ -166,6 +167,16 @@ def _add_coefficients() -> None:
 
 
 _add_coefficients()
+
+#: Names that datasets of gyrostab use; a channel has another one.
+RESERVED_NAMES = frozenset(
+    {
+        *SIGNAL_UNITS,
+        *VARIABLES,
+        *("row", "gap", "gap_start", "gap_end", "gap_samples", "gap_rows", "gap_cause"),
+        *("bnds", "time_bounds", "time_start", "time_index"),
+    }
+)
 
 
 def attributes(name: str, *, variance: str = "Allan") -> dict[str, Any]:

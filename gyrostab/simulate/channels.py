@@ -11,6 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
+from gyrostab.schema import RESERVED_NAMES
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import stamp_ns, time_coordinate
 from gyrostab.units import INNER, parse_unit
@@ -117,6 +118,10 @@ def channel(
     >>> found.supply_voltage.sizes
     Frozen({'time_supply_voltage': 3600})
     """
+    if name in RESERVED_NAMES:
+        raise OptionError(
+            f"channel {name!r}: variables of gyrostab have this name; choose another one"
+        )
     if not 0 < sensor_rate <= 1e5:
         raise OptionError(
             f"channel {name!r}: the sensor rate {sensor_rate!r} must be a number of Hz "

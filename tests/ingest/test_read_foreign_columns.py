@@ -10,10 +10,14 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from gyrostab.allan.davar import davar
+from gyrostab.allan.fit import fit_noise
 from gyrostab.errors import GyrostabError, MissingUnitError, UnitError
 from gyrostab.ingest import read_log
 from gyrostab.ingest.columns.headers import split_header
 from gyrostab.ingest.files import scan_file
+from gyrostab.ingest.grid.regularise import regularise
+from gyrostab.io.datasets import open_log, to_netcdf
 
 
 def write(folder: Path, text: str, name: str = "log.csv") -> Path:
@@ -308,3 +312,19 @@ def test_a_slow_channel_with_its_own_stamps_is_read(tmp_path: Path, ending: str)
     write(tmp_path, "time,gyro_x [deg/h]\n2026-03-14T08:00:00,1\n2026-03-14T08:00:01,2\n")
     joined = read_log(tmp_path / "log.csv", channel=path)
     assert joined.T_case.values == pytest.approx(celsius + 273.15)  # in K, as in the file
+
+
+@pytest.mark.parametrize("name", ["rate", "axis", "count", "tau", "term", "gap_start", "gap", "N"])
+def test_a_channel_named_like_a_variable_of_gyrostab_gets_another_name(
+    name: str, tmp_path: Path
+) -> None:
+    rows = "".join(f"{n / 10},{n % 7},{n},20\n" for n in range(300))
+    path = tmp_path / "log.csv"
+    path.write_text(f"time [s],gyro_x [deg/h],{name} [V],temperature [degC]\n{rows}")
+    log = regularise(read_log(path))
+    assert any(f"'{name}_channel'" in note for note in log.attrs["notes"])
+    to_netcdf(log, tmp_path / "log.nc")
+    product = fit_noise(davar(open_log(tmp_path / "log.nc"), window="10s"))
+    means = product[f"{name}_channel"]
+    assert means.dims == ("time",)
+    np.testing.assert_allclose(means[0], 49.5)  # the mean of 0 to 99

@@ -64,6 +64,7 @@ from tests.support.simulated import BIASED, LOG, WORLD, model
         ),
         ({"environment": [WORLD[0], WORLD[0]]}, "the channel 'vibration' twice"),
         ({"environment": [WORLD[1] | {"channel": 3}]}, "channel = 3 is not text"),
+        ({"environment": [WORLD[1] | {"channel": "axis"}]}, "channel 'axis': variables of gyrosta"),
         ({"environment": [WORLD[5] | {"cuts": 3}]}, "cuts = 3 is not a list"),
         ({"environment": ["chamber"]}, "environment 1 is 'chamber', not a table"),
         ({"effect": [BIASED[0] | {"axes": 3}]}, "axes = 3 is not a list of names"),

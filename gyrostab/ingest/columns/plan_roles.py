@@ -30,6 +30,7 @@ from gyrostab.ingest.columns.headers import (
 from gyrostab.ingest.columns.plan_draft import MAX_HEADERS, Column, PlanDraft, by_lower_name
 from gyrostab.ingest.columns.stamps import TimeUnit, names_epoch, parse_time_unit
 from gyrostab.ingest.limits import limit_value
+from gyrostab.schema import RESERVED_NAMES
 from gyrostab.units import HOUR, INNER, known_units, parse_unit
 from gyrostab.wording import list_some
 
@@ -383,6 +384,12 @@ def _plan_channel(
             draft.refuse(UnitError, f"{message}; {fix}")
         else:
             quantity = None
+    if name in RESERVED_NAMES:
+        draft.notes.append(
+            f"column {column.header!r} is kept as '{name}_channel', as {name!r} is a variable of "
+            f'gyrostab; for another name give --map "{column.key}=NAME"'
+        )
+        name += "_channel"
     draft.kept_channels += 1
     planned = column.source, column.header, "channel", name, quantity or "other", units
     draft.columns.append(Column(*planned, factor, offset))
