@@ -33,7 +33,7 @@ from gyrostab.simulate.block import BlockState, Plan, Step
 from gyrostab.simulate.channels import combine
 from gyrostab.simulate.drivers import Source, make_course, make_source
 from gyrostab.simulate.lazy import lazy_rates
-from gyrostab.simulate.model import PROFILES, Model, read_model
+from gyrostab.simulate.model import PROFILES, Model, naming_of, read_model
 from gyrostab.simulate.noise import begin_noise, stream
 from gyrostab.time.clock import time_of_day
 from gyrostab.time.durations import duration_seconds
@@ -114,23 +114,24 @@ def simulate(
     """
     made = model if isinstance(model, Model) else read_model(model)
     like = None if like is None else as_log(like)
-    frame = _make_frame(made, duration=duration, rate=rate, start=start, seed=seed, like=like)
-    _check_axes(made, frame)
     if chunk is not None and chunk < 1:
         raise OptionError(f"chunk={chunk!r}: give at least 1 sample")
-    environment = _make_world(made, frame, like, environment)
-    table = _gap_table(environment, frame)
-    plan = _make_plan(made, frame, environment, table, like)
-    starts = [
-        begin_noise(
-            frame.seed,
-            axis,
-            rate=frame.rate * frame.oversampling,
-            terms=_noise_terms(plan, row),
-            flicker_band=made.flicker_band,
-        )
-        for row, axis in enumerate(frame.axes)
-    ]
+    frame = _make_frame(made, duration=duration, rate=rate, start=start, seed=seed, like=like)
+    _check_axes(made, frame)
+    with naming_of(made.source):
+        environment = _make_world(made, frame, like, environment)
+        table = _gap_table(environment, frame)
+        plan = _make_plan(made, frame, environment, table, like)
+        starts = [
+            begin_noise(
+                frame.seed,
+                axis,
+                rate=frame.rate * frame.oversampling,
+                terms=_noise_terms(plan, row),
+                flicker_band=made.flicker_band,
+            )
+            for row, axis in enumerate(frame.axes)
+        ]
     data = lazy_rates(
         plan,
         _begin_states(plan, frame.seed),
@@ -207,8 +208,10 @@ def _make_frame(
 
 def _check_axes(model: Model, frame: _Frame) -> None:
     """Check that the log has the axes that a model names."""
-    named = [axis for axis in model.noise if axis] + [
-        axis for effect in model.effects for axis in effect.axes
+    named = [
+        *(axis for axis in model.noise if axis),
+        *model.bias,
+        *(axis for effect in model.effects for axis in effect.axes),
     ]
     for axis in named:
         if axis not in frame.axes:

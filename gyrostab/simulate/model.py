@@ -6,20 +6,23 @@ import inspect
 import json
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gyrostab.errors import FormatError, OptionError
+from gyrostab.errors import FormatError, GyrostabError, OptionError
 from gyrostab.noise import LAWS, TERMS
 from gyrostab.physics.base import Effect
 from gyrostab.physics.registry import amount, close_to, is_number, make_effect
 from gyrostab.simulate import environment, losses
 from gyrostab.simulate.noise import FLICKER_LOW
 from gyrostab.store.toml import parse_toml, read_toml_text
+from gyrostab.time.durations import duration_seconds
+from gyrostab.time.grid import stamp_ns
 
-__all__ = ["PROFILES", "Model", "read_model"]
+__all__ = ["PROFILES", "Model", "naming_of", "read_model"]
 
 #: Largest noise coefficient: its square, and sums of squares, stay within the range of numbers.
 _MAX_COEFFICIENT = 1e100
@@ -97,6 +100,17 @@ class Model:
     def coefficients(self, axis: str) -> dict[str, float]:
         """Noise coefficients of an axis, all five."""
         return {**dict.fromkeys(TERMS, 0.0), **self.noise.get("", {}), **self.noise.get(axis, {})}
+
+
+@contextmanager
+def naming_of(source: str) -> Iterator[None]:
+    """Name the model in errors of functions that take its numbers."""
+    try:
+        yield
+    except GyrostabError as error:
+        if str(error).startswith(source):
+            raise
+        raise type(error)(f"{source}: {error}") from error
 
 
 def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
@@ -278,8 +292,12 @@ def _read_log_section(table: Mapping[str, Any], where: str) -> dict[str, Any]:
         raise OptionError(
             f"{where}, [log]: oversampling = {section['oversampling']!r} is more than 1000"
         )
-    if "start" in section:
-        section["start"] = str(section["start"])
+    with naming_of(where):
+        if "start" in section:
+            section["start"] = str(section["start"])
+            stamp_ns(section["start"])
+        if "duration" in section:
+            duration_seconds(section["duration"], "duration")
     return section
 
 

@@ -8,7 +8,7 @@ import tomllib
 import numpy as np
 import pytest
 
-from gyrostab.errors import FormatError, OptionError, SchemaError
+from gyrostab.errors import FormatError, OptionError, SchemaError, TimeError
 from gyrostab.ingest.grid.regularise import gap_table
 from gyrostab.io.datasets import open_log
 from gyrostab.schema import check_log
@@ -101,6 +101,33 @@ def test_a_wrong_effect_names_file_and_place(tmp_path):
         read_model(path)
     with pytest.raises(FormatError, match="cannot be read"):
         read_model(tmp_path / "none.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[log]\nduration = -5", "duration -5 must be longer"),
+        ("[log]\nstart = 'yesterday'", "start 'yesterday' is not a date"),
+        (
+            "[noise]\nB = 1\nflicker_band = [1, 0.1]",
+            "the band of flicker noise 1 to 0.1 Hz is empty",
+        ),
+        ("[[environment]]\nprofile = 'vibration'\npoints = [[0, nan]]", "points of vibration: "),
+        (
+            "[[effect]]\nname = 'temperature_bias'\nsensitivity = 1",
+            "needs the channel 'temperature'",
+        ),
+        ("[noise.x]\nN = 1\n[bias]\nq = 2", "there is no axis 'q' in this log; it has x"),
+    ],
+)
+def test_errors_of_a_simulation_name_the_file_of_the_model(text, words, tmp_path):
+    path = tmp_path / "m.toml"
+    path.write_text(text)
+    duration = None if "duration" in text else "1min"
+    with pytest.raises((OptionError, SchemaError, TimeError)) as error:
+        simulate(path, duration=duration, rate=10.0)
+    assert str(error.value).startswith(f"{path}: ")
+    assert words in str(error.value)
 
 
 def test_axes_come_from_the_model():
