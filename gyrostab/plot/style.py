@@ -62,6 +62,8 @@ GREY = "#8c8c8c"
 PAGE_MM = 180.0
 INCH_MM = 25.4
 NARROW_MM = 120.0
+#: Widths that a figure can have [mm]; a narrower one has no room for its labels.
+MIN_WIDTH_MM, MAX_WIDTH_MM = 50.0, 1000.0
 _DPI = 155
 _FONT_POINTS = 8.0
 #: Sizes relative to `_FONT_POINTS`, and line widths [points].
@@ -207,6 +209,11 @@ def draws_figure(draw: Callable[P, Figure]) -> Callable[P, Figure]:
         import matplotlib as mpl
 
         width = cast(float, options.get("width", PAGE_MM))
+        if not MIN_WIDTH_MM <= width <= MAX_WIDTH_MM:
+            raise OptionError(
+                f"a figure cannot be {width:g} mm wide; give --width (width=) from "
+                f"{MIN_WIDTH_MM:g} to {MAX_WIDTH_MM:g}, for instance 180 for a page"
+            )
         points = _FONT_POINTS if width >= NARROW_MM else _FONT_POINTS - 1.0
         sizes = {
             name: size * points / _FONT_POINTS if name.endswith("size") else size

@@ -372,3 +372,9 @@ def test_product_of_a_constant_signal_is_drawn_without_warnings(share, tmp_path)
         save_all(product, tmp_path)
         save_png(plot_davar_3d(product), tmp_path / "3d.png", dpi=40)
         write_report(product, tmp_path / "report.html")
+
+
+@pytest.mark.parametrize("width", [0.0, -85.0, 1e9, float("nan")])
+def test_impossible_widths_are_refused(product, width):
+    with pytest.raises(OptionError, match=r"cannot be .* mm wide; give --width"):
+        plot_coefficients(product, width=width)
