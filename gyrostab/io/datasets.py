@@ -562,6 +562,9 @@ def _open_path(
         with reading_of(path):
             check(dataset)
     except SchemaError as error:
+        kind = find_kind(dataset)
         dataset.close()
+        if kind != "dataset":
+            raise FormatError(f"{path}: holds a {kind}, not {content}; {advice}") from error
         raise FormatError(f"{path}: does not hold {content} ({error}); {advice}") from error
     return dataset

@@ -377,7 +377,7 @@ def test_foreign_and_damaged_files(tmp_path, files):
     ("kind", "opener"), [("surface", open_product), ("log", open_surface), ("product", open_log)]
 )
 def test_the_wrong_kind_is_named(files, kind, opener):
-    with pytest.raises(FormatError, match=r"does not hold a .*make one with 'gyrostab"):
+    with pytest.raises(FormatError, match=rf"holds a {kind}, not a .*; make one with 'gyrostab"):
         opener(files[kind])
 
 
