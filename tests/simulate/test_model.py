@@ -238,3 +238,16 @@ def test_the_guide_lists_every_profile():
     text = (ROOT / "docs" / "simulate.md").read_text(encoding="utf-8")
     for name in PROFILES:
         assert f"`{name}`" in text
+
+
+@pytest.mark.parametrize(
+    "option",
+    [("--channel", "t.csv"), ("--map", "a=gyro_x"), ("--from", "1min"), ("--max-gap", "1h")],
+)
+def test_reading_options_without_a_recording_are_refused(option, tmp_path, capfd):
+    path = tmp_path / "m.toml"
+    path.write_text("[noise]\nN = 0.01\n")
+    options = ["--duration", "1min", "--rate", "10", *option]
+    assert call("simulate", path, "-o", tmp_path / "log.nc", *options) == 2
+    assert "how to read the recording of --like" in capfd.readouterr().err
+    assert not (tmp_path / "log.nc").exists()

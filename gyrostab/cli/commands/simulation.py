@@ -67,10 +67,10 @@ def simulate(
                 model, like=load_log(like, **reading.options()), duration=duration, seed=seed
             )
         else:
-            if reading.time_from or reading.time_to or reading.exclude:
+            if reading.given().keys() - {"rate", "start"}:
                 raise OptionError(
-                    "--from, --to and --exclude cut the recording of --like; "
-                    "give that recording too, or --duration"
+                    "reading options except --rate and --start say how to read the recording of "
+                    "--like; give that recording too, or leave them out"
                 )
             log = make(model, duration=duration, rate=reading.rate, start=reading.start, seed=seed)
         stage("simulating", count_samples(log))
