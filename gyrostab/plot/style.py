@@ -63,7 +63,7 @@ PAGE_MM = 180.0
 INCH_MM = 25.4
 NARROW_MM = 120.0
 #: Widths that a figure can have [mm]; a narrower one has no room for its labels.
-MIN_WIDTH_MM, MAX_WIDTH_MM = 50.0, 1000.0
+MIN_WIDTH_MM, MAX_WIDTH_MM = 80.0, 1000.0
 _DPI = 155
 _FONT_POINTS = 8.0
 #: Sizes relative to `_FONT_POINTS`, and line widths [points].
