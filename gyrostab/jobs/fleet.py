@@ -395,9 +395,9 @@ def process_run(
             report = Path(target, row["report"]) if reports else None
             row |= _finish_run(product, report, "../" * name.count("/") + PLOTLY_FILE)
     except (GyrostabError, OSError) as error:
-        row["error"] = " ".join(str(error).split())
+        row |= {"error": " ".join(str(error).split()), "report": ""}
     except Exception as error:  # one run must not stop the others
-        row["error"] = f"unexpected {type(error).__name__}: {error}"
+        row |= {"error": f"unexpected {type(error).__name__}: {error}", "report": ""}
     return row
 
 

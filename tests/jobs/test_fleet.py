@@ -22,7 +22,7 @@ from gyrostab.cli import main
 from gyrostab.errors import FormatError, OptionError, OutputError
 from gyrostab.ingest.files import scan_file
 from gyrostab.jobs import fleet as fleet_module
-from gyrostab.jobs.archive import find_archive, find_runs
+from gyrostab.jobs.archive import LogRun, find_archive, find_runs
 from gyrostab.jobs.fleet import process_run, run_fleet, write_file_table
 from gyrostab.jobs.fleet_table import TREND_COLUMNS, read_table, write_table
 from gyrostab.jobs.run import run
@@ -178,6 +178,15 @@ def test_the_overview_escapes_names_and_links_reports(done, tmp_path):
     assert text.count("0.0333 (0.0111 to 0.0444)") == 1
     assert "<i>" not in text
     assert 'href="reports/tool%201/run%20%3Cb%3E.html"' in text
+
+
+def test_a_run_that_failed_has_no_report(archive, tmp_path):
+    log = archive / "tool 2" / "broken" / "log.nc"
+    options = {"reading": {}, "windows": WINDOWS, "fitting": {}}
+    broken = LogRun("tool 2/broken", "tool 2", (log,), 2000, None, "")
+    row = process_run(str(tmp_path), json.dumps(options), True, False, broken)
+    assert "is damaged" in row["error"]
+    assert not row["report"]
 
 
 def test_survey_terms_are_those_of_the_windows_of_all_runs(done, tmp_path, capsys):
