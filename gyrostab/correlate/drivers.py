@@ -89,10 +89,12 @@ def _align_channel(
     """Average a channel and its rate of change over the windows, for every lag."""
     if isinstance(channel, str):
         if channel not in product.data_vars or product[channel].dims != ("time",):
-            available = ", ".join(_channel_names(product)) or "none"
+            available = ", ".join(_channel_names(product))
             raise OptionError(
                 f"the product has no channel {channel!r}; it has {available}; give another, or a "
                 "file with --channel"
+                if available
+                else "the product has no channels; give a file with --channel"
             )
         name, units = channel, str(product[channel].attrs.get("units", "1"))
         mean, rate = _align_product_channel(product, channel, lags, step)

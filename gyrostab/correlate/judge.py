@@ -30,7 +30,7 @@ LIMITS = {
     "constant": "{driver} is constant",
     "too_few": "there are too few independent windows",
     "clusters": "{driver} differs only between segments separated by a gap",
-    "one_moment": "{driver} changes at one moment only",
+    "one_moment": "{driver} changes mainly at one moment",
     "no_reversal": "{driver} never reverses, so a drift or slow noise looks the same",
     "no_plateau": "{driver} is never constant, so its effect and that of its rate of change "
     "look alike",

@@ -293,6 +293,12 @@ def test_statement_gives_the_reason_why_a_record_cannot_tell():
     )
     assert verdict(rise, axis="x", variable="window_mean", driver="temperature") == "not_told_apart"
     assert "never reverses" in str(rise["statement"].values[0, 0, 0])
+    steps = coupled.product(axes="x")
+    levels = np.repeat([20.0, 25.0, 20.0, 60.0], 30)[: steps.sizes["time"]]
+    steps = steps.assign(temperature=steps["temperature"].copy(data=levels))
+    steps = steps.drop_vars("temperature_rate", errors="ignore")
+    moments = gyrostab.correlate(steps)["statement"].values[0, 0, 1]
+    assert "temperature changes mainly at one moment" in str(moments)
 
 
 def test_two_clusters_across_a_gap_give_no_slope():
@@ -384,6 +390,9 @@ def test_errors_say_what_to_do():
     product = coupled.product()
     with pytest.raises(OptionError, match="no channel 'vibration'; it has temperature"):
         gyrostab.correlate(product, channel="vibration")
+    alone = product.drop_vars(["temperature", "temperature_rate"])
+    with pytest.raises(OptionError, match="the product has no channels; give a file"):
+        gyrostab.correlate(alone)
     with pytest.raises(OptionError, match="longer than the record"):
         gyrostab.correlate(product, max_lag="3D")
     with pytest.raises(OptionError, match="variable 'avar'"):
