@@ -202,9 +202,10 @@ def survey_terms(
         if any(name in magnitudes[kind] for group in groups for name in group)
     ]
     if all(math.isnan(term.value) for term in terms if term.unit != "deg/h/g"):
+        silent = [axis for axis, walk in magnitudes["walk"].items() if math.isnan(walk.value)]
         raise SchemaError(
-            "no window of the product observes or limits N, B and K; "
-            "make the product again with a longer --window"
+            f"no window of the product observes or limits N of axis {', '.join(silent)}; make the "
+            "product again with a longer --window, or without that axis (--axis)"
         )
     return SurveyModel(
         tool,
@@ -237,7 +238,7 @@ def _find_tool(axes: Sequence[str]) -> Tool:
     """Find which gyros a tool has, from the axes of its product."""
     if strange := sorted(set(axes) - set("xyz")):
         raise SchemaError(
-            f"the product has the axis {', '.join(strange)}; survey terms need the axes x and y "
+            f"the product has axes named {', '.join(strange)}; survey terms need the axes x and y "
             "across the tool and z along it: name them with --map when reading the log, or with "
             "product.assign_coords(axis=[...])"
         )

@@ -114,7 +114,8 @@ def open_fleet(folder: Path) -> xr.Dataset | None:
     combined = xr.concat(
         products, "time", data_vars="all", join="outer", combine_attrs="drop_conflicts"
     )
-    return combined.assign_attrs(source_files=[f"{len(products)} runs of {folder.name}"])
+    runs = "run" if len(products) == 1 else "runs"
+    return combined.assign_attrs(source_files=[f"{len(products)} {runs} of {folder.name}"])
 
 
 def summarise_run(product: xr.Dataset) -> dict[str, Any]:

@@ -145,10 +145,23 @@ def test_product_that_shows_nothing_is_refused():
         survey_terms(product)
 
 
+def test_axis_that_shows_nothing_is_named():
+    product = make_product("xy")
+    for name in ("N", "N_upper"):
+        product[name] = product[name].where(product["axis"] == "x")
+    product["observable"] = product["observable"].where(product["axis"] == "x", 0)
+    with pytest.raises(SchemaError, match=r"limits N of axis y; .*without that axis"):
+        survey_terms(product)
+
+
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        (lambda p: p.assign_coords(axis=["u", "v", "w"]), SchemaError, "axis u, v, w.*--map"),
+        (
+            lambda p: p.assign_coords(axis=["u", "v", "w"]),
+            SchemaError,
+            "axes named u, v, w; .*--map",
+        ),
         (lambda p: p.drop_vars("N"), SchemaError, "N"),
         (lambda p: p["N"], SchemaError, "DataArray"),
     ],
