@@ -71,9 +71,9 @@ def diagnose(
     log : xarray.Dataset
         The recording: a regular log with its channels, in memory or lazy.
     simulation : model, path of a model, or xarray.Dataset, optional
-        What the recording is compared with: noise and effects of a model, or a simulated log on
-        the same time stamps. By default, the five noise terms calibrated on quiescent stretches of
-        the recording.
+        What the recording is compared with: noise and effects of a model, or the noise of a
+        simulated log on the same time stamps, without what effects do to its mean rate. By default,
+        the five noise terms calibrated on quiescent stretches of the recording.
     quiet : (start, end) or list of these, optional
         Quiescent stretches, as seconds since the start or ISO times; detected automatically by
         default. With a `simulation` they calibrate the level of its noise: one factor per axis.

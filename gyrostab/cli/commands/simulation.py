@@ -109,8 +109,9 @@ def diagnose(
     output
         Folder to write.
     simulation
-        Simulation to compare with: a model, or a simulated log with the same time stamps (default:
-        noise calibrated on quiescent stretches of the recording).
+        Simulation to compare with: a model, or a simulated log with the same time stamps, of which
+        only the noise is compared, not what effects do to its mean rate (default: noise calibrated
+        on quiescent stretches of the recording).
     quiet
         Quiescent stretch of the recording, on which the noise is calibrated:
         2026-03-14T08:00/2026-03-14T08:30, or 0s/30min after the start. Repeat for more (default:
