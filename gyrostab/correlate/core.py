@@ -94,7 +94,13 @@ def correlate(
     time = (product["time"].values - product["time"].values[0]) / np.timedelta64(1, "s")
     length, step = _window_lengths(product, time)
     lags = _choose_lags(max_lag, float(time[-1] - time[0]) if time.size else 0.0, step)
-    channels = [channel] if isinstance(channel, str | xr.DataArray) else list(channel)
+    channels = list(channel) if isinstance(channel, list | tuple) else [channel]
+    for item in channels:
+        if not isinstance(item, str | xr.DataArray):
+            raise OptionError(
+                f"channel={item!r} is neither a name nor an xarray.DataArray; a pandas.Series on "
+                "dates becomes one with .to_xarray().assign_attrs(units=...)"
+            )
     drivers = align_drivers(product, channels, lags, step)
     other_series = [product[name].values for name in other_channels(product, drivers)]
     entries: dict[tuple[int, int, int], dict[str, Any]] = {}

@@ -29,7 +29,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -40,6 +40,9 @@ from gyrostab.io.survey_model import Status, SurveyModel, SurveyTerm, Tool
 from gyrostab.noise import LAWS
 from gyrostab.schema import texts
 from gyrostab.time.durations import duration_seconds
+
+if TYPE_CHECKING:
+    from gyrostab.diagnose.result.diagnosis import Diagnosis
 
 __all__ = ["drift_rate", "survey_terms"]
 
@@ -142,7 +145,7 @@ def survey_terms(
     section_time: Any = "1h",
     calibration_time: Any = None,
     statistic: Statistic = "median",
-    diagnosis: Mapping[str, Any] | None = None,
+    diagnosis: Mapping[str, Any] | Diagnosis | None = None,
 ) -> SurveyModel:
     """Compute the gyro terms of an ISCWSA tool error model from the noise of a product.
 
@@ -162,8 +165,9 @@ def survey_terms(
     statistic : {"median", "p95"}
         Median or 95 % quantile over the windows that observe a coefficient; for upper limits
         always the median.
-    diagnosis : mapping, optional
-        Contents of ``diagnosis.json``, from which the g-dependent terms are taken.
+    diagnosis : mapping or Diagnosis, optional
+        Contents of ``diagnosis.json``, or what `gyrostab.diagnose` or `gyrostab.open_diagnosis`
+        returns; the g-dependent terms are taken from it.
 
     Returns
     -------
@@ -192,10 +196,15 @@ def survey_terms(
         "section": duration_seconds(section_time, "--section-time"),
         "calibration": duration_seconds(calibration_time or station_time, "--calibration-time"),
     }
+    content = getattr(diagnosis, "content", diagnosis)
+    if not (content is None or isinstance(content, Mapping)):
+        raise OptionError(
+            f"diagnosis is a {type(diagnosis).__name__}: give gyrostab.open_diagnosis(folder)"
+        )
     summaries = summarise_terms(product)
     tool = _find_tool([summary.axis for summary in summaries])
     magnitudes = _compute_magnitudes(summaries, statistic, times)
-    magnitudes["g"] = _read_sensitivities(diagnosis or {})
+    magnitudes["g"] = _read_sensitivities(content or {})
     terms = [
         _make_term(code, kind, groups, magnitudes[kind])
         for code, kind, groups in _TABLES[tool]
@@ -212,7 +221,7 @@ def survey_terms(
         tuple(terms),
         _find_ranges(product),
         _describe_origin(product, times, statistic),
-        (_CONFIRM, *_make_notes(product, terms, times["section"], diagnosis)),
+        (_CONFIRM, *_make_notes(product, terms, times["section"], content)),
     )
 
 

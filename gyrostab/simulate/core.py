@@ -165,9 +165,10 @@ def _make_frame(
     seed: int | None,
     like: xr.Dataset | None,
 ) -> _Frame:
-    chosen = int(model.log.get("seed", 0) if seed is None else seed)
-    if chosen < 0:
+    chosen = model.log.get("seed", 0) if seed is None else seed
+    if not isinstance(chosen, int | np.integer) or chosen < 0:
         raise OptionError(f"seed={seed!r}: give a whole number from 0 up")
+    chosen = int(chosen)
     factor = int(model.log.get("oversampling", 1))
     if like is not None:
         grid_options = {"duration": duration, "rate": rate, "start": start}
@@ -243,8 +244,26 @@ def _make_world(
             arguments.setdefault("seed", frame.seed)
         parts.append(function(**arguments))
     if environment is not None:
+        _check_environment(environment, frame.size)
         parts.append(environment)
     return combine(*parts).drop_attrs(deep=False) if parts else xr.Dataset()
+
+
+def _check_environment(environment: Any, size: int) -> None:
+    """Raise `SchemaError` unless channels lie on the samples or have their own time axes."""
+    if not isinstance(environment, xr.Dataset):
+        raise SchemaError(
+            f"environment is a {type(environment).__name__}, not an xarray.Dataset; the functions "
+            "of gyrostab.simulate.environment make one"
+        )
+    for name, variable in environment.data_vars.items():
+        on_samples = variable.dims == ("time",) and variable.size == size
+        if not on_samples and variable.dims not in (("gap",), (f"time_{name}",)):
+            raise SchemaError(
+                f"channel {name!r} of the environment has dimensions "
+                f"{dict(environment[name].sizes)}, expected 'time_{name}', with a coordinate of "
+                "times; gyrostab.simulate.environment.ramps makes such a channel"
+            )
 
 
 def _gap_table(environment: xr.Dataset, frame: _Frame) -> NDArray[np.int64]:

@@ -390,6 +390,9 @@ def test_errors_say_what_to_do():
     product = coupled.product()
     with pytest.raises(OptionError, match="no channel 'vibration'; it has temperature"):
         gyrostab.correlate(product, channel="vibration")
+    series = product["temperature"].to_series()
+    with pytest.raises(OptionError, match=r"neither a name nor .*DataArray.*\.to_xarray\(\)"):
+        gyrostab.correlate(product, channel=series)
     alone = product.drop_vars(["temperature", "temperature_rate"])
     with pytest.raises(OptionError, match="the product has no channels; give a file"):
         gyrostab.correlate(alone)

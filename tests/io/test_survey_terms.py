@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -222,6 +223,14 @@ def test_g_dependent_terms_come_from_the_diagnosis():
     assert (terms["GXYZ-XYG1"].low, terms["GXYZ-XYG1"].high) == (0.3, 0.7)
     assert (terms["GXYZ-XYG2"].low, terms["GXYZ-XYG2"].high) == (0.0, 0.3)
     assert any("earth_rate" in note for note in model.notes)
+
+
+def test_a_diagnosis_is_taken_as_its_contents():
+    content = make_diagnosis(make_effect(["x"], x=(0.3, 0.2, 0.4)))
+    expected = survey_terms(make_product(), diagnosis=content)
+    assert survey_terms(make_product(), diagnosis=SimpleNamespace(content=content)) == expected
+    with pytest.raises(OptionError, match=r"is a str: give gyrostab\.open_diagnosis\(folder\)"):
+        survey_terms(make_product(), diagnosis="run7-diagnosis")
 
 
 def test_limit_of_a_diagnosis_is_the_limit_of_all_g_dependent_terms():

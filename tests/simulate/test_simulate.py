@@ -12,6 +12,7 @@ import cloudpickle
 import dask
 import numpy as np
 import pytest
+import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -329,3 +330,21 @@ def test_writing_in_pieces_makes_each_block_once(tmp_path, monkeypatch):
     for first in range(0, 360_000, 90_000):
         log.rate.isel(time=slice(first, first + 90_000)).compute()
     assert len(made) <= 60 + 3  # threads that come out of turn may make one again
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ({"seed": 1.5}, OptionError, "seed=1.5: give a whole number"),
+        ({"seed": "a"}, OptionError, "seed='a': give a whole number"),
+        ({"environment": xr.DataArray([1.0])}, SchemaError, "environment is a DataArray, not"),
+        (
+            {"environment": xr.Dataset({"temperature": ("time", [1.0, 2.0])})},
+            SchemaError,
+            "channel 'temperature' of the environment has .*'time': 2.*expected 'time_temperature'",
+        ),
+    ],
+)
+def test_arguments_of_a_wrong_kind_are_refused(options, error, words):
+    with pytest.raises(error, match=words):
+        simulate({"noise": {"N": 1}}, duration="10s", rate=10.0, **options)
