@@ -94,7 +94,8 @@ def correlate(
     time = (product["time"].values - product["time"].values[0]) / np.timedelta64(1, "s")
     length, step = _window_lengths(product, time)
     lags = _choose_lags(max_lag, float(time[-1] - time[0]) if time.size else 0.0, step)
-    channels = list(channel) if isinstance(channel, list | tuple) else [channel]
+    is_list = isinstance(channel, Sequence) and not isinstance(channel, str)
+    channels: list[Any] = list(channel) if is_list else [channel]
     for item in channels:
         if not isinstance(item, str | xr.DataArray):
             raise OptionError(
