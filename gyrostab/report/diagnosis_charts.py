@@ -155,7 +155,7 @@ def _draw_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
                     {
                         "line": {"width": 0},
                         "fill": "tonexty",
-                        "fillcolor": f"{colour}2e",
+                        "fillcolor": f"rgba{(*bytes.fromhex(colour[1:]), 0.18)}",
                         "showlegend": False,
                     },
                 ),

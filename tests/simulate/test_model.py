@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tomllib
 
 import numpy as np
 import pytest
@@ -223,15 +222,6 @@ def test_p16_model_has_its_timeline():
     assert (np.flatnonzero(shaken)[[0, -1]] == [330, 629]).all()
     x = log.rate.sel(axis="x").values.reshape(93, 4000)
     assert np.nanstd(x[33:43]) > 3 * np.nanstd(x[:33])
-
-
-def test_the_model_in_the_guide_is_a_model():
-    text = (ROOT / "docs" / "simulate.md").read_text(encoding="utf-8")
-    table = tomllib.loads(text.split("```toml\n")[1].split("```")[0])
-    made = read_model(table)
-    assert made.log["oversampling"] == 1
-    with pytest.raises(SchemaError, match="needs the channel 'temperature'"):
-        simulate(table)
 
 
 def test_the_guide_lists_every_profile():

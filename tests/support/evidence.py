@@ -17,7 +17,6 @@ from gyrostab.diagnose.evidence.held_out import (
     mean_factors,
     noise_columns,
     stack_designs,
-    values_by_record,
     with_independent_cells,
 )
 from gyrostab.diagnose.evidence.products import Array
@@ -53,9 +52,9 @@ def power_factors(
         As in `mean_factors`.
     """
     shape = (data.sizes["block"], data.sizes["band"])
-    values = values_by_record(
-        (data["power"] / baseline["spectrum"] - 1.0).sel(axis=axis), "block", "band"
-    )
+    excess = (data["power"] / baseline["spectrum"] - 1.0).sel(axis=axis)
+    by_record = excess.transpose("block", "band", ...).values
+    values = by_record.reshape(*shape, -1)
     weight = np.asarray(
         baseline["shape_alone"].sel(axis=axis).transpose("block", "band").values, dtype=np.float64
     )
