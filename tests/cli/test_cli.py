@@ -268,7 +268,7 @@ def test_doctor_describes_the_installation(capsys, monkeypatch):
     assert call("doctor") == 2
     shown = capsys.readouterr()
     assert "extra ulog: pyulog missing; pip install 'gyrostab[ulog]'" in shown.out
-    assert "numpy 1.26.4 (needs >=2.1): install gyrostab again" in shown.err
+    assert re.search(r"numpy 1\.26\.4 \(needs >=2[\d.]*\): install gyrostab again", shown.err)
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash is absent")
