@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import warnings
 from collections.abc import Mapping
@@ -10,11 +11,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.errors import OptionError, SchemaError
+from gyrostab.errors import GyrostabError, OptionError, SchemaError
 from gyrostab.ingest.convert import as_log
 from gyrostab.simulate.model import Model, read_model
+from gyrostab.store.toml import parse_toml
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import first_stamp
+from gyrostab.wording import join_words
 
 __all__ = ["check_options", "parse_quiescent_span", "read_simulation", "varying_axes"]
 
@@ -54,10 +57,28 @@ def read_simulation(
     if isinstance(simulation, xr.Dataset):
         simulated = as_log(simulation)
         _check_same_stamps(log, simulated)
+        _note_effects_on_means(simulated)
         return simulated
     if simulation is None or isinstance(simulation, Model):
         return simulation
     return read_model(simulation)
+
+
+def _note_effects_on_means(simulated: xr.Dataset) -> None:
+    """Warn that the mean rate of a log that was simulated with effects is not compared."""
+    text = str(simulated.attrs.get("simulation_model", ""))  # TOML of a file, JSON of a mapping
+    try:
+        model = read_model(json.loads(text) if text.startswith("{") else parse_toml(text))
+    except (GyrostabError, ValueError, RecursionError):  # not written by this version
+        return
+    names = sorted({effect.name for effect in model.effects if effect.stage in ("motion", "rate")})
+    if names:
+        warnings.warn(
+            f"the simulated log has effects on the rate: {join_words(names)}; only noise and "
+            "steady lines of a simulated log are compared, so the diagnosis may name such an "
+            "effect again; to compare with the effects, give their model in place of the log",
+            stacklevel=2,
+        )
 
 
 def _check_same_stamps(log: xr.Dataset, simulated: xr.Dataset) -> None:

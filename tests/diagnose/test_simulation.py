@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import cache
 
 import pytest
 
 import gyrostab
+from gyrostab.diagnose.inputs import read_simulation
 from gyrostab.simulate import simulate
 
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
@@ -74,3 +76,20 @@ def test_effect_in_addition_to_the_simulation_is_identified(lacking):
     assert [effect["name"] for effect in diagnosis.effects] == [
         {"line": "spectral_line"}.get(lacking, lacking)
     ]
+
+
+def test_effects_on_the_rate_of_a_simulated_log_are_noted():
+    warm = {"profile": "steps", "channel": "temperature", "unit": "degC", "points": [[0, 35]]}
+    noise = {"noise": {"N": 0.01}}
+    effect = {"name": "temperature_bias", "sensitivity": 0.1}
+    biased = simulate(
+        noise | {"effect": [effect], "environment": [warm]}, duration="1min", rate=10.0
+    )
+    with pytest.warns(UserWarning, match=r"effects on the rate: temperature_bias; .* their model"):
+        read_simulation(biased, biased)
+    plain = simulate(noise, duration="1min", rate=10.0)
+    foreign = plain.assign_attrs(simulation_model="[[effect")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_simulation(plain, plain)
+        read_simulation(plain, foreign)
