@@ -180,6 +180,8 @@ def append_netcdf(
         target = h5py.File(path, "r+")
         datasets = {name: target[name].id for name in large}
     creation = {name: dataset.get_create_plist() for name, dataset in datasets.items()}
+    # asked here, because h5py answers wrongly while another thread writes
+    chunks = {name: plist.get_chunk() for name, plist in creation.items()}
     codecs = {name: find_hdf5_codecs(plist) for name, plist in creation.items()}
     fills = {
         name: variable.attrs.get("_FillValue", encoding[name].get("_FillValue"))
@@ -188,7 +190,7 @@ def append_netcdf(
 
     def compress(name: str, values: NDArray[Any]) -> Any:
         fill = fills[name]
-        chunk = np.full(creation[name].get_chunk(), 0 if fill is None else fill, values.dtype)
+        chunk = np.full(chunks[name], 0 if fill is None else fill, values.dtype)
         inside = chunk[tuple(map(slice, values.shape))]
         inside[...] = values
         if fill is not None and values.dtype.kind == "f":
@@ -203,7 +205,6 @@ def append_netcdf(
             datasets[name].write_direct_chunk(tuple(part.start for part in box), compressed)
 
     try:
-        chunks = {name: plist.get_chunk() for name, plist in creation.items()}
         _copy_variables(large, chunks, compress, put, progress)
         with lock:
             target.flush()

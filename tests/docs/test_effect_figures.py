@@ -14,6 +14,7 @@ from gyrostab.ingest.make_log import make_log
 from gyrostab.physics.registry import effects
 from gyrostab.plot import plot_comparison
 from tests.conftest import ROOT
+from tests.support.pictures import same_layout
 from tests.support.scripts import load_script
 
 PAGES = ROOT / "docs" / "physics"
@@ -62,6 +63,7 @@ def test_the_table_of_confusions_names_effects() -> None:
     assert set(effects()) - named == set()
 
 
+@same_layout
 @pytest.mark.parametrize("name", ["shared_source", "earth_rate"])
 def test_the_script_draws_an_effect(name: str, tmp_path: Path) -> None:
     shown = np.asarray(Image.open(SCRIPT.draw(name, tmp_path)).convert("L"), float)

@@ -177,7 +177,7 @@ ORDER = {
     "another name of the signal": lambda log: log.rename(rate="gyro"),
     "folded": lambda log: log.coarsen(time=100).construct(time=("time", "fast")),
     "grouped": lambda log: log.groupby("time.second").mean(),
-    "without units": lambda log: log.assign(rate=log.rate.drop_attrs()),
+    "without units": lambda log: log.assign(rate=log.rate.drop_attrs(deep=False)),
     "one sample": lambda log: log.isel(time=[5]),
     "no sample": lambda log: log.isel(time=slice(0, 0)),
     "rows as read": lambda log: log.drop_vars("time").rename_dims(time="row"),

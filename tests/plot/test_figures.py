@@ -23,6 +23,7 @@ from gyrostab.plot import plot_coefficients, plot_davar, plot_signal
 from gyrostab.plot.figures import product_figures, save_figures
 from gyrostab.plot.style import save_png
 from tests.support import synthetic
+from tests.support.pictures import same_layout
 
 BASELINE = Path(__file__).parent / "baseline"
 # pixels of a baseline; downscaling removes font hinting and keeps lines and colours
@@ -71,11 +72,13 @@ def remake() -> None:
         picture(draw()).save(BASELINE / f"{name}.png", optimize=True)
 
 
+@same_layout
 @pytest.mark.parametrize("name", list(drawings()))
 def test_figure_matches_its_baseline(name):
     assert difference(picture(drawings()[name]()), baseline(name)) < TOLERANCE
 
 
+@same_layout
 def test_comparison_detects_a_change_of_content():
     product = synthetic.product()
     filled = product.assign(
@@ -88,6 +91,7 @@ def test_comparison_detects_a_change_of_content():
     assert difference(picture(plot_davar(noisier)), baseline("davar")) > 2 * TOLERANCE
 
 
+@same_layout
 def test_comparison_ignores_another_font():
     import matplotlib as mpl
 

@@ -369,6 +369,7 @@ def test_product_of_a_constant_signal_is_drawn_without_warnings(share, tmp_path)
     product = fit_noise(davar(log, window="1min", step="30s")).load()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        warnings.simplefilter("ignore", DeprecationWarning)  # of one library to another
         save_all(product, tmp_path)
         save_png(plot_davar_3d(product), tmp_path / "3d.png", dpi=40)
         write_report(product, tmp_path / "report.html")
