@@ -180,7 +180,7 @@ def append_netcdf(
         target = h5py.File(path, "r+")
         datasets = {name: target[name].id for name in large}
     creation = {name: dataset.get_create_plist() for name, dataset in datasets.items()}
-    # asked here, because h5py answers wrongly while another thread writes
+    # not in the threads: a call of h5py there made the writing of chunks fail
     chunks = {name: plist.get_chunk() for name, plist in creation.items()}
     codecs = {name: find_hdf5_codecs(plist) for name, plist in creation.items()}
     fills = {

@@ -160,7 +160,7 @@ def _sum_heads_and_tails(builder: Any, heads: list[list[Any]], tails: list[list[
     if 2 * count > LANES:
         return [_sum_vectors(builder, sums) for sums in (heads, tails)]
     vectors = heads + tails
-    # what is left over is filled with any
+    # the remaining lanes are filled with any
     totals = _sum_vectors(builder, [vectors[place % len(vectors)] for place in range(LANES)])
     return [
         builder.shuffle_vector(totals, totals, _shuffle_mask(list(range(begin, begin + count))))
