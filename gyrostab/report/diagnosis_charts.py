@@ -131,6 +131,26 @@ def _region_label(region: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def _band_outline(
+    x: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the outline of a band: a polygon for each stretch without a missing value.
+
+    Examples
+    --------
+    >>> x, y = _band_outline(np.arange(4.0), np.array([0.0, 0, np.nan, 0]), np.ones(4))
+    >>> x.tolist(), y.tolist()
+    ([0.0, 1.0, 1.0, 0.0, 0.0, 3.0, 3.0, 3.0], [0.0, 0.0, 1.0, 1.0, nan, 0.0, 1.0, nan])
+    """
+    present = np.isfinite(low) & np.isfinite(high)
+    ends = np.flatnonzero(np.diff(present, prepend=False, append=False)).reshape(-1, 2)
+    place, edge = [x[:0]], [low[:0]]
+    for part in (slice(*pair) for pair in ends):
+        place += [x[part], x[part][::-1], x[part][:1]]
+        edge += [low[part], high[part][::-1], np.full(1, np.nan)]
+    return np.concatenate(place), np.concatenate(edge)
+
+
 def _draw_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
     """Draw the mean rate of each axis with both simulations, and the channels below."""
     names, channels = axis_names(surfaces), select_channels(surfaces, content)
@@ -148,25 +168,17 @@ def _draw_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
             colour = COLOURS[1 - number]
             mean = part["mean"].sel(case=case).values
             band = NORMAL_95 * part["mean_stderr"].sel(case=case).values
-            for values, look in (
-                (mean - band, {"line": {"width": 0}, "showlegend": False}),
-                (
-                    mean + band,
-                    {
-                        "line": {"width": 0},
-                        "fill": "tonexty",
-                        "fillcolor": f"rgba{(*bytes.fromhex(colour[1:]), 0.18)}",
-                        "showlegend": False,
-                    },
-                ),
-                (mean, {"line": {"color": colour, "dash": "solid" if number else "dash"}}),
-            ):
-                figure.add_scatter(
-                    **{
-                        "x": window, "y": single(values), "mode": "lines",
-                        "name": f"{title}, 95 %", "legendgroup": case, **shared, **look,
-                    }
-                )  # fmt: skip
+            place, edge = _band_outline(window, mean - band, mean + band)
+            common = {"mode": "lines", "legendgroup": case, **shared}
+            figure.add_scatter(
+                x=place, y=single(edge), fill="toself", line={"width": 0}, hoverinfo="skip",
+                fillcolor=f"rgba{(*bytes.fromhex(colour[1:]), 0.18)}",
+                **(common | {"showlegend": False}),
+            )  # fmt: skip
+            figure.add_scatter(
+                x=window, y=single(mean), name=f"{title}, 95 %",
+                line={"color": colour, "dash": "solid" if number else "dash"}, **common,
+            )  # fmt: skip
         for region in content["mismatches"]:
             if name in region["axes"] and region["view"] in ("mean", "restart"):
                 figure.add_shape(
