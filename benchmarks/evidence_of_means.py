@@ -26,7 +26,7 @@ from gyrostab.diagnose.evidence.held_out import mean_factors
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
 from gyrostab.diagnose.predict.search import collect_evidence, combine_rows
 from gyrostab.diagnose.statistics import find_statistic
-from gyrostab.noise import HOUR
+from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
 BLOCKS, BLOCK_S, RATE = 90, 20.0, 10.0

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from gyrostab.ingest import read_log as read_log
     from gyrostab.ingest.convert import from_dataarray as from_dataarray
     from gyrostab.ingest.convert import from_dataframe as from_dataframe
-    from gyrostab.ingest.grid.regularise import gap_table as gap_table
+    from gyrostab.ingest.grid.gaps import gap_table as gap_table
     from gyrostab.ingest.grid.regularise import regularise as regularise
     from gyrostab.ingest.make_log import make_log as make_log
     from gyrostab.ingest.scan import scan as scan
@@ -65,7 +65,7 @@ _HOME = {
     "fit_noise": "allan.fit",
     "from_dataarray": "ingest.convert",
     "from_dataframe": "ingest.convert",
-    "gap_table": "ingest.grid.regularise",
+    "gap_table": "ingest.grid.gaps",
     "make_log": "ingest.make_log",
     "make_noise": "simulate",
     "open_diagnosis": "report.diagnosis_folder",

@@ -12,21 +12,6 @@ from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 
-__all__ = [
-    "DamageError",
-    "FormatError",
-    "GyrostabError",
-    "MissingUnitError",
-    "OptionError",
-    "OutputError",
-    "ResumeError",
-    "SchemaError",
-    "TimeError",
-    "UnitError",
-    "WorkerError",
-    "reading_of",
-]
-
 #: Errors of the operating system that concern the process or the path, not the content of a file.
 _SYSTEM_ERRNOS = (
     errno.EACCES, errno.EDQUOT, errno.EFBIG, errno.EINTR, errno.EISDIR, errno.ELOOP, errno.EMFILE,

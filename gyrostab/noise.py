@@ -33,19 +33,6 @@ from numpy.typing import NDArray
 
 from gyrostab.units import HOUR
 
-__all__ = [
-    "HOUR",
-    "LAWS",
-    "NORMAL_95",
-    "TERMS",
-    "URAD_PER_S",
-    "NoiseLaw",
-    "avar_columns",
-    "model_avar",
-    "sample_squares",
-    "sampled_psd",
-]
-
 #: One microradian per second in degree per hour.
 URAD_PER_S = 1e-6 * 180.0 / math.pi * HOUR
 #: Standard errors on either side of an estimate that hold 95 % of a normal distribution.

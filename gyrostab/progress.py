@@ -8,8 +8,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Protocol
 
-__all__ = ["Stage", "no_stage", "show_progress", "watch_compiler"]
-
 _COMPILING = "compiling, once after installation"
 #: Events of numba: it compiles, or `gyrostab.kernels.compile_ahead` waits for another process.
 _COMPILER_EVENTS = ("numba:compile", "gyrostab:compile")

@@ -21,25 +21,6 @@ from gyrostab.errors import SchemaError
 from gyrostab.noise import LAWS, TERMS
 from gyrostab.units import INNER
 
-__all__ = [
-    "ESTIMATORS",
-    "GAP_CAUSES",
-    "OBSERVABLE",
-    "RESERVED_NAMES",
-    "SIGNAL_LONG_NAMES",
-    "SIGNAL_UNITS",
-    "VARIABLES",
-    "attributes",
-    "check_coefficients",
-    "check_log",
-    "check_product",
-    "check_raw",
-    "check_surface",
-    "log_channels",
-    "signal_name",
-    "texts",
-]
-
 #: Flag values of ``gap_cause(gap)``, in the order of their numbers.
 GAP_CAUSES = (
     "missing",

@@ -18,8 +18,6 @@ from dataclasses import dataclass
 
 from gyrostab.errors import UnitError
 
-__all__ = ["DAY", "HOUR", "INNER", "ON_DISK", "Unit", "known_units", "on_disk", "parse_unit"]
-
 #: Quantity -> the unit that every array of that quantity has in memory.
 INNER = {
     "rate": "degree hour-1",

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-__all__ = ["format_value", "join_words", "list_some", "value_digits"]
-
 
 def join_words(words: Sequence[str]) -> str:
     """Join words as in a sentence; empty without a word.

@@ -22,8 +22,6 @@ import gyrostab
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["GyroAccessor", "GyrostabBackend"]
-
 
 @xr.register_dataset_accessor("gyro")  # type: ignore[no-untyped-call]
 @xr.register_dataarray_accessor("gyro")  # type: ignore[no-untyped-call]

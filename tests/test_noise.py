@@ -14,7 +14,6 @@ from scipy.integrate import quad
 from gyrostab.allan.davar import davar
 from gyrostab.ingest.make_log import make_log
 from gyrostab.noise import (
-    HOUR,
     LAWS,
     TERMS,
     URAD_PER_S,
@@ -23,6 +22,7 @@ from gyrostab.noise import (
     sample_squares,
     sampled_psd,
 )
+from gyrostab.units import HOUR
 from tests.support.noise_records import flicker, quantization, random_walk, white
 
 PACKAGE = Path(__file__).resolve().parents[1] / "gyrostab"

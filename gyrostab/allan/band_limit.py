@@ -23,8 +23,6 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import gammaincc
 
-__all__ = ["BandLimit", "choose_windows", "filter_response", "find_band_limit", "limit_response"]
-
 Array = NDArray[np.float64]
 #: Fit of rows: (avar, responses of N, Q and R, gap factor), trend, its response, set of terms ->
 #: squared coefficients (row, term), chi-square and degrees of freedom (row, 2).

@@ -12,14 +12,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.kernels.regression.trend import window_trend
-from gyrostab.noise import HOUR
 from gyrostab.schema import log_channels
 from gyrostab.store.lazy import read_slice
 from gyrostab.time.grid import first_stamp, grid_times
 from gyrostab.time.stamps import to_nanoseconds
-from gyrostab.units import INNER
-
-__all__ = ["window_channels"]
+from gyrostab.units import HOUR, INNER
 
 TEMPERATURE_RATE = "K hour-1"
 #: Largest number of values of a channel that are read at once for all windows of a part.

@@ -12,8 +12,6 @@ from gyrostab.kernels.allan.surface import Cells
 from gyrostab.kernels.compile_ahead import start_compilation
 from gyrostab.kernels.fit.least_squares import fit_windows
 
-__all__ = ["compile_fit", "compile_fit_ahead"]
-
 
 def compile_fit_ahead() -> None:
     """Compile the kernels in another process, unless they are compiled already.

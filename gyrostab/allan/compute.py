@@ -29,22 +29,9 @@ from gyrostab.kernels.allan.trend import window_trends
 from gyrostab.kernels.fit.least_squares import cell_freedoms, combine_diagonal, identify_noise
 from gyrostab.kernels.fit.mixture import Curves
 from gyrostab.kernels.workspace import Workspace
-from gyrostab.noise import HOUR, sample_squares
+from gyrostab.noise import sample_squares
 from gyrostab.store.lazy import find_source, keep_sources, read_into, read_slice
-
-__all__ = [
-    "CELL_FIELDS",
-    "FIELD_TYPES",
-    "PLANE_FIELDS",
-    "compute_unit",
-    "estimate_freedoms",
-    "join_units",
-    "make_noise_tables",
-    "read_spans",
-    "run_published_method",
-    "run_units",
-    "tabulate_noise",
-]
+from gyrostab.units import HOUR
 
 Floats = NDArray[np.float64]
 

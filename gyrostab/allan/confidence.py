@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from gyrostab.errors import OptionError
 from gyrostab.schema import check_surface
 
-__all__ = ["confidence_interval"]
-
 
 def confidence_interval(surface: xr.Dataset, *, level: float = 0.95) -> xr.Dataset:
     """Compute the confidence interval of the Allan variance of each cell.

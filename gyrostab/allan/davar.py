@@ -36,8 +36,6 @@ from gyrostab.kernels.workspace import Workspace
 from gyrostab.schema import attributes, log_channels
 from gyrostab.time.grid import first_stamp, grid_times
 
-__all__ = ["davar", "davar_part", "davar_parts", "davar_sample"]
-
 #: Smallest number of parts for the threads to share, if there are as many units of work.
 _MIN_PARTS = 4
 #: Largest share of the remaining units of work in one part: two threads then end at about the same

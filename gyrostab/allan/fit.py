@@ -20,12 +20,11 @@ from gyrostab.allan.plan import thin_factors
 from gyrostab.allan.window_fit import FitTables, fit_block, fit_tables, run_kernel
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.fit.covariance import STOCHASTIC
-from gyrostab.kernels.fit.least_squares import FIT_FIELDS
-from gyrostab.noise import HOUR, LAWS, TERMS, avar_columns
+from gyrostab.kernels.fit.submodels import FIT_FIELDS
+from gyrostab.noise import LAWS, TERMS, avar_columns
 from gyrostab.schema import attributes, check_surface
 from gyrostab.time.durations import duration_seconds, thin
-
-__all__ = ["Bands", "find_bands", "fit_noise", "fit_part", "refit"]
+from gyrostab.units import HOUR
 
 #: Band limit of each axis, by its name.
 Bands = Mapping[str, tuple[float, ...]]

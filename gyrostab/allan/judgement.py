@@ -8,12 +8,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.noise import HOUR, LAWS
+from gyrostab.noise import LAWS
 from gyrostab.schema import OBSERVED, check_product, texts
 from gyrostab.time.durations import format_duration
+from gyrostab.units import HOUR
 from gyrostab.wording import join_words
-
-__all__ = ["SUGGESTED_WINDOWS_S", "judge_product", "smallest_observable", "suggest_windows"]
 
 #: Lengths of windows to suggest [s].
 SUGGESTED_WINDOWS_S = (60, 300, 1200, *(int(hours * HOUR) for hours in (1, 4, 24)))

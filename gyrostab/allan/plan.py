@@ -15,17 +15,6 @@ from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.schema import signal_name
 from gyrostab.time.durations import averaging_factors, samples, thin
 
-__all__ = [
-    "MOST_CELLS",
-    "WINDOWS_S",
-    "Plan",
-    "choose_window",
-    "last_sample",
-    "make_plan",
-    "thin_factors",
-    "units_of_work",
-]
-
 #: Largest number of cells (windows times averaging times) of a unit of work, and of a part of a
 #: surface over all axes.
 MOST_CELLS = 2**20

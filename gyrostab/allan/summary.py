@@ -15,16 +15,6 @@ from gyrostab.allan.window_fit import is_described
 from gyrostab.noise import LAWS
 from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY, check_product
 
-__all__ = [
-    "FitSummary",
-    "TermSummary",
-    "describe_record",
-    "find_fit_from",
-    "format_product",
-    "summarise_fit",
-    "summarise_terms",
-]
-
 #: Largest number of windows that are fitted again to find the averaging time from which the terms
 #: describe the record.
 _MAX_TRIED_WINDOWS = 24

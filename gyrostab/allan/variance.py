@@ -12,14 +12,6 @@ from gyrostab.kernels.fit.covariance import product_tables
 from gyrostab.kernels.fit.third_differences import third_columns, third_tables
 from gyrostab.noise import avar_columns, sample_squares
 
-__all__ = [
-    "covariance_tables",
-    "surface_columns",
-    "variance_columns",
-    "variance_name",
-    "white_freedoms",
-]
-
 
 def variance_columns(variance: str, ks: NDArray[np.int64], rate: float) -> NDArray[np.float64]:
     """Compute the design matrix of the five-term model: the variance per squared coefficient.

@@ -13,13 +13,13 @@ from gyrostab.allan.variance import covariance_tables, variance_columns, white_f
 from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.compile_ahead import await_compilation
 from gyrostab.kernels.fit.covariance import STOCHASTIC
-from gyrostab.kernels.fit.least_squares import FIT_FIELDS, combine_diagonal, fit_windows
+from gyrostab.kernels.fit.least_squares import combine_diagonal, fit_windows
 from gyrostab.kernels.fit.limits import cell_limits, estimate_bounds
 from gyrostab.kernels.fit.mixture import Curves
+from gyrostab.kernels.fit.submodels import FIT_FIELDS
 from gyrostab.kernels.fit.trend import detrend_tables
-from gyrostab.noise import HOUR, NORMAL_95, TERMS, sample_squares
-
-__all__ = ["FitTables", "fit_block", "fit_tables", "is_described", "quantile_curve", "run_kernel"]
+from gyrostab.noise import NORMAL_95, TERMS, sample_squares
+from gyrostab.units import HOUR
 
 #: One-sided normal quantiles: 95 % for limits, 99 % for an observed term; two-sided 99 %, for the
 #: sign of a ramp is unknown.

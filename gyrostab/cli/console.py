@@ -19,16 +19,6 @@ from cyclopts import CycloptsError
 from gyrostab.cli.options import read_toml
 from gyrostab.errors import GyrostabError, OptionError
 
-__all__ = [
-    "attach_negative_values",
-    "describe_error",
-    "print_error",
-    "read_config",
-    "relaxed_gc",
-    "show_plain_warnings",
-    "sigterm_as_interrupt",
-]
-
 
 def attach_negative_values(tokens: Sequence[str]) -> list[str]:
     """Attach each negative number to the option before it, so that it is not parsed as an option.

@@ -12,8 +12,6 @@ from cyclopts import App, Parameter
 
 from gyrostab.cli.options import Common
 
-__all__ = ["Logs", "Output", "Product", "app", "find_inputs", "show_stages"]
-
 Logs = Annotated[list[Path], Parameter(name="LOG...", negative=())]
 Product = Annotated[Path, Parameter(name="PRODUCT")]
 Output = Annotated[Path, Parameter(name=["--output", "-o"], metavar="FILE")]

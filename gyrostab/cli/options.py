@@ -14,18 +14,6 @@ from gyrostab.errors import OptionError
 from gyrostab.ingest.limits import check_limits
 from gyrostab.store.toml import parse_toml, read_toml_text
 
-__all__ = [
-    "ChannelFile",
-    "Common",
-    "Fitting",
-    "Flag",
-    "Reading",
-    "Running",
-    "Survey",
-    "Windows",
-    "read_toml",
-]
-
 _READING = Group("Reading options", sort_key=1)
 _WINDOWS = Group("Analysis options", sort_key=2)
 _FITTING = Group("Fitting options", sort_key=3)

@@ -19,8 +19,6 @@ from gyrostab.noise import TERMS
 from gyrostab.schema import OBSERVED, check_product
 from gyrostab.time.durations import duration_seconds
 
-__all__ = ["correlate"]
-
 Array = NDArray[np.float64]
 _MAX_LAGS = 48
 

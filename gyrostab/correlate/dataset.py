@@ -12,8 +12,6 @@ from gyrostab.correlate.drivers import Driver, slope_units
 from gyrostab.correlate.judge import LIMITS, VERDICTS, slope_label
 from gyrostab.noise import TERMS
 
-__all__ = ["assemble", "join"]
-
 # Key of the entry, long name and units of each variable.
 _STATISTICS = {
     "coupling_lag": ("lag", "time by which the variable follows the driver", "s"),

@@ -12,11 +12,8 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError, SchemaError, TimeError
 from gyrostab.kernels.regression.trend import window_trend
-from gyrostab.noise import HOUR
 from gyrostab.time.stamps import to_nanoseconds
-from gyrostab.units import INNER
-
-__all__ = ["Driver", "align_drivers", "other_channels", "slope_units"]
+from gyrostab.units import HOUR, INNER
 
 Array = NDArray[np.float64]
 

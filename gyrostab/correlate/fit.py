@@ -26,8 +26,6 @@ from gyrostab.kernels.regression.coupling import (
 )
 from gyrostab.kernels.regression.windows import average_windows
 
-__all__ = ["SIGNIFICANCE", "Blocks", "fit_driver", "fit_partial_effects", "make_blocks"]
-
 Array = NDArray[np.float64]
 _MAX_BLOCKS = 160  # longer records are averaged further
 _MAX_SIMULATED_LAGS = 12  # in the simulation of the search; lags in between add no information

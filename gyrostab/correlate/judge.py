@@ -10,16 +10,6 @@ from numpy.typing import NDArray
 
 from gyrostab.correlate.drivers import slope_units
 
-__all__ = [
-    "LIMITS",
-    "VERDICTS",
-    "describe_coupling",
-    "driver_limits",
-    "format_p_value",
-    "readable_units",
-    "slope_label",
-]
-
 Array = NDArray[np.float64]
 
 #: Flag values of ``coupling_verdict``.

@@ -7,8 +7,6 @@ import xarray as xr
 
 from gyrostab.correlate.judge import VERDICTS, format_p_value
 
-__all__ = ["correlation_rows", "format_correlation"]
-
 
 def correlation_rows(result: xr.Dataset) -> list[dict[str, str]]:
     """List every coupling as a row of a table.

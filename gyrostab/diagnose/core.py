@@ -44,8 +44,6 @@ from gyrostab.ingest.convert import as_log
 from gyrostab.progress import Stage, no_stage
 from gyrostab.simulate.model import Model
 
-__all__ = ["diagnose"]
-
 
 def diagnose(
     log: xr.Dataset,

@@ -19,8 +19,6 @@ from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import first_stamp
 from gyrostab.wording import join_words
 
-__all__ = ["check_options", "parse_quiescent_span", "read_simulation", "varying_axes"]
-
 #: Fewest null records: one of them is expected beyond the default level of 1 %.
 MIN_NULL_RECORDS = 100
 #: Largest power [deg^2/h] that rounding alone gives a constant rate; noise of any gyro has more.

@@ -13,8 +13,6 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
-__all__ = ["DEFAULTS", "INTERVAL_TAILS", "Settings", "stored_settings"]
-
 #: Probabilities at the ends of all reported intervals; `diagnosis.json` fixes them to 95 %.
 INTERVAL_TAILS = (0.025, 0.975)
 

@@ -18,8 +18,6 @@ from gyrostab.diagnose.settings import Settings
 from gyrostab.progress import Stage
 from gyrostab.simulate.model import Model
 
-__all__ = ["Comparison", "Task", "lines_without_motion", "take_lines_at_rest"]
-
 
 @dataclass(frozen=True)
 class Task:

@@ -13,8 +13,6 @@ from gyrostab.ingest.combine import attach_channels
 from gyrostab.ingest.files import read_file
 from gyrostab.ingest.options import ReadOptions
 
-__all__ = ["read_channel"]
-
 
 def read_channel(
     path: str | Path,

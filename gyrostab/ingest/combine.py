@@ -26,8 +26,6 @@ from gyrostab.store.lazy import concatenate_columns, select_part, stack_rows
 from gyrostab.store.write import common_packing
 from gyrostab.wording import list_some
 
-__all__ = ["attach_channels", "concatenate", "memory_bytes", "move_to_disk", "with_channels"]
-
 
 def memory_bytes(part: xr.Dataset) -> int:
     """Return the size of the columns of a raw log that are in memory [bytes]; 0 for other logs."""

@@ -22,13 +22,10 @@ from gyrostab.errors import (
     UnitError,
 )
 from gyrostab.ingest.uniform import advise_dates, as_uniform
-from gyrostab.noise import HOUR
 from gyrostab.schema import SIGNAL_LONG_NAMES, SIGNAL_UNITS, texts
 from gyrostab.store.private import is_in_memory
 from gyrostab.store.read import MIN_LAZY_VALUES, make_variable_lazy
-from gyrostab.units import Unit, known_units, parse_unit
-
-__all__ = ["as_log", "from_dataarray", "from_dataframe"]
+from gyrostab.units import HOUR, Unit, known_units, parse_unit
 
 #: An option of a command with its value, as messages on files advise it.
 _OPTION = re.compile(
@@ -163,7 +160,8 @@ def _read_frame(
     kind: str | None = None,
 ) -> xr.Dataset:
     """Read a pandas table into a raw log, by the rules for files."""
-    from gyrostab.ingest.columns.plan import plan_columns, split_header
+    from gyrostab.ingest.columns.headers import split_header
+    from gyrostab.ingest.columns.plan import plan_columns
     from gyrostab.ingest.columns.typed import read_columns
     from gyrostab.ingest.files import check_options
     from gyrostab.ingest.options import ReadOptions

@@ -15,8 +15,6 @@ from gyrostab.ingest.options import FileSummary
 from gyrostab.schema import texts
 from gyrostab.time.stamps import format_stamp, to_nanoseconds
 
-__all__ = ["add_lost_notes", "check_share", "find_lost_spans", "is_damage", "reason_of"]
-
 #: Largest share of unreadable files; more suggest a wrong option instead of damage.
 MAX_LOST_SHARE = 0.5
 

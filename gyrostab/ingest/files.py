@@ -34,17 +34,6 @@ from gyrostab.ingest.overlap import stamp_span
 from gyrostab.schema import texts
 from gyrostab.store.remote import fetch_file, find_store, find_url, list_urls
 
-__all__ = [
-    "OnFile",
-    "ReadFile",
-    "Reader",
-    "check_options",
-    "read_file",
-    "read_log",
-    "readers",
-    "scan_file",
-]
-
 GROUP = "gyrostab.readers"
 #: Text files that are read in parallel.
 _FILES_AHEAD = 2

@@ -15,29 +15,6 @@ from gyrostab.time.grid import grid_index, grid_times
 from gyrostab.time.stamps import format_stamp, to_nanoseconds
 from gyrostab.units import HOUR
 
-__all__ = [
-    "CLOCK_STEP",
-    "COLUMNS",
-    "DUPLICATE",
-    "END",
-    "FIRST",
-    "MISSING",
-    "OUTSIDE_RANGE",
-    "RESTART",
-    "ROWS",
-    "SAMPLES",
-    "UNREADABLE",
-    "clip_table",
-    "describe_break",
-    "describe_clock_change",
-    "format_duration",
-    "gap_variables",
-    "name_lost",
-    "read_gap_columns",
-    "read_gaps",
-    "sort_gaps",
-]
-
 #: Largest table; in a longer one, neighbours of one cause are merged into one row.
 _MAX_TABLE_ROWS = 10_000
 

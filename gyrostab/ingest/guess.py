@@ -30,8 +30,6 @@ from gyrostab.ingest.guess_unit import given_unit, guess_unit, name_unit
 from gyrostab.ingest.inspect import ColumnInspection, FileInspection
 from gyrostab.time.grid import MAX_RATE_HZ
 
-__all__ = ["Guess", "guess_columns"]
-
 #: Number of a column, in its name.
 _NUMBER = re.compile(r"[0-9]{1,9}\Z")
 #: Typical rate of gyro logs [Hz], and spread [decades].

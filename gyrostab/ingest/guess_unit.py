@@ -12,15 +12,6 @@ from gyrostab.ingest.columns.headers import is_unit_of
 from gyrostab.ingest.inspect import ColumnInspection, FileInspection
 from gyrostab.units import HOUR, parse_unit
 
-__all__ = [
-    "EARTH_RATE_DPH",
-    "given_unit",
-    "guess_unit",
-    "name_unit",
-    "rate_plausibility",
-    "temperature_unit",
-]
-
 #: Rotation of the Earth [deg/h].
 EARTH_RATE_DPH = 15.041
 

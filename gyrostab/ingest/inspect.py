@@ -15,8 +15,6 @@ from gyrostab.errors import FormatError, GyrostabError
 from gyrostab.ingest.files import read_file, scan_file
 from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
 
-__all__ = ["ColumnInspection", "FileInspection", "inspect_file"]
-
 #: Largest number of columns to inspect; a sensor log has tens of them.
 MAX_COLUMNS = 100
 #: Rows that are inspected at one time.

@@ -21,18 +21,6 @@ from gyrostab.errors import FormatError, OptionError
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = [
-    "LIMITS",
-    "check_chunk",
-    "check_columns",
-    "check_declared",
-    "check_limits",
-    "check_stored",
-    "describe_limit",
-    "is_absurd_grid",
-    "limit_value",
-]
-
 #: Name -> largest number and what it counts; ``--limit NAME=NUMBER`` raises it
 #: (``limits={"NAME": NUMBER}`` in Python).
 LIMITS: Mapping[str, tuple[float, str]] = {
@@ -140,7 +128,7 @@ def is_absurd_grid(samples: int, rows: int, given: Mapping[str, float] | None = 
     return samples > max(limit_value("grid_samples", given), GRID_SAMPLES_PER_ROW * rows)
 
 
-def bytes_present(path: Path) -> int:
+def _bytes_present(path: Path) -> int:
     """Return the size of a file, or of all files in a directory."""
     if not path.is_dir():
         return path.stat().st_size
@@ -162,7 +150,7 @@ def check_stored(
     claimed = rows * columns
     if claimed <= limit_value("stored_samples", given):
         return
-    present = bytes_present(path)
+    present = _bytes_present(path)
     if claimed > STORED_SAMPLES_PER_BYTE * present:
         raise FormatError(
             f"{path.name}: it declares {rows:.4g} samples in each of {columns} columns, but "

@@ -13,8 +13,6 @@ from gyrostab.schema import SIGNAL_LONG_NAMES, SIGNAL_UNITS
 from gyrostab.time.grid import check_rate, check_span, stamp_ns, time_coordinate
 from gyrostab.units import INNER, parse_unit
 
-__all__ = ["make_log"]
-
 
 def make_log(
     values: Any,

@@ -12,8 +12,6 @@ from gyrostab.errors import OptionError
 from gyrostab.ingest.limits import check_limits
 from gyrostab.time.grid import check_rate, stamp_ns
 
-__all__ = ["ColumnSummary", "FileSummary", "ReadOptions"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class ReadOptions:

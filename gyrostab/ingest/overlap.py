@@ -11,8 +11,6 @@ from gyrostab.ingest.columns.stamps import NAT, read_stamps
 from gyrostab.ingest.concat.place import count_alike, is_copy
 from gyrostab.schema import SIGNAL_UNITS
 
-__all__ = ["drop_repeats", "first_known_stamp", "stamp_span"]
-
 _BLOCK_ROWS = 2**20
 _FIRST_ROWS = 2**16  # read at once in search of the first stamp
 _COMPARED_ROWS = 2**15  # at each end of an overlap

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from gyrostab.ingest.guess import Guess
     from gyrostab.ingest.inspect import FileInspection
 
-__all__ = ["COLUMNS", "InspectedFile", "ScanResult", "scan", "scan_and_inspect"]
-
 #: Largest share of missing samples at a plausible sampling rate; above it, the mean rate of the
 #: rows is tried.
 MAX_MISSING_SHARE = 0.1
@@ -250,7 +248,8 @@ def _named_rate(path: Path) -> float | None:
 def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
     from gyrostab.ingest import ReadOptions, read_log, scan_file
     from gyrostab.ingest.grid.fill import count_present
-    from gyrostab.ingest.grid.regularise import gap_table, regularise
+    from gyrostab.ingest.grid.gaps import gap_table
+    from gyrostab.ingest.grid.regularise import regularise
     from gyrostab.ingest.uniform import cut_log
     from gyrostab.schema import log_channels, signal_name, texts
 

@@ -17,8 +17,6 @@ import pandas as pd
 if TYPE_CHECKING:
     from gyrostab.ingest.scan import InspectedFile
 
-__all__ = ["next_command", "print_inspection", "print_next", "print_scan"]
-
 #: Options whose flag on the command line has another name.
 _FLAGS = {"limits": "--limit", "time_from": "--from", "time_to": "--to"}
 

@@ -46,16 +46,6 @@ from gyrostab.store.write import (
     large_variables,
 )
 
-__all__ = [
-    "open_dataset",
-    "open_log",
-    "open_product",
-    "open_surface",
-    "plan_zarr",
-    "to_netcdf",
-    "to_zarr",
-]
-
 #: Values in one compressed chunk of a surface or product: 1 MiB of float64.
 CHUNK_VALUES = 2**17
 #: Samples from which a log is stored without the time of each sample by default.

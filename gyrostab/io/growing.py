@@ -19,8 +19,6 @@ from gyrostab.io.datasets import plan_zarr
 from gyrostab.store.cf import to_disk
 from gyrostab.store.output import find_foreign_item, new_output
 
-__all__ = ["LayoutError", "write_windows"]
-
 #: Smallest number of windows in one chunk.
 _MIN_CHUNK_WINDOWS = 1024
 

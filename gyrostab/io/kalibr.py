@@ -41,11 +41,10 @@ from gyrostab.allan.fit import fit_noise
 from gyrostab.allan.summary import FitSummary, summarise_fit, summarise_terms
 from gyrostab.errors import SchemaError
 from gyrostab.ingest.make_log import make_log
-from gyrostab.noise import HOUR, LAWS
+from gyrostab.noise import LAWS
 from gyrostab.schema import check_product, texts
 from gyrostab.store.output import new_output
-
-__all__ = ["ACCELEROMETER_KEYS", "KEYS", "KalibrValue", "convert_terms", "to_kalibr"]
+from gyrostab.units import HOUR
 
 _GRAVITY = 9.80665  # m/s^2
 #: Samples of an accelerometer that are read at a time.

@@ -36,8 +36,6 @@ from gyrostab.io.survey_terms import survey_terms
 from gyrostab.store.output import check_output, new_output
 from gyrostab.units import HOUR
 
-__all__ = ["SUFFIXES", "WEIGHTS", "to_iscwsa"]
-
 SUFFIXES = (".csv", ".json", ".xml")
 _H = "(EarthRate * Cos(Latitude))"
 _STEP = "(MD - MDPrev) / "

@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-__all__ = ["Status", "SurveyModel", "SurveyTerm", "Tool"]
-
 Status = Literal["observed", "upper_limit_only", "not_observable"]
 Tool = Literal["xyz", "xy", "z"]
 

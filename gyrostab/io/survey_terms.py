@@ -44,8 +44,6 @@ from gyrostab.time.durations import duration_seconds
 if TYPE_CHECKING:
     from gyrostab.diagnose.result.diagnosis import Diagnosis
 
-__all__ = ["drift_rate", "survey_terms"]
-
 Statistic = Literal["median", "p95"]
 _Groups = tuple[tuple[str, ...], ...]
 #: From best to worst: a term has the worst status of its coefficients.

@@ -16,8 +16,6 @@ from gyrostab.noise import LAWS
 from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY
 from gyrostab.units import INNER, parse_unit
 
-__all__ = ["Alarm", "check_alarms", "describe_windows", "parse_alarm"]
-
 _SYNTAX = re.compile(
     r"\s*(?:(?P<axis>\w+)\s*:)?\s*(?P<name>[A-Za-z]\w*)\s*(?P<sign>[<>])\s*"
     r"(?P<limit>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(?P<unit>.*?)\s*"

@@ -34,20 +34,6 @@ from gyrostab.store.remote import (
     walk_address,
 )
 
-__all__ = [
-    "DIAGNOSIS",
-    "FLEET_MARK",
-    "FLEET_SCHEMA",
-    "RESERVED_NAMES",
-    "Archive",
-    "LogRun",
-    "find_archive",
-    "find_runs",
-    "index_files",
-    "is_fleet",
-    "read_diagnosis",
-]
-
 #: File that marks a folder of `gyrostab.jobs.fleet`.
 FLEET_MARK = "fleet.json"
 FLEET_SCHEMA = "gyrostab.fleet/1"

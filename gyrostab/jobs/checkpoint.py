@@ -22,8 +22,6 @@ from gyrostab.io.datasets import CHUNK_VALUES
 from gyrostab.store.lazy import Source, make_dask
 from gyrostab.store.output import replace_file
 
-__all__ = ["Block", "assemble", "block_path", "find_blocks", "write_block"]
-
 _MAGIC = b"GYROBLK1"
 _ALIGN_BYTES = 64
 _DIGEST_BYTES = hashlib.sha256().digest_size

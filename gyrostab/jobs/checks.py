@@ -8,8 +8,6 @@ from typing import Any
 
 from gyrostab.errors import OptionError
 
-__all__ = ["check_options"]
-
 
 def check_options(
     *,
@@ -33,12 +31,12 @@ def check_options(
         "fitting": dict(fitting or {}),
     }
     check_cut(**options["reading"])
-    check_windows(**options["windows"])
+    _check_windows(**options["windows"])
     check_fit_options(**options["fitting"])
     return options
 
 
-def check_windows(
+def _check_windows(
     *,
     window: str | None = None,
     step: str | None = None,
@@ -56,7 +54,7 @@ def check_windows(
 
     Examples
     --------
-    >>> check_windows(window="10", step="1min")
+    >>> _check_windows(window="10", step="1min")
     Traceback (most recent call last):
     gyrostab.errors.OptionError: window 10 has no unit; write '10s' for seconds or '10samples' ...
     """

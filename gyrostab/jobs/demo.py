@@ -13,8 +13,6 @@ from gyrostab.errors import OutputError
 from gyrostab.jobs.run import count_samples, load_log
 from gyrostab.progress import Stage, no_stage
 
-__all__ = ["PARTS", "format_summary", "run_demo", "sample_log", "summarise"]
-
 WINDOW, STEP = "4h", "30min"
 #: Parts of the record, which ``data/models/demo.toml`` describes: begin and end [h].
 PARTS = {"warming up": (0, 6), "at rest": (6, 12), "shaken": (12, 18), "at rest again": (18, 24)}

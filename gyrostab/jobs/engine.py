@@ -24,15 +24,6 @@ from gyrostab.jobs.schedule import Pool, run_calls
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.progress import Stage
 
-__all__ = [
-    "Blocks",
-    "compute_blocks",
-    "compute_part",
-    "find_constant_shares",
-    "find_record_bands",
-    "write_blocks",
-]
-
 #: Finished parts by their number.
 Blocks = dict[int, Block]
 # Results are held at most this long, or this large, before the inputs are checked again,

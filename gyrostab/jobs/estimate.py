@@ -19,8 +19,6 @@ from gyrostab.jobs.engine import compute_part
 from gyrostab.jobs.run import load_log
 from gyrostab.progress import watch_compiler
 
-__all__ = ["estimate_run"]
-
 
 def estimate_run(
     paths: Sequence[str | Path],

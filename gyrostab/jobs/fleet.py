@@ -71,8 +71,6 @@ from gyrostab.store.remote import (
     upload_file,
 )
 
-__all__ = ["process_run", "run_fleet", "write_file_table"]
-
 #: Time after which the table of runs is written again [s]; a killed call loses rows of this time,
 #: which are made again from the products.
 _SAVE_SECONDS = 30.0

@@ -19,22 +19,6 @@ from gyrostab.store.read import open_stored
 from gyrostab.store.remote import full_name, read_bytes, upload_file
 from gyrostab.units import DAY, INNER
 
-__all__ = [
-    "FILES",
-    "TREND_COLUMNS",
-    "find_trends",
-    "is_zarr",
-    "list_effects",
-    "make_table",
-    "open_fleet",
-    "product_path",
-    "read_rows",
-    "read_table",
-    "summarise_run",
-    "write_rows",
-    "write_table",
-]
-
 FILES, RUNS = "files", "runs"  # contents of tables
 #: Name of the metadata of a table of this package in a Parquet file.
 _METADATA = b"gyrostab"

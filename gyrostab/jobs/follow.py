@@ -18,8 +18,6 @@ from gyrostab.ingest.files import read_file
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.store.output.inputs import describe_file, match_files
 
-__all__ = ["FileMemory", "FileStates", "RowKeeper", "list_files"]
-
 #: Files written this long [s] before the newest one, or later, may still grow.
 _GROWING_SECONDS = 60.0
 #: Size of the files in which rows of standard input are kept [bytes].

@@ -29,26 +29,6 @@ from gyrostab.store.output.content import read_json
 from gyrostab.store.remote import find_url, full_name
 from gyrostab.store.system import lock_file, write_at
 
-__all__ = [
-    "begin_job",
-    "check_job_folder",
-    "clear_job",
-    "count_finished_parts",
-    "describe_differences",
-    "describe_inputs",
-    "format_option",
-    "has_finished_work",
-    "hash_fingerprint",
-    "is_lock",
-    "job_folder",
-    "lock_job",
-    "make_fingerprint",
-    "read_job",
-    "remove_damage",
-    "remove_job",
-    "write_store_checksum",
-]
-
 _SCHEMA = "gyrostab.job/1"
 _REMOVES_OPEN_FILES = os.name != "nt"
 _JOB_FILE = re.compile(r"lock|job\.json|log\.zarr|log\.sha256|windows-\d{10}\.block")

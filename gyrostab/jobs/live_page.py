@@ -15,8 +15,6 @@ from typing import Any
 from gyrostab.errors import OptionError
 from gyrostab.noise import LAWS
 
-__all__ = ["LivePage"]
-
 _HOST = "127.0.0.1"
 #: Windows, and alarms and notes, that the page shows at most.
 _MAX_WINDOWS, _MAX_EVENTS = 500, 100

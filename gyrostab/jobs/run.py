@@ -56,8 +56,6 @@ from gyrostab.store.output import (
 from gyrostab.store.remote import find_url
 from gyrostab.store.system import return_large_arrays
 
-__all__ = ["count_samples", "find_job_name", "load_log", "read_job_name", "run"]
-
 #: Options of `check_output` for a NetCDF file and for a Zarr group.
 _FORMS: dict[bool, dict[str, Any]] = {
     False: {"suffixes": [".nc", ".zarr"]},

@@ -19,8 +19,6 @@ from typing import Any, NamedTuple
 from gyrostab.errors import GyrostabError, OptionError, WorkerError
 from gyrostab.store.remote import full_name
 
-__all__ = ["Pool", "check_scheduler", "open_pool", "run_calls"]
-
 _CONNECT_TIMEOUT_S = 20.0  # s, for a scheduler to answer and for a first worker to come
 _NO_WORKER_TIMEOUT_S = 60.0  # s without any worker
 

@@ -49,8 +49,6 @@ from gyrostab.store.system import release_memory, return_large_arrays
 from gyrostab.time.durations import duration_seconds, samples
 from gyrostab.time.grid import first_stamp, grid_times
 
-__all__ = ["Listener", "rows_folder", "watch"]
-
 #: Attribute of the product with the options that made it.
 _OPTIONS = "gyrostab_watch"
 #: Largest share of the time that is spent on updates: after a long one, the next one waits.
@@ -320,7 +318,7 @@ class _View:
         common = repr(
             (start, rate, fitting, log["axis"].values.tolist(), log_channels(log), source)
         )
-        digests = [hash_samples(log, span, common) for span in spans]
+        digests = [_hash_samples(log, span, common) for span in spans]
         same_record, self.common = common == self.common, common
         self._write_product(used, units, digests, fitting or {}, same_record=same_record)
 
@@ -377,7 +375,7 @@ class _View:
                     self.listener.show_alarm(event)
 
 
-def hash_samples(log: xr.Dataset, span: tuple[int, int], common: str) -> bytes:
+def _hash_samples(log: xr.Dataset, span: tuple[int, int], common: str) -> bytes:
     """Hash what determines the samples of a span: where rows of text lie, or else the values.
 
     Rows that were read are taken not to change; which row a sample comes from may change when late

@@ -15,8 +15,6 @@ from typing import Any
 
 from numba.core import event
 
-__all__ = ["WAITING", "await_compilation", "start_compilation"]
-
 #: Event of numba that is triggered while this process waits for the other.
 WAITING = "gyrostab:compile"
 

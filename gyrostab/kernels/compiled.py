@@ -11,8 +11,6 @@ from typing import Any
 
 from numba import njit
 
-__all__ = ["INNER", "KERNEL", "REORDER"]
-
 
 def _has_cache() -> bool:
     """Whether numba finds a folder for compiled code.

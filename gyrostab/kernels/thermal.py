@@ -19,16 +19,6 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import KERNEL
 
-__all__ = [
-    "apply_dead_band",
-    "mean_changes",
-    "mean_dead_band_distance",
-    "mean_followed",
-    "mean_rates",
-    "relax",
-    "slab",
-]
-
 Array = NDArray[np.float64]
 
 #: Smaller numbers are zero: the processor is slow with those that it cannot normalise.

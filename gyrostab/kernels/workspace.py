@@ -8,8 +8,6 @@ import threading
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Workspace", "Workspaces"]
-
 # Bytes of a line of the cache; vectors that begin with one are loaded at once.
 _LINE = 64
 

@@ -11,8 +11,6 @@ import numpy as np
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Windows, parameter
 from gyrostab.units import DAY, HOUR
 
-__all__ = ["AgeingBias", "AgeingNoise"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class AgeingBias(Effect):

@@ -14,8 +14,6 @@ from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windo
 from gyrostab.physics.phase import lorentz_density, sine_means, steady_line
 from gyrostab.units import HOUR, INNER
 
-__all__ = ["Clipping", "ClockError", "GaussMarkov", "SupplyBias"]
-
 _PPM = 1e-6
 _MAX_KEPT_SAMPLES = 2**20
 _LAGS_S = np.array([0.0, 8.0, 25.0, 80.0, 250.0])

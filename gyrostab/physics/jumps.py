@@ -13,8 +13,6 @@ from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windo
 from gyrostab.physics.phase import lorentz_density
 from gyrostab.units import HOUR
 
-__all__ = ["BiasJump", "FringeHop", "Telegraph", "step_means"]
-
 _LIGHT_M_PER_S = 299_792_458.0  # m/s
 _RADIAN_PER_S = math.degrees(1.0) * HOUR  # deg/h
 

@@ -23,8 +23,6 @@ from gyrostab.physics.phase import (
 )
 from gyrostab.units import INNER
 
-__all__ = ["RotationLine", "SpectralLine"]
-
 #: Slower rotation is rest: a turn takes more than 100 s, and the channel may have noise. Design
 #: choice, a tenth of the slowest stick-slip.
 _LEAST_TURNING_DEG_S = 3.6

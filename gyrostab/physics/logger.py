@@ -13,9 +13,6 @@ from gyrostab.errors import OptionError
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
 from gyrostab.units import HOUR
 
-__all__ = ["HeldSamples", "LoggerFilter", "RateQuantization", "Spikes"]
-
-
 #: Mean lengths of a frame sent twice, to which its geometric law is cut: longer ones have a
 #: probability of 2e-9.
 _FRAME_LENGTHS = 20.0

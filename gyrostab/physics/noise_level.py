@@ -15,12 +15,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.noise import HOUR, sampled_psd
+from gyrostab.noise import sampled_psd
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Windows, parameter
-from gyrostab.units import INNER
-
-__all__ = ["LightPowerNoise", "TemperatureNoise", "VibrationNoise", "VibrationRandomWalk"]
-
+from gyrostab.units import HOUR, INNER
 
 #: Least N^2 of a polynomial law, as a share of its value at the reference (a tenth of N). Outside
 #: of the range where it was measured, the polynomial could be negative.

@@ -15,8 +15,6 @@ from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windo
 from gyrostab.physics.phase import comb_density, fold, lorentz_density
 from gyrostab.units import HOUR, INNER
 
-__all__ = ["DeadZone", "FeedbackReset", "SharedSource"]
-
 _NRAD_PER_S = math.degrees(1e-9) * HOUR  # deg/h
 _HARMONICS = 40
 _PARTS_OF_BIN = 32  # of the phase of the ramp, over which a prediction is averaged

@@ -8,20 +8,6 @@ import numpy as np
 
 from gyrostab.physics.base import Array, Chunk, Windows
 
-__all__ = [
-    "TURN",
-    "comb_density",
-    "fold",
-    "line_density",
-    "lorentz_density",
-    "resonance_density",
-    "sine_means",
-    "steady_line",
-    "turn_means",
-    "turns_of_samples",
-    "turns_of_windows",
-]
-
 #: Degrees in a turn.
 TURN = 360.0
 

@@ -18,8 +18,6 @@ from gyrostab.errors import OptionError, UnitError
 from gyrostab.physics.base import Effect
 from gyrostab.units import DAY, HOUR, parse_unit
 
-__all__ = ["amount", "close_to", "effect_table", "effects", "is_number", "make_effect"]
-
 
 @cache
 def effects() -> Mapping[str, type[Effect]]:

@@ -21,8 +21,6 @@ from gyrostab.physics.phase import (
 )
 from gyrostab.units import HOUR, INNER
 
-__all__ = ["EarthRate", "Misalignment", "RealMotion", "ScaleFactor"]
-
 _PPM = 1e-6
 _MRAD = 1e-3
 

@@ -13,8 +13,6 @@ from gyrostab.noise import NORMAL_95
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Windows, parameter
 from gyrostab.units import HOUR, INNER
 
-__all__ = ["Shupe", "TemperatureBias", "ThermalGradient", "ThermalHysteresis"]
-
 _MINUTE = 60.0
 _NO_LAG_S = 1e-3
 

@@ -12,8 +12,6 @@ from gyrostab.errors import OptionError
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
 from gyrostab.units import INNER
 
-__all__ = ["AliasedVibration", "GSensitivity", "Magnetic", "VibrationRectification"]
-
 _MIN_EDGE_HZ = 0.01
 _FOLDED_POINTS = 1001  # of the spectrum of the samples, from which a sentence takes the band
 

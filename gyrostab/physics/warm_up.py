@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
 from gyrostab.units import HOUR
 
-__all__ = ["WarmUp"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class WarmUp(Effect):

@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["find_shown_values", "plot_coefficients"]
-
 
 @draws_figure
 def plot_coefficients(

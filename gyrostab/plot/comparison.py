@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["plot_comparison"]
-
 Array = NDArray[np.float64]
 _STYLES: tuple[dict[str, Any], dict[str, Any]] = (
     {"color": GREY, "lw": 2.4},

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["plot_correlation"]
-
 #: Points while the driver rises, and while it falls.
 _RISING: dict[str, Any] = {"linestyle": "none", "marker": "^", "color": COLOURS[1]}
 _FALLING: dict[str, Any] = {

@@ -29,15 +29,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "plot_change",
-    "plot_deviations",
-    "plot_means",
-    "plot_spectra",
-    "plot_surfaces",
-    "select_channels",
-]
-
 Array = NDArray[np.float64]
 _TITLES = {"recording": "Recording", "before": "Simulation before", "after": "Simulation after"}
 _STYLES: dict[str, dict[str, Any]] = {

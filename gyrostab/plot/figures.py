@@ -22,8 +22,6 @@ from gyrostab.store.output import check_folder, new_folder
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["product_figures", "save_figures"]
-
 
 def product_figures(
     product: xr.Dataset, *, width: float = PAGE_MM

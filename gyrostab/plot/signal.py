@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["plot_signal", "thin"]
-
 _BLOCK_SAMPLES = 2**22  # samples read at a time: 32 MiB
 
 

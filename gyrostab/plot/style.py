@@ -23,35 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
-__all__ = [
-    "COLOURS",
-    "INCH_MM",
-    "MARKERS",
-    "NARROW_MM",
-    "PAGE_MM",
-    "axis_names",
-    "axis_style",
-    "draws_figure",
-    "duration",
-    "embedded",
-    "find_runs",
-    "is_narrow",
-    "label_log_axis",
-    "log_edges",
-    "new_figure",
-    "save_png",
-    "shade_spans",
-    "stack_panels",
-    "time_axis",
-    "title_figure",
-    "unit_label",
-    "unit_of_time",
-    "unit_symbol",
-    "upper_limit_marker",
-    "window_text",
-    "write_in_middle",
-]
-
 P = ParamSpec("P")
 
 #: Palette of Okabe and Ito, without its yellow, which is hard to see in print.

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["find_time_edges", "plot_davar", "plot_davar_3d"]
-
 CMAP = "viridis"
 CHANGE_CMAP = "PuOr_r"  # safe for colour-blind readers, white where nothing changes
 _WEIGHTED = ESTIMATORS.index("weighted_clusters")

@@ -16,25 +16,6 @@ from gyrostab.time.stamps import to_nanoseconds
 if TYPE_CHECKING:
     import plotly.graph_objects as go
 
-__all__ = [
-    "DEVIATION_LABEL",
-    "SYMBOLS",
-    "TAU_LABEL",
-    "TIME_AXIS",
-    "Chart",
-    "decade_bar",
-    "embeddable",
-    "gap_shapes",
-    "label_panel",
-    "log_axis",
-    "milliseconds",
-    "new_chart",
-    "plain_text",
-    "plotly_script",
-    "single",
-    "stacked_panels",
-]
-
 DEVIATION_LABEL, TAU_LABEL = "Allan deviation [deg/h]", "averaging time [s]"
 TIME_AXIS = {"type": "date", "title": {"text": "time (UTC)"}}
 #: Markers of the axes, by number, like `gyrostab.plot.style.MARKERS`.

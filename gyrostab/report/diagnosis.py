@@ -30,8 +30,6 @@ from gyrostab.report.page import page_text
 from gyrostab.store.output import new_output
 from gyrostab.wording import value_digits
 
-__all__ = ["write_diagnosis_report"]
-
 _VIEW_TEXT = {
     "davar": "noise over time and averaging time (dynamic Allan variance)",
     "mean": "mean rate over time",

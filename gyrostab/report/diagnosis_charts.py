@@ -29,8 +29,6 @@ from gyrostab.report.charts import (
 if TYPE_CHECKING:
     import plotly.graph_objects as go
 
-__all__ = ["diagnosis_charts"]
-
 _RED = "#D00000"
 _CASES = {"before": "simulation before", "after": "simulation after"}
 _MAX_LINES = 4000

@@ -18,8 +18,6 @@ from gyrostab.store.output import new_output
 from gyrostab.store.output.content import read_json
 from gyrostab.store.toml import read_toml_text
 
-__all__ = ["FILES", "find_foreign_file", "open_diagnosis", "write_diagnosis"]
-
 #: Files of the folder.
 FILES = ("diagnosis.json", "model.toml", "diagnosis.nc", "report.html")
 

@@ -33,8 +33,6 @@ from gyrostab.store.output import new_output
 from gyrostab.store.remote import find_url, upload_file
 from gyrostab.units import HOUR
 
-__all__ = ["combine_effects", "write_overview"]
-
 _PANEL_MM = 45.0
 _MAX_CHANCE = 0.05  # probability that chance alone shows any trend
 

@@ -8,8 +8,6 @@ from typing import Any
 
 from gyrostab.report.charts import plotly_script
 
-__all__ = ["page_text"]
-
 
 def page_text(template: str, *, title: str, plotly: str = "", **content: Any) -> str:
     """Render a template, with the time and the version that made the page.

@@ -21,8 +21,6 @@ from gyrostab.store.output import new_output
 if TYPE_CHECKING:
     from gyrostab.allan.summary import TermSummary
 
-__all__ = ["write_report"]
-
 _MAX_GAPS_LISTED = 20
 
 

@@ -37,8 +37,6 @@ from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY
 if TYPE_CHECKING:
     import plotly.graph_objects as go
 
-__all__ = ["product_charts", "window_data"]
-
 #: Largest numbers of windows that are drawn over time, and of windows and averaging times of which
 #: the whole surface is in the page: a page of three axes then has about 7 MB, 4.8 of them plotly.
 _MAX_WINDOWS, _MAX_SURFACE_WINDOWS, _MAX_TAUS = 1000, 200, 60

@@ -17,8 +17,6 @@ from gyrostab.simulate.noise import Units, shape
 from gyrostab.time.grid import grid_times
 from gyrostab.units import HOUR
 
-__all__ = ["BlockState", "Plan", "Step", "next_block"]
-
 Array = NDArray[np.float64]
 
 

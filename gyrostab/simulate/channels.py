@@ -16,8 +16,6 @@ from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import stamp_ns, time_coordinate
 from gyrostab.units import INNER, parse_unit
 
-__all__ = ["HELD", "Points", "channel", "check_points", "combine", "inner_unit", "piecewise"]
-
 Array = NDArray[np.float64]
 #: Table of a profile: rows of a time [s] and what holds there.
 Points = Sequence[Sequence[float]]

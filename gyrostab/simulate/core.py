@@ -41,8 +41,6 @@ from gyrostab.time.grid import first_stamp, grid_index, stamp_ns, time_coordinat
 from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import parse_unit
 
-__all__ = ["simulate"]
-
 #: Samples of the instrument in one block of the lazy log.
 BLOCK = 2**17
 _RECORDED = "recorded rate of "  # source of an effect, in front of the name of the axis

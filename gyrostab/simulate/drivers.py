@@ -16,8 +16,6 @@ from gyrostab.time.grid import TimeGridIndex, grid_index, grid_times
 from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import INNER
 
-__all__ = ["Source", "make_course", "make_source"]
-
 Array = NDArray[np.float64]
 #: Longer channels are read stretch by stretch.
 SHORT = 2**22

@@ -24,10 +24,7 @@ from gyrostab.simulate.channels import (
     inner_unit,
     piecewise,
 )
-from gyrostab.simulate.turning import rotation
 from gyrostab.time.durations import duration_seconds
-
-__all__ = ["chamber", "light_power", "ramps", "rotation", "steps", "supply", "trip", "vibration"]
 
 Array = NDArray[np.float64]
 

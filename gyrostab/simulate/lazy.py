@@ -15,8 +15,6 @@ from gyrostab.simulate.drivers import SHORT
 from gyrostab.simulate.noise import NoiseState, draw
 from gyrostab.time.grid import grid_times
 
-__all__ = ["Chain", "lazy_rates"]
-
 #: Results that a chain keeps, for the threads that ask for them a little later.
 RECENT = 3
 #: States that a chain keeps over its whole length, to begin again from.

@@ -17,8 +17,6 @@ from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import stamp_ns
 from gyrostab.units import HOUR
 
-__all__ = ["gaps", "losses", "power_cuts"]
-
 _MISSING, _RESTART = (GAP_CAUSES.index(name) for name in ("missing", "restart"))
 
 

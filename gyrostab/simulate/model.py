@@ -18,11 +18,10 @@ from gyrostab.physics.base import Effect
 from gyrostab.physics.registry import amount, close_to, is_number, make_effect
 from gyrostab.simulate import environment, losses
 from gyrostab.simulate.noise import FLICKER_LOW
+from gyrostab.simulate.turning import rotation
 from gyrostab.store.toml import parse_toml, read_toml_text
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import stamp_ns
-
-__all__ = ["PROFILES", "Model", "naming_of", "read_model"]
 
 #: Largest noise coefficient: its square, and sums of squares, stay within the range of numbers.
 _MAX_COEFFICIENT = 1e100
@@ -54,7 +53,7 @@ PROFILES: dict[str, tuple[Callable[..., Any], dict[str, str]]] = {
         },
     ),
     "rotation": (
-        environment.rotation,
+        rotation,
         {
             "stick_slip": "1",
             "period": "s",

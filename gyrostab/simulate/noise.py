@@ -26,18 +26,8 @@ from gyrostab.kernels.random.stochastic import (
     ornstein_uhlenbeck_means,
     sinusoid_means,
 )
-from gyrostab.noise import HOUR, TERMS, URAD_PER_S
-
-__all__ = [
-    "FLICKER_LOW",
-    "NoiseState",
-    "Units",
-    "begin_noise",
-    "draw",
-    "make_noise",
-    "shape",
-    "stream",
-]
+from gyrostab.noise import TERMS, URAD_PER_S
+from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
 #: Lowest frequency of flicker noise [Hz] unless a model says otherwise: flat within 0.2 % to

@@ -13,8 +13,6 @@ from gyrostab.errors import OptionError
 from gyrostab.simulate.channels import HELD, Points, channel, check_points, combine
 from gyrostab.time.durations import duration_seconds
 
-__all__ = ["rotation"]
-
 Array = NDArray[np.float64]
 
 

@@ -21,14 +21,6 @@ from gyrostab.store.safe_names import is_storable, make_name_storable
 from gyrostab.time.clock import time_of_day
 from gyrostab.units import ON_DISK, on_disk
 
-__all__ = [
-    "JSON_NAMES",
-    "decode_attributes",
-    "encode_attributes",
-    "find_version",
-    "make_global_attributes",
-]
-
 _CONVENTIONS = "CF-1.11, ACDD-1.3"
 _TITLES = {
     "product": "Dynamic Allan variance of a gyro log, "

@@ -20,8 +20,6 @@ from typing import Any
 from gyrostab.errors import FormatError
 from gyrostab.store.output.content import METADATA
 
-__all__ = ["check_blosc_chunks", "is_blosc_cut"]
-
 _HEADER_BYTES = 16
 
 

@@ -49,8 +49,6 @@ from gyrostab.store.times import (
     time_attributes,
 )
 
-__all__ = ["PACKING", "find_kind", "from_disk", "to_disk"]
-
 #: Dimensions in the order of the file; those not named keep their place between `tau` and `time`.
 _ORDER = ("axis", "term", "tau")
 #: Labels of variables that have none.

@@ -19,8 +19,6 @@ from typing import BinaryIO
 
 from gyrostab.errors import FormatError
 
-__all__ = ["check_global_heaps"]
-
 _SUPERBLOCK = b"\x89HDF\r\n\x1a\n"
 _COLLECTION = b"GCOL\x01\0\0\0"
 _OBJECT = struct.Struct("<HHIQ")  # number, references, reserved, bytes

@@ -27,18 +27,6 @@ from gyrostab.kernels.encoding.checksum import fletcher32
 from gyrostab.store.blosc_chunks import is_blosc_cut
 from gyrostab.store.private import library_lock
 
-__all__ = [
-    "ChunkCache",
-    "ChunkDamage",
-    "decode_chunk",
-    "find_hdf5_codecs",
-    "find_zarr_codecs",
-    "has_known_filters",
-    "is_readable",
-    "read_chunk",
-    "read_written_chunk",
-]
-
 #: Variables whose layout is cached: several for each file of a long archive.
 _MAX_CACHED_LAYOUTS = 2**12
 #: Numbers of the filters of HDF5 that are known here.

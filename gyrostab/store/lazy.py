@@ -22,29 +22,6 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import reading_of
 
-__all__ = [
-    "Converted",
-    "FileVariable",
-    "InMemory",
-    "RowSource",
-    "Source",
-    "Stacked",
-    "can_read_directly",
-    "concatenate_columns",
-    "find_files",
-    "find_source",
-    "keep_sources",
-    "make_dask",
-    "make_lazy",
-    "read_box",
-    "read_into",
-    "read_slice",
-    "select_part",
-    "stack_rows",
-    "take_samples",
-    "transpose_lazy",
-]
-
 
 class Source:
     """Values that are read when they are needed; as much of an array as dask asks for."""

@@ -31,8 +31,6 @@ from gyrostab.store.remote import find_url
 from gyrostab.store.safe_names import ORIGINAL_NAME
 from gyrostab.store.times import GRID, follows_rule, parse_time_grids
 
-__all__ = ["StoredLog", "open_netcdf_log", "read_attribute"]
-
 #: Attributes of a variable that xarray moves to its encoding.
 _ENCODED = ("_FillValue", "scale_factor")
 #: Attributes of the library: dimensions, by number, and the name of one that is a dimension itself.

@@ -9,8 +9,6 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-__all__ = ["close_function", "is_in_memory", "library_lock"]
-
 _OWN_LOCK = threading.RLock()
 
 

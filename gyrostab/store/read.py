@@ -31,8 +31,6 @@ from gyrostab.store.remote import find_store, find_url, reaching
 from gyrostab.store.times import decode_stamps, index_dim, parse_time_grids, replace_stamps
 from gyrostab.time.grid import grid_times
 
-__all__ = ["MIN_LAZY_VALUES", "Stored", "make_variable_lazy", "open_stored"]
-
 #: Dataset as it is on disk.
 Stored = xr.Dataset | StoredLog
 #: Values from which a variable is a dask array.

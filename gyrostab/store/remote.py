@@ -20,12 +20,6 @@ from typing import Any
 
 from gyrostab.errors import FormatError, GyrostabError, OptionError, OutputError
 
-__all__ = [
-    "ROOT_METADATA", "describe_address", "fetch_file", "find_store", "find_url", "full_name",
-    "has_content", "has_file", "is_folder", "is_taken", "list_urls", "reaching", "read_bytes",
-    "remove_address", "remove_copies", "upload", "upload_file", "walk_address",
-]  # fmt: skip
-
 _URL = re.compile(r"([a-z][a-z0-9+.-]+):/+(.+)")  # a single letter is a drive of Windows
 #: Scheme -> the extra that installs its library.
 _EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs", "http": "http", "https": "http"}

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.grid.stamps import scan_cells
 
-__all__ = ["RowInspection", "inspect_rows"]
-
 _NO_SPANS = np.empty((0, 2), dtype=np.int64)
 
 

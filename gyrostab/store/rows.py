@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 from gyrostab.errors import DamageError
 from gyrostab.store.layout import ChunkCache, ChunkDamage, has_known_filters, read_written_chunk
 
-__all__ = ["ChunkedRows", "EvenRows", "LibraryRows", "Rows", "hdf5_rows"]
-
 #: Bytes that are read at a time when other variables lie between the rows.
 _STRIDED_READ_BYTES = 2**23
 #: Limit of the number of chunks of a variable; the place of each takes about 200 bytes.

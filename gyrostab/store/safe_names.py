@@ -10,10 +10,6 @@ from typing import Any
 
 import xarray as xr
 
-__all__ = [
-    "ORIGINAL_NAME", "is_storable", "make_name_storable", "make_names_storable", "restore_names",
-]  # fmt: skip
-
 # NetCDF User's Guide, "Permitted characters in netCDF names"; Zarr adds that a name is part of a
 # path, and reserves two underscores.
 _STORABLE = re.compile(

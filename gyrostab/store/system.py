@@ -16,18 +16,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-__all__ = [
-    "exchange_paths",
-    "lock_file",
-    "read_at",
-    "release_memory",
-    "rename_new",
-    "rename_with_flag",
-    "return_large_arrays",
-    "sync_path",
-    "write_at",
-]
-
 
 def _import_if_present(name: str) -> Any:
     return importlib.import_module(name) if find_spec(name) else None

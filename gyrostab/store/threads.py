@@ -8,8 +8,6 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
-__all__ = ["MAX_WORKERS", "map_in_order"]
-
 #: Limit of the number of threads, for any number of cores.
 MAX_WORKERS = 4
 

@@ -23,22 +23,6 @@ from gyrostab.store.lazy import RowSource, make_dask
 from gyrostab.time.grid import TimeGridIndex, grid_times, period_ns, time_coordinate
 from gyrostab.time.stamps import to_nanoseconds
 
-__all__ = [
-    "GRID",
-    "decode_stamps",
-    "encode_all_stamps",
-    "encode_first_stamp",
-    "encode_stamps",
-    "find_time_grids",
-    "follows_rule",
-    "has_whole_microseconds",
-    "index_dim",
-    "make_time_axes",
-    "parse_time_grids",
-    "replace_stamps",
-    "time_attributes",
-]
-
 #: Attribute with the rule of a computed time axis, on the variable that holds its first stamp.
 GRID = "sampling_grid"
 #: Stamps that are computed together.

@@ -6,8 +6,6 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-__all__ = ["parse_toml", "read_toml_text"]
-
 
 def read_toml_text(path: Path) -> str:
     """Read the text of a TOML file: UTF-8, also with the byte order mark that some editors write.

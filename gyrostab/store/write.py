@@ -24,17 +24,6 @@ from gyrostab.store.lazy import Converted, find_source, make_dask, read_box
 from gyrostab.store.private import library_lock
 from gyrostab.store.threads import MAX_WORKERS, map_in_order
 
-__all__ = [
-    "NotCountsError",
-    "Progress",
-    "append_netcdf",
-    "append_zarr",
-    "as_counts",
-    "chunk_samples",
-    "common_packing",
-    "large_variables",
-]
-
 CHUNK_SECONDS = 1200.0
 #: Least and most samples in one chunk, for very slow and very fast logs.
 CHUNK_LIMITS = (2**16, 2**22)

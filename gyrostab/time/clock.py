@@ -8,8 +8,6 @@ from typing import Any
 
 from gyrostab.errors import OptionError
 
-__all__ = ["extend_history", "time_of_day"]
-
 
 def time_of_day() -> str:
     """Return the current time, UTC, as ISO 8601.

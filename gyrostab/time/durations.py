@@ -11,15 +11,6 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
 
-__all__ = [
-    "TAUS",
-    "averaging_factors",
-    "duration_seconds",
-    "format_duration",
-    "samples",
-    "thin",
-]
-
 #: Examples of averaging times, for messages.
 TAUS = "--taus 40 (how many), octave, all or 0.1s,1s,10s"
 _SAMPLE_COUNT = re.compile(r"^\s*(\d{1,18})\s*samples?\s*$", re.ASCII)
@@ -45,10 +36,10 @@ def duration_seconds(value: Any, option: str, *, example: str = "10min, 30s or 2
     """
     try:
         if isinstance(value, str):
-            if is_bare_number(value):
+            if _is_bare_number(value):
                 raise OptionError(f"{option} {value!r} has no unit; write for instance {example}")
             seconds = pd.Timedelta(re.sub(r"(?<=[\d ])m$", "min", value.strip())).value / 1e9
-        elif is_bare_number(value):
+        elif _is_bare_number(value):
             seconds = float(value)
         else:
             seconds = pd.Timedelta(value).value / 1e9
@@ -97,7 +88,7 @@ def samples(value: Any, rate: float, option: str) -> int:
     >>> samples("10s", 400.0, "window"), samples("2000samples", 400.0, "window")
     (4000, 2000)
     """
-    if is_bare_number(value):
+    if _is_bare_number(value):
         text = str(value).strip()
         raise OptionError(
             f"{option} {text} has no unit; "
@@ -119,12 +110,12 @@ def samples(value: Any, rate: float, option: str) -> int:
     return count
 
 
-def is_bare_number(value: Any) -> bool:
+def _is_bare_number(value: Any) -> bool:
     """Whether a length is a number without a unit, also as text.
 
     Examples
     --------
-    >>> is_bare_number(60), is_bare_number("60"), is_bare_number("60s")
+    >>> _is_bare_number(60), _is_bare_number("60"), _is_bare_number("60s")
     (True, True, False)
     """
     if isinstance(value, str):

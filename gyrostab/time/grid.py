@@ -24,19 +24,6 @@ from xarray.indexes import CoordinateTransform, CoordinateTransformIndex
 from gyrostab.errors import OptionError, TimeError
 from gyrostab.time.stamps import to_nanoseconds
 
-__all__ = [
-    "TimeGridIndex",
-    "check_rate",
-    "check_span",
-    "first_stamp",
-    "grid_index",
-    "grid_times",
-    "period_ns",
-    "split_instant",
-    "stamp_ns",
-    "time_coordinate",
-]
-
 NANOSECONDS = 10**9
 #: Stamps are integer nanoseconds: at a higher rate, several samples would share one.
 MAX_RATE_HZ = 1e9

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["format_stamp", "to_nanoseconds"]
-
 
 def to_nanoseconds(stamps: Any) -> NDArray[np.int64]:
     """Convert datetime64 of the years 1678 to 2262 to integers.

@@ -37,7 +37,7 @@ from gyrostab.blindtest.scenarios.plan import DEGRADATIONS, plan_case, plan_case
 from gyrostab.blindtest.scoring.baseline_detectors import allan_detector, channel_detector
 from gyrostab.blindtest.scoring.visibility import MAX_SEPARATION
 from gyrostab.errors import FormatError, OptionError
-from gyrostab.ingest.grid.regularise import gap_table
+from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.schema import check_log
 
 EVERY = CATALOGUE | OUT_OF_CATALOGUE

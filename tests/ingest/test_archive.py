@@ -19,8 +19,9 @@ from gyrostab.errors import OptionError, TimeError, UnitError
 from gyrostab.ingest import read_log
 from gyrostab.ingest.concat import concatenate_logs
 from gyrostab.ingest.concat.grid import runs_of
+from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.place import append_runs
-from gyrostab.ingest.grid.regularise import gap_table, regularise
+from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.io import datasets as export
 from gyrostab.schema import GAP_CAUSES
 from gyrostab.time.grid import TimeGridIndex, grid_times

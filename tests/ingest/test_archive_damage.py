@@ -10,7 +10,8 @@ import pytest
 from gyrostab.cli import main
 from gyrostab.errors import FormatError, MissingUnitError, OptionError
 from gyrostab.ingest import read_log
-from gyrostab.ingest.grid.regularise import gap_table, regularise
+from gyrostab.ingest.grid.gaps import gap_table
+from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.io import datasets as export
 from gyrostab.jobs.run import load_log
 from tests.support.regular_logs import RATE, cut, log_of, said, signal

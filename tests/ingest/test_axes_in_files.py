@@ -15,7 +15,8 @@ from gyrostab.errors import SchemaError, TimeError
 from gyrostab.ingest import ReadOptions, files, read_log, scan_file
 from gyrostab.ingest.columns import pieces
 from gyrostab.ingest.concat import group_axes
-from gyrostab.ingest.grid.regularise import gap_table, regularise
+from gyrostab.ingest.grid.gaps import gap_table
+from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.store.lazy import find_source
 from tests.ingest.field_files import write_trace
 

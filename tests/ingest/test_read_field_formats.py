@@ -13,7 +13,8 @@ from gyrostab.errors import FormatError, GyrostabError, MissingUnitError, Option
 from gyrostab.ingest import ReadOptions, read_log, scan_file
 from gyrostab.ingest.channel import read_channel
 from gyrostab.ingest.formats.messages import crc32_mpeg2
-from gyrostab.ingest.grid.regularise import gap_table, regularise
+from gyrostab.ingest.grid.gaps import gap_table
+from gyrostab.ingest.grid.regularise import regularise
 from tests.ingest.field_files import (
     RATES,
     ROWS,

@@ -13,7 +13,8 @@ import xarray as xr
 
 from gyrostab.errors import FormatError, GyrostabError, OptionError
 from gyrostab.ingest import ReadOptions, read_log, scan_file
-from gyrostab.ingest.grid.regularise import gap_table, regularise
+from gyrostab.ingest.grid.gaps import gap_table
+from gyrostab.ingest.grid.regularise import regularise
 from tests.ingest.field_files import write_trace
 
 Find = Callable[[str], Path]

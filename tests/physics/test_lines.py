@@ -12,8 +12,8 @@ from gyrostab.errors import OptionError
 from gyrostab.kernels.random.coloured import oscillator_psd
 from gyrostab.physics.phase import fold
 from gyrostab.physics.registry import make_effect
-from gyrostab.simulate import environment as env
 from gyrostab.simulate import simulate
+from gyrostab.simulate.turning import rotation
 from tests.support.effect_bench import allan_of_density, build_effect, run, sigma
 
 
@@ -121,7 +121,7 @@ def test_fractional_number_of_lines_is_refused():
 
 
 def test_a_pump_is_another_channel():
-    strokes = env.rotation([[0, 720.0]], duration=100, accelerations=False)[["rotation_rate"]]
+    strokes = rotation([[0, 720.0]], duration=100, accelerations=False)[["rotation_rate"]]
     strokes = strokes.rename(rotation_rate="pump", time_rotation_rate="time_pump")
     effect = {"name": "rotation_line", "amplitude": 0.3, "driver": "pump", "axes": ["x"]}
     log = simulate(

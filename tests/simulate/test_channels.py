@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from gyrostab.allan.davar import davar
 from gyrostab.cli import main
 from gyrostab.errors import OptionError
-from gyrostab.ingest.grid.regularise import gap_table
+from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.make_log import make_log
 from gyrostab.io.datasets import open_log
 from gyrostab.jobs.run import load_log

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gyrostab.ingest.grid.regularise import gap_table
+from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.simulate import combine, simulate
 from gyrostab.simulate import environment as env
 from gyrostab.simulate.losses import gaps, losses, power_cuts
+from gyrostab.simulate.turning import rotation
 
 
 def test_chamber_is_the_test_of_li_et_al():
@@ -49,7 +50,7 @@ def test_trip_reaches_the_rock_and_circulation_cools_it():
 
 @pytest.mark.parametrize("stick_slip", [0.0, 1.0])
 def test_toolface_is_the_integral_of_the_rate(stick_slip):
-    turning = env.rotation(
+    turning = rotation(
         [[0, 0], [3, 40], [8, 400], [10, 400]],
         duration=15.0,
         stick_slip=stick_slip,
@@ -66,7 +67,7 @@ def test_toolface_is_the_integral_of_the_rate(stick_slip):
 
 
 def test_vertical_tool_has_gravity_on_its_axis():
-    still = env.rotation([[0, 0]], duration=1.0, inclination=0.0)
+    still = rotation([[0, 0]], duration=1.0, inclination=0.0)
     assert (still.accel_z.values == -1.0).all()  # z points down; what holds the tool pushes up
     np.testing.assert_allclose(still.accel_x.values, 0.0, atol=1e-15)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gyrostab.errors import FormatError, OptionError, SchemaError, TimeError
-from gyrostab.ingest.grid.regularise import gap_table
+from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.io.datasets import open_log
 from gyrostab.schema import check_log
 from gyrostab.simulate import read_model, simulate

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from gyrostab.allan.davar import davar
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.ingest.grid.regularise import gap_table
+from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.make_log import make_log
 from gyrostab.io.datasets import open_log, to_netcdf
 from gyrostab.physics.registry import effects

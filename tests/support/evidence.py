@@ -12,14 +12,13 @@ from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.held_out import (
     LinearModel,
     Tier,
-    held_out_evidence,
     linear_model_factors,
     mean_factors,
     noise_columns,
     stack_designs,
     with_independent_cells,
 )
-from gyrostab.diagnose.evidence.products import Array
+from gyrostab.diagnose.evidence.products import Array, held_out_evidence
 
 
 def power_factors(

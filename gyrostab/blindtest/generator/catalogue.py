@@ -15,8 +15,6 @@ from gyrostab.blindtest.generator import (
 )
 from gyrostab.blindtest.generator.scenario import Effect
 
-__all__ = ["AMBIGUITY", "CATALOGUE", "OUT_OF_CATALOGUE", "Entry", "merge_ambiguous"]
-
 
 @dataclass(frozen=True)
 class Entry:

@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-__all__ = ["diffusion_time", "layer_temperatures", "layer_weights"]
-
 Array = NDArray[np.float64]
 
 

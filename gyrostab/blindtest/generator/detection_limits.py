@@ -27,21 +27,6 @@ from gyrostab.blindtest.generator.noise_floor import floor_psd, white_level
 from gyrostab.blindtest.generator.scenario import Scenario, count_per_second
 from gyrostab.errors import OptionError
 
-__all__ = [
-    "NATS",
-    "amplitude_for",
-    "band_density",
-    "learned_filter_nats",
-    "learned_nats",
-    "learned_random_nats",
-    "line_density_of",
-    "mean_size",
-    "shared_size",
-    "variance_nats",
-    "variance_size",
-    "white_shares",
-]
-
 Array = NDArray[np.float64]
 
 #: Log-likelihood at the limit.

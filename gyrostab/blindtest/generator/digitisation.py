@@ -14,8 +14,6 @@ from gyrostab.blindtest.generator.noise_floor import white_level
 from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario
 from gyrostab.blindtest.generator.shapes import make_variance_effect
 
-__all__ = ["clipping", "dead_zone", "rate_quantization"]
-
 Array = NDArray[np.float64]
 
 #: Evidence of one sample that noise alone cannot produce [nats].

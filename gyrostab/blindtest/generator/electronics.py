@@ -28,17 +28,6 @@ from gyrostab.blindtest.generator.shapes import (
     scale_by_axis,
 )
 
-__all__ = [
-    "bias_jump",
-    "feedback_reset",
-    "held_samples",
-    "logger_filter",
-    "shared_source",
-    "spectral_line",
-    "spikes",
-    "supply_bias",
-]
-
 Array = NDArray[np.float64]
 
 

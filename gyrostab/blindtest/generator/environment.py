@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-__all__ = ["lag", "light_monitor", "read_sensor", "shaking", "supply", "temperature"]
-
 Array = NDArray[np.float64]
 
 

@@ -7,8 +7,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["detector_psd", "loss_db", "relative_psd", "share_source"]
-
 Array = NDArray[np.float64]
 
 CHARGE = 1.602176634e-19

@@ -7,8 +7,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["dead_zone", "ramp_phase", "reset_error", "reset_frequency"]
-
 Array = NDArray[np.float64]
 
 

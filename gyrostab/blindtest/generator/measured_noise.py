@@ -16,8 +16,6 @@ from scipy import fft, signal, special
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import nnls
 
-__all__ = ["BANDS", "MeasuredNoise", "line_density", "measure_noise"]
-
 Array = NDArray[np.float64]
 
 #: Bands of equal width in which levels are measured, from 0 to half the rate.

@@ -29,16 +29,6 @@ from gyrostab.blindtest.generator.shapes import (
     scale_by_axis,
 )
 
-__all__ = [
-    "aliased_vibration",
-    "earth_rate",
-    "misalignment",
-    "rotation_line",
-    "scale_factor",
-    "vibration_noise",
-    "vibration_rectification",
-]
-
 Array = NDArray[np.float64]
 
 

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.signal import lfilter
 
-__all__ = ["flicker", "floor_psd", "quantize_angle", "random_walk", "white_level"]
-
 Array = NDArray[np.float64]
 
 _URAD = math.degrees(1e-6) * 3600.0  # urad -> deg/h s

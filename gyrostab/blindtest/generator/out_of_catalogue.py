@@ -17,8 +17,6 @@ from gyrostab.blindtest.generator.shapes import (
     make_variance_effect,
 )
 
-__all__ = ["breathing_noise", "chirped_line", "informative_gaps", "slow_memory", "three_levels"]
-
 
 def breathing_noise(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
     """Draw a periodic noise level without a driver."""

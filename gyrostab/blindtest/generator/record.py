@@ -25,16 +25,6 @@ from gyrostab.ingest import gap_variables
 from gyrostab.schema import check_log
 from gyrostab.time.grid import time_coordinate
 
-__all__ = [
-    "add_channels",
-    "draw_base_noise",
-    "find_missing",
-    "make_channels",
-    "make_gap_variables",
-    "make_log",
-    "make_record",
-]
-
 Array = NDArray[np.float64]
 
 #: Channel -> unit in memory.

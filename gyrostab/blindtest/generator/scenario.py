@@ -14,18 +14,6 @@ from numpy.typing import NDArray
 from gyrostab.blindtest.generator import environment, telemetry, tool
 from gyrostab.blindtest.generator.measured_noise import MeasuredNoise
 
-__all__ = [
-    "AXES",
-    "ROTATION_STEP_S",
-    "STREAM_LABELS",
-    "Effect",
-    "Scenario",
-    "count_per_second",
-    "draw_scenario",
-    "stream",
-    "to_samples",
-]
-
 Array = NDArray[np.float64]
 
 AXES = ("x", "y", "z")

@@ -22,16 +22,6 @@ from gyrostab.blindtest.generator.detection_limits import (
 from gyrostab.blindtest.generator.environment import lag
 from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario, to_samples
 
-__all__ = [
-    "axes_with_share",
-    "draw_shares",
-    "fit_lagged_driver",
-    "make_mean_effect",
-    "make_variance_effect",
-    "scale_by_axis",
-    "signed_peaks",
-]
-
 Array = NDArray[np.float64]
 _MIN_LAG_S, _LAG_COUNT = 1.0, 24
 

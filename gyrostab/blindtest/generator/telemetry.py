@@ -7,17 +7,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "MIN_POWER_CUT_S",
-    "draw_losses",
-    "draw_power_cuts",
-    "flip_bits",
-    "limit_losses",
-    "list_spans",
-    "mark_power_cuts",
-    "repeat_frames",
-]
-
 Array = NDArray[np.float64]
 
 #: Shortest power cut [s]; telemetry losses are shorter where an effect depends on restarts.

@@ -18,16 +18,6 @@ from gyrostab.blindtest.generator.shapes import (
     signed_peaks,
 )
 
-__all__ = [
-    "ageing_noise",
-    "light_power_noise",
-    "shupe",
-    "temperature_bias",
-    "temperature_noise",
-    "thermal_hysteresis",
-    "warm_up",
-]
-
 Array = NDArray[np.float64]
 
 
@@ -122,7 +112,7 @@ def thermal_hysteresis(scenario: Scenario, rng: np.random.Generator, *, strength
     return effect
 
 
-def since_power_on(scenario: Scenario) -> Array:
+def _since_power_on(scenario: Scenario) -> Array:
     """Compute the time since the last power-on [s], one value a second."""
     t = np.arange(scenario.temperature.size, dtype=float)
     since = t.copy()
@@ -135,7 +125,7 @@ def warm_up(scenario: Scenario, rng: np.random.Generator, *, strength: float) ->
     """Draw a bias that decays after every start: exponential, stretched, or a power of time."""
     kind = rng.choice(["exponential", "stretched", "power"])
     tau = float(np.exp(rng.uniform(np.log(0.015), np.log(0.25)))) * scenario.seconds
-    x = since_power_on(scenario) / tau
+    x = _since_power_on(scenario) / tau
     shape = {
         "exponential": np.exp(-x),
         "stretched": np.exp(-(x**0.6)),

@@ -7,8 +7,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["EARTH_RATE", "cross_axis", "gravity", "rotation", "toolface"]
-
 Array = NDArray[np.float64]
 
 #: Rate of the earth [deg/h].

@@ -8,16 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-__all__ = [
-    "FAST_HZ",
-    "band_noise",
-    "decimate",
-    "decimator_taps",
-    "folded_psd",
-    "mount_filter",
-    "rectify",
-]
-
 Array = NDArray[np.float64]
 
 #: Rate at which vibration is generated [Hz].

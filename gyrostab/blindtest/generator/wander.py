@@ -18,8 +18,6 @@ from gyrostab.blindtest.generator.noise_floor import floor_psd
 from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario, to_samples
 from gyrostab.blindtest.generator.shapes import axes_with_share, draw_shares, make_mean_effect
 
-__all__ = ["ageing_bias", "gauss_markov", "telegraph", "wander_size"]
-
 Array = NDArray[np.float64]
 
 

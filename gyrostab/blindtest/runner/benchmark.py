@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
     from gyrostab.progress import Stage
 
-__all__ = ["Proof", "prove"]
-
 _DEFAULTS = {"cases": 40, "nulls": 400, "counterparts": 4}
 
 _CASES_PER_INJECTION = 40  # each injection makes four more cases

@@ -11,14 +11,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
 
-__all__ = [
-    "draw_calibration",
-    "draw_completeness",
-    "draw_ranks",
-    "draw_reliability",
-    "draw_roc",
-]
-
 _COLUMNS = 5
 _POOL_LIMITS = (1.5, 4.0)  # detection is not required below the first
 _LABELS = {

@@ -21,18 +21,6 @@ from gyrostab.errors import FormatError, OptionError, OutputError, ResumeError
 from gyrostab.jobs import is_lock
 from gyrostab.store.output import check_target, is_leftover, read_json, write_text
 
-__all__ = [
-    "FIRST_PUBLIC_SEED",
-    "begin_run",
-    "case_name",
-    "fingerprint_code",
-    "inspect_folder",
-    "read_request",
-    "read_sums",
-    "write_json",
-    "write_sums",
-]
-
 #: Seeds below this one are for tuning; published runs use others.
 FIRST_PUBLIC_SEED = 1_000_000
 

@@ -38,8 +38,6 @@ from gyrostab.blindtest.scoring.score import drawn_rows, first_rows, score_case
 from gyrostab.blindtest.scoring.table import list_missed, markdown
 from gyrostab.store.output import replace_file, write_text
 
-__all__ = ["page_text", "score_rows", "write_outcome"]
-
 Rows = list[dict[str, Any]]
 
 #: Diagnosis of a case whose diagnosis failed: nothing was detected.

@@ -16,8 +16,6 @@ from typing import Any, TypeVar
 
 from gyrostab.errors import WorkerError
 
-__all__ = ["run_in_processes"]
-
 T = TypeVar("T")
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")

@@ -16,8 +16,6 @@ from gyrostab.store.output import write_text
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["compare_case", "diagnose_case", "draw_case"]
-
 
 def draw_case(directory: Path, name: str, plan: dict[str, Any], real: Path | None = None) -> str:
     """Write recording and truth of a plan unless they exist; return the SHA-256 of the truth.

@@ -22,8 +22,6 @@ from gyrostab.blindtest.scoring.visibility import find_visibility
 from gyrostab.errors import OptionError
 from gyrostab.time.grid import grid_times
 
-__all__ = ["WAVEFORM_BLOCK_S", "describe_truth", "draw_effects", "draw_suitable", "make_case"]
-
 #: Length of the block means of a waveform in the truth [s].
 WAVEFORM_BLOCK_S = 10.0
 
@@ -186,7 +184,7 @@ def _format_time(scenario: Scenario, second: float) -> str:
     return str(np.datetime_as_string(stamp, unit="ms"))
 
 
-def list_intervals(scenario: Scenario, active: NDArray[np.bool_] | None) -> list[list[str]]:
+def _list_intervals(scenario: Scenario, active: NDArray[np.bool_] | None) -> list[list[str]]:
     """List the ISO 8601 intervals in which an effect is active; without a mask the whole record."""
     if active is None:
         return [[_format_time(scenario, 0.0), _format_time(scenario, scenario.seconds)]]
@@ -233,7 +231,7 @@ def _describe_effect(scenario: Scenario, effect: Effect, strength: float) -> dic
         "tau_min_s": float(effect.tau[0]),
         "tau_max_s": float(effect.tau[1]),
         "localised": effect.active is not None,
-        "intervals": list_intervals(scenario, effect.active),
+        "intervals": _list_intervals(scenario, effect.active),
         "parameters": effect.parameters,
         "waveform_10s": waveform,
     }

@@ -14,8 +14,6 @@ from gyrostab.blindtest.generator.scenario import stream
 from gyrostab.errors import FormatError
 from gyrostab.units import on_disk
 
-__all__ = ["commit_case", "fingerprint", "open_truth", "truth_text"]
-
 
 def truth_text(truth: dict[str, Any]) -> str:
     """Format a truth as the text to commit: JSON with sorted keys, and a nonce against guessing.

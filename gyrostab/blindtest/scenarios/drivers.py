@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
 
-__all__ = ["degrade_driver"]
-
 Array = NDArray[np.float64]
 Channels = dict[str, tuple[Array, float]]
 

@@ -23,8 +23,6 @@ from gyrostab.errors import OptionError
 from gyrostab.schema import check_log, signal_name
 from gyrostab.time.grid import first_stamp
 
-__all__ = ["estimate_noise", "inject_effect", "quantization_step"]
-
 Array = NDArray[np.float64]
 
 _MAX_TRIES = 60

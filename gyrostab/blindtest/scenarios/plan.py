@@ -11,16 +11,6 @@ from gyrostab.blindtest.generator.catalogue import CATALOGUE, OUT_OF_CATALOGUE
 from gyrostab.blindtest.generator.scenario import stream
 from gyrostab.errors import OptionError
 
-__all__ = [
-    "DEGRADATIONS",
-    "INCOMPATIBLE",
-    "KINDS",
-    "STRENGTHS",
-    "plan_case",
-    "plan_cases",
-    "plan_counterparts",
-]
-
 #: Kind of case -> its number in 20 cases. "single", "sub_threshold", "out_of_catalogue" and
 #: "degraded_driver" hold one effect.
 KINDS = {

@@ -12,8 +12,6 @@ import xarray as xr
 from gyrostab.blindtest.generator.scenario import stream
 from gyrostab.blindtest.scenarios.injection import inject_effect
 
-__all__ = ["COPIES", "RECORDINGS", "make_injection_case", "plan_injections"]
-
 #: The injected recording, and its controls.
 COPIES = ("injected", "untouched", "flipped", "reversed")
 

@@ -12,18 +12,6 @@ from scipy import special
 
 from gyrostab.blindtest.generator import noise_floor as floor
 
-__all__ = [
-    "allan_band",
-    "allan_detector",
-    "allan_variance",
-    "band_excess",
-    "block_series",
-    "channel_detector",
-    "channel_means",
-    "log_allan",
-    "octaves",
-]
-
 Array = NDArray[np.float64]
 
 #: Level of both detectors.

@@ -15,15 +15,6 @@ from gyrostab.blindtest.scoring.proportions import share_columns, wilson
 from gyrostab.blindtest.scoring.score import CATALOGUE_KINDS, catalogue_rows, drawn_rows, first_rows
 from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH, SURE_STRENGTH
 
-__all__ = [
-    "by_effect",
-    "curves",
-    "fitted_noise_curve",
-    "names_given",
-    "rank_histogram",
-    "reliability",
-]
-
 Row = Mapping[str, Any]
 
 _CURVES = [f"{key}{end}" for key in ("detected", "named") for end in ("", "_low", "_high")]

@@ -14,13 +14,6 @@ from gyrostab.blindtest.scoring.proportions import Target, share, share_of
 from gyrostab.blindtest.scoring.score import CATALOGUE_KINDS, drawn_rows, first_rows
 from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH
 
-__all__ = [
-    "FALSE_ALARM_RATES",
-    "counterpart_table",
-    "detection_shares",
-    "roc_curves",
-]
-
 Row = Mapping[str, Any]
 Array = NDArray[np.float64]
 

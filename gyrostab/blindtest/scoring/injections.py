@@ -11,8 +11,6 @@ from gyrostab.blindtest.generator.catalogue import merge_ambiguous
 from gyrostab.blindtest.scoring.proportions import share
 from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH, SURE_STRENGTH
 
-__all__ = ["injection_differences", "injection_table"]
-
 Row = Mapping[str, Any]
 
 

@@ -13,13 +13,6 @@ from numpy.typing import NDArray
 from gyrostab.blindtest.scoring.proportions import NO_TARGET, Line, Target, make_line, wilson
 from gyrostab.blindtest.scoring.score import drawn_rows, first_rows
 
-__all__ = [
-    "calibration_curve",
-    "expected_calibration_error",
-    "probability_lines",
-    "risk_coverage",
-]
-
 Row = Mapping[str, Any]
 Array = NDArray[np.float64]
 

@@ -9,21 +9,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = [
-    "NO_TARGET",
-    "Line",
-    "Target",
-    "at_least",
-    "at_most",
-    "make_line",
-    "median",
-    "share",
-    "share_columns",
-    "share_of",
-    "spread",
-    "wilson",
-]
-
 Line = dict[str, Any]
 
 

@@ -23,14 +23,6 @@ from scipy.special import ndtri
 
 from gyrostab.errors import GyrostabError
 
-__all__ = [
-    "check_model",
-    "likelihood_ratio",
-    "measure_statistics",
-    "record_statistics",
-    "simulate_statistics",
-]
-
 Array = NDArray[np.float64]
 _RECORDS = 8  # simulated with and without effects; limits time
 _SEGMENTS = 32  # of a record, for statistics that change over time

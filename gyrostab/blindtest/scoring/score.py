@@ -12,16 +12,6 @@ from gyrostab.blindtest.generator.catalogue import merge_ambiguous
 from gyrostab.blindtest.generator.detection_limits import NATS
 from gyrostab.errors import SchemaError
 
-__all__ = [
-    "CATALOGUE_KINDS",
-    "catalogue_rows",
-    "detection_score",
-    "drawn_rows",
-    "first_rows",
-    "intersection_over_union",
-    "score_case",
-]
-
 Intervals = Sequence[Sequence[str]]
 
 #: Kinds of cases with catalogue effects and an undisturbed driver.

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from gyrostab.blindtest.scoring.baseline_detectors import block_series, channel_means
 
-__all__ = ["stepwise_detector"]
-
 Array = NDArray[np.float64]
 
 _BLOCKS = 300  # in a long record

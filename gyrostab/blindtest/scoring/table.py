@@ -23,8 +23,6 @@ from gyrostab.blindtest.scoring.proportions import (
 )
 from gyrostab.blindtest.scoring.score import catalogue_rows, drawn_rows, first_rows
 
-__all__ = ["CLEAR_STRENGTH", "SURE_STRENGTH", "list_missed", "markdown", "score_table"]
-
 Row = Mapping[str, Any]
 
 #: Half width of a central interval of the normal law, by its probability [%].

@@ -13,8 +13,6 @@ from gyrostab.blindtest.generator.noise_floor import white_level
 from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario
 from gyrostab.blindtest.scoring.baseline_detectors import allan_band, band_excess
 
-__all__ = ["MAX_SEPARATION", "find_visibility", "trace_visibility"]
-
 Array = NDArray[np.float64]
 
 #: Separation d' below which an effect is invisible in a trace.

@@ -16,8 +16,6 @@ from gyrostab.errors import GyrostabError
 if TYPE_CHECKING:
     from packaging.requirements import Requirement
 
-__all__ = ["doctor"]
-
 #: Extras that users install; the others are for developers.
 _EXTRAS = (
     "ardupilot", "distributed", "dlis", "gcs", "http", "las", "matlab", "miniseed", "novatel",

@@ -16,8 +16,6 @@ from gyrostab.wording import list_some
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["fleet", "index"]
-
 Archives = Annotated[list[Path], Parameter(name="ARCHIVE...", negative=())]
 Scheduler = Annotated[str, Parameter(metavar="ADDRESS")]
 

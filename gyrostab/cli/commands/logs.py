@@ -14,8 +14,6 @@ from gyrostab.errors import FormatError, OptionError
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["ingest", "scan"]
-
 
 @app.command(sort_key=1, help_epilogue="")
 def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common()) -> None:

@@ -11,8 +11,6 @@ from gyrostab.cli.frame import Output, Product, app, show_stages
 from gyrostab.cli.options import ChannelFile, Common, Survey
 from gyrostab.errors import OptionError
 
-__all__ = ["correlate", "export", "plot", "report"]
-
 
 @app.command(sort_key=6, help_epilogue="")
 def report(

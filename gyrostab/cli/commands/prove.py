@@ -16,8 +16,6 @@ from gyrostab.cli.frame import app, show_stages
 from gyrostab.cli.options import Common, Flag
 from gyrostab.units import HOUR
 
-__all__ = ["prove"]
-
 _PROGRESS_INTERVAL_S = 60.0  # between two lines of progress without a terminal
 
 

@@ -12,8 +12,6 @@ from gyrostab.cli.frame import Output, app, show_stages
 from gyrostab.cli.options import Common, Reading
 from gyrostab.errors import OptionError
 
-__all__ = ["diagnose", "simulate"]
-
 
 @app.command(sort_key=10, help_epilogue="")
 def simulate(

@@ -10,8 +10,6 @@ from cyclopts import Parameter
 from gyrostab.cli.frame import Logs, Output, app, show_stages
 from gyrostab.cli.options import Common, Fitting, Flag, Reading, Running, Windows
 
-__all__ = ["davar", "demo", "fit", "run"]
-
 
 @app.command(sort_key=0, help_epilogue="")
 def demo(*, output: Output = Path("gyrostab-demo"), common: Common = Common()) -> None:

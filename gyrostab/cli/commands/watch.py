@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from gyrostab.jobs.alarms import Alarm
     from gyrostab.jobs.live_page import LivePage
 
-__all__ = ["watch"]
-
 
 @app.command(sort_key=4, help_epilogue="")
 def watch(
@@ -96,7 +94,7 @@ class _Console:
 
     def show_window(self, window: Mapping[str, Any]) -> None:
         """Print a line."""
-        print(format_window(window), flush=True)
+        print(_format_window(window), flush=True)
         if self.page is not None:
             self.page.add_window(window)
 
@@ -123,13 +121,13 @@ class _Console:
             self.page.add_event(event, active)
 
 
-def format_window(window: Mapping[str, Any]) -> str:
+def _format_window(window: Mapping[str, Any]) -> str:
     """Format a window as one line: its centre, and for each axis what is observed.
 
     Examples
     --------
     >>> values = {"N": 0.0123, "N_upper": None, "B": None, "B_upper": 0.4, "misfit": 1.1, "loss": 0}
-    >>> format_window({"time": "2026-05-01T00:05:00.000", "axes": {"x": values}})
+    >>> _format_window({"time": "2026-05-01T00:05:00.000", "axes": {"x": values}})
     '2026-05-01T00:05:00  x: N 0.0123 B <0.4 misfit 1.1 loss 0%'
     """
     axes = []

@@ -40,9 +40,8 @@ from gyrostab.diagnose.evidence.products import mean_products
 from gyrostab.diagnose.reduce.schema import BASELINE, label_variables
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.errors import SchemaError
-from gyrostab.noise import HOUR, TERMS
-
-__all__ = ["DRAWS", "assemble_baseline", "calibrate_axes", "calibrate_noise", "grid_values"]
+from gyrostab.noise import TERMS
+from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
 #: Number of draws from the posterior of the noise of an axis; limits memory.

@@ -14,16 +14,6 @@ from gyrostab.kernels.spectra.expected import expected_powers
 from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
 from gyrostab.noise import LAWS
 
-__all__ = [
-    "NOISE",
-    "band_columns",
-    "common_variance",
-    "line_columns",
-    "noise_powers",
-    "sum_noise",
-    "white_variance",
-]
-
 Array = NDArray[np.float64]
 #: Random noise terms, in the order of the dimension `noise`.
 NOISE = ("Q", "N", "B", "K")

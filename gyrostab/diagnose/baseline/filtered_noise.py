@@ -19,8 +19,6 @@ from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.physics.logger import LoggerFilter
 
-__all__ = ["fit_filter_response"]
-
 Array = NDArray[np.float64]
 
 

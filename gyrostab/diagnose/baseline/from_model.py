@@ -18,10 +18,9 @@ from gyrostab.diagnose.baseline.quiescent import given_quiescent_blocks, use_giv
 from gyrostab.diagnose.reduce.schema import BASELINE, label_variables
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.errors import OptionError
-from gyrostab.noise import HOUR, TERMS
+from gyrostab.noise import TERMS
 from gyrostab.simulate.model import Model, read_model
-
-__all__ = ["baseline_from_model"]
+from gyrostab.units import HOUR
 
 
 def baseline_from_model(

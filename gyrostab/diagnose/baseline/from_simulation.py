@@ -27,8 +27,6 @@ from gyrostab.diagnose.baseline.simulated import (
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.errors import SchemaError
 
-__all__ = ["baseline_from_simulation"]
-
 Array = NDArray[np.float64]
 
 

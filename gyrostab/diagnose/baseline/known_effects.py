@@ -31,15 +31,6 @@ from gyrostab.physics.logger import LoggerFilter
 from gyrostab.physics.prediction import Prediction
 from gyrostab.simulate.model import Model
 
-__all__ = [
-    "KnownEffects",
-    "Wandering",
-    "expect_known_effects",
-    "expect_known_motion",
-    "remove_known_motion",
-    "with_wandering",
-]
-
 Array = NDArray[np.float64]
 _EVERYWHERE = "lattice"  # the anomaly of every sample
 

@@ -18,14 +18,6 @@ from gyrostab.kernels.spectra.line_levels import LEAK_LINES
 from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
 from gyrostab.physics.base import Effect
 
-__all__ = [
-    "average_in_bands",
-    "expect_lines",
-    "independent_line_share",
-    "remove_known_lines",
-    "resonance_density",
-]
-
 Array = NDArray[np.float64]
 _LEAK_LINES = 100  # on either side, that a line leaks into; limits time
 _PLACES_BETWEEN = 4  # positions of a line on either side of a frequency of the spectrum

@@ -13,8 +13,6 @@ from gyrostab.diagnose.baseline.expected_statistics import common_variance
 from gyrostab.diagnose.baseline.posterior import Posterior
 from gyrostab.errors import SchemaError
 
-__all__ = ["quiescent_level", "scale_axes"]
-
 Array = NDArray[np.float64]
 _ROUNDS = 20  # of Fisher scoring, which converges quadratically
 _MIN_FACTOR_RATIO = 0.1  # of the factor before: no round may reach zero

@@ -11,17 +11,7 @@ from scipy.special import ndtr, ndtri
 from gyrostab.diagnose.evidence.products import marginalise, mean_products, scale_columns
 from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.kernels.regression.nonnegative import solve_nonnegative
-from gyrostab.noise import HOUR
-
-__all__ = [
-    "Fit",
-    "Posterior",
-    "average_blocks",
-    "fit_squares",
-    "floor_square",
-    "noise_posterior",
-    "visible_coefficients",
-]
+from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
 _MIN_POWER_RATIO = 0.05  # of expected powers that fitted effects may leave; design choice

@@ -13,8 +13,6 @@ from gyrostab.diagnose.predict.windows import channel_units, make_windows
 from gyrostab.physics.base import Effect, driver_error
 from gyrostab.physics.prediction import Prediction
 
-__all__ = ["complex_factors", "find_drivers", "predict_effect", "sizes_by_axis"]
-
 Array = NDArray[np.float64]
 
 

@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.baseline.posterior import average_blocks, fit_squares
 from gyrostab.diagnose.reduce.zero_bin import truncated_axes
 from gyrostab.diagnose.settings import DEFAULTS, Settings
-from gyrostab.noise import HOUR, URAD_PER_S
-
-__all__ = ["angle_share", "rounded_rates"]
+from gyrostab.noise import URAD_PER_S
+from gyrostab.units import HOUR
 
 _SERIES_TERMS = 40  # of the correlation series of `angle_share`
 

@@ -14,15 +14,6 @@ from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.errors import OptionError
 from gyrostab.time.grid import stamp_ns
 
-__all__ = [
-    "LEVEL_SPANS",
-    "find_quiescent_blocks",
-    "find_quiescent_spans",
-    "given_quiescent_blocks",
-    "noise_level_excess",
-    "use_given_blocks",
-]
-
 Array = NDArray[np.float64]
 # Criterion of blocks that the user gave.
 GIVEN = "the given quiescent stretches"

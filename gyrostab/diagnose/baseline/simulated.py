@@ -20,8 +20,6 @@ from gyrostab.diagnose.reduce.schema import BASELINE, label_variables
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.line_levels import local_level
 
-__all__ = ["ExtraStatistics", "add_extra_statistics", "measure_extra_statistics", "worst_band"]
-
 Array = NDArray[np.float64]
 _MAX_LINES = 100  # on an axis; limits time
 _SMOOTHING_LINES = 5  # over which a peak is smoothed; design choice

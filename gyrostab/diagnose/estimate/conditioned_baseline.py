@@ -33,8 +33,6 @@ from gyrostab.diagnose.settings import Settings
 from gyrostab.noise import sampled_psd
 from gyrostab.physics.registry import effects
 
-__all__ = ["add_outlier_power", "expected_baseline", "predict_baseline", "without_expected"]
-
 _EVERYWHERE = "lattice"  # rounding affects every sample, so that the calibrated noise includes it
 
 

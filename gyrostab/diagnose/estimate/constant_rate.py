@@ -13,8 +13,6 @@ from gyrostab.physics.base import Effect
 from gyrostab.physics.logger import RateQuantization
 from gyrostab.units import HOUR
 
-__all__ = ["constant_rates", "noise_lost_by_truncation"]
-
 Array = NDArray[np.float64]
 _ROUNDS = 200  # of a fixed-point iteration that halves its error in about one
 _MAX_LEVELS = 4000  # of a truncated normal law, beyond which it is as good as continuous

@@ -33,8 +33,6 @@ from gyrostab.physics.prediction import Windows
 from gyrostab.physics.registry import effects
 from gyrostab.physics.rotation import EarthRate
 
-__all__ = ["Estimate", "Fitted", "fit_expected", "fit_identifications"]
-
 _ANGLE = "deg"
 _TAIL = float(ndtr(-NORMAL_95))  # beyond either end of an interval
 _PLACE = "frequency"  # of a line: where it is does not depend on what makes it

@@ -36,8 +36,6 @@ from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.diagnose.reduce.block_statistics import MIN_BLOCKS
 from gyrostab.physics.base import Effect
 
-__all__ = ["recalibrate", "refer_to_kept_noise", "remove_fast_switching"]
-
 Array = NDArray[np.float64]
 LEVEL_GROUPS = 150  # of blocks of similar level, over which powers are averaged
 

@@ -15,8 +15,6 @@ from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.windows import TIME_PARAMETER
 from gyrostab.diagnose.statistics.rotation_order import fit_amplitude, harmonic_sets
 
-__all__ = ["split_harmonics", "split_steps"]
-
 MAX_BLOCKS_OF_STEP = 2  # by which the times of a step on two axes may differ; design choice
 
 

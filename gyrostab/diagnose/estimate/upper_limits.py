@@ -19,8 +19,6 @@ from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.physics.registry import effects
 
-__all__ = ["UpperLimit", "find_upper_limits", "mixture_limit"]
-
 CONFIDENCE = 0.95
 MAX_VARIANTS = 9  # evenly spread over the grid of a mean: enough for a smooth mixture
 ONE_SIDED_SIGMA = float(ndtri(CONFIDENCE))  # quantile of the normal law

@@ -38,8 +38,6 @@ from gyrostab.kernels.spectra.periodogram import (
 )
 from gyrostab.physics.phase import lorentz_density
 
-__all__ = ["SwitchingEvidence", "switching_evidence", "switching_powers"]
-
 Array = NDArray[np.float64]
 _AR_ORDERS = (0, 1, 2, 4, 8, 16, 32)  # of the autoregression that approximates any spectrum
 _MAX_MEANS = 12_000  # in the search of a course; sub-blocks are merged beyond; limits time

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import SchemaError
 
-__all__ = ["FOLDS", "LENGTHS", "fold_blocks", "fold_subsets"]
-
 #: Folds of each length; consecutive intervals belong to them in turn.
 FOLDS = 4
 #: Length of an interval [s], and its largest share of the record. Design choice.

@@ -30,7 +30,6 @@ from gyrostab.diagnose.evidence.products import (
     axis_noise,
     column_pairs,
     factor_errors,
-    held_out_evidence,
     log_evidence,
     marginalise,
     mean_products,
@@ -39,19 +38,6 @@ from gyrostab.diagnose.evidence.products import (
 )
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.errors import OptionError
-
-__all__ = [
-    "LinearModel",
-    "Tier",
-    "held_out_evidence",
-    "linear_model_factors",
-    "mean_factors",
-    "mean_residual",
-    "noise_columns",
-    "noise_weight",
-    "stack_designs",
-    "with_independent_cells",
-]
 
 #: "free": the noise may differ from the calibrated one (to name an effect); "calibrated": it is the
 #: calibrated one (to detect an effect).

@@ -14,23 +14,7 @@ from gyrostab.diagnose.evidence.wandering import RandomProcesses, expected_proce
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.kernels.regression.evidence import chosen_products, mixed_evidence
 from gyrostab.kernels.regression.state_space import flicker_states, whiten
-from gyrostab.noise import HOUR
-
-__all__ = [
-    "WIDTHS",
-    "Array",
-    "Products",
-    "axis_noise",
-    "column_pairs",
-    "factor_errors",
-    "held_out_evidence",
-    "log_evidence",
-    "marginalise",
-    "mean_products",
-    "power_products",
-    "remove_common_part",
-    "scale_columns",
-]
+from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
 #: Standard deviations of the prior of a factor, in units of its error in white noise. Design

@@ -11,21 +11,6 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.folds import FOLDS
 
-__all__ = [
-    "COUNTS",
-    "GRID_COUNTS",
-    "CountEvidence",
-    "ExpectedCounts",
-    "excess_extremes",
-    "expected_counts",
-    "has_coarse_grid",
-    "hidden_by_grid",
-    "kurtosis_evidence",
-    "kurtosis_moments",
-    "quiescent_scatter",
-    "sample_count_evidence",
-]
-
 Array = NDArray[Any]
 #: Counts that effects raise.
 COUNTS = ("outliers", "repeats", "extremes", "stuck", "filled")

@@ -13,8 +13,6 @@ from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.line_levels import EDGE_LINES, LEAK_LINES, level_around, local_level
 
-__all__ = ["expected_lines", "line_evidence", "line_skirt"]
-
 Array = NDArray[Any]
 _MIN_LEVEL_RATIO = 1e-3  # of the spectrum, that known lines leave; design choice
 _MAX_SKIRT_LINES = 40  # design choice

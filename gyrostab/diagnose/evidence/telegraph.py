@@ -33,15 +33,6 @@ from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.regression.evidence import mixed_evidence
 from gyrostab.kernels.regression.levels import level_tables, levels_smooth
 
-__all__ = [
-    "TelegraphCourses",
-    "course_evidence",
-    "drift_waves",
-    "simulated_courses",
-    "telegraph_courses",
-    "telegraph_evidence",
-]
-
 Array = NDArray[np.float64]
 #: Parts of a block, each on one level. Design choice.
 PARTS_PER_BLOCK = 4

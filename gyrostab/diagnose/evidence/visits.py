@@ -24,8 +24,6 @@ from gyrostab.diagnose.evidence.products import (
 )
 from gyrostab.diagnose.reduce.schema import axis_values
 
-__all__ = ["Visits", "compare_visits", "visit_columns"]
-
 Array = NDArray[np.float64]
 #: Standard deviation of the heights of an arbitrary course over its step. Design choice.
 _SCATTER = 0.5

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.reduce.schema import axis_values
 
-__all__ = ["RandomProcesses", "block_mean_variance", "expected_processes", "with_walk"]
-
 Array = NDArray[np.float64]
 
 

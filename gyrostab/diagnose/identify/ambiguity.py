@@ -11,8 +11,6 @@ from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.reduce.zero_bin import possibly_truncated_axes
 
-__all__ = ["find_equivalent_effects", "find_spectral_alternatives"]
-
 #: Effect -> effects that look the same in block statistics, whatever the excitation.
 OBSERVATIONALLY_EQUIVALENT: dict[str, tuple[str, ...]] = {
     "gauss_markov": ("telegraph",),

@@ -16,9 +16,7 @@ from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import mean_mixture
 from gyrostab.diagnose.reduce.schema import axis_values
-from gyrostab.noise import HOUR
-
-__all__ = ["excess_low_frequency_noise", "variance_fluctuation", "with_neighbouring_variants"]
+from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
 #: Flicker and random walk that are tried, as multiples of the least that the record can show.

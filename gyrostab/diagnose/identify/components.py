@@ -11,19 +11,6 @@ from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, C
 from gyrostab.diagnose.predict.search import combine_rows
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
-__all__ = [
-    "PLAIN_LINE",
-    "are_lines",
-    "axes_of",
-    "candidates_of",
-    "evidence_of",
-    "find_components",
-    "group_components",
-    "merge_lines",
-    "split_layers",
-    "sum_evidence",
-]
-
 #: The effect for a line of unknown cause.
 PLAIN_LINE = "spectral_line"
 

@@ -26,12 +26,10 @@ from gyrostab.diagnose.predict.windows import (
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS
 from gyrostab.errors import OptionError
-from gyrostab.noise import HOUR
 from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Prediction, Windows
 from gyrostab.physics.registry import effects
-
-__all__ = ["effect_candidates", "largest_size"]
+from gyrostab.units import HOUR
 
 Array = NDArray[Any]
 _MAX_VALUES = 60  # of a nuisance parameter; limits time

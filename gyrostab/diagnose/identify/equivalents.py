@@ -17,8 +17,6 @@ from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.physics.registry import effects
 
-__all__ = ["prefer_plainer", "settle_forms"]
-
 
 def settle_forms(identifications: Identifications, baseline: xr.Dataset) -> Identifications:
     """Return identifications with the forms that their models will have.

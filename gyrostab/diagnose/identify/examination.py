@@ -20,8 +20,6 @@ from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.settings import Settings
 
-__all__ = ["Examination"]
-
 
 @dataclass(frozen=True)
 class Examination:

@@ -16,8 +16,6 @@ from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.physics.base import Effect
 
-__all__ = ["identify_expected_effects"]
-
 MAX_ROUNDS_PER_EFFECT = 6  # components of one kind that an effect may add, one in each round
 _SINGLE_EVENT = {"telegraph": "bias_jump"}  # a switch that does not return
 

@@ -27,8 +27,6 @@ from gyrostab.diagnose.statistics.wording import COARSE_ANGLE_GRID
 from gyrostab.physics.base import Effect
 from gyrostab.progress import Stage, no_stage
 
-__all__ = ["MIN_P_VALUE", "name_effects", "tail_level", "tail_probability"]
-
 Array = NDArray[np.float64]
 #: Floor of an extrapolated probability; decides nothing, because no level is that low.
 MIN_P_VALUE = 1e-12

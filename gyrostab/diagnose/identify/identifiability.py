@@ -19,13 +19,6 @@ from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.physics.registry import effects
 
-__all__ = [
-    "EQUIVALENTS",
-    "find_better_form",
-    "find_plainer_effect",
-    "is_physical",
-]
-
 Array = NDArray[np.float64]
 _PPM = 1e6  # in one
 #: Effect -> effect that it becomes at the end of the range of a parameter: without a dead band,

@@ -18,24 +18,6 @@ from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.windows import rebuild_variant
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
-__all__ = [
-    "Identification",
-    "Identifications",
-    "Rejection",
-    "Selection",
-    "Unidentified",
-    "add_identification",
-    "components_of",
-    "condition_on_selections",
-    "conditioned_states",
-    "find_unidentified",
-    "form_error",
-    "make_identification",
-    "remove_phase_locked",
-    "with_axes_of",
-    "with_noise",
-]
-
 Array = NDArray[np.float64]
 #: What filters the noise of the log, and would explain an error in the spectrum of another effect.
 _FILTER = "logger_filter"

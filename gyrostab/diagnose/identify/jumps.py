@@ -14,8 +14,6 @@ from gyrostab.diagnose.predict.sizes import Mixture, component_mixture, mean_mix
 from gyrostab.diagnose.predict.windows import TIME_PARAMETER
 from gyrostab.diagnose.reduce.schema import axis_values
 
-__all__ = ["event_nats", "gradual_nats", "is_free_jump", "is_step", "scatter_nats"]
-
 Array = NDArray[np.float64]
 _JUMP = "bias_jump"
 _TRANSITION_BLOCKS = (4, 8)  # lengths of the gradual changes that a jump is compared with

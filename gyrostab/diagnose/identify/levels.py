@@ -14,8 +14,6 @@ from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.statistics.telegraph import add_fast_switching, fast_switching_evidence
 
-__all__ = ["further_level_nats", "unequal_levels_nats"]
-
 Array = NDArray[np.float64]
 _JUMP_CHANGES = 2  # from block to block, in the column of a jump within a block
 

@@ -21,8 +21,6 @@ from gyrostab.diagnose.settings import INTERVAL_TAILS
 from gyrostab.noise import NORMAL_95
 from gyrostab.physics.registry import effects
 
-__all__ = ["fit_filter_sizes", "separate_axes_nats", "without_slopes"]
-
 Array = NDArray[np.float64]
 ZOOM_POINTS, ZOOM_STEPS = 21, 4  # of the refinement of a cutoff on its grid
 GRID_REACH = 0.25  # distance in ln(cutoff) of one place on the grid of filters

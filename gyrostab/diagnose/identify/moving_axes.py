@@ -20,8 +20,6 @@ from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.progress import Stage, no_stage
 
-__all__ = ["moving_blocks", "unexplained_motion", "without_motion"]
-
 Array = NDArray[np.float64]
 #: Share of the blocks whose means lie closest together, and the width of the central quarter of a
 #: normal law in standard deviations: 2 * 0.3186.

@@ -13,8 +13,6 @@ from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
 
-__all__ = ["order_passing", "order_rivals"]
-
 
 def order_passing(
     components: Mapping[str, list[Component]],

@@ -13,8 +13,6 @@ from gyrostab.diagnose.predict.candidates import Candidate, Variant
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.noise import sampled_psd
 
-__all__ = ["NUISANCE_ALTERNATIVES", "burst_intervals", "hat_functions", "nuisance_alternatives"]
-
 Array = NDArray[np.float64]
 #: Name -> description.
 NUISANCE_ALTERNATIVES = {

@@ -14,8 +14,6 @@ from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
 
-__all__ = ["find_pair"]
-
 
 def find_pair(
     examination: Examination,

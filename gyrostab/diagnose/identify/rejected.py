@@ -22,8 +22,6 @@ from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State
 
-__all__ = ["find_rejections"]
-
 _NOISE = "noise"
 
 

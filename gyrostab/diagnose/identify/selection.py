@@ -39,8 +39,6 @@ from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import reusable_evidence
 
-__all__ = ["score_candidates", "select_effects"]
-
 # Limits of the time of a search; a record has fewer effects.
 MAX_EFFECTS = 10
 #: Lines are counted apart: whatever rotates or switches makes combs of them.

@@ -31,8 +31,6 @@ from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.settings import Settings
 
-__all__ = ["evidence_instead", "prune_selections", "settle_selections", "without_pulses"]
-
 
 def without_pulses(chosen: Sequence[Selection], settings: Settings) -> list[Selection]:
     """Drop spikes on axes that have a comb of lines or a profile of the feedback ramp.

@@ -13,8 +13,6 @@ from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture, disagreement_nats
 from gyrostab.diagnose.reduce.accumulate import RECORD_PARTS
 
-__all__ = ["intermittent_nats"]
-
 _STEADY = ("gauss_markov", "telegraph", "logger_filter")
 
 

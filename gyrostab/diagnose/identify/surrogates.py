@@ -22,8 +22,6 @@ from gyrostab.diagnose.predict.windows import (
 from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.physics.prediction import Windows
 
-__all__ = ["TIME_SHIFTS", "TimeShifts", "passes_time_shift_test"]
-
 #: Number of time-shifted surrogates: two of them make the allowed share of 1 %.
 TIME_SHIFTS = 200
 SHIFT_RANGE = (0.05, 0.95)  # of the record

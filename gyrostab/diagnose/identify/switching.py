@@ -24,14 +24,6 @@ from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
 
-__all__ = [
-    "drop_explained_jumps",
-    "identify_switching",
-    "put_followers_first",
-    "remove_telegraph_bias",
-    "renew_component",
-]
-
 
 def put_followers_first(
     passing: list[str], components: Mapping[str, Sequence[Component]], state: State

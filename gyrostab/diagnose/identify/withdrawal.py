@@ -18,8 +18,6 @@ from gyrostab.diagnose.identify.identification import (
 )
 from gyrostab.diagnose.predict.linear_model import State
 
-__all__ = ["withdraw_effects"]
-
 #: Effects that change the white variance of the means, which the calibration then misjudges.
 _SPECTRAL_SHAPES = ("logger_filter", "held_samples", "gauss_markov", "telegraph")
 #: Arbitrary courses of the bias.

@@ -16,8 +16,6 @@ from gyrostab.diagnose.statistics.mean import region_mean
 from gyrostab.errors import OptionError
 from gyrostab.kernels.spectra.line_levels import LEAK_LINES
 
-__all__ = ["FIELDS", "locate_mismatches"]
-
 Array = NDArray[np.float64]
 # Limits of the table; the rows left out are the least certain.
 MAX_PER_ROW = 8  # mismatches of one statistic and row

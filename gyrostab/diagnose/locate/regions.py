@@ -8,8 +8,6 @@ from typing import Any
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import find_statistic
 
-__all__ = ["merge_regions", "merge_wandering_regions"]
-
 Region = dict[str, Any]
 TAU_TOLERANCE = 0.99  # ratio of averaging times that are equal but for rounding
 _SEPARATE_KINDS = ("slow", "variance", "drifting")

@@ -35,9 +35,7 @@ from gyrostab.kernels.random.stochastic import (
     ornstein_uhlenbeck_means,
 )
 from gyrostab.kernels.spectra.periodogram import band_covariance, taper
-from gyrostab.noise import HOUR
-
-__all__ = ["null_records", "repeatable_null_records"]
+from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
 #: Null records up to this size stay in memory; larger ones are drawn again on each pass.

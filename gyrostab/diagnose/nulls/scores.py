@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS
 
-__all__ = ["MaximumDistribution", "NullScores", "StatisticNull", "null_scores", "standardise"]
-
 Array = NDArray[np.float64]
 _KEPT_BELOW_SIGMA = 1.4  # below the largest of independent cells, from which scores are kept
 _POWERS_AT_ONCE = 1_000_000  # band powers of null records scored at once; limits memory

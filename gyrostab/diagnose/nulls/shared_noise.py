@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.reduce.block_statistics import pair_indices
 
-__all__ = ["SharedNoise", "draw_shared_spectra", "draw_shared_white", "find_shared_noise"]
-
 Array = NDArray[np.float64]
 _MIN_EIGENVALUE = 1e-9  # of a coherence: with gaps it may be negative for nearly equal axes
 

@@ -16,8 +16,6 @@ from gyrostab.diagnose.settings import INTERVAL_TAILS
 from gyrostab.noise import NORMAL_95
 from gyrostab.physics.registry import effects
 
-__all__ = ["average_sizes", "plain_places"]
-
 Array = NDArray[np.float64]
 MAX_ZERO_LAG_S = 1e-2  # a lag that counts as zero
 #: Probability beyond the values that a grid supports. Design choice: a tenth of the tail of a 95 %

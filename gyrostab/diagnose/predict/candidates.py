@@ -15,8 +15,6 @@ from gyrostab.physics.prediction import Prediction
 if TYPE_CHECKING:
     from gyrostab.diagnose.statistics.base import Statistic
 
-__all__ = ["Candidate", "CandidateEvidence", "Component", "Prospect", "Variant"]
-
 Array = NDArray[Any]
 
 

@@ -11,8 +11,6 @@ from gyrostab.diagnose.predict.windows import channel_units
 from gyrostab.diagnose.reduce.aligned_channels import ROTATION_WAVE_PREFIXES
 from gyrostab.physics.registry import effects
 
-__all__ = ["CALIBRATION_CHANNELS", "MIN_BLOCK_SHARE", "missing_channel_reason", "unused_channels"]
-
 #: Least share of the blocks in which a channel must have values. Design choice.
 MIN_BLOCK_SHARE = 0.5
 #: The angle whose rate of change is the channel ``rotation_rate``.

@@ -15,19 +15,6 @@ from gyrostab.diagnose.predict.linear_model import State, pair_rows
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
-__all__ = [
-    "MIN_POWER_RATIO",
-    "bands_at",
-    "condition_on",
-    "condition_on_components",
-    "drop_changed_tails",
-    "free_covariance",
-    "free_shape",
-    "mean_columns",
-    "power_shares",
-    "refit_weights",
-]
-
 Array = NDArray[np.float64]
 #: Least fitted power over the expected one. Design choice.
 MIN_POWER_RATIO = 0.2

@@ -17,14 +17,6 @@ from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Prediction
 from gyrostab.physics.registry import effects
 
-__all__ = [
-    "band_response",
-    "band_shape_factor",
-    "frequencies_in_bands",
-    "undo_filter",
-    "with_band_response",
-]
-
 Array = NDArray[np.float64]
 _FREQUENCIES_PER_BAND = 48  # to average a response; design choice
 _SIZE_COUNT = 50  # filter sizes that are tried; limits resolution

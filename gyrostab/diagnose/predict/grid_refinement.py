@@ -17,7 +17,6 @@ from gyrostab.errors import OptionError
 from gyrostab.physics.registry import effects
 from gyrostab.units import HOUR
 
-__all__ = ["Point", "refine_grid"]
 _SECONDS = {"s": 1.0, "h": HOUR}
 #: Units of parameters that have values between those of the grid.
 _SCALES = (*_SECONDS, "degC")

@@ -20,29 +20,6 @@ from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.periodogram import taper
 
-__all__ = [
-    "State",
-    "band_widths",
-    "cross_column",
-    "cross_without",
-    "expected_cross",
-    "given_columns",
-    "initial_state",
-    "mix_with_mean",
-    "moves_within_blocks",
-    "pair_rows",
-    "power_column",
-    "real_and_imaginary",
-    "records_last",
-    "reference_channel_power",
-    "select_row",
-    "simulate_noise",
-    "spread_by_gaps",
-    "stack_columns",
-    "stack_designs",
-    "unspread_share",
-]
-
 Array = NDArray[Any]
 
 

@@ -9,19 +9,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.evidence.held_out import held_out_evidence
+from gyrostab.diagnose.evidence.products import held_out_evidence
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence
 from gyrostab.diagnose.predict.linear_model import State
-
-__all__ = [
-    "Trial",
-    "collect_evidence",
-    "combine_rows",
-    "compute_evidence",
-    "evidence_by_effect",
-    "reusable_evidence",
-]
 
 Array = NDArray[np.float64]
 _TAIL_VARIABLES = ("kurtosis", "outliers")  # not used by the evidence of means

@@ -13,15 +13,6 @@ from gyrostab.diagnose.evidence.products import axis_noise, mean_products
 from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
 
-__all__ = [
-    "Mixture",
-    "component_mixture",
-    "component_size",
-    "disagreement_nats",
-    "linear_mixture",
-    "mean_mixture",
-]
-
 Array = NDArray[np.float64]
 _RIDGE = 1e-12  # of the trace of the Gram matrix, against singular columns
 

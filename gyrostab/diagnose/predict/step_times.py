@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from gyrostab.physics.prediction import Windows
 
-__all__ = ["power_on_times", "select_step_times"]
-
 Array = NDArray[np.float64]
 _MAX_TIMES = 240  # limits time
 _MAX_STEPS = 20  # largest steps of the means among them: a step one block off does not fit

@@ -17,18 +17,6 @@ from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Prediction, Windows
 from gyrostab.physics.registry import effects
 
-__all__ = [
-    "TIME_PARAMETER",
-    "channel_units",
-    "distinct_variants",
-    "driver_names",
-    "fill_linearly",
-    "make_windows",
-    "predict_exogenous",
-    "rebuild_variant",
-    "weigh_by_time",
-]
-
 Array = NDArray[Any]
 #: Nuisance parameter that is a time.
 TIME_PARAMETER = "at"

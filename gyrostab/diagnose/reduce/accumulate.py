@@ -21,15 +21,6 @@ from gyrostab.kernels.spectra import periodogram as kernel
 from gyrostab.kernels.spectra.outliers import HISTOGRAM
 from gyrostab.time.grid import first_stamp
 
-__all__ = [
-    "CHANNEL_PARTS",
-    "LAGGED_CHANNEL_PREFIXES",
-    "RAMP_PHASE_BINS",
-    "RECORD_PARTS",
-    "SUB_BLOCKS",
-    "Accumulator",
-]
-
 Array = NDArray[np.float64]
 #: Parts of the record, each with its own line spectrum. Design choice: eight show whether a line
 #: persists or drifts.

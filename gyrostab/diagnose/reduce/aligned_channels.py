@@ -16,8 +16,6 @@ from gyrostab.schema import log_channels, signal_name
 from gyrostab.time.grid import TimeGridIndex, first_stamp, grid_index, grid_times
 from gyrostab.time.stamps import format_stamp, to_nanoseconds
 
-__all__ = ["ROTATION_WAVE_PREFIXES", "Aligned", "align_channels"]
-
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 #: Sampling periods of the gyro up to which a channel counts as sampled like the gyro: each sample

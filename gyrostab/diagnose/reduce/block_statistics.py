@@ -16,15 +16,6 @@ from gyrostab.progress import Stage, no_stage
 from gyrostab.schema import check_log
 from gyrostab.time.durations import duration_seconds, samples
 
-__all__ = [
-    "MIN_BLOCKS",
-    "block_samples",
-    "measured",
-    "noise_at_orders",
-    "pair_indices",
-    "reduce_log",
-]
-
 Array = NDArray[np.float64]
 _BLOCK_S = 20.0  # default block; design choice
 _MIN_DEFAULT_BLOCKS = 90  # shorter blocks in shorter records; design choice

@@ -24,8 +24,6 @@ from gyrostab.schema import GAP_CAUSES, texts
 from gyrostab.time.grid import grid_index, grid_times
 from gyrostab.time.stamps import format_stamp, to_nanoseconds
 
-__all__ = ["MIN_MEAN_SHARE", "label_statistics"]
-
 Array = NDArray[np.float64]
 _MAX_SMOOTHING_BLOCKS = 2.0  # longest time scale of the smoothing of a channel; design choice
 _STEP_VALUES_PER_BLOCK = 256  # values from which the quantization step is found; limits time

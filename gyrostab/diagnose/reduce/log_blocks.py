@@ -9,21 +9,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.noise import HOUR
 from gyrostab.schema import log_channels, signal_name
 from gyrostab.simulate.drivers import Source, make_source
 from gyrostab.store import lazy
 from gyrostab.time.stamps import to_nanoseconds
-
-__all__ = [
-    "BlockBatch",
-    "channel_at",
-    "channel_means",
-    "count_samples",
-    "finite_range",
-    "numeric_channels",
-    "read_batches",
-]
+from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
 _SAMPLES_PER_READ = 2**20  # over all rows, unless a chunk holds more; limits memory

@@ -10,19 +10,6 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.spectra.outliers import HISTOGRAM, departures, histogram_edge, peaks
 
-__all__ = [
-    "EXPECTED_FALSE_OUTLIERS",
-    "Peaks",
-    "count_outliers",
-    "find_peaks",
-    "outlier_limit",
-    "probability_all_zero",
-    "quantization_step",
-    "simultaneous_samples",
-    "simultaneous_zeros",
-    "zeros_beyond_chance",
-]
-
 Array = NDArray[np.float64]
 #: Expected number of false outliers of an axis in a record of Gaussian noise. Design choice.
 EXPECTED_FALSE_OUTLIERS = 0.02

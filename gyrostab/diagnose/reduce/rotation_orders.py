@@ -14,8 +14,6 @@ from gyrostab.simulate.drivers import Source, make_source
 from gyrostab.time.grid import first_stamp, grid_times
 from gyrostab.units import INNER, parse_unit
 
-__all__ = ["HARMONICS", "RotationOrders", "make_rotation_orders"]
-
 Array = NDArray[np.float64]
 #: Multiples of the tool rotation that are measured.
 HARMONICS = (1, 2, 3)

@@ -16,15 +16,6 @@ from numpy.typing import NDArray
 from gyrostab.noise import LAWS, TERMS
 from gyrostab.units import INNER
 
-__all__ = [
-    "BASELINE",
-    "BLOCK_STATISTICS",
-    "COORDINATES",
-    "Variable",
-    "axis_values",
-    "label_variables",
-]
-
 
 class Variable(NamedTuple):
     """Dimensions, unit and meaning of a variable."""

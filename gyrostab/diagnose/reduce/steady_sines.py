@@ -16,8 +16,6 @@ from scipy.special import gammaincinv, logsumexp
 from gyrostab.kernels.spectra.line_levels import LEAK_LINES, level_around
 from gyrostab.kernels.spectra.periodogram import ordinates, taper
 
-__all__ = ["SineSearch", "sine_factors"]
-
 Array = NDArray[np.float64]
 _MAX_SAMPLES = 2**21  # of a segment; bounds memory
 #: Segments are transformed whole, and in parts, for lines whose phase wanders.

@@ -11,8 +11,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-__all__ = ["BINS", "bin_widths", "empty_zone", "possibly_truncated_axes", "truncated_axes"]
-
 Array = NDArray[np.float64]
 #: Bins whose widths are measured: the zero bin, and its two neighbours together.
 BINS = ("zero", "next")

@@ -24,8 +24,6 @@ from gyrostab.diagnose.result.attribution_weights import (
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics.sample_counts import find_anomalous_blocks
 
-__all__ = ["active_blocks", "attribute_mismatches", "drop_expected", "join_blocks"]
-
 Array = NDArray[np.float64]
 MAX_SPANS = 6  # more intervals than that are reported as the whole record
 

@@ -19,8 +19,6 @@ from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS
 from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
 
-__all__ = ["Scores", "needed_effects", "score_left", "statistic_scores"]
-
 Scores = Sequence[tuple[str, xr.Dataset, NDArray[np.float64]]]
 Region = Mapping[str, Any]
 

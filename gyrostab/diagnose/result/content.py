@@ -23,8 +23,6 @@ from pydantic import (
 
 from gyrostab.errors import SchemaError
 
-__all__ = ["HELD_OUT", "SCHEMA", "VERDICTS", "Content", "check_diagnosis"]
-
 Verdict = Literal["no mismatch", "explained", "partly explained", "unknown"]
 View = Literal["davar", "mean", "cross_axis", "spectrum", "distribution", "restart"]
 VERDICTS: tuple[str, ...] = get_args(Verdict)

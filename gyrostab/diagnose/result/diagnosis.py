@@ -24,8 +24,6 @@ from gyrostab.diagnose.settings import Settings, stored_settings
 from gyrostab.diagnose.statistics.wording import COARSE_ANGLE_GRID
 from gyrostab.physics.base import Effect
 
-__all__ = ["Diagnosis", "effect_table", "model_text", "plain"]
-
 
 @dataclass(frozen=True)
 class Diagnosis:

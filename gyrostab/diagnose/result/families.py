@@ -10,8 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc
 
-__all__ = ["find_families", "group_families", "group_unrelated"]
-
 Array = NDArray[np.float64]
 #: Probability that lines without relation form a family, below which they are one.
 MAX_CHANCE = 0.05

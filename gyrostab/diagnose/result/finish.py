@@ -50,8 +50,6 @@ from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
 from gyrostab.diagnose.task import Comparison, Task, lines_without_motion
 from gyrostab.simulate.model import Model
 
-__all__ = ["Fit", "finish_diagnosis", "fit_supported", "measure_evidence", "refit_with_noise"]
-
 
 class Fit(NamedTuple):
     """The effects with their final sizes."""

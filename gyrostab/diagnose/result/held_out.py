@@ -18,8 +18,6 @@ from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score
 from gyrostab.errors import OptionError
 from gyrostab.noise import NORMAL_95
 
-__all__ = ["Trained", "cut_stretches", "held_out", "log_likelihood", "select_forecast_start"]
-
 #: A baseline, or a function that fits one to the blocks where its argument, a mask, is true.
 Trained = xr.Dataset | Callable[[NDArray[np.bool_]], xr.Dataset]
 STRETCH_S = 100.0  # length of a held-out stretch; longer ones would hide a whole event
@@ -122,6 +120,7 @@ class Gain(NamedTuple):
     variance: float
 
     def plus(self, other: Gain) -> Gain:
+        """Add the gain of another, independent stretch."""
         return Gain(self.nats + other.nats, self.variance + other.variance)
 
 

@@ -24,14 +24,6 @@ from gyrostab.diagnose.result.text import (
 from gyrostab.diagnose.statistics.wording import axes_text
 from gyrostab.wording import join_words
 
-__all__ = [
-    "identified_mismatches",
-    "iso",
-    "mismatch_tables",
-    "motion_mismatches",
-    "unidentified_mismatches",
-]
-
 #: Nuisance alternative -> `view` in `diagnosis.json`.
 _NUISANCE_VIEWS = {
     "~bias(t)": "mean", "~levels": "mean", "~red": "mean", "~N(t)": "davar", "~burst": "davar",

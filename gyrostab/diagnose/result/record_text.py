@@ -18,8 +18,6 @@ from gyrostab.diagnose.settings import Settings, stored_settings
 from gyrostab.diagnose.statistics.wording import axes_text
 from gyrostab.wording import format_value, join_words
 
-__all__ = ["join_axes", "joined_statements", "noise_texts", "summary"]
-
 
 def summary(content: Mapping[str, Any]) -> str:
     """Write the verdict as the first sentences of a report."""

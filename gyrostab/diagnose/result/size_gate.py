@@ -17,8 +17,6 @@ from gyrostab.diagnose.identify.identification import (
 )
 from gyrostab.physics.registry import effects
 
-__all__ = ["keep_supported", "supported_axes"]
-
 
 def _has_zero(estimate: Estimate) -> bool:
     """Return whether the 95 % interval of a parameter contains zero, or is unknown."""

@@ -13,8 +13,6 @@ from gyrostab.diagnose.statistics.mean import window_means
 from gyrostab.diagnose.statistics.power import allan_surface
 from gyrostab.diagnose.statistics.scores import Array, Windows, sum_over_windows
 
-__all__ = ["CASES", "make_surfaces", "surfaces_with_blocks"]
-
 #: The three cases side by side: the simulation without and with the effects.
 CASES = ("recording", "before", "after")
 WINDOW_BLOCKS = 15  # 5 min at 20 s: the length of the windows of the DAVAR in the report

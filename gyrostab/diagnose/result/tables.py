@@ -28,14 +28,6 @@ from gyrostab.physics.base import Effect
 from gyrostab.simulate.model import Model
 from gyrostab.units import HOUR
 
-__all__ = [
-    "baseline_table",
-    "effect_tables",
-    "model_tables",
-    "recording_table",
-    "rejected_tables",
-]
-
 Array = NDArray[np.float64]
 #: Samples of an instrument that is "much faster than the log" (`instrument = 0`): a low-pass of the
 #: instrument is then resolved in the samples of the log.

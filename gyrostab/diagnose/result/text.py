@@ -12,24 +12,6 @@ from gyrostab.diagnose.statistics.wording import axes_text, subject
 from gyrostab.physics.registry import effects
 from gyrostab.wording import join_words
 
-__all__ = [
-    "chance",
-    "chance_share",
-    "clock",
-    "effect_statement",
-    "family_text",
-    "mismatch_statement",
-    "motion_statement",
-    "named_statement",
-    "next_measurement",
-    "plain_name",
-    "probability_text",
-    "rejection_text",
-    "span_text",
-    "unsized_statement",
-    "without_chance",
-]
-
 #: Smallest probability that is printed: the extrapolated tail of the null records goes no further.
 MIN_PRINTED_PROBABILITY = 1e-6
 #: A stretch that starts and ends within this share of the record from its ends is the whole record.

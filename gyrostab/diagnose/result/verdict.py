@@ -11,8 +11,6 @@ import numpy as np
 from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
-__all__ = ["decide_verdict", "doubtful_names", "failed_checks", "name_probability"]
-
 
 def _has_gain(held: Mapping[str, Any]) -> bool:
     gain = held["log_likelihood_gain"]

@@ -28,8 +28,6 @@ from gyrostab.diagnose.settings import Settings
 from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Prediction, Windows
 
-__all__ = ["NullDraw", "Region", "SizeFit", "Sizes", "Statistic", "column_choices"]
-
 Array = NDArray[Any]
 Sizes = Mapping[str, tuple[float, ...]]
 Region = Mapping[str, Any]

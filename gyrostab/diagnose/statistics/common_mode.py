@@ -25,9 +25,7 @@ from gyrostab.diagnose.statistics.scores import (
 )
 from gyrostab.diagnose.statistics.wording import subject, taus_text
 from gyrostab.kernels.regression.state_space import flicker_states, whiten
-from gyrostab.noise import HOUR
-
-__all__ = ["LENGTHS", "SPANS", "CommonMode"]
+from gyrostab.units import HOUR
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (60,)

@@ -40,8 +40,6 @@ from gyrostab.diagnose.statistics.scores import (
 from gyrostab.diagnose.statistics.shared_factors import estimate_shared_factors
 from gyrostab.diagnose.statistics.wording import subject, taus_text
 
-__all__ = ["LENGTHS", "CrossSpectrum", "correlation_score"]
-
 Complex = NDArray[np.complex128]
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.

@@ -23,8 +23,6 @@ from gyrostab.diagnose.statistics.scores import (
 from gyrostab.diagnose.statistics.wording import axes_text
 from gyrostab.kernels.spectra.line_levels import local_level
 
-__all__ = ["DriftingLine"]
-
 _SPECTRUM_SECTIONS = 8  # in which paths begin and end; design choice
 _MIN_PARTS = 6  # of the record, that a path must cover; design choice
 _MIN_MOVED_LINES = 4  # of a drifting line; design choice

@@ -42,20 +42,9 @@ from gyrostab.kernels.regression.boxcars import (
     remaining_information,
 )
 from gyrostab.kernels.regression.state_space import flicker_states
-from gyrostab.noise import HOUR
 from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Windows as PredictionWindows
-
-__all__ = [
-    "LENGTHS",
-    "BlockMeanStatistic",
-    "Mean",
-    "MeanNoise",
-    "apply_precision",
-    "mean_noise",
-    "region_mean",
-    "window_means",
-]
+from gyrostab.units import HOUR
 
 #: Lengths of the windows [blocks].
 LENGTHS = (1, 5, 15, 45)

@@ -14,8 +14,6 @@ from gyrostab.diagnose.reduce.outliers import (
 )
 from gyrostab.diagnose.reduce.zero_bin import truncated_axes
 
-__all__ = ["COARSE_STEP_SIGMA", "null_counts"]
-
 Array = NDArray[np.float64]
 _ITERATIONS = 20  # of an iteration that halves its error
 #: Standard deviations in a quantization step from which the values have few levels. Design choice.
@@ -41,7 +39,7 @@ def null_counts(
     samples = blocks["samples"].values.astype(np.int64)
     adjacent = blocks["adjacent"].values.astype(np.int64)
     mean = _interpolate_means(blocks["mean"].values)
-    scatter, correlation = neighbour_statistics(blocks, sd)
+    scatter, correlation = _neighbour_statistics(blocks, sd)
     truncated = truncated_axes(blocks)
     nothing = np.zeros(samples.shape[1])
     chances = [
@@ -68,7 +66,7 @@ def null_counts(
     }
 
 
-def neighbour_statistics(blocks: xr.Dataset, sd: Array) -> tuple[Array, Array]:
+def _neighbour_statistics(blocks: xr.Dataset, sd: Array) -> tuple[Array, Array]:
     """Measure the scatter of the samples of each block, and the correlation of neighbours.
 
     Both (axis, block) are interpolated over blocks with losses or outliers. The standard deviations

@@ -39,8 +39,6 @@ from gyrostab.diagnose.statistics.scores import (
 from gyrostab.diagnose.statistics.wording import is_higher, subject, taus_text
 from gyrostab.noise import LAWS, sampled_psd
 
-__all__ = ["LENGTHS", "Power", "allan_surface", "allan_transfer"]
-
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (1, 5, 15)
 #: Columns of the score that show another level of the noise.

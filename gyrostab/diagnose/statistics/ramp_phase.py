@@ -30,8 +30,6 @@ from gyrostab.diagnose.statistics.wording import axes_text
 from gyrostab.kernels.spectra.line_levels import LEAK_LINES
 from gyrostab.physics.phase import fold
 
-__all__ = ["LENGTHS", "RampPhase"]
-
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (5, 15)
 

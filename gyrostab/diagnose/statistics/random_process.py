@@ -27,7 +27,7 @@ from gyrostab.diagnose.predict.search import Trial
 from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.statistics.base import SizeFit, Sizes
 from gyrostab.diagnose.statistics.mean import BlockMeanStatistic
-from gyrostab.noise import HOUR
+from gyrostab.units import HOUR
 
 Array = NDArray[Any]
 #: Sizes of a walk that are tried, as multiples of the walk that the means just show; and those

@@ -13,8 +13,6 @@ from gyrostab.diagnose.statistics.mean import MeanNoise, apply_precision, mean_n
 from gyrostab.diagnose.statistics.scores import Array, Windows, statistic_dataset
 from gyrostab.diagnose.statistics.wording import axes_text
 
-__all__ = ["Restart"]
-
 _DECAY_BLOCKS = (2, 6, 18)  # in which a transient falls to 1/e; design choice
 _SIDE_BLOCKS = 15  # before and after a restart, that are compared; design choice
 
@@ -32,7 +30,7 @@ class Restart(Statistic):
         Both are independent of a constant of the record, and have the noise of the simulation.
         ``estimate`` is the transient at the restart, or the jump [degree hour-1].
         """
-        restarts = restart_blocks(blocks)
+        restarts = _restart_blocks(blocks)
         if restarts.size == 0:
             return None
         block, block_count = float(blocks.attrs["block_s"]), blocks.sizes["block"]
@@ -74,7 +72,7 @@ class Restart(Statistic):
         )
 
 
-def restart_blocks(blocks: xr.Dataset) -> np.ndarray:
+def _restart_blocks(blocks: xr.Dataset) -> np.ndarray:
     """Return the first whole block after each restart with blocks on both sides."""
     if "restart_end" not in blocks:
         return np.empty(0, np.int64)

@@ -42,8 +42,6 @@ from gyrostab.diagnose.statistics.scores import (
 )
 from gyrostab.diagnose.statistics.wording import subject
 
-__all__ = ["COUNTS", "LENGTHS", "SampleCounts"]
-
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (1, 5, 15)
 #: Counts of samples.
@@ -95,7 +93,7 @@ class SampleCounts(Statistic):
         counts = sum_over_windows(
             np.stack([counts_by_block[name] for name in COUNTS], axis=-1), windows
         )
-        tail_score, used = kurtosis_score(blocks["kurtosis"].values, samples)
+        tail_score, used = _kurtosis_score(blocks["kurtosis"].values, samples)
         # Rounding has no tails, so that the noise itself may differ from 0.
         usual = np.median(tail_score, axis=-1, keepdims=True)
         tail_score = np.where(
@@ -193,14 +191,14 @@ class SampleCounts(Statistic):
         return f"{subject(region)} {verb} {samples} {when}"
 
 
-def kurtosis_score(excess: Array, samples: Array) -> tuple[Array, Array]:
+def _kurtosis_score(excess: Array, samples: Array) -> tuple[Array, Array]:
     """Return the normal score of the excess kurtosis of Gaussian samples, and 1 where known.
 
     Anscombe and Glynn (1983), doi:10.1093/biomet/70.1.227.
 
     Examples
     --------
-    >>> z, used = kurtosis_score(np.array([0.0, 0.5]), np.array([2000.0, 2000.0]))
+    >>> z, used = _kurtosis_score(np.array([0.0, 0.5]), np.array([2000.0, 2000.0]))
     >>> z.round(1)
     array([0.1, 3.8])
     """

@@ -16,8 +16,6 @@ from gyrostab.diagnose.settings import INTERVAL_TAILS, Settings
 from gyrostab.noise import NORMAL_95
 from gyrostab.units import HOUR
 
-__all__ = ["centre_of_range", "estimate_from_counts", "has_empty_zone"]
-
 #: Standard deviation of the difference of white noise and the median of its eight neighbours, in
 #: standard deviations of the noise.
 MEDIAN_DEPARTURE_SIGMA = 1.08

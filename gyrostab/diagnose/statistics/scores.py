@@ -10,18 +10,6 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import ndtri_exp
 
-__all__ = [
-    "Array",
-    "Windows",
-    "cube_root_score",
-    "cumulative",
-    "exponential_score",
-    "moving_sum",
-    "statistic_dataset",
-    "sum_over_windows",
-    "window_set",
-]
-
 Array = NDArray[np.float64]
 #: tau * f at the maximum of sin(pi f tau)^4 / (pi f tau)^2, the Allan variance of a sine.
 SINE_TAU_CYCLES = 0.371

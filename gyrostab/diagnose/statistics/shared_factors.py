@@ -22,8 +22,6 @@ from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import INTERVAL_TAILS
 from gyrostab.noise import NORMAL_95
 
-__all__ = ["estimate_shared_factors"]
-
 Array = NDArray[np.float64]
 DRAWS = 1000  # of the posterior: 25 beyond each end of a 95 % interval
 FACTOR_ROUNDS = 50  # of the iteration for a matrix of rank 1

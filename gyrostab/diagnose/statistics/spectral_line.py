@@ -40,8 +40,6 @@ from gyrostab.diagnose.statistics.scores import (
 from gyrostab.diagnose.statistics.wording import axes_text
 from gyrostab.kernels.spectra.line_levels import LEAK_LINES, local_level
 
-__all__ = ["SpectralLine"]
-
 _WIDTH_LINES = 5  # of a line with its leakage
 _CERTAIN_SIGMA = 3.0  # by which the power of a line varies more than that of noise; design choice
 _MAX_COHERENCE_BLOCKS = 3.0  # longest coherence time that the scatter of block powers determines

@@ -23,8 +23,6 @@ from gyrostab.diagnose.statistics.scores import (
 )
 from gyrostab.diagnose.statistics.wording import axes_text, length_text, taus_text
 
-__all__ = ["LENGTHS", "SPANS", "VarianceStability", "scale_to_expected", "scatter_moments"]
-
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (20, 80)
 #: Blocks whose powers are averaged before their scatter is judged.

@@ -8,8 +8,6 @@ from typing import Any
 from gyrostab.units import DAY, HOUR
 from gyrostab.wording import join_words
 
-__all__ = ["COARSE_ANGLE_GRID", "axes_text", "is_higher", "length_text", "subject", "taus_text"]
-
 #: Why no rounding of a rate is named where the values of a counter of angles are coarse.
 COARSE_ANGLE_GRID = "not identifiable: the coarse quantization grid is that of angles"
 

@@ -10,20 +10,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
-__all__ = [
-    "DAY_FIRST",
-    "MONTH_FIRST",
-    "NO_DATE",
-    "YEAR_FIRST",
-    "as_iso",
-    "find_order",
-    "has_offset",
-    "holds_date",
-    "is_iso",
-    "is_time_of_day",
-    "parse_order",
-]
-
 #: Orders of the parts of a date.
 YEAR_FIRST, DAY_FIRST, MONTH_FIRST = "YYYY/MM/DD", "DD/MM/YYYY", "MM/DD/YYYY"
 #: In place of an order: times of day without a date.

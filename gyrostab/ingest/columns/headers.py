@@ -12,26 +12,6 @@ from gyrostab.ingest.columns.dates import YEAR_FIRST
 from gyrostab.ingest.columns.stamps import parse_time_unit
 from gyrostab.units import known_units, parse_unit
 
-__all__ = [
-    "AXIS_PATTERN",
-    "GYRO_PATTERNS",
-    "INCREMENT_PATTERN",
-    "KNOWN_CHANNEL_PATTERN",
-    "TEMPERATURE_PATTERN",
-    "TIME_PATTERN",
-    "Header",
-    "distinct_columns",
-    "example_unit",
-    "free_name",
-    "is_contract_name",
-    "is_time_unit",
-    "is_unit",
-    "is_unit_of",
-    "quantity_of",
-    "split_header",
-    "unit_quantity",
-]  # fmt: skip
-
 _BRACKET = re.compile(r"^(.*?)\s*\[([^\[\]]*)\]\s*$")
 _PARENTHESES = re.compile(r"^(.*?)\s*\(([^()]*)\)\s*$")
 AXIS_PATTERN = re.compile(r"^(gyro|angle)_([a-z]\d*|\d+)$")

@@ -22,24 +22,6 @@ from gyrostab.store.lazy import RowSource, Stacked, find_source, make_dask
 from gyrostab.store.row_inspection import RowInspection
 from gyrostab.store.system import read_at, write_at
 
-__all__ = [
-    "CHUNK_ROWS",
-    "SPILL_BYTES",
-    "Buffers",
-    "CountsPiece",
-    "EvenStampsPiece",
-    "FilePiece",
-    "InspectedRows",
-    "NaNPiece",
-    "Piece",
-    "PiecewiseColumn",
-    "PlainPiece",
-    "Spool",
-    "as_lazy",
-    "pieces_of",
-    "stack_as_rows",
-]
-
 #: Largest total size of the columns of one file that is held in memory [bytes].
 SPILL_BYTES = 128 * 2**20
 

@@ -21,8 +21,6 @@ from gyrostab.ingest.limits import check_columns
 from gyrostab.ingest.options import ColumnSummary, ReadOptions
 from gyrostab.wording import list_some
 
-__all__ = ["Column", "Plan", "plan_columns", "split_header"]
-
 
 @dataclass(frozen=True)
 class Plan:

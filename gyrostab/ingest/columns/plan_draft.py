@@ -23,15 +23,6 @@ from gyrostab.ingest.limits import describe_limit
 from gyrostab.ingest.options import ColumnSummary, ReadOptions
 from gyrostab.wording import list_some
 
-__all__ = [
-    "MAX_HEADERS",
-    "Column",
-    "PlanDraft",
-    "by_lower_name",
-    "name_columns",
-    "resolve_duplicates",
-]
-
 #: Columns that a message lists by name.
 MAX_HEADERS = 30
 

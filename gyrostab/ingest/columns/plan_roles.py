@@ -34,8 +34,6 @@ from gyrostab.schema import RESERVED_NAMES
 from gyrostab.units import HOUR, INNER, known_units, parse_unit
 from gyrostab.wording import list_some
 
-__all__ = ["find_time", "plan_channels", "plan_gyro", "scan_advice"]
-
 
 def find_time(draft: PlanDraft, named: list[Header]) -> Header | None:
     """Choose the time column and its unit; other candidates are left out with a note."""

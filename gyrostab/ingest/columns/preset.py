@@ -18,8 +18,6 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-__all__ = ["PresetMatch", "find_preset"]
-
 _KEYS = {"name", "above", "file", "needs", "times", "drops", "rate", "columns"}
 
 

@@ -19,14 +19,13 @@ from gyrostab.ingest.columns.pieces import (
     as_lazy,
     stack_as_rows,
 )
-from gyrostab.ingest.columns.plan import Column, Plan
+from gyrostab.ingest.columns.plan import Plan
+from gyrostab.ingest.columns.plan_draft import Column
 from gyrostab.ingest.columns.stamps import CLOCK_PERIODS, NAT, continue_clock, find_turn
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store.lazy import read_slice
 from gyrostab.store.row_inspection import RowInspection
-
-__all__ = ["ConvertedBlock", "RawLogBuilder", "summary_of"]
 
 #: Largest number of bad places that a note lists.
 MAX_NAMED_PLACES = 10

@@ -24,22 +24,6 @@ from gyrostab.store.lazy import read_slice
 from gyrostab.time.grid import split_instant
 from gyrostab.time.stamps import to_nanoseconds
 
-__all__ = [
-    "CLOCK_PERIODS",
-    "NAT",
-    "TimeUnit",
-    "cells_to_ns",
-    "continue_clock",
-    "dates_to_ns",
-    "find_turn",
-    "integers_to_ns",
-    "names_epoch",
-    "numbers_to_ns",
-    "parse_time_unit",
-    "read_stamps",
-    "texts_to_ns",
-]
-
 #: The integer of ``NaT``.
 NAT = np.iinfo(np.int64).min
 _MAX_INT64 = 2**63 - 1

@@ -12,21 +12,13 @@ from numpy.typing import NDArray
 
 from gyrostab.ingest.columns.dates import is_iso
 from gyrostab.ingest.columns.pieces import EvenStampsPiece, FilePiece
-from gyrostab.ingest.columns.plan import Column, Plan
+from gyrostab.ingest.columns.plan import Plan
+from gyrostab.ingest.columns.plan_draft import Column
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
 from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, dates_to_ns, numbers_to_ns
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.store.row_inspection import inspect_rows
 from gyrostab.store.threads import map_in_order
-
-__all__ = [
-    "batch_rows",
-    "convert_batch",
-    "holds_dates",
-    "read_columns",
-    "summarise_columns",
-    "to_stamps",
-]
 
 #: Largest number of rows, and of bytes of all columns, that are converted at one time.
 BATCH_ROWS = 2**20
@@ -37,11 +29,11 @@ END_ROWS = 64
 Fetch = Callable[[int, int, int], Any]
 
 
-def to_floats(values: Any) -> tuple[NDArray[np.float64], int]:
+def _to_floats(values: Any) -> tuple[NDArray[np.float64], int]:
     """Convert values to float64, NaN where missing, and count the cells that are not numbers."""
     if np.ma.isMaskedArray(values):
         mask = np.ma.getmaskarray(values)
-        plain, words = to_floats(np.ma.getdata(values))
+        plain, words = _to_floats(np.ma.getdata(values))
         plain[mask] = np.nan
         return plain, words
     array = np.asarray(values)
@@ -178,7 +170,7 @@ def _read_column(
     stored = fetch(column.source, start, stop)
     if column.role == "time":
         return to_stamps(stored, column, options)
-    values, _ = to_floats(stored)
+    values, _ = _to_floats(stored)
     clean_column(values, column.factor, column.offset)
     return values
 
@@ -189,7 +181,7 @@ def convert_batch(
     """Convert one batch of columns for the builder."""
     values, words = {}, 0
     for column in [*builder.gyro, *builder.channels]:
-        values[column.source], not_numbers = to_floats(batch[column.source])
+        values[column.source], not_numbers = _to_floats(batch[column.source])
         words += not_numbers if column.role == "channel" else 0
     stamps = (
         None

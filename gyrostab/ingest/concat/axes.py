@@ -12,8 +12,6 @@ from gyrostab.errors import SchemaError
 from gyrostab.schema import signal_name, texts
 from gyrostab.store.lazy import select_part, stack_rows
 
-__all__ = ["group_axes", "split_axes"]
-
 
 def group_axes(axes: Sequence[Sequence[str]]) -> list[list[int]]:
     """Group logs by their axes: logs of one group share axes, directly or through other logs.

@@ -16,8 +16,6 @@ from gyrostab.store.lazy import concatenate_columns, take_samples
 from gyrostab.time.grid import grid_index, grid_times
 from gyrostab.time.stamps import to_nanoseconds
 
-__all__ = ["concatenate_channels"]
-
 # stamps of two copies of a value differ by the rounding of each to its own grid
 _SAME_STAMP_PERIODS = 0.75
 

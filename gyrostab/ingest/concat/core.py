@@ -28,8 +28,6 @@ from gyrostab.time.grid import grid_times, time_coordinate
 from gyrostab.time.stamps import format_stamp
 from gyrostab.wording import list_some
 
-__all__ = ["absence_notes", "concatenate_logs", "merge_notes"]
-
 #: Smallest share of a log without an axis of other logs that is noted; recorders are started one
 #: after the other.
 _NOTED_SHARE = 0.01

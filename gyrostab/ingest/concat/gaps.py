@@ -20,8 +20,6 @@ from gyrostab.ingest.gap_table import (
     sort_gaps,
 )
 
-__all__ = ["merge_gaps"]
-
 Table = NDArray[np.int64]
 
 _EMPTY: Table = np.empty((0, 5), dtype=np.int64)

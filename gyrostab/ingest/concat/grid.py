@@ -16,8 +16,6 @@ from gyrostab.store.lazy import read_slice
 from gyrostab.store.threads import map_in_order
 from gyrostab.time.grid import TimeGridIndex, first_stamp, grid_times
 
-__all__ = ["LogSlice", "PlacedLog", "Source", "log_span", "read_log_slices", "runs_of", "source_of"]
-
 
 @dataclass(frozen=True, eq=False)
 class Source:

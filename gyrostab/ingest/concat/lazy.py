@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from gyrostab.store.lazy import RowSource, can_read_directly, find_source, make_dask, read_into
 
-__all__ = ["GridSource", "PlacedArray", "chunk_of", "place_in_memory", "place_on_grid"]
-
 #: An array (time), or (axis, time) with the row to read, and its runs: first sample of the grid,
 #: first of the array, length.
 PlacedArray = tuple[Any, int | None, NDArray[np.int64]]

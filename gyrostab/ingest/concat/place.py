@@ -21,8 +21,6 @@ from gyrostab.time.grid import grid_index, grid_times
 from gyrostab.time.stamps import format_stamp
 from gyrostab.wording import list_some
 
-__all__ = ["count_alike", "is_copy", "place_logs"]
-
 #: Smallest share of equal samples in a copy, which may be damaged.
 MIN_ALIKE_SHARE = 0.9
 

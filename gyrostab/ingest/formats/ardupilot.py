@@ -22,8 +22,6 @@ from gyrostab.ingest.formats.recognise import read_head
 from gyrostab.ingest.formats.tables import Messages, TablesOfFile, library, make_reader
 from gyrostab.ingest.options import ReadOptions
 
-__all__ = ["matches", "read", "scan"]
-
 #: Held while the standard streams of the process are redirected.
 _LOCK = threading.Lock()
 _BINARY = b"\xa3\x95\x80"

@@ -30,8 +30,6 @@ from gyrostab.ingest.formats.tables import (
 )
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
-__all__ = ["has_layout", "matches", "read", "scan"]
-
 SUFFIXES = (".bin", ".raw")
 
 

@@ -29,8 +29,6 @@ from gyrostab.ingest.formats.tables import (
 )
 from gyrostab.ingest.options import ReadOptions
 
-__all__ = ["matches", "read", "scan"]
-
 #: Held while the settings of the process are changed.
 _LOCK = threading.Lock()
 

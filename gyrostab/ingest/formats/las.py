@@ -29,8 +29,6 @@ from gyrostab.ingest.formats.tables import (
 )
 from gyrostab.ingest.options import ReadOptions
 
-__all__ = ["matches", "read", "scan"]
-
 # Date fields in units of curves -> codes of `datetime.strptime`.
 _DATE_CODES = {"yyyy": "%Y", "yy": "%y", "mmm": "%b", "mm": "%m", "dd": "%d"}
 #: A cell with a date and a time of day, such as ``14-Mar-26/08:00:00.5``.

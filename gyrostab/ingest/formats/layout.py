@@ -32,8 +32,6 @@ from gyrostab.errors import OptionError
 from gyrostab.ingest.formats.messages import CRC_BYTES, find_messages
 from gyrostab.store.toml import parse_toml, read_toml_text
 
-__all__ = ["Field", "Layout", "find_layout", "layout_path"]
-
 #: Name of a type -> code of numpy; 24 bits are read as three bytes.
 TYPES = {
     **{

@@ -36,8 +36,6 @@ from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.store.hdf5_heaps import check_global_heaps
 from gyrostab.store.rows import LibraryRows, hdf5_rows
 
-__all__ = ["matches", "read", "scan"]
-
 HDF_SUFFIXES = (".h5", ".hdf5")
 _PLAIN_ARRAYS = (
     "of a timeseries ts: s.time = ts.Time; s.data = ts.Data; save('log.mat', '-struct', 's'); "

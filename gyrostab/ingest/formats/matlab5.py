@@ -15,8 +15,6 @@ from typing import BinaryIO
 
 from gyrostab.errors import FormatError
 
-__all__ = ["check_structure"]
-
 _HEADER_BYTES = 128
 _MATRIX, _COMPRESSED = 14, 15
 #: Numeric data type -> bytes of an item.

@@ -18,8 +18,6 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-__all__ = ["CRC_BYTES", "crc32_mpeg2", "find_messages", "unwrap_counter"]
-
 CRC_BYTES = 4
 _POLYNOMIAL = np.uint32(0x04C11DB7)
 #: Bytes that are searched at one time.

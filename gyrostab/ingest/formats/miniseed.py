@@ -29,8 +29,6 @@ from gyrostab.ingest.formats.tables import (
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.time.grid import grid_times
 
-__all__ = ["matches", "read", "scan"]
-
 SUFFIXES = (".mseed", ".miniseed", ".msd", ".ms", ".mseed3")
 _HEAD = re.compile(rb"\d{6}[DRQM][ \0]|MS\x03")
 _MAX_RECORD_BYTES = 2**20  # version 2 allows longer records, which nobody writes

@@ -50,8 +50,6 @@ from gyrostab.time.grid import grid_times, time_coordinate
 from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import ON_DISK
 
-__all__ = ["matches", "read", "scan"]
-
 MAX_COLUMNS = 64
 CHECKED_BLOCKS = 33
 #: Options to open a file with xarray; numbers and stamps are decoded when they are read.

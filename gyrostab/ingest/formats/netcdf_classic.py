@@ -18,8 +18,6 @@ import numpy as np
 
 from gyrostab.errors import FormatError
 
-__all__ = ["ClassicVariable", "read_classic_header"]
-
 #: nc_type -> numpy type, big-endian.
 _TYPES = {
     1: "i1",

@@ -21,8 +21,6 @@ from gyrostab.ingest.limits import check_chunk
 from gyrostab.store.private import library_lock
 from gyrostab.store.rows import ChunkedRows, EvenRows, LibraryRows, Rows, hdf5_rows
 
-__all__ = ["StoredVariable", "open_variables", "with_default_fill"]
-
 #: Dimension of the rows, index along the other -> column.
 Locate = Callable[[int, int], Rows]
 

@@ -18,8 +18,6 @@ from gyrostab.ingest.formats.recognise import read_head
 from gyrostab.ingest.formats.tables import Messages, TablesOfFile, library, make_reader
 from gyrostab.ingest.options import ReadOptions
 
-__all__ = ["matches", "read", "scan"]
-
 _SYNC = (b"\xaa\x44\x12", b"\xaa\x44\x13")
 _TEXT = re.compile(rb"^[#%][A-Z0-9]{3,}A,[^\r\n]*;", re.MULTILINE)
 _SENSORS = ("gyro", "accel")

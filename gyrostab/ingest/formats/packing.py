@@ -20,7 +20,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, UnitError
-from gyrostab.ingest.columns.plan import Column, Plan
+from gyrostab.ingest.columns.plan import Plan
+from gyrostab.ingest.columns.plan_draft import Column
 from gyrostab.ingest.columns.stamps import (
     NAT,
     TimeUnit,
@@ -29,15 +30,6 @@ from gyrostab.ingest.columns.stamps import (
     parse_time_unit,
 )
 from gyrostab.store.lazy import Converted, FileVariable, Source, make_dask
-
-__all__ = [
-    "ATTRIBUTES",
-    "Decoder",
-    "Packing",
-    "decode_variables",
-    "fold_packing",
-    "text_attributes",
-]
 
 #: Stored numbers -> counts or values.
 Decoder = Callable[[Any], Any]
@@ -92,7 +84,7 @@ class Packing:
         """
         stored: np.dtype[Any] = np.dtype(dtype).newbyteorder("=")
         declared = {key: attributes[key] for key in _PACKING if key in attributes}
-        if stored.kind in "iu" and (text := attribute_text(declared.get("_Unsigned"))):
+        if stored.kind in "iu" and (text := _attribute_text(declared.get("_Unsigned"))):
             stored = np.dtype(f"{'u' if text.lower() == 'true' else 'i'}{stored.itemsize}")
         wraps = "_Unsigned" in declared
         numbers = {
@@ -154,7 +146,7 @@ class Packing:
         return np.logical_or.reduce(masks) if masks else None
 
 
-def attribute_text(value: Any) -> str | None:
+def _attribute_text(value: Any) -> str | None:
     """Return an attribute if it is text, otherwise None."""
     value = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
     return (
@@ -171,7 +163,7 @@ def text_attributes(attributes: Iterable[Mapping[str, Any]], name: str) -> dict[
     return {
         place: text
         for place, attrs in enumerate(attributes)
-        if (text := attribute_text(attrs.get(name)))
+        if (text := _attribute_text(attrs.get(name)))
     }
 
 
@@ -355,7 +347,7 @@ def _decode_variable(
     if names_epoch(str(attrs.get("units", ""))):
         try:
             unit = parse_time_unit(
-                str(attrs.pop("units")), attribute_text(attrs.pop("calendar", None))
+                str(attrs.pop("units")), _attribute_text(attrs.pop("calendar", None))
             )
         except UnitError as error:
             raise UnitError(f"{where}: {error}") from error

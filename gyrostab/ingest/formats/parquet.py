@@ -25,8 +25,6 @@ from gyrostab.ingest.limits import check_stored
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.store.threads import map_in_order
 
-__all__ = ["matches", "read", "scan"]
-
 #: Bytes of a column that are read at one time; without a buffer a whole row group is read, which
 #: may be the whole log.
 _BUFFER_BYTES = 2**20

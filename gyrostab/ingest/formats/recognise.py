@@ -10,8 +10,6 @@ from pathlib import Path
 
 from gyrostab.errors import FormatError
 
-__all__ = ["begins_like", "read_head", "refuse_unread"]
-
 #: Bytes at the beginning of a file that decide its format.
 _HEAD_BYTES = 8192
 

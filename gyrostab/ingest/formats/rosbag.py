@@ -19,8 +19,6 @@ from gyrostab.ingest.formats.recognise import read_head
 from gyrostab.ingest.formats.tables import Messages, TablesOfFile, library, make_reader
 from gyrostab.ingest.options import ReadOptions
 
-__all__ = ["matches", "read", "scan"]
-
 _MAGICS = (b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0")
 #: Type of a message -> field -> target in the form of ``--map``.
 _MEANINGS = {

@@ -18,8 +18,6 @@ from gyrostab.ingest.limits import check_stored
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.store.rows import EvenRows, LibraryRows, Rows
 
-__all__ = ["StoredColumn", "StoredTable", "plan_stored"]
-
 
 @dataclass(frozen=True)
 class StoredColumn:

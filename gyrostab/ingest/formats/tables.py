@@ -21,18 +21,6 @@ from gyrostab.ingest.columns.typed import read_columns, summarise_columns
 from gyrostab.ingest.combine import concatenate, with_channels
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
-__all__ = [
-    "NO_NAME",
-    "Messages",
-    "Table",
-    "TableColumn",
-    "library",
-    "make_reader",
-    "read_tables",
-    "scan_tables",
-    "sliced",
-]
-
 #: First row, row after the last one -> values.
 ReadSlice = Callable[[int, int], Any]
 
@@ -121,12 +109,12 @@ NO_NAME = ("",)
 _NO_STAMPS = TableColumn(NO_NAME, sliced(()))
 
 
-def plain_names(names: Sequence[tuple[str, ...]]) -> list[str]:
+def _plain_names(names: Sequence[tuple[str, ...]]) -> list[str]:
     """Return the last part of each name if that is unique, otherwise all parts joined by dots.
 
     Examples
     --------
-    >>> plain_names([("imu", "wx"), ("imu", "temp"), ("probe", "temp")])
+    >>> _plain_names([("imu", "wx"), ("imu", "temp"), ("probe", "temp")])
     ['wx', 'imu.temp', 'probe.temp']
     """
     counts = Counter(name[-1] for name in names)
@@ -166,7 +154,7 @@ def _with_stamps(table: Table) -> list[TableColumn]:
 
 
 def _plan_tables(path: Path, tables: Sequence[Table], options: ReadOptions) -> _PlannedTables:
-    names = iter(plain_names([c.name for table in tables for c in _with_stamps(table)]))
+    names = iter(_plain_names([c.name for table in tables for c in _with_stamps(table)]))
     filled: list[Table] = []
     first: list[int] = []
     headers: list[str] = []

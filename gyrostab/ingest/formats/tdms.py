@@ -31,8 +31,6 @@ from gyrostab.ingest.formats.tables import (
 )
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
-__all__ = ["matches", "read", "scan"]
-
 _FIRST_DATE = np.datetime64(
     "1950-01-01", "us"
 )  # LabVIEW counts from 1904, and writes 1904 if it has no clock

@@ -29,15 +29,14 @@ from gyrostab.ingest.columns.dates import (
     holds_date,
     is_time_of_day,
 )
-from gyrostab.ingest.columns.plan import Column, Plan, plan_columns
+from gyrostab.ingest.columns.plan import Plan, plan_columns
+from gyrostab.ingest.columns.plan_draft import Column
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
 from gyrostab.ingest.columns.stamps import NAT, cells_to_ns
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.ingest.text.cells import VOID_CELLS, BlockParser
 from gyrostab.ingest.text.layout import Layout, find_layout, is_number, is_text, unit_of_duration
 from gyrostab.store.threads import map_in_order
-
-__all__ = ["matches", "read", "read_head", "scan"]
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log")
 #: Bytes of the file in which the layout is searched; more, up to the second number, if they contain

@@ -20,8 +20,6 @@ from gyrostab.ingest.formats.tables import (
 )
 from gyrostab.ingest.options import ReadOptions
 
-__all__ = ["matches", "read", "scan"]
-
 MAGIC = b"ULog\x01\x12\x35"
 
 

@@ -21,8 +21,6 @@ from gyrostab.ingest.formats.recognise import begins_like
 from gyrostab.ingest.formats.tables import Messages, TablesOfFile, make_reader
 from gyrostab.ingest.options import ReadOptions
 
-__all__ = ["matches", "read", "scan"]
-
 _HEAD = re.compile(rb"^\s*&&\s*\n\s*\d{4}")
 _ITEM = re.compile(r"^\s*(\d\d)(\d\d)\s?(.*?)\s*$")
 _LONGEST_LINE = 1000

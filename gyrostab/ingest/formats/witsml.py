@@ -30,8 +30,6 @@ from gyrostab.ingest.formats.tables import (
 )
 from gyrostab.ingest.options import ReadOptions
 
-__all__ = ["matches", "read", "scan"]
-
 _HEAD = re.compile(rb"(?is)^(?:\xef\xbb\xbf)?\s*<.*witsml")
 
 

@@ -11,8 +11,6 @@ from gyrostab.schema import texts
 from gyrostab.time.grid import first_stamp
 from gyrostab.wording import list_some
 
-__all__ = ["regularise_axes"]
-
 
 def regularise_axes(
     raw: xr.Dataset,

@@ -18,8 +18,6 @@ from gyrostab.store.lazy import find_source, read_slice
 from gyrostab.store.threads import map_in_order
 from gyrostab.time.grid import grid_times
 
-__all__ = ["MAX_PLAIN_NUMBERS", "count_present", "gather_channel", "rows_on_grid", "samples_of"]
-
 #: Largest array that is held in memory instead of being computed when needed [numbers].
 MAX_PLAIN_NUMBERS = 2_000_000
 

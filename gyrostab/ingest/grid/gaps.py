@@ -15,8 +15,6 @@ from gyrostab.ingest.grid.scan_pass import ScanPass
 from gyrostab.kernels.grid.stamps import DUPLICATE, OUT_OF_ORDER, RESTART, STEP
 from gyrostab.schema import GAP_CAUSES
 
-__all__ = ["find_gaps", "gap_table"]
-
 
 def _missing_samples(placement: Placement, scanned: ScanPass) -> NDArray[np.int64]:
     """List the samples without a row between the runs."""

@@ -16,18 +16,6 @@ from numpy.typing import NDArray
 from gyrostab.kernels.grid.course import follow
 from gyrostab.kernels.grid.stamps import NO_STAMP, piece_sums
 
-__all__ = [
-    "GAIN",
-    "MIN_SIGMA",
-    "TRACE_ROWS",
-    "Integers",
-    "JitterModel",
-    "count_samples",
-    "fit_jitter",
-    "fit_jitter_near",
-    "observe_rows",
-]
-
 Integers = NDArray[np.int64]
 
 ObservedStamps = tuple[Integers, Integers]

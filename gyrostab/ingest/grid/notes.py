@@ -24,8 +24,6 @@ from gyrostab.schema import log_channels
 from gyrostab.time.grid import grid_times
 from gyrostab.time.stamps import format_stamp, to_nanoseconds
 
-__all__ = ["describe_angles", "describe_channels", "describe_placement", "describe_rate"]
-
 _MAX_NAMED = 5  # events of one kind that are listed one by one
 #: Rows of which the steps of angles are taken, and the least number.
 _STEP_ROWS, _MIN_STEP_ROWS = 2**14, 100

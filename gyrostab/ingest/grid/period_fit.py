@@ -12,8 +12,6 @@ from gyrostab.ingest.grid.starting_period import GAIN, SECOND, Stamps, readable_
 from gyrostab.kernels.grid.stamps import NO_STAMP, piece_sums, track
 from gyrostab.store.threads import map_in_order
 
-__all__ = ["fit_pieces", "longest_step", "pool_pieces"]
-
 _MAX_PIECES = 200_000
 
 

@@ -29,17 +29,6 @@ from gyrostab.kernels.grid.stamps import (
 from gyrostab.time.grid import period_ns
 from gyrostab.time.stamps import format_stamp
 
-__all__ = [
-    "NO_STAMPS",
-    "Placement",
-    "append_runs",
-    "check_grid",
-    "make_placement",
-    "place_by_count",
-    "place_by_stamp",
-    "place_without_time",
-]
-
 NO_STAMPS = (
     "{where}: no row has a readable stamp; check the time column and its unit (--map), "
     "or give --rate HZ for a log without time"

@@ -21,8 +21,6 @@ from gyrostab.kernels.grid.course import find_breaks, find_phase, trace
 from gyrostab.kernels.grid.stamps import DUPLICATE, RESTART, STEP
 from gyrostab.time.grid import period_ns
 
-__all__ = ["place_in_order"]
-
 _AHEAD_ROWS = 1 << 12
 
 _MAX_ROWS, _MAX_AHEAD_ROWS = 1 << 20, 1 << 18

@@ -33,8 +33,6 @@ from gyrostab.ingest.grid.starting_period import (
 )
 from gyrostab.kernels.grid.stamps import NO_STAMP
 
-__all__ = ["RateEstimate", "deviating_stretches", "estimate_near", "estimate_rate", "is_far_worse"]
-
 _MAX_TRUSTED_SAMPLES = 500.0  # reached in a long log
 # Larger than the share of backward steps by jitter: 0.12 at a scatter of 0.6 samples; random order
 # has 0.5.

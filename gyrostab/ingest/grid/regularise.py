@@ -19,7 +19,7 @@ from gyrostab.ingest.columns.pieces import PiecewiseColumn
 from gyrostab.ingest.gap_table import gap_variables, name_lost
 from gyrostab.ingest.grid.axes import regularise_axes
 from gyrostab.ingest.grid.fill import gather_channel, rows_on_grid
-from gyrostab.ingest.grid.gaps import find_gaps, gap_table
+from gyrostab.ingest.grid.gaps import find_gaps
 from gyrostab.ingest.grid.jitter import JitterModel
 from gyrostab.ingest.grid.notes import (
     describe_angles,
@@ -55,8 +55,6 @@ from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import check_rate, check_span, period_ns, stamp_ns, time_coordinate
 from gyrostab.time.stamps import format_stamp
 from gyrostab.units import HOUR
-
-__all__ = ["gap_table", "regularise"]
 
 _MAX_RATE_DIFFERENCE = 0.02  # relative, between declared and estimated rate
 _EVEN_ROWS = 2**18  # rows at the beginning that give the rate of a log with even stamps

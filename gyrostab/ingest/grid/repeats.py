@@ -14,8 +14,6 @@ from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS
 from gyrostab.kernels.grid.stamps import DUPLICATE, NO_STAMP, RESTART, STEP
 from gyrostab.store.lazy import read_slice
 
-__all__ = ["find_repeats", "with_repeats"]
-
 _MAX_CANDIDATES = 8  # earlier rows with the stamp of a set-back that are compared
 _MIN_ROWS = 16  # shorter repetitions are found by their stamps alone
 

@@ -19,8 +19,6 @@ from gyrostab.store.lazy import find_source, read_slice
 from gyrostab.store.row_inspection import RowInspection, inspect_rows
 from gyrostab.store.threads import map_in_order
 
-__all__ = ["BLOCK_ROWS", "ScanPass", "file_of", "record_name", "scan_rows", "stamp_blocks"]
-
 #: Rows in memory at one time.
 BLOCK_ROWS = 1 << 20
 

@@ -9,22 +9,6 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.grid.stamps import NO_STAMP, track
 
-__all__ = [
-    "GAIN",
-    "SECOND",
-    "SHARED_SHARE",
-    "Stamps",
-    "cut_stretches",
-    "finer_period",
-    "period_of_lines",
-    "readable_stamps",
-    "recut_blocks",
-    "rms_misfit",
-    "sample_stretches",
-    "starting_period",
-    "step_scatter",
-]
-
 SECOND = 1e9
 
 #: Returns a new iterator over all blocks of row numbers and stamps at each call.
@@ -108,7 +92,7 @@ def cut_stretches(parts: list[NDArray[np.int64]], length: int) -> NDArray[np.flo
     return np.asarray(table - table[:, :1], dtype=np.float64)
 
 
-def refine_period(steps: NDArray[np.float64], period: float) -> float:
+def _refine_period(steps: NDArray[np.float64], period: float) -> float:
     """Refine a first guess of the period [ns] of which the steps are multiples, if there is one."""
     start = period
     for _ in range(30):
@@ -134,7 +118,7 @@ def finer_period(parts: list[NDArray[np.int64]], period: float) -> float | None:
     rising = table[table > 0]
     if rising.size == 0:
         return None
-    single = refine_period(table.ravel(), float(np.quantile(rising, 0.1)))
+    single = _refine_period(table.ravel(), float(np.quantile(rising, 0.1)))
     if single > 0.9 * period:
         return None
     counts = np.rint(table / single)
@@ -222,11 +206,11 @@ def starting_period(stretches: list[NDArray[np.int64]]) -> tuple[float, bool, bo
         return _time_per_row(stretches, ticks=True), True, True
     period = period_of_lines(parts)
     if period is None:
-        period = refine_period(steps, float(np.quantile(rising, 0.5, method="lower")))
+        period = _refine_period(steps, float(np.quantile(rising, 0.5, method="lower")))
         if (
             rms_misfit(steps, period) > 0.2
         ):  # with most rows missing, the median step is longer than one sample
-            shorter = refine_period(steps, float(np.quantile(rising, 0.1)))
+            shorter = _refine_period(steps, float(np.quantile(rising, 0.1)))
             period = shorter if rms_misfit(steps, shorter) < 0.15 else period
     return (
         (_time_per_row(stretches), True, False)

@@ -14,8 +14,6 @@ from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, integers_to_ns
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.ingest.text.layout import BLANK, Layout, is_number
 
-__all__ = ["VOID_CELLS", "BlockParser", "ParsedBlock"]
-
 #: Cells without a value, in lower case; other text is unreadable. The kernel knows them too.
 VOID_CELLS = frozenset(("", "nan", "-nan", "null", "na", "n/a", "none"))
 

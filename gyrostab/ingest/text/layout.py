@@ -15,16 +15,6 @@ from gyrostab.ingest.columns.headers import is_unit
 from gyrostab.ingest.limits import check_columns
 from gyrostab.wording import list_some
 
-__all__ = [
-    "BLANK",
-    "Layout",
-    "find_layout",
-    "is_number",
-    "is_text",
-    "split_line",
-    "unit_of_duration",
-]
-
 #: Separator that means any run of blanks.
 BLANK = " "
 HEAD_LINES = 200

@@ -29,17 +29,6 @@ from gyrostab.store.private import close_function
 from gyrostab.time.grid import TimeGridIndex, grid_index, time_coordinate
 from gyrostab.time.stamps import to_nanoseconds
 
-__all__ = [
-    "add_spans",
-    "advise_dates",
-    "as_uniform",
-    "grid_of",
-    "has_gap_table",
-    "merge_lines",
-    "place_samples",
-    "with_table",
-]
-
 
 def as_uniform(log: xr.Dataset) -> xr.Dataset:
     """Place a log on the uniform time axis of its stamps.
@@ -181,10 +170,10 @@ def _with_true_table(
         return with_table(
             log, None, grid.start, grid.rate
         )  # averaged samples have other gaps than selected ones
-    fitting = table if same_rate else change_rate(table, log, declared, grid.start, grid.rate)  # type: ignore[arg-type]
+    fitting = table if same_rate else _change_rate(table, log, declared, grid.start, grid.rate)  # type: ignore[arg-type]
     fitting = clip_table(fitting, 0, grid.size)
     if len(grid.runs) > 1:
-        fitting = add_holes(fitting, grid.runs)
+        fitting = _add_holes(fitting, grid.runs)
     if fitting is table or np.array_equal(fitting, table):
         return log
     return with_table(log, fitting, grid.start, grid.rate)
@@ -256,7 +245,7 @@ def has_gap_table(log: xr.Dataset) -> bool:
     return "gap" in log.dims
 
 
-def change_rate(table: Table, log: xr.Dataset, old_rate: float, start: int, rate: float) -> Table:
+def _change_rate(table: Table, log: xr.Dataset, old_rate: float, start: int, rate: float) -> Table:
     """Convert the table for a log of which every n-th sample was selected.
 
     Parameters
@@ -284,7 +273,7 @@ def change_rate(table: Table, log: xr.Dataset, old_rate: float, start: int, rate
     return np.asarray(table[~lost])
 
 
-def add_holes(table: Table, runs: Table) -> Table:
+def _add_holes(table: Table, runs: Table) -> Table:
     """Add the samples between runs that the table does not list, with cause "missing"."""
     first, end = runs[:-1, 0] + runs[:-1, 2], runs[1:, 0]
     begin, stop = merge_lines(table[table[:, END] > table[:, FIRST]])

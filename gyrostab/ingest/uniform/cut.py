@@ -29,8 +29,6 @@ from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import grid_index, grid_times, stamp_ns
 from gyrostab.time.stamps import to_nanoseconds
 
-__all__ = ["check_cut", "cut_log", "parse_instant"]
-
 _EXAMPLE = "2026-11-20T14:00 (UTC) or 10min after the start"
 _SPAN_EXAMPLE = "2026-11-20T14:00/2026-11-20T14:05 or 10min/15min after the start"
 

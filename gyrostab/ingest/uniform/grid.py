@@ -13,8 +13,6 @@ from gyrostab.errors import TimeError
 from gyrostab.ingest.limits import is_absurd_grid
 from gyrostab.time.grid import NANOSECONDS, grid_index
 
-__all__ = ["ReadStamps", "UniformGrid", "find_grid"]
-
 #: Stamps in memory at one time.
 BLOCK_STAMPS = 2**20
 #: Largest distance of a stamp from its grid sample [samples]. It allows for rounded stamps, and

@@ -31,15 +31,6 @@ try:
 except ImportError:  # without llvmlite, or where numba has moved what the vectors are built with
     from gyrostab.kernels.allan.plain_sums import split_sums
 
-__all__ = [
-    "Cut",
-    "full_counts",
-    "group_factors",
-    "grouped_blocks",
-    "held_points",
-    "windows_from_blocks",
-]
-
 # Points that a group of averaging factors goes through before the next one does: so few that they
 # stay in the second-level cache, so many
 # that the processor can foresee where the loops of short blocks end.

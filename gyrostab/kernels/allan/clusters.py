@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 from gyrostab.kernels.allan.blocks import windows_from_blocks
 from gyrostab.kernels.compiled import INNER, REORDER
 
-__all__ = ["cluster_cells", "cluster_factor", "cluster_strides", "integrate_places", "pack_mask"]
-
 # First terms of the pairs that are summed for the degrees of freedom, at most; where there are
 # more, sections of so many.
 _TERMS = 384

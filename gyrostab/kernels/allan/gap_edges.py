@@ -12,8 +12,6 @@ from numba import njit
 
 from gyrostab.kernels.compiled import KERNEL
 
-__all__ = ["EDGE_SAMPLES", "MIN_DIFFERENCES", "gap_edge_ratio"]
-
 #: Samples on either side of a gap that count as next to it: few enough that a fifth of the samples
 #: lost one by one leaves others.
 EDGE_SAMPLES = 8

@@ -13,20 +13,6 @@ from numpy.typing import NDArray
 from gyrostab.kernels.allan.plain_sums import LANES, MAX_LAGS
 from gyrostab.kernels.compiled import INNER, KERNEL, REORDER
 
-__all__ = [
-    "TILE",
-    "block_sums",
-    "first_present",
-    "integrate",
-    "integrate_tile",
-    "integrate_two",
-    "needs_two_doubles",
-    "present_runs",
-    "pyramid_places",
-    "sum_two",
-    "thin_pyramid",
-]
-
 #: Samples that are integrated, measured and thinned while they are in the cache.
 TILE = 4096
 # Samples that are looked at one by one where some of them are missing.

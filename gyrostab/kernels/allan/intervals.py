@@ -11,8 +11,6 @@ from numba import njit
 
 from gyrostab.kernels.compiled import INNER, KERNEL, REORDER
 
-__all__ = ["single_blocks", "valid_intervals"]
-
 
 @njit(**INNER)
 def _valid_runs(starts, stops, span):  # type: ignore[no-untyped-def]

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import KERNEL
 
-__all__ = ["LIMIT_SIGMA", "count_outliers"]
-
 LIMIT_SIGMA = 8.0
 #: Samples of a segment, and second differences spread over it whose median gives its noise to 10 %,
 #: which is precise enough for 8 sigma.

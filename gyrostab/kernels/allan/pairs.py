@@ -13,8 +13,6 @@ from numba import njit
 
 from gyrostab.kernels.compiled import INNER, KERNEL
 
-__all__ = ["strict_gap_factors", "white_pair_sum"]
-
 
 @njit(**INNER)
 def _weighted_moment(n, slope, a, b):  # type: ignore[no-untyped-def]

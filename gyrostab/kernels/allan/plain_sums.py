@@ -10,8 +10,6 @@ from numba import njit
 
 from gyrostab.kernels.compiled import KERNEL, REORDER
 
-__all__ = ["CONSECUTIVE_LAGS", "LANES", "MAX_LAGS", "split_sums"]
-
 #: Elements of a vector.
 LANES = 8
 #: Most lags in one pass, and most of lags that follow each other.

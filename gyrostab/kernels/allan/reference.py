@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
 
-__all__ = ["direct_sums", "recursive_sums", "reference_theta"]
-
 
 def reference_theta(
     x: NDArray[np.generic], *, angle: bool, paper: bool

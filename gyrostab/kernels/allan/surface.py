@@ -41,17 +41,6 @@ from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.compiled import KERNEL
 from gyrostab.kernels.workspace import Workspace
 
-__all__ = [
-    "NONE",
-    "STRICT",
-    "WEIGHTED",
-    "Cells",
-    "Unit",
-    "convert_to_native",
-    "surface_unit",
-    "window_means",
-]
-
 NONE, STRICT, WEIGHTED = 0, 1, 2
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

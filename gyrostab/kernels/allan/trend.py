@@ -10,8 +10,6 @@ from gyrostab.kernels.allan.blocks import windows_from_blocks
 from gyrostab.kernels.allan.intervals import valid_intervals
 from gyrostab.kernels.compiled import INNER, KERNEL
 
-__all__ = ["difference_slopes", "window_trends"]
-
 #: Moments of a block: present samples, their places, squares of these, rates, rates times places.
 _MOMENTS = 5
 

@@ -23,8 +23,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["VARIANCES", "Variance"]
-
 
 class Variance(NamedTuple):
     """One variance: its name in texts, order of its differences, and whether angles are summed."""

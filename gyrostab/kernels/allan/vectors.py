@@ -22,8 +22,6 @@ from numba.extending import intrinsic
 from gyrostab.kernels.allan.plain_sums import CONSECUTIVE_LAGS, LANES, MAX_LAGS
 from gyrostab.kernels.compiled import KERNEL
 
-__all__ = ["split_sums"]
-
 _INDEX = ir.IntType(64)
 _SHORT = ir.IntType(32)
 _DOUBLES = ir.VectorType(ir.DoubleType(), LANES)

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import KERNEL
 
-__all__ = ["fletcher32"]
-
 
 def fletcher32(data: NDArray[np.uint8]) -> int:
     """Compute Fletcher's 32-bit checksum of big-endian 16-bit words, as in HDF5 and numcodecs.

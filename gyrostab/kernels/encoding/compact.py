@@ -15,14 +15,6 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import KERNEL
 
-__all__ = [
-    "even_steps",
-    "find_grid",
-    "pack_counts",
-    "unpack_counts",
-    "unroll_steps",
-]
-
 #: Stands for a value that is missing.
 _FILL = np.int32(np.iinfo(np.int32).min)
 _LARGEST = float(np.iinfo(np.int32).max)

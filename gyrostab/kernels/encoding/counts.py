@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import KERNEL
 
-__all__ = ["from_counts", "to_counts"]
-
 
 def to_counts(
     values: NDArray[np.floating[Any]], scale: float, dtype: Any, fill: int

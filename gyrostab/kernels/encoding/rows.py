@@ -16,9 +16,6 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
 
-__all__ = ["BLANKS", "DAY_FIRST", "MONTH_FIRST", "NUMBER", "NUMERIC_TIME", "SKIPPED", "YEAR_FIRST",
-           "clean_column", "read_rows"]  # fmt: skip
-
 #: What a column holds.
 SKIPPED, NUMBER, NUMERIC_TIME, YEAR_FIRST, DAY_FIRST, MONTH_FIRST = range(6)
 #: Separator code of runs of blanks and tabs.

@@ -24,8 +24,6 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL, REORDER
 
-__all__ = ["STOCHASTIC", "product_tables"]
-
 #: Number of stochastic terms: quantization, angle random walk, bias instability, rate random walk.
 STOCHASTIC = 4
 

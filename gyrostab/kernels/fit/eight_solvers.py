@@ -14,14 +14,6 @@ from numba import njit
 from gyrostab.kernels.compiled import INNER
 from gyrostab.kernels.fit.lanes import PLACES, put, root, take, take_four, where_above
 
-__all__ = [
-    "back_substitute",
-    "eliminate",
-    "scale_equations",
-    "solve_nonnegative_eights",
-    "solve_terms",
-]
-
 #: Terms at most, of which a problem has a set.
 _TERMS = 5
 

@@ -25,8 +25,6 @@ from numba.extending import intrinsic, register_model
 
 from gyrostab.kernels.compiled import INNER
 
-__all__ = ["PLACES", "eights", "number", "put", "root", "take", "where_above"]
-
 #: Problems side by side.
 PLACES = 8
 

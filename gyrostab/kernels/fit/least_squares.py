@@ -38,8 +38,6 @@ from gyrostab.kernels.fit.mixture import (
 )
 from gyrostab.kernels.fit.submodels import FIT_FIELDS, average_submodels, make_submodels
 
-__all__ = ["FIT_FIELDS", "cell_freedoms", "combine_diagonal", "fit_windows", "identify_noise"]
-
 
 class _Cells(NamedTuple):
     """What `observe` says of eight windows."""

@@ -9,8 +9,6 @@ from numba import njit
 
 from gyrostab.kernels.compiled import INNER, KERNEL
 
-__all__ = ["cell_limits", "chi_square_quantile", "estimate_bounds"]
-
 #: Largest number of Newton steps to a bound, and the change of the score that ends them.
 _STEPS, _TOLERANCE = 20, 1e-6
 

@@ -16,21 +16,6 @@ from numpy.typing import NDArray
 from gyrostab.kernels.compiled import INNER
 from gyrostab.kernels.fit.lanes import number, put, root, take, take_four, where_above
 
-__all__ = [
-    "DATA",
-    "PRODUCTS",
-    "WIDTH",
-    "Curves",
-    "combine_products",
-    "compress_products",
-    "covariance_rows",
-    "degrees_of_freedom",
-    "observe",
-    "root_squares",
-    "root_units",
-    "whole_degrees_of_freedom",
-]
-
 #: Products of the four stochastic terms with each other and with a ramp, which does not scatter
 #: alone: (a, b) for a in 0..3 and b in a..4.
 PRODUCTS = 14

@@ -28,8 +28,6 @@ from numpy.typing import NDArray
 from gyrostab.kernels.compiled import INNER
 from gyrostab.kernels.fit.mixture import PRODUCTS
 
-__all__ = ["FIT_FIELDS", "Submodels", "average_submodels", "make_submodels"]
-
 #: Rows of the per-term result of a fit.
 FIT_FIELDS = (
     "square",

@@ -22,8 +22,6 @@ from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.compiled import INNER, KERNEL
 from gyrostab.kernels.fit.covariance import STOCHASTIC
 
-__all__ = ["third_columns", "third_tables"]
-
 #: Lags are taken in steps of this share of the shorter factor.
 _LAG_STEPS = 32
 _WEIGHTS = (-1.0, 3.0, -3.0, 1.0)

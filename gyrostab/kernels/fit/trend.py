@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.fit.covariance import STOCHASTIC
 
-__all__ = ["TrendTables", "detrend_tables"]
-
 #: Second differences are taken at steps of this share of k, and at this many places at least.
 _STEPS, _PLACES = 32, 2**16
 

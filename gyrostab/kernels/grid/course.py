@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
 
-__all__ = ["find_breaks", "find_phase", "follow", "trace"]
-
 Integers = NDArray[np.int64]
 
 #: Largest number of simultaneous hypotheses: each late row is the possible end of a loss.

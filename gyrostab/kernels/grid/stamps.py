@@ -13,23 +13,6 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
 
-__all__ = [
-    "DUPLICATE",
-    "FIRST",
-    "LOOK_AHEAD",
-    "NO_STAMP",
-    "OPEN_RUN",
-    "OUT_OF_ORDER",
-    "RESTART",
-    "STARTED",
-    "STEP",
-    "new_state",
-    "piece_sums",
-    "place",
-    "scan_cells",
-    "track",
-]
-
 Integers = NDArray[np.int64]
 
 #: Value of a stamp that could not be read (numpy's NaT as an integer).

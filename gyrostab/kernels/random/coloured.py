@@ -23,19 +23,6 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 
 from gyrostab.kernels.compiled import KERNEL
 
-__all__ = [
-    "ORDER",
-    "Process",
-    "Reading",
-    "band",
-    "band_psd",
-    "begin_process",
-    "folded_psd",
-    "oscillator",
-    "oscillator_psd",
-    "read_process",
-]
-
 Array = NDArray[np.float64]
 
 #: Order of the Butterworth low-pass from which a band is made: the band has twice as many poles.

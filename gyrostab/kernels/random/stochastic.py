@@ -16,15 +16,6 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import KERNEL
 
-__all__ = [
-    "brownian_means",
-    "flicker_means",
-    "flicker_times",
-    "ornstein_uhlenbeck",
-    "ornstein_uhlenbeck_means",
-    "sinusoid_means",
-]
-
 Array = NDArray[np.float64]
 
 #: Ratio of neighbouring correlation times in `flicker_times`: the Allan variance of their sum

@@ -17,8 +17,6 @@ from numba import njit
 
 from gyrostab.kernels.compiled import KERNEL
 
-__all__ = ["boxcar_information", "filter_gains", "precision_times", "remaining_information"]
-
 
 @njit(**KERNEL)
 def filter_gains(variance, present, walk, ou_variance, decay, innovation, gain):  # type: ignore[no-untyped-def]

@@ -11,23 +11,6 @@ from scipy.special import stdtr, stdtrit
 
 from gyrostab.kernels.regression.windows import slow_covariance, white_covariance
 
-__all__ = [
-    "LagFit",
-    "Laws",
-    "calibrated",
-    "decompose",
-    "fit_lags",
-    "mixture",
-    "noise_laws",
-    "null_weights",
-    "p_values",
-    "project_out",
-    "simulate_p_values",
-    "slope_interval",
-    "uncalibrated",
-    "weights",
-]
-
 Array = NDArray[np.float64]
 
 #: Correlation times of the slow part [share of the record], and its spectral density against the

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import KERNEL
 
-__all__ = ["chosen_products", "mixed_evidence"]
-
 Array = NDArray[np.float64]
 #: What is this much less likely than the best, as a logarithm, adds nothing that counts: it is
 #: taken for so likely.

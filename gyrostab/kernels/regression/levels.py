@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import KERNEL
 
-__all__ = ["level_tables", "levels_smooth"]
-
 Array = NDArray[np.float64]
 _TINY = 1e-290
 

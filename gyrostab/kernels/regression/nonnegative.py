@@ -10,8 +10,6 @@ from numba import njit
 
 from gyrostab.kernels.compiled import INNER, KERNEL
 
-__all__ = ["solve_nonnegative"]
-
 
 @njit(**INNER)
 def _list_members(subset, members):  # type: ignore[no-untyped-def]

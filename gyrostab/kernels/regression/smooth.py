@@ -7,8 +7,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["smooth_curve"]
-
 Array = NDArray[np.float64]
 _LEAST, _STEPS, _FEWEST = 0.7, 10, 8
 _DIFFERENCE = (1.0, -2.0, 1.0)

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
 
-__all__ = ["flicker_states", "whiten"]
-
 Array = NDArray[np.float64]
 #: Ratio of neighbouring correlation times in `flicker_states`.
 RATIO = 4.0

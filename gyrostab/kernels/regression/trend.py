@@ -7,8 +7,6 @@ from numba import njit
 
 from gyrostab.kernels.compiled import INNER, KERNEL, REORDER
 
-__all__ = ["window_trend"]
-
 
 @njit(fastmath=REORDER, **INNER)
 def _sum_finite(values, seconds, origin, start):  # type: ignore[no-untyped-def]

@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-__all__ = ["average_windows", "slow_covariance", "white_covariance"]
-
 Array = NDArray[np.float64]
 
 

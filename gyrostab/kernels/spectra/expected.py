@@ -7,8 +7,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["expected_powers", "sample_covariance"]
-
 Array = NDArray[np.float64]
 # ordinates that are computed one by one; above, the ratio to the plain spectrum is interpolated
 _EXACT = 48

@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["EDGE_LINES", "LEAK_LINES", "level_around", "local_level"]
-
 Array = NDArray[Any]
 #: Lines on each side that a steady line leaks into; of the taper.
 LEAK_LINES = 3

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
 
-__all__ = ["HISTOGRAM", "departures", "histogram_edge", "peaks"]
-
 Array = NDArray[np.float64]
 
 #: Bins of the histogram of departures: one for zero, then four an octave from 2**-32 to 2**32.

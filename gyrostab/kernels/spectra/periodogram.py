@@ -23,19 +23,6 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
 
-__all__ = [
-    "band_covariance",
-    "band_edges",
-    "band_powers",
-    "block_samples",
-    "gap_spectra",
-    "ordinates",
-    "phase_profile",
-    "resent_samples",
-    "shape_of_bands",
-    "taper",
-]
-
 Array = NDArray[np.float64]
 
 _EXACT = 12  # ordinates of a band up to which the covariance of each pair is summed

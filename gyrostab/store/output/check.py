@@ -13,8 +13,6 @@ from gyrostab.store.output.content import FindForeign, find_foreign_item, is_sto
 from gyrostab.store.output.inputs import match_files, protected_inputs
 from gyrostab.store.remote import find_url, is_taken
 
-__all__ = ["check_folder", "check_output", "check_target", "resolve_link"]
-
 _MAX_LINKS = 40  # limit of Linux (path_resolution(7)); more links are treated as a loop
 
 

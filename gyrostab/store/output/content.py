@@ -11,8 +11,6 @@ from typing import Any
 
 from gyrostab.store.remote import ROOT_METADATA, read_bytes
 
-__all__ = ["METADATA", "FindForeign", "find_foreign_item", "is_store", "read_json"]
-
 #: Function that returns the name of an item of a folder that must not be removed, or None.
 FindForeign = Callable[[Path], str | None]
 

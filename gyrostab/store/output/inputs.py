@@ -19,16 +19,6 @@ from gyrostab.errors import FormatError
 from gyrostab.store.output.content import is_store
 from gyrostab.store.remote import describe_address, find_url
 
-__all__ = [
-    "check_unchanged",
-    "describe_file",
-    "find_sources",
-    "follow_inputs",
-    "match_files",
-    "protect_inputs",
-    "protected_inputs",
-]
-
 #: Inputs of the current command, each with its first `describe_file`; None where a change does not
 #: matter.
 _PROTECTED: ContextVar[dict[Path, dict[str, Any] | None] | None] = ContextVar(

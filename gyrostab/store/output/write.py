@@ -21,15 +21,6 @@ from gyrostab.store.output.inputs import check_unchanged
 from gyrostab.store.remote import find_url, upload, upload_file
 from gyrostab.store.system import exchange_paths, rename_new, sync_path
 
-__all__ = [
-    "is_leftover",
-    "new_folder",
-    "new_output",
-    "remove_leftovers",
-    "replace_file",
-    "write_text",
-]
-
 #: Number of checks, 20 ms apart, after which a removed folder counts as gone: on a busy machine, a
 #: thread may be delayed that long before it writes again.
 _MIN_ABSENT_CHECKS = 15

@@ -10,8 +10,8 @@ import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks, fold_subsets
-from gyrostab.diagnose.evidence.held_out import held_out_evidence, mean_factors, noise_columns
-from gyrostab.diagnose.evidence.products import WIDTHS
+from gyrostab.diagnose.evidence.held_out import mean_factors, noise_columns
+from gyrostab.diagnose.evidence.products import WIDTHS, held_out_evidence
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.linear_model import initial_state
@@ -20,7 +20,7 @@ from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.regression.state_space import flicker_states
-from gyrostab.noise import HOUR
+from gyrostab.units import HOUR
 from tests.kernels.regression.test_state_space import relaxation_covariance, walk_covariance
 from tests.support.evidence import mean_evidence, power_evidence, power_factors
 

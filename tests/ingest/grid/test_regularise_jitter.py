@@ -10,7 +10,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gyrostab.errors import TimeError
-from gyrostab.ingest.grid.regularise import gap_table, regularise
+from gyrostab.ingest.grid.gaps import gap_table
+from gyrostab.ingest.grid.regularise import regularise
 from tests.support.raw_rows import START, raw_log, stamps_of
 from tests.support.stamp_scatter import (
     JITTER,

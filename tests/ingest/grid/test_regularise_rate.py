@@ -10,9 +10,10 @@ import pytest
 from gyrostab import davar, fit_noise, open_log, to_netcdf
 from gyrostab.allan.judgement import judge_product
 from gyrostab.errors import TimeError
+from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.place import place_by_stamp
 from gyrostab.ingest.grid.rate import estimate_rate
-from gyrostab.ingest.grid.regularise import gap_table, regularise
+from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.ingest.uniform import cut_log
 from gyrostab.kernels.grid.stamps import NO_STAMP
 from gyrostab.time.grid import time_coordinate

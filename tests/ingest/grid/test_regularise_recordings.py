@@ -6,7 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from gyrostab.ingest.grid.regularise import gap_table, regularise
+from gyrostab.ingest.grid.gaps import gap_table
+from gyrostab.ingest.grid.regularise import regularise
 from tests.support.raw_rows import raw_log
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gyrostab.ingest.grid.regularise import gap_table, regularise
+from gyrostab.ingest.grid.gaps import gap_table
+from gyrostab.ingest.grid.regularise import regularise
 from tests.support.raw_rows import raw_log, stamps_of
 
 
