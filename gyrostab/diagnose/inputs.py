@@ -27,6 +27,9 @@ MAX_ROUNDING_POWER = 1e-20
 
 def check_options(nulls: int, level: float, seed: int) -> None:
     """Raise `OptionError` unless these options of `gyrostab.diagnose` make sense."""
+    for name, value in (("nulls", nulls), ("seed", seed)):
+        if not isinstance(value, int | np.integer):
+            raise OptionError(f"{name}={value!r}: give a whole number")
     if not 0.0 < level < 0.5:
         raise OptionError(
             f"false_alarm_level={level!r}: give a false-alarm probability above 0 and below 0.5, "

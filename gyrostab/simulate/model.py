@@ -133,8 +133,8 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
     FormatError
         When the file is not TOML or cannot be read.
     OptionError
-        When a name, a parameter or a unit is unknown or missing; the message names it and lists
-        what exists.
+        When `model` is neither, or a name, a parameter or a unit is unknown or missing; the message
+        names it and lists what exists.
 
     Examples
     --------
@@ -143,6 +143,11 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
     """
     if isinstance(model, Mapping):
         where, tables, text = "model", dict(model), json.dumps(model, default=str)
+    elif not isinstance(model, str | os.PathLike):
+        raise OptionError(
+            f"the model is of type {type(model).__name__}; give a TOML file, a mapping of its "
+            "tables, or what gyrostab.read_model returns"
+        )
     else:
         where, path = str(model), Path(model)
         try:

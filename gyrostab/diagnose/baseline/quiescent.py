@@ -195,6 +195,8 @@ def given_quiescent_blocks(
                 f"give one bool for each of the {n} blocks, or (start, end) pairs"
             )
         chosen = array.copy()
+    elif array.ndim not in (1, 2) or array.shape[-1] != 2:
+        raise OptionError(f"quiet={quiet!r}: give (start, end), or a list of such pairs")
     else:
         begin, end = blocks["begin"].values, blocks["end"].values
         chosen = np.zeros(n, np.bool_)
