@@ -27,9 +27,10 @@ from gyrostab.store.layout import ChunkCache, ChunkDamage, is_readable, read_chu
 from gyrostab.store.lazy import FileVariable, RowSource, make_dask
 from gyrostab.store.netcdf_log import StoredLog, open_netcdf_log
 from gyrostab.store.private import close_function
-from gyrostab.store.remote import find_store, find_url, reaching
+from gyrostab.store.remote import ROOT_METADATA, find_store, find_url, reaching
 from gyrostab.store.times import decode_stamps, index_dim, parse_time_grids, replace_stamps
 from gyrostab.time.grid import grid_times
+from gyrostab.wording import list_some
 
 #: Dataset as it is on disk.
 Stored = xr.Dataset | StoredLog
@@ -99,6 +100,12 @@ def _open_dataset(
             long = _find_long_variables(log, path, strict=strict)
             return replace(log, variables=log.variables | long)
         check_global_heaps(path)
+    elif not any((path / name).exists() for name in ROOT_METADATA):
+        inside = sorted(item.name for item in path.iterdir() if item.suffix in (".nc", ".zarr"))
+        raise DamageError(
+            f"{path}: is a folder, not a Zarr store (neither zarr.json nor .zgroup is in it)"
+            + (f"; name a file in it: {list_some(inside)}" if inside else "")
+        )
     engine: Any = "zarr" if path.is_dir() else "netcdf4"
     name = "Zarr" if path.is_dir() else "NetCDF"
     try:

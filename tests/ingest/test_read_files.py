@@ -91,6 +91,8 @@ def test_a_pipe_is_refused_with_advice() -> None:
     [
         ("log.zip", b"PK\x03\x04", "log.zip: this file is packed; unpack it"),
         ("log.csv.xz", b"\xfd7zXZ\0", "log.csv.xz: this file is packed"),
+        ("log.npz", b"PK\x03\x04", "log.npz: numpy files state neither units nor times"),
+        ("log.npy", b"\x93NUMPY\x01\0", "log.npy: numpy files state neither units nor times"),
         ("log.xlsx", b"PK\x03\x04", "log.xlsx: spreadsheets are not read; save the sheet"),
         ("log.xls", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "log.xls: spreadsheets are not read"),
     ],

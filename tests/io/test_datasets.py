@@ -356,11 +356,17 @@ def test_foreign_and_damaged_files(tmp_path, files):
         files["product"].read_bytes()[: files["product"].stat().st_size // 2]
     )
     (tmp_path / "store.zarr").mkdir()
+    (tmp_path / "store.zarr" / "zarr.json").write_text("{")
     for name in ("words.nc", "half.nc", "store.zarr"):
         with pytest.raises(
             FormatError, match=rf"{name}: is not (NetCDF|Zarr), or is damaged or cut short"
         ):
             open_product(tmp_path / name)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(FormatError, match=r"empty: is a folder, not a Zarr store \([^)]*\)$"):
+        open_product(tmp_path / "empty")
+    with pytest.raises(FormatError, match=r"name a file in it: half\.nc, store\.zarr, words\.nc"):
+        open_product(tmp_path)
     xr.Dataset({"sst": ("x", [1.0])}).to_netcdf(tmp_path / "sea.nc")
     for opener, kind in (
         (open_product, "a product"),

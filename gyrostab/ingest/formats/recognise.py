@@ -15,6 +15,7 @@ _HEAD_BYTES = 8192
 
 _R_DATA = (b"RDX2\n", b"RDX3\n", b"RDA2\n", b"RDA3\n", b"X\n\0\0\0")
 _PACKED = (b"PK\x03\x04", b"7z\xbc\xaf\x27\x1c", b"Rar!", b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd")
+_NUMPY = b"\x93NUMPY"
 _OLD_OFFICE = b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
 _SHEETS = (".xls", ".xlsx", ".xlsm", ".xlsb", ".ods")
 
@@ -53,6 +54,11 @@ def refuse_unread(path: Path) -> None:
         raise FormatError(
             f"{path.name}: this is a file of R data, which is not read; save it as CSV in R: "
             "write.csv(as.data.frame(x), 'log.csv', row.names = FALSE)"
+        )
+    if head.startswith(_NUMPY) or (head.startswith(_PACKED) and path.suffix.lower() == ".npz"):
+        raise FormatError(
+            f"{path.name}: numpy files state neither units nor times and are not read; in Python: "
+            "gyrostab.make_log(numpy.load(...), rate=HZ, unit='deg/s'), then gyrostab.to_netcdf"
         )
     if head.startswith((*_PACKED, _OLD_OFFICE)) and path.suffix.lower() in _SHEETS:
         raise FormatError(
