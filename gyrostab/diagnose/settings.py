@@ -292,7 +292,7 @@ class Settings:
         4.5,
         "standard deviation",
         "Excess of the noise level of a block above which it is not quiescent.",
-        "P = 8e-6 a block of 1000 lines, 0.05 of 6000 blocks; 6e-5 with 49 lines "
+        "P = 8e-6 a block of 1000 lines, 0.008 in 1000 blocks; 6e-5 with 49 lines "
         "(benchmarks/settings_derivations.py)",
     )
     excess_sigma: float = _make_setting(
@@ -301,7 +301,7 @@ class Settings:
         "Excess above which the noise of the mean of a block is raised, and difference from the "
         "noise terms above which a band does not count in the noise of means, or has a separate "
         "form in a simulation.",
-        "P = 6e-5 a block of 1000 lines, 0.4 of 6000 blocks, and then by the excess itself "
+        "P = 6e-5 a block of 1000 lines, 0.06 in 1000 blocks, and then by the excess "
         "(benchmarks/settings_derivations.py)",
     )
     quiescent_share: float = _make_setting(
@@ -352,7 +352,7 @@ class Settings:
         5.0,
         "standard error",
         "Excess over a known line above which it is another line.",
-        "P = 7e-4 a line and part of the shortest record, 1e-6 of the longest "
+        "P = 7e-4 a line and part of the shortest record, 5e-6 of 1000 blocks "
         "(benchmarks/settings_derivations.py)",
     )
     line_nats: float = _make_setting(
@@ -360,7 +360,7 @@ class Settings:
         "nat",
         "Evidence of a line of a simulation above which it is known.",
         "the largest evidence of 1000 lines of noise is 7.3 nats in 400 records of 24 blocks, "
-        "and 1.0 of 6000 blocks (benchmarks/settings_derivations.py)",
+        "and 3.0 of 1000 blocks (benchmarks/settings_derivations.py)",
     )
     # thresholds from null records
     tail_share: float = _make_setting(
