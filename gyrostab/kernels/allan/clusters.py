@@ -19,7 +19,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from gyrostab.kernels.allan.blocks import windows_from_blocks
-from gyrostab.kernels.compiled import INNER, REORDER
+from gyrostab.kernels.compiled import INNER, KERNEL, REORDER
 
 # First terms of the pairs that are summed for the degrees of freedom, at most; where there are
 # more, sections of so many.
@@ -67,7 +67,7 @@ def _places_before(mask, row, low):  # type: ignore[no-untyped-def]
     return mask[row, 4] + (np.int64(row) << 6) * _count_ones(word) + _sum_places(word)
 
 
-@njit(**INNER)
+@njit(**KERNEL)
 def pack_mask(starts, stops, n):  # type: ignore[no-untyped-def]
     """Pack the runs of present samples into a mask of 64 samples per row.
 
@@ -103,7 +103,7 @@ def _count_before(mask, m):  # type: ignore[no-untyped-def]
     return mask[row, 2] + _count_ones(mask[row, 0] & ((np.int64(1) << (m & 63)) - 1))
 
 
-@njit(**INNER)
+@njit(**KERNEL)
 def integrate_places(starts, stops, n):  # type: ignore[no-untyped-def]
     """Integrate a ramp of one per sample over the present samples; exact up to 2^26 samples."""
     out = np.empty(n + 1)
@@ -169,7 +169,7 @@ def _add_pairs(theta, places, mask, a, b, k, stride, row):  # type: ignore[no-un
     row[6] += slope
 
 
-@njit(**INNER)
+@njit(**KERNEL)
 def cluster_cells(theta, places, mask, window, step, k, stride, poor):  # type: ignore[no-untyped-def]
     """Compute the cells of the `poor` windows of one averaging factor by weighted cluster means.
 
@@ -319,20 +319,38 @@ def _pair_sums(mask, begin, end, grid, k, sums):  # type: ignore[no-untyped-def]
         _add_section(part, lags, close, many, sums)
 
 
-@njit(**INNER)
-def cluster_factor(mask, first, window, k, stride):  # type: ignore[no-untyped-def]
-    """Compute the degrees of freedom of a cell under white noise, relative to those without gaps.
+@njit(**KERNEL)
+def cluster_factors(mask, wanted, window, step, k, stride):  # type: ignore[no-untyped-def]
+    """Compute the degrees of freedom of cells under white noise, relative to those without gaps.
 
     The pairs of terms are on a grid of k/8 to k/4, finer if few terms fit the window or all those
-    on the grid are lost. Arguments as for `cluster_cells`; `first` is the first sample of the
-    window.
+    on the grid are lost.
+
+    Parameters
+    ----------
+    wanted : bool (n_windows,)
+        Windows to compute.
+    mask, window, step, k, stride
+        As for `cluster_cells`.
+
+    Returns
+    -------
+    float64 (n_windows,)
+        0 where not computed.
     """
-    end = first + window - 2 * k + 1
-    grid = stride
-    while 8 * grid <= k and 48 * grid <= end - first:
-        grid *= 2
+    factors = np.zeros(wanted.size)
     sums = np.zeros(4)
-    while grid >= stride and sums[1] == 0.0:
-        _pair_sums(mask, (first + stride - 1) // stride * stride, end, grid, k, sums)
-        grid //= 2
-    return sums[0] * sums[0] / sums[1] * sums[3] / (sums[2] * sums[2]) if sums[1] > 0.0 else 0.0
+    for j in range(wanted.size):
+        if not wanted[j]:
+            continue
+        first, end = j * step, j * step + window - 2 * k + 1
+        grid = stride
+        while 8 * grid <= k and 48 * grid <= end - first:
+            grid *= 2
+        sums[:] = 0.0
+        while grid >= stride and sums[1] == 0.0:
+            _pair_sums(mask, (first + stride - 1) // stride * stride, end, grid, k, sums)
+            grid //= 2
+        if sums[1] > 0.0:
+            factors[j] = sums[0] * sums[0] / sums[1] * sums[3] / (sums[2] * sums[2])
+    return factors

@@ -18,7 +18,7 @@ from gyrostab.kernels.allan.blocks import (
 )
 from gyrostab.kernels.allan.clusters import (
     cluster_cells,
-    cluster_factor,
+    cluster_factors,
     cluster_strides,
     integrate_places,
     pack_mask,
@@ -135,34 +135,6 @@ def _share_gaps(  # type: ignore[no-untyped-def]
         )
         for j in range(factors.size):
             cells[3, j, i] = factors[j]
-
-
-@njit(**KERNEL)
-def _bridge_gaps(theta, starts, stops, window, step, ks, strides, poor, cells):  # type: ignore[no-untyped-def]
-    """Weighted clusters where too few terms are left (rate logs only)."""
-    mask = pack_mask(starts, stops, theta.size - 1)
-    pairs = 0.0  # to a sample
-    for i in range(ks.size):
-        pairs += poor[:, i].any() / strides[i]
-    places = integrate_places(starts, stops, theta.size - 1) if pairs > 1.0 else np.empty(0)
-    for i in range(ks.size):
-        if not poor[:, i].any():
-            continue
-        bridged = cluster_cells(theta, places, mask, window, step, ks[i], strides[i], poor[:, i])
-        for j in range(poor.shape[0]):
-            if poor[j, i]:
-                has_pairs = bridged[j, 4] > 0.0
-                cells[0, j, i] = bridged[j, 0] if has_pairs else np.nan
-                cells[1, j, i] = bridged[j, 4]
-                cells[2, j, i] = bridged[j, 3]
-                cells[3, j, i] = (
-                    cluster_factor(mask, j * step, window, ks[i], strides[i]) if has_pairs else 0.0
-                )
-                cells[4, j, i] = WEIGHTED
-                cells[5, j, i] = bridged[j, 1]
-                cells[6, j, i] = bridged[j, 2]
-                cells[7, j, i] = bridged[j, 5]
-                cells[8, j, i] = bridged[j, 6]
 
 
 class _Work(NamedTuple):
@@ -365,9 +337,7 @@ def _cells_with_gaps(work: _Work, sums: Floats, counts: Floats, full: Floats) ->
     poor = counts < unit.min_strict * full
     bridge = unit.order == 2 and not unit.zero_fill and not unit.angle
     if bridge and poor.any():
-        strides = cluster_strides(unit.window, unit.ks, unit.shifts)
-        angle = _angle_of(work, np.flatnonzero(poor.any(axis=1)))
-        _bridge_gaps(angle, starts, stops, unit.window, unit.step, unit.ks, strides, poor, cells)
+        _bridge_gaps(work, _angle_of(work, np.flatnonzero(poor.any(axis=1))), poor, cells)
     if not unit.zero_fill:
         blank = ~(cells[2] >= unit.min_coverage)
         cells[0][blank] = np.nan
@@ -375,6 +345,26 @@ def _cells_with_gaps(work: _Work, sums: Floats, counts: Floats, full: Floats) ->
         cells[4][blank] = NONE
         cells[3][blank] = 0.0
     return Cells(*cells)
+
+
+def _bridge_gaps(work: _Work, theta: Floats, poor: NDArray[np.bool_], cells: Floats) -> None:
+    """Weighted clusters where too few terms are left (rate logs only)."""
+    unit, runs = work.unit, (work.starts, work.stops, theta.size - 1)
+    mask = pack_mask(*runs)
+    strides = cluster_strides(unit.window, unit.ks, unit.shifts)
+    pairs_per_sample = (poor.any(axis=0) / strides).sum()
+    places = integrate_places(*runs) if pairs_per_sample > 1.0 else np.empty(0)
+    for i in np.flatnonzero(poor.any(axis=0)):
+        rows = np.ascontiguousarray(poor[:, i])
+        pairs = unit.window, unit.step, unit.ks[i], strides[i]
+        bridged = cluster_cells(theta, places, mask, *pairs, rows)
+        has_pairs = bridged[:, 4] > 0.0
+        factor = cluster_factors(mask, has_pairs, *pairs)
+        avar, white, quantization, coverage, count, ramp, slope = bridged.T
+        avar = np.where(has_pairs, avar, np.nan)
+        method = np.full(rows.size, WEIGHTED)
+        fields = avar, count, coverage, factor, method, white, quantization, ramp, slope
+        cells[:, rows, i] = np.stack(fields)[:, rows]
 
 
 def _find_slopes(work: _Work, with_gaps: NDArray[np.bool_]) -> Floats:

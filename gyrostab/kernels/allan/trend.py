@@ -92,9 +92,19 @@ def _sum_differences(sums, a, b, k):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _sum_before(m, begin, end, sums, totals, k):  # type: ignore[no-untyped-def]
-    """Count and sum the valid second differences before m; `totals` are those before intervals."""
-    v = np.searchsorted(end, m)
+def _interval_at(end, m, v):  # type: ignore[no-untyped-def]
+    """Find the first interval from number v on that does not end before m."""
+    while v < end.size and end[v] < m:
+        v += 1
+    return v
+
+
+@njit(**INNER)
+def _sum_before(m, v, begin, sums, totals, k):  # type: ignore[no-untyped-def]
+    """Count and sum the valid second differences before m; `totals` are those before intervals.
+
+    v is the first interval that does not end before m.
+    """
     if v < begin.size and begin[v] < m:
         return totals[v, 0] + m - begin[v], totals[v, 1] + _sum_differences(sums, begin[v], m, k)
     return totals[v, 0], totals[v, 1]
@@ -133,10 +143,12 @@ def difference_slopes(theta, starts, stops, window, step, n_windows, ks, points)
         for v in range(begin.size):
             totals[v + 1, 0] = totals[v, 0] + end[v] - begin[v]
             totals[v + 1, 1] = totals[v, 1] + _sum_differences(sums, begin[v], end[v], k)
+        first = last = np.int64(0)
         for j in range(n_windows):
-            a = j * step
-            count, total = _sum_before(a + window - 2 * k + 1, begin, end, sums, totals, k)
-            earlier_count, lower = _sum_before(a, begin, end, sums, totals, k)
+            a, b = j * step, j * step + window - 2 * k + 1
+            first, last = _interval_at(end, a, first), _interval_at(end, b, last)
+            count, total = _sum_before(b, last, begin, sums, totals, k)
+            earlier_count, lower = _sum_before(a, first, begin, sums, totals, k)
             slope = (
                 (total - lower) / (float(k) * k * (count - earlier_count))
                 if count > earlier_count

@@ -183,8 +183,7 @@ def even_steps(stamps: NDArray[np.int64]) -> NDArray[np.int64] | None:
     return table[: _find_steps(stamps, table)].copy()
 
 
-@njit(**KERNEL)
-def unroll_steps(table, begin, stamps):  # type: ignore[no-untyped-def]
+def unroll_steps(table: NDArray[np.int64], begin: int, stamps: NDArray[np.int64]) -> None:
     """Restore stamps from row `begin` on from the table of `even_steps`.
 
     Parameters
@@ -194,7 +193,12 @@ def unroll_steps(table, begin, stamps):  # type: ignore[no-untyped-def]
     stamps : int64 (m,)
         Overwritten.
     """
-    n = np.searchsorted(table[:, 0], begin, side="right") - 1
+    _unroll_steps(table, int(np.searchsorted(table[:, 0], begin, side="right")) - 1, begin, stamps)
+
+
+@njit(**KERNEL)
+def _unroll_steps(table, n, begin, stamps):  # type: ignore[no-untyped-def]
+    """Restore stamps from row `begin` on, which is in row n of the table."""
     row, end = np.int64(begin), begin + stamps.size
     while row < end:
         stop = min(end, table[n + 1, 0]) if n + 1 < len(table) else end

@@ -373,8 +373,8 @@ def _reduce_windows(cells, room, tables):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _average_window(allowed, place, low_sigma, fit, cells, room, submodels, start, form, result):  # type: ignore[no-untyped-def]
-    """Average the window in one place over its submodels."""
+def _take_window(place, fit, cells, room, submodels, start):  # type: ignore[no-untyped-def]
+    """Copy the reduced window in one place of the eights."""
     for a in range(4):
         start[a] = fit.squares[a, place]
         submodels.data[a] = room.right[a, place]
@@ -384,7 +384,6 @@ def _average_window(allowed, place, low_sigma, fit, cells, room, submodels, star
     for table in range(PRODUCTS):
         for entry in range(10):
             submodels.products[table, entry] = room.products[10 * table + entry, place]
-    average_submodels(allowed, start, cells.trend[4, place], low_sigma, submodels, form, result)
 
 
 @njit(**KERNEL)
@@ -453,8 +452,9 @@ def fit_windows(  # type: ignore[no-untyped-def]
             misfit[w, 0], misfit[w, 1] = chi2[0, place], valid[place]
             for a in range(4):
                 misfit[w, 1] -= 1.0 if fit.terms[a, place] > 0.5 else 0.0
-            _average_window(
-                allowed, place, low_sigma, fit, cells, room, submodels, start, form, result[w]
+            _take_window(place, fit, cells, room, submodels, start)
+            average_submodels(
+                allowed, start, cells.trend[4, place], low_sigma, submodels, form, result[w]
             )
             for a in range(5):
                 squares[a] = result[w, 0, a] if result[w, 0, a] > 0.0 else 0.0
