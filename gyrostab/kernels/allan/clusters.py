@@ -320,7 +320,7 @@ def _pair_sums(mask, begin, end, grid, k, sums):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def cluster_factors(mask, wanted, window, step, k, stride):  # type: ignore[no-untyped-def]
+def cluster_factors(mask, has_pairs, window, step, k, stride):  # type: ignore[no-untyped-def]
     """Compute the degrees of freedom of cells under white noise, relative to those without gaps.
 
     The pairs of terms are on a grid of k/8 to k/4, finer if few terms fit the window or all those
@@ -328,7 +328,7 @@ def cluster_factors(mask, wanted, window, step, k, stride):  # type: ignore[no-u
 
     Parameters
     ----------
-    wanted : bool (n_windows,)
+    has_pairs : bool (n_windows,)
         Windows to compute.
     mask, window, step, k, stride
         As for `cluster_cells`.
@@ -338,10 +338,10 @@ def cluster_factors(mask, wanted, window, step, k, stride):  # type: ignore[no-u
     float64 (n_windows,)
         0 where not computed.
     """
-    factors = np.zeros(wanted.size)
+    factors = np.zeros(has_pairs.size)
     sums = np.zeros(4)
-    for j in range(wanted.size):
-        if not wanted[j]:
+    for j in range(has_pairs.size):
+        if not has_pairs[j]:
             continue
         first, end = j * step, j * step + window - 2 * k + 1
         grid = stride
