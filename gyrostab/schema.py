@@ -208,6 +208,11 @@ def log_channels(log: xr.Dataset) -> list[str]:
     ]
 
 
+def is_rate_of_change(name: str, product: xr.Dataset) -> bool:
+    """Whether a channel of a product is the rate of change of another of its channels."""
+    return name.endswith("_rate") and name.removesuffix("_rate") in product.data_vars
+
+
 def _require_variables(dataset: xr.Dataset, kind: str, dims: dict[str, tuple[str, ...]]) -> None:
     if not isinstance(dataset, xr.Dataset):
         raise SchemaError(

@@ -29,6 +29,19 @@ def list_some(words: Sequence[str], most: int = 3) -> str:
     return ", ".join(filter(None, words[:most])) + (f" and {more} more" if more > 0 else "")
 
 
+def format_share(share: float) -> str:
+    """Format a share in percent; only none and all are written as 0 % and 100 %.
+
+    Examples
+    --------
+    >>> [format_share(share) for share in (0.0, 0.002, 0.37, 0.996, 1.0)]
+    ['0 %', '< 1 %', '37 %', '> 99 %', '100 %']
+    """
+    if 0.0 < share < 0.01:
+        return "< 1 %"
+    return "> 99 %" if 0.99 < share < 1.0 else f"{100.0 * share:.0f} %"
+
+
 def format_value(value: float, error: float | None = None) -> str:
     """Format a value to the second digit of its error; to four digits without an error.
 

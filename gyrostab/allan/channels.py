@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.errors import TimeError
 from gyrostab.kernels.regression.trend import window_trend
 from gyrostab.schema import log_channels
 from gyrostab.store.lazy import read_slice
@@ -45,6 +46,11 @@ def window_channels(
     dict of str to xarray.Variable
         ``<channel>(time)`` [unit of the channel] and, for temperatures, ``<channel>_rate(time)`` [K
         hour-1]; dask arrays if the channel is one and `part` is None.
+
+    Raises
+    ------
+    TimeError
+        When the times of a channel run backwards.
     """
     out: dict[str, xr.Variable] = {}
     rate, start = float(log.attrs["sampling_rate_hz"]), first_stamp(log)
@@ -55,6 +61,11 @@ def window_channels(
         stamps = None
         if channel.dims != ("time",):
             stamps = to_nanoseconds(log.variables[f"time_{name}"].values)
+            if (np.diff(stamps) < 0).any():
+                raise TimeError(
+                    f"time_{name} runs backwards; put the channel in the order of time: "
+                    f"log.sortby('time_{name}')"
+                )
 
         def ends(
             group: slice, stamps: NDArray[np.int64] | None = stamps

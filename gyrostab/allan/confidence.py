@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.allan.variance import variance_name
 from gyrostab.errors import OptionError
 from gyrostab.schema import check_surface
 
@@ -72,7 +73,8 @@ def confidence_interval(surface: xr.Dataset, *, level: float = 0.95) -> xr.Datas
         )
         out[name] = limit.assign_attrs(
             units=surface["avar"].attrs["units"],
-            long_name=f"{end} end of the {100 * level:.0f} % interval of the Allan variance",
+            long_name=f"{end} end of the {100 * level:g} % interval of the "
+            f"{variance_name(surface)} variance",
         )
     return out
 

@@ -208,7 +208,9 @@ def _fit_checked(
 ) -> xr.Dataset:
     fitted_terms, chosen = _check_options(surface, terms, method, tau_min, tau_max)
     if bands is None:
-        bands = find_bands(surface, terms=terms, method=method, tau_min=tau_min, tau_max=tau_max)
+        bands = find_bands(
+            surface, terms=fitted_terms, method=method, tau_min=tau_min, tau_max=tau_max
+        )
     limits = [BandLimit(*bands[str(axis)]) for axis in surface["axis"].values]
     if method == "gls":
         product = _fit_gls(
@@ -328,7 +330,7 @@ def check_fit_options(
     >>> check_fit_options("NB", tau_min="1min")
     (['N', 'B'], 60.0, inf)
     """
-    fitted_terms = list(terms)
+    fitted_terms = list(dict.fromkeys(terms))
     unknown = [term for term in fitted_terms if term not in TERMS]
     if unknown or not fitted_terms:
         raise OptionError(f"terms {unknown or fitted_terms}: choose among {', '.join(TERMS)}")
@@ -480,12 +482,11 @@ def _fit_gls(
         fitted = block(*cells)
     else:
         lazy = isinstance(cells[0], da.Array)
+        chunks = (*cells[0].chunks[:2], -1) if lazy else (1, 256, -1)
         chunked = [
-            cell.rechunk({2: -1}) if lazy else da.from_array(cell, chunks=(1, 256, -1))
-            for cell in cells[:-2]
+            cell.rechunk(chunks) if isinstance(cell, da.Array) else da.from_array(cell, chunks)
+            for cell in cells
         ]
-        planes = (*chunked[-1].chunks[:2], -1)
-        chunked += [da.from_array(cell, chunks=planes) for cell in cells[-2:]]
         fitted = da.map_blocks(
             block, *chunked, chunks=(*chunked[0].chunks[:2], (width,)), dtype=np.float64
         )

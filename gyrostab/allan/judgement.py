@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.noise import LAWS
-from gyrostab.schema import OBSERVED, check_product, texts
+from gyrostab.schema import OBSERVED, check_product, is_rate_of_change, texts
 from gyrostab.time.durations import format_duration
 from gyrostab.units import HOUR
 from gyrostab.wording import join_words
@@ -156,7 +156,9 @@ def _compare_channels(
                 if ratio != 1.0:
                     changes[channel, term][axis] = ratio
                 if only:
-                    absences[term, f"while {_name_channel(channel)} is {only}"].append(axis)
+                    absences[term, f"while {_name_channel(product, channel)} is {only}"].append(
+                        axis
+                    )
     return changes, absences
 
 
@@ -167,8 +169,14 @@ def _judge_changes(product: xr.Dataset, changes: dict[tuple[str, str], dict[str,
     (channel, term), ratios = max(
         changes.items(), key=lambda item: max(abs(np.log(ratio)) for ratio in item[1].values())
     )
-    sizes = join_words([f"{ratio:.2g} on {axis}" for axis, ratio in ratios.items()])
-    return f"{term} is larger by a factor of {sizes} while {_name_channel(channel)} is high."
+    falls = all(ratio < 1.0 for ratio in ratios.values())
+    sizes = join_words(
+        [f"{1.0 / ratio if falls else ratio:.2g} on {axis}" for axis, ratio in ratios.items()]
+    )
+    rises = all(ratio > 1.0 for ratio in ratios.values())
+    change = "is smaller" if falls else "is larger" if rises else "changes"
+    name = _name_channel(product, channel)
+    return f"{term} {change} by a factor of {sizes} while {name} is high."
 
 
 def _find_states(product: xr.Dataset) -> list[tuple[str, NDArray[np.bool_], NDArray[np.bool_]]]:
@@ -178,7 +186,7 @@ def _find_states(product: xr.Dataset) -> list[tuple[str, NDArray[np.bool_], NDAr
         if channel.dims != ("time",) or channel.dtype.kind != "f":
             continue
         values = np.asarray(channel.values)
-        if str(name).endswith("_rate") and str(name) != "rotation_rate":
+        if is_rate_of_change(str(name), product):
             values = np.abs(values)
         finite = values[np.isfinite(values)]
         if not finite.size or np.ptp(finite) <= _MIN_RANGE_SHARE * np.abs(finite).max():
@@ -209,8 +217,8 @@ def _compare_states(
     return (ratio if differs else 1.0), ""
 
 
-def _name_channel(channel: str) -> str:
-    if channel.endswith("_rate") and channel != "rotation_rate":
+def _name_channel(product: xr.Dataset, channel: str) -> str:
+    if is_rate_of_change(channel, product):
         return f"the rate of change of {channel.removesuffix('_rate').replace('_', ' ')}"
     return channel.replace("_", " ")
 
@@ -243,13 +251,15 @@ def _judge_steadiness(product: xr.Dataset) -> str:
 
 def _judge_terms(product: xr.Dataset, absences: dict[tuple[str, str], list[str]]) -> str:
     """Say which terms no axis observes more often than by chance, and which windows would."""
+    terms = _fitted_terms(product)
     observed_share = (product["observable"] == OBSERVED).mean("time").max("axis")
-    hidden = [term for term in LAWS if observed_share.sel(term=term) <= _FALSE_ALARMS]
+    hidden = [term for term in terms if observed_share.sel(term=term) <= _FALSE_ALARMS]
     window = float(product.attrs.get("window_s", np.nan))
     where = f"in windows of {format_duration(window)}" if np.isfinite(window) else "in any window"
     if not hidden:
-        return f"All five terms are observed {where}{_list_absences(product, absences)}."
-    if len(hidden) == len(LAWS):  # the terms do not describe the record, which has a sentence
+        which = "five" if len(terms) == len(LAWS) else "fitted"
+        return f"All {which} terms are observed {where}{_list_absences(product, absences)}."
+    if len(hidden) == len(terms):  # the terms do not describe the record, which has a sentence
         return f"No term is observed {where}."
     chance = f"no more often than by chance (in up to {100 * _FALSE_ALARMS:.0f} % of them)"
     is_rare = bool(observed_share.sel(term=hidden).any())
@@ -266,13 +276,24 @@ def _judge_terms(product: xr.Dataset, absences: dict[tuple[str, str], list[str]]
         slow = join_words([term for term in hidden if term != "Q"])
         return f"{text}; only a longer record could show {slow}."
     limits = smallest_observable(longer[-1], white)
+    is_allan = product.attrs.get("variance", "avar") == "avar"  # which the limits are for
     sizes = [
         f"{term} from {limits[term]:.2g} {LAWS[term].label}"
         for term in hidden
-        if term in limits and np.isfinite(white)
+        if term in limits and np.isfinite(white) and is_allan
     ]
     text += f": use --window {format_duration(longer[-1])}"
     return text + (f", which observes {join_words(sizes)}." if sizes else ".")
+
+
+def _fitted_terms(product: xr.Dataset) -> list[str]:
+    """List the terms that the fit could find on any axis."""
+    fitted = set(product.attrs.get("fit_terms", LAWS))
+    if product.attrs.get("variance") == "hadamard":
+        fitted -= {"R"}
+    if "filter_time_constant" in product and bool((product["filter_time_constant"] > 0).all()):
+        fitted -= {"Q"}
+    return [term for term in LAWS if term in fitted]
 
 
 def _list_absences(product: xr.Dataset, absences: dict[tuple[str, str], list[str]]) -> str:

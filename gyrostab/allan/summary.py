@@ -14,6 +14,7 @@ from gyrostab.allan.judgement import judge_product
 from gyrostab.allan.window_fit import is_described
 from gyrostab.noise import LAWS
 from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY, check_product
+from gyrostab.wording import format_share
 
 #: Largest number of windows that are fitted again to find the averaging time from which the terms
 #: describe the record.
@@ -228,7 +229,7 @@ def format_product(product: xr.Dataset) -> str:
                 sign + _number_text(term.value),
                 spread,
                 term.unit,
-                _share_text(term.observed_share),
+                _share_or_all(term.observed_share),
             )
         )
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
@@ -261,8 +262,8 @@ def _number_text(value: float) -> str:
     return f"{float(f'{value:.3g}'):g}" if np.isfinite(value) else "-"
 
 
-def _share_text(share: float) -> str:
-    return "all" if share == 1.0 else f"{100 * share:.0f} %"
+def _share_or_all(share: float) -> str:
+    return "all" if share == 1.0 else format_share(share)
 
 
 def _count_windows(affected: NDArray[np.bool_]) -> str:
@@ -284,7 +285,7 @@ def _describe_misfit(product: xr.Dataset) -> list[str]:
     ratios = ", ".join(f"{fit.axis} {_number_text(fit.chi2_per_dof)}" for fit in fits)
     lines = [f"Misfit, median chi2/dof (1 is ideal): {ratios}."]
     failing = [
-        f"{fit.axis} in {_share_text(fit.failing_share)} of its windows"
+        f"{fit.axis} in {_share_or_all(fit.failing_share)} of its windows"
         for fit in fits
         if fit.fails
     ]

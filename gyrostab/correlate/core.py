@@ -91,7 +91,7 @@ def correlate(
     names = _select_variables(product, variables)
     time = (product["time"].values - product["time"].values[0]) / np.timedelta64(1, "s")
     length, step = _window_lengths(product, time)
-    lags = _choose_lags(max_lag, float(time[-1] - time[0]) if time.size else 0.0, step)
+    lags = _choose_lags(max_lag, float(time[-1] - time[0]), step)
     is_list = isinstance(channel, Sequence) and not isinstance(channel, str)
     channels: list[Any] = list(channel) if is_list else [channel]
     for item in channels:
@@ -105,12 +105,11 @@ def correlate(
     entries: dict[tuple[int, int, int], dict[str, Any]] = {}
     groups: dict[bytes, list[tuple[int, int]]] = {}
     masks, lags, drivers = _usable_windows(product, names, lags, drivers)
+    coverage = product["window_coverage"].values
     for place, mask in masks.items():
-        groups.setdefault(mask.tobytes(), []).append(place)
+        groups.setdefault(mask.tobytes() + coverage[place[0]].tobytes(), []).append(place)
     for places in groups.values():
-        blocks = make_blocks(
-            masks[places[0]], time, length, step, product["window_coverage"].values[places[0][0]]
-        )
+        blocks = make_blocks(masks[places[0]], time, length, step, coverage[places[0][0]])
         series = (
             np.stack([product[names[v]].values[a] for a, v in places], axis=1)[blocks.windows]
             if blocks
@@ -168,21 +167,13 @@ def _select_variables(product: xr.Dataset, variables: str | Sequence[str] | None
 def _window_lengths(product: xr.Dataset, time: Array) -> tuple[float, float]:
     """Find length and step of the windows [s]."""
     bounds = product["time_bounds"].values
-    length = (
-        float(np.median(bounds[:, 1] - bounds[:, 0]) / np.timedelta64(1, "s"))
-        if len(bounds)
-        else 1.0
-    )
+    length = float(np.median(bounds[:, 1] - bounds[:, 0]) / np.timedelta64(1, "s"))
     spacing = float(np.median(np.diff(time))) if time.size > 1 else length
     return length, float(product.attrs.get("step_s", spacing))
 
 
 def _choose_lags(max_lag: Any, span: float, step: float) -> NDArray[np.int64]:
-    longest = 0.0
-    if max_lag is None:
-        longest = 0.1 * span
-    elif max_lag and str(max_lag).strip() != "0s":
-        longest = duration_seconds(max_lag, "max_lag")
+    longest = 0.1 * span if max_lag is None else duration_seconds(max_lag, "max_lag", zero=True)
     if longest > span:
         raise OptionError(
             f"max_lag {max_lag} is longer than the record ({span:g} s); give a shorter --max-lag"
@@ -203,11 +194,7 @@ def _usable_windows(
     is_known = np.logical_and.accumulate(
         np.all([np.isfinite(driver.values) for driver in drivers], axis=0), axis=0
     )
-    last_lag = int(
-        np.flatnonzero(is_known.sum(axis=1) >= min(2 / 3 * is_known[0].sum(), is_known[0].sum()))[
-            -1
-        ]
-    )
+    last_lag = int(np.flatnonzero(is_known.sum(axis=1) >= 2 / 3 * is_known[0].sum())[-1])
     lags = lags[: last_lag + 1]
     drivers = [replace(driver, values=driver.values[: last_lag + 1]) for driver in drivers]
     masks = {}

@@ -152,8 +152,8 @@ def _limit_flags(
 def _slope_label(key: str, level: float) -> str:
     ends = {
         "stderr": "standard error",
-        "low": f"lower end of the {100 * level:.0f} % interval",
-        "high": f"upper end of the {100 * level:.0f} % interval",
+        "low": f"lower end of the {100 * level:g} % interval",
+        "high": f"upper end of the {100 * level:g} % interval",
     }
     ramps = {
         f"{way}{end}": f"while it {verb}{text}"
@@ -168,7 +168,17 @@ def _slope_label(key: str, level: float) -> str:
 
 
 def join(product: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
-    """Merge product and correlation; a variable that both hold is that of the product."""
+    """Merge product and correlation; a variable that both hold is that of the product.
+
+    An earlier correlation in the product is replaced.
+    """
+    earlier = [str(name) for name in product.get("driver", xr.DataArray([])).values]
+    sensitivities = [
+        name
+        for name in map(str, product.data_vars)
+        if any(f"_per_{driver}" in name for driver in earlier)
+    ]
+    product = product.drop_vars(sensitivities).drop_dims(["driver", "variable"], errors="ignore")
     new = [name for name in result.data_vars if name not in product.variables]
     return product.merge(result[new], compat="no_conflicts").assign_attrs(
         interval_level=result.attrs["interval_level"], longest_lag_s=result.attrs["longest_lag_s"]

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError, SchemaError, TimeError
 from gyrostab.kernels.regression.trend import window_trend
+from gyrostab.schema import is_rate_of_change
 from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import HOUR, INNER
 
 Array = NDArray[np.float64]
 
 # A gap is bridged if it is at most as long as a window or this many sample spacings of the channel.
-_MAX_GAP_SPACINGS = 3.0
+MAX_GAP_SPACINGS = 3.0
 
 # Names in the denominator of a sensitivity: a difference of temperatures is in kelvin, and UDUNITS
 # takes "g" for the gram.
@@ -27,12 +28,13 @@ _DIFFERENCE_UNITS = {"degree_Celsius": "K", "g": "standard_free_fall"}
 
 @dataclass(frozen=True)
 class Driver:
-    """A channel, or its rate of change, by (lag, window)."""
+    """A channel, or its rate of change (`derived`), by (lag, window)."""
 
     name: str
     label: str
     units: str
     values: Array
+    derived: bool = False
 
 
 def align_drivers(
@@ -100,12 +102,13 @@ def _align_channel(
         mean, rate = _align_file_channel(channel, product, lags, step)
     label = name.replace("_", " ")
     return [
-        Driver(name, label, units, mean),
+        Driver(name, label, units, mean, is_rate_of_change(name, product)),
         Driver(
             f"{name}_rate",
             f"rate of change of {label}",
             _multiply_units(_difference_unit(units), {"hour": -1}),
             rate,
+            derived=True,
         ),
     ]
 
@@ -168,7 +171,7 @@ def _align_product_channel(
     max_windows = (
         max(
             _window_length_ns(product) / 1e9 / step,
-            _MAX_GAP_SPACINGS * float(np.median(apart)) if apart.size else 0.0,
+            MAX_GAP_SPACINGS * float(np.median(apart)) if apart.size else 0.0,
         )
         + 1e-6
     )
@@ -205,9 +208,9 @@ def _align_file_channel(
     first, last = np.searchsorted(stamps, start), np.searchsorted(stamps, start + length)
     held = last - first
     spacing = float(np.median(np.diff(stamps))) if stamps.size > 1 else 0.0
-    longest = max(length, _MAX_GAP_SPACINGS * spacing)
+    longest = max(length, MAX_GAP_SPACINGS * spacing)
     if spacing > 0.5 * length:
-        mean = _interpolate_values(values, stamps, start + length // 2, longest)
+        mean = interpolate_values(values, stamps, start + length // 2, longest)
         rate = _difference_means(mean, step)
     else:
         mean, rate = window_trend(values, (stamps - stamps[0]) / 1e9, first, last)
@@ -218,7 +221,7 @@ def _align_file_channel(
     return [_shift_by_lags(row, lead, place, lags) for row in (mean, rate)]
 
 
-def _interpolate_values(
+def interpolate_values(
     values: Array, stamps: NDArray[np.int64], at: NDArray[np.int64], longest: float
 ) -> Array:
     """Interpolate between values that are at most `longest` apart; NaN elsewhere."""

@@ -104,9 +104,7 @@ def fit_driver(
         return [_empty_entry({"too_few"}) for _ in range(series.shape[1])]
     x = np.asarray(blocks.average @ driver.values[:, blocks.windows].T)
     y = np.asarray(blocks.average @ series)
-    limits = driver_limits(
-        x[:, 0], blocks.pieces, driver.units, derived=driver.name.endswith("_rate")
-    )
+    limits = driver_limits(x[:, 0], blocks.pieces, driver.units, derived=driver.derived)
     timed = np.concatenate([blocks.offsets, blocks.trend], axis=1)
     nuisance = blocks.offsets if "no_reversal" in limits else timed
     if not limits & {"constant", "too_few"}:
@@ -117,7 +115,7 @@ def fit_driver(
     if limits & {"constant", "too_few", "one_moment"}:
         return [_empty_entry(limits, windows=blocks.windows.size) for _ in range(series.shape[1])]
     other_series = [
-        np.asarray(blocks.average @ np.nan_to_num(row[blocks.windows]))
+        np.asarray(blocks.average @ row[blocks.windows])
         for row in other_series
         if np.isfinite(row[blocks.windows]).all()
     ]

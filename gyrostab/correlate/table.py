@@ -45,7 +45,7 @@ def correlation_rows(result: xr.Dataset) -> list[dict[str, str]]:
                         "driver": str(driver),
                         "lag [s]": lag,
                         "sensitivity": value,
-                        f"{100 * result.attrs['interval_level']:.0f} % interval": "-"
+                        f"{100 * result.attrs['interval_level']:g} % interval": "-"
                         if np.isnan(low)
                         else f"{low:.3g} .. {high:.3g}",
                         **_partial_column(cell, f"{name}_per_{driver}_partial"),

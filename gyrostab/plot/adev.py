@@ -169,7 +169,7 @@ def _select_window(part: xr.Dataset, when: Any) -> int:
         raise OptionError(
             f"time {when!r} is not understood; write it as 2026-11-20T14:30:00"
         ) from error
-    half = np.timedelta64(int(float(part.attrs.get("window_s", 0.0)) * 1e9), "ns")
+    half = np.timedelta64(int(float(part.attrs.get("window_s", 0.0)) * 0.5e9), "ns")
     if not time[0] - half <= stamp <= time[-1] + half:
         raise OptionError(
             f"time {when} is outside the record, which has windows from {time[0]} to {time[-1]}"
@@ -183,6 +183,7 @@ def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours:
 
     tau = window["tau"].values
     total = np.zeros(tau.size)
+    power = 0.5 if window.attrs.get("fit_method") == "adev" else 1.0  # deviations add in that fit
     responses = {"N": "white_response", "Q": "quantization_response", "R": "ramp_response"}
     columns = surface_columns(window)
     for number, (symbol, law) in enumerate(LAWS.items()):
@@ -191,9 +192,10 @@ def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours:
         term = columns[:, number] * np.nan_to_num(float(estimates[symbol])) ** 2
         response = window[responses[symbol]].values if responses.get(symbol) in window else 1.0
         term = term * np.where(np.isfinite(response), response, 1.0)
-        total += term * (limit_response(window, tau) if symbol == "N" else 1.0)
+        total += (term * (limit_response(window, tau) if symbol == "N" else 1.0)) ** power
         if state == OBSERVED:
-            label = f"{symbol} = {value:.3g} ± {error:.1g} {unit_symbol(law.label)} ({law.name})"
+            spread = f" ± {error:.1g}" if np.isfinite(error) else ""
+            label = f"{symbol} = {value:.3g}{spread} {unit_symbol(law.label)} ({law.name})"
             panel.plot(
                 tau,
                 np.sqrt(term),
@@ -206,7 +208,9 @@ def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours:
             label = f"{symbol} < {upper:.3g} {unit_symbol(law.label)} ({law.name})"
             panel.plot([], [], linestyle="none", label=label)
     if np.nansum(total) > 0:
-        panel.plot(tau, np.sqrt(total), color="black", linewidth=1.6, label=_name_curve(window))
+        panel.plot(
+            tau, total ** (0.5 / power), color="black", linewidth=1.6, label=_name_curve(window)
+        )
 
 
 def _name_curve(window: xr.Dataset) -> str:
@@ -215,6 +219,6 @@ def _name_curve(window: xr.Dataset) -> str:
 
     chi2, dof = float(window["fit_chi2"]), float(window["fit_dof"])
     if not dof > 0:
-        return "sum of the five fitted terms"
+        return "sum of the fitted terms"
     verdict = "" if is_described(chi2, dof) else ": the terms do not describe this window"
     return f"sum of the fitted terms, χ²/dof = {chi2 / dof:.3g}{verdict}"

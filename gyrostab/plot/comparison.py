@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -124,7 +125,10 @@ def plot_comparison(
     )
     if moments:
         _draw_curves(
-            panels[0, 0], logs, pair, [duration_seconds(moment, "moment") for moment in moments]
+            panels[0, 0],
+            logs,
+            pair,
+            [duration_seconds(moment, "moment", zero=True) for moment in moments],
         )
         panels[0, 0].set_title(f"Allan deviation, windows of {name}")
     else:
@@ -160,7 +164,8 @@ def _draw_curves(panel: Axes, logs: Any, pair: Any, moments: list[float]) -> Non
         **_STYLES[0],
         label="without, mean",
     )
-    for colour, dashes, moment in zip(COLOURS, ("-", "--", "-.", ":"), moments, strict=False):
+    lines = zip(itertools.cycle(COLOURS), itertools.cycle(("-", "--", "-.", ":")), strict=True)
+    for moment, (colour, dashes) in zip(moments, lines, strict=False):
         when = moment / {"h": HOUR, "min": 60.0}[word]
         curve = np.sqrt(pair[1]["avar"].values[np.abs(centres - when).argmin()])
         panel.loglog(tau, curve, dashes, color=colour, lw=1.3, label=f"with, at {when:g} {word}")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from gyrostab.correlate.drivers import MAX_GAP_SPACINGS, interpolate_values
 from gyrostab.correlate.judge import VERDICTS, format_p_value
 from gyrostab.errors import SchemaError
 from gyrostab.noise import LAWS
@@ -22,6 +23,7 @@ from gyrostab.plot.style import (
     write_in_middle,
 )
 from gyrostab.schema import OBSERVED
+from gyrostab.time.stamps import to_nanoseconds
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -119,7 +121,8 @@ def plot_correlation(
 def _draw_panel(panel: Axes, part: xr.Dataset, variable: str, driver: str) -> None:
     cell = part.sel(variable=variable, driver=driver)
     lag = float(np.nan_to_num(cell["coupling_lag"]))
-    x, rising = _shift_driver(part[driver], lag)
+    longest = sum(float(part.attrs.get(name, 0.0)) for name in ("window_s", "step_s"))
+    x, rising = _shift_driver(part[driver], lag, longest)
     y = part[variable].values
     good = np.isfinite(x) & np.isfinite(y)
     if variable in LAWS and "observable" in part:
@@ -162,17 +165,20 @@ def _verdict_text(verdict: str, lag: float, p: float) -> str:
     return f"{verdict.replace('_', ' ')}{late}, p {'' if p < 1e-4 else '= '}{format_p_value(p)}"
 
 
-def _shift_driver(driver: xr.DataArray, lag: float) -> tuple[Any, Any]:
-    """Shift the driver by the lag, and find where it rises; NaN before the record and in gaps."""
-    seconds = (driver["time"].values - driver["time"].values[0]) / np.timedelta64(1, "s")
+def _shift_driver(driver: xr.DataArray, lag: float, longest: float) -> tuple[Any, Any]:
+    """Shift the driver by the lag, and find where it rises.
+
+    NaN before the record, and in gaps that `gyrostab.correlate` does not bridge.
+    """
     values = driver.values.astype(np.float64)
     is_finite = np.isfinite(values)
     if is_finite.sum() < 3:
         return np.full(values.size, np.nan), np.zeros(values.size, bool)
-    at = seconds - lag
-    moved = np.interp(at, seconds[is_finite], values[is_finite], left=np.nan, right=np.nan)
-    slope = np.interp(at, seconds[is_finite], np.gradient(values[is_finite], seconds[is_finite]))
-    return moved, slope > 0
+    stamps, values = to_nanoseconds(driver["time"].values), values[is_finite]
+    at, stamps = stamps - round(1e9 * lag), stamps[is_finite]
+    spacing = float(np.median(np.diff(stamps)))
+    moved = interpolate_values(values, stamps, at, max(1e9 * longest, MAX_GAP_SPACINGS * spacing))
+    return moved, np.interp(at, stamps, np.gradient(values, stamps)) > 0
 
 
 def _legend_handles(driver: str, level: float) -> list[Any]:
@@ -187,7 +193,7 @@ def _legend_handles(driver: str, level: float) -> list[Any]:
             facecolor="#8c8c8c",
             alpha=0.3,
             edgecolor="black",
-            label=f"{100 * level:.0f} % interval of the slope",
+            label=f"{100 * level:g} % interval of the slope",
         ),
         Line2D([], [], color="black", linewidth=1.2, label="slope where coupled"),
     ]

@@ -33,6 +33,7 @@ def product_figures(
     two windows and two averaging times).
     """
     check_product(product)
+    drivers = product["driver"].values if "driver" in product.coords else ()
     figures: dict[str, Callable[[], Figure]] = {
         "coefficients": lambda: plot_coefficients(product, width=width),
         "davar": lambda: plot_davar(product, width=width),
@@ -40,7 +41,9 @@ def product_figures(
     }
     if "temperature" in product and product["temperature"].dims == ("time",):
         figures["temperature"] = lambda: plot_correlation(
-            product if "coupling_verdict" in product else correlate(product), width=width
+            product if "temperature" in drivers else correlate(product),
+            driver="temperature",
+            width=width,
         )
     for axis in axis_names(product):
         figures[f"adev_{axis}"] = lambda axis=axis: plot_adev(product, axis, width=width)  # type: ignore[misc]

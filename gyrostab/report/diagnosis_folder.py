@@ -136,7 +136,7 @@ def open_diagnosis(directory: str | os.PathLike[str]) -> Diagnosis:
             f"{error.filename}: cannot be read ({error.strerror}); "
             f"is {directory} the folder of a diagnosis?"
         ) from error
-    except (ValueError, SchemaError) as error:
+    except (ValueError, RecursionError, SchemaError) as error:
         raise FormatError(
             f"{directory}: holds no diagnosis that can be read ({error}); "
             "make it again with gyrostab diagnose"

@@ -17,6 +17,7 @@ from gyrostab.report.page import page_text
 from gyrostab.report.product_charts import product_charts, window_data
 from gyrostab.schema import GAP_CAUSES, check_product, texts
 from gyrostab.store.output import new_output
+from gyrostab.wording import format_share
 
 if TYPE_CHECKING:
     from gyrostab.allan.summary import TermSummary
@@ -117,12 +118,6 @@ def _number_text(value: float) -> str:
     return "–" if not np.isfinite(value) else f"{value:.3g}"
 
 
-def _share_text(share: float) -> str:
-    if 0.0 < share < 0.01:
-        return "< 1 %"
-    return "> 99 %" if 0.99 < share < 1.0 else f"{100.0 * share:.0f} %"
-
-
 def _missing_shares(product: xr.Dataset) -> dict[str, float]:
     coverage = product["window_coverage"]
     return {name: 1.0 - float(coverage.sel(axis=name).mean()) for name in axis_names(product)}
@@ -169,7 +164,7 @@ def _describe_findings(
     if missing:
         lines.append(
             "Missing samples, mean over the windows: "
-            + ", ".join(f"axis {axis} {_share_text(share)}" for axis, share in missing.items())
+            + ", ".join(f"axis {axis} {format_share(share)}" for axis, share in missing.items())
             + "."
         )
     else:
@@ -182,7 +177,7 @@ def _list_facts(product: xr.Dataset) -> list[tuple[str, str]]:
     start, end = _record_span(product)
     tau = product["tau"].values
     shortest, longest = (duration(float(tau[end])) for end in (0, -1))
-    missing = (f"{axis}: {_share_text(share)}" for axis, share in _missing_shares(product).items())
+    missing = (f"{axis}: {format_share(share)}" for axis, share in _missing_shares(product).items())
     facts = [
         ("Files", ", ".join(_file_names(product)) or "not recorded"),
         ("Span (UTC)", f"{_stamp_text(start)} to {_stamp_text(end)}"),
@@ -209,7 +204,7 @@ def _list_facts(product: xr.Dataset) -> list[tuple[str, str]]:
         for name, label in plain.items()
         if name in attrs
     ]
-    shares = [f"{label}: {_share_text(share)}" for label, share in _estimator_shares(product)]
+    shares = [f"{label}: {format_share(share)}" for label, share in _estimator_shares(product)]
     return [*facts, ("Cells of the surface", ", ".join(shares))]
 
 
@@ -232,11 +227,11 @@ def _coefficient_rows(terms: list[TermSummary]) -> list[dict[str, Any]]:
             "range": f"{_number_text(term.low)} to {_number_text(term.high)}"
             if np.isfinite(term.median)
             else "–",
-            "observed": _share_text(term.observed_share),
-            "rare": f" (observed in {_share_text(term.observed_share)} of the windows only)"
+            "observed": format_share(term.observed_share),
+            "rare": f" (observed in {format_share(term.observed_share)} of the windows only)"
             if term.observed_share < 0.5
             else "",
-            "limited": _share_text(term.limited_share),
+            "limited": format_share(term.limited_share),
             "limit": f"< {_number_text(term.limit)}" if np.isfinite(term.limit) else "–",
         }
         for term in terms

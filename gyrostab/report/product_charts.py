@@ -143,6 +143,8 @@ def _fitted_avar(part: xr.Dataset) -> NDArray[np.float64]:
     white = list(LAWS).index("N")
     filtered = (limit_response(part, part["tau"].values) - 1.0) * unit[white]
     curve = np.nan_to_num(squares)
+    if part.attrs.get("fit_method") == "adev":  # deviations add in that fit, without a filter
+        return np.where(fitted, (np.sqrt(curve) @ np.sqrt(unit)) ** 2, np.nan)
     curve = curve @ unit + curve[..., white, None] * np.atleast_2d(filtered)[:, None]
     return np.where(fitted, curve, np.nan)
 
@@ -187,15 +189,13 @@ def _average_windows(product: xr.Dataset) -> xr.Dataset:
     part = _thin_product(product, _MAX_WINDOWS, _MAX_TAUS)
     surface = part[[name for name in part.data_vars if part[name].dims[-1:] == ("tau",)]]
     mean = surface.mean("time", keep_attrs=True).expand_dims(time=1, axis=1)
-    span = (part["time"].values[-1] - part["time"].values[0]) / np.timedelta64(1, "s")
-    independent = 1.0 + span / float(product.attrs.get("window_s", np.inf))
     record = part.isel(time=[part.sizes["time"] // 2])
     record = record.assign({name: mean[name].transpose(*part[name].dims) for name in surface})
-    record["edf"] = record["edf"] * independent
     if "window_trend" in part:  # ramps add the mean of their squares to the mean surface
         trend = (part["window_trend"] ** 2).mean("time") ** 0.5
         record["window_trend"] = trend.expand_dims(time=1, axis=1)
-    return record
+    # the mean of that has a sign, and does not belong to the root mean square of the other
+    return record.drop_vars("difference_trend", errors="ignore")
 
 
 def _draw_coefficients(product: xr.Dataset, gaps: list[dict[str, Any]]) -> go.Figure:

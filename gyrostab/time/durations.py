@@ -18,7 +18,9 @@ _COUNT = re.compile(r"^\d{1,18}$", re.ASCII)
 _NUMBER = re.compile(r"^\s*[-+]?(\d+(\.\d*)?|\.\d+)(e[-+]?\d+)?\s*$", re.IGNORECASE)
 
 
-def duration_seconds(value: Any, option: str, *, example: str = "10min, 30s or 2h") -> float:
+def duration_seconds(
+    value: Any, option: str, *, example: str = "10min, 30s or 2h", zero: bool = False
+) -> float:
     """Convert a duration to seconds: a number [s], a timedelta, or a string such as ``"10min"``.
 
     Lengths that may also be counted in samples (window, step and block) are read by `samples`,
@@ -27,7 +29,7 @@ def duration_seconds(value: Any, option: str, *, example: str = "10min, 30s or 2
     Raises
     ------
     OptionError
-        When it cannot be read or is not above zero.
+        When it cannot be read or is not above zero; with `zero`, when it is below zero.
 
     Examples
     --------
@@ -36,7 +38,7 @@ def duration_seconds(value: Any, option: str, *, example: str = "10min, 30s or 2
     """
     try:
         if isinstance(value, str):
-            if _is_bare_number(value):
+            if _is_bare_number(value) and not (zero and float(value) == 0.0):
                 raise OptionError(f"{option} {value!r} has no unit; write for instance {example}")
             seconds = pd.Timedelta(re.sub(r"(?<=[\d ])m$", "min", value.strip())).value / 1e9
         elif _is_bare_number(value):
@@ -49,7 +51,7 @@ def duration_seconds(value: Any, option: str, *, example: str = "10min, 30s or 2
         raise OptionError(
             f"{option} {value!r} is not a duration; write for instance {example}"
         ) from error
-    if not (np.isfinite(seconds) and seconds > 0):
+    if not (np.isfinite(seconds) and (seconds > 0 or (zero and seconds == 0))):
         raise OptionError(f"{option} {value!r} must be longer than zero")
     return float(seconds)
 

@@ -451,6 +451,28 @@ def test_a_lazy_surface_stays_lazy_and_fits_the_same():
         np.testing.assert_array_equal(lazy[name].values, eager[name].values)
 
 
+@pytest.mark.parametrize("planes", [None, 3])
+def test_cubes_and_planes_may_have_other_chunks(planes):
+    """Of a stored surface only the long variables are lazy."""
+    x = np.random.default_rng(12).standard_normal((2, 20_000))
+    surface = davar(make_log(x, rate=RATE, unit="deg/h"), window="2000samples", step="500samples")
+    chunks = {name: {"time": 16} if "tau" in v.dims else planes for name, v in surface.items()}
+    lazy = surface.assign(
+        {name: surface[name].chunk(size) for name, size in chunks.items() if size is not None}
+    )
+    fitted = fit_noise(lazy)
+    assert isinstance(fitted.N.data, da.Array)
+    xr.testing.assert_allclose(fitted.compute(), fit_noise(surface))
+
+
+def test_terms_count_once_whatever_iterable_holds_them():
+    x = np.random.default_rng(12).standard_normal(6000)
+    surface = davar(make_log(x, rate=RATE, unit="deg/h"), window="2000samples", step="500samples")
+    expected = fit_noise(surface, terms="NB")
+    for terms in ("NBN", ["N", "B"], iter("NB")):
+        xr.testing.assert_identical(fit_noise(surface, terms=terms), expected)
+
+
 def test_many_averaging_times_are_thinned_for_the_fit():
     surface = davar(
         make_log(np.random.default_rng(13).standard_normal(6000), rate=RATE, unit="deg/h"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from gyrostab.allan.davar import davar
 from gyrostab.allan.fit import fit_noise
@@ -80,3 +81,14 @@ def test_edge_ratio_equals_its_definition_and_ignores_gaps_outside_the_window():
                 (near_gaps if np.isnan(around).any() else elsewhere).append(second)
         assert ratio == pytest.approx(np.mean(near_gaps) / np.mean(elsewhere), rel=1e-12)
     assert np.isnan(gap_edge_ratio(np.arange(3000), np.array([0]), 3000)[0])  # integers
+
+
+def test_an_infinite_sample_is_a_missing_one():
+    values = np.random.default_rng(3).standard_normal(6000) + 0.05 * np.arange(6000)
+    values[2000:2100] = np.nan
+    fitted = []
+    for number in (np.nan, np.inf):
+        values[3000] = number
+        log = make_log(values, rate=10.0, unit="deg/h")
+        fitted.append(fit_noise(davar(log, window="1min", step="1min")))
+    xr.testing.assert_equal(*(product.drop_vars("outlier_count") for product in fitted))

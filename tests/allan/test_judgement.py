@@ -102,3 +102,20 @@ def test_suggested_windows_fit_the_record():
     assert "--window 4h --step 24min" in lines[-1]
     assert suggest_windows(100.0, WHITE) == []
     assert suggest_windows(1e5, float("nan")) == []
+
+
+def test_terms_that_were_not_fitted_are_not_missed():
+    product = _make_product(dict.fromkeys("QBKR", UPPER_LIMIT_ONLY)).assign_attrs(fit_terms="N")
+    assert judge_product(product)[1].startswith("All fitted terms are observed")
+    product = _make_product({"B": UPPER_LIMIT_ONLY, "R": UPPER_LIMIT_ONLY})
+    text = judge_product(product.assign_attrs(variance="hadamard"))[1]
+    assert text.startswith("B is not observed")
+    assert "which observes" not in text
+
+
+def test_a_decrease_and_a_channel_called_a_rate_are_described_as_what_they_are():
+    product = _make_product({}, vibration=[0.0, 8.0]).rename(vibration="flow_rate")
+    product["N"].loc[{"axis": "x"}] = np.resize([5.0, 1.0], product.sizes["time"])
+    assert judge_product(product)[0] == (
+        "N is smaller by a factor of 5 on x while flow rate is high."
+    )

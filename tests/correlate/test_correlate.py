@@ -14,6 +14,7 @@ import xarray as xr
 
 import gyrostab
 from gyrostab.cli import main
+from gyrostab.correlate.dataset import join
 from gyrostab.correlate.judge import VERDICTS
 from gyrostab.correlate.table import format_correlation
 from gyrostab.errors import OptionError, TimeError
@@ -25,6 +26,7 @@ from gyrostab.kernels.regression.coupling import (
     slope_interval,
     uncalibrated,
 )
+from gyrostab.plot.figures import product_figures
 from tests.support import coupled, synthetic
 from tests.support.cf_checker import assert_follows_cf
 
@@ -521,3 +523,39 @@ def test_term_observed_in_scattered_windows_only_gives_no_verdict():
         VERDICTS[int(correlation["coupling_verdict"].sel(axis="x", variable="Q").values[0])]
         == "cannot_tell"
     )
+
+
+def test_an_axis_is_judged_by_its_own_coverage():
+    product = coupled.product(axes="xy", gap=False, terms=False)
+    product["window_coverage"].loc["y"] = np.resize(np.repeat([1.0, 0.08], 10), 120)
+    both, alone = (gyrostab.correlate(part) for part in (product, product.sel(axis=["y"])))
+    own = both.sel(axis=["y"])
+    for name in ("p_value", "window_mean_per_temperature", "window_mean_per_temperature_stderr"):
+        np.testing.assert_array_equal(own[name].values, alone[name].values)
+
+
+def test_a_second_correlation_replaces_the_first():
+    product = shaken_product()
+    first = join(product, gyrostab.correlate(product))
+    second = gyrostab.correlate(first, channel="vibration", variables="window_mean")
+    joined = join(first, second)
+    assert list(joined["driver"].values) == ["vibration", "vibration_rate"]
+    assert not [name for name in joined if "_per_temperature" in str(name)]
+    assert all(joined[name].variable.equals(second[name].variable) for name in second)
+    figure = product_figures(joined)["temperature"]()
+    assert figure.axes[-2].get_xlabel().startswith("temperature")
+
+
+@pytest.mark.parametrize("name", ["spin", "rotation_rate", "temperature_rate"])
+def test_only_the_rate_of_change_of_a_channel_needs_no_plateau(name):
+    product = coupled.product(terms=False)
+    ramp = np.abs(np.arange(120) % 40 - 20.0)
+    product[name] = ("time", ramp, {"units": "degree s-1"})
+    limits = gyrostab.correlate(product, channel=name)["coupling_limits"].sel(driver=name)
+    bit = dict(zip(limits.flag_meanings.split(), limits.flag_masks, strict=True))["no_plateau"]
+    assert bool((limits & bit).any()) == (name != "temperature_rate")
+
+
+@pytest.mark.parametrize("none", [0, "0", "0min", np.timedelta64(0, "s")])
+def test_no_lag_can_be_written_in_any_way(none):
+    assert float(gyrostab.correlate(coupled.product(), max_lag=none).attrs["longest_lag_s"]) == 0.0

@@ -81,9 +81,10 @@ def test_the_panels_show_what_the_closed_forms_say() -> None:
     own, common = rng.standard_normal((2, 36_000)), rng.standard_normal(36_000)
     without = make_log(own, rate=10.0, unit="deg/h")
     louder = make_log(np.stack([own[0] + common, own[1] - common]) + 3.0, rate=10.0, unit="deg/h")
-    figure = plot_comparison(without, louder, window="10min", moments=[1800.0])
+    figure = plot_comparison(without, louder, window="10min", moments=[1800.0, *range(9)])
     curves, means, power, across = figure.axes
-    before, after = (np.asarray(line.get_ydata(), float) for line in curves.get_lines())
+    before, after, *others = (np.asarray(line.get_ydata(), float) for line in curves.get_lines())
+    assert len(others) == 9
     assert after[0] / before[0] == pytest.approx(np.sqrt(2.0), rel=0.05)
     before, after = (np.asarray(line.get_ydata(), float) for line in means.get_lines())
     assert np.mean(after - before) == pytest.approx(3.0, abs=0.1)

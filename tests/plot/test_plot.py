@@ -20,6 +20,7 @@ from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import LAWS, model_avar
 from gyrostab.plot import plot_adev, plot_coefficients, plot_davar, plot_davar_3d, plot_signal
 from gyrostab.plot.adev import band
+from gyrostab.plot.correlation import _shift_driver
 from gyrostab.plot.signal import thin
 from gyrostab.plot.style import save_png
 from gyrostab.report.product import write_report
@@ -302,11 +303,23 @@ def test_adev_without_a_time_avoids_the_gap(product):
 
 
 @pytest.mark.parametrize(
-    ("when", "words"), [("2031-01-01", "outside the record"), ("noon", "not understood")]
+    ("when", "words"),
+    [
+        ("2031-01-01", "outside the record"),
+        ("noon", "not understood"),
+    ],
 )
 def test_adev_refuses_an_impossible_time(product, when, words):
     with pytest.raises(OptionError, match=words):
         plot_adev(product, "x", when=when)
+
+
+def test_adev_takes_times_within_half_a_window_of_the_first(product):
+    first = product["time"].values[0]
+    half = np.timedelta64(int(500 * product.attrs["window_s"]), "ms")
+    plot_adev(product, "x", when=first - half)
+    with pytest.raises(OptionError, match="outside the record"):
+        plot_adev(product, "x", when=first - half - np.timedelta64(1, "s"))
 
 
 def save_all(product: xr.Dataset, folder: Path) -> None:
@@ -379,3 +392,25 @@ def test_product_of_a_constant_signal_is_drawn_without_warnings(share, tmp_path)
 def test_impossible_widths_are_refused(product, width):
     with pytest.raises(OptionError, match=r"cannot be .* mm wide; give --width"):
         plot_coefficients(product, width=width)
+
+
+def test_points_are_drawn_where_the_fit_knows_the_channel():
+    time = np.datetime64("2026-01-01", "ns") + np.arange(40) * np.timedelta64(60, "s")
+    values = np.where((np.arange(40) >= 10) & (np.arange(40) < 20), np.nan, np.arange(40.0))
+    values[30] = np.nan
+    driver = xr.DataArray(values, {"time": time})
+    moved, rises = _shift_driver(driver, 60.0, 120.0)
+    assert rises.all()
+    known = np.r_[1:11, 21:40]
+    np.testing.assert_allclose(moved[known], known - 1.0)
+    assert np.isnan(moved[[0, *range(11, 21)]]).all()
+
+
+def test_curve_of_a_fit_of_deviations_is_their_sum():
+    noise = np.random.default_rng(4).standard_normal(6000)
+    surface = davar(make_log(noise, rate=10.0, unit="deg/h"), window="2min", step="2min")
+    fitted = fit_noise(surface, terms="NB", method="adev")
+    line = plot_adev(fitted, "x").axes[0].lines[-1]
+    window = fitted.isel(axis=0, time=fitted.sizes["time"] // 2)
+    parts = (model_avar(fitted.tau.values, {term: float(window[term])}) for term in "NB")
+    np.testing.assert_allclose(line.get_ydata(), sum(map(np.sqrt, parts)), rtol=1e-9)

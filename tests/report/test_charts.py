@@ -13,6 +13,7 @@ import subprocess
 import numpy as np
 import pytest
 
+from gyrostab import davar, fit_noise, make_log
 from gyrostab.jobs.archive import LogRun
 from gyrostab.jobs.fleet_table import list_effects, make_table, summarise_run
 from gyrostab.noise import model_avar
@@ -81,6 +82,14 @@ def test_the_record_is_the_mean_of_the_windows_and_its_fit_follows():
     np.testing.assert_allclose(
         _decode_numbers(fitted["y"]), np.sqrt(model_avar(tau, terms)), rtol=0.12
     )
+
+
+def test_the_fit_of_the_record_follows_through_gaps():
+    values = np.random.default_rng(7).standard_normal(36_000)
+    values[(np.arange(36_000) % 1500) < 20] = np.nan
+    product = fit_noise(davar(make_log(values, rate=10.0, unit="deg/h"), window="5min"))
+    measured, fitted = (_decode_numbers(t["y"]) for t in _figures(product)["record"]["data"])
+    np.testing.assert_allclose(fitted[-3:], measured[-3:], rtol=0.06)
 
 
 def test_coefficients_are_estimates_or_limits_on_one_time_axis():

@@ -42,7 +42,7 @@ def gap_edge_ratio(x, starts, length):  # type: ignore[no-untyped-def]
     out = np.full(starts.size, np.nan)
     missing = 0
     for i in range(x.size):
-        missing += 1 if x[i] != x[i] else 0
+        missing += 0 if np.isfinite(x[i]) else 1
     if missing == 0:
         return out
     total = np.zeros((x.size + 1, 2))  # sums and counts before each sample: near gaps, elsewhere
@@ -50,7 +50,7 @@ def gap_edge_ratio(x, starts, length):  # type: ignore[no-untyped-def]
     first = 0
     while first < x.size:
         last = first
-        while last < x.size and x[last] == x[last]:
+        while last < x.size and np.isfinite(x[last]):
             last += 1
         for i in range(first + 1, last - 1):
             difference = abs(np.float64(x[i - 1]) - 2.0 * np.float64(x[i]) + np.float64(x[i + 1]))

@@ -21,7 +21,7 @@ def _add_moments(x, angle, base, first, last, out):  # type: ignore[no-untyped-d
     for i in range(first, last):
         value = np.float64(x[i + 1]) - np.float64(x[i]) if angle else np.float64(x[i])
         value -= base
-        if value == value:
+        if np.isfinite(value):
             count += 1.0
             place += i
             square += np.float64(i) * i
