@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from gyrostab.allan.variance import variance_name
 from gyrostab.errors import OptionError
@@ -57,31 +56,55 @@ def confidence_interval(surface: xr.Dataset, *, level: float = 0.95) -> xr.Datas
     check_surface(surface)
     if not 0.0 < level < 1.0:
         raise OptionError(f"level={level!r}: give a probability between 0 and 1, such as 0.95")
-    out = xr.Dataset()
-    for name, side, end in (
-        ("avar_lower", 0.5 + level / 2, "lower"),
-        ("avar_upper", 0.5 - level / 2, "upper"),
-    ):
-        limit = xr.apply_ufunc(
-            _interval_limit,
-            surface["avar"],
-            surface["edf"],
-            side,
-            dask="parallelized",
-            output_dtypes=[np.float64],
-            keep_attrs=False,
-        )
-        out[name] = limit.assign_attrs(
-            units=surface["avar"].attrs["units"],
-            long_name=f"{end} end of the {100 * level:g} % interval of the "
-            f"{variance_name(surface)} variance",
-        )
-    return out
+    limits = xr.apply_ufunc(
+        interval_limits,
+        surface["avar"],
+        surface["edf"],
+        level,
+        output_core_dims=[[], []],
+        dask="parallelized",
+        output_dtypes=[np.float64, np.float64],
+        keep_attrs=False,
+    )
+    interval = f"the {100 * level:g} % interval of the {variance_name(surface)} variance"
+    return xr.Dataset(
+        {
+            f"avar_{end}": limit.assign_attrs(
+                units=surface["avar"].attrs["units"], long_name=f"{end} end of {interval}"
+            )
+            for end, limit in zip(("lower", "upper"), limits, strict=True)
+        }
+    )
 
 
-def _interval_limit(avar: NDArray[np.float64], edf: NDArray[np.float64], side: float) -> Any:
+def interval_limits(avar: Any, edf: Any, level: float = 0.95) -> tuple[Any, Any]:
+    """Compute the ends of the interval of a variance that is chi-square distributed.
+
+    Parameters
+    ----------
+    avar : array_like
+        Allan variance, any unit.
+    edf : array_like
+        Equivalent degrees of freedom [1].
+    level : float
+        Probability that the interval holds the true value.
+
+    Returns
+    -------
+    low, high : ndarray
+        In the unit of `avar`; NaN without degrees of freedom.
+
+    Examples
+    --------
+    >>> low, high = interval_limits(1.0, 10.0)
+    >>> round(float(low), 3), round(float(high), 3)
+    (0.488, 3.08)
+    """
     from scipy.special import gammaincinv
 
+    avar, edf = np.asarray(avar, dtype=np.float64), np.asarray(edf, dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
-        quantile = 2.0 * gammaincinv(edf / 2.0, side)  # of chi-square
-        return np.where(edf > 0, edf * avar / quantile, np.nan)
+        return tuple(
+            np.where(edf > 0, edf * avar / (2.0 * gammaincinv(edf / 2.0, side)), np.nan)
+            for side in (0.5 + level / 2, 0.5 - level / 2)
+        )  # type: ignore[return-value]

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.allan.confidence import interval_limits
 from gyrostab.allan.variance import surface_columns, variance_name
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import LAWS
@@ -75,7 +75,7 @@ def plot_adev(
     figure = new_figure(width / INCH_MM, 4.4, stacked=True)
     panel = figure.subplots()
     colour = axis_style(product, name)["color"]
-    low, high = band(window["avar"].values, window["edf"].values)
+    low, high = interval_limits(window["avar"].values, window["edf"].values)
     panel.fill_between(
         tau, np.sqrt(low), np.sqrt(high), color=colour, alpha=0.2, linewidth=0, label="95 % band"
     )
@@ -120,35 +120,6 @@ def plot_adev(
     )
     stack_panels([panel])
     return figure
-
-
-def band(avar: Any, edf: Any) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Find the 95 % confidence limits of an Allan variance from its degrees of freedom.
-
-    The estimate is taken as chi-square distributed.
-
-    Parameters
-    ----------
-    avar : array_like
-        Allan variance, any unit.
-    edf : array_like
-        Equivalent degrees of freedom [1].
-
-    Returns
-    -------
-    low, high : ndarray
-        Limits in the unit of `avar`.
-
-    Examples
-    --------
-    >>> low, high = band(1.0, 10.0)
-    >>> round(float(low), 3), round(float(high), 3)
-    (0.488, 3.08)
-    """
-    from scipy.special import chdtri
-
-    avar, edf = np.asarray(avar, dtype=np.float64), np.asarray(edf, dtype=np.float64)
-    return avar * edf / chdtri(edf, 0.025), avar * edf / chdtri(edf, 0.975)
 
 
 def _select_window(part: xr.Dataset, when: Any) -> int:

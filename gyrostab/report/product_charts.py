@@ -10,9 +10,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.allan.confidence import interval_limits
 from gyrostab.allan.variance import surface_columns, variance_name
 from gyrostab.noise import LAWS
-from gyrostab.plot.adev import band
 from gyrostab.plot.coefficients import find_shown_values
 from gyrostab.plot.style import axis_names, axis_style, unit_label, unit_of_time, unit_symbol
 from gyrostab.report.charts import (
@@ -83,7 +83,7 @@ def window_data(product: xr.Dataset) -> str:
     can stand in a script element.
     """
     part = _thin_product(product, _MAX_SURFACE_WINDOWS, _MAX_TAUS)
-    low, high = band(part["avar"].values, part["edf"].values)
+    low, high = interval_limits(part["avar"].values, part["edf"].values)
     squares = {
         "measured": part["avar"].values,
         "low": low,

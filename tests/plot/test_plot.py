@@ -15,11 +15,11 @@ from matplotlib.dates import date2num
 from scipy.stats import chi2
 
 from gyrostab import davar, fit_noise, make_log
+from gyrostab.allan.confidence import interval_limits
 from gyrostab.allan.fit import refit
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import LAWS, model_avar
 from gyrostab.plot import plot_adev, plot_coefficients, plot_davar, plot_davar_3d, plot_signal
-from gyrostab.plot.adev import band
 from gyrostab.plot.correlation import _shift_driver
 from gyrostab.plot.signal import thin
 from gyrostab.plot.style import save_png
@@ -247,13 +247,13 @@ def test_coefficients_of_a_surface_are_refused():
 
 @given(edf=st.floats(1.0, 1e5), avar=st.floats(1e-6, 1e6))
 def test_band_is_the_chi_square_band(edf, avar):
-    low, high = band(avar, edf)
+    low, high = interval_limits(avar, edf)
     assert float(low) == pytest.approx(avar * edf / chi2.ppf(0.975, edf), rel=1e-8)
     assert float(high) == pytest.approx(avar * edf / chi2.ppf(0.025, edf), rel=1e-8)
 
 
 def test_band_covers_the_truth_in_95_percent(product):
-    low, high = band(product.avar.values, product.edf.values)
+    low, high = interval_limits(product.avar.values, product.edf.values)
     truth = np.stack(
         [
             [model_avar(product.tau.values, _truth(a, t, product.sizes["time"])) for t in range(40)]
