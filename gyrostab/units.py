@@ -166,7 +166,8 @@ _LISTED = {
     "acceleration": "g, mg, m/s^2",
 }
 _TOKEN = re.compile(r'\s*(/|per\b)?\s*\(?\s*([A-Za-zµμ°"_]+)([+-]?\d)?\s*\)?', re.IGNORECASE)
-_NUMBER = re.compile(r"^([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*\*?\s*(.+)$")
+#: A factor in front of a unit, not followed by further digits of its number.
+_NUMBER = re.compile(r"^([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?)(?![\d.])\s*\*?\s*(.+)$")
 
 
 @dataclass(frozen=True)

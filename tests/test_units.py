@@ -109,6 +109,18 @@ def test_what_is_not_a_unit_is_refused_with_what_is(text):
         parse_unit("quux")
 
 
+@pytest.mark.parametrize("text", ["21", "2.1", "1.1", "1e-11", "0.1", "1.2.3 deg"])
+def test_a_number_is_not_a_factor_of_its_last_digit(text):
+    with pytest.raises(UnitError, match="not known"):
+        parse_unit(text)
+
+
+def test_factors_in_front_of_units():
+    units = ("0.1 arcsec/s", "1e-3deg", "2*deg/s", "10 1", "2. deg", "1e-11 rad", "9.80665 m s-2")
+    factors = [parse_unit(text).factor for text in units]
+    assert factors == pytest.approx([0.1, 1e-3, 7200, 10, 2, 1.8e-9 / np.pi, 1])
+
+
 def test_known_units_lists_the_contract():
     listed = known_units("rate")
     for text in ("deg/h", "deg/s", "rad/s", "mrad/s", "urad/s", "nrad/s", "arcsec/s", "rpm"):
