@@ -19,7 +19,7 @@ import zarr
 from gyrostab import davar, make_log, open_log, read_log, regularise, scan, to_netcdf, to_zarr
 from gyrostab.allan.davar import davar_part
 from gyrostab.errors import FormatError, OptionError, TimeError
-from gyrostab.ingest import ReadOptions
+from gyrostab.ingest import ReadOptions, scan_file
 from gyrostab.ingest.columns import pieces
 from gyrostab.ingest.columns import typed as arrays
 from gyrostab.ingest.columns.pieces import Spool
@@ -387,6 +387,15 @@ def test_table_of_100_000_columns_is_refused_at_once(header: str, tmp_path: Path
     ):
         read_log(path)
     assert time.process_time() - begun < 10.0
+
+
+@pytest.mark.parametrize("cell", ["[" * 64_000, f"a{' ' * 64_000}b", "1" * 16_000 + "x"])
+def test_hostile_header_takes_linear_time(cell: str, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(f"time [s],gyro_x [deg/h],{cell}\n0,1,2\n1,2,3\n")
+    begin = time.process_time()
+    assert scan_file(path).axes == ("x",)
+    assert time.process_time() - begin < 0.5
 
 
 def test_line_of_a_wide_table_is_longer_than_the_usual_head(tmp_path: Path) -> None:

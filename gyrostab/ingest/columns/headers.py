@@ -12,8 +12,6 @@ from gyrostab.ingest.columns.dates import YEAR_FIRST
 from gyrostab.ingest.columns.stamps import parse_time_unit
 from gyrostab.units import known_units, parse_unit
 
-_BRACKET = re.compile(r"^(.*?)\s*\[([^\[\]]*)\]\s*$")
-_PARENTHESES = re.compile(r"^(.*?)\s*\(([^()]*)\)\s*$")
 AXIS_PATTERN = re.compile(r"^(gyro|angle)_([a-z]\d*|\d+)$")
 _TIME_SUFFIX = r"s|sec|seconds?|ms|milliseconds?|us|microseconds?|ns|nanoseconds?|utc|iso"
 TIME_PATTERN = re.compile(
@@ -85,20 +83,23 @@ def split_header(text: str) -> tuple[str, str | None]:
     >>> split_header("Gyroscope x (rad/s)"), split_header("Supply (raw)")
     (('Gyroscope x', 'rad/s'), ('Supply (raw)', None))
     """
-    match = _PARENTHESES.match(text.strip())
-    if (
-        match
-        and match.group(1)
-        and not match.group(2).strip().isdigit()
-        and is_unit(match.group(2))
-    ):
-        return match.group(1).strip(), match.group(2).strip()
-    match = _BRACKET.match(text.strip())
-    if not match or (match.group(2).strip().isdigit() and match.group(2).strip() != "1"):
-        return text.strip(), None
-    if match.group(2).strip() == "1" and not re.search(r"\s\[", text):
-        return text.strip(), None  # "gyro_rad[1]" is an index, "ramp [1]" a unit
-    return match.group(1).strip(), match.group(2).strip()
+    text = text.strip()
+    name, unit = _split_last(text, "(", ")")
+    if name and unit is not None and not unit.isdigit() and is_unit(unit):
+        return name, unit
+    name, unit = _split_last(text, "[", "]")
+    # "gyro_rad[1]" is an index, "ramp [1]" a unit
+    if unit is None or (unit.isdigit() and (unit != "1" or not re.search(r"\s\[", text))):
+        return text, None
+    return name, unit
+
+
+def _split_last(text: str, opening: str, closing: str) -> tuple[str, str | None]:
+    """Split off the brackets at the end of a text; their content is None if there are none."""
+    begin = text.rfind(opening)
+    if begin < 0 or text.find(closing, begin) != len(text) - 1:
+        return text, None
+    return text[:begin].strip(), text[begin + 1 : -1].strip()
 
 
 def is_unit(text: str) -> bool:

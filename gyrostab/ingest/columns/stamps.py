@@ -56,7 +56,7 @@ _CALENDARS = {
 #: Longest cell that can be a stamp [characters]: a double written in full has at most 325 digits
 #: before and 1074 after the point.
 _MAX_DIGITS = 1400
-_NUMBER = re.compile(r"^[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,4})?$")
+_NUMBER = re.compile(r"^[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d{1,4})?$")
 
 
 @dataclass(frozen=True)

@@ -24,13 +24,13 @@ MAX_LINES = 2 * HEAD_LINES + 20
 #: with another word than the row before: random words of two kinds have half.
 _MIN_RECURRENCES, _MIN_CHANGING_SHARE = 4, 0.75
 
-_NUMBER = re.compile(r"^[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?$")
-_HEADER_CELLS = re.compile(r"(?:[^\s\[]+(?:\[[^\]]*\])?(?:[ \t]+\[[^\]]*\])?)")
+_NUMBER = re.compile(r"^[+-]?(\d+(\.\d*)?|\.\d+)([eEdD][+-]?\d+)?$")
+_HEADER_CELLS = re.compile(r"(?:[^\s\[]+(?:\[[^\[\]]*\])?(?:[ \t]+\[[^\[\]]*\])?)")
 _DURATION = re.compile(r"^\s*[+-]?\d+(?:\.\d+)? (ms|s|sec|min|h|hr|d|day|days)\s*$")
 _COMMENT = re.compile(r"^\s*[#%]")
 #: Where commas do not separate cells: in brackets, and before the fraction of a second if blanks
 #: separate the cells.
-_WITHIN_CELL = re.compile(r"\[[^\]]*\]|(?<=:\d\d),(?=\d+[ \t]+[^\s,])")
+_WITHIN_CELL = re.compile(r"\[[^\[\]]*\]|(?<=:\d\d),(?=\d+[ \t]+[^\s,])")
 
 
 @dataclass(frozen=True)
