@@ -186,10 +186,12 @@ def _read_frame(
     headers = [str(column) for column in table.columns]
     renamed = dict(map or {})
     if not isinstance(units, Mapping):
+        keys = {key.strip().lower() for key in renamed}
+        lows = {header: split_header(header)[0].lower() for header in headers}
         renamed |= {
-            header: f"gyro_{split_header(header)[0].lower()}"
-            for header in headers
-            if split_header(header)[0].lower() in ("x", "y", "z")
+            header: f"gyro_{low}"
+            for header, low in lows.items()
+            if low in ("x", "y", "z") and keys.isdisjoint((low, header.strip().lower()))
         }
     units_by_name = {"gyro": str(units)} if isinstance(units, str) else dict(units or {})
     options = ReadOptions(map=renamed, unit=units_by_name, kind=kind)
@@ -393,6 +395,11 @@ def _dataset_of(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[
         if "axis" in da.coords
         else list("xyz"[: da.sizes.get("axis", 1)])
     )
+    if len(axes) < da.sizes.get("axis", 1):
+        raise SchemaError(
+            f"the DataArray has {da.sizes['axis']} axes without names; give them: "
+            "da.assign_coords(axis=[...])"
+        )
     array = da if "axis" in da.dims else da.drop_vars("axis", errors="ignore").expand_dims("axis")
     signal = array.variable.transpose("axis", "time")
     data = signal.data * unit.factor if unit.factor != 1.0 else signal.data

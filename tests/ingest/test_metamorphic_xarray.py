@@ -486,6 +486,10 @@ class TestDataArray:
             (lambda a: a.rename(time="t"), "rename them"),
             (lambda a: a.drop_vars("time"), "no datetime64 coordinate 'time'"),
             (lambda a: a.expand_dims("run"), "rename them"),
+            (
+                lambda a: xr.concat([a, a], "axis").drop_vars("axis"),
+                r"4 axes without names; .*assign_coords",
+            ),
         ],
     )
     def test_other_inputs_are_refused(self, change, message):
@@ -520,6 +524,15 @@ class TestDataFrame:
         hot = self.frame(x).assign(temperature=300.0)
         log = gyrostab.from_dataframe(hot, units={"gyro": "deg/h", "temperature": "K"})
         np.testing.assert_allclose(log.temperature, 26.85)
+
+    @pytest.mark.parametrize("names", [("x", "y", "z"), ("X", "y", "z [deg/h]")])
+    def test_a_map_overrules_the_names_x_y_z(self, names):
+        x = record()[:, :50]
+        frame = self.frame(np.vstack([x, x[0] + 1]), names)
+        mapped = {"x": "gyro_z", "y": "-", "Z": "gyro_x"}
+        log = gyrostab.from_dataframe(frame, units="deg/h", map=mapped)
+        assert log.axis.values.tolist() == ["x", "z"]
+        np.testing.assert_array_equal(log.rate, [x[0] + 1, x[0]])
 
     @pytest.mark.filterwarnings("ignore::UserWarning")
     def test_dropped_rows_and_time_zones(self):
