@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from gyrostab.errors import GyrostabError, UnitError
 from gyrostab.ingest.columns.dates import YEAR_FIRST
 from gyrostab.ingest.columns.stamps import parse_time_unit
+from gyrostab.schema import RESERVED_NAMES
 from gyrostab.units import known_units, parse_unit
 
 AXIS_PATTERN = re.compile(r"^(gyro|angle)_([a-z]\d*|\d+)$")
@@ -140,7 +141,7 @@ def distinct_columns(headers: Sequence[str]) -> Iterator[Header]:
     split = [(header.strip(), *split_header(header)) for header in headers]
     names = Counter(name.lower() for _, name, _ in split)
     header_counts = Counter(header.lower() for header, _, _ in split)
-    used_names: Collection[str] = header_counts.keys() | names.keys()
+    used_names = header_counts.keys() | names.keys()
     counts: Counter[str] = Counter()
     for source, (header, name, unit) in enumerate(split):
         key = name if names[name.lower()] == 1 else header
@@ -148,6 +149,7 @@ def distinct_columns(headers: Sequence[str]) -> Iterator[Header]:
             counts[key.lower()] += 1
             number = counts[key.lower()]
             key = key if number == 1 else free_name(f"{name}_", used_names, number)
+            used_names.add(key.lower())
         yield Header(source, header, name, unit, key=key)
 
 
@@ -185,6 +187,11 @@ def example_unit(quantity: str | None) -> str:
     )
 
 
-def is_contract_name(low: str) -> bool:
-    """Return whether a lower-case name is that of an axis, the time or a known channel."""
-    return bool(AXIS_PATTERN.match(low) or KNOWN_CHANNEL_PATTERN.match(low) or low == "time")
+def channel_name(column: Header) -> str:
+    """Return the name of a column as a channel, without blanks and slashes."""
+    return re.sub(r"[/\s]+", "_", column.low if quantity_of(column.low) else column.name)
+
+
+def stored_name(name: str) -> str:
+    """Return the name that a channel has in the log, where that of a variable is taken."""
+    return f"{name}_channel" if name in RESERVED_NAMES else name

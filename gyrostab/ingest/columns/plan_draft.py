@@ -12,11 +12,12 @@ from gyrostab.ingest.columns.dates import YEAR_FIRST
 from gyrostab.ingest.columns.headers import (
     AXIS_PATTERN,
     Header,
+    channel_name,
     distinct_columns,
     example_unit,
     free_name,
-    is_contract_name,
     split_header,
+    stored_name,
 )
 from gyrostab.ingest.columns.stamps import TimeUnit
 from gyrostab.ingest.limits import describe_limit
@@ -191,9 +192,9 @@ def resolve_duplicates(draft: PlanDraft, named: list[Header]) -> list[Header]:
     """Give columns of one name different names; an axis must be one column."""
     groups: dict[str, list[Header]] = {}
     for column in named:
-        groups.setdefault(column.low if is_contract_name(column.low) else column.name, []).append(
-            column
-        )
+        axis = AXIS_PATTERN.match(column.low)
+        channel = "time" if column.low == "time" else stored_name(channel_name(column))
+        groups.setdefault(f"gyro_{axis[2]}" if axis else channel, []).append(column)
     used_names, dropped = set(groups), set[int]()
     renamed: list[str] = []
     for name, same in groups.items():
@@ -203,19 +204,20 @@ def resolve_duplicates(draft: PlanDraft, named: list[Header]) -> list[Header]:
         if len(asked) > 1 or (AXIS_PATTERN.match(name) and not asked):
             headers = ", ".join(repr(column.header) for column in same[:5])
             fix = f'drop the others, for instance --map "{(asked or same)[1].key}=-"'
-            draft.refuse(FormatError, f"{len(same)} columns are called {name!r} ({headers}); {fix}")
+            names = " or ".join(dict.fromkeys(repr(column.low) for column in same))
+            draft.refuse(FormatError, f"{len(same)} columns are called {names} ({headers}); {fix}")
         elif AXIS_PATTERN.match(name):
             unmapped = [column for column in same if not column.mapped]
             dropped.update(column.source for column in unmapped)
             draft.notes.append(
-                f"left out, as --map names another column {name}: "
+                f"left out, as --map names another column {asked[0].low}: "
                 f"{list_some([column.header for column in unmapped], MAX_HEADERS)}"
             )
         else:
             for number, column in enumerate(
                 sorted(same, key=lambda column: not column.mapped)[1:], 2
             ):
-                column.name = free_name(f"{column.name}_", used_names, number)
+                column.name = free_name(f"{name}_", used_names, number)
                 used_names.add(column.name)
                 renamed.append(f"{column.header!r} is {column.name!r}")
     if renamed:

@@ -18,6 +18,7 @@ from gyrostab.ingest.columns.headers import (
     TEMPERATURE_PATTERN,
     TIME_PATTERN,
     Header,
+    channel_name,
     distinct_columns,
     example_unit,
     is_time_unit,
@@ -25,12 +26,12 @@ from gyrostab.ingest.columns.headers import (
     is_unit_of,
     quantity_of,
     split_header,
+    stored_name,
     unit_quantity,
 )
 from gyrostab.ingest.columns.plan_draft import MAX_HEADERS, Column, PlanDraft, by_lower_name
 from gyrostab.ingest.columns.stamps import TimeUnit, names_epoch, parse_time_unit
 from gyrostab.ingest.limits import limit_value
-from gyrostab.schema import RESERVED_NAMES
 from gyrostab.units import HOUR, INNER, known_units, parse_unit
 from gyrostab.wording import list_some
 
@@ -289,7 +290,7 @@ def plan_channels(draft: PlanDraft, rest: list[Header]) -> None:
         quantity = quantity_of(column.low)
         likely = quantity or ("temperature" if TEMPERATURE_PATTERN.search(column.low) else None)
         is_known = bool(KNOWN_CHANNEL_PATTERN.match(column.low))
-        name = column.low if is_known or quantity else re.sub(r"[/\s]+", "_", column.name)
+        name = channel_name(column)
         keys = [
             name,
             column.name,
@@ -366,7 +367,7 @@ def _plan_channel(
             unit = parse_unit(text, expected)
             scale = 1.0 / HOUR if quantity == "rotation_rate" else 1.0
             factor, offset, units = unit.factor * scale, unit.offset, INNER[quantity]
-        elif quantity == "number":
+        elif quantity == "number" and is_known:
             units = INNER["number"]
         elif is_known:
             message = f"column {column.header!r}: {text!r} is not a known unit of {expected}"
@@ -382,16 +383,16 @@ def _plan_channel(
             draft.refuse(UnitError, f"{message}; {fix}")
         else:
             quantity = None
-    if name in RESERVED_NAMES:
+    stored = stored_name(name)
+    if stored != name:
         draft.notes.append(
-            f"column {column.header!r} is kept as '{name}_channel', as {name!r} is a variable of "
+            f"column {column.header!r} is kept as {stored!r}, as {name!r} is a variable of "
             f'gyrostab; for another name give --map "{column.key}=NAME"'
         )
-        name += "_channel"
     draft.kept_channels += 1
-    planned = column.source, column.header, "channel", name, quantity or "other", units
+    planned = column.source, column.header, "channel", stored, quantity or "other", units
     draft.columns.append(Column(*planned, factor, offset))
-    draft.add_summary(column, name, "channel", quantity or "other", text)
+    draft.add_summary(column, stored, "channel", quantity or "other", text)
 
 
 def _describe_lack(path: Path, headers: Sequence[str]) -> str:

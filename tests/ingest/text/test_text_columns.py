@@ -11,6 +11,7 @@ import pytest
 
 from gyrostab.errors import FormatError, GyrostabError, MissingUnitError, OptionError, UnitError
 from gyrostab.ingest import read_log
+from gyrostab.ingest.columns.headers import distinct_columns
 from gyrostab.units import INNER
 from tests.support.text_logs import PLAIN, ns, write
 
@@ -168,8 +169,41 @@ def test_unknown_columns_are_kept_with_a_unit_and_left_out_without(tmp_path: Pat
 
 
 @pytest.mark.parametrize(
+    ("header", "names"),
+    [
+        ("Motor voltage [V],Motor_voltage [V]", ["Motor_voltage", "Motor_voltage_2"]),
+        ("Temperature_2 [degC],temperature_2 [degC]", ["temperature_2", "temperature_2_2"]),
+        ("count [V],count_channel [V]", ["count_channel", "count_channel_2"]),
+        ("count [V],count [V]", ["count_channel", "count_channel_2"]),
+    ],
+)
+def test_channels_of_one_name_in_the_log_are_kept(
+    tmp_path: Path, header: str, names: list[str]
+) -> None:
+    raw = read_log(write(tmp_path, f"gyro_x [deg/h],{header}\n1,2,3\n1,2,3\n"), rate=1)
+    assert [(name, raw[name].values[0]) for name in names] == [(names[0], 2), (names[1], 3)]
+    assert any("are renamed" in note and names[1] in note for note in raw.attrs["notes"])
+
+
+def test_only_the_ramp_has_any_scale(tmp_path: Path) -> None:
+    raw = read_log(write(tmp_path, "gyro_x [deg/h],ramp [V],ramp_out [V]\n1,2,3\n1,2,3\n"), rate=1)
+    assert [raw[name].attrs["units"] for name in ("ramp", "ramp_out")] == ["1", "V"]
+
+
+def test_keys_of_columns_are_unique() -> None:
+    keys = [column.key for column in distinct_columns(["wx", "wx", "wx", "wx_2", "wx"])]
+    assert keys == ["wx", "wx_3", "wx_4", "wx_2", "wx_5"]
+
+
+@pytest.mark.parametrize(
     ("text", "options", "error", "message"),
     [
+        (
+            "time [s],gyro_x [deg],angle_x [deg]\n0,1,1\n1,2,1\n",
+            {"kind": "rate"},
+            FormatError,
+            r"2 columns are called 'gyro_x' or 'angle_x' \(.*--map \"angle_x=-\"",
+        ),
         (
             "time [s],gyro_x\n0,1\n1,2\n",
             {},
