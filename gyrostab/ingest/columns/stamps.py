@@ -253,6 +253,11 @@ def numbers_to_ns(values: NDArray[Any], unit: TimeUnit, epoch: int) -> NDArray[n
     return integers_to_ns(_signed_counts(values), unit, epoch)
 
 
+def from_fortran(text: str) -> str:
+    """Write the exponent of a number with E, where Fortran writes D."""
+    return text.upper().replace("D", "E")
+
+
 def cells_to_ns(
     cells: Sequence[str], unit: TimeUnit | None, epoch: int, order: str = YEAR_FIRST
 ) -> NDArray[np.int64]:
@@ -265,7 +270,7 @@ def cells_to_ns(
     zero = epoch if unit.epoch is None else unit.epoch
     stamps = np.full(len(cells), NAT, dtype=np.int64)
     for index, cell in enumerate(cells):
-        text = cell.strip()
+        text = from_fortran(cell.strip())
         if len(text) <= _MAX_DIGITS and _NUMBER.match(text):
             value = Fraction(text) * unit.ns
             nanoseconds = round(value) + zero

@@ -32,10 +32,17 @@ from gyrostab.ingest.columns.dates import (
 from gyrostab.ingest.columns.plan import Plan, plan_columns
 from gyrostab.ingest.columns.plan_draft import Column
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
-from gyrostab.ingest.columns.stamps import NAT, cells_to_ns
+from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, from_fortran
 from gyrostab.ingest.options import FileSummary, ReadOptions
-from gyrostab.ingest.text.cells import VOID_CELLS, BlockParser
-from gyrostab.ingest.text.layout import Layout, find_layout, is_number, is_text, unit_of_duration
+from gyrostab.ingest.text.cells import BlockParser
+from gyrostab.ingest.text.layout import (
+    VOID_CELLS,
+    Layout,
+    find_layout,
+    is_number,
+    is_text,
+    unit_of_duration,
+)
 from gyrostab.store.threads import map_in_order
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log")
@@ -156,7 +163,7 @@ def _is_rising(layout: Layout, column: int) -> bool:
     """Return whether the first filled cells of a column rise from row to row, as stamps do."""
     cells = [row[column] for row in layout.full_samples if row[column].strip()]
     if all(is_number(cell, comma=layout.decimal_comma) for cell in cells):
-        steps = np.diff([float(cell.replace(",", ".")) for cell in cells])
+        steps = np.diff([float(from_fortran(cell.replace(",", "."))) for cell in cells])
     else:
         order = find_order(cells) or DAY_FIRST
         if order == NO_DATE:
@@ -170,7 +177,7 @@ def _sample_stamps(
     layout: Layout, time: Column, rows: Sequence[Sequence[str]], options: ReadOptions
 ) -> NDArray[np.int64]:
     cells = [row[time.source] for row in rows if len(row) == layout.width]
-    if layout.decimal_comma:
+    if layout.decimal_comma and time.time_unit is not None:
         cells = [cell.replace(",", ".") for cell in cells]
     return cells_to_ns(cells, time.time_unit, options.epoch_ns, time.date_order)
 

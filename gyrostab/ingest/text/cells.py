@@ -10,12 +10,9 @@ from numpy.typing import NDArray
 
 from gyrostab.ingest.columns.dates import DAY_FIRST, YEAR_FIRST
 from gyrostab.ingest.columns.plan import Plan
-from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, integers_to_ns
+from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, from_fortran, integers_to_ns
 from gyrostab.ingest.options import ReadOptions
-from gyrostab.ingest.text.layout import BLANK, Layout, is_number
-
-#: Cells without a value, in lower case; other text is unreadable. The kernel knows them too.
-VOID_CELLS = frozenset(("", "nan", "-nan", "null", "na", "n/a", "none"))
+from gyrostab.ingest.text.layout import BLANK, VOID_CELLS, Layout
 
 
 class ParsedBlock(NamedTuple):
@@ -63,7 +60,7 @@ class BlockParser:
         values = np.empty((len(self.sources), lines))
         counts, starts = np.empty(lines, np.int64), np.empty(lines, np.int64)
         separator = BLANKS if self.layout.separator == BLANK else ord(self.layout.separator)
-        point = ord("," if self.layout.decimal_comma else ".")
+        point = ord("," if self.layout.decimal_comma and b"," in block else ".")
         other_lines: dict[int, str] = {}
         row = at = 0
         while True:
@@ -116,9 +113,10 @@ class BlockParser:
                 words += sum(cells[index].strip().lower() not in VOID_CELLS for index in bad)
         if stamps is not None and self.time is not None:
             cells = ["" if row is None else row[self.time] for row in rows]
-            if self.layout.decimal_comma:
-                cells = [cell.replace(",", ".") for cell in cells]
-            if self.unit is not None:  # durations as MATLAB writes them
+            if self.unit is not None:
+                if self.layout.decimal_comma:
+                    cells = [cell.replace(",", ".") for cell in cells]
+                # durations as MATLAB writes them
                 cells = [cell.strip().removesuffix(f" {self.unit.text}") for cell in cells]
             stamps[at] = cells_to_ns(cells, self.unit, self.epoch, self.order)
         return words
@@ -137,10 +135,8 @@ class BlockParser:
 
 def _parse_number(cell: str, layout: Layout) -> float:
     text = cell.replace(",", ".") if layout.decimal_comma else cell
-    if is_number(text):
-        text = text.upper().replace("D", "E")  # as Fortran writes exponents
     try:
-        value = float(text)
+        value = float(from_fortran(text))
     except ValueError:
         return np.nan
     return np.nan if "_" in cell else value

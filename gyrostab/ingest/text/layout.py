@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+from codecs import BOM_UTF8
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice, pairwise, takewhile
@@ -11,12 +12,16 @@ from pathlib import Path
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.dates import holds_date, is_time_of_day, parse_order
-from gyrostab.ingest.columns.headers import is_unit
+from gyrostab.ingest.columns.headers import is_unit, split_header
 from gyrostab.ingest.limits import check_columns
 from gyrostab.wording import list_some
 
 #: Separator that means any run of blanks.
 BLANK = " "
+#: Separators of files that may have decimal commas.
+COMMA_SEPARATORS = (";", "\t")
+#: Cells without a value, in lower case; other text is unreadable. The kernel knows them too.
+VOID_CELLS = frozenset(("", "nan", "-nan", "null", "na", "n/a", "none"))
 HEAD_LINES = 200
 #: Lines that are read: those that may be the header, those that follow it, and the first data rows.
 MAX_LINES = 2 * HEAD_LINES + 20
@@ -46,7 +51,7 @@ class Layout:
     offset: int
     line: int
     samples: tuple[tuple[str, ...], ...]
-    decimal_comma: bool = False
+    decimal_comma: bool = False  # a comma in a number is its decimal point
     notes: tuple[str, ...] = ()
     above: tuple[str, ...] = ()  # lines above the header
     #: Column whose dates have their times of day in the next one; both are one column here.
@@ -131,21 +136,20 @@ def find_layout(
     if units:
         first = data.pop(0) + 1
     offset = sum(len(line) for line in head.splitlines(keepends=True)[:first])
+    if first == 0 and head.startswith(BOM_UTF8):
+        offset = len(BOM_UTF8)
     if not data:
         raise FormatError(
             f"{path.name}: there is a header (line {content[0] + 1}) but no data row below it; "
             "copy it again"
         )
-    rows = [
-        tuple(split_line(re.split("[#%]", lines[index])[0], separator))
-        for index in data[:HEAD_LINES]
-    ]
+    rows = [tuple(split_line(lines[index].split("#")[0], separator)) for index in data[:HEAD_LINES]]
     paired = _find_pair(rows)
     if paired is not None:
         rows = [tuple(_join_pair(list(row), paired)) for row in rows]
     width = _commonest_width(rows)
     if header is not None and paired is not None and len(header) > width:
-        header = _join_pair(header, paired)
+        header = _join_headers(header, paired)
         units = {column - (column > paired): unit for column, unit in reversed(units.items())}
     headers = list(header) if header is not None else [str(column) for column in range(width)]
     if width == len(headers) + 1 and all(row[-1] == "" for row in rows if len(row) == width):
@@ -160,7 +164,7 @@ def find_layout(
             f"skipped {len(skipped)} line{'s' * (len(skipped) > 1)} above the header (from line "
             f"{skipped[0]})"
         )
-    comma = separator == ";" and _has_decimal_comma(rows)
+    comma = separator in COMMA_SEPARATORS and not _has_decimal_point(rows)
     notes += _describe_sources(headers, rows)
     top = tuple(lines[:above]) if header is not None else ()
     return Layout(
@@ -224,7 +228,7 @@ def _describe_sources(headers: Sequence[str], rows: Sequence[Sequence[str]]) -> 
             1 < len(values) <= len(cells) / _MIN_RECURRENCES
             and changes >= _MIN_CHANGING_SHARE * (len(cells) - 1)
             and not any(
-                value.lower() in ("", "nan", "null", "na", "n/a", "none")
+                value.lower() in VOID_CELLS
                 or is_number(value, comma=True)
                 or holds_date(value)
                 or is_time_of_day(value)
@@ -261,10 +265,18 @@ def _commonest_width(rows: Sequence[Sequence[str]]) -> int:
 
 
 def _join_pair(cells: list[str], paired: int | None) -> list[str]:
-    """Join a date and its time of day, or the names of their columns."""
+    """Join a date and its time of day."""
     if paired is not None and len(cells) > paired + 1:
         cells[paired : paired + 2] = [" ".join(cells[paired : paired + 2])]
     return cells
+
+
+def _join_headers(header: list[str], paired: int) -> list[str]:
+    """Join the headers of a date and its time of day: names, then units such as YYYY-MM-DD."""
+    names, units = zip(*map(split_header, header[paired : paired + 2]), strict=True)
+    unit = " ".join(filter(None, units))
+    joined = " ".join(names) + f" [{unit}]" * bool(unit)
+    return [*header[:paired], joined, *header[paired + 2 :]]
 
 
 def _is_utf8(line: bytes) -> bool:
@@ -290,7 +302,7 @@ def _header_cells(line: str, separator: str) -> list[str]:
 
 def _is_data(cells: list[str], *, comma: bool) -> bool:
     """Return whether a row is data: it has numbers or dates, and the other cells are few."""
-    void = ("", "nan", "-nan", "inf", "-inf", "null", "na", "n/a", "none")
+    void = VOID_CELLS | {"inf", "-inf"}
     solid = [cell for cell in cells if cell.lower() not in void and not set(cell) <= set("*-")]
     values = [
         cell
@@ -311,14 +323,14 @@ def _find_header(
     for place, index in enumerate(content[:HEAD_LINES]):
         separator = _guess_separator(lines[index])
         cells = split_line(lines[index], separator)
-        if _is_data(cells, comma=separator == ";"):
+        if _is_data(cells, comma=separator in COMMA_SEPARATORS):
             return _commented_header(lines, index, separator, len(cells)), separator, index, index
         names = _header_cells(lines[index], separator)
         following = [
             (_guess_separator(lines[i]), lines[i]) for i in content[place + 1 : place + 21]
         ]
         rows = [(mark, split_line(line, mark)) for mark, line in following]
-        solid = [(mark, row) for mark, row in rows if _is_data(row, comma=mark == ";")]
+        solid = [(mark, row) for mark, row in rows if _is_data(row, comma=mark in COMMA_SEPARATORS)]
         widths = {len(row) for mark, row in solid or rows if mark == separator}
         if separator != BLANK and _precedes_header(names, separator, rows):
             continue  # a line above the header, padded to the width of the table
@@ -341,7 +353,7 @@ def _precedes_header(
     names: Sequence[str], separator: str, rows: Sequence[tuple[str, list[str]]]
 ) -> bool:
     """Return whether a row above the data fills more cells than this one."""
-    above = takewhile(lambda row: not _is_data(row[1], comma=row[0] == ";"), rows)
+    above = takewhile(lambda row: not _is_data(row[1], comma=row[0] in COMMA_SEPARATORS), rows)
     filled = [sum(map(bool, row)) for mark, row in above if mark == separator]
     return len(filled) < len(rows) and max(filled, default=0) > sum(map(bool, names))
 
@@ -369,8 +381,5 @@ def _commented_header(lines: list[str], first: int, separator: str, width: int) 
     return None
 
 
-def _has_decimal_comma(rows: list[tuple[str, ...]]) -> bool:
-    cells = [cell for row in rows for cell in row]
-    return any("," in cell and is_number(cell, comma=True) for cell in cells) and not any(
-        "." in cell and is_number(cell) for cell in cells
-    )
+def _has_decimal_point(rows: list[tuple[str, ...]]) -> bool:
+    return any("." in cell and is_number(cell) for row in rows for cell in row)

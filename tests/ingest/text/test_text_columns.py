@@ -42,6 +42,12 @@ from tests.support.text_logs import PLAIN, ns, write
         "time [s],gyro_x,n\n(ms),(deg/h),\n0,1.5,7\n1,2.5,7\n",
         "day,clock,gyro_x\nYYYY-MM-DD,,deg/h\n1970-01-01,00:00:00,1.5\n1970-01-01,00:00:01,2.5\n",
         "time,gyro_x\nDD/MM/YYYY,deg/h\n01/01/1970 00:00,1.5\n01/01/1970 00:00:01,2.5\n",
+        "time [s]\tgyro_x [deg/h]\n0,0\t1,5\n1,0\t2,5\n",
+        "t;gyro_x [deg/h]\n01.01.1970, 00:00:00;1,5\n01.01.1970, 00:00:01;2,5\n",
+        "time [s] gyro_x [deg/h]\n 0.000D+00 0.150D+01\n 0.100D+01 0.250D+01\n",
+        "time,battery,gyro_x [deg/h]\n1970-01-01T00:00:00,87%,1.5\n1970-01-01T00:00:01,87%,2.5\n",
+        "date [DD/MM/YYYY],time [hh:mm:ss],gyro_x [deg/h]\n"
+        "01/01/1970,00:00:00,1.5\n01/01/1970,00:00:01,2.5\n",
     ],
 )
 def test_layouts_of_the_same_log(tmp_path: Path, text: str) -> None:
@@ -71,6 +77,23 @@ def test_numbers_without_a_header_are_mapped_by_column(tmp_path: Path) -> None:
     raw = read_log(path, map={"0": "time [s]", "2": "gyro_z [deg/s]"})
     assert list(raw.axis.values) == ["z"]
     np.testing.assert_array_equal(raw.rate[0], [5400.0, 9000.0])
+
+
+def test_first_row_of_numbers_after_a_byte_order_mark_is_read(tmp_path: Path) -> None:
+    path = write(tmp_path, "\ufeff0 1.5\n1 2.5\n", "log.txt")
+    raw = read_log(path, map={"0": "time [s]", "1": "gyro_x [deg/h]"})
+    assert ns(raw) == [0, 10**9]
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_decimal_commas_after_whole_numbers_are_read(tmp_path: Path, separator: str) -> None:
+    rows = [f"{row};{row % 7}" for row in range(300)] + ["300;1,5", "300,5;-2", "301,0;3.5"]
+    text = "\n".join(["time [s];gyro_x [deg/h]", *rows, ""]).replace(";", separator)
+    raw = read_log(write(tmp_path, text))
+    assert raw.rate[0].values[-3:].tolist() == [1.5, -2.0, 3.5]
+    assert ns(raw)[-2:] == [300_500_000_000, 301_000_000_000]
+    raw = read_log(write(tmp_path, text.replace(f"7{separator}0\n", f"7{separator}0.0\n")))
+    assert np.isnan(raw.rate[0].values[-3])  # the points are decimal, so the comma is not
 
 
 def test_a_latin_1_header_is_read_with_a_note(tmp_path: Path) -> None:
