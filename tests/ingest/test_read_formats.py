@@ -389,7 +389,15 @@ def test_buffers_spill_to_disk_and_read_back(monkeypatch: pytest.MonkeyPatch) ->
             column[:], np.where(np.isin(np.arange(43), rows), -1, expected["b"])
         )
         np.testing.assert_array_equal(column[5:7], [-1, -1])
-    spool = Spool()
+    reads: list[int] = []
+    read_into = PiecewiseColumn.read_into
+    monkeypatch.setattr(
+        PiecewiseColumn, "read_into", lambda *args: (reads.append(1), read_into(*args))[1]
+    )
+    spool, values, rows = Spool(), rng.normal(size=10_000), np.arange(5, 9995, 7)
+    monkeypatch.setattr(pieces, "CHUNK_ROWS", 4096)
+    np.testing.assert_array_equal(spool.store(values).take_rows(rows), values[rows])
+    assert len(reads) == 3
     first, second = (
         spool.store(np.arange(5.0)),
         spool.store(np.array(["2026-01-01", "NaT"], dtype="datetime64[ns]")),
