@@ -7,12 +7,14 @@ from typing import Any
 
 import cf_units
 import cftime
+import dask.array
 import h5py
 import netCDF4
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pytest
+import xarray as xr
 from pyarrow import parquet
 
 from gyrostab.errors import FormatError, OptionError, UnitError
@@ -307,6 +309,30 @@ def test_clock_that_begins_again_at_midnight_is_continued(
     log = regularise(raw)
     assert log.sizes["time"] == 4000
     assert not (log.gap_samples.values > 1).any()
+
+
+@pytest.mark.parametrize("name", ["log.h5", "log.nc"])
+@pytest.mark.parametrize("batch", [128, 2**20])
+def test_clock_is_continued_where_values_stay_in_the_file(tmp_path, monkeypatch, name, batch):
+    monkeypatch.setattr("gyrostab.ingest.columns.pieces.SPILL_BYTES", 1000)
+    monkeypatch.setattr("gyrostab.ingest.columns.typed.BATCH_ROWS", batch)
+    clock = 86400.0 - 100.0 + np.arange(10_000) / 20
+    clock = np.round(clock + 0.002 * np.random.default_rng(1).standard_normal(clock.size), 4)
+    path = tmp_path / name
+    columns = {"time": (clock % 86400, "s"), "gyro_x": (np.arange(10_000.0), "deg/h")}
+    if name == "log.h5":
+        with h5py.File(path, "w") as file:
+            for key, (values, units) in columns.items():
+                file[key] = values
+                file[key].attrs["units"] = units
+    else:
+        data = {key: ("obs", values, {"units": units}) for key, (values, units) in columns.items()}
+        xr.Dataset(data).to_netcdf(path, format="NETCDF3_64BIT")
+    raw = read_log(path)
+    assert isinstance(raw.rate.data, dask.array.Array)
+    read = raw.time.values.astype("datetime64[ns]").view(np.int64) / 1e9
+    np.testing.assert_allclose(read, clock, atol=1e-6)
+    assert sum("the clock begins again" in note for note in raw.attrs["notes"]) == 1
 
 
 @pytest.mark.parametrize("first", [0.2, 40.0])

@@ -104,7 +104,6 @@ def read_columns(
     stay = stay and 8 * rows * len(plan.columns) > builder.buffers.limit
     if stay:
         builder.grids = dict.fromkeys(builder.grids)  # nothing is packed
-        builder.continues_clock = False  # stamps are read again from the file
     step = batch_rows(len(plan.columns))
     spans = ((start, min(start + step, rows)) for start in range(0, rows, step))
     take = partial(_convert_span, builder, plan, options, fetch, stay)
@@ -155,7 +154,8 @@ def _convert_span(
     block: dict[int, Any] = {}
     for column in plan.columns:
         piece = converted.block[column.source]
-        if not isinstance(piece, EvenStampsPiece):
+        is_continued = column.role == "time" and converted.clock and converted.clock.turns
+        if not (is_continued or isinstance(piece, EvenStampsPiece)):
             piece = FilePiece(partial(_read_column, column, options, fetch), begin, rows)
         block[column.source] = piece
     return converted._replace(block=block, inspection=inspection)
