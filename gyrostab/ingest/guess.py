@@ -18,6 +18,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from gyrostab.ingest.columns.dates import DAY_FIRST, EITHER_FIRST, MONTH_FIRST
 from gyrostab.ingest.columns.headers import (
     AXIS_PATTERN,
     INCREMENT_PATTERN,
@@ -79,9 +80,9 @@ class Guess:
     """Guessed roles of the columns of a file, with the reasons.
 
     `axes` are the columns of the gyro by axis (empty if no column looks like one); `unit` is the
-    unit to give for them, None if they carry one; `time` and `time_unit` likewise; `kind` is the
-    kind to give for angles; `rate` [Hz] is set for a file without time. `sampling_rate_hz` is the
-    rate that the guess is based on.
+    unit to give for them, None if they carry one; `time` and `time_unit` likewise (of dates, the
+    order of day and month); `kind` is the kind to give for angles; `rate` [Hz] is set for a file
+    without time. `sampling_rate_hz` is the rate that the guess is based on.
     """
 
     axes: dict[str, ColumnInspection]
@@ -119,15 +120,22 @@ def guess_columns(
     time, time_unit = (
         (None, None) if inspection.time is not None else _guess_time(inspection, reasons)
     )
+    if inspection.time is not None and inspection.time.unit == EITHER_FIRST:
+        time_unit = DAY_FIRST
+        warnings.append(
+            f"--unit time={DAY_FIRST} is an assumption, because the dates can be read in two ways: "
+            f"use {MONTH_FIRST} instead if the month comes first"
+        )
     assumed = None
     if inspection.time is None and time is None and rate is None:
         assumed = rate_hint or TYPICAL_RATE_HZ
-        rate_note = (
-            "is named in the file"
+        warnings.append(
+            f"the file names {assumed:g} Hz; if that is not its sampling rate, use the true rate "
+            "instead"
             if rate_hint
-            else "is an assumption, because the file has no time column: use the true rate instead"
+            else f"--rate {assumed:g} is an assumption, because the file has no time column: use "
+            "the true rate instead"
         )
-        (reasons if rate_hint else warnings).append(f"--rate {assumed:g} {rate_note}")
     sampling = (
         rate
         or assumed

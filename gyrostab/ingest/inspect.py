@@ -103,8 +103,11 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
     names = {f"column_{place}": column for place, column in enumerate(data_columns[:MAX_COLUMNS])}
     chosen = {column.key: f"{name} [1]" for name, column in names.items()}
     chosen.update({column.key: "-" for column in data_columns[MAX_COLUMNS:]})
+    unit: dict[str, str] = {}
     if time is not None:
-        chosen[time.key] = "time" if time.unit == "ISO 8601" else f"time [{time.unit}]"
+        if time.unit is not None and time.unit != "ISO 8601":
+            unit["time"] = time.unit
+        chosen[time.key] = "time"
         if (
             time.key == "time" and "time" not in options.map
         ):  # stamps of the format, not a named column
@@ -112,7 +115,7 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
     reading = replace(
         options,
         map=chosen,
-        unit={},
+        unit=unit,
         rate=options.rate or 1.0,
         start=None,
         channels_only=True,

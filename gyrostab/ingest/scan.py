@@ -25,6 +25,9 @@ MAX_MISSING_SHARE = 0.1
 #: Samples from which the noise is estimated: 8 MB for each axis, an estimate within 1 %.
 _MAX_NOISE_SAMPLES = 2**20
 
+_FREQUENCY = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?) ?(k?)Hz\b", re.IGNORECASE)
+_RATE_WORD = re.compile(r"(?<![a-z])(rate|odr)(?![a-z])|sampl", re.IGNORECASE)
+
 #: Options that place or cut the samples of a log; the others are those of `ReadOptions`.
 _CUTTING = ("time_from", "time_to", "exclude")
 _PLACING = ("max_gap", "on_file", *_CUTTING)
@@ -200,9 +203,9 @@ def _try_guess(
     if guess.unit is not None:
         angle = any(column.name.lower().startswith("angle_") for column in guess.axes.values())
         options["unit"]["angle" if angle else "gyro"] = guess.unit
-    if guess.time is not None:
-        if guess.time.role != "time":
-            options["map"][guess.time.key] = "time"
+    if guess.time is not None and guess.time.role != "time":
+        options["map"][guess.time.key] = "time"
+    if guess.time_unit is not None:
         options["unit"]["time"] = guess.time_unit
     if guess.temperature is not None:
         options["map"][guess.temperature.key] = (
@@ -237,12 +240,20 @@ def _select_reading(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _named_rate(path: Path) -> float | None:
-    """Find a sampling rate such as ``100 Hz`` in the text at the beginning of a file."""
+    """Find a sampling rate such as ``100 Hz`` in the text at the beginning of a file.
+
+    If it names several frequencies, only one of them may be in a phrase on a rate or on sampling.
+    """
     from gyrostab.ingest.formats.text import read_head
 
-    match = re.search(r"(?<![\w.])(\d+(?:\.\d+)?) ?(k?)Hz\b", read_head(path), re.IGNORECASE)
-    rate = float(match[1]) * (1000.0 if match[2] else 1.0) if match else 0.0
-    return rate or None
+    rates: dict[float, bool] = {}  # whether a phrase says that this is a rate
+    for phrase in re.split(r"[\n,;]", read_head(path)):
+        for match in _FREQUENCY.finditer(phrase):
+            rate = float(match[1]) * (1000.0 if match[2] else 1.0)
+            rates[rate] = rates.get(rate, False) or bool(_RATE_WORD.search(phrase))
+    rates.pop(0.0, None)
+    named = [rate for rate, is_named in rates.items() if is_named or len(rates) == 1]
+    return named[0] if len(named) == 1 else None
 
 
 def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:

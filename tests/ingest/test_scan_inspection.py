@@ -265,6 +265,51 @@ def test_what_the_guess_settles_is_not_a_note(tmp_path: Path, capsys) -> None:
     assert "left out, as they carry no unit: HHZ" in lines
 
 
+@pytest.mark.parametrize(
+    ("line", "rate"),
+    [
+        ("recorded at 50 Hz", 50),
+        ("low-pass cutoff 50 Hz, output data rate 0.2 kHz", 200),
+        ("cutoff 50 Hz; calibrated at 10 Hz", 100),
+        ("sampled at 200 Hz, update rate 10 Hz", 100),
+    ],
+)
+def test_rate_that_a_file_names_is_to_be_checked(
+    tmp_path: Path, capsys, line: str, rate: int
+) -> None:
+    path = write(tmp_path / "log.csv", {"wx": GX})
+    path.write_text(f"# {line}\n{path.read_text()}")
+    assert call("scan", path) == 0
+    shown = capsys.readouterr().out
+    words = next_command(shown)
+    assert words[words.index("--rate") + 1] == str(rate)
+    assert ("check: --rate 100 is an assumption" if rate == 100 else "check: the file names") in (
+        shown
+    )
+
+
+@pytest.mark.parametrize("header", ["time,gyro_x [deg/s]", "Zeit,wx"])
+def test_dates_of_two_meanings_get_an_order_to_be_checked(
+    tmp_path: Path, monkeypatch, capsys, header: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    stamps = pd.date_range("2026-01-05 08:00", periods=ROWS, freq="10ms")
+    rows = [f"{stamp:%d/%m/%Y %H:%M:%S.%f},{x}" for stamp, x in zip(stamps, GX, strict=True)]
+    (tmp_path / "log.csv").write_text("\n".join([header, *rows, ""]))
+    assert call("scan", "log.csv") == 0
+    shown = capsys.readouterr().out
+    assert "check: --unit time=DD/MM/YYYY is an assumption" in shown
+    words = next_command(shown)
+    assert "time=DD/MM/YYYY" in words
+    assert call(*words, "--quiet-progress") == 0
+
+
+def test_unit_of_the_time_is_used_in_the_inspection(tmp_path: Path, capsys) -> None:
+    path = write(tmp_path / "log.csv", {"time": TIME * 1e3, "wx": GX})
+    call("scan", path, "--unit", "time=ms")
+    assert {"wx=gyro_x", "time=ms"} <= set(next_command(capsys.readouterr().out))
+
+
 def test_file_without_a_gyro_is_inspected(tmp_path: Path, capsys) -> None:
     path = write(
         tmp_path / "weather.csv", {"time [s]": TIME, "humidity": 50 + 0.01 * TIME, "wind": AX}

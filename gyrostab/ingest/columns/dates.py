@@ -12,6 +12,8 @@ from collections.abc import Iterable
 
 #: Orders of the parts of a date.
 YEAR_FIRST, DAY_FIRST, MONTH_FIRST = "YYYY/MM/DD", "DD/MM/YYYY", "MM/DD/YYYY"
+#: In place of an order: unknown, taken for that with the day first where the file is inspected.
+EITHER_FIRST = f"{DAY_FIRST} or {MONTH_FIRST}"
 #: In place of an order: times of day without a date.
 NO_DATE = "hh:mm:ss"
 

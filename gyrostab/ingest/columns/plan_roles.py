@@ -9,7 +9,14 @@ from functools import partial
 from pathlib import Path
 
 from gyrostab.errors import FormatError, GyrostabError, MissingUnitError, OptionError, UnitError
-from gyrostab.ingest.columns.dates import DAY_FIRST, MONTH_FIRST, NO_DATE, YEAR_FIRST, parse_order
+from gyrostab.ingest.columns.dates import (
+    DAY_FIRST,
+    EITHER_FIRST,
+    MONTH_FIRST,
+    NO_DATE,
+    YEAR_FIRST,
+    parse_order,
+)
 from gyrostab.ingest.columns.headers import (
     AXIS_PATTERN,
     GYRO_PATTERNS,
@@ -146,7 +153,7 @@ def _date_order(draft: PlanDraft, column: Header) -> str:
             f"the dates in the time column {column.header!r} can be read in two ways; say which "
             f"number is the day: --unit time={DAY_FIRST} or --unit time={MONTH_FIRST}",
         )
-    return order or YEAR_FIRST
+    return order or EITHER_FIRST
 
 
 def _time_unit(draft: PlanDraft, column: Header) -> TimeUnit | None:
