@@ -190,38 +190,23 @@ def texts_to_ns(texts: Sequence[Any] | NDArray[Any]) -> NDArray[np.int64]:
     return dates_to_ns(stamps.dt.tz_convert(None).to_numpy())
 
 
-def _all_fit(values: NDArray[np.int64], units: int, up: int, remainder: int) -> bool:
-    """Return whether all stamps and intermediate results fit into 64 bits."""
-    ends = (int(values.min()) + units, int(values.max()) + units)
-    return all(
-        abs(end) < _MAX_INT64
-        and abs(end * up) < _MAX_INT64
-        and abs(end * up + remainder) < _MAX_INT64
-        for end in ends
-    )
-
-
 def integers_to_ns(values: NDArray[np.int64], unit: TimeUnit, epoch: int) -> NDArray[np.int64]:
     """Convert counts of `unit` since `epoch` to stamps; `NAT` outside 1678 to 2262."""
     zero = epoch if unit.epoch is None else unit.epoch
     up, down = unit.ns.numerator, unit.ns.denominator
-    # Whole units of the epoch are added to the counts, so no sum exceeds 64 bits for any epoch.
-    units, remainder = divmod(zero, up) if down == 1 else (0, zero)
-    limit = (_MAX_INT64 - down) // up - 1
-    if max(abs(units), abs(remainder)) > _MAX_INT64 // 2:
-        return np.full(np.shape(values), NAT, dtype=np.int64)
-    if down == 1 and np.size(values) and _all_fit(values, units, up, remainder):
-        return values if (units, up, remainder) == (0, 1, 0) else (values + units) * up + remainder
-    inside = (values <= min(limit - units, _MAX_INT64)) & (
-        values >= max(-limit - units, -_MAX_INT64)
-    )
-    scaled = np.where(inside, values + np.where(inside, units, 0), 0) * up
+    if (up, down, zero) == (1, 1, 0):
+        return values
+    inside: Any = True
     if down > 1:
-        scaled = (scaled + down // 2) // down
-    inside &= (scaled <= _MAX_INT64 - max(remainder, 0)) & (
-        scaled >= -_MAX_INT64 - min(remainder, 0)
-    )
-    return np.where(inside, np.where(inside, scaled, 0) + remainder, NAT)
+        limit = (_MAX_INT64 - down) // up
+        inside = (values >= -limit) & (values <= limit)
+        values, up = (np.where(inside, values, 0) * up + down // 2) // down, 1
+    low, high = max(-((_MAX_INT64 + zero) // up), -_MAX_INT64), (_MAX_INT64 - zero) // up
+    # Products and sums may exceed 64 bits on the way; those that fit in the end are exact.
+    stamps = values * up + np.int64((zero + 2**63) % 2**64 - 2**63)
+    if down == 1 and np.size(values) and low <= values.min() and values.max() <= high:
+        return stamps
+    return np.where(inside & (values >= low) & (values <= high), stamps, NAT)
 
 
 def _signed_counts(counts: NDArray[Any]) -> NDArray[np.int64]:
