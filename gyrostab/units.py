@@ -52,7 +52,6 @@ _WORDS = {
     for short, words in {
         "deg": "degree degrees degs",
         "rad": "radian radians",
-        "mrad": "milliradian milliradians",
         "arcsec": "arcsecond arcseconds arcsecs asec",
         "s": "second seconds sec secs",
         "h": "hour hours hr hrs",

@@ -126,7 +126,11 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
         log = read_file(path, reading)
     except GyrostabError as error:
         raise FormatError(str(error)) from error
-    columns = [_inspect_column(column, log, name) for name, column in names.items()]
+    dims = {name: str(log[name].dims[0]) if name in log.data_vars else "row" for name in names}
+    rates = {dim: _row_rate(log, dim) for dim in {"row", *dims.values()}}
+    columns = [
+        _inspect_column(column, log, name, rates[dims[name]]) for name, column in names.items()
+    ]
     if not any(column.rows for column in columns):
         raise FormatError(f"{path.name}: there is no number in any of its columns; is it a log?")
     notes = (
@@ -135,7 +139,7 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
         else []
     )
     rows = max((log.sizes[str(log[name].dims[0])] for name in names if name in log), default=0)
-    return FileInspection(summary, tuple(columns), rows, time, _row_rate(log, "row"), tuple(notes))
+    return FileInspection(summary, tuple(columns), rows, time, rates["row"], tuple(notes))
 
 
 def _row_rate(log: xr.Dataset, dim: str) -> float:
@@ -168,7 +172,9 @@ def _value_chunks(variable: xr.DataArray) -> Iterator[NDArray[np.float64]]:
         yield values[np.abs(values) < MAX_MAGNITUDE]
 
 
-def _inspect_column(column: ColumnSummary, log: xr.Dataset, name: str) -> ColumnInspection:
+def _inspect_column(
+    column: ColumnSummary, log: xr.Dataset, name: str, row_rate_hz: float
+) -> ColumnInspection:
     chunks: list[tuple[float, ...]] = []
     paces: list[float] = []
     for values in _value_chunks(log[name]) if name in log.data_vars else ():
@@ -192,7 +198,7 @@ def _inspect_column(column: ColumnSummary, log: xr.Dataset, name: str) -> Column
     ends = (table[0, 0], table[-1, 1], table[:, 2].min(), table[:, 3].max()) if has_values else ()
     first, last, low, high = ends or (math.nan,) * 4
     variance = max(0.0, squares / rows - (total / rows) ** 2) if has_values else math.nan
-    dim = str(log[name].dims[0]) if name in log.data_vars else "row"
+    size = log[name].size if name in log.data_vars else log.sizes.get("row", 1)
     return ColumnInspection(
         key=column.key or column.header,
         header=column.header,
@@ -211,5 +217,5 @@ def _inspect_column(column: ColumnSummary, log: xr.Dataset, name: str) -> Column
         first=float(first),
         last=float(last),
         pace=float(np.median(paces)) if paces else math.nan,
-        rate_hz=_row_rate(log, dim) * float(rows) / max(1, log.sizes.get(dim, 1)),
+        rate_hz=row_rate_hz * float(rows) / max(1, size),
     )

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
-from gyrostab.errors import GyrostabError, UnitError
+from gyrostab.errors import GyrostabError
 from gyrostab.ingest.columns.dates import YEAR_FIRST
 from gyrostab.ingest.columns.stamps import parse_time_unit
 from gyrostab.schema import RESERVED_NAMES
 from gyrostab.units import known_units, parse_unit
+
+_T = TypeVar("_T")
 
 AXIS_PATTERN = re.compile(r"^(gyro|angle)_([a-z]\d*|\d+)$")
 _TIME_SUFFIX = r"s|sec|seconds?|ms|milliseconds?|us|microseconds?|ns|nanoseconds?|utc|iso"
@@ -105,35 +108,28 @@ def _split_last(text: str, opening: str, closing: str) -> tuple[str, str | None]
 
 def is_unit(text: str) -> bool:
     """Return whether a text is a known unit, of time or of any other quantity."""
-    for parse in (parse_unit, parse_time_unit):
-        try:
-            parse(text)
-        except GyrostabError:
-            continue
-        return bool(text.strip(" -"))
-    return False
+    is_known = _parse_or_none(parse_unit, text) is not None or is_time_unit(text)
+    return is_known and bool(text.strip(" -"))
 
 
 def is_unit_of(text: str | None, quantities: Collection[str]) -> bool:
     """Return whether a text is a unit of one of these quantities."""
     if text is None:
         return False
-    for quantity in quantities:
-        try:
-            if parse_unit(text, quantity).quantity == quantity:
-                return True
-        except UnitError:
-            continue
-    return False
+    units = ((_parse_or_none(parse_unit, text, quantity), quantity) for quantity in quantities)
+    return any(unit is not None and unit.quantity == quantity for unit, quantity in units)
 
 
 def is_time_unit(text: str) -> bool:
     """Return whether a text is a unit of time."""
+    return _parse_or_none(parse_time_unit, text) is not None
+
+
+def _parse_or_none(parse: Callable[..., _T], *arguments: str) -> _T | None:
     try:
-        parse_time_unit(text)
+        return parse(*arguments)
     except GyrostabError:
-        return False
-    return True
+        return None
 
 
 def distinct_columns(headers: Sequence[str]) -> Iterator[Header]:

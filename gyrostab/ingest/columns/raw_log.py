@@ -160,26 +160,21 @@ class RawLogBuilder:
         bad_cells += sum(int(np.count_nonzero(mask)) for mask in gyro)
         if self.gyro and all(mask is not None for mask in masks):
             bad = bad | np.logical_and.reduce([mask for mask in masks if mask is not None])
-        any_bad = bool(bad.any())
+        bad_rows = np.flatnonzero(bad)
         cell_masks = [mask & ~bad for mask in gyro]
-        converted = ConvertedBlock(size, block, ranges, bad_cells=bad_cells)
-        if any_bad:
-            converted = converted._replace(bad_rows=np.flatnonzero(bad))
-        if cell_masks:
-            converted = converted._replace(
-                cell_rows=np.flatnonzero(np.logical_or.reduce(cell_masks)),
-                cells=sum(int(np.count_nonzero(mask)) for mask in cell_masks),
-            )
-        if stamps is None or self.time is None:
-            return converted
-        if self.continues_clock:
-            stamps, clock = _continue_block(stamps)
-            converted = converted._replace(clock=clock)
-        block[self.time.source] = _pack_stamps(stamps)
-        good = stamps[~bad] if any_bad else stamps
-        if len(good):
-            converted = converted._replace(low=int(good.min()), high=int(good.max()))
-        return converted
+        cell_rows = np.flatnonzero(np.logical_or.reduce(cell_masks)) if cell_masks else _NO_ROWS
+        cells = sum(int(np.count_nonzero(mask)) for mask in cell_masks)
+        low, high, clock = np.iinfo(np.int64).max, NAT, None
+        if stamps is not None and self.time is not None:
+            if self.continues_clock:
+                stamps, clock = _continue_block(stamps)
+            block[self.time.source] = _pack_stamps(stamps)
+            good = stamps[~bad] if bad_rows.size else stamps
+            if len(good):
+                low, high = int(good.min()), int(good.max())
+        return ConvertedBlock(
+            size, block, ranges, bad_rows, cell_rows, bad_cells, cells, low, high, clock=clock
+        )
 
     def add(
         self,
