@@ -152,6 +152,28 @@ def test_what_the_engine_opened_can_be_written(tmp_path, form, chunks):
         xr.testing.assert_equal(original.compute(), other.compute())
 
 
+@pytest.mark.parametrize("source", ["open_log", "engine", "make_log", "read_log"])
+@pytest.mark.parametrize("form", WRITERS)
+def test_gaps_of_counts_stay_gaps_where_xarray_writes_them(tmp_path, form, source):
+    log = long_log().isel(time=slice(5000))
+    log["rate"][0, 7] = np.nan
+    if source in ("open_log", "engine"):
+        path = WRITERS[form](log, tmp_path / f"log.{form}")
+        log = open_log(path) if source == "open_log" else xr.open_dataset(path, engine="gyrostab")
+    elif source == "read_log":
+        for part in (range(1000), range(1010, 2000)):
+            rows = "".join(f"{i / 10},{i}\n" for i in part)
+            (tmp_path / f"{part[0]}.csv").write_text(f"time [s],gyro_x [deg/h]\n{rows}")
+        log = gyrostab.regularise(gyrostab.read_log(tmp_path / "*.csv"))
+    copy = tmp_path / f"copy.{form}"
+    log.to_zarr(copy, zarr_format=2) if form == "zarr" else log.to_netcdf(copy)
+    with xr.open_dataset(copy) as plain, open_log(copy) as back:
+        assert plain.rate.encoding["dtype"].kind == "i"
+        assert np.isnan(plain.rate).any()
+        np.testing.assert_array_equal(plain.rate.values, log.rate.values)
+        np.testing.assert_array_equal(back.rate.values, log.rate.values)
+
+
 @pytest.mark.parametrize("form", WRITERS)
 @pytest.mark.parametrize("name", ["product", "surface"])
 def test_what_xarray_wrote_is_opened(tmp_path, form, name):

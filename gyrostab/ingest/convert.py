@@ -25,6 +25,7 @@ from gyrostab.ingest.uniform import advise_dates, as_uniform
 from gyrostab.schema import SIGNAL_LONG_NAMES, SIGNAL_UNITS, texts
 from gyrostab.store.private import is_in_memory
 from gyrostab.store.read import MIN_LAZY_VALUES, make_variable_lazy
+from gyrostab.store.write import declare_counts
 from gyrostab.units import HOUR, Unit, known_units, parse_unit
 
 #: An option of a command with its value, as messages on files advise it.
@@ -404,7 +405,7 @@ def _dataset_of(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[
     signal = array.variable.transpose("axis", "time")
     data = signal.data * unit.factor if unit.factor != 1.0 else signal.data
     packing = (
-        {"dtype": signal.dtype, "scale_factor": unit.factor}
+        declare_counts(signal.dtype, unit.factor)
         if signal.dtype.kind in "iu" and not increments
         else {}
     )

@@ -10,6 +10,7 @@ import xarray as xr
 
 from gyrostab.errors import OptionError
 from gyrostab.schema import SIGNAL_LONG_NAMES, SIGNAL_UNITS
+from gyrostab.store.write import declare_counts
 from gyrostab.time.grid import check_rate, check_span, stamp_ns, time_coordinate
 from gyrostab.units import INNER, parse_unit
 
@@ -69,9 +70,7 @@ def make_log(
     if parsed.quantity != kind:
         raise OptionError(f"unit {unit!r} is a unit of {parsed.quantity}, but kind is {kind!r}")
     data = values if hasattr(values, "ndim") else np.asarray(values)
-    packing = (
-        {"dtype": data.dtype, "scale_factor": parsed.factor} if data.dtype.kind in "iu" else {}
-    )
+    packing = declare_counts(data.dtype, parsed.factor) if data.dtype.kind in "iu" else {}
     data = data[None, :] if data.ndim == 1 else data
     names = list(axis) if axis is not None else list("xyz")[: data.shape[0]]
     if data.ndim != 2 or len(names) != data.shape[0]:

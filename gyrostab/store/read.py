@@ -205,7 +205,11 @@ def _find_long_variables(stored: Stored, path: Path, *, strict: bool) -> dict[An
             zarr=path.is_dir(),
         )
         packing = (
-            {"dtype": np.dtype(disk["dtype"]), "scale_factor": float(array.scale)}
+            {
+                "dtype": np.dtype(disk["dtype"]),
+                "scale_factor": float(array.scale),
+                "_FillValue": array.missing,
+            }
             if array.scale is not None
             else {}
         )

@@ -31,7 +31,8 @@ CHUNK_LIMITS = (2**16, 2**22)
 MAX_BATCH_BYTES = 2**26
 #: Values from which the chunks of a variable are compressed in several threads.
 _MIN_LARGE_VALUES = 2**15
-FILL_VALUES = {"int16": -32767, "int32": -2147483647}  # the defaults of NetCDF
+#: Counts of missing values: the defaults of NetCDF, of 64 bits the least, which a double holds.
+FILL_VALUES = {"int16": -32767, "int32": -2147483647, "int64": -(2**63)}
 
 #: Function that is called with the share that is done.
 Progress = Callable[[float], None]
@@ -102,14 +103,31 @@ def _pack_counts(
     return counts
 
 
+def declare_counts(dtype: Any, scale: float) -> dict[str, Any]:
+    """Return the encoding of integer counts, in a signed type that has a count for missing values.
+
+    Without such a count, xarray writes a missing value as 0.
+
+    Examples
+    --------
+    >>> declare_counts("u2", 0.1)
+    {'dtype': dtype('int32'), 'scale_factor': 0.1, '_FillValue': np.int32(-2147483647)}
+    """
+    signed = np.promote_types(dtype, np.int16)
+    if signed.kind != "i":  # 64 bits without a sign
+        signed = np.dtype(np.int64)
+    fill = signed.type(FILL_VALUES[signed.name])
+    return {"dtype": signed, "scale_factor": float(scale), "_FillValue": fill}
+
+
 def common_packing(encodings: Iterable[Mapping[Any, Any]]) -> dict[str, Any]:
     """Find the encoding of a variable of concatenated logs: counts if all are counts of one factor.
 
     Examples
     --------
-    >>> common_packing([{"dtype": "i2", "scale_factor": 0.1}, {"dtype": "i4", "scale_factor": 0.1}])
-    {'dtype': dtype('int32'), 'scale_factor': 0.1}
-    >>> common_packing([{"dtype": "i2", "scale_factor": 0.1}, {}])
+    >>> common_packing([declare_counts("i2", 0.1), declare_counts("i4", 0.1)])["dtype"]
+    dtype('int32')
+    >>> common_packing([declare_counts("i2", 0.1), {}])
     {}
     """
     encodings = list(encodings)
@@ -117,10 +135,8 @@ def common_packing(encodings: Iterable[Mapping[Any, Any]]) -> dict[str, Any]:
     scale = scales.pop() if len(scales) == 1 else None
     if scale is None or not all("dtype" in encoding for encoding in encodings):
         return {}
-    return {
-        "dtype": np.result_type(*(np.dtype(encoding["dtype"]) for encoding in encodings)),
-        "scale_factor": float(scale),
-    }
+    dtypes = (np.dtype(encoding["dtype"]) for encoding in encodings)
+    return declare_counts(np.result_type(*dtypes), scale)
 
 
 def large_variables(stored: xr.Dataset) -> dict[str, xr.Variable]:

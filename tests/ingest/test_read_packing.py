@@ -210,7 +210,11 @@ def test_whole_counts_stay_whole_on_the_grid(tmp_path):
             {"_Unsigned": "true", "scale_factor": 0.5, "_FillValue": np.int8(-97)},
         )
     )
-    assert raw.rate.encoding == {"dtype": np.dtype("int16"), "scale_factor": 0.5}
+    assert raw.rate.encoding == {
+        "dtype": np.dtype("int16"),
+        "scale_factor": 0.5,
+        "_FillValue": -32767,
+    }
 
 
 @pytest.mark.parametrize(

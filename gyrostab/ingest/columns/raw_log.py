@@ -26,6 +26,7 @@ from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store.lazy import read_slice
 from gyrostab.store.row_inspection import RowInspection
+from gyrostab.store.write import declare_counts
 
 #: Largest number of bad places that a note lists.
 MAX_NAMED_PLACES = 10
@@ -266,7 +267,7 @@ class RawLogBuilder:
             return {}
         reach = max(max(-low, high) for low, high in filter(None, spans))
         dtype = next((kind for kind in ("int16", "int32") if reach < np.iinfo(kind).max), None)
-        return {"dtype": np.dtype(dtype), "scale_factor": factors.pop()} if dtype else {}
+        return declare_counts(dtype, factors.pop()) if dtype else {}
 
     def finish(self, notes: Sequence[str] = ()) -> xr.Dataset:
         """Return the raw log.

@@ -30,6 +30,7 @@ from gyrostab.ingest.columns.stamps import (
     parse_time_unit,
 )
 from gyrostab.store.lazy import Converted, FileVariable, Source, make_dask
+from gyrostab.store.write import declare_counts
 
 #: Stored numbers -> counts or values.
 Decoder = Callable[[Any], Any]
@@ -357,7 +358,7 @@ def _decode_variable(
         return source, attrs, variable.encoding
     encoding = dict(chunks)
     if packing.dtype.kind in "iu" and packing.scale != 1.0:
-        encoding |= {"dtype": variable.dtype, "scale_factor": packing.scale}
+        encoding |= declare_counts(packing.dtype, packing.scale)
         encoding |= {"add_offset": packing.offset} if packing.offset else {}
     return Converted(source, packing.read_values, np.float64), attrs, encoding
 
