@@ -195,7 +195,8 @@ def append_netcdf(
 
     def compress(name: str, values: NDArray[Any]) -> Any:
         fill = fills[name]
-        chunk = np.full(chunks[name], 0 if fill is None else fill, values.dtype)
+        native = values.dtype.newbyteorder("=")  # that of the variable in the file
+        chunk = np.full(chunks[name], 0 if fill is None else fill, native)
         inside = chunk[tuple(map(slice, values.shape))]
         inside[...] = values
         if fill is not None and values.dtype.kind == "f":

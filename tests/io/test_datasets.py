@@ -21,6 +21,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gyrostab.errors import FormatError, OptionError, SchemaError
+from gyrostab.ingest.make_log import make_log
 from gyrostab.io import datasets as export
 from gyrostab.io.datasets import (
     open_dataset,
@@ -476,3 +477,20 @@ def test_chunks_that_threads_compress_are_those_of_the_library(tmp_path, monkeyp
             ):
                 assert reference.read_direct_chunk(place) == other.read_direct_chunk(place)
     assert multichunk > 5
+
+
+@pytest.mark.parametrize("kind", [">f8", ">f4", ">i2", ">i4"])
+@pytest.mark.parametrize("form", ["nc", "zarr"])
+def test_large_data_of_the_other_byte_order_come_back(tmp_path, kind, form):
+    writer = to_netcdf if form == "nc" else to_zarr
+    values = np.arange(40_000).astype(kind)
+    channel = ("time", values, {"units": "V"})
+    if np.dtype(kind).kind == "f":
+        log = make_log(values.astype("f8"), rate=100.0, unit="deg/h")
+        log["rate"] = (log.rate.dims, values[None, :], log.rate.attrs)
+    else:
+        log = make_log(values, rate=100.0, unit="deg/h")
+    log["channel"] = channel
+    with open_log(writer(log, tmp_path / f"log.{form}")) as back:
+        np.testing.assert_array_equal(back.rate.values[0], values)
+        np.testing.assert_array_equal(back.channel.values, values)
