@@ -230,6 +230,8 @@ def _open_variable(
 ) -> xr.Variable:
     encoding = {key: attrs.pop(key) for key in _ENCODED if key in attrs}
     dtype, is_packed = values.dtype, "scale_factor" in encoding
+    if _FOREIGN & set(attrs):
+        raise ValueError(name)
     if GRID in attrs and dims:
         data = np.broadcast_to(dtype.type(0), values.shape)
     elif dims and dims[-1].startswith("time") and (dtype.kind == "f" or is_packed):
@@ -242,7 +244,7 @@ def _open_variable(
             raise ValueError(name)
         encoding |= {"dtype": dtype, "chunksizes": chunks}
         data = np.broadcast_to(missing, values.shape)
-    elif encoding or _FOREIGN & set(attrs) or math.prod(values.shape) > _MAX_READ_VALUES:
+    elif encoding or math.prod(values.shape) > _MAX_READ_VALUES:
         raise ValueError(name)
     else:
         data = _read_part(values, (0,) * len(dims), values.shape)

@@ -36,6 +36,8 @@ from gyrostab.wording import list_some
 Stored = xr.Dataset | StoredLog
 #: Values from which a variable is a dask array.
 MIN_LAZY_VALUES = 2**17
+#: Encodings that xarray decodes; gyrostab writes none of them in a log.
+_FOREIGN_PACKING = {"_Unsigned", "add_offset", "missing_value"}
 #: Bytes of the cache of chunks of which only a part was requested.
 _CACHE_BYTES = 2**24
 
@@ -186,8 +188,9 @@ def _find_long_variables(stored: Stored, path: Path, *, strict: bool) -> dict[An
             continue
         dim = str(variable.dims[-1])
         is_known = all(size == 1 for size in chunks[:-1]) and is_readable(path, str(name), disk)
-        if not is_known or ("scale_factor" in disk and "_FillValue" not in disk):
-            continue  # some other program has laid it out anew
+        has_fill = "scale_factor" not in disk or "_FillValue" in disk
+        if not is_known or not has_fill or _FOREIGN_PACKING & set(disk):
+            continue  # some other program has written it anew
         array = _ChunkedVariable(
             path=path.absolute(),
             name=str(name),

@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gyrostab.errors import OptionError, SchemaError, TimeError
+from gyrostab.ingest.make_log import make_log
 from gyrostab.io import datasets
 from gyrostab.io.datasets import open_log, to_netcdf, to_zarr
 from gyrostab.kernels.encoding.counts import from_counts, to_counts
@@ -238,3 +239,31 @@ def test_a_name_that_the_time_axis_needs(tmp_path):
     log = counts_log(samples=10).assign(time_start=3)
     with pytest.raises(SchemaError, match="'time_start' is needed for the time axis; rename"):
         to_netcdf(log, tmp_path / "log.nc")
+
+
+@pytest.mark.parametrize("form", WRITERS)
+@pytest.mark.parametrize(
+    "packing",
+    [
+        {"dtype": "int16", "add_offset": 100.0, "_FillValue": -32767},
+        {"dtype": "int16", "missing_value": -9},
+        {"dtype": "uint8", "add_offset": -20.0, "_FillValue": 255},
+        {"dtype": "int8", "_Unsigned": "true", "_FillValue": -1},
+    ],
+)
+def test_counts_that_another_program_packed_are_read_as_xarray_reads_them(tmp_path, form, packing):
+    values = np.arange(50.0)[None, :] * 0.5
+    values[0, 7] = np.nan
+    log = make_log(values, rate=10.0, unit="deg/h")
+    path = WRITERS[form](log, tmp_path / f"own.{form}")
+    with xr.open_dataset(path) as plain:
+        plain = plain.load().drop_encoding()
+    cut = {"chunks": (1, 50)} if form == "zarr" else {"chunksizes": (1, 50)}
+    packing = {"scale_factor": 0.5, "_FillValue": None, **packing, **cut}
+    copy, encoding = tmp_path / f"copy.{form}", {"rate": packing}
+    if form == "zarr":
+        plain.to_zarr(copy, encoding=encoding, zarr_format=2)
+    else:
+        plain.to_netcdf(copy, encoding=encoding)
+    with open_log(copy) as back:
+        np.testing.assert_array_equal(back.rate.values, values)
