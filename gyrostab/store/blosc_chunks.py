@@ -14,11 +14,12 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from gyrostab.errors import FormatError
-from gyrostab.store.output.content import METADATA
+from gyrostab.store.output.content import METADATA, UNFINISHED
 
 _HEADER_BYTES = 16
 
@@ -55,7 +56,8 @@ def check_blosc_chunks(folder: Path, *, skip: Collection[Any] = ()) -> None:
         if array.name in skip:
             continue
         for path in _find_chunks(array):
-            with path.open("rb") as file:
+            # another process may replace or remove a chunk meanwhile
+            with suppress(FileNotFoundError), path.open("rb") as file:
                 header = file.read(_HEADER_BYTES)
                 if is_blosc_cut(header, os.fstat(file.fileno()).st_size):
                     raise FormatError(
@@ -108,4 +110,5 @@ def _uses_blosc(metadata: Any) -> bool:
 
 def _find_chunks(array: Path) -> Iterator[Path]:
     for place, _, names in os.walk(array):
-        yield from (Path(place, name) for name in names if name not in METADATA)
+        finished_names = (name for name in names if not UNFINISHED.search(name))
+        yield from (Path(place, name) for name in finished_names if name not in METADATA)

@@ -15,6 +15,7 @@ from gyrostab import davar, make_log, open_log, open_product, read_log, scan, to
 from gyrostab.allan.fit import fit_noise
 from gyrostab.errors import FormatError
 from gyrostab.store.blosc_chunks import check_blosc_chunks, is_blosc_cut
+from gyrostab.store.output import find_foreign_item
 
 
 def write_foreign(path: Path, zarr_format: int) -> None:
@@ -87,6 +88,17 @@ def test_cut_chunk_of_a_product_is_refused(tmp_path: Path) -> None:
     chunk.write_bytes(chunk.read_bytes()[:-1])
     with pytest.raises(FormatError, match=r"product\.zarr: is damaged: the chunk avar"):
         open_product(path)
+
+
+def test_files_that_the_library_is_writing_are_no_damage(tmp_path: Path) -> None:
+    log = make_log(np.random.default_rng(1).standard_normal(6000), rate=100.0, unit="deg/h")
+    path = to_zarr(fit_noise(davar(log, window="20s")), tmp_path / "product.zarr")
+    for name in ("0.0", ".zarray"):
+        (path / "avar" / f"{name}.{'0123456789abcdef' * 2}.partial").write_bytes(b"")
+    open_product(path)
+    assert find_foreign_item(path) is None
+    (path / "avar" / "0.0.partial").touch()
+    assert find_foreign_item(path) == "avar/0.0.partial"
 
 
 def test_cut_chunk_of_the_samples_of_an_own_log_is_a_gap(tmp_path: Path) -> None:

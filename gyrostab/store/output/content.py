@@ -16,9 +16,10 @@ FindForeign = Callable[[Path], str | None]
 
 #: Names of the metadata of Zarr stores.
 METADATA = {".zarray", *ROOT_METADATA}
-#: Keys of chunks of formats 2 and 3, ``1.0``, ``c.1.0``, or one level of ``c/1/0``, and chunks that
-#: a killed process left.
-_CHUNK = re.compile(r"(c|(c\.)?\d+(\.\d+)*)(\.[0-9a-f]{32}\.partial)?")
+#: Keys of chunks of formats 2 and 3, ``1.0``, ``c.1.0``, or one level of ``c/1/0``.
+_CHUNK = re.compile(r"c|(c\.)?\d+(\.\d+)*")
+#: How the name of a file ends that the library is writing, or that a killed process left.
+UNFINISHED = re.compile(r"\.[0-9a-f]{32}\.partial$")
 
 
 def read_json(path: Path) -> Any:
@@ -70,7 +71,8 @@ def _find_in_node(folder: str, node: str | None) -> str | None:
     with os.scandir(folder) as entries:
         sorted_entries = sorted(entries, key=lambda entry: entry.name)
     for entry in sorted_entries:
-        is_chunk = node in ("array", "chunks") and _CHUNK.fullmatch(entry.name)
+        name = UNFINISHED.sub("", entry.name)
+        is_chunk = node in ("array", "chunks") and _CHUNK.fullmatch(name)
         if node is None or entry.is_symlink() or (node == "chunks" and not is_chunk):
             return entry.path
         if entry.is_dir():
@@ -78,6 +80,6 @@ def _find_in_node(folder: str, node: str | None) -> str | None:
             foreign_item = _find_in_node(entry.path, inner_node)
             if foreign_item is not None:
                 return foreign_item
-        elif not entry.is_file() or not (is_chunk or entry.name in METADATA):
+        elif not entry.is_file() or not (is_chunk or name in METADATA):
             return entry.path
     return None
