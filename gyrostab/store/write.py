@@ -143,7 +143,8 @@ def large_variables(stored: xr.Dataset) -> dict[str, xr.Variable]:
     """Find the numbers that are written chunk by chunk: lazy ones along time, and large data."""
 
     def is_lazy(variable: xr.Variable) -> bool:
-        return variable.chunks is not None and str(variable.dims[-1]).startswith("time")
+        is_series = variable.ndim > 0 and str(variable.dims[-1]).startswith("time")
+        return variable.chunks is not None and is_series
 
     return {
         str(name): variable
@@ -249,7 +250,11 @@ def append_zarr(
     for name, variable in large.items():
         options = dict(encoding[name])
         fill = variable.attrs.get("_FillValue", options.pop("_FillValue", None))
-        attrs = {key: value for key, value in variable.attrs.items() if key != "_FillValue"}
+        attrs = {
+            key: value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+            for key, value in variable.attrs.items()
+            if key != "_FillValue"
+        }
         targets[name] = group.create_array(
             name,
             shape=variable.shape,

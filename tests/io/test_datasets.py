@@ -494,3 +494,13 @@ def test_large_data_of_the_other_byte_order_come_back(tmp_path, kind, form):
     with open_log(writer(log, tmp_path / f"log.{form}")) as back:
         np.testing.assert_array_equal(back.rate.values[0], values)
         np.testing.assert_array_equal(back.channel.values, values)
+
+
+@pytest.mark.parametrize("write", [to_netcdf, to_zarr])
+def test_lazy_numbers_and_arrays_in_attributes_can_be_written(tmp_path, write):
+    log = make_log(np.arange(40_000.0), rate=100.0, unit="deg/h").chunk(time=10_000)
+    log["mean"] = log.rate.mean()
+    log.rate.attrs["valid_range"] = np.array([-1e5, 1e5])
+    with open_log(write(log, tmp_path / "log")) as back:
+        assert float(back["mean"]) == float(log["mean"])
+        np.testing.assert_array_equal(back.rate.attrs["valid_range"], [-1e5, 1e5])
