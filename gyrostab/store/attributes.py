@@ -61,7 +61,7 @@ def encode_attributes(attrs: dict[str, Any]) -> dict[str, Any]:
             attrs[name] = json.dumps(value, default=str)
             coded.append(name)
     if coded:
-        attrs[JSON_NAMES] = " ".join(coded)
+        attrs[JSON_NAMES] = json.dumps(coded)
     return attrs
 
 
@@ -109,10 +109,17 @@ def make_global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[st
     return encode_attributes(attrs)
 
 
+def decode_json(attrs: dict[str, Any]) -> None:
+    """Decode the attributes that are JSON, whose names are in one of them."""
+    text = str(attrs.pop(JSON_NAMES, ""))
+    names = json.loads(text) if text.startswith("[") else text.split()  # of an earlier version
+    for name in set(names) & set(attrs):
+        attrs[name] = json.loads(attrs[name])
+
+
 def decode_attributes(attrs: dict[str, Any]) -> dict[str, Any]:
     """Convert attributes of a file back; those that concern only the file are dropped."""
-    for name in set(str(attrs.pop(JSON_NAMES, "")).split()) & set(attrs):
-        attrs[name] = json.loads(attrs[name])
+    decode_json(attrs)
     for name, value in attrs.items():
         attrs[name] = value.item() if isinstance(value, np.generic) else value
     if "since" in str(attrs.get("units", "")):

@@ -504,3 +504,19 @@ def test_lazy_numbers_and_arrays_in_attributes_can_be_written(tmp_path, write):
     with open_log(write(log, tmp_path / "log")) as back:
         assert float(back["mean"]) == float(log["mean"])
         np.testing.assert_array_equal(back.rate.attrs["valid_range"], [-1e5, 1e5])
+
+
+@pytest.mark.parametrize("write", [to_netcdf, to_zarr])
+def test_names_of_attributes_may_hold_blanks(tmp_path, write):
+    attrs = {"tool info": ["a", "b"], "info": "run 7"}
+    path = write(synthetic.log().assign_attrs(attrs), tmp_path / "log")
+    with open_log(path) as back:
+        assert {name: back.attrs[name] for name in attrs} == attrs
+
+
+def test_names_of_attributes_of_an_earlier_version_are_read(tmp_path):
+    path = to_netcdf(synthetic.log().assign_attrs(info=["a"]), tmp_path / "log.nc")
+    with netCDF4.Dataset(path, "a") as file:
+        file.json_attributes = " ".join(json.loads(file.json_attributes))
+    with open_log(path) as back:
+        assert back.attrs["info"] == ["a"]

@@ -7,7 +7,6 @@ from the coordinate of the short dimension, or ``name/0`` without such a coordin
 
 from __future__ import annotations
 
-import json
 import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -37,7 +36,7 @@ from gyrostab.ingest.limits import check_declared, check_stored
 from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
 from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name, texts
-from gyrostab.store.attributes import decode_attributes
+from gyrostab.store.attributes import decode_attributes, decode_json
 from gyrostab.store.blosc_chunks import check_blosc_chunks
 from gyrostab.store.cf import from_disk
 from gyrostab.store.hdf5_heaps import check_global_heaps
@@ -157,8 +156,7 @@ def _as_in_memory(path: Path, log: xr.Dataset) -> xr.Dataset:
     log = log.assign_coords(
         axis=_read_labels(path, log["axis"]) if log["axis"].ndim else str(log["axis"].values)
     )
-    for name in str(log.attrs.pop("json_attributes", "")).split():
-        log.attrs[name] = json.loads(log.attrs[name])
+    decode_json(log.attrs)
     log.attrs = {
         name: value.item() if isinstance(value, np.generic) else value
         for name, value in log.attrs.items()
