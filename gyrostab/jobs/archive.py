@@ -18,6 +18,7 @@ import pandas as pd
 from gyrostab.diagnose.result.content import SCHEMA, check_diagnosis
 from gyrostab.errors import DamageError, FormatError, GyrostabError, OptionError, SchemaError
 from gyrostab.ingest.files import scan_file
+from gyrostab.ingest.formats.binary import list_layouts
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.jobs.schedule import Pool, run_calls
 from gyrostab.progress import Stage
@@ -218,11 +219,12 @@ def index_files(
     changed: list[str] = []
     for path in [*archive.files, *archive.diagnoses]:
         state = describe_file(path)
+        layouts = [describe_file(layout)["changed_ns"] for layout in list_layouts([path])]
         row = {
             "file": full_name(path),
             "base": str(archive.base),
             "bytes": state["bytes"],
-            "changed_ns": state["changed_ns"],
+            "changed_ns": max([state["changed_ns"], *layouts]),
             "listing": state.get("listing", ""),
             "options": options,
         }

@@ -271,9 +271,11 @@ def _describe_job(
     paths: Sequence[str | Path], target: Path, options: dict[str, Any], *, zarr: bool = False
 ) -> _Job:
     from gyrostab.ingest.files import expand
+    from gyrostab.ingest.formats.binary import list_layouts
 
     extra = options["reading"].get("channel", ())
     files = expand(paths) + (expand(extra) if extra else [])
+    files += list_layouts(files)
     fingerprint = make_fingerprint(
         files, {**options, "reading": {**options["reading"], "channel": None}}
     )

@@ -224,6 +224,21 @@ def test_a_second_call_computes_what_is_new_changed_or_failed(tmp_path, computed
     assert computed == []
 
 
+def test_a_changed_layout_of_a_binary_log_counts_as_a_change(tmp_path, computed):
+    log, output, means = tmp_path / "archive" / "run" / "log.bin", tmp_path / "fleet", []
+    log.parent.mkdir(parents=True)
+    np.random.default_rng(1).integers(-99, 99, 12_000, dtype=np.int16).tofile(log)
+    for unit in ("deg/h", "deg/h", "10 deg/h"):
+        layout = f'fields = [{{name = "gyro_x [{unit}]", type = "int16"}}]'
+        if not means or unit != "deg/h":
+            log.with_name("log.bin.toml").write_text(layout)
+        run_fleet([tmp_path / "archive" / "run" / "*.bin"], output, **OPTIONS, reading={"rate": 20})
+        with open_product(next(output.rglob("*.nc"))) as product:
+            means.append(float(product["window_mean"][0, 0]))
+    assert len(computed) == 2
+    np.testing.assert_allclose(means, [means[0], means[0], 10 * means[0]])
+
+
 def test_a_table_of_files_takes_the_place_of_the_archive(archive, tmp_path, monkeypatch):
     table = tmp_path / "files.parquet"
     options = ["--quiet-progress", "--scheduler", "threads"]

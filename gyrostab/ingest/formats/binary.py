@@ -6,6 +6,7 @@ time follows from it and ``--rate``, and lost messages are gaps.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
@@ -18,7 +19,13 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, OptionError
 from gyrostab.ingest.columns.stamps import TimeUnit, integers_to_ns
-from gyrostab.ingest.formats.layout import Field, Layout, find_layout, layout_path
+from gyrostab.ingest.formats.layout import (
+    Field,
+    Layout,
+    find_layout,
+    find_layout_file,
+    layout_path,
+)
 from gyrostab.ingest.formats.messages import find_messages, unwrap_counter
 from gyrostab.ingest.formats.tables import (
     NO_NAME,
@@ -45,6 +52,12 @@ def matches(path: Path) -> bool:
 def has_layout(path: Path) -> bool:
     """Return whether a file has a layout file named after it."""
     return not path.is_dir() and layout_path(path).is_file()
+
+
+def list_layouts(paths: Iterable[Path]) -> list[Path]:
+    """List the layout files by which files are read, each once."""
+    places = (find_layout_file(path) for path in paths if matches(path))
+    return list(dict.fromkeys(filter(None, places)))
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:

@@ -77,6 +77,12 @@ def layout_path(path: Path) -> Path:
     return path.with_name(f"{path.name}.toml")
 
 
+def find_layout_file(path: Path) -> Path | None:
+    """Return the layout file of a file; None without one."""
+    places = [layout_path(path), path.with_suffix(".toml"), path.with_name("layout.toml")]
+    return next((place for place in places if place.is_file()), None)
+
+
 def find_layout(path: Path) -> Layout:
     """Return the layout of a file: that of a layout file, or of a sensor whose messages it holds.
 
@@ -85,10 +91,9 @@ def find_layout(path: Path) -> Layout:
     OptionError
         When there is no layout, or it is not usable.
     """
-    places = [layout_path(path), path.with_suffix(".toml"), path.with_name("layout.toml")]
-    place = next((place for place in places if place.is_file()), None)
+    place = find_layout_file(path)
     if place is None:
-        return _find_known(path, places[0].name)
+        return _find_known(path, layout_path(path).name)
     try:
         content = parse_toml(read_toml_text(place))
     except (ValueError, RecursionError) as error:
