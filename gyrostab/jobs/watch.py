@@ -231,7 +231,8 @@ class _View:
     ):
         self.path, self.options, self.lateness = path, options, lateness
         self.alarms, self.listener = alarms, listener
-        self.until, self.exists = until, until is not None  # of a product that is continued
+        self.until = until  # last window that this call, or an earlier one, has shown
+        self.exists = until is not None
         self.memory = FileMemory()
         self.space = Workspace()
         self.digests: list[bytes] = []
@@ -245,7 +246,12 @@ class _View:
     def take_files(self, files: FileStates) -> None:
         """Take over a new list of files."""
         if self.memory.update(files):
-            self.digests = []
+            self.digests, self.common = [], ""
+            self.shown, self.missing_samples, self.bytes = 0, 0, 0
+            text = "a file was cut, replaced or removed, so the product is computed again"
+            if self.until is not None:
+                text += f"; windows up to {self.until} are not shown again"
+            self.listener.show_note(text)
         self.is_new_data = True
 
     def update(self, *, final: bool = False) -> None:
@@ -364,11 +370,13 @@ class _View:
             )
 
     def _show_windows(self, windows: Sequence[Mapping[str, Any]]) -> None:
-        """Show new windows and alarms; windows of an earlier call only set the alarms."""
+        """Show new windows and alarms; windows that were shown before only set the alarms."""
         for window in windows:
             self.shown += 1
-            is_known = self.until is not None and bool(np.datetime64(window["time"]) <= self.until)
+            stamp = np.datetime64(window["time"])
+            is_known = self.until is not None and bool(stamp <= self.until)
             if not is_known:
+                self.until = stamp
                 self.listener.show_window(window)
             for event in (event for alarm in self.alarms for event in alarm.update(window)):
                 if not is_known:

@@ -24,6 +24,7 @@ from gyrostab.io.datasets import open_product, to_netcdf, to_zarr
 from gyrostab.jobs import follow as follow_module
 from gyrostab.jobs import watch as module
 from gyrostab.jobs.alarms import parse_alarm
+from gyrostab.jobs.checks import check_options
 from gyrostab.jobs.live_page import LivePage
 from gyrostab.jobs.run import run
 from gyrostab.jobs.watch import rows_folder, watch
@@ -168,6 +169,24 @@ def test_a_file_that_comes_late_changes_earlier_windows(rows, tmp_path):
     assert any("late rows changed 1 earlier part" in note for note in recorder.notes)
     assert len({window["time"] for window in first.windows + recorder.windows}) == len(
         first.windows + recorder.windows
+    )
+
+
+def test_a_file_that_is_cut_is_followed_on(tmp_path):
+    rows, recorder = make_rows(12_000), Recorder()
+    source, output = tmp_path / "log.csv", tmp_path / "live.zarr"
+    view = module._View(output, check_options(windows=WINDOWS), 0.0, [], recorder, None)
+    for count in (8_000, 5_000, 6_500, 12_000):
+        source.write_text(HEADER + "".join(rows[:count]))
+        view.take_files(follow_module.list_files(str(source)))
+        view.update()
+        with open_product(output) as product:
+            assert product.sizes["time"] == count // 1_000
+            times = product["time"].values.astype("datetime64[ms]").astype(str).tolist()
+    assert [window["time"] for window in recorder.windows] == times
+    assert recorder.notes[-1] == (
+        "a file was cut, replaced or removed, so the product is computed again; "
+        f"windows up to {times[7]} are not shown again"
     )
 
 
