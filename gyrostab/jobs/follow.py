@@ -99,6 +99,8 @@ class RowKeeper:
         self.error: Exception | None = None  # that ended the copying
         folder.mkdir(exist_ok=True)
         self._files = sorted(folder.glob(_ROW_FILE.format("*")))
+        numbers = re.findall(r"\d+", " ".join(path.stem for path in self._files))
+        self._last_number = max(map(int, numbers), default=0)
         threading.Thread(target=self._copy_stream, args=(stream,), daemon=True).start()
 
     def _copy_stream(self, stream: Any) -> None:
@@ -116,7 +118,8 @@ class RowKeeper:
         """Write rows to a new file as they come, until it is full; return what follows."""
         has_header = not (_DATA_ROW.match(piece) and self._files)
         header = b"" if has_header else _read_header(self._files[0])
-        path = self.folder / _ROW_FILE.format(f"{len(self._files) + 1:06d}")
+        self._last_number += 1
+        path = self.folder / _ROW_FILE.format(f"{self._last_number:06d}")
         size = 0
         with path.open("xb") as file:
             self._files.append(path)

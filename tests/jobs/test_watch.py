@@ -239,6 +239,15 @@ def test_rows_of_a_stream_are_kept_in_files_of_whole_rows(tmp_path, monkeypatch,
     assert keeper.error is None
 
 
+def test_rows_of_a_stream_are_kept_where_an_earlier_file_was_removed(tmp_path):
+    for number in (2, 10):
+        (tmp_path / f"rows-{number:06d}.csv").write_text("t,a\n1,2\n")
+    keeper = follow_module.RowKeeper(io.BytesIO(b"3,4\n"), tmp_path)
+    while not keeper.ended:
+        time.sleep(0.001)
+    assert (tmp_path / "rows-000011.csv").read_text() == "t,a\n3,4\n"
+
+
 def test_alarms_are_said_once_when_they_begin_and_end(tmp_path):
     noise = np.random.default_rng(0).standard_normal(12_000) * 3.0
     noise[4_000:8_000] *= 10.0
