@@ -344,16 +344,15 @@ def _name_groups(groups: Mapping[Path, list[Path]], base: Path, per: str) -> dic
         for name in names.values()
         for depth in range(1, name.count("/") + 1)
     }
-    return {
-        _avoid_names(name, {*above, *RESERVED_NAMES}): groups[path] for path, name in names.items()
-    }
-
-
-def _avoid_names(name: str, used_names: Iterable[str]) -> str:
-    """Return the name, or for a folder around other runs ``name/files``."""
-    while name in used_names:
-        name = f"{name}/files"
-    return name
+    used_names, named = {*above, *RESERVED_NAMES}, {}
+    for path, name in sorted(names.items(), key=lambda item: item[1] in used_names):
+        if name in used_names:  # a folder around other runs
+            name = f"{name}/files"
+        while name in used_names:
+            name += "_"
+        used_names.add(name)
+        named[name] = groups[path]
+    return named
 
 
 def read_diagnosis(folder: Path) -> Mapping[str, Any] | None:

@@ -22,7 +22,7 @@ from gyrostab.cli import main
 from gyrostab.errors import FormatError, OptionError, OutputError
 from gyrostab.ingest.files import scan_file
 from gyrostab.jobs import fleet as fleet_module
-from gyrostab.jobs.archive import LogRun, find_archive, find_runs
+from gyrostab.jobs.archive import Archive, LogRun, find_archive, find_runs
 from gyrostab.jobs.fleet import process_run, run_fleet, write_file_table
 from gyrostab.jobs.fleet_table import TREND_COLUMNS, read_table, write_table
 from gyrostab.jobs.run import run
@@ -105,6 +105,16 @@ def test_runs_are_folders_or_files(tmp_path, per, expected):
         assert {item.name: [path.name for path in item.files] for item in runs} == expected
     assert {item.tool for item in runs} == {item.name.rpartition("/")[0] for item in runs}
     assert {item.tool for item in find_runs(archive, table, tool="^.")} == {"a", "b"}
+
+
+def test_every_run_has_a_name_also_where_a_folder_is_called_files(tmp_path):
+    files = [tmp_path / name for name in ("x/1.nc", "x/files/2.nc", "x/y/3.nc", "reports/4.nc")]
+    table = pd.DataFrame({"file": map(str, files), "bytes": 0, "is_log": True, "note": ""})
+    runs = find_runs(Archive(tmp_path, files, []), table)
+    names = {item.name: item.files[0].name for item in runs}
+    assert names == {
+        "reports/files": "4.nc", "x/files": "2.nc", "x/files_": "1.nc", "x/y": "3.nc"
+    }  # fmt: skip
 
 
 def test_an_archive_of_ten_thousand_files_is_listed_in_linear_time(tmp_path):
