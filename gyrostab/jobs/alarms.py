@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,7 +15,7 @@ import xarray as xr
 from gyrostab.errors import OptionError, UnitError
 from gyrostab.noise import LAWS
 from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY
-from gyrostab.units import INNER, parse_unit
+from gyrostab.units import INNER, Unit, parse_unit
 
 _SYNTAX = re.compile(
     r"\s*(?:(?P<axis>\w+)\s*:)?\s*(?P<name>[A-Za-z]\w*)\s*(?P<sign>[<>])\s*"
@@ -70,8 +71,8 @@ class Alarm:
         value, units = window["channels"][self.name]
         if value is None:
             return {"": None}
-        unit = parse_unit(self.unit or "1", _quantity_of(units))
-        return {"": (value - unit.offset) / unit.factor}
+        unit = _find_unit(self.unit, units)
+        return {"": None if unit is None else (value - unit.offset) / unit.factor}
 
 
 def parse_alarm(text: str) -> Alarm:
@@ -86,7 +87,7 @@ def parse_alarm(text: str) -> Alarm:
     Raises
     ------
     OptionError
-        When the text or the unit cannot be read.
+        When the text cannot be read, or the unit is not that of the quantity.
 
     Examples
     --------
@@ -108,18 +109,13 @@ def parse_alarm(text: str) -> Alarm:
             if expected
             else f"--alarm {text!r}: {name} has no unit; write {name}{sign}{limit}"
         )
-    if expected is None:
-        if axis is not None:
-            raise OptionError(f"--alarm {text!r}: the channel {name} has no axis")
-        try:
-            parse_unit(unit or "1")
-        except UnitError as error:
-            raise OptionError(f"--alarm {text!r}: {error}") from error
+    if expected is None and axis is not None:
+        raise OptionError(f"--alarm {text!r}: the channel {name} has no axis")
     return Alarm(" ".join(text.split()), axis, name, sign, float(limit), unit)
 
 
 def check_alarms(alarms: Sequence[Alarm], window: Mapping[str, Any]) -> None:
-    """Refuse alarms on axes and channels that a window of `describe_windows` does not have."""
+    """Refuse alarms on axes, channels and units that a window of `describe_windows` lacks."""
     for alarm in alarms:
         if alarm.axis is not None and alarm.axis not in window["axes"]:
             raise OptionError(
@@ -132,12 +128,22 @@ def check_alarms(alarms: Sequence[Alarm], window: Mapping[str, Any]) -> None:
             known_names = ", ".join([*_UNITS, *window["channels"]])
             raise OptionError(f"--alarm {alarm.text!r}: {alarm.name} is not one of {known_names}")
         units = window["channels"][alarm.name][1]
-        if parse_unit(alarm.unit or "1", _quantity_of(units)).quantity != _quantity_of(units):
-            raise OptionError(f"--alarm {alarm.text!r}: {alarm.name} is in {units}")
+        if _find_unit(alarm.unit, units) is None:
+            raise OptionError(
+                f"--alarm {alarm.text!r}: {alarm.name} is in {units}; "
+                f"write {alarm.name}{alarm.sign}{alarm.limit:g} {units}, or a unit that converts"
+            )
 
 
-def _quantity_of(units: str) -> str | None:
-    return next((quantity for quantity, unit in INNER.items() if unit == units), None)
+def _find_unit(text: str, units: str) -> Unit | None:
+    """Find how the unit of a limit converts to that of a channel; None if it does not."""
+    if text == units:
+        return Unit(text, "", 1.0)  # also of a quantity that gyrostab does not know
+    quantity = next((quantity for quantity, unit in INNER.items() if unit == units), None)
+    with suppress(UnitError):
+        unit = parse_unit(text or "1", quantity)
+        return unit if unit.quantity == quantity else None
+    return None
 
 
 def describe_windows(part: xr.Dataset) -> list[dict[str, Any]]:

@@ -23,7 +23,7 @@ from gyrostab.ingest.make_log import make_log
 from gyrostab.io.datasets import open_product, to_netcdf, to_zarr
 from gyrostab.jobs import follow as follow_module
 from gyrostab.jobs import watch as module
-from gyrostab.jobs.alarms import parse_alarm
+from gyrostab.jobs.alarms import check_alarms, parse_alarm
 from gyrostab.jobs.checks import check_options
 from gyrostab.jobs.live_page import LivePage
 from gyrostab.jobs.run import run
@@ -267,13 +267,23 @@ def test_alarms_are_said_once_when_they_begin_and_end(tmp_path):
     assert (repeated.windows, repeated.alarms) == ([], [])
 
 
+@pytest.mark.parametrize("units", ["L/min", "degree_Celsius hour-1"])
+def test_a_channel_of_an_unknown_quantity_has_alarms_in_its_own_unit(units):
+    window = {"time": "t", "axes": {}, "channels": {"flow": (2.0, units)}}
+    alarm = parse_alarm(f"flow>1.5 {units}")
+    check_alarms([alarm], window)
+    assert alarm.update(window)[0]["text"].startswith(f"alarm begins: flow is 2 {units} (")
+    for text in ("flow>1", "flow>1 deg/h", "flow>1 parsec"):
+        with pytest.raises(OptionError, match=f"flow is in {units}; write flow>1 {units}, or"):
+            check_alarms([parse_alarm(text)], window)
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
         ("N>0.01", "needs the unit 'deg/sqrt(h)'"),
         ("N=3 deg/sqrt(h)", "write NAME>LIMIT UNIT"),
         ("misfit>3 deg", "has no unit"),
-        ("temperature>3 parsec", "not known"),
         ("x:temperature>3 degC", "has no axis"),
     ],
 )
@@ -288,7 +298,8 @@ def test_alarms_that_cannot_be_read(text, says):
     [
         ("z:misfit>3", "there is no axis z"),
         ("pressure>3 Pa", "is not one of Q, N"),
-        ("temperature>3 V", "in degree_Celsius"),
+        ("temperature>3 V", "in degree_Celsius; write temperature>3 degree_Celsius, or"),
+        ("temperature>3 parsec", "in degree_Celsius"),
     ],
 )
 def test_alarms_that_do_not_fit_the_log(text, says, tmp_path):
