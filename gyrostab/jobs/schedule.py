@@ -51,13 +51,12 @@ def check_scheduler(scheduler: str) -> str:
     )
 
 
-@contextlib.contextmanager
 def open_pool(
     scheduler: str, *, workers: int | None = None, files: Sequence[Path] = ()
-) -> Iterator[Pool]:
+) -> contextlib.AbstractContextManager[Pool]:
     """Open threads, processes, or a connection to a scheduler for the ``with`` block.
 
-    Waiting calls are cancelled at the end of the block.
+    Waiting calls are cancelled at the end of the block. An interruption ends processes at once.
 
     Parameters
     ----------
@@ -76,45 +75,55 @@ def open_pool(
     OptionError
         When dask.distributed is not installed.
     """
-    if scheduler in ("threads", "processes"):
-        from dask.system import CPU_COUNT
+    from dask.system import CPU_COUNT
 
-        count = workers or CPU_COUNT
-        remote = scheduler == "processes"
-        executor = _start_processes(count) if remote else ThreadPoolExecutor(count)
-        submit: Callable[..., Future[Any]] = executor.submit
-        if remote:
-            submit = partial(submit, _call_with_warnings)
-        try:
-            yield Pool(submit, lambda: count, remote, _identity)
-        finally:
-            executor.shutdown(wait=True, cancel_futures=True)
-    else:
-        with _connect_cluster(scheduler, files) as pool:
-            yield pool
+    if scheduler == "threads":
+        return _open_threads(workers or CPU_COUNT)
+    if scheduler == "processes":
+        return _open_processes(workers or CPU_COUNT)
+    return _connect_cluster(scheduler, files)
 
 
-def _start_processes(count: int) -> Any:
+@contextlib.contextmanager
+def _open_threads(count: int) -> Iterator[Pool]:
+    executor = ThreadPoolExecutor(count)
+    try:
+        yield Pool(executor.submit, lambda: count, False, _identity)
+    finally:
+        executor.shutdown(wait=True, cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _open_processes(count: int) -> Iterator[Pool]:
+    """Open processes, which end when the block is interrupted or this process is killed."""
     import multiprocessing
     from concurrent.futures import ProcessPoolExecutor
 
     spawn = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(count, mp_context=spawn, initializer=_begin_process)
+    watched_end, own_end = spawn.Pipe(duplex=False)
+    executor = ProcessPoolExecutor(
+        count, mp_context=spawn, initializer=_begin_process, initargs=(watched_end,)
+    )
+    try:
+        submit = partial(executor.submit, _call_with_warnings)
+        yield Pool(submit, lambda: count, True, _identity)
+    except KeyboardInterrupt:
+        own_end.close()
+        raise
+    finally:
+        executor.shutdown(wait=True, cancel_futures=True)
+        own_end.close()
 
 
-def _begin_process() -> None:
-    """Ignore Ctrl-C, which the parent handles, and end when the parent ends or is killed."""
-    import multiprocessing
-
+def _begin_process(watched_end: Any) -> None:
+    """Ignore Ctrl-C, which the parent handles, and end when its end of the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
 
-    def end_with_parent() -> None:
-        if parent is not None:
-            parent.join()
-            os._exit(1)
+    def end_with_pipe() -> None:
+        watched_end.poll(None)
+        os._exit(1)
 
-    threading.Thread(target=end_with_parent, daemon=True).start()
+    threading.Thread(target=end_with_pipe, daemon=True).start()
     # the parent opens the same files and shows the same warnings
     warnings.showwarning = lambda message, *_: None
 

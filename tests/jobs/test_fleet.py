@@ -26,6 +26,7 @@ from gyrostab.jobs.archive import Archive, LogRun, find_archive, find_runs
 from gyrostab.jobs.fleet import process_run, run_fleet, write_file_table
 from gyrostab.jobs.fleet_table import TREND_COLUMNS, read_table, write_table
 from gyrostab.jobs.run import run
+from gyrostab.jobs.schedule import open_pool
 from gyrostab.report.fleet import write_overview
 from gyrostab.store.remote import find_url
 
@@ -499,6 +500,21 @@ def test_the_command_line_tells_the_failures(archive, tmp_path, capfd):
 
 # ------------------------------------------------------------------------------
 # stopped and killed
+
+
+def test_an_interrupted_pool_does_not_wait_for_its_processes():
+    def interrupt_call() -> None:
+        with open_pool("processes", workers=2) as pool:
+            pool.submit(os.getpid).result()
+            call = pool.submit(time.sleep, 60)
+            while not call.running():
+                time.sleep(0.01)
+            raise KeyboardInterrupt
+
+    begun = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        interrupt_call()
+    assert time.monotonic() - begun < 50
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
