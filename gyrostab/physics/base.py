@@ -193,6 +193,10 @@ class Effect:
         for name in ("axes", "driver"):
             value = getattr(self, name)
             object.__setattr__(self, name, (value,) if isinstance(value, str) else tuple(value))
+        if len(set(self.axes)) < len(self.axes):
+            raise OptionError(
+                f"effect {self.name!r}: axes = {list(self.axes)} names an axis twice; name it once"
+            )
         if self.driver and len(self.driver) == len(self.needs()):
             renamed = dict(zip(self.needs(), self.driver, strict=True))
             names = tuple(renamed.get(channel, channel) for channel in self.channels)

@@ -346,9 +346,7 @@ def _make_plan(
     measured = [] if like is None else log_channels(like)
     steps = []
     for effect in sorted(model.effects, key=lambda effect: STAGES.index(effect.stage)):
-        rows = tuple(
-            row for row, axis in enumerate(frame.axes) if not effect.axes or axis in effect.axes
-        )
+        rows = tuple(frame.axes.index(axis) for axis in effect.axes or frame.axes)
         setup = _make_setup(model, frame, table, effect, rows)
         factors = _convert_units(effect, environment, present)
         steps.append(Step(effect, setup, rows, factors, _choose_sources(effect, measured)))

@@ -228,6 +228,10 @@ def test_sizes_are_sourced(kind):
             {"name": "temperature_bias", "sensitivity": 1, "driver": ["a", "b"]},
             "driver names 2 channels; it takes temperature",
         ),
+        (
+            {"name": "temperature_bias", "sensitivity": 1, "axes": ["x", "y", "x"]},
+            "names an axis twice",
+        ),
     ],
 )
 def test_a_wrong_table_is_explained(table, words):

@@ -214,6 +214,12 @@ def test_two_effects_of_one_name_add():
     np.testing.assert_allclose(log.rate.values, 0.4, rtol=1e-12)
 
 
+def test_one_number_per_axis_goes_to_the_axes_in_the_order_of_the_effect():
+    jump = {"name": "bias_jump", "step": [1.0, 2.0], "axes": ["z", "x"]}
+    log = simulate({"effect": [jump]}, duration="1s", rate=10.0)
+    np.testing.assert_array_equal(log.rate.sel(axis=["x", "y", "z"]).values[:, 5], [2.0, 0.0, 1.0])
+
+
 def add_sensor_noise(log, name, size):
     """Return a recording of which a channel has the noise of its sensor."""
     noise = size * np.random.default_rng(5).standard_normal(log[name].size)
