@@ -43,7 +43,8 @@ class Plan:
     steps: tuple[Step, ...]  # the effects, in the order in which they act
     sources: Mapping[str, Source]  # channels that are needed, by their names in the log
     turning: str  # axis that feels the channel ``rotation_rate``; empty when none does
-    #: (n, 2): samples of the log that are missing, [first, one past last], rising.
+    #: (n, 2): samples that are missing on all axes, [first, one past last], rising; not those of
+    #: the recording that the log is simulated like.
     gaps: NDArray[np.int64]
     recorded: Mapping[str, str]  # axis -> source of its recorded rate
     bias: tuple[float, ...]  # constant rate of each axis [degree hour-1]

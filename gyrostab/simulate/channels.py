@@ -33,10 +33,20 @@ def inner_unit(unit: str, values: Any) -> tuple[str, Any]:
     except ValueError:
         return unit, values
     if source.quantity == "rate":  # of a tool, not of a gyro's output
-        return INNER["rotation_rate"], np.asarray(values) * (
+        return INNER["rotation_rate"], values * (
             source.factor / parse_unit(INNER["rotation_rate"]).factor
         )
-    return INNER[source.quantity], np.asarray(values) * source.factor + source.offset
+    return INNER[source.quantity], values * source.factor + source.offset
+
+
+def convert_units(environment: xr.Dataset) -> xr.Dataset:
+    """Convert every channel to its unit in memory, lazy ones lazily."""
+    changed = {}
+    for name, variable in environment.data_vars.items():
+        if "units" in variable.attrs:
+            unit, values = inner_unit(str(variable.attrs["units"]), variable.data)
+            changed[name] = (variable.dims, values, variable.attrs | {"units": unit})
+    return environment.assign(changed)
 
 
 def check_points(

@@ -30,15 +30,22 @@ from gyrostab.schema import (
     signal_name,
 )
 from gyrostab.simulate.block import BlockState, Plan, Step
-from gyrostab.simulate.channels import combine
+from gyrostab.simulate.channels import combine, convert_units
 from gyrostab.simulate.drivers import Source, make_course, make_source
 from gyrostab.simulate.lazy import lazy_rates
 from gyrostab.simulate.model import PROFILES, Model, naming_of, read_model
 from gyrostab.simulate.noise import begin_noise, stream
 from gyrostab.time.clock import time_of_day
 from gyrostab.time.durations import duration_seconds
-from gyrostab.time.grid import first_stamp, grid_index, stamp_ns, time_coordinate
-from gyrostab.time.stamps import to_nanoseconds
+from gyrostab.time.grid import (
+    TimeGridIndex,
+    first_stamp,
+    grid_index,
+    grid_times,
+    stamp_ns,
+    time_coordinate,
+)
+from gyrostab.time.stamps import format_stamp, to_nanoseconds
 from gyrostab.units import parse_unit
 
 #: Samples of the instrument in one block of the lazy log.
@@ -117,9 +124,12 @@ def simulate(
     frame = _make_frame(made, duration=duration, rate=rate, start=start, seed=seed, like=like)
     _check_axes(made, frame)
     with naming_of(made.source):
-        environment = _make_world(made, frame, like, environment)
+        added = _add_environment(made, frame, like, environment)
+        environment = combine(*([] if like is None else [_take_environment(like)]), added)
+        environment = environment.drop_attrs(deep=False)
         table = _gap_table(environment, frame)
-        plan = _make_plan(made, frame, environment, table, like)
+        lost = _gap_table(added, frame)
+        plan = _make_plan(made, frame, environment, (table, lost), like)
         starts = [
             begin_noise(
                 frame.seed,
@@ -220,21 +230,21 @@ def _check_axes(model: Model, frame: _Frame) -> None:
             )
 
 
-def _make_world(
+def _take_environment(like: xr.Dataset) -> xr.Dataset:
+    """Channels and gaps of a recording."""
+    names = {
+        *log_channels(like),
+        *(name for name, variable in like.variables.items() if variable.dims == ("gap",)),
+    }
+    environment = like[[name for name in like.variables if name in names]]
+    return environment.drop_vars("axis", errors="ignore")
+
+
+def _add_environment(
     model: Model, frame: _Frame, like: xr.Dataset | None, environment: xr.Dataset | None
 ) -> xr.Dataset:
-    """Channels and gaps from all that there are."""
+    """Channels and gaps of the model and of `environment`, without those of a recording."""
     parts = []
-    if like is not None:
-        names = {
-            *log_channels(like),
-            *(name for name, variable in like.variables.items() if variable.dims == ("gap",)),
-        }
-        parts.append(
-            like[[name for name in like.variables if name in names]].drop_vars(
-                "axis", errors="ignore"
-            )
-        )
     for name, values in model.environment:
         function = PROFILES[name][0]
         arguments = {"duration": frame.size / frame.rate, "start": frame.start, **values}
@@ -242,26 +252,84 @@ def _make_world(
             arguments.setdefault("seed", frame.seed)
         parts.append(function(**arguments))
     if environment is not None:
-        _check_environment(environment, frame.size)
-        parts.append(environment)
-    return combine(*parts).drop_attrs(deep=False) if parts else xr.Dataset()
+        _check_environment(environment, frame)
+        if "time" in environment.dims:
+            grid = (
+                time_coordinate(frame.start, frame.rate, frame.size)
+                if like is None
+                else xr.Coordinates.from_xindex(like.xindexes["time"])
+            )
+            environment = environment.drop_vars("time", errors="ignore").assign_coords(grid)
+        parts.append(convert_units(environment))
+    return combine(*parts)
 
 
-def _check_environment(environment: Any, size: int) -> None:
-    """Raise `SchemaError` unless channels lie on the samples or have their own time axes."""
+def _check_environment(environment: Any, frame: _Frame) -> None:
+    """Raise `SchemaError` unless channels and gaps have times that belong to the log."""
     if not isinstance(environment, xr.Dataset):
         raise SchemaError(
             f"environment is a {type(environment).__name__}, not an xarray.Dataset; the functions "
             "of gyrostab.simulate.environment make one"
         )
     for name, variable in environment.data_vars.items():
-        on_samples = variable.dims == ("time",) and variable.size == size
-        if not on_samples and variable.dims not in (("gap",), (f"time_{name}",)):
+        if variable.dims == ("gap",):
+            continue
+        on_samples = variable.dims == ("time",) and variable.size == frame.size
+        if not on_samples and variable.dims != (f"time_{name}",):
             raise SchemaError(
                 f"channel {name!r} of the environment has dimensions "
                 f"{dict(environment[name].sizes)}, expected 'time_{name}', with a coordinate of "
                 "times; gyrostab.simulate.environment.ramps makes such a channel"
             )
+        if not on_samples or "time" in environment.coords:
+            _check_times(environment, str(variable.dims[0]), frame)
+    columns = [name for name in ("gap_start", "gap_end", "gap_cause") if name in environment]
+    if len(columns) == 3:
+        begin, end = (to_nanoseconds(environment[name].values) for name in columns[:2])
+        if begin.size and not _is_inside(begin.min(), end.max(), frame):
+            raise _outside_error("every gap", begin.min(), end.max(), frame)
+    elif columns:
+        raise SchemaError(
+            f"the environment has {', '.join(columns)} of a table of gaps, which needs gap_start, "
+            "gap_end and gap_cause; gyrostab.simulate.losses.gaps makes one"
+        )
+
+
+def _check_times(environment: xr.Dataset, dim: str, frame: _Frame) -> None:
+    """Raise `SchemaError` unless the coordinate of a channel has times that belong to the log."""
+    if dim not in environment.coords or environment[dim].dtype.kind != "M":
+        raise SchemaError(
+            f"the dimension {dim!r} of the environment has no coordinate of times (datetime64); "
+            "gyrostab.simulate.environment.ramps makes a channel with its times"
+        )
+    index, size = environment.xindexes.get(dim), environment.sizes[dim]
+    # a computed axis is not read as a whole
+    places = np.array([0, size - 1]) if isinstance(index, TimeGridIndex) else np.arange(size)
+    stamps = to_nanoseconds(environment[dim][places].values)
+    if dim == "time":
+        if np.any(np.abs(grid_index(frame.start, frame.rate, stamps) - places) > 1e-3):
+            raise SchemaError(
+                "the times of the environment are not those of the log, which begins at "
+                f"{format_stamp(frame.start)} with {frame.rate:.10g} Hz; leave the coordinate "
+                "'time' out, or give the channel a dimension time_<name> with its own times"
+            )
+    elif np.any(np.diff(stamps) < 0):
+        raise SchemaError(f"the times {dim!r} of the environment do not rise; sort them")
+    elif not _is_inside(stamps[0], stamps[-1], frame):
+        raise _outside_error(repr(dim.removeprefix("time_")), stamps[0], stamps[-1], frame)
+
+
+def _is_inside(first: int, last: int, frame: _Frame) -> bool:
+    """Whether a span of time [ns since 1970] shares some of that of the log."""
+    return last >= frame.start and first <= grid_times(frame.start, frame.rate, frame.size)
+
+
+def _outside_error(item: str, first: int, last: int, frame: _Frame) -> SchemaError:
+    return SchemaError(
+        f"{item} of the environment is outside of the log, which begins at "
+        f"{format_stamp(frame.start)}: from {format_stamp(first)} to {format_stamp(last)}; "
+        "give the start of the log to the function that makes it"
+    )
 
 
 def _gap_table(environment: xr.Dataset, frame: _Frame) -> NDArray[np.int64]:
@@ -339,9 +407,11 @@ def _make_plan(
     model: Model,
     frame: _Frame,
     environment: xr.Dataset,
-    table: NDArray[np.int64],
+    tables: tuple[NDArray[np.int64], NDArray[np.int64]],
     like: xr.Dataset | None,
 ) -> Plan:
+    """Make the plan from the tables of all gaps, and of those that a recording does not have."""
+    table, lost = tables
     present = log_channels(environment)
     measured = [] if like is None else log_channels(like)
     steps = []
@@ -379,7 +449,7 @@ def _make_plan(
             **{f"{_RECORDED}{axis}": source for axis, source in recorded.items()},
         },
         turning=turning,
-        gaps=table[:, :2],
+        gaps=lost[:, :2],
         recorded={axis: f"{_RECORDED}{axis}" for axis in recorded},
         bias=tuple(model.bias.get(axis, 0.0) for axis in frame.axes),
     )

@@ -117,6 +117,21 @@ def test_a_log_like_a_recording_has_its_stamps_gaps_and_channels():
         simulate({"noise": {"x": {"N": 0.01}}}, like=recorded)
 
 
+def test_gaps_of_a_recording_are_lost_on_their_axis_and_those_of_the_model_on_all():
+    values = np.zeros((2, 200))
+    values[0, 30:60] = np.nan
+    recorded = make_log(values, rate=10.0, unit="deg/h", axis=["x", "y"])
+    edges = recorded.time.values[[30, 60]]
+    table = {"gap_start": edges[:1], "gap_end": edges[1:], "gap_samples": [30], "gap_rows": [0]}
+    table["gap_cause"] = np.zeros(1, np.int8)
+    gaps = [name for name, variable in recorded.variables.items() if variable.dims == ("gap",)]
+    recorded = recorded.drop_vars(gaps).assign({k: ("gap", v) for k, v in table.items()})
+    lost = [{"profile": "gaps", "spans": [[10, 12]]}]
+    log = simulate({"noise": {"N": 1.0}, "environment": lost}, like=recorded)
+    assert np.isnan(log.rate.values).sum(axis=1).tolist() == [50, 20]
+    assert gap_table(log).seconds.tolist() == [3.0, 2.0]
+
+
 def test_simulation_like_a_real_recording(recordings, tmp_path):
     """Stamps, gaps, restarts and channels are the recording's; its temperature drives an effect."""
     path = recordings("fog-hybrid-warmup/run1_static.txt")

@@ -24,7 +24,10 @@ from gyrostab.io.datasets import open_log, to_netcdf
 from gyrostab.physics.registry import effects
 from gyrostab.schema import check_log
 from gyrostab.simulate import drivers, lazy, read_model, simulate
+from gyrostab.simulate.environment import ramps
 from gyrostab.simulate.lazy import Chain
+from gyrostab.simulate.losses import gaps
+from gyrostab.time.grid import time_coordinate
 from tests.support.simulated import BIASED, LOG, WORLD, every_channel, model
 
 # --------------------------------------------------------------------------------
@@ -349,8 +352,59 @@ def test_writing_in_pieces_makes_each_block_once(tmp_path, monkeypatch):
             SchemaError,
             "channel 'temperature' of the environment has .*'time': 2.*expected 'time_temperature'",
         ),
+        (
+            {"environment": xr.Dataset({"a": ("time_a", [1.0, 2.0])})},
+            SchemaError,
+            "'time_a' of the environment has no coordinate of times",
+        ),
+        (
+            {"environment": xr.Dataset({"a": ("time", np.ones(100))}, {"time": np.arange(100)})},
+            SchemaError,
+            "'time' of the environment has no coordinate of times",
+        ),
+        (
+            {"environment": xr.Dataset({"a": ("time", np.ones(100))}, time_coordinate(0, 20, 100))},
+            SchemaError,
+            "times of the environment are not those of the log.*10 Hz",
+        ),
+        (
+            {"environment": ramps("a", "V", [[0, 1]], duration=9.0, start="2020-01-01")},
+            SchemaError,
+            "'a' of the environment is outside of the log, which begins at 1970.*from 2020",
+        ),
+        (
+            {"environment": gaps([[1, 2], [3, 4]], start="2020-01-01")},
+            SchemaError,
+            "every gap of the environment is outside of the log",
+        ),
+        (
+            {"environment": gaps([[1, 2]]).drop_vars("gap_cause")},
+            SchemaError,
+            "has gap_start, gap_end of a table of gaps, which needs",
+        ),
     ],
 )
 def test_arguments_of_a_wrong_kind_are_refused(options, error, words):
     with pytest.raises(error, match=words):
         simulate({"noise": {"N": 1}}, duration="10s", rate=10.0, **options)
+
+
+def test_a_channel_on_the_samples_gets_the_times_of_the_log():
+    warm = xr.Dataset({"temperature": ("time", np.arange(100.0), {"units": "degC"})})
+    bias = {"name": "temperature_bias", "sensitivity": 1.0, "reference": 0.0}
+    log = simulate(
+        {"effect": [bias]}, duration="10s", rate=10.0, start="2026-01-01", environment=warm
+    )
+    np.testing.assert_allclose(log.rate.sel(axis="x"), np.arange(100.0), rtol=1e-12)
+    assert str(log.time.values[1]) == "2026-01-01T00:00:00.100000000"
+    like = simulate({"effect": [bias]}, like=log.drop_vars("temperature"), environment=warm)
+    xr.testing.assert_identical(like.time, log.time)
+    np.testing.assert_array_equal(like.rate, log.rate)
+
+
+def test_the_rotation_of_the_environment_may_be_in_another_unit():
+    turning = ramps("rotation_rate", "degree s-1", [[0, 6.0]], duration=10.0)
+    turning.rotation_rate.attrs.update(units="rpm", rotation_axis="z")
+    log = simulate({}, duration="10s", rate=10.0, environment=turning)
+    np.testing.assert_allclose(log.rate.sel(axis="z"), 36.0 * 3600.0, rtol=1e-12)
+    assert log.rotation_rate.units == "degree s-1"

@@ -53,6 +53,7 @@ def every_channel(duration: float) -> xr.Dataset:
                 unit,
                 [[0, typical.get(unit, 1.0)], [duration, 1.3 * typical.get(unit, 1.0)]],
                 duration=duration,
+                start=LOG["start"],
             )
             for name, unit in units.items()
         )
