@@ -377,7 +377,7 @@ class ClockError(Effect):
         if self.output == "angle":
             middle = (edges[:-1] + 0.5) / chunk.rate
             values = values * (1.0 - (self.error + self.drift * middle / HOUR) * _PPM)
-        return values, (keep, history[:, history.shape[1] - keep :])
+        return values, (keep, history[:, -keep:].copy())
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict window means proportional to the rate, if the gyro gives angle increments."""

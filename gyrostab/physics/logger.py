@@ -111,7 +111,7 @@ class LoggerFilter(Effect):
         if taps > 1:
             memory = np.repeat(signal[:, :1], taps - 1, axis=1) if memory is None else memory
             history = np.concatenate([memory, signal], axis=1)
-            memory = history[:, history.shape[1] - (taps - 1) :]
+            memory = history[:, 1 - taps :].copy()
             total = np.zeros_like(signal)
             for lag in range(taps):
                 total += history[:, lag : lag + chunk.size]

@@ -215,7 +215,7 @@ class FeedbackReset(Effect):
         if self.tail:
             added, tail = self._average_tail(resets, ages, tail, chunk.rate)
             error = error + added
-        return chunk.signal + error, (edges[:, -1], reading, tail)
+        return chunk.signal + error, (edges[:, -1].copy(), reading, tail)
 
     def _average_tail(
         self, resets: Array, ages: Array, tail: Array, rate: float
@@ -233,7 +233,7 @@ class FeedbackReset(Effect):
         tail_at_start = np.concatenate([tail, tail_at_end[:, :-1]], axis=1)
         return tail_at_start * samples * -math.expm1(-1.0 / samples) + size * (
             resets - ages
-        ), tail_at_end[:, -1:]
+        ), tail_at_end[:, -1:].copy()
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """List decay times from the sampling interval to half a turn, and diameters.

@@ -40,7 +40,7 @@ class Chain:
     """
 
     def __init__(self, step: Callable[[int, Any], tuple[Any, Any]], state: Any, length: int):
-        self._step, self._stride = step, max(1, length // STATES)
+        self._step, self._stride = step, -(-length // STATES)
         self._states, self._taken = {0: state}, 0
         self._recent: dict[int, Any] = {}
         self._lock = threading.Lock()

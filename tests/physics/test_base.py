@@ -105,6 +105,26 @@ def test_chunks_do_not_matter(kind, seed):
 
 
 @with_each_effect
+def test_a_state_is_no_view_of_a_block(kind, monkeypatch):
+    states, generate = [], kind.generate
+
+    def remember(effect, chunk, state):
+        values, state = generate(effect, chunk, state)
+        states.append(state)
+        return values, state
+
+    monkeypatch.setattr(kind, "generate", remember)
+    more = {"length": 0.5} if kind.name == "logger_filter" else {}
+    run(kind.example(**more), **options(kind))
+    while states:
+        item = states.pop()
+        if isinstance(item, list | tuple):
+            states += item
+        elif isinstance(item, np.ndarray) and isinstance(item.base, np.ndarray):
+            assert item.base.size <= item.size
+
+
+@with_each_effect
 def test_say_returns_one_sentence(kind):
     text = kind.example().say()
     assert text.endswith(".")

@@ -295,6 +295,7 @@ def test_chain_takes_each_step_once_and_resumes_from_a_state():
     chain = Chain(step, 1, 2000)
     whole = [chain(number) for number in range(2000)]
     assert steps_taken == list(range(2000))
+    assert len(chain._states) <= lazy.STATES + 3 * lazy.RECENT
     steps_taken.clear()
     assert chain(1001) == whole[1001]
     assert len(steps_taken) <= 4  # 2000 steps, 512 states
