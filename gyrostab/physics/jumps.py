@@ -350,7 +350,7 @@ class FringeHop(Effect):
         mean = (
             HOUR * chunk.rate / self.per_hour if self.per_hour and math.isinf(self.at) else math.inf
         )
-        losses = chunk.setup.restarts[:, 0].astype(np.float64)
+        returns = chunk.setup.restarts[:, 1].astype(np.float64)
 
         def switch(process: _Stepping) -> None:
             if process.level:
@@ -359,7 +359,7 @@ class FringeHop(Effect):
                 return
             sign = 1.0 if math.isfinite(self.at) or process.rng.random() < 0.5 else -1.0
             process.level = sign
-            later = losses[losses > process.next]
+            later = returns[returns > process.next]
             process.next = min(
                 process.next + _draw_wait(process.rng, self.hold * chunk.rate),
                 float(later[0]) if later.size else math.inf,

@@ -177,12 +177,12 @@ def _add_noise(
             for row, row_values in zip(
                 step.rows, np.broadcast_to(values, (len(rows), size)), strict=True
             ):
-                levels[row][term] = np.maximum(row_values, 0.0)
+                levels[row][term] = row_values
     signal = np.empty((len(plan.axes), size))
     for row, axis in enumerate(plan.axes):
         noise, state.noise[axis] = shape(
             units[row],
-            levels[row],
+            {term: np.maximum(values, 0.0) for term, values in levels[row].items()},
             plan.rate * plan.oversampling,
             state.noise.get(axis, {}),
             ramp=plan.coefficients[row]["R"],

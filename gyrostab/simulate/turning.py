@@ -40,6 +40,7 @@ def _integrate_turns(table: Array, stick_slip: float, period: float) -> tuple[An
 
     # the oscillating part of the angle, up to the beginning of each piece
     part = swing(times[1:], rates[1:], slope) - swing(times[:-1], rates[:-1], slope)
+    part = np.where(np.diff(times) > 0.0, part, 0.0)  # a step takes no time
     swung = np.concatenate([[0.0], np.cumsum(part)])
 
     def angle(t: Array) -> Array:

@@ -124,7 +124,7 @@ def test_telegraph_equals_gauss_markov_to_second_order_with_two_levels():
     assert abs(np.corrcoef(rates)[0, 1]) < 0.1
 
 
-def test_fringe_step_has_its_size_and_ends_at_power_loss():
+def test_fringe_step_has_its_size_and_ends_at_the_return_of_power():
     table = {
         "name": "fringe_hop",
         "length": 500,
@@ -137,10 +137,12 @@ def test_fringe_step_has_its_size_and_ends_at_power_loss():
     once = make_effect(table | {"order": -2, "at": 30.05})
     rates = run(once, size=1000, signal=7.0, restarts=np.array([[600, 620]]))[0]
     np.testing.assert_allclose(
-        rates[[0, 299, 301, 599, 600, 999]],
+        rates[[0, 299, 301, 619, 620, 999]],
         7 - 2 * fringe * np.array([0, 0, 1, 1, 0, 0]),
         rtol=1e-12,
     )
+    without_power = make_effect(table | {"at": 61.05})
+    assert not run(without_power, size=1000, restarts=np.array([[600, 620]]))[0, 620:].any()
     assert rates[300] == pytest.approx(7 - fringe, rel=1e-9)  # half of this sample
     back = make_effect(table | {"at": 10, "hold": 20}).explain(windows_of(1000, 10.0, 10.0))
     np.testing.assert_allclose(back.mean["order"][:5], fringe * np.array([0, 1, 1, 0, 0]))

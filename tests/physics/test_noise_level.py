@@ -206,9 +206,11 @@ def test_random_walk_spreads_according_to_k():
     assert rates[:, -1].var() == pytest.approx(expected, rel=0.2)
 
 
-def test_the_order_of_noise_effects_does_not_matter():
+@pytest.mark.parametrize("linear", [0.01, -0.025])
+def test_the_order_of_noise_effects_does_not_matter(linear):
     tables = [
-        {"name": "temperature_noise", "linear": 0.01},
+        {"name": "temperature_noise", "linear": linear},
+        {"name": "temperature_noise", "linear": linear},  # -0.025: below zero together
         {"name": "vibration_noise", "white": 0.02},
         {"name": "ageing_noise", "growth": 2.0},
         {"name": "light_power_noise", "thermal": 0.5},

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from scipy.linalg import solve_discrete_lyapunov
 
 from gyrostab.allan.davar import davar
 from gyrostab.errors import OptionError
@@ -49,6 +50,19 @@ def test_samples_of_a_band_have_its_folded_density(mount, rate, average):
     strong = expected > 1e-6 * expected.max()
     np.testing.assert_allclose(density_of_samples[strong], expected[strong], rtol=2e-3)
     assert strong.sum() >= 1
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "rate"), [(1.0, 3000.0, 1000.0), (0.01, 50.0, 100.0), (20.0, 2100.0, 400.0)]
+)
+def test_a_wide_band_has_unit_variance_and_its_density(low, high, rate):
+    reading = band(low, high, rate)
+    f = np.geomspace(1e-3, 0.49, 12) * rate
+    expected = folded_psd(lambda g: band_psd(g, low, high), f, rate, 20.0 * high, average=False)
+    np.testing.assert_allclose(density_of_reading(reading, f, rate), expected, rtol=1e-4)
+    noise = (reading.kick @ reading.kick.T)[:-1, :-1]
+    variance = reading.read @ solve_discrete_lyapunov(reading.step, noise) @ reading.read
+    assert variance == pytest.approx(1.0, rel=1e-5)
 
 
 @pytest.mark.parametrize("average", [False, True], ids=["point", "average"])

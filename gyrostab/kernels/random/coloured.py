@@ -27,6 +27,9 @@ Array = NDArray[np.float64]
 
 #: Order of the Butterworth low-pass from which a band is made: the band has twice as many poles.
 ORDER = 6
+#: Ratio of the edges above which the sections of a band are paired and scaled: one after the other
+#: in the order of frequency, they attenuate the noise between them below the rounding error.
+WIDE = 100.0
 
 
 class Reading(NamedTuple):
@@ -127,9 +130,10 @@ def _band_sections(low: float, high: float) -> list[_Section]:
     root = np.sqrt(half**2 - centre**2 + 0j)
     poles = np.concatenate([half + root, half - root])
     poles = poles[poles.imag > 0.0]  # one of each pair, whose product is real
-    return [
-        _Section(float(abs(pole)), float(-2.0 * pole.real), True) for pole in sorted(poles, key=abs)
-    ]
+    poles = poles[np.argsort(np.abs(poles))]
+    if high > WIDE * low:  # a low one and a high one by turns, which pass the band between them
+        poles = poles.reshape(2, -1).T.ravel()
+    return [_Section(float(abs(pole)), float(-2.0 * pole.real), True) for pole in poles]
 
 
 def band(
@@ -161,6 +165,12 @@ def band(
         omega = 2.0 * math.pi * resonance
         sections.append(_Section(omega, omega / quality, False))
     a, b, c = _chain_sections(sections)
+    for end in range(2, size + 1, 2) if high > WIDE * low else ():
+        # unit variance behind each section
+        part = solve_continuous_lyapunov(a[:end, :end], -np.outer(b[:end], b[:end]))
+        scale = math.sqrt(part[-1, -1])
+        a[end - 1, : end - 2] /= scale
+        b[end - 1] /= scale
     covariance = solve_continuous_lyapunov(a, -np.outer(b, b))
     power = covariance[size - 1, size - 1]  # of the band before the mount
     return _make_reading(a, covariance / power, c, rate, average=average)
