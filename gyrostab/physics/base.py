@@ -60,6 +60,7 @@ class Parameter:
     high: float = math.inf
     choices: tuple[str, ...] = ()  # allowed words of a text parameter
     many: bool = False  # whether it has one number per axis; see `Effect.expand_to_axes`
+    difference: bool = False  # whether it is a difference of two values, as of temperatures
     #: What the value must be, "whole number" or "whole number of fringes"; empty for any number.
     whole: str = ""
     source: str = "estimate"  # source of the typical size: author and year, or "estimate"

@@ -101,7 +101,7 @@ class FeedbackReset(Effect):
     follows the ramp, where A is the `sawtooth` and the phase goes from 0 to 1. All errors are
     averaged exactly over every sample, so fast resets are aliased correctly. The phase follows from
     the gyro's rate including noise, or with ``phase = "channel"`` from the channel `ramp`, read at
-    the end of every sample.
+    the end of every sample; the model then has no oversampling.
 
     References
     ----------
@@ -193,6 +193,12 @@ class FeedbackReset(Effect):
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """Start with zero turns, no reading of the channel, and no tail on any axis."""
+        if self.phase == "channel" and setup.oversampling > 1:
+            raise OptionError(
+                f"effect {self.name!r}: a ramp that wraps cannot be interpolated to "
+                f"{setup.oversampling} samples of the instrument; leave oversampling out of the "
+                'model\'s [log], or set phase = "rate"'
+            )
         rows = 1 if self.phase == "channel" else len(setup.axes)
         return np.zeros(rows), None, np.zeros((rows, 1))
 

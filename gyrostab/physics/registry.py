@@ -9,6 +9,7 @@ import pkgutil
 import re
 from collections.abc import Mapping, Sequence
 from functools import cache
+from numbers import Real
 from types import MappingProxyType
 from typing import Any, TypeGuard
 
@@ -112,7 +113,7 @@ def make_effect(table: Mapping[str, Any], *, where: str = "effect") -> Effect:
     try:
         return kind(
             **{
-                key: amount(value, definition.unit, f"parameter {key!r}")
+                key: amount(value, definition.unit, f"parameter {key!r}", definition.difference)
                 if (definition := parameters.get(key)) and not definition.choices
                 else value
                 for key, value in values.items()
@@ -134,11 +135,13 @@ _HERTZ = {"mHz": 1e-3, "Hz": 1.0, "kHz": 1e3, "MHz": 1e6, "1/min": 1 / 60}
 
 def is_number(value: Any) -> TypeGuard[float]:
     """Test whether a value of a model is a number, which true and false are not."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
-def amount(value: Any, unit: str, where: str) -> Any:
+def amount(value: Any, unit: str, where: str, difference: bool = False) -> Any:
     """Read a value of a model in `unit`: a number, text such as ``"3 min"``, or a list of these.
+
+    A `difference` is converted without the zero point of its scale.
 
     Raises
     ------
@@ -151,7 +154,7 @@ def amount(value: Any, unit: str, where: str) -> Any:
     (180.0, 26.85...)
     """
     if isinstance(value, list | tuple):
-        return [amount(entry, unit, where) for entry in value]
+        return [amount(entry, unit, where, difference) for entry in value]
     if not isinstance(value, str):
         return value
     match = re.fullmatch(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*", value)
@@ -168,7 +171,8 @@ def amount(value: Any, unit: str, where: str) -> Any:
     with contextlib.suppress(UnitError):
         source, target = parse_unit(symbol), parse_unit(unit)
         if source.quantity == target.quantity:
-            return (number * source.factor + source.offset - target.offset) / target.factor
+            offset = 0.0 if difference else source.offset - target.offset
+            return (number * source.factor + offset) / target.factor
     raise OptionError(f"{where}: the unit {symbol!r} is not known here; give the number in {unit}")
 
 

@@ -347,7 +347,9 @@ class ThermalHysteresis(Effect):
     sensitivity: float = parameter(
         "deg/h/degC", "bias per degree in the dead band", typical=3e-4, low=-10.0, high=10.0
     )
-    width: float = parameter("degC", "half of the dead band", default=3.0, low=0.0, high=500.0)
+    width: float = parameter(
+        "degC", "half of the dead band", default=3.0, low=0.0, high=500.0, difference=True
+    )
 
     def courses(self) -> tuple[str, ...]:
         """List the temperature, because its extremes would be those of the noise."""

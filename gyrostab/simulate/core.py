@@ -39,6 +39,7 @@ from gyrostab.time.clock import time_of_day
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import (
     TimeGridIndex,
+    check_span,
     first_stamp,
     grid_index,
     grid_times,
@@ -50,6 +51,8 @@ from gyrostab.units import parse_unit
 
 #: Samples of the instrument in one block of the lazy log.
 BLOCK = 2**17
+#: Largest number of samples of the instrument: a year at 300 Hz.
+MAX_SAMPLES = 10**10
 _RECORDED = "recorded rate of "  # source of an effect, in front of the name of the axis
 _COURSE = "course of "  # source of an effect, in front of the name of a recorded channel
 _RESTART = GAP_CAUSES.index("restart")
@@ -140,9 +143,10 @@ def simulate(
             )
             for row, axis in enumerate(frame.axes)
         ]
+        state = _begin_states(plan, frame.seed)
     data = lazy_rates(
         plan,
-        _begin_states(plan, frame.seed),
+        state,
         starts,
         frame.size,
         chunk=chunk or max(1, BLOCK // frame.oversampling),
@@ -211,7 +215,13 @@ def _make_frame(
         raise OptionError(
             f"{model.source}: a duration of {length} is shorter than one sample at {hertz:g} Hz"
         )
+    if size * factor > MAX_SAMPLES:
+        raise OptionError(
+            f"{model.source}: a duration of {length} at {hertz * factor:g} Hz has more than "
+            f"{MAX_SAMPLES:.0e} samples; give a shorter duration or a lower rate or oversampling"
+        )
     begin = stamp_ns(start if start is not None else model.log.get("start", "1970-01-01"))
+    check_span(begin, hertz, size, model.source)
     return _Frame(float(hertz), size, begin, chosen, model.axes or ("x", "y", "z"), factor)
 
 

@@ -46,10 +46,14 @@ def gaps(spans: Points, *, duration: Any = None, start: Any = "1970-01-01") -> x
     >>> gaps([[432, 450]]).gap_end.values
     array(['1970-01-01T00:07:30.000000000'], dtype='datetime64[ns]')
     """
-    table = check_points(spans, "spans of gaps", ("from [s]", "to [s]"))
+    return _make_table(_check_spans(spans, "spans of gaps"), _MISSING, start)
+
+
+def _check_spans(spans: Points, where: str, *, optional: bool = False) -> NDArray[np.float64]:
+    table = check_points(spans, where, ("from [s]", "to [s]"), optional=optional)
     if np.any(table[:, 1] <= table[:, 0]):
-        raise OptionError(f"spans of gaps: {table.tolist()}: each must end after it begins")
-    return _make_table(table, _MISSING, start)
+        raise OptionError(f"{where}: {table.tolist()}: each must end after it begins")
+    return table
 
 
 def losses(
@@ -146,7 +150,7 @@ def power_cuts(
     >>> power_cuts([[100, 160]], duration="1h").gap_cause.values
     array([6], dtype=int8)
     """
-    table = check_points(cuts, "cuts of power_cuts", ("from [s]", "to [s]"), optional=True)
+    table = _check_spans(cuts, "cuts of power_cuts", optional=True)
     rng = stream(seed, "power_cuts")
     begin = _draw_poisson(rng, 0.0, duration_seconds(duration, "duration"), per_day / 24.0)
     more = np.stack(

@@ -353,7 +353,7 @@ def _read_profile(table: Mapping[str, Any], where: str) -> tuple[str, Mapping[st
         if item.default is inspect.Parameter.empty and key not in values:
             raise OptionError(
                 f"{where}: profile {name!r} lacks {key!r}; "
-                f"see gyrostab.simulate.environment.{name} for its parameters"
+                f"see {function.__module__}.{name} for its parameters"
             )
     for key, value in values.items():
         kind, expected = (

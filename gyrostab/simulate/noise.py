@@ -24,9 +24,9 @@ from gyrostab.kernels.random.stochastic import (
     flicker_means,
     flicker_times,
     ornstein_uhlenbeck_means,
-    sinusoid_means,
 )
 from gyrostab.noise import TERMS, URAD_PER_S
+from gyrostab.physics.phase import turn_means
 from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
@@ -214,7 +214,9 @@ def _add_parts(
         total += sigma * means
     if sinusoid:
         amplitude, frequency, phase = sinusoid
-        total += amplitude * sinusoid_means(first + np.arange(size), frequency, rate, phase)
+        cycles = frequency / rate
+        middle = (first + np.arange(size) + 0.5) * cycles
+        total += amplitude * turn_means(middle, np.full(1, cycles), phase - math.pi / 2.0)
     return total, (noise, carry, rng, position)
 
 
@@ -287,6 +289,16 @@ def make_noise(
             raise OptionError(
                 f"{name}={value!r}: give a number {'from 0 up' if name in TERMS else 'above 0'}"
             )
+    for name, value in {"size": size, "chunk": chunk}.items():
+        if not isinstance(value, int | np.integer):
+            raise OptionError(f"{name}={value!r}: give a whole number of samples")
+    if gauss_markov and not (
+        all(math.isfinite(value) for value in gauss_markov) and gauss_markov[1] > 0.0
+    ):
+        raise OptionError(
+            f"gauss_markov={gauss_markov!r}: give the standard deviation in deg/h and the "
+            "correlation time in s, above 0"
+        )
     terms = "".join(term for term in "QNBK" if coefficients[term] > 0.0)
     noise = begin_noise(seed, axis, rate=rate, terms=terms, flicker_band=flicker_band)
     rng = stream(seed, "noise", axis, "gauss_markov")

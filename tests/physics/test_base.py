@@ -273,6 +273,7 @@ def test_units_are_converted():
     assert build_effect(
         "temperature_bias", sensitivity="0.1 deg/h/degC", reference="300 K"
     ).reference == pytest.approx(26.85)
+    assert build_effect("thermal_hysteresis", sensitivity=1e-3, width="280 K").width == 280.0
 
 
 def test_table_lists_every_parameter_of_every_effect():

@@ -56,6 +56,7 @@ from tests.support.simulated import BIASED, LOG, WORLD, model
             r"no parameter 'speeed' .did you mean 'speed'.*speed \[degC/min\]",
         ),
         ({"environment": [{"profile": "vibration"}]}, "lacks 'points'"),
+        ({"environment": [{"profile": "rotation"}]}, "see gyrostab.simulate.turning.rotation for"),
         ({"environment": [{"profile": "vibration", "points": [[5, 1], [0, 1]]}]}, "do not rise"),
         (
             {"environment": [{"profile": "vibration", "points": [1, 2]}]},
@@ -65,11 +66,13 @@ from tests.support.simulated import BIASED, LOG, WORLD, model
         ({"environment": [WORLD[1] | {"channel": 3}]}, "channel = 3 is not text"),
         ({"environment": [WORLD[1] | {"channel": "axis"}]}, "channel 'axis': variables of gyrosta"),
         ({"environment": [WORLD[5] | {"cuts": 3}]}, "cuts = 3 is not a list"),
+        ({"environment": [WORLD[5] | {"cuts": [[20, 10]]}]}, "each must end after it begins"),
         ({"environment": ["chamber"]}, "environment 1 is 'chamber', not a table"),
         ({"effect": [BIASED[0] | {"axes": 3}]}, "axes = 3 is not a list of names"),
         ({"effect": [BIASED[0] | {"driver": [3]}]}, r"driver = \[3\] is not a list of names"),
         ({"log": LOG | {"axes": ["x", "x"]}}, "is not a list of different names"),
         ({"log": LOG | {"duration": 1e300}}, "the duration 1e.300 is not valid"),
+        ({"log": LOG | {"duration": 1e9, "rate": 1e6}}, "a duration of .* has more than 1e.10 "),
         ({"environment": [{"profile": "losses", "per_hour": 1e300}]}, "at most 1e8 gaps"),
         ({"environment": [{"profile": "losses", "seed": "x"}]}, "seed='x': give a whole number"),
         (
@@ -117,6 +120,13 @@ def test_a_wrong_effect_names_file_and_place(tmp_path):
             "needs the channel 'temperature'",
         ),
         ("[noise.x]\nN = 1\n[bias]\nq = 2", "there is no axis 'q' in this log; it has x"),
+        ("[log]\nstart = '2262-04-11T23:47:00'", "begin or end outside the years 1678 to 2262"),
+        (
+            "[log]\noversampling = 2\n[[effect]]\nname = 'feedback_reset'\nkick = 1\n"
+            "phase = 'channel'\n[[environment]]\nprofile = 'ramps'\nchannel = 'ramp'\nunit = '1'\n"
+            "points = [[0, 0]]",
+            "a ramp that wraps cannot be interpolated to 2 samples",
+        ),
     ],
 )
 def test_errors_of_a_simulation_name_the_file_of_the_model(text, words, tmp_path):

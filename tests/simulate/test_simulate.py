@@ -217,6 +217,10 @@ def test_two_effects_of_one_name_add():
     np.testing.assert_allclose(log.rate.values, 0.4, rtol=1e-12)
 
 
+def test_a_rate_may_be_a_number_of_numpy():
+    assert simulate({"noise": {"N": 1}}, duration="1s", rate=np.int64(10)).sizes["time"] == 10
+
+
 def test_one_number_per_axis_goes_to_the_axes_in_the_order_of_the_effect():
     jump = {"name": "bias_jump", "step": [1.0, 2.0], "axes": ["z", "x"]}
     log = simulate({"effect": [jump]}, duration="1s", rate=10.0)

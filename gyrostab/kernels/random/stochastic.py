@@ -178,16 +178,3 @@ def flicker_means(
         inner += 2.0 * times[-1] * rate / (RATIO - 1.0)
     total, last = ornstein_uhlenbeck(normal, decay, weight, math.sqrt(inner), position)
     return math.sqrt(variance) * total, last
-
-
-def sinusoid_means(index: NDArray[np.int64], frequency: float, rate: float, phase: float) -> Array:
-    """Average ``sin(2 pi f t + phase)`` over the samples `index`; `frequency` and `rate` in Hz.
-
-    Examples
-    --------
-    >>> sinusoid_means(np.array([0, 1]), 1.0, 4.0, 0.0).round(4)  # quarters of a sine: 2/pi
-    array([0.6366, 0.6366])
-    """
-    cycles = frequency / rate
-    turn = np.remainder((index + 0.5) * cycles, 1.0)
-    return np.asarray(np.sinc(cycles) * np.sin(2.0 * math.pi * turn + phase))
