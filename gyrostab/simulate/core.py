@@ -296,8 +296,8 @@ def _check_environment(environment: Any, frame: _Frame) -> None:
     columns = [name for name in ("gap_start", "gap_end", "gap_cause") if name in environment]
     if len(columns) == 3:
         begin, end = (to_nanoseconds(environment[name].values) for name in columns[:2])
-        if begin.size and not _is_inside(begin.min(), end.max(), frame):
-            raise _outside_error("every gap", begin.min(), end.max(), frame)
+        if begin.size and not _is_inside(int(begin.min()), int(end.max()), frame):
+            raise _outside_error("every gap", int(begin.min()), int(end.max()), frame)
     elif columns:
         raise SchemaError(
             f"the environment has {', '.join(columns)} of a table of gaps, which needs gap_start, "
@@ -307,12 +307,12 @@ def _check_environment(environment: Any, frame: _Frame) -> None:
 
 def _check_times(environment: xr.Dataset, dim: str, frame: _Frame) -> None:
     """Raise `SchemaError` unless the coordinate of a channel has times that belong to the log."""
-    if dim not in environment.coords or environment[dim].dtype.kind != "M":
+    index, size = environment.xindexes.get(dim), environment.sizes[dim]
+    if index is None or not size or environment[dim].dtype.kind != "M":
         raise SchemaError(
             f"the dimension {dim!r} of the environment has no coordinate of times (datetime64); "
             "gyrostab.simulate.environment.ramps makes a channel with its times"
         )
-    index, size = environment.xindexes.get(dim), environment.sizes[dim]
     # a computed axis is not read as a whole
     places = np.array([0, size - 1]) if isinstance(index, TimeGridIndex) else np.arange(size)
     stamps = to_nanoseconds(environment[dim][places].values)
@@ -325,13 +325,13 @@ def _check_times(environment: xr.Dataset, dim: str, frame: _Frame) -> None:
             )
     elif np.any(np.diff(stamps) < 0):
         raise SchemaError(f"the times {dim!r} of the environment do not rise; sort them")
-    elif not _is_inside(stamps[0], stamps[-1], frame):
+    elif not _is_inside(int(stamps[0]), int(stamps[-1]), frame):
         raise _outside_error(repr(dim.removeprefix("time_")), stamps[0], stamps[-1], frame)
 
 
 def _is_inside(first: int, last: int, frame: _Frame) -> bool:
     """Whether a span of time [ns since 1970] shares some of that of the log."""
-    return last >= frame.start and first <= grid_times(frame.start, frame.rate, frame.size)
+    return last >= frame.start and first <= int(grid_times(frame.start, frame.rate, frame.size))
 
 
 def _outside_error(item: str, first: int, last: int, frame: _Frame) -> SchemaError:

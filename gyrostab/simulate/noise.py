@@ -215,7 +215,7 @@ def _add_parts(
     if sinusoid:
         amplitude, frequency, phase = sinusoid
         cycles = frequency / rate
-        middle = (first + np.arange(size) + 0.5) * cycles
+        middle = (np.arange(first, first + size, dtype=np.float64) + 0.5) * cycles
         total += amplitude * turn_means(middle, np.full(1, cycles), phase - math.pi / 2.0)
     return total, (noise, carry, rng, position)
 
