@@ -88,6 +88,16 @@ def samples_of(placement: Placement, rows: NDArray[np.int64]) -> NDArray[np.int6
     return np.where(inside, runs[which, 0] + rows - runs[which, 1], -1)
 
 
+def count_placed(channel: Any, placement: Placement) -> int:
+    """Count the rows with a sample in which a channel has a value."""
+    count = 0
+    for begin in range(0, channel.shape[0], BLOCK_ROWS):
+        end = min(begin + BLOCK_ROWS, channel.shape[0])
+        rows = np.flatnonzero(np.isfinite(read_slice(channel, begin, end))) + begin
+        count += int(np.count_nonzero(samples_of(placement, rows) >= 0))
+    return count
+
+
 def gather_channel(
     raw: xr.Dataset, name: str, placement: Placement, rate: float
 ) -> tuple[NDArray[np.datetime64], NDArray[np.float64]]:

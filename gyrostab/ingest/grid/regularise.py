@@ -18,7 +18,7 @@ from gyrostab.errors import OptionError, TimeError
 from gyrostab.ingest.columns.pieces import PiecewiseColumn
 from gyrostab.ingest.gap_table import gap_variables, name_lost
 from gyrostab.ingest.grid.axes import regularise_axes
-from gyrostab.ingest.grid.fill import gather_channel, rows_on_grid
+from gyrostab.ingest.grid.fill import count_placed, gather_channel, rows_on_grid
 from gyrostab.ingest.grid.gaps import find_gaps
 from gyrostab.ingest.grid.jitter import JitterModel
 from gyrostab.ingest.grid.notes import (
@@ -63,6 +63,8 @@ _EVEN_ROWS = 2**18  # rows at the beginning that give the rate of a log with eve
 _SHARP_SIGMA = 0.2
 _MIN_DROPPED_ROWS = 10  # rows without a sample for which placing in order is tried
 _LATE_SHARE = 0.9  # share of the dropped rows that placing in order must recover
+# Share of the values of a channel that may be lost with rows that have no sample.
+_MAX_UNPLACED_SHARE = 0.1
 _MAX_ROUNDS = 4  # a repetition within another is found after the latter is removed
 _OWN_ATTRIBUTES = (
     "declared_rate_hz",
@@ -260,6 +262,18 @@ def _place_once(raw: xr.Dataset, scanned: ScanPass, place: Callable[[], Placemen
     return with_repeats(placement, raw, all_repeats) if len(all_repeats) else placement
 
 
+def _is_on_grid(channel: Any, n_filled: int, scanned: ScanPass, placement: Placement) -> bool:
+    """Whether a channel has values for most samples, and few in rows without a gyro value."""
+    present = scanned.rows - scanned.absent
+    if n_filled <= 0.5 * present:
+        return False
+    if scanned.absent <= _MAX_UNPLACED_SHARE * n_filled:
+        return True  # without reading the channel
+    dropped = max(0, present - placement.placed)  # they lose their channels too
+    unplaced = n_filled - count_placed(channel, placement)
+    return unplaced - dropped <= _MAX_UNPLACED_SHARE * n_filled
+
+
 def _place_channels(
     raw: xr.Dataset, scanned: ScanPass, placement: Placement, rate: float, chunk: int
 ) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -268,7 +282,7 @@ def _place_channels(
     coordinates: dict[str, Any] = {}
     for name, rows in scanned.filled.items():
         channel = raw[name]
-        if rows > 0.5 * (scanned.rows - scanned.absent):
+        if _is_on_grid(channel.data, rows, scanned, placement):
             variables[name] = (
                 "time",
                 rows_on_grid(channel.data, placement, chunk=chunk),

@@ -239,6 +239,20 @@ def test_rows_with_only_a_slow_channel_are_not_samples():
     np.testing.assert_array_equal(log.time_temperature.values.astype(np.int64), stamps[other])
 
 
+def test_channel_in_rows_without_a_gyro_value_keeps_its_values():
+    n = 600
+    other = np.arange(n) % 2 == 1
+    values = np.where(other, np.nan, np.arange(n))
+    log = regularise(
+        raw_log(stamps_of(np.arange(n), 200.0), values, force=np.where(other, np.arange(n), np.nan))
+    )
+    assert log.attrs["sampling_rate_hz"] == 100.0
+    np.testing.assert_array_equal(log.force.values, np.arange(n)[other])
+    np.testing.assert_array_equal(
+        log.time_force.values.astype(np.int64), stamps_of(np.arange(n)[other], 200.0)
+    )
+
+
 def test_many_gaps_are_merged():
     samples = np.flatnonzero(np.random.default_rng(0).random(90_000) > 0.2)
     samples -= samples[0]
