@@ -67,10 +67,14 @@ def sample_stretches(stamps: Stamps) -> list[NDArray[np.int64]]:
     counted.
     """
     stretches: list[NDArray[np.int64]] = []
+    number, stride = 0, 1  # of all stretches so far; every stride-th is kept
     for _, block in stamps():
-        stretches += [block[i : i + _STRETCH] for i in range(0, len(block), _STRETCH)]
-        if len(stretches) > _MAX_STRETCHES:
-            stretches = stretches[::2]
+        for begin in range(0, len(block), _STRETCH):
+            if number % stride == 0:
+                stretches.append(block[begin : begin + _STRETCH])
+            number += 1
+            if len(stretches) > _MAX_STRETCHES:
+                stretches, stride = stretches[::2], 2 * stride
     return [part for part in stretches if np.count_nonzero(part != NO_STAMP) > 1]
 
 

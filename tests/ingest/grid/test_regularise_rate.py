@@ -14,6 +14,7 @@ from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.place import place_by_stamp
 from gyrostab.ingest.grid.rate import estimate_rate
 from gyrostab.ingest.grid.regularise import regularise
+from gyrostab.ingest.grid.starting_period import sample_stretches
 from gyrostab.ingest.uniform import cut_log
 from gyrostab.kernels.grid.stamps import NO_STAMP
 from gyrostab.time.grid import time_coordinate
@@ -267,3 +268,11 @@ def test_noise_is_not_judged_across_a_change_of_the_rate(rates, tmp_path):
     before = cut_log(log, time_to=str(change - np.timedelta64(10, "s")))
     judgement = judge_product(fit_noise(davar(before, window="10s", step="5s")))[0]
     assert "N cannot be judged" not in judgement
+
+
+def test_sampled_stretches_are_spread_evenly_over_a_long_log():
+    blocks = [np.full(1 << 18, number) for number in range(60)]
+    stretches = sample_stretches(lambda: ((block, block) for block in blocks))
+    counts = np.bincount([stretch[0] for stretch in stretches], minlength=60)
+    assert 64 <= len(stretches) <= 128
+    assert counts.max() - counts.min() <= 1
