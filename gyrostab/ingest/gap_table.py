@@ -87,12 +87,17 @@ def describe_clock_change(jump: float) -> str:
 
 def sort_gaps(table: NDArray[np.int64]) -> NDArray[np.int64]:
     """Sort a table by sample; merge nearest neighbours of one cause in one that is too long."""
-    if len(table) > _MAX_TABLE_ROWS:
-        table = _merge_neighbours(table)
+    table = sort_lines(table)
+    return sort_lines(_merge_neighbours(table)) if len(table) > _MAX_TABLE_ROWS else table
+
+
+def sort_lines(table: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Sort a table by sample, and the lines of a sample by cause."""
     return np.asarray(table[np.lexsort((table[:, CAUSE], table[:, FIRST]))])
 
 
 def _merge_neighbours(table: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Merge lines of a sorted table."""
     parts = []
     for cause in np.unique(table[:, CAUSE]):
         part = table[table[:, CAUSE] == cause]
@@ -102,9 +107,9 @@ def _merge_neighbours(table: NDArray[np.int64]) -> NDArray[np.int64]:
             at = np.concatenate(
                 [[0], np.sort(np.argsort(distance, kind="stable")[len(distance) - room + 1 :]) + 1]
             )
-            last = np.append(at[1:], len(part)) - 1
+            ends = np.maximum.reduceat(part[:, END], at)
             sums = np.add.reduceat(part[:, [SAMPLES, ROWS]], at, axis=0)
-            part = np.column_stack([part[at, FIRST], part[last, END], sums, part[at, CAUSE]])
+            part = np.column_stack([part[at, FIRST], ends, sums, part[at, CAUSE]])
         parts.append(part)
     return np.concatenate(parts)
 

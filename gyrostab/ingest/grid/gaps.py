@@ -8,7 +8,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import SchemaError
-from gyrostab.ingest.gap_table import MISSING, OUTSIDE_RANGE, UNREADABLE, sort_gaps
+from gyrostab.ingest.gap_table import MISSING, OUTSIDE_RANGE, UNREADABLE, sort_lines
 from gyrostab.ingest.grid.fill import samples_of
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.scan_pass import ScanPass
@@ -68,7 +68,7 @@ def _dropped_rows(events: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def find_gaps(placement: Placement, scanned: ScanPass) -> NDArray[np.int64]:
-    """Make the table of gaps in samples, with the columns of `ingest.gap_table.COLUMNS`."""
+    """Make the table of all gaps in samples, with the columns of `ingest.gap_table.COLUMNS`."""
     table = np.concatenate(
         [
             _missing_samples(placement, scanned),
@@ -77,7 +77,7 @@ def find_gaps(placement: Placement, scanned: ScanPass) -> NDArray[np.int64]:
             _dropped_rows(placement.events),
         ]
     )
-    return sort_gaps(table)
+    return sort_lines(table)
 
 
 def gap_table(log: xr.Dataset) -> pd.DataFrame:

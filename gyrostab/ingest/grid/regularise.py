@@ -16,7 +16,7 @@ import xarray as xr
 
 from gyrostab.errors import OptionError, TimeError
 from gyrostab.ingest.columns.pieces import PiecewiseColumn
-from gyrostab.ingest.gap_table import gap_variables, name_lost
+from gyrostab.ingest.gap_table import gap_variables, name_lost, sort_gaps
 from gyrostab.ingest.grid.axes import regularise_axes
 from gyrostab.ingest.grid.fill import count_placed, gather_channel, rows_on_grid
 from gyrostab.ingest.grid.gaps import find_gaps
@@ -435,7 +435,7 @@ def regularise(
             packing,
         ),
         **variables,
-        **gap_variables(table, placement.start, hertz),
+        **gap_variables(sort_gaps(table), placement.start, hertz),
     }
     coordinates = (
         xr.Coordinates({"axis": raw["axis"].variable, **channel_times})

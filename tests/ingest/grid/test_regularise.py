@@ -19,6 +19,7 @@ from gyrostab.ingest.grid.fill import rows_on_grid
 from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.place import place_by_stamp
 from gyrostab.ingest.grid.regularise import regularise
+from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import check_log
 from tests.support.raw_rows import START, expected, raw_log, stamps_of
 
@@ -261,6 +262,22 @@ def test_many_gaps_are_merged():
     assert holes > 12_000
     assert 9_000 < log.sizes["gap"] <= 10_000
     assert gap_table(log).samples.sum() == samples[-1] + 1 - len(samples)
+    note = log.attrs["notes"][-1]
+    assert f"in {holes} places" in note
+    assert not any("without samples from" in note for note in log.attrs["notes"])
+
+
+def test_a_long_table_of_gaps_of_several_kinds_is_valid():
+    n = 60_000
+    values = np.ones((2, n))
+    values[:, np.arange(n) % 10 == 3] = np.nan
+    values[1, np.arange(n) % 10 == 6] = np.nan
+    log = regularise(raw_log(stamps_of(np.arange(n), 100.0), values))
+    table = gap_table(log)
+    assert len(table) <= 10_000
+    assert (table.end > table.start).all()
+    assert table.samples.sum() == 12_000
+    assert as_uniform(log).sizes["gap"] == len(table)
 
 
 def test_names_of_several_files():
