@@ -11,7 +11,7 @@ import gyrostab
 from gyrostab.cli import main
 from gyrostab.errors import OptionError
 from gyrostab.ingest.make_log import make_log
-from gyrostab.ingest.uniform import cut_log
+from gyrostab.ingest.uniform import cut_log, parse_instant
 from gyrostab.jobs.run import load_log
 from tests.reference import direct_surface
 
@@ -164,6 +164,8 @@ def test_lazy_log_stays_lazy():
             r".*T10:05:00 \(300 s\)",
         ),
         ({"time_from": "2026-02-01T00:00"}, "outside the record"),
+        ({"time_to": 9e9}, "--to 9000000000.0 lies outside the record"),
+        ({"time_to": np.timedelta64(90_000, "D")}, "lies outside the record"),
         ({"time_to": "2027-02-01T00:00"}, "--to 2027-02-01T00:00 lies outside the record"),
         (
             {"time_from": "3min", "time_to": "2min"},
@@ -183,6 +185,24 @@ def test_lazy_log_stays_lazy():
 def test_invalid_input_is_refused(given, message):
     with pytest.raises(OptionError, match=message):
         cut_log(make(), **given)
+
+
+@pytest.mark.parametrize(
+    ("given", "instant"),
+    [
+        ("36000s", 36000.0),
+        ("20000 min", 1_200_000.0),
+        (np.timedelta64(0, "s"), 0.0),
+        (pd.Timedelta("2s"), 2.0),
+        ("19700101", 0),
+        ("19700101T000002", 2_000_000_000),
+        ("1970-01-01", 0),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_durations_and_dates_are_distinguished(given, instant):
+    assert parse_instant(given, "--from") == instant
+    assert type(parse_instant(given, "--from")) is type(instant)
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from datetime import date
+from datetime import date, timedelta
 from typing import Any
 
 import numpy as np
@@ -32,7 +32,7 @@ from gyrostab.time.stamps import to_nanoseconds
 _EXAMPLE = "2026-11-20T14:00 (UTC) or 10min after the start"
 _SPAN_EXAMPLE = "2026-11-20T14:00/2026-11-20T14:05 or 10min/15min after the start"
 
-_DATE = re.compile(r"\d{4}-?\d")
+_DATE = re.compile(r"\d{4}-\d|\d{8}(?:$|[T ]\d)")
 
 #: Ends of a span: one text "START/END", or a pair.
 Span = str | tuple[Any, Any]
@@ -71,8 +71,9 @@ def parse_instant(value: Any, option: str, *, example: str = _EXAMPLE) -> int | 
 
 
 def _is_zero(value: Any) -> bool:
+    unit = None if isinstance(value, str | timedelta | np.timedelta64) else "s"
     try:
-        return pd.Timedelta(value, unit=None if isinstance(value, str) else "s") == pd.Timedelta(0)
+        return pd.Timedelta(value, unit=unit) == pd.Timedelta(0)
     except (ValueError, TypeError):
         return False
 
@@ -214,6 +215,8 @@ class _Clock:
     def first_at(self, value: Any, option: str, *, example: str = _EXAMPLE) -> int:
         """Return the first grid sample at or after an instant, also outside the record."""
         instant = parse_instant(value, option, example=example)
+        if isinstance(instant, float):  # keep it within 64-bit nanoseconds
+            instant = min(instant, (self.grid.size + 1) / self.grid.rate)
         stamp = instant if isinstance(instant, int) else self.grid.start + round(instant * 1e9)
         sample = (
             int(np.ceil(grid_index(self.grid.start, self.grid.rate, stamp))) - 1
