@@ -198,8 +198,10 @@ def _candidate_periods(
 ) -> list[float]:
     """Return candidate periods [ns] near the smaller slopes; losses increase slopes."""
     longer = _fit_lines(observed, 128)
-    slopes = longer[0] if longer is not None and len(longer[0]) >= 16 and group < 2 else slope
-    slopes = slopes[slopes > 0.2 * np.median(slope)]
+    min_slope = 0.2 * np.median(slope)
+    slopes = slope[slope > min_slope]
+    if longer is not None and (longer[0] > min_slope).sum() >= 16 and group < 2:
+        slopes = longer[0][longer[0] > min_slope]
     low, high = np.quantile(slopes, [0.05, 0.6])
     low, high = low * 0.995, max(high * 1.005, np.median(slope))
     steps = int(min(np.ceil(np.log(high / low) * group / _PERIOD_STEP), _MAX_CANDIDATES)) + 1

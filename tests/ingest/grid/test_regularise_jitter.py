@@ -196,3 +196,11 @@ def test_stamps_of_a_broken_frame_make_no_gap_longer_than_allowed():
     stamps[29:] = (np.random.default_rng(3).integers(-2000, 2000, 53) % 2**32) * 1_000_000
     log = regularise(raw_log(stamps), max_gap="1h")
     assert log.sizes["time"] < 36_000
+
+
+def test_every_restart_of_a_clock_within_the_second_is_found():
+    random = np.random.default_rng(0)
+    stamps = (np.arange(3000) / 30 * 1000 + 10 * random.standard_normal(3000)).astype(int) % 1000
+    log = regularise(raw_log(stamps * 1_000_000))
+    assert log.attrs["sampling_rate_hz"] == pytest.approx(30.0, rel=0.01)
+    assert (gap_table(log).cause == "restart").sum() == 99
