@@ -345,7 +345,7 @@ class TimeGridIndex(CoordinateTransformIndex):
         nearest = np.clip(nearest, 0, self.transform.size - 1)
         if tolerance is not None:
             miss = np.abs(self.transform.forward({dim: nearest})[name] - stamps)
-            if np.any(miss > np.timedelta64(pd.Timedelta(tolerance))):
+            if np.any(miss > pd.Timedelta(tolerance).to_timedelta64()):
                 raise KeyError(f"no sample within {tolerance} of {label}")
         if isinstance(label, xr.DataArray | xr.Variable):
             return _wrap_positions({dim: xr.Variable(label.dims, nearest)})
@@ -363,14 +363,12 @@ class TimeGridIndex(CoordinateTransformIndex):
                 and not re.search(r"(Z|[+-]\d\d:?\d\d)$", bound)
             )
             # "T12:00:03" ends with that second
-            stamp = pd.Period(bound).end_time if is_period_end else pd.Timestamp(bound)
-            stamp = stamp.tz_convert(None) if stamp.tzinfo else stamp
-            guess = int(np.floor(self.transform.reverse({name: np.datetime64(stamp)})[dim])) - 1
+            time = pd.Period(bound).end_time if is_period_end else pd.Timestamp(bound)
+            stamp = (time.tz_convert(None) if time.tzinfo else time).as_unit("ns").to_datetime64()
+            guess = int(np.floor(self.transform.reverse({name: stamp})[dim])) - 1
             while guess < self.transform.size:  # at most three steps: only rounding is missing
                 grid_stamp = self.transform.forward({dim: guess})[name]
-                if grid_stamp > np.datetime64(stamp) or (
-                    grid_stamp == np.datetime64(stamp) and side == "left"
-                ):
+                if grid_stamp > stamp or (grid_stamp == stamp and side == "left"):
                     break
                 guess += 1
             return max(0, min(guess, self.transform.size))

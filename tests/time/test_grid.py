@@ -74,6 +74,8 @@ class TestIndex:
             ("2026-11-21T00:00:00", "2026-11-21T00:00:03"),
             (None, "2026-11-20T23:59:59.5"),
             ("2026-11-21", None),
+            (None, log.time.values[4]),
+            (log.time.values[4], log.time.values[8]),
         ):
             np.testing.assert_array_equal(log.x.sel(time=slice(a, b)), frame.loc[a:b])
         np.testing.assert_array_equal(log.x.sel(time="2026-11-20"), frame.loc["2026-11-20"])
