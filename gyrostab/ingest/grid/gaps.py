@@ -19,8 +19,11 @@ from gyrostab.schema import GAP_CAUSES
 def _missing_samples(placement: Placement, scanned: ScanPass) -> NDArray[np.int64]:
     """List the samples without a row between the runs."""
     runs, events = placement.runs, placement.events
-    end, row_end = runs[:-1, 0] + runs[:-1, 2], runs[:-1, 1] + runs[:-1, 2]
-    start, row_start = runs[1:, 0], runs[1:, 1]
+    end, start = runs[:-1, 0] + runs[:-1, 2], runs[1:, 0]
+    # a late row that was put in its place has no neighbours among the rows
+    is_late = np.isin(runs[:, 1], events[events[:, 0] == OUT_OF_ORDER, 2])
+    row_end = np.maximum.accumulate(np.where(is_late, 0, runs[:, 1] + runs[:, 2]))[:-1]
+    row_start = np.where(is_late[1:], row_end, runs[1:, 1])
     listed_rows = np.sort(
         events[np.isin(events[:, 0], (DUPLICATE, OUT_OF_ORDER)), 2]
     )  # rows that have a line of another cause

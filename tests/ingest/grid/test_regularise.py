@@ -201,6 +201,13 @@ def test_unreadable_cells_infinite_values_and_lost_stamps():
     assert any("infinite" in note for note in log.attrs["notes"])
 
 
+def test_late_row_in_its_place_leaves_no_gap():
+    samples = np.r_[0:100, 101:140, 100, 140:1000]
+    log = regularise(raw_log(stamps_of(samples, 100.0)))
+    np.testing.assert_array_equal(log.rate.values[0], expected(samples))
+    assert gap_table(log).cause.tolist() == ["out_of_order"]
+
+
 def test_channels_on_time_and_slow_channels_on_their_own():
     n = 300
     stamps = np.concatenate([stamps_of(np.arange(n), 100.0), stamps_of(np.arange(n), 100.0)])
