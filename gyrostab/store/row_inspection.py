@@ -45,14 +45,15 @@ def inspect_rows(
     absent, holes, infinities, low, high = scan_cells(
         np.ascontiguousarray(cells, dtype=np.float64), present
     )
-    unreadable = _find_spans(np.isnan(cells).any(axis=0) & present, begin) if holes else _NO_SPANS
-    infinite = _find_spans(np.isinf(cells).any(axis=0), begin) if infinities else _NO_SPANS
+    unreadable = find_spans(np.isnan(cells).any(axis=0) & present, begin) if holes else _NO_SPANS
+    infinite = find_spans(np.isinf(cells).any(axis=0), begin) if infinities else _NO_SPANS
     filled = {name: int(np.isfinite(values).sum()) for name, values in channels.items()}
     return RowInspection(
         present.size, absent, np.packbits(present), unreadable, infinite, low, high, filled
     )
 
 
-def _find_spans(bad: Any, offset: int) -> NDArray[np.int64]:
+def find_spans(bad: Any, offset: int) -> NDArray[np.int64]:
+    """Return the half-open spans in which `bad` is true, as rows from `offset` on."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]])))
     return np.asarray(edges.reshape(-1, 2) + offset, dtype=np.int64)

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import SchemaError
 from gyrostab.ingest.gap_table import MISSING, OUTSIDE_RANGE, UNREADABLE, sort_lines
-from gyrostab.ingest.grid.fill import samples_of
 from gyrostab.ingest.grid.place import Placement
-from gyrostab.ingest.grid.scan_pass import ScanPass
+from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, join_spans
 from gyrostab.kernels.grid.stamps import DUPLICATE, OUT_OF_ORDER, RESTART, STEP
 from gyrostab.schema import GAP_CAUSES
+from gyrostab.store.row_inspection import find_spans
 
 
 def _missing_samples(placement: Placement, scanned: ScanPass) -> NDArray[np.int64]:
@@ -48,13 +48,28 @@ def _missing_samples(placement: Placement, scanned: ScanPass) -> NDArray[np.int6
 def _unusable_cells(
     spans: NDArray[np.int64], cause: int, placement: Placement
 ) -> NDArray[np.int64]:
-    """List the placed rows in which an axis has no usable number."""
-    first, last = samples_of(placement, spans[:, 0]), samples_of(placement, spans[:, 1] - 1)
-    is_placed = (first >= 0) & (last >= first)
-    rows = (spans[:, 1] - spans[:, 0])[is_placed]
-    return np.stack(
-        [first[is_placed], last[is_placed] + 1, rows, rows, np.full(len(rows), cause)], axis=1
-    )
+    """List the placed rows in which an axis has no usable number; each run has its own lines."""
+    runs = placement.runs[np.argsort(placement.runs[:, 1], kind="stable")]
+    run_ends = runs[:, 1] + runs[:, 2]
+    first_run = np.searchsorted(run_ends, spans[:, 0], side="right")
+    n_runs = np.maximum(np.searchsorted(runs[:, 1], spans[:, 1]) - first_run, 0)
+    span = np.repeat(spans, n_runs, axis=0)
+    run = np.arange(len(span)) + np.repeat(first_run - np.cumsum(n_runs) + n_runs, n_runs)
+    begin = np.maximum(span[:, 0], runs[run, 1])
+    rows = np.minimum(span[:, 1], run_ends[run]) - begin
+    first = runs[run, 0] + begin - runs[run, 1]
+    return np.stack([first, first + rows, rows, rows, np.full_like(rows, cause)], axis=1)
+
+
+def _absent_rows(placement: Placement, scanned: ScanPass) -> NDArray[np.int64]:
+    """Return the spans of rows without any number, if rows have samples because they count."""
+    if placement.placed <= scanned.rows - scanned.absent - scanned.repeated:
+        return np.empty((0, 2), dtype=np.int64)
+    spans = [
+        find_spans(~scanned.mask(begin, min(begin + BLOCK_ROWS, scanned.rows)), begin)
+        for begin in range(0, scanned.rows, BLOCK_ROWS)
+    ]
+    return join_spans(spans)
 
 
 def _dropped_rows(events: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -75,6 +90,7 @@ def find_gaps(placement: Placement, scanned: ScanPass) -> NDArray[np.int64]:
     table = np.concatenate(
         [
             _missing_samples(placement, scanned),
+            _unusable_cells(_absent_rows(placement, scanned), UNREADABLE, placement),
             _unusable_cells(scanned.unreadable, UNREADABLE, placement),
             _unusable_cells(scanned.infinite, OUTSIDE_RANGE, placement),
             _dropped_rows(placement.events),

@@ -52,13 +52,12 @@ class ScanPass:
         return bits[begin % 8 : begin % 8 + end - begin].astype(bool)
 
 
-def _join_spans(parts: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+def join_spans(parts: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """Concatenate the spans of successive blocks of rows; spans that touch become one."""
     spans = np.concatenate([*parts, np.empty((0, 2), dtype=np.int64)])
     if len(spans) < 2:
         return spans
-    new = np.concatenate(
-        [[True], spans[1:, 0] != spans[:-1, 1]]
-    )  # a span that continues in the next block is one span
+    new = np.concatenate([[True], spans[1:, 0] != spans[:-1, 1]])
     starts = np.flatnonzero(new)
     ends = np.append(starts[1:], len(spans)) - 1
     return np.stack([spans[starts, 0], spans[ends, 1]], axis=1)
@@ -136,7 +135,7 @@ def scan_rows(raw: xr.Dataset, name: str, *, block: int = BLOCK_ROWS) -> ScanPas
     empty = [
         axis for axis, lowest, highest in zip(axes, low, high, strict=True) if lowest > highest
     ]
-    packed, spans = np.concatenate(bits), (_join_spans(unreadable), _join_spans(infinite))
+    packed, spans = np.concatenate(bits), (join_spans(unreadable), join_spans(infinite))
     return ScanPass(rows, packed, absent, *spans, still, empty, filled)
 
 

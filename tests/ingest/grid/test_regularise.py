@@ -201,6 +201,27 @@ def test_unreadable_cells_infinite_values_and_lost_stamps():
     assert any("infinite" in note for note in log.attrs["notes"])
 
 
+def test_rows_without_any_number_that_count_are_listed():
+    values = np.ones((2, 6000))
+    values[:, 500:505] = np.nan
+    values[1, 505:507] = np.nan
+    log = regularise(raw_log(None, values), rate=100.0)
+    assert np.isnan(log.rate.values).any(axis=0).sum() == 7
+    table = gap_table(log)
+    assert set(table.cause) == {"unreadable"}
+    assert table.samples.sum() == table.rows.sum() == 7
+
+
+def test_unreadable_span_that_begins_with_a_dropped_row_is_listed():
+    samples = np.r_[0:500, 499:1000]
+    values = np.ones((2, len(samples)))
+    values[1, 500:700] = np.nan
+    log = regularise(raw_log(stamps_of(samples, 100.0), values))
+    table = gap_table(log)
+    unreadable = table[table.cause == "unreadable"]
+    assert unreadable.samples.tolist() == [np.isnan(log.rate.values[1]).sum()] == [199]
+
+
 def test_late_row_in_its_place_leaves_no_gap():
     samples = np.r_[0:100, 101:140, 100, 140:1000]
     log = regularise(raw_log(stamps_of(samples, 100.0)))
