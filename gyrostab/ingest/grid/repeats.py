@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
@@ -15,6 +17,8 @@ from gyrostab.kernels.grid.stamps import DUPLICATE, NO_STAMP, RESTART, STEP
 from gyrostab.store.lazy import read_slice
 
 _MAX_CANDIDATES = 8  # earlier rows with the stamp of a set-back that are compared
+_FIRST_ROWS = 256  # rows that are compared first
+_MIN_SAME_SHARE = 0.5  # smaller share of equal values at which the comparison ends
 _MIN_ROWS = 16  # shorter repetitions are found by their stamps alone
 
 
@@ -41,48 +45,45 @@ def find_repeats(raw: xr.Dataset, name: str, placement: Placement) -> NDArray[np
         if repeats and row < repeats[-1][0] + repeats[-1][2]:
             continue
         for source in _rows_at(raw, stamp, row):
-            length = _same_stamps(raw, source, row)
-            if length >= _MIN_ROWS and _same_values(raw, name, source, row, length):
+            length = _count_repeated(raw, name, source, row)
+            if length >= _MIN_ROWS:
                 repeats.append((row, source, length))
                 break
     return np.array(repeats, dtype=np.int64).reshape(-1, 3)
 
 
+def _growing_blocks(rows: int) -> Iterator[tuple[int, int]]:
+    """Yield begin and end of blocks, first small ones, as most comparisons end soon."""
+    begin, size = 0, _FIRST_ROWS
+    while begin < rows:
+        yield begin, min(begin + size, rows)
+        begin, size = begin + size, min(2 * size, BLOCK_ROWS)
+
+
 def _rows_at(raw: xr.Dataset, stamp: int, end_row: int) -> list[int]:
     """Return the first few rows with a stamp."""
     rows: list[int] = []
-    for begin in range(0, end_row, BLOCK_ROWS):
-        rows += (
-            np.flatnonzero(read_stamps(raw, begin, min(begin + BLOCK_ROWS, end_row)) == stamp)
-            + begin
-        ).tolist()
+    for begin, end in _growing_blocks(end_row):
+        rows += (np.flatnonzero(read_stamps(raw, begin, end) == stamp) + begin).tolist()
         if len(rows) >= _MAX_CANDIDATES:
             break
     return rows[:_MAX_CANDIDATES]
 
 
-def _same_stamps(raw: xr.Dataset, source: int, row: int) -> int:
-    """Return how many rows from `row` on have the stamps of those from `source` on."""
-    room = min(raw.sizes["row"] - row, row - source)
-    for begin in range(0, room, BLOCK_ROWS):
-        end = min(begin + BLOCK_ROWS, room)
-        mismatches = np.flatnonzero(
-            read_stamps(raw, source + begin, source + end)
-            != read_stamps(raw, row + begin, row + end)
-        )
-        if len(mismatches):
-            return begin + int(mismatches[0])
-    return room
+def _count_repeated(raw: xr.Dataset, name: str, source: int, row: int) -> int:
+    """Return how many rows from `row` on repeat those from `source` on, 0 if none do.
 
-
-def _same_values(raw: xr.Dataset, name: str, source: int, row: int, length: int) -> bool:
-    """Return whether values are equal where both are known, and not constant."""
-    compared = same = 0
+    Their stamps are equal, and their values where both are known, but not constant.
+    """
+    compared = same = length = 0
     changes = False
-    for begin in range(0, length, BLOCK_ROWS):
-        end = min(begin + BLOCK_ROWS, length)
+    for begin, end in _growing_blocks(min(raw.sizes["row"] - row, row - source)):
+        differ = read_stamps(raw, source + begin, source + end) != read_stamps(
+            raw, row + begin, row + end
+        )
+        length = begin + int(differ.argmax()) if differ.any() else end
         left, right = (
-            read_slice(raw[name].data, first + begin, first + end) for first in (source, row)
+            read_slice(raw[name].data, first + begin, first + length) for first in (source, row)
         )
         is_known = np.isfinite(left) & np.isfinite(right)
         rows = is_known.any(axis=0)
@@ -91,7 +92,9 @@ def _same_values(raw: xr.Dataset, name: str, source: int, row: int, length: int)
         changes = changes or bool(
             ((np.diff(left, axis=1) != 0) & is_known[:, 1:] & is_known[:, :-1]).any()
         )
-    return changes and is_copy(compared, same)
+        if differ.any() or same < _MIN_SAME_SHARE * compared:
+            break
+    return length if changes and is_copy(compared, same) else 0
 
 
 def with_repeats(placement: Placement, raw: xr.Dataset, repeats: NDArray[np.int64]) -> Placement:

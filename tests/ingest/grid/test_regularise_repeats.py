@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gyrostab.ingest.columns.stamps import read_stamps
 from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.regularise import regularise
-from tests.support.raw_rows import raw_log, stamps_of
+from tests.support.raw_rows import START, raw_log, stamps_of
 
 
 def test_long_step_is_a_step_of_the_clock_unless_allowed():
@@ -79,3 +80,18 @@ def test_restarted_clock_is_not_a_repetition(values):
     log = regularise(raw_log(stamps_of(np.r_[0:6000, 0:3000], 300.0), values))
     assert log.sizes["time"] == 9001
     assert gap_table(log).cause.tolist() == ["restart"]
+
+
+def test_few_rows_are_compared_at_each_of_many_restarts(monkeypatch):
+    rows_read = []
+
+    def count_rows(raw, begin, end):
+        rows_read.append(end - begin)
+        return read_stamps(raw, begin, end)
+
+    monkeypatch.setattr("gyrostab.ingest.grid.repeats.read_stamps", count_rows)
+    n = 20_000
+    values = np.random.default_rng(0).standard_normal(n)
+    log = regularise(raw_log(START + np.arange(n) % 100 * 10_000_000, values))
+    assert (gap_table(log).cause == "restart").sum() == n // 100 - 1
+    assert sum(rows_read) < 100 * n
