@@ -371,7 +371,7 @@ def _read_text(path: Path, options: ReadOptions, stop: Event) -> xr.Dataset:
 def _is_text(path: Path) -> bool:
     try:
         return bool(_find_reader(path) is _entry_points()["text"].load())
-    except FormatError:
+    except (FormatError, OSError):
         return False  # reading raises the error
 
 

@@ -82,6 +82,17 @@ def test_the_first_and_the_last_file_leave_no_gap(archive: list[Path]) -> None:
     )
 
 
+def test_a_file_without_read_permission_is_left_out(archive: list[Path], monkeypatch) -> None:
+    def refuse(path: Path) -> None:
+        if path == archive[2]:
+            raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr("gyrostab.ingest.files.refuse_unread", refuse)
+    raw = read_log(archive)
+    assert raw.attrs["unreadable_files"] == ["run_10.csv"]
+    assert any("run_10.csv: cannot be read (Permission denied)" in n for n in raw.attrs["notes"])
+
+
 def test_more_than_half_unreadable_is_an_error(archive: list[Path]) -> None:
     for path in archive[:3]:
         empty(path)
