@@ -15,7 +15,7 @@ from gyrostab.ingest.columns.stamps import read_stamps
 from gyrostab.ingest.gap_table import format_duration
 from gyrostab.ingest.grid.rate import RateEstimate
 from gyrostab.ingest.grid.scan_pass import file_of
-from gyrostab.ingest.grid.starting_period import Stamps, recut_blocks
+from gyrostab.ingest.grid.starting_period import Stamps, readable_stamps, recut_blocks
 from gyrostab.ingest.limits import describe_limit, is_absurd_grid
 from gyrostab.kernels.grid import stamps as kernel
 from gyrostab.kernels.grid.stamps import (
@@ -36,6 +36,10 @@ NO_STAMPS = (
 
 #: Rows that the placement kernel processes at one time.
 _STRETCH_ROWS = 1 << 18
+
+#: Stamps with which the first one is compared, itself included, and the ratio of its distance from
+#: them to their largest distance from each other at which it is corrected.
+_FIRST_STAMPS, _MIN_DELAY_RATIO = 32, 4.0
 
 
 @dataclass(frozen=True)
@@ -162,7 +166,10 @@ def place_by_stamp(
     state, ring = kernel.new_state()
     runs: list[NDArray[np.int64]] = []
     events: list[NDArray[np.int64]] = []
+    first = np.empty(0, dtype=np.int64)
     for rows, values in recut_blocks(stamps, _STRETCH_ROWS, LOOK_AHEAD):
+        if len(first) == 0:
+            first = readable_stamps(values)[:_FIRST_STAMPS]
         n = _STRETCH_ROWS if len(rows) == _STRETCH_ROWS + LOOK_AHEAD else len(rows)
         new, happened = kernel.place(
             rows, values, n, period, 0.5 + tolerance, max_gap * rate, state, ring
@@ -172,7 +179,18 @@ def place_by_stamp(
     if not state[kernel.STARTED]:
         raise TimeError(NO_STAMPS.format(where=where))
     runs.append(state[kernel.OPEN_RUN][None])
-    return make_placement(int(state[kernel.FIRST]), runs, events)
+    return make_placement(_find_start(first, period), runs, events)
+
+
+def _find_start(stamps: NDArray[np.int64], period: float) -> int:
+    """Return the first stamp [ns], corrected if it disagrees with all others, which agree."""
+    samples = (stamps[1:] - stamps[0]) / period
+    off = samples - np.rint(samples)
+    if len(off) < _FIRST_STAMPS - 1:
+        return int(stamps[0])
+    delay = float(np.median(off))
+    is_certain = abs(delay) > _MIN_DELAY_RATIO * np.abs(off - delay).max()
+    return int(stamps[0]) + (int(np.rint(delay * period)) if is_certain else 0)
 
 
 @dataclass

@@ -276,3 +276,19 @@ def test_sampled_stretches_are_spread_evenly_over_a_long_log():
     counts = np.bincount([stretch[0] for stretch in stretches], minlength=60)
     assert 64 <= len(stretches) <= 128
     assert counts.max() - counts.min() <= 1
+
+
+@pytest.mark.parametrize("delay_ms", [-4.5, 3.0])
+def test_a_late_first_stamp_does_not_move_the_others(delay_ms):
+    stamps = stamps_of(np.arange(500), 100.0)
+    stamps[0] += int(delay_ms * 1e6)
+    log = regularise(raw_log(stamps))
+    np.testing.assert_array_equal(log.time.values[1:].astype(np.int64), stamps[1:])
+
+
+@pytest.mark.parametrize("rate", [300.0, 400.0, 99.3])
+@pytest.mark.parametrize("phase", [0.0, 0.3, 0.45, 0.8])
+def test_the_first_stamp_in_milliseconds_stays_as_written(rate, phase):
+    stamps = stamps_of(np.arange(500) + phase, rate) // 1_000_000 * 1_000_000
+    log = regularise(raw_log(stamps))
+    assert log.time.values[0].astype(np.int64) == stamps[0]
