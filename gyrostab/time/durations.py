@@ -13,6 +13,8 @@ from gyrostab.errors import OptionError
 
 #: Examples of averaging times, for messages.
 TAUS = "--taus 40 (how many), octave, all or 0.1s,1s,10s"
+#: Part of the window that the longest averaging time takes, by the order of the differences.
+_PARTS = {2: "half", 3: "a third"}
 _SAMPLE_COUNT = re.compile(r"^\s*(\d{1,18})\s*samples?\s*$", re.ASCII)
 _COUNT = re.compile(r"^\d{1,18}$", re.ASCII)
 _NUMBER = re.compile(r"^\s*[-+]?(\d+(\.\d*)?|\.\d+)(e[-+]?\d+)?\s*$", re.IGNORECASE)
@@ -139,7 +141,8 @@ def averaging_factors(
     window : int
         Window [samples].
     tau_max : float or str, optional
-        Longest averaging time; by default a third of the terms of the window is left.
+        Longest averaging time, also of a list; by default a third of the terms of the window is
+        left, and a list is used as it is.
     order : int
         Order of the differences: a term spans ``order * k`` samples.
 
@@ -155,14 +158,14 @@ def averaging_factors(
     >>> averaging_factors(["0.1s", "1s"], rate=100.0, window=1000)
     array([ 10, 100])
     """
-    longest, part = window // order, {2: "half", 3: "a third"}[order]
+    longest = window // order
     limit = 2 * window // (3 * order)
     if tau_max is not None:
         limit = int(duration_seconds(tau_max, "tau_max") * rate + 1e-6)
         if limit > longest or limit < 1:
             raise OptionError(
                 f"tau_max of {limit / rate:g} s does not fit the window of {window / rate:g} s; "
-                f"give {1 / rate:g} s to {longest / rate:g} s ({part} of the window)"
+                f"give {1 / rate:g} s to {longest / rate:g} s ({_PARTS[order]} of the window)"
             )
     limit = max(1, limit)
     if isinstance(taus, str):
@@ -173,13 +176,25 @@ def averaging_factors(
             return np.arange(1, limit + 1, dtype=np.int64)
         is_count = _COUNT.match(text)
         taus = int(text) if is_count else [part for part in text.split(",") if part.strip()]
-    if isinstance(taus, (int, np.integer)):
-        if taus < 1:
-            raise OptionError(
-                f"taus={taus}: give a number of averaging times above 0, 'octave', 'all' "
-                "or a list such as 0.1s,1s"
-            )
+    is_number = isinstance(taus, int | np.integer)
+    if (is_number and taus < 1) or not (is_number or np.iterable(taus)):
+        raise OptionError(
+            f"taus={taus}: give a number of averaging times above 0, 'octave', 'all' "
+            "or a list such as 0.1s,1s"
+        )
+    if is_number:
         return _spaced_factors(int(taus), limit)
+    factors = _listed_factors(taus, rate, longest, order)
+    if tau_max is not None:
+        factors = factors[factors <= limit]
+    if len(factors) == 0:
+        given = "given" if tau_max is None else f"given up to tau_max of {limit / rate:g} s"
+        raise OptionError(f"no averaging time is {given}; write for instance {TAUS}")
+    return factors
+
+
+def _listed_factors(taus: Any, rate: float, longest: int, order: int) -> NDArray[np.int64]:
+    """Return the averaging factors of a list of durations, of which `longest` is the largest."""
     ks = []
     for tau in taus:
         k = round(duration_seconds(tau, "tau", example=TAUS) * rate)
@@ -190,13 +205,11 @@ def averaging_factors(
             )
         if k > longest:
             raise OptionError(
-                f"tau {tau!r} is longer than {part} of the window ({longest / rate:g} s), "
+                f"tau {tau!r} is longer than {_PARTS[order]} of the window ({longest / rate:g} s), "
                 f"so no {'second' if order == 2 else 'third'} difference fits; "
                 "give a longer --window or shorter --taus"
             )
         ks.append(k)
-    if not ks:
-        raise OptionError(f"no averaging time is given; write for instance {TAUS}")
     return np.unique(np.asarray(ks, dtype=np.int64))
 
 

@@ -44,3 +44,16 @@ def test_lengths_out_of_range_are_refused_clearly(value):
         samples(value, 100.0, "window")
     with pytest.raises(OptionError):
         duration_seconds(value, "window")
+
+
+def test_tau_max_limits_a_list():
+    factors = averaging_factors(["1s", "4s"], rate=100.0, window=1000, tau_max="2s")
+    assert factors.tolist() == [100]
+    with pytest.raises(OptionError, match="no averaging time is given up to tau_max of 2 s"):
+        averaging_factors("3s,4s", rate=100.0, window=1000, tau_max="2s")
+
+
+@pytest.mark.parametrize("taus", [40.0, None, np.array(0.5)])
+def test_averaging_times_of_another_type_are_refused_clearly(taus):
+    with pytest.raises(OptionError, match="give a number of averaging times above 0"):
+        averaging_factors(taus, rate=100.0, window=1000)
