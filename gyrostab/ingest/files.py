@@ -31,6 +31,7 @@ from gyrostab.ingest.formats.binary import has_layout
 from gyrostab.ingest.formats.recognise import refuse_unread
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.ingest.overlap import stamp_span
+from gyrostab.ingest.uniform import check_same_rate
 from gyrostab.schema import texts
 from gyrostab.store.remote import fetch_file, find_store, find_url, list_urls
 
@@ -388,12 +389,8 @@ def _stamp_spans(parts: Mapping[Path, xr.Dataset]) -> dict[Path, tuple[int, int]
 
 def _check_regular(log: xr.Dataset, name: str, options: ReadOptions) -> xr.Dataset:
     """Refuse options that contradict a regular log, and note options that have no effect on it."""
-    rate = float(log.attrs["sampling_rate_hz"])
-    if options.rate is not None and abs(options.rate / rate - 1) > 1e-6:
-        raise OptionError(
-            f"{name} is a regular log of {rate:.10g} Hz, not of {options.rate:.10g} Hz; leave "
-            "out --rate, or ingest its source again"
-        )
+    if options.rate is not None:
+        check_same_rate(log, options.rate, name)
     idle = [
         f"--{option}"
         for option in ("start", "epoch", "map", "unit", "kind")

@@ -46,7 +46,7 @@ from gyrostab.ingest.grid.repeats import find_repeats, with_repeats
 from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, file_of, scan_rows, stamp_blocks
 from gyrostab.ingest.grid.starting_period import Stamps
 from gyrostab.ingest.limits import check_limits
-from gyrostab.ingest.uniform import as_uniform
+from gyrostab.ingest.uniform import as_uniform, check_same_rate
 from gyrostab.schema import SIGNAL_UNITS, check_raw, signal_name, texts
 from gyrostab.store.lazy import find_source, read_slice
 from gyrostab.store.write import chunk_samples
@@ -381,11 +381,14 @@ def regularise(
     >>> log.attrs["sampling_rate_hz"]
     100.0
     """
+    _check_options(rate=rate, tolerance=tolerance, chunk=chunk, block=block)
     is_log = isinstance(raw, xr.Dataset) and "row" not in raw.dims
     if is_log and "sampling_rate_hz" in raw.attrs:
-        return as_uniform(raw)
+        log = as_uniform(raw)
+        if rate is not None:
+            check_same_rate(log, rate, ", ".join(texts(log, "source_files")) or "this")
+        return log
     check_raw(raw)
-    _check_options(rate=rate, tolerance=tolerance, chunk=chunk, block=block)
     if "axis_rows" in raw.attrs:
         regularise_group = partial(
             regularise,

@@ -9,7 +9,7 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.errors import SchemaError, TimeError
+from gyrostab.errors import OptionError, SchemaError, TimeError
 from gyrostab.ingest.concat.lazy import chunk_of, place_in_memory, place_on_grid
 from gyrostab.ingest.gap_table import (
     END,
@@ -78,6 +78,16 @@ def as_uniform(log: xr.Dataset) -> xr.Dataset:
     if all(log.attrs.get(name) == value for name, value in true.items()):
         return log
     return log.assign_attrs(true)
+
+
+def check_same_rate(log: xr.Dataset, rate: float, name: str) -> None:
+    """Refuse a given rate [Hz] that contradicts that of a regular log; `name` names the log."""
+    own_rate = float(log.attrs["sampling_rate_hz"])
+    if abs(rate / own_rate - 1) > 1e-6:
+        raise OptionError(
+            f"{name} is a regular log of {own_rate:.10g} Hz, not of {rate:.10g} Hz; leave "
+            "out --rate, or ingest its source again"
+        )
 
 
 def grid_of(log: xr.Dataset, nominal: float | None = None) -> tuple[UniformGrid, bool]:

@@ -349,6 +349,11 @@ def test_one_sample_with_a_given_rate_and_a_constant_axis():
 def test_a_regular_log_passes_through():
     log = regularise(raw_log(stamps_of(np.arange(10), 100.0)))
     assert regularise(log) is log
+    assert regularise(log, rate=100.0) is log
+    with pytest.raises(OptionError, match=r"tool.csv is a regular log of 100 Hz, not of 200 Hz"):
+        regularise(log, rate=200.0)
+    with pytest.raises(OptionError, match="tolerance=7"):
+        regularise(log, tolerance=7)
 
 
 def test_arrays_keep_every_bit():
