@@ -131,7 +131,7 @@ def describe_rate(
             f"give --rate {estimate.finer:g}"
         )
     off = abs(estimate.raw / rate - 1)
-    if off * placement.size > 1 and off > 2 * estimate.stderr / rate:
+    if off * placement.size > 1 and off > 2 * estimate.error / rate:
         notes.append(
             f"{where}: the stamps say {estimate.raw:.10g} Hz, {1e6 * off:.1f} parts per million "
             f"from {rate:.10g} Hz"

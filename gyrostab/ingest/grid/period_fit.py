@@ -82,7 +82,7 @@ def _piece_sums(
 def pool_pieces(
     pieces: NDArray[np.float64], period: float, counted: bool
 ) -> tuple[float, float, float]:
-    """Pool the pieces: period [ns], standard error [ns], samples of the longest stretch."""
+    """Pool the pieces: period [ns], three standard errors [ns], longest stretch [samples]."""
     n, cc, ct, residuals = pieces[:, 0], pieces[:, 3], pieces[:, 4], pieces[:, 5]
     if cc.sum() <= 0:
         return period, period, 1.0

@@ -53,7 +53,7 @@ class RateEstimate:
     """A sampling rate, and how it was found."""
 
     rate: float  # sampling rate [Hz]
-    stderr: float  # its standard error [Hz]
+    error: float  # three standard errors of it [Hz]
     counted: bool  # whether rows are placed by their count, not by their stamps
     coarse: bool  # whether many rows share one stamp
     raw: float  # rate before rounding to a plain number [Hz]
@@ -195,10 +195,10 @@ def _estimate_pooled(
     pieces = fit_pieces(stamps, period, counted, coarse, longest, jitter)
     period, error, samples = pool_pieces(pieces, period, counted and not coarse)
     rate = SECOND / period
-    stderr = rate * error / period
+    rate_error = rate * error / period
     return RateEstimate(
-        _round_rate(rate, stderr + 1e-12 * rate, samples, counted and not coarse),
-        stderr,
+        _round_rate(rate, rate_error + 1e-12 * rate, samples, counted and not coarse),
+        rate_error,
         counted,
         coarse,
         rate,
