@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.pieces import InspectedRows
 from gyrostab.ingest.columns.stamps import read_stamps
+from gyrostab.ingest.uniform.core import merge_lines
 from gyrostab.schema import texts
 from gyrostab.store.lazy import find_source, read_slice
 from gyrostab.store.row_inspection import RowInspection, inspect_rows
@@ -55,12 +56,7 @@ class ScanPass:
 def join_spans(parts: list[NDArray[np.int64]]) -> NDArray[np.int64]:
     """Concatenate the spans of successive blocks of rows; spans that touch become one."""
     spans = np.concatenate([*parts, np.empty((0, 2), dtype=np.int64)])
-    if len(spans) < 2:
-        return spans
-    new = np.concatenate([[True], spans[1:, 0] != spans[:-1, 1]])
-    starts = np.flatnonzero(new)
-    ends = np.append(starts[1:], len(spans)) - 1
-    return np.stack([spans[starts, 0], spans[ends, 1]], axis=1)
+    return np.stack(merge_lines(spans), axis=1)
 
 
 def _scan_block(
