@@ -46,13 +46,13 @@ class TemperatureBias(Effect):
     size_parameters = ("sensitivity", "quadratic", "cubic")
 
     sensitivity: float = parameter(
-        "deg/h/degC", "bias per degree", typical=1e-3, low=-10.0, high=10.0
+        "deg/h/degC", "bias per degree", typical=1e-3, low=-1e4, high=1e4
     )
     quadratic: float = parameter(
-        "deg/h/degC^2", "bias per degree squared", default=0.0, typical=1e-5, low=-1.0, high=1.0
+        "deg/h/degC^2", "bias per degree squared", default=0.0, typical=1e-5, low=-1e3, high=1e3
     )
     cubic: float = parameter(
-        "deg/h/degC^3", "bias per degree cubed", default=0.0, typical=1e-7, low=-0.1, high=0.1
+        "deg/h/degC^3", "bias per degree cubed", default=0.0, typical=1e-7, low=-1e2, high=1e2
     )
     reference: float = parameter(
         "degC", "temperature at which the bias is zero", default=25.0, low=-273.15, high=500.0
@@ -345,7 +345,7 @@ class ThermalHysteresis(Effect):
     size_parameters = ("sensitivity",)
 
     sensitivity: float = parameter(
-        "deg/h/degC", "bias per degree in the dead band", typical=3e-4, low=-10.0, high=10.0
+        "deg/h/degC", "bias per degree in the dead band", typical=3e-4, low=-1e4, high=1e4
     )
     width: float = parameter(
         "degC", "half of the dead band", default=3.0, low=0.0, high=500.0, difference=True

@@ -17,7 +17,7 @@ _FOLDED_POINTS = 1001  # of the spectrum of the samples, from which a sentence t
 
 
 def _declare_sensitivity(unit: str, meaning: str) -> Any:
-    return parameter(unit, meaning, default=0.0, typical=1e-3, low=-10.0, high=10.0)
+    return parameter(unit, meaning, default=0.0, typical=1e-3, low=-1e4, high=1e4)
 
 
 @dataclass(frozen=True, kw_only=True)

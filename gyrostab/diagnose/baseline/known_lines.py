@@ -137,7 +137,7 @@ def _line_leakage(size: int, apart: float = 0.0) -> tuple[Array, Array, Array]:
     The offset `apart` from the middle line is in lines.
     """
     weights = taper(size)
-    reach = min(_LEAK_LINES, ordinates(size) // 2)
+    reach = min(_LEAK_LINES, (ordinates(size) - 1) // 2)
     finer = 2 * _PLACES_BETWEEN
     turned = weights * np.exp(2j * np.pi * apart * np.arange(size) / size)
     padded = np.abs(np.fft.fft(turned, size * finer)) ** 2 / (size * (weights**2).sum())

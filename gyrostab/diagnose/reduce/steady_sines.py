@@ -75,14 +75,15 @@ class SineSearch:
         segments = -(-block_count * length // _MAX_SAMPLES)
         blocks = block_count // segments
         self.rate, self.length = rate, length
-        self.segment = np.full((axes, blocks * length), np.nan)
-        self.filled = 0
         sizes = [blocks // parts * length for parts in _PARTS if blocks >= 2 * parts]
+        # none in blocks so long that hardly one fits a segment
+        self.segment = np.full((axes, blocks * length if sizes else 0), np.nan)
+        self.filled = 0
         self.spectra = [_make_spectrum(axes, size) for size in sizes]
 
     def add(self, values: Array) -> None:
         """Add the samples (axis, sample) that follow; NaN where missing."""
-        while values.shape[1]:
+        while self.spectra and values.shape[1]:
             count = min(values.shape[1], self.segment.shape[1] - self.filled)
             self.segment[:, self.filled : self.filled + count] = values[:, :count]
             self.filled, values = self.filled + count, values[:, count:]

@@ -148,11 +148,7 @@ class RotationOrder(Statistic):
                     state = state.with_columns("power", axis, [column])
                     state = free_covariance(state, (axis,), column)
         lines = state.blocks["line_frequency"].values
-        near_order = np.zeros(lines.size, np.bool_)
-        for k in chosen:
-            near_order |= (lines >= np.nanmin(turn) * (k + 1) - 2 * lines[0]) & (
-                lines <= np.nanmax(turn) * (k + 1) + 2 * lines[0]
-            )
+        near_order = np.logical_or.reduce([_lines_near(lines, turn * (k + 1)) for k in chosen])
         return state.with_columns("line", "all", [near_order])
 
     def estimate(self, fit: SizeFit) -> Sizes:
@@ -268,6 +264,16 @@ def fit_amplitude(component: Component, state: State) -> tuple[float, float, flo
     mean, covariance = component_mixture(component, state).moments()
     sd = float(math.sqrt(np.trace(covariance[:2, :2]) / 2.0))
     return float(math.hypot(mean[0], mean[1])), sd, math.degrees(math.atan2(mean[1], mean[0]))
+
+
+def _lines_near(lines: Array, turning: Array) -> NDArray[np.bool_]:
+    """Find the lines within two lines of the rates of blocks that turn, and between neighbours."""
+    pairs = np.stack([np.append(turning, turning[:-1]), np.append(turning, turning[1:])])
+    low, high = np.sort(pairs[:, (pairs > 0.0).all(axis=0)], axis=0)
+    ends = np.zeros(lines.size + 1)
+    np.add.at(ends, np.searchsorted(lines, low - 2.0 * lines[0]), 1.0)
+    np.add.at(ends, np.searchsorted(lines, high + 2.0 * lines[0], side="right"), -1.0)
+    return np.asarray(np.cumsum(ends[:-1]) > 0.0)
 
 
 def turns_per_second(blocks: xr.Dataset) -> Array:

@@ -187,7 +187,7 @@ def _solve_factors(
 ) -> Array:
     """Return the factors (draw, axis) whose products are nearest to those of the pairs.
 
-    Their sign is that in which they agree with the first axis.
+    Their sign makes the largest of them positive.
     """
     place = {row: number for number, row in enumerate(rows)}
     matrix = np.zeros((product.shape[0], len(axes), len(axes)))

@@ -91,7 +91,7 @@ def expected_powers(weights: Array, rate: float, ordinates: int) -> Array:
     --------
     >>> powers = expected_powers(np.ones(256), 1.0, 100)
     >>> plain = 1.0 / (2.0 * np.pi * np.arange(1, 101) / 256.0) ** 2
-    >>> (powers[3] / plain)[:3].round(1)  # no taper: a random walk appears threefold
+    >>> (powers[3] / plain)[:3].round(1)  # no taper: a random walk appears twice
     array([2., 2., 2.])
     """
     size = weights.size
@@ -111,7 +111,7 @@ def expected_powers(weights: Array, rate: float, ordinates: int) -> Array:
     taper, box = np.fft.fft(weights, 2 * size), np.fft.fft(np.ones(size), 2 * size)
     powers = np.empty((4, places.size))
     for number, k in enumerate(places):
-        response = np.roll(taper, 2 * k) - taper[2 * k] * box / size
+        response = np.roll(taper, 2 * k) - np.conj(taper[2 * k]) * box / size
         powers[:, number] = density @ (response.real**2 + response.imag**2) / (2 * size)
     powers /= powers[1]
     ratio = powers / _plain_spectra(places * rate / size, rate)

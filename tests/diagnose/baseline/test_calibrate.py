@@ -21,7 +21,7 @@ from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics.power import allan_surface
 from gyrostab.diagnose.statistics.scores import cube_root_score
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.kernels.spectra.expected import expected_powers
+from gyrostab.kernels.spectra.expected import expected_powers, sample_covariance
 from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
 from gyrostab.noise import URAD_PER_S
 from gyrostab.simulate import simulate
@@ -395,3 +395,17 @@ def test_null_means_have_the_noise_of_means_where_it_is_apart():
         ratio[apart] = float(steps / baseline["mean_variance"].mean())
     assert ratio[True] == pytest.approx(1.0, abs=0.15)
     assert ratio[False] > 2.0
+
+
+@pytest.mark.parametrize("size", [16, 25, 100])
+def test_expected_powers_are_the_quadratic_form_of_the_covariance(size):
+    weights, rate, i = taper(size), 10.0, np.arange(size)
+    covariance = sample_covariance(size, rate)[:, np.abs(i[:, None] - i)]
+    expected = []
+    for k in range(1, ordinates(size) + 1):
+        row = weights * np.exp(-2j * np.pi * k * i / size)
+        row -= row.mean()
+        expected.append(((row @ covariance) * row.conj()).sum(axis=-1).real)
+    expected = np.array(expected).T / np.array(expected)[:, 1]
+    made = expected_powers(weights, rate, ordinates(size))
+    np.testing.assert_allclose(made / made[1], expected, rtol=1e-9)

@@ -11,11 +11,12 @@ import xarray as xr
 import gyrostab
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.baseline.from_simulation import baseline_from_simulation
-from gyrostab.diagnose.baseline.known_lines import remove_known_lines
+from gyrostab.diagnose.baseline.known_lines import _line_leakage, remove_known_lines
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines, line_evidence
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics import find_statistic
+from gyrostab.kernels.spectra.periodogram import ordinates
 from gyrostab.simulate import simulate
 
 NOISE = {"N": 0.003, "K": 0.02}
@@ -140,3 +141,8 @@ def test_a_weak_sine_of_a_simulated_log_is_known():
     without = remove_known_lines(recorded, baseline_from_simulation(recorded, plain))
     assert float(with_sine["sine_nats"].max()) < 3.0
     assert float(without["sine_nats"].max()) > 10.0
+
+
+@pytest.mark.parametrize("size", [162, 250, 251, 400, 2000])
+def test_a_line_leaks_into_as_many_lines_as_a_block_has(size):
+    assert all(leak.size % 2 and leak.size <= ordinates(size) for leak in _line_leakage(size))

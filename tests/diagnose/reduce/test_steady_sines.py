@@ -166,3 +166,9 @@ def test_a_slow_sine_counts_by_its_phase(frequency, slow):
         Candidate("spectral_line", line, (), (variant,)), variant, ("x",), 50.0, place
     )
     assert line.is_only_in_phase(component, blocks) is slow
+
+
+def test_blocks_longer_than_a_segment_have_no_search():
+    sines = SineSearch(1, 24, 3_600_000, 1000.0)
+    sines.add(np.zeros((1, 100)))
+    assert np.isneginf(sines.strongest(np.arange(1.0, 5.0))["sine_nats"]).all()
