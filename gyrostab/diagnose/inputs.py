@@ -30,7 +30,7 @@ def check_options(nulls: int, level: float, seed: int) -> None:
     for name, value in (("nulls", nulls), ("seed", seed)):
         if not isinstance(value, int | np.integer):
             raise OptionError(f"{name}={value!r}: give a whole number")
-    if not 0.0 < level < 0.5:
+    if not (isinstance(level, int | float | np.number) and 0.0 < level < 0.5):
         raise OptionError(
             f"false_alarm_level={level!r}: give a false-alarm probability above 0 and below 0.5, "
             "for instance 0.01"
@@ -161,7 +161,7 @@ def _parse_end(end: str, text: str) -> float | str:
     try:
         if "-" in end:
             return str(np.datetime64(end.removesuffix("Z")))
-        return 0.0 if end in ("0", "0s") else duration_seconds(end, "quiet")
+        return duration_seconds(end, "quiet", zero=True)
     except ValueError as error:
         raise OptionError(
             f"quiet {text!r}: {end!r} is neither a time (2026-03-14T08:00) nor a duration after "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture
+from gyrostab.physics.base import Effect
 from gyrostab.physics.registry import effects
 
 CONFIDENCE = 0.95
@@ -70,10 +71,17 @@ def find_upper_limits(identifications: Identifications) -> dict[str, UpperLimit]
                 "not identifiable: free noise does as much" if limits else "below limit",
             )
             continue
-        value, column = max(finite_limits)
+        first = min((column for _, column in finite_limits), key=_place_of(kind))
+        value, column = max(limit for limit in finite_limits if limit[1] == first)
         unit = next((item.unit for item in kind.parameters() if item.name == column), unit)
         out[name] = UpperLimit(value, unit, "below limit")
     return out
+
+
+def _place_of(kind: type[Effect]) -> Callable[[str], int]:
+    """Return the place of a parameter among those of an effect, and the last for other names."""
+    names = [item.name for item in kind.parameters()]
+    return lambda name: names.index(name) if name in names else len(names)
 
 
 def _limit_candidate(candidate: Candidate, state: State) -> tuple[float, str]:

@@ -118,7 +118,7 @@ def _locate_regions(
             region = _take_region(statistic, scores, row, remaining, z[row], critical, settings)
             if region is None:
                 break
-            region["p_value"] = float(null.p_value(name, region["z"]))
+            region["p_value"] = float(null.p_value(name, region.pop("cell_z")))
             regions.append(region)
     return regions
 
@@ -150,7 +150,7 @@ def _locate_mean_regions(
             if region is None:
                 open_rows.discard(row)
                 continue
-            region["p_value"] = float(null.p_value(name, region["z"]))
+            region["p_value"] = float(null.p_value(name, region.pop("cell_z")))
             inside = (blocks["begin"].values >= region["begin"] - 1e-9) & (
                 blocks["end"].values <= region["end"] + 1e-9
             )
@@ -174,7 +174,7 @@ def _take_region(
     critical: float,
     settings: Settings,
 ) -> dict[str, Any] | None:
-    """Return the region around the largest score left, or None; remove it from `left`."""
+    """Return the region around the largest score left, or None; remove it from `remaining`."""
     if not np.isfinite(remaining).any() or np.nanmax(np.abs(remaining)) < critical:
         return None
     window, column = np.unravel_index(np.nanargmax(np.abs(remaining)), remaining.shape)
@@ -199,6 +199,7 @@ def _take_region(
         "frequency": float(scores["frequency"].values[column]),
         "sign": int(sign),
         "z": float(sign * largest),
+        "cell_z": float(remaining[window, column]),  # null records have the largest of cells
         "ratio": float(ratio[column]),
         "estimate": float(ratio[column]),
     }

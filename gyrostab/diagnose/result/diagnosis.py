@@ -138,6 +138,8 @@ def plain(value: Any) -> Any:
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):
         return None
+    if isinstance(value, str):  # names of files may hold bytes that are no text
+        return value.encode("utf-8", "replace").decode()
     return value
 
 
@@ -192,7 +194,8 @@ def model_text(model: Mapping[str, Any], *, heading: str = "") -> str:
     import tomli_w
 
     tables = {name: table for name, table in model.items() if isinstance(table, Mapping) or table}
-    comment = "".join(f"# {line}\n" for line in heading.splitlines())
+    printable = ("".join(filter(str.isprintable, line)) for line in heading.splitlines())
+    comment = "".join(f"# {line}\n" for line in printable)
     return f"{comment}\n" * bool(comment) + tomli_w.dumps(_to_toml(tables))
 
 

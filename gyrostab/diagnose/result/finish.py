@@ -214,7 +214,7 @@ def measure_evidence(
         shown=with_phase_locked if phase_locked_nats else None,
         forecast=partial(train, replace(judged, identified=lasting)) if lasting else before,
     )
-    if identified and not lasting:
+    if not lasting:
         evidence["forecast_gain"] = np.nan  # no effect can be forecast
     return evidence
 

@@ -48,15 +48,13 @@ def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> 
     for baseline in (before, after):
         noise = allan_surface(blocks, baseline, windows)
         shape = noise["shape"][..., keep]
-        known_avar = _known_avar(blocks, baseline, windows)[..., keep]
+        expected = noise["expected"][..., keep]
         with np.errstate(invalid="ignore"):
-            avar.append(noise["expected"][..., keep] + known_avar)
-            low.append(
-                noise["expected"][..., keep] * gammaincinv(shape, 0.025) / shape + known_avar
-            )
-            high.append(
-                noise["expected"][..., keep] * gammaincinv(shape, 0.975) / shape + known_avar
-            )
+            avar.append(expected + _known_avar(blocks, baseline, windows)[..., keep])
+            # what the known mean adds to the Allan variance of this noise
+            shift = (recorded["observed"] - noise["observed"])[..., keep]
+            low.append(expected * gammaincinv(shape, 0.025) / shape + shift)
+            high.append(expected * gammaincinv(shape, 0.975) / shape + shift)
             information = window_means(blocks, baseline, windows)[1]
             error.append(1.0 / np.sqrt(information))
         mean.append(_predicted_means(blocks, baseline, windows))
@@ -171,7 +169,7 @@ def surfaces_with_blocks(
         has_data = np.isfinite(blocks["power"].values)
         density = np.stack([_average_where(case.values, has_data) for case in cases])
         lines = blocks["line_power"].weighted(blocks["line_weight"].fillna(0.0)).mean("part")
-    step = max(1, lines.sizes["line"] // MAX_LINES)
+    step = -(-lines.sizes["line"] // MAX_LINES)
     lines = lines.coarsen(line=step, boundary="trim").max() if step > 1 else lines
     frequency = (
         blocks["line_frequency"].coarsen(line=step, boundary="trim").mean()
@@ -191,7 +189,8 @@ def surfaces_with_blocks(
                 lines.values,
                 {
                     "units": power,
-                    "long_name": "two-sided power density of the recording at full resolution",
+                    "long_name": "two-sided power density of the recording"
+                    + (f", highest of {step} lines" if step > 1 else " at full resolution"),
                 },
             ),
             **{

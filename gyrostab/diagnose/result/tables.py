@@ -50,6 +50,7 @@ def recording_table(blocks: xr.Dataset) -> dict[str, Any]:
 def baseline_table(baseline: xr.Dataset, expected: Sequence[Fitted]) -> dict[str, Any]:
     """Describe the noise compared with, and the effects of the simulation that fit it."""
     noise: dict[str, Any] = {}
+    is_calibrated = baseline.attrs["source"] == "calibrated"
     for axis in baseline["axis"].values:
         noise[str(axis)] = {}
         for term in baseline["term"].values:
@@ -59,7 +60,10 @@ def baseline_table(baseline: xr.Dataset, expected: Sequence[Fitted]) -> dict[str
             )
             noise[str(axis)][str(term)] = {
                 "value": value,
-                "stderr": error if math.isfinite(error) else None,
+                # a ramp is not calibrated: drift is a mismatch, which effects explain
+                "stderr": None
+                if not math.isfinite(error) or (is_calibrated and term == "R")
+                else error,
                 "unit": LAWS[str(term)].label,
             }
     spans = baseline.attrs.get("calibrated_on", [])
@@ -218,10 +222,12 @@ def model_tables(
         ]
     )
     log = {"log": {"oversampling": instrument}} if instrument > 1 else {}
+    band = own.flicker_band if own is not None else Model.flicker_band
+    flicker = {"flicker_band": list(band)} if band != Model.flicker_band else {}
     rates = constant_rates(blocks, [*given_effects, *added_effects], turning)
     return {
         **log,
-        "noise": noise,
+        "noise": {**flicker, **noise},
         "bias": {axis: float(f"{rate:.6g}") for axis, rate in rates.items()},
         "effect": [effect_table(effect) for effect in [*given_effects, *added_effects]],
     }

@@ -56,7 +56,7 @@ def chance_share(p_value: float) -> str:
     if p_value < MIN_PRINTED_PROBABILITY:
         return "fewer than 1 in a million"
     number = 1.0 / p_value
-    return f"1 of {number:.2g}" if number < 100 else f"1 of {_round_to_two_digits(number)}"
+    return f"1 of {number:.2g}" if number < 99.5 else f"1 of {_round_to_two_digits(number)}"
 
 
 def _round_to_two_digits(number: float) -> str:

@@ -236,6 +236,13 @@ def test_folder_of_four_files_round_trips(tmp_path: Path):
 
 
 @plain_pages
+def test_a_file_name_that_is_no_text_is_replaced(tmp_path: Path):
+    made = {**content(), "recording": {**content()["recording"], "files": ["a\udcff\x01.csv"]}}
+    write_diagnosis(Diagnosis(plain(made), surfaces(), model()), tmp_path / "found")
+    assert open_diagnosis(tmp_path / "found").content["recording"]["files"] == ["a?\x01.csv"]
+
+
+@plain_pages
 def test_folder_is_replaced_only_with_overwrite(tmp_path: Path):
     folder = tmp_path / "found"
     write_diagnosis(diagnosis(), folder)

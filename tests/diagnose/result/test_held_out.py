@@ -284,6 +284,23 @@ def test_surfaces_have_all_three_cases():
     )
 
 
+def test_band_of_a_known_mean_holds_95_percent():
+    """Mean and noise have a product in the Allan variance, however well the mean is known."""
+    inside = []
+    for seed in range(12):
+        base, blocks = _record(seed)
+        wave = 10.0 * np.sqrt(VARIANCE) * np.sin(2.0 * np.pi * np.arange(180) / 30.0)
+        blocks["mean"] = blocks["mean"] + xr.DataArray(wave, dims="block")
+        after = base.assign(known_mean=base["known_mean"] + xr.DataArray(wave, dims="block"))
+        surfaces = make_surfaces(blocks, base, after)
+        surfaces = surfaces.isel(tau=surfaces["tau"].values >= BLOCK_S)
+        recorded = surfaces["avar"].sel(case="recording")
+        low, high = (surfaces[f"avar_{end}"].sel(case="after") for end in ("low", "high"))
+        inside.append(((recorded >= low) & (recorded <= high)).where(np.isfinite(recorded)))
+    share = xr.concat(inside, "seed").mean(["seed", "axis", "window"])
+    np.testing.assert_allclose(share, 0.95, atol=0.05)
+
+
 def test_surfaces_of_a_long_record_stay_small():
     base = baseline(block_count=1000)
     blocks = records(base, 1, np.random.default_rng(1), block_count=1000).isel(record=0)
