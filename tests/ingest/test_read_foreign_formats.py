@@ -85,6 +85,7 @@ def write_las(path: Path, date: str, clock: str, rows: list[str]) -> Path:
         ("MM/DD/YYYY", "", ["03/14/2026 23:59:59", "03/15/2026 00:00:00.500"]),
         ("", "", ["14/03/2026 23:59:59", "15/03/2026 00:00:00.500"]),
     ],
+        ("YYYYMMDD", "MS", ["20260314 86399000", "20260315 500"]),
 )
 def test_date_and_time_curves_of_las_are_the_time(
     tmp_path: Path, date: str, clock: str, rows: list[str]
@@ -99,6 +100,32 @@ def test_date_and_time_curves_of_las_are_the_time(
 
 
 def test_ambiguous_dates_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("date", "clock", "row", "first"),
+    [
+        ("DDMMYY", "HHMMSS", "010526 080001", "2026-05-01T08:00:01"),
+        ("YYYYMMDD", "HHMM", "20260501 0830", "2026-05-01T08:30"),
+        ("YYYYMMDD", "HR", "20260501 8.25", "2026-05-01T08:15"),
+    ],
+)
+def test_units_of_las_give_digits_of_dates_and_times(
+    tmp_path: Path, date: str, clock: str, row: str, first: str
+) -> None:
+    raw = read_log(write_las(tmp_path / "a.las", date, clock, [row] * 2))
+    assert raw.time.values[0] == np.datetime64(first)
+
+
+def test_las_without_rows_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=r"^a\.las: it holds no values"):
+        read_log(write_las(tmp_path / "a.las", "YYYYMMDD", "HHMMSS", []))
+
+
+def test_dates_with_the_year_first_or_last_are_refused(tmp_path: Path) -> None:
+    path = write_las(tmp_path / "a.las", "", "S", ["26/03/14 1", "26/03/14 2"])
+    with pytest.raises(FormatError, match=r"is not clear.*--map DATE=-"):
+        read_log(path)
+
+
     path = write_las(tmp_path / "a.las", "", "S", ["03/04/2026 1", "03/05/2026 2"])
     with pytest.raises(FormatError, match=r"order of day and month.*--map DATE=-"):
         read_log(path)

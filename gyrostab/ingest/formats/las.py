@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.stamps import NAT, dates_to_ns
+from gyrostab.ingest.columns.headers import is_time_unit
+from gyrostab.ingest.columns.stamps import dates_to_ns, floats_to_ns, parse_time_unit
 from gyrostab.ingest.columns.typed import holds_dates
 from gyrostab.ingest.formats.recognise import read_head
 from gyrostab.ingest.formats.tables import (
@@ -44,7 +45,8 @@ def matches(path: Path) -> bool:
 def _read_curves(path: Path, options: ReadOptions) -> TablesOfFile:
     lasio = library("lasio", path, extra="las")
     curves = list(lasio.read(str(path)).curves)
-    clocks, dates = _find_clock(path, curves, options)
+    rows = len(curves[0].data) if curves else 0
+    clocks, dates = _find_clock(path, curves, options) if rows else ([], None)
     columns = [
         TableColumn(
             NO_NAME if any(curve is clock for clock in clocks) else (str(curve.mnemonic),),
@@ -53,7 +55,6 @@ def _read_curves(path: Path, options: ReadOptions) -> TablesOfFile:
         )
         for curve in curves
     ]
-    rows = len(curves[0].data) if curves else 0
     stamps = None if dates is None else TableColumn(NO_NAME, sliced(dates))
     return [Table(rows, columns, stamps)], ()
 
@@ -77,11 +78,14 @@ def _find_clock(
     if not pair:
         return [], None
     date, time = by_name["DATE"], by_name["TIME"]
-    days = [
-        str(int(cell)) if isinstance(cell, float) and np.isfinite(cell) else str(cell).strip()
+    unit = str(date.unit or "").strip()
+    days = [  # numbers have lost their leading zeros
+        str(int(cell)).zfill(len(unit))
+        if isinstance(cell, float) and np.isfinite(cell)
+        else str(cell).strip()
         for cell in date.data
     ]
-    stamps = _to_stamps(path, "DATE", days, str(date.unit or ""), time.data, str(time.unit))
+    stamps = _to_stamps(path, "DATE", days, unit, time.data, str(time.unit or "").strip())
     return [date, time], stamps
 
 
@@ -109,10 +113,10 @@ def _to_stamps(
     else:
         numbers = clock.to_numpy(dtype=np.float64)
         if "HHMM" in time_unit.upper():
+            numbers = numbers if "SS" in time_unit.upper() else numbers * 100
             numbers = numbers // 10000 * 3600 + numbers // 100 % 100 * 60 + numbers % 100
-        usable = np.isfinite(numbers)
-        counts = np.rint(np.where(usable, numbers, 0.0) * 1e9).astype(np.int64)
-        since = np.where(usable, counts, NAT).view("timedelta64[ns]")
+        unit = parse_time_unit(time_unit if is_time_unit(time_unit) else "s")
+        since = floats_to_ns(numbers, unit, 0).view("timedelta64[ns]")
     return np.asarray(start + since)
 
 
@@ -138,7 +142,10 @@ def _date_order(unit: str, days: list[str]) -> str | None:
             return order
     unclear = [
         order
-        for order in ("%d/%m/%Y", "%m/%d/%Y", "%d/%m/%y", "%m/%d/%y", "%d-%m-%Y", "%m-%d-%Y")
+        for order in (
+            *("%d/%m/%Y", "%m/%d/%Y", "%d-%m-%Y", "%m-%d-%Y"),
+            *("%d/%m/%y", "%m/%d/%y", "%y/%m/%d"),
+        )
         if _has_date_format(order, days)
     ]
     return unclear[0] if len(unclear) == 1 else None
