@@ -69,6 +69,11 @@ def test_packed_decimals_equal_parsed_ones(wholes, digits, law, missing):
     assert np.isnan(back[~np.isfinite(values)]).all()
 
 
+def test_the_count_of_missing_values_is_not_packed_as_a_value():
+    values = np.array([1.0, 2.0, -(2.0**31), 3.0])
+    assert not pack_counts(values, 1.0, 1.0, np.empty(4, dtype=np.int32))[0]
+
+
 def test_a_negative_zero_is_packed_as_zero():
     values = np.array([-0.0, 0.02, -0.04])  # as np.rint makes one of -0.3 counts
     counts = np.empty(3, np.int32)

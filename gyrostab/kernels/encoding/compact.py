@@ -64,7 +64,7 @@ def pack_counts(values, step, divisor, counts):  # type: ignore[no-untyped-def]
             inside = abs(nearest) < _LARGEST
             count = np.int32(nearest) if finite and inside else _FILL
             back = np.float64(count) * step / divisor
-            off += finite and back != value
+            off += finite and (not inside or back != value)
             absent += not finite
             odd += finite and np.rint(value) != value
             smallest = min(smallest, count if finite else np.int32(2147483647))
