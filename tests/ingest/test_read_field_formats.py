@@ -170,6 +170,13 @@ def test_without_a_unit_or_a_rate_the_messages_are_refused(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("order", ["little", "big"])
+def test_the_rate_of_numbered_messages_has_any_number_of_decimals(tmp_path: Path) -> None:
+    made = WRITERS["messages"](tmp_path)
+    raw = read_log(made.path, **{**made.options, "rate": 1000 / 3})
+    since = (raw.time.values - STAMPS[0]).astype(np.int64)
+    assert np.array_equal(since, np.arange(ROWS) * 3_000_000)
+
+
 def test_numbers_of_24_bits(tmp_path: Path, order: Any) -> None:
     values = [0, 1, -1, 2**23 - 1, -(2**23)]
     path = tmp_path / "run.bin"
@@ -186,6 +193,7 @@ def test_numbers_of_24_bits(tmp_path: Path, order: Any) -> None:
         'fields = [{name = "gyro_x", type = "int8"}, {counter = 128, type = "float32"}]',
         'fields = [{name = "gyro_x", type = "int8"}, {counter = 1, type = "uint8"}]',
         'fields = [{name = "gyro_x", type = ["int8"]}]',
+        'fields = [{name = "gyro_x", type = "int8"}, {counter = 1000, type = "uint8"}]',
         "fields = 3",
     ],
 )

@@ -7,7 +7,6 @@ time follows from it and ``--rate``, and lost messages are gaps.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, OptionError
-from gyrostab.ingest.columns.stamps import TimeUnit, integers_to_ns
 from gyrostab.ingest.formats.layout import (
     Field,
     Layout,
@@ -36,6 +34,7 @@ from gyrostab.ingest.formats.tables import (
     sliced,
 )
 from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.time.grid import check_span, grid_times
 
 SUFFIXES = (".bin", ".raw")
 
@@ -124,9 +123,10 @@ def _count_time(
     step = max(int(steps[times.argmax()]) if len(steps) else 1, 1)
     numbers = (counts + step // 2) // step
     lost = int(numbers[-1]) + 1 - rows
-    period = TimeUnit("", 10**9 / Fraction(repr(float(options.rate))))
     notes = [f"by their counter, {lost} messages were lost"] if lost > 0 else []
-    return sliced(integers_to_ns(numbers, period, 0)), notes
+    rate = float(options.rate)
+    check_span(0, rate, int(numbers[-1]) + 1, path.name)
+    return sliced(grid_times(0, rate, numbers)), notes
 
 
 def _read_field(

@@ -180,4 +180,5 @@ def _parse_field(item: Any, order: str, offset: int) -> Field | None:
         return Field(str(item["name"]), stored, offset)
     turn = item.get("counter")
     usable = keys == {"counter", "type"} and isinstance(turn, int) and stored.kind == "u"
-    return Field("", stored, offset, turn) if usable and 1 < turn <= 2**32 else None
+    most = 2 ** min(8 * stored.itemsize, 32)
+    return Field("", stored, offset, turn) if usable and 1 < turn <= most else None
