@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,6 +14,14 @@ import xarray as xr
 
 from gyrostab.errors import FormatError, GyrostabError, OptionError
 from gyrostab.ingest import ReadOptions, read_log, scan_file
+from gyrostab.ingest.formats.tables import (
+    NO_NAME,
+    Table,
+    TableColumn,
+    read_tables,
+    scan_tables,
+    sliced,
+)
 from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.regularise import regularise
 from tests.ingest.field_files import write_trace
@@ -163,6 +172,40 @@ def test_las(las: Path) -> None:
         ROWS,
         STAMPS[-1],
     )
+
+
+def make_tables(stamps: Sequence[tuple[Any, str | None] | None]) -> list[Table]:
+    """Return a table with a gyro and tables with the channels ``a1``, ..., each with its stamps."""
+    tables = []
+    for number, clock in enumerate(stamps):
+        name, unit = ("gyro_x", "deg/h") if number == 0 else (f"a{number}", "degC")
+        column = TableColumn((name,), sliced(np.arange(10.0)), unit)
+        times = None if clock is None else TableColumn(NO_NAME, sliced(clock[0]), clock[1])
+        tables.append(Table(10, [column], times))
+    return tables
+
+
+def test_stamps_of_tables_have_their_own_units() -> None:
+    times = np.arange(10.0)
+    tables = make_tables([(times * 1e3, "ms"), (times, "s")])
+    raw = read_tables(Path("a.dlis"), tables, ReadOptions())
+    assert np.array_equal(raw.time.values, raw.time_a1.values)
+    raw = read_tables(Path("a.dlis"), tables, ReadOptions(unit={"time": "us"}))
+    assert raw.time.values[1].astype(np.int64) == 1_000_000
+
+
+@pytest.mark.parametrize("is_dated", [False, True])
+def test_tables_that_cannot_be_placed_are_left_out_with_a_note(is_dated: bool) -> None:
+    clocks = [(np.arange(10.0), "s"), (STAMPS[:10], None)]
+    tables = make_tables([clocks[is_dated], clocks[not is_dated], None, clocks[is_dated]])
+    raw = read_tables(Path("a.tdms"), tables, ReadOptions())
+    assert list(raw.data_vars) == ["rate", "a3"]
+    notes = "; ".join(raw.attrs["notes"])
+    assert "left out, as they have no stamps: a2" in notes
+    assert "need --epoch: a1" in notes
+    assert scan_tables(Path("a.tdms"), "tdms", tables, ReadOptions()).channels == ("a3",)
+    raw = read_tables(Path("a.tdms"), tables, ReadOptions(epoch="2026-03-01"))
+    assert list(raw.data_vars) == ["rate", "a1", "a3"]
 
 
 def write_tdms(path: Path, *, waveform: bool) -> None:

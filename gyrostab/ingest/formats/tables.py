@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from array import array
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,10 +17,12 @@ import xarray as xr
 
 from gyrostab.errors import FormatError, OptionError
 from gyrostab.ingest.columns.plan import Plan, plan_columns
-from gyrostab.ingest.columns.stamps import NAT
+from gyrostab.ingest.columns.plan_draft import MAX_HEADERS, Column
+from gyrostab.ingest.columns.stamps import NAT, parse_time_unit
 from gyrostab.ingest.columns.typed import read_columns, summarise_columns
 from gyrostab.ingest.combine import concatenate, with_channels
 from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.wording import list_some
 
 #: First row, row after the last one -> values.
 ReadSlice = Callable[[int, int], Any]
@@ -140,13 +143,52 @@ class _PlannedTables:
             column for column in self.plan.columns if begin <= column.source < begin + len(stored)
         ]
         if stored[0] is not _NO_STAMPS:
-            clocks = [replace(clock, source=begin) for clock in self.plan.of("time")]
+            clocks = [self._clock_of(place, clock) for clock in self.plan.of("time")]
             columns = clocks + [c for c in columns if not (clocks and c.role == "time")]
 
         def fetch(source: int, start: int, stop: int) -> Any:
             return stored[source - begin].values(start, stop)
 
         return replace(self.plan, columns=tuple(columns)), fetch
+
+    def _clock_of(self, place: int, planned: Column) -> Column:
+        """Return the stamps of a table, in the planned unit if both clocks are stored in one."""
+        holder = bisect_right(self.first, planned.source) - 1
+        stored = _with_stamps(self.tables[holder])[planned.source - self.first[holder]]
+        unit, time_unit = _with_stamps(self.tables[place])[0].unit, planned.time_unit
+        if unit != stored.unit:
+            time_unit = parse_time_unit(unit) if unit else None
+        return replace(planned, source=self.first[place], time_unit=time_unit)
+
+
+def _leave_out_unplaced(planned: _PlannedTables, options: ReadOptions) -> _PlannedTables:
+    """Leave out, with notes, tables whose rows have no place on the time of the log."""
+    plans = [planned.part(place)[0] for place in range(len(planned.tables))]
+    is_dated = {
+        place: options.epoch is not None
+        or time.time_unit is None
+        or time.time_unit.epoch is not None
+        for place, time in enumerate(plan.time for plan in plans)
+        if time is not None
+    }
+    kinds = {is_dated[place] for place in planned.main if place in is_dated}
+    undated = {place for place, kind in is_dated.items() if kind != max(kinds, default=kind)}
+    unstamped = set(range(len(plans))) - set(is_dated) - set(planned.main)
+    plan = planned.plan
+    for reason, places in (
+        ("they have no stamps", unstamped),
+        ("some stamps of the file are dates and others need --epoch", undated),
+    ):
+        left_out = [c for place in sorted(places) for c in plans[place].columns if c.role != "time"]
+        if left_out:
+            names = list_some([column.name for column in left_out], MAX_HEADERS)
+            plan = replace(
+                plan,
+                columns=tuple(column for column in plan.columns if column not in left_out),
+                notes=(*plan.notes, f"left out, as {reason}: {names}"),
+            )
+    main = [place for place in planned.main if place not in undated]
+    return replace(planned, plan=plan, main=main)
 
 
 def _with_stamps(table: Table) -> list[TableColumn]:
@@ -189,9 +231,8 @@ def _plan_tables(path: Path, tables: Sequence[Table], options: ReadOptions) -> _
         max(place for place, begin in enumerate(first) if begin <= column.source)
         for column in main_columns
     }
-    return _PlannedTables(
-        filled, first, plan, sorted(holders) if plan.of("gyro") else [min(holders, default=0)]
-    )
+    main = sorted(holders) if plan.of("gyro") else [min(holders, default=0)]
+    return _leave_out_unplaced(_PlannedTables(filled, first, plan, main), options)
 
 
 def scan_tables(
