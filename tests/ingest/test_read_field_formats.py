@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 import sys
 from pathlib import Path
 from typing import Any
@@ -169,7 +170,6 @@ def test_without_a_unit_or_a_rate_the_messages_are_refused(tmp_path: Path) -> No
         read_log(path, rate=1000.0)
 
 
-@pytest.mark.parametrize("order", ["little", "big"])
 def test_the_rate_of_numbered_messages_has_any_number_of_decimals(tmp_path: Path) -> None:
     made = WRITERS["messages"](tmp_path)
     raw = read_log(made.path, **{**made.options, "rate": 1000 / 3})
@@ -177,6 +177,7 @@ def test_the_rate_of_numbered_messages_has_any_number_of_decimals(tmp_path: Path
     assert np.array_equal(since, np.arange(ROWS) * 3_000_000)
 
 
+@pytest.mark.parametrize("order", ["little", "big"])
 def test_numbers_of_24_bits(tmp_path: Path, order: Any) -> None:
     values = [0, 1, -1, 2**23 - 1, -(2**23)]
     path = tmp_path / "run.bin"
@@ -192,8 +193,8 @@ def test_numbers_of_24_bits(tmp_path: Path, order: Any) -> None:
         'sync = "GG"\nfields = [{name = "gyro_x", type = "int8"}]',
         'fields = [{name = "gyro_x", type = "int8"}, {counter = 128, type = "float32"}]',
         'fields = [{name = "gyro_x", type = "int8"}, {counter = 1, type = "uint8"}]',
-        'fields = [{name = "gyro_x", type = ["int8"]}]',
         'fields = [{name = "gyro_x", type = "int8"}, {counter = 1000, type = "uint8"}]',
+        'fields = [{name = "gyro_x", type = ["int8"]}]',
         "fields = 3",
     ],
 )
@@ -213,8 +214,61 @@ def test_items_of_wits_are_channels(tmp_path: Path) -> None:
     assert {column.name for column in scan_file(path).columns} >= {"0110", "0921"}
 
 
-def test_witsml_over_depth_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("index", ["measured depth", "elapsed time"])
+def test_witsml_over_anything_but_dates_is_refused(tmp_path: Path, index: str) -> None:
     made = write_witsml(tmp_path)
-    made.path.write_text(made.path.read_text().replace("date time", "measured depth"))
+    made.path.write_text(made.path.read_text().replace("date time", index))
     with pytest.raises(FormatError, match=r"log\.xml: .*export the log by time"):
         read_log(made.path)
+
+
+def test_curves_of_witsml_have_separate_null_values(tmp_path: Path) -> None:
+    path = write_witsml(tmp_path).path
+    null = "<unit>degC</unit><nullValue>60.25</nullValue>"
+    path.write_text(path.read_text().replace("<unit>degC</unit>", null))
+    assert np.array_equal(
+        read_log(path).temperature.values[:3], [60.0, np.nan, 60.5], equal_nan=True
+    )
+
+
+def test_accelerometers_of_ardupilot_are_channels_without_imu_messages(tmp_path: Path) -> None:
+    path = tmp_path / "a.log"
+    lines = [
+        "FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns",
+        "FMT, 141, 31, ACC, QBQfff, TimeUS,I,SampleUS,AccX,AccY,AccZ",
+        "FMT, 142, 31, GYR, QBQfff, TimeUS,I,SampleUS,GyrX,GyrY,GyrZ",
+    ]
+    for row in range(10):
+        for kind in ("ACC", "GYR"):
+            lines.append(f"{kind}, {20000 * row + 7}, 0, {20000 * row}, 0.1, 0.2, {row}.5")
+    path.write_text("\n".join(lines) + "\n")
+    raw = read_log(path)
+    assert raw.axis.values.tolist() == ["x", "y", "z"]
+    np.testing.assert_allclose(raw.accel_z * 9.80665, np.arange(10) + 0.5, rtol=1e-6)
+
+
+def test_topics_of_an_unknown_type_are_left_out_of_a_bag(tmp_path: Path) -> None:
+    """The file of a bag, whose messages have no definitions, as ROS 2 Humble writes it."""
+    file = next(WRITERS["ros2"](tmp_path).path.glob("*.db3"))
+    with sqlite3.connect(file) as bag:
+        bag.execute("drop table message_definitions")
+        bag.execute("update schema set schema_version = 3")
+        bag.execute("update topics set type = 'my_msgs/msg/Heat' where name = '/imu/temperature'")
+    bag.close()
+    settings = file.with_name("metadata.yaml")
+    text = settings.read_text().replace("sensor_msgs/msg/Temperature", "my_msgs/msg/Heat")
+    settings.write_text(text.replace("version: 9", "version: 5"))
+    raw = read_log(file.parent)
+    assert raw.sizes["row"] == ROWS
+    assert any("/imu/temperature" in note for note in raw.attrs["notes"])
+
+
+def test_timetables_of_matlab_are_read_next_to_vectors(tmp_path: Path) -> None:
+    from matio import load_from_mat, save_to_mat
+
+    made = WRITERS["timetable5"](tmp_path)
+    content = load_from_mat(str(made.path))
+    save_to_mat(str(made.path), {"TT": content["TT"], "bias": np.arange(3.0)[None]}, version="v7")
+    raw = read_log(made.path, **made.options)
+    assert np.array_equal(raw.time.values, STAMPS)
+    assert any("bias" in note for note in raw.attrs["notes"])

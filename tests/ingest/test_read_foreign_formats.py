@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from gyrostab.errors import FormatError, MissingUnitError
 from gyrostab.ingest import read_log, scan_file
@@ -84,8 +85,8 @@ def write_las(path: Path, date: str, clock: str, rows: list[str]) -> Path:
         ("DD/MM/YY", "", ["14/03/26 23:59:59", "15/03/26 00:00:00.500"]),
         ("MM/DD/YYYY", "", ["03/14/2026 23:59:59", "03/15/2026 00:00:00.500"]),
         ("", "", ["14/03/2026 23:59:59", "15/03/2026 00:00:00.500"]),
-    ],
         ("YYYYMMDD", "MS", ["20260314 86399000", "20260315 500"]),
+    ],
 )
 def test_date_and_time_curves_of_las_are_the_time(
     tmp_path: Path, date: str, clock: str, rows: list[str]
@@ -99,7 +100,6 @@ def test_date_and_time_curves_of_las_are_the_time(
     assert list(raw.data_vars) == ["rate", "temperature"]
 
 
-def test_ambiguous_dates_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("date", "clock", "row", "first"),
     [
@@ -126,6 +126,7 @@ def test_dates_with_the_year_first_or_last_are_refused(tmp_path: Path) -> None:
         read_log(path)
 
 
+def test_ambiguous_dates_are_refused(tmp_path: Path) -> None:
     path = write_las(tmp_path / "a.las", "", "S", ["03/04/2026 1", "03/05/2026 2"])
     with pytest.raises(FormatError, match=r"order of day and month.*--map DATE=-"):
         read_log(path)
@@ -160,6 +161,24 @@ def test_matlab_timeseries_is_refused_with_advice(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match=r"a timeseries 'ts'.*MATLAB alone.*ts\.Data") as caught:
         read_log(tmp_path / "ts.mat")
     assert "None" not in str(caught.value)
+
+
+def test_function_handles_of_matlab_are_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "a.mat"
+    savemat(path, {"gyro_x": np.arange(20.0)})
+    flags = matlab_element(6, struct.pack("<II", 16, 0))
+    head = matlab_element(5, struct.pack("<ii", 1, 1)) + matlab_element(1, b"f")
+    inner = matlab_element(6, struct.pack("<II", 6, 0)) + matlab_element(
+        5, struct.pack("<ii", 40, 1)
+    )
+    inner += matlab_element(1, b"") + matlab_element(9, bytes(320))
+    handle = matlab_element(14, flags + head + matlab_element(14, inner))
+    path.write_bytes(path.read_bytes() + handle)
+    raw = read_log(path, rate=10.0, unit={"gyro": "deg/h"})
+    assert raw.rate.values.tolist() == [list(range(20))]
+    path.write_bytes(path.read_bytes()[:-330])
+    with pytest.raises(FormatError, match=r"a\.mat: this MATLAB file is damaged"):
+        read_log(path, rate=10.0, unit={"gyro": "deg/h"})
 
 
 def test_a_matlab_object_of_version_7_3_is_named(tmp_path: Path) -> None:

@@ -85,10 +85,10 @@ def _read_messages(path: Path, options: ReadOptions) -> TablesOfFile:
                     if isinstance(value, int | float)
                 }
                 by_instance.setdefault((kind, instance), Messages()).add(stamp, numbers)
-    axes = "IMU" if ("IMU", 0) in by_instance else "GYR"
+    inertial = ("IMU",) if ("IMU", 0) in by_instance else ("GYR", "ACC")
     targets = {
         f"{kind}[0].{field}": target
-        for kind in (axes, "MAG", "BARO")
+        for kind in (*inertial, "MAG", "BARO")
         for field, target in _MEANINGS[kind].items()
     }
     return [

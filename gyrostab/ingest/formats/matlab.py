@@ -19,7 +19,7 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.errors import FormatError
+from gyrostab.errors import FormatError, OptionError
 from gyrostab.ingest.columns.headers import (
     AXIS_PATTERN,
     KNOWN_CHANNEL_PATTERN,
@@ -70,8 +70,11 @@ def _plan_file(path: Path, options: ReadOptions, stack: ExitStack) -> StoredTabl
         for name, array in _find_arrays(path, stack, objects)
         for column in _columns_of(path, name, array, options)
     ]
-    if not sized_columns:
-        sized_columns = list(_read_tables(path, objects))
+    try:
+        sized_columns += _read_tables(path, objects)
+    except OptionError:  # without the library, the arrays are read
+        if not sized_columns:
+            raise
     if not sized_columns and objects:
         problem = f"it holds {', '.join(dict.fromkeys(objects))}, which MATLAB alone can read"
         raise FormatError(f"{path.name}: {problem}; save plain arrays instead: {_PLAIN_ARRAYS}")
@@ -154,8 +157,10 @@ def _find_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[t
 
 
 def _flatten_struct(name: str, value: Any, objects: list[str]) -> Iterator[tuple[str, Any]]:
-    from scipy.io.matlab import MatlabObject, MatlabOpaque
+    from scipy.io.matlab import MatlabFunction, MatlabObject, MatlabOpaque
 
+    if isinstance(value, MatlabFunction):
+        return
     fields = value.dtype.names if isinstance(value, np.ndarray) else None
     if isinstance(value, MatlabOpaque):
         objects.append(_describe_opaque(name, value))

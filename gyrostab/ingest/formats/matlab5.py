@@ -20,7 +20,7 @@ _MATRIX, _COMPRESSED = 14, 15
 #: Numeric data type -> bytes of an item.
 _ITEM_BYTES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8}
 _TEXT_TYPES = (1, 2, 3, 4, 16, 17, 18)
-_CELL, _STRUCT, _OBJECT, _CHAR, _SPARSE, _OPAQUE = 1, 2, 3, 4, 5, 17
+_CELL, _STRUCT, _OBJECT, _CHAR, _SPARSE, _FUNCTION, _OPAQUE = 1, 2, 3, 4, 5, 16, 17
 _NUMERIC = range(6, 16)
 #: Deepest nesting of arrays; MATLAB itself nests a few.
 _MAX_DEPTH = 50
@@ -112,8 +112,8 @@ class _Elements:
         elif array == _CHAR:
             if count and self.take()[0] not in _TEXT_TYPES:
                 raise _Damage("a text is damaged")
-        elif array in (_CELL, _STRUCT, _OBJECT):
-            self._check_members(array, count, depth)
+        elif array in (_CELL, _STRUCT, _OBJECT, _FUNCTION):
+            self._check_members(array, 1 if array == _FUNCTION else count, depth)
         elif array == _SPARSE:
             for _ in range(3 + is_complex):
                 self._check_numbers(None)
@@ -148,7 +148,7 @@ class _Elements:
     def _check_members(self, array: int, count: int, depth: int) -> None:
         if array == _OBJECT:
             self.take()
-        if array != _CELL:
+        if array in (_STRUCT, _OBJECT):
             kind, data = self.take()
             length = struct.unpack_from(self.order + "i", data)[0]
             _, names = self.take()

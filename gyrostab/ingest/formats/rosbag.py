@@ -42,14 +42,16 @@ def matches(path: Path) -> bool:
 
 
 def _read_topics(path: Path, options: ReadOptions) -> TablesOfFile:
-    """Return a table for each topic with numbers, and a note on topics that are left out."""
+    """Return a table for each topic with numbers, and notes on topics that are left out."""
     highlevel = library("rosbags.highlevel", path, extra="rosbag")
     typesys = library("rosbags.typesys", path, extra="rosbag")
     typestore = typesys.get_typestore(typesys.Stores.LATEST)
     by_topic: dict[tuple[str, str], Messages] = {}
     left_out: dict[str, None] = {}
     with highlevel.AnyReader([path], default_typestore=typestore) as reader:
-        for connection, received, raw in reader.messages():
+        known = [c for c in reader.connections if c.msgtype in reader.typestore.fielddefs]
+        unknown = {c.topic for c in reader.connections if c not in known}
+        for connection, received, raw in reader.messages(known) if known else ():
             if len(raw) > _LARGEST_MESSAGE:
                 left_out[connection.topic] = None
                 continue
@@ -60,8 +62,13 @@ def _read_topics(path: Path, options: ReadOptions) -> TablesOfFile:
         messages.make_table(topic, targets=_MEANINGS.get(kind))
         for (topic, kind), messages in by_topic.items()
     ]
-    notes = [f"left out, as their messages are large: {', '.join(left_out)}"] if left_out else []
-    return tables, notes
+    reasons = (
+        ("their messages are large", left_out),
+        ("the types of their messages are unknown", sorted(unknown)),
+    )
+    return tables, [
+        f"left out, as {reason}: {', '.join(topics)}" for reason, topics in reasons if topics
+    ]
 
 
 def _message_time(message: Any) -> int:

@@ -62,12 +62,14 @@ def _read_logs(path: Path, options: ReadOptions) -> TablesOfFile:
 
 
 def _make_table(log: Any) -> Table | None:
-    if "time" not in _child_text(log, "indexType").lower():
+    if "date" not in _child_text(log, "indexType").lower():
         return None
-    names, units, lines = [], {}, []
+    names, units, nulls, lines = [], {}, {}, []
     for element in log.iter():
         if _local_name(element) == "logCurveInfo":
-            units[_child_text(element, "mnemonic")] = _child_text(element, "unit")
+            name = _child_text(element, "mnemonic")
+            units[name] = _child_text(element, "unit")
+            nulls[name] = _child_text(element, "nullValue")
         elif _local_name(element) == "mnemonicList":
             names = [name.strip() for name in (element.text or "").split(",")]
         elif _local_name(element) == "data" and element.text:
@@ -80,7 +82,10 @@ def _make_table(log: Any) -> Table | None:
         header=None,
         names=range(len(names)),
         index_col=False,
-        na_values=[_child_text(log, "nullValue")],
+        na_values={
+            number: [nulls.get(name) or _child_text(log, "nullValue")]
+            for number, name in enumerate(names)
+        },
         on_bad_lines="skip",
     )
     index = _child_text(log, "indexCurve")
