@@ -293,6 +293,33 @@ def test_masked_netcdf_cells_are_missing(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["cut.parquet", "cut.nc", "cut.mat"])
 def test_a_damaged_file_is_named(tmp_path: Path, name: str) -> None:
     whole = tmp_path / f"whole{Path(name).suffix}"
+def test_labels_of_axes_in_netcdf_are_characters(tmp_path: Path) -> None:
+    with netCDF4.Dataset(tmp_path / "log.nc", "w", format="NETCDF3_CLASSIC") as file:
+        file.createDimension("time", 40)
+        file.createDimension("axis", 3)
+        clock = file.createVariable("time", "f8", ("time",))
+        clock.units, clock[:] = "seconds since 2026-01-01", np.arange(40)
+        file.createVariable("axis", "S1", ("axis",))[:] = np.array([b"x", b"y", b"z"])
+        gyro = file.createVariable("gyro", "f8", ("time", "axis"))
+        gyro.units, gyro[:] = "deg/h", np.zeros((40, 3))
+    assert read_log(tmp_path / "log.nc").axis.values.tolist() == ["x", "y", "z"]
+
+
+@pytest.mark.parametrize("name", ["gyro_x", "omega"])
+def test_gyro_axes_of_netcdf_are_on_a_shorter_dimension(tmp_path: Path, name: str) -> None:
+    with netCDF4.Dataset(tmp_path / "log.nc", "w") as file:
+        for dim, size, column, unit in (("a", 200, "accel_x", "m/s^2"), ("g", 50, name, "deg/h")):
+            file.createDimension(dim, size)
+            clock = file.createVariable("time" if dim == "g" else dim, "f8", (dim,))
+            clock.units, clock[:] = "seconds since 2026-01-01", np.arange(size) / size
+            values = file.createVariable(column, "f8", (dim,))
+            values.units, values[:] = unit, np.zeros(size)
+    options = {"map": {"OMEGA": "gyro_x"}} if name == "omega" else {}
+    raw = read_log(tmp_path / "log.nc", **options)
+    assert (raw.sizes["row"], raw.sizes["time_accel_x"]) == (50, 200)
+    assert raw.axis.values.tolist() == ["x"]
+
+
     {".parquet": as_parquet, ".nc": as_netcdf, ".mat": as_mat73}[whole.suffix](whole)
     cut = tmp_path / name
     cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])

@@ -20,6 +20,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, SchemaError, TimeError
+from gyrostab.ingest.columns.headers import AXIS_PATTERN, split_header
 from gyrostab.ingest.columns.stamps import names_epoch
 from gyrostab.ingest.combine import with_channels
 from gyrostab.ingest.concat.grid import log_span
@@ -50,6 +51,8 @@ from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import ON_DISK
 
 MAX_COLUMNS = 64
+#: Names of variables whose columns are gyro axes.
+_SIGNALS = ("gyro", "rate")
 CHECKED_BLOCKS = 33
 #: Options to open a file with xarray; numbers and stamps are decoded when they are read.
 _UNDECODED: dict[str, Any] = {
@@ -343,17 +346,22 @@ def _make_summary(
 def _plan_file(
     path: Path, variables: Mapping[str, StoredVariable], options: ReadOptions
 ) -> tuple[StoredTable, list[StoredTable]]:
-    """Plan the variables on the longest dimension, and channels on others that have stamps."""
+    """Plan the variables on the main dimension, and channels on others that have stamps.
+
+    The main dimension is the longest of those with gyro axes, otherwise the longest.
+    """
     numeric = [v for v in variables.values() if v.dtype.kind in "iuf" and len(v.shape) in (1, 2)]
     sizes = {dim: size for v in numeric for dim, size in zip(v.dimensions, v.shape, strict=True)}
-    lines = Counter(v.dimensions[0] for v in numeric if len(v.shape) == 1)
-    lines.update(max(v.dimensions, key=lambda d: sizes[d]) for v in numeric if len(v.shape) == 2)
+    lines = Counter(max(v.dimensions, key=lambda d: sizes[d]) for v in numeric)
     if not lines:
         raise FormatError(
             f"{path.name}: there is no numeric variable on a dimension; groups are not searched, "
             "so store variables at the top level"
         )
-    main_dim = max(lines, key=lambda d: (sizes[d], lines[d]))
+    with_axes = {
+        max(v.dimensions, key=lambda d: sizes[d]) for v in numeric if _holds_axes(v, options)
+    }
+    main_dim = max(lines, key=lambda d: (d in with_axes, sizes[d], lines[d]))
     stamped = {
         v.dimensions[0]: v
         for v in numeric
@@ -398,6 +406,16 @@ def _add_slower_channels(log: xr.Dataset, tables: Sequence[StoredTable]) -> xr.D
     return log
 
 
+def _holds_axes(variable: StoredVariable, options: ReadOptions) -> bool:
+    """Return whether the name of a variable, or ``--map``, makes it one or several gyro axes."""
+    stored = variable.name.lower()
+    mapped = [
+        target for key, target in options.map.items() if key.lower().partition("/")[0] == stored
+    ]
+    names = (split_header(text)[0].lower() for text in mapped or [stored])
+    return (len(variable.shape) == 2 and stored in _SIGNALS) or any(map(AXIS_PATTERN.match, names))
+
+
 def _columns_of(
     variables: Mapping[str, StoredVariable], variable: StoredVariable, dim: str
 ) -> list[StoredColumn]:
@@ -412,8 +430,11 @@ def _columns_of(
         return []
     labels = [str(place) for place in range(size)]
     if other_dim in variables and variables[other_dim].shape == (size,):
-        labels = [str(label) for label in np.ma.getdata(variables[other_dim].values[:])]
-    stem = "gyro_" if variable.name.lower() in ("gyro", "rate") else f"{variable.name}/"
+        labels = [
+            label.decode(errors="replace") if isinstance(label, bytes) else str(label)
+            for label in np.ma.getdata(variables[other_dim].values[:])
+        ]
+    stem = "gyro_" if variable.name.lower() in _SIGNALS else f"{variable.name}/"
     return [
         make(f"{stem}{label}", rows=variable.locate(along, place))
         for place, label in enumerate(labels)
