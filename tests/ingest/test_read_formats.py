@@ -249,6 +249,27 @@ def test_parquet_dates_and_field_units(tmp_path: Path) -> None:
     assert raw.attrs["unreadable_cells"] == 1
 
 
+@pytest.mark.parametrize("name", ["time", "time [s]"])
+def test_times_of_parquet_are_durations(tmp_path: Path, name: str) -> None:
+    since = pa.array([0, 10, None, 30], pa.duration("ms"))
+    table = pa.table({name: since, "gyro_x [deg/h]": [0.0, 1.0, 2.0, 3.0]})
+    parquet.write_table(table, tmp_path / "log.parquet")
+    raw = read_log(tmp_path / "log.parquet", epoch="2026-03-01")
+    since = raw.time.values - np.datetime64("2026-03-01", "ns")
+    assert since[[0, 1, 3]].astype(np.int64).tolist() == [0, 10_000_000, 30_000_000]
+    assert np.isnat(since[2])
+    summary = scan_file(tmp_path / "log.parquet")
+    assert summary.last is not None
+    assert summary.last.astype(np.int64) == 30_000_000
+
+
+def test_the_last_stamp_of_a_short_parquet_file_is_in_its_last_row_group(tmp_path: Path) -> None:
+    table = pa.table({"time [s]": np.arange(50.0), "gyro_x [deg/h]": np.arange(50.0)})
+    parquet.write_table(table, tmp_path / "log.parquet", row_group_size=10)
+    summary = scan_file(tmp_path / "log.parquet")
+    assert (summary.first, summary.last) == (np.datetime64(0, "s"), np.datetime64(49, "s"))
+
+
 def test_float32_stamps_are_noted(tmp_path: Path) -> None:
     path = tmp_path / "single.parquet"
     parquet.write_table(
@@ -272,27 +293,6 @@ def test_unit_option_overrules_netcdf_units(tmp_path: Path) -> None:
     np.testing.assert_array_equal(raw.rate[0], [0.5, 1.0, 1.5, 2.0])
 
 
-def test_masked_netcdf_cells_are_missing(tmp_path: Path) -> None:
-    path = tmp_path / "packed.nc"
-    with netCDF4.Dataset(path, "w") as file:
-        file.createDimension("n", 4)
-        time = file.createVariable("time", "i8", ("n",), fill_value=-1)
-        time.units = "milliseconds since 2026-01-01"
-        time[:] = [0, 10, -1, 30]
-        gyro = file.createVariable("gyro_x", "i2", ("n",), fill_value=-9999)
-        gyro.setncatts({"units": "degree hour-1", "scale_factor": 0.25})
-        gyro.set_auto_maskandscale(False)
-        gyro[:] = [4, -9999, 8, 12]
-    raw = read_log(path)
-    np.testing.assert_array_equal(raw.rate[0], [1.0, np.nan, 2.0, 3.0])
-    assert np.isnat(raw.time.values).tolist() == [False, False, True, False]
-    assert raw.time.values[3] == np.datetime64("2026-01-01T00:00:00.030")
-    assert raw.attrs["unreadable_rows"] == 2
-
-
-@pytest.mark.parametrize("name", ["cut.parquet", "cut.nc", "cut.mat"])
-def test_a_damaged_file_is_named(tmp_path: Path, name: str) -> None:
-    whole = tmp_path / f"whole{Path(name).suffix}"
 def test_labels_of_axes_in_netcdf_are_characters(tmp_path: Path) -> None:
     with netCDF4.Dataset(tmp_path / "log.nc", "w", format="NETCDF3_CLASSIC") as file:
         file.createDimension("time", 40)
@@ -320,6 +320,27 @@ def test_gyro_axes_of_netcdf_are_on_a_shorter_dimension(tmp_path: Path, name: st
     assert raw.axis.values.tolist() == ["x"]
 
 
+def test_masked_netcdf_cells_are_missing(tmp_path: Path) -> None:
+    path = tmp_path / "packed.nc"
+    with netCDF4.Dataset(path, "w") as file:
+        file.createDimension("n", 4)
+        time = file.createVariable("time", "i8", ("n",), fill_value=-1)
+        time.units = "milliseconds since 2026-01-01"
+        time[:] = [0, 10, -1, 30]
+        gyro = file.createVariable("gyro_x", "i2", ("n",), fill_value=-9999)
+        gyro.setncatts({"units": "degree hour-1", "scale_factor": 0.25})
+        gyro.set_auto_maskandscale(False)
+        gyro[:] = [4, -9999, 8, 12]
+    raw = read_log(path)
+    np.testing.assert_array_equal(raw.rate[0], [1.0, np.nan, 2.0, 3.0])
+    assert np.isnat(raw.time.values).tolist() == [False, False, True, False]
+    assert raw.time.values[3] == np.datetime64("2026-01-01T00:00:00.030")
+    assert raw.attrs["unreadable_rows"] == 2
+
+
+@pytest.mark.parametrize("name", ["cut.parquet", "cut.nc", "cut.mat"])
+def test_a_damaged_file_is_named(tmp_path: Path, name: str) -> None:
+    whole = tmp_path / f"whole{Path(name).suffix}"
     {".parquet": as_parquet, ".nc": as_netcdf, ".mat": as_mat73}[whole.suffix](whole)
     cut = tmp_path / name
     cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])

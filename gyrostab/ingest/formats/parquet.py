@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import xarray as xr
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.dates import find_order, holds_date
+from gyrostab.ingest.columns.headers import split_header
 from gyrostab.ingest.columns.plan import Plan, plan_columns
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder
 from gyrostab.ingest.columns.typed import (
@@ -37,25 +39,29 @@ def matches(path: Path) -> bool:
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Summarise schema and row count from the footer, and first and last stamps."""
+    import pyarrow as pa
+
     file, plan = _open_parquet(path, options)
-    groups = range(file.num_row_groups)
+    groups, rows = range(file.num_row_groups), file.metadata.num_rows
     filled = [group for group in groups if file.metadata.row_group(group).num_rows > 0]
 
     def fetch(source: int, start: int, stop: int) -> Any:
+        is_whole = stop - start == rows
         parts = file.iter_batches(
             batch_size=batch_rows(1),
-            row_groups=filled[:1] if start == 0 else filled[-1:],
+            row_groups=filled if is_whole else filled[:1] if start == 0 else filled[-1:],
             columns=[file.schema_arrow.names[source]],
         )
-        part = next(parts, None) if start == 0 else next(iter(deque(parts, maxlen=1)), None)
-        if part is None:
+        batches = islice(parts, 1) if start == 0 and not is_whole else parts
+        columns = [part.column(0) for part in deque(batches, maxlen=None if is_whole else 1)]
+        if not columns:
             raise FormatError(
                 f"{path.name}: a row group holds fewer rows than the file says; copy it again"
             )
-        values = _to_numpy(part.column(0))
+        values = _to_numpy(pa.chunked_array(columns))
         return values[: stop - start] if start == 0 else values[start - stop :]
 
-    return summarise_columns("parquet", plan, options, file.metadata.num_rows, fetch)
+    return summarise_columns("parquet", plan, options, rows, fetch)
 
 
 def read(path: Path, options: ReadOptions) -> xr.Dataset:
@@ -82,6 +88,7 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
 
 
 def _open_parquet(path: Path, options: ReadOptions) -> tuple[Any, Plan]:
+    import pyarrow as pa
     from pyarrow import parquet
 
     file = parquet.ParquetFile(path, buffer_size=_BUFFER_BYTES, pre_buffer=False)
@@ -92,6 +99,11 @@ def _open_parquet(path: Path, options: ReadOptions) -> tuple[Any, Plan]:
         for index, entry in enumerate(schema)
         if (text := (entry.metadata or {}).get(b"units")) is not None
     }
+    durations = {i: kind.unit for i, kind in enumerate(schema.types) if pa.types.is_duration(kind)}
+    headers = [
+        split_header(name)[0] if index in durations else name
+        for index, name in enumerate(schema.names)
+    ]
     samples = [] if head is None else [_to_numpy(column) for column in head.columns]
     texts = [[value for value in values if isinstance(value, str)] for values in samples]
     orders = {
@@ -99,7 +111,12 @@ def _open_parquet(path: Path, options: ReadOptions) -> tuple[Any, Plan]:
     }
     dates = [index for index, values in enumerate(samples) if holds_dates(values)]
     return file, plan_columns(
-        path, schema.names, options, units=units, stamped={*dates, *orders}, orders=orders
+        path,
+        headers,
+        options,
+        units=units | durations,
+        stamped={*dates, *orders},
+        orders=orders,
     )
 
 
@@ -113,6 +130,8 @@ def _to_numpy(column: Any) -> Any:
         return column.cast(pa.timestamp(kind.unit)).to_numpy(
             zero_copy_only=False
         )  # in UTC; `to_stamps` converts the unit
+    if pa.types.is_duration(kind):
+        column, kind = column.cast(pa.int64()), pa.int64()
     if pa.types.is_integer(kind) and column.null_count:
         return np.ma.array(
             column.fill_null(0).to_numpy(zero_copy_only=False),
