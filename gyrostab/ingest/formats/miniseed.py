@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ from gyrostab.ingest.formats.tables import (
     library,
     read_tables,
     scan_tables,
+    sliced,
 )
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.time.grid import grid_times
@@ -128,7 +128,7 @@ def _group_traces(traces: list[_Trace]) -> list[Table]:
         columns = [
             TableColumn(
                 trace.name,
-                partial(_join_values, trace.values, rows),
+                sliced(_join_values(trace.values, rows)),
                 target=_axis_of_code(trace.name[-1]),
             )
             for trace in group
@@ -155,14 +155,10 @@ def _axis_of_code(code: str) -> str | None:
     return f"gyro_{match.group(1).lower()}" if match else None
 
 
-def _join_values(pieces: list[NDArray[Any]], rows: int, start: int, stop: int) -> NDArray[Any]:
-    values = (pieces[0] if len(pieces) == 1 else np.concatenate(pieces))[start:stop]
-    missing = min(stop, rows) - start - len(values)
-    return (
-        np.concatenate([values.astype(np.float64), np.full(missing, np.nan)])
-        if missing > 0
-        else values
-    )
+def _join_values(pieces: list[NDArray[Any]], rows: int) -> NDArray[Any]:
+    """Join the segments of a trace, with NaN up to the number of rows; empty if not loaded."""
+    missing = rows - sum(map(len, pieces)) if pieces else 0
+    return np.concatenate([*pieces, np.full(missing, np.nan)] if missing else pieces or [[]])
 
 
 def _trace_stamps(trace: _Trace) -> ReadSlice:
