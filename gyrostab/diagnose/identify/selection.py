@@ -104,15 +104,16 @@ def _select_all(examination: Examination) -> tuple[list[Selection], list[Candida
             return chosen, all_evidence
         selection, rejected = selected
         barred |= rejected
-        if selection is not None and are_lines(selection.components):
+        if selection is None:
+            continue
+        if are_lines(selection.components):
             lines_left -= 1
             barred |= set() if lines_left else {PLAIN_LINE}
         else:
             effects_left -= 1
-        if selection is not None:
-            chosen = add_identification(chosen, selection)
-            barred |= _explained_count_keys(examination, selection)
-            state = condition_on(state, list(selection.components))
+        chosen = add_identification(chosen, selection)
+        barred |= _explained_count_keys(examination, selection)
+        state = condition_on(state, list(selection.components))
     return chosen, []
 
 

@@ -129,9 +129,7 @@ def _finish_identification(
     layers = _find_layers_again(
         examination, identification.components, on_axes.get(key, []), weighted
     )
-    evidence_nats = (
-        sum(max(sum_evidence(layer), 0.0) for layer in layers) or identification.evidence_nats
-    )
+    evidence_nats = sum(max(sum_evidence(layer), 0.0) for layer in layers)
     min_nats = evidence_nats - examination.settings.ambiguous_nats
     rivals = [
         components[0].candidate.effect

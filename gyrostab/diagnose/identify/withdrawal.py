@@ -12,6 +12,7 @@ from gyrostab.diagnose.identify.completeness import (
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identification import (
     Identification,
+    Selection,
     Unidentified,
     components_of,
     find_unidentified,
@@ -44,7 +45,9 @@ def withdraw_effects(
         on_axis = _identified_on(remaining, axis, in_means=False)
         if not on_axis:
             continue
-        excess_nats = variance_fluctuation(examination.state_with(remaining), axis)
+        excess_nats = variance_fluctuation(
+            examination.state_with([*remaining, *unidentified]), axis
+        )
         weak, _ = _find_weak(examination, on_axis, excess_nats)
         if weak:
             remaining = [
@@ -148,13 +151,17 @@ def _find_part_of_drift(
 
     They may be a piece of that drift.
     """
-    drift = sum(
-        selection.evidence_nats
-        for selection in unidentified
-        if selection.generic in _DRIFTS and axis in selection.axes
-    )
+    drifts = [selection for selection in unidentified if selection.generic in _DRIFTS]
+    drift_nats = sum(_evidence_on(selection, axis) for selection in drifts)
     return [
         identification
         for identification in on_axis
-        if not any(identification.driver) and identification.evidence_nats < drift
+        if not any(identification.driver) and _evidence_on(identification, axis) < drift_nats
     ]
+
+
+def _evidence_on(selection: Selection, axis: str) -> float:
+    """Return the evidence of a selection on one axis [nats]."""
+    return sum(
+        component.evidence_nats for component in selection.components if component.row == (axis,)
+    )

@@ -90,12 +90,13 @@ def average_sizes(
     weighed = evidence + np.log([point.share for point in points])
     share = np.exp(weighed - np.logaddexp.reduce(weighed))
     nuisance: dict[str, tuple[float, ...]] = {}
-    for name in {
+    names = (
         key
         for variant in family
         for key, value in variant.values.items()
         if not isinstance(value, str)
-    }:
+    )
+    for name in dict.fromkeys(names):
         tried = np.array([float(variant.values[name]) for variant in family])
         if not np.isfinite(tried).all():
             continue

@@ -138,7 +138,7 @@ def plain(value: Any) -> Any:
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):
         return None
-    if isinstance(value, str):  # names of files may hold bytes that are no text
+    if isinstance(value, str):  # names of files may hold bytes that UTF-8 does not allow
         return value.encode("utf-8", "replace").decode()
     return value
 

@@ -158,7 +158,8 @@ def _axis_of_code(code: str) -> str | None:
 def _join_values(pieces: list[NDArray[Any]], rows: int) -> NDArray[Any]:
     """Join the segments of a trace, with NaN up to the number of rows; empty if not loaded."""
     missing = rows - sum(map(len, pieces)) if pieces else 0
-    return np.concatenate([*pieces, np.full(missing, np.nan)] if missing else pieces or [[]])
+    padding = [np.full(missing, np.nan)] if missing or not pieces else []
+    return np.concatenate([*pieces, *padding])
 
 
 def _trace_stamps(trace: _Trace) -> ReadSlice:

@@ -77,7 +77,7 @@ def _make_table(log: Any) -> Table | None:
     names = names or list(units)
     if not lines or not names:
         return None
-    cells = pd.read_csv(
+    cells = pd.read_csv(  # type: ignore[call-overload]
         StringIO("\n".join(lines)),
         header=None,
         names=range(len(names)),

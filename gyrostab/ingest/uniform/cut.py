@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from datetime import date, timedelta
+from datetime import date
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
@@ -61,21 +60,11 @@ def parse_instant(value: Any, option: str, *, example: str = _EXAMPLE) -> int | 
             return stamp_ns(text, option)
         if isinstance(text, str) and ":" in text:  # a time of day without a date
             raise OptionError(text)
-        if _is_zero(text):
-            return 0.0
-        return duration_seconds(text, option, example=example)
+        return duration_seconds(text, option, example=example, zero=True)
     except OptionError as error:
         raise OptionError(
             f"{option} {value!r} is neither a time nor a duration; write {example}"
         ) from error
-
-
-def _is_zero(value: Any) -> bool:
-    unit = None if isinstance(value, str | timedelta | np.timedelta64) else "s"
-    try:
-        return pd.Timedelta(value, unit=unit) == pd.Timedelta(0)
-    except (ValueError, TypeError):
-        return False
 
 
 def cut_log(
