@@ -230,7 +230,8 @@ def interpolate_values(
         return np.full(at.size, np.nan)
     apart = stamps[following] - stamps[following - 1]
     share = (at - stamps[following - 1]) / np.maximum(apart, 1)
-    inside = (at >= stamps[0]) & (at <= stamps[-1]) & (apart <= longest)
+    is_stamp = (share == 0.0) | (share == 1.0)
+    inside = (at >= stamps[0]) & (at <= stamps[-1]) & ((apart <= longest) | is_stamp)
     return np.where(
         inside, values[following - 1] + share * (values[following] - values[following - 1]), np.nan
     )

@@ -185,8 +185,8 @@ def averaging_factors(
     if is_number:
         return _spaced_factors(int(taus), limit)
     factors = _listed_factors(taus, rate, longest, order)
-    if tau_max is not None:
-        factors = factors[factors <= limit]
+    if tau_max is not None:  # to the nearest factor, as those of the list
+        factors = factors[factors <= round(duration_seconds(tau_max, "tau_max") * rate)]
     if len(factors) == 0:
         given = "given" if tau_max is None else f"given up to tau_max of {limit / rate:g} s"
         raise OptionError(f"no averaging time is {given}; write for instance {TAUS}")

@@ -24,6 +24,7 @@ from gyrostab.ingest.grid.place import append_runs
 from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.io import datasets as export
 from gyrostab.schema import GAP_CAUSES
+from gyrostab.store.write import declare_counts
 from gyrostab.time.grid import TimeGridIndex, grid_times
 from tests.support.regular_logs import (
     RATE,
@@ -399,8 +400,8 @@ def test_a_channel_that_is_slow_in_one_log_only_lies_on_the_common_time() -> Non
 def test_counts_stay_counts_where_all_logs_have_the_same_factor() -> None:
     first, second = cut(signal(400) * 0.25, (0, 200), (200, 400))
     for log in (first, second):
-        log.rate.encoding = {"dtype": np.dtype("int32"), "scale_factor": 0.25}
-    assert join(first, second).rate.encoding == {"dtype": np.dtype("int32"), "scale_factor": 0.25}
+        log.rate.encoding = declare_counts("int32", 0.25)
+    assert join(first, second).rate.encoding == declare_counts("int32", 0.25)
     second.rate.encoding["scale_factor"] = 0.5
     assert not join(first, second).rate.encoding
 

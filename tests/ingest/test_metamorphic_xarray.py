@@ -673,7 +673,7 @@ def make_table(**columns) -> pd.DataFrame:
     (make_table(gyro_x=None), {"units": "deg"}, "give kind='angle' if it is the cumulative angle"),
     (make_table(gyro_x=np.nan), {"units": "deg/h"}, "unreadable.*check the columns and the index"),
     (make_table(gyro_x=None, angle_x=None), {"units": {"gyro": "deg/h", "angle": "deg"}},
-     r"drop the others with map=\{'NAME': '-'\}"),
+     r"drop the others, for instance map=\{'angle_x': '-'\}"),
     (make_table(gyro_x=None)[:0], {"units": "deg/h"}, "the DataFrame has 0 rows"),
     (make_table(gyro_x=None)[:1], {"units": "deg/h"}, "give it with rate=HZ"),
     (make_table(gyro_x=None).set_index(pd.DatetimeIndex(["2026-03-01"] * 200)),

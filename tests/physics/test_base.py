@@ -243,7 +243,7 @@ def test_sizes_are_sourced(kind):
         ({"name": "temperature_bias", "sensitivity": "much"}, "not a number with a unit"),
         ({"name": "temperature_bias", "sensitivity": True}, "True is not a number"),
         ({"name": "temperature_bias", "sensitivity": [1.0, 2.0]}, "give one number"),
-        ({"name": "temperature_bias", "sensitivity": 99}, "outside of the allowed range -10 to 10"),
+        ({"name": "temperature_bias", "sensitivity": 2e4}, "outside .* range -10000 to 10000"),
         (
             {"name": "temperature_bias", "sensitivity": 1, "driver": ["a", "b"]},
             "driver names 2 channels; it takes temperature",

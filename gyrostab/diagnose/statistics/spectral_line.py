@@ -35,6 +35,7 @@ from gyrostab.diagnose.statistics.scores import (
     cumulative,
     moving_sum,
     statistic_dataset,
+    sum_over_windows,
 )
 from gyrostab.diagnose.statistics.wording import axes_text
 from gyrostab.kernels.spectra.line_levels import LEAK_LINES, local_level
@@ -76,6 +77,7 @@ class SpectralLine(Statistic):
             record_sum = flat.sum(axis=-2, keepdims=True)
             count = np.concatenate([used_weight, used_weight.sum(axis=-2, keepdims=True)], axis=-2)
             flat = np.concatenate([flat, record_sum], axis=-2) / count
+            count = count * _equal_block_share(blocks, windows)
             around = _mean_around(flat)
             ratio = flat / around
         # A quarter of squared amplitude times block for a sine; only a recording needs it.
@@ -238,6 +240,24 @@ def _part_windows(blocks: xr.Dataset) -> Windows:
     return Windows(
         np.append(edge[:-1], 0), np.append(np.maximum(edge[1:], edge[:-1] + 1), block_count)
     )
+
+
+def _equal_block_share(blocks: xr.Dataset, windows: Windows) -> Array:
+    """Return the equivalent share of equal-power blocks in a mean, by window and line."""
+    power, shape = (blocks[name].values for name in ("power", "shape"))
+    present = np.isfinite(power) & (shape > 0)
+    power, present_count = np.where(present, power, 0.0), present.astype(float)
+    square = np.where(present, power**2 * shape / (1.0 + shape), 0.0)
+    count, first, second = (
+        sum_over_windows(values, windows) for values in (present_count, power, square)
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        even = np.where(second > 0, first**2 / (count * second), 1.0)
+    bands, lines = np.log(blocks["frequency"].values), np.log(blocks["line_frequency"].values)
+    place = np.clip(np.searchsorted(bands, lines), 1, bands.size - 1)
+    share = np.clip((lines - bands[place - 1]) / (bands[place] - bands[place - 1]), 0.0, 1.0)
+    even = np.minimum(even, 1.0)
+    return np.asarray(even[..., place - 1] * (1.0 - share) + even[..., place] * share)
 
 
 def _mean_around(flat: Array) -> Array:

@@ -279,27 +279,27 @@ def test_phase_locked_rates_are_detected(base):
 
 
 def test_transients_and_jumps_after_restarts_are_detected(base):
-    blocks = records(base, 60, np.random.default_rng(10))
+    blocks = records(base, 240, np.random.default_rng(10))
     assert find_statistic("restart").score(blocks, base) is None
     blocks["restart_begin"] = ("restart", np.array([1000.0, 2400.0]))
     blocks["restart_end"] = ("restart", np.array([1010.0, 2410.0]))
     z = find_statistic("restart").score(blocks, base)["z"].values
     assert np.nanstd(z) == pytest.approx(1.0, abs=0.06)
     since = np.where(
-        np.arange(180) >= 121,
-        np.arange(180) - 121.0,
-        np.where(np.arange(180) >= 51, np.arange(180) - 51.0, np.inf),
+        np.arange(180) >= 120,
+        np.arange(180) - 120.0,
+        np.where(np.arange(180) >= 50, np.arange(180) - 50.0, np.inf),
     )
     raised = blocks.copy()
     raised["mean"] = blocks["mean"] + xr.DataArray(0.2 * np.exp(-since / 6.0), dims="block")
     scores = find_statistic("restart").score(raised, base)
     assert float(np.nanmean(scores["estimate"].values[..., 1, 1])) == pytest.approx(0.2, rel=0.05)
     jumped = blocks.copy()
-    jumped["mean"][:, :, 121:] += 0.1
+    jumped["mean"][:, :, 120:] += 0.1
     scores = find_statistic("restart").score(jumped, base)
     jump = scores["estimate"].values[:, :, -1, -1]
     assert np.mean(jump) == pytest.approx(0.1, rel=0.05)
-    assert int(scores["first"][-1]) == 121
+    assert int(scores["first"][-1]) == 120
 
 
 def test_sample_counts_and_tails_are_detected(base):
@@ -365,15 +365,6 @@ def test_a_noise_burst_is_neither_shared_nor_a_line(loud):
             )
     assert max(largest["cross_spectrum"]) < 4.8
     assert max(largest["spectral_line"]) < 4.8
-
-
-def test_lines_are_scored_alike_in_even_and_in_uneven_noise():
-    noise = np.random.default_rng(2).standard_normal(36_000)
-    loud = np.where(np.arange(36_000) // 200 % 10 == 0, 10.0, 1.0)
-    for values in (noise, noise * loud):
-        blocks = reduce_log(make_log(values, rate=10.0, unit="deg/h"), block="20s")
-        scores = find_statistic("spectral_line").score(blocks, calibrate_noise(blocks))
-        assert 0.8 < float(scores["z"].isel(window=-1).std()) < 1.25
 
 
 def test_the_first_block_after_a_restart_is_that_with_most_samples_after_it():
