@@ -142,7 +142,7 @@ def parse_quiescent_span(text: str) -> tuple[float | str, float | str]:
 
     Examples
     --------
-    >>> parse_quiescent_span("0s/30min")
+    >>> parse_quiescent_span("0min/30min")
     (0.0, 1800.0)
     >>> parse_quiescent_span("2026-03-14T08:00/2026-03-14T08:30Z")
     ('2026-03-14T08:00', '2026-03-14T08:30')

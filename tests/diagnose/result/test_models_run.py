@@ -12,8 +12,12 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.estimate.joint_fit import _make_effect
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result.diagnosis import effect_table, model_text
+from gyrostab.diagnose.result.tables import baseline_table, model_tables
 from gyrostab.physics.registry import effects
 from gyrostab.simulate import read_model, simulate
 
@@ -104,3 +108,14 @@ def test_falling_noise_stops_at_a_tenth():
             3, 0
         ),
     )
+
+
+def test_tables_keep_the_flicker_band_and_give_a_ramp_no_error():
+    noise = {"flicker_band": [1e-3, 0.1], "x": {"N": 0.003, "B": 0.004}}
+    given = read_model({"log": {"axes": ["x"]}, "noise": noise})
+    blocks = reduce_log(simulate(given, duration="10min", rate=10.0, seed=1))
+    table = model_tables(baseline_from_model(blocks, given), [], given, blocks)
+    assert read_model(table).flicker_band == (1e-3, 0.1)
+    calibrated = baseline_table(calibrate_noise(blocks), [])["noise"]["x"]
+    assert calibrated["R"]["stderr"] is None
+    assert calibrated["N"]["stderr"] > 0.0

@@ -1,0 +1,102 @@
+"""Effects are tested again with all others in the model, and keep only what they explain alone."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from gyrostab.diagnose.baseline.from_model import baseline_from_model
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.evidence.sample_counts import CountEvidence
+from gyrostab.diagnose.identify import selection as selecting
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
+from gyrostab.diagnose.identify.examination import Examination
+from gyrostab.diagnose.identify.identification import Identification, Unidentified
+from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
+from gyrostab.diagnose.identify.settling import prune_selections, settle_selections
+from gyrostab.diagnose.identify.withdrawal import _find_part_of_drift, withdraw_effects
+from gyrostab.diagnose.predict.linear_model import initial_state
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.ingest.make_log import make_log
+
+MODEL = {"noise": {"N": 0.003, "K": 0.005}, "log": {"axes": ["x"]}}
+BLOCKS = 180
+
+
+def _examine(values, rate, channels, chosen):
+    blocks = reduce_log(make_log(values, rate=rate, unit="deg/h", channels=channels), block="20s")
+    baseline = baseline_from_model(blocks, MODEL)
+    candidates, _ = effect_candidates(blocks, baseline["coefficient"])
+    chosen_candidates = [
+        candidate
+        for candidate in [*candidates, *nuisance_alternatives(blocks)]
+        if candidate.effect in chosen
+    ]
+    state = initial_state(blocks, baseline)
+    return Examination(chosen_candidates, fold_blocks(blocks), CountEvidence({}), 8.0, state)
+
+
+def test_a_channel_that_two_others_make_superfluous_is_dropped():
+    rng = np.random.default_rng(0)
+
+    def smooth():
+        course = np.convolve(rng.standard_normal(BLOCKS + 8), np.hanning(9), "valid")
+        return np.repeat((course - course.mean()) / course.std(), 20)
+
+    first, second, third = smooth(), smooth(), smooth()
+    values = 0.18 * rng.standard_normal(BLOCKS * 20) + 0.3 * (first + 0.6 * second)
+    courses = (first + second + 0.25 * third, first, second)
+    names = ("temperature", "temperature_2", "temperature_3")
+    channels = {
+        name: (30.0 + 5.0 * course, "degC") for name, course in zip(names, courses, strict=True)
+    }
+    examination = _examine(values, 1.0, channels, ("temperature_bias",))
+    chosen, _ = selecting._select_all(examination)
+    assert chosen[0].driver == ("temperature",)
+    _, settled = settle_selections(examination, prune_selections(examination, chosen))
+    assert {identification.driver for identification in settled} == {(names[1],), (names[2],)}
+
+
+def test_an_effect_stays_beside_an_unidentified_burst():
+    rng = np.random.default_rng(1)
+    vibration = np.full(BLOCKS, 0.02)
+    vibration[20:60] = 1.0 + np.abs(np.sin(np.arange(40)))
+    level = 1.0 + 0.2 * (vibration / 2.0) ** 2
+    level[120:135] *= 1.8
+    values = 0.18 * np.sqrt(5.0 * np.repeat(level, 100)) * rng.standard_normal(BLOCKS * 100)
+    channels = {"vibration": (np.repeat(vibration, 100), "g")}
+    examination = _examine(values, 5.0, channels, ("vibration_noise", "~N(t)", "~burst"))
+    chosen, _ = selecting._select_all(examination)
+    named = [selection for selection in chosen if isinstance(selection, Identification)]
+    others = [selection for selection in chosen if isinstance(selection, Unidentified)]
+    assert [selection.effect for selection in named] == ["vibration_noise"]
+    assert [selection.generic for selection in others] == ["~burst"]
+    state = examination.state_with([*named, *others])
+    assert withdraw_effects(examination, state, named, others) == (named, [])
+
+
+@pytest.mark.parametrize(("on_axis", "is_part"), [(3.5, False), (60.0, True)])
+def test_a_drift_of_another_axis_takes_nothing(on_axis, is_part):
+    def selection(evidence, **more):
+        components = [SimpleNamespace(row=(axis,), evidence_nats=n) for axis, n in evidence.items()]
+        return SimpleNamespace(components=components, axes=tuple(evidence), **more)
+
+    jump = selection({"x": 50.0}, driver=(), evidence_nats=50.0)
+    drift = selection({"x": on_axis, "y": 201.0}, generic="~bias(t)", evidence_nats=201.0 + on_axis)
+    assert _find_part_of_drift([jump], [drift], "x") == [jump] * is_part
+
+
+def test_rejected_channels_do_not_use_up_the_number_of_effects(monkeypatch):
+    rounds = iter(range(100))
+
+    def select_next(*_):
+        number = next(rounds)
+        return (None, {f"channel {number}"}) if number < 2 * selecting.MAX_EFFECTS else None
+
+    monkeypatch.setattr(selecting, "_select_next", select_next)
+    monkeypatch.setattr(selecting, "score_candidates", lambda *_: [])
+    monkeypatch.setattr(selecting, "reusable_evidence", lambda *_: [])
+    selecting._select_all(SimpleNamespace(start=None, expected=()))
+    assert next(rounds) == 2 * selecting.MAX_EFFECTS + 1
