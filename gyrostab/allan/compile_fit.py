@@ -6,19 +6,9 @@ import gc
 
 import numpy as np
 
-from gyrostab.allan.compute import estimate_freedoms, tabulate_noise
+from gyrostab.allan.freedoms import estimate_freedoms, tabulate_noise
 from gyrostab.allan.window_fit import fit_block, fit_tables
 from gyrostab.kernels.allan.surface import Cells
-from gyrostab.kernels.compile_ahead import start_compilation
-from gyrostab.kernels.fit.least_squares import fit_windows
-
-
-def compile_fit_ahead() -> None:
-    """Compile the kernels in another process, unless they are compiled already.
-
-    A command calls this before it reads its logs.
-    """
-    start_compilation("gyrostab.allan.compile_fit", fit_windows)
 
 
 def compile_fit() -> None:

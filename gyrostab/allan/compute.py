@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import dask
 import dask.array as da
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.allan.plan import Plan, last_sample, thin_factors, units_of_work
-from gyrostab.allan.variance import covariance_tables, variance_columns, white_freedoms
+from gyrostab.allan.freedoms import NoiseTables, estimate_freedoms, make_noise_tables
+from gyrostab.allan.plan import Plan, last_sample, units_of_work
 from gyrostab.errors import OptionError
 from gyrostab.kernels.allan.gap_edges import gap_edge_ratio
 from gyrostab.kernels.allan.outlier_count import count_outliers
@@ -26,10 +26,7 @@ from gyrostab.kernels.allan.surface import (
     window_means,
 )
 from gyrostab.kernels.allan.trend import window_trends
-from gyrostab.kernels.fit.least_squares import cell_freedoms, combine_diagonal, identify_noise
-from gyrostab.kernels.fit.mixture import Curves
 from gyrostab.kernels.workspace import Workspace
-from gyrostab.noise import sample_squares
 from gyrostab.store.lazy import find_source, keep_sources, read_into, read_slice
 from gyrostab.units import HOUR
 
@@ -143,45 +140,6 @@ def _describe_windows(
 def _trend_scale(unit: Unit) -> float:
     """Slope per sample (for angles: of the angle per sample) to deg/h^2."""
     return float((HOUR / unit.interval) ** (2 if unit.angle else 1))
-
-
-class NoiseTables(NamedTuple):
-    """Arguments of `identify_noise` and `cell_freedoms` that all windows share."""
-
-    chosen: NDArray[np.int64]
-    columns: Floats
-    weight: Floats
-    to_samples: Floats
-    diagonal: Floats
-
-
-def make_noise_tables(plan: Plan) -> NoiseTables:
-    """Make the tables for the degrees of freedom of a plan."""
-    unit = plan.unit
-    factors, thinning = tuple(unit.ks.tolist()), tuple(unit.shifts.tolist())
-    return tabulate_noise(unit.window, factors, thinning, plan.rate, unit.variance)
-
-
-@lru_cache(maxsize=4)
-def tabulate_noise(
-    window: int, factors: tuple[int, ...], thinning: tuple[int, ...], rate: float, variance: str
-) -> NoiseTables:
-    """Make the tables for the degrees of freedom, once for all parts of a log."""
-    ks, shifts = np.array(factors, dtype=np.int64), np.array(thinning, dtype=np.int64)
-    columns = variance_columns(variance, ks, rate)
-    pairs, ramps = covariance_tables(variance, window, ks, shifts, diagonal=True)
-    weight = white_freedoms(variance, window, ks, pairs)
-    diagonal = combine_diagonal(pairs, ramps)
-    return NoiseTables(thin_factors(ks), columns, weight, sample_squares(rate), diagonal)
-
-
-def estimate_freedoms(cells: Cells, tables: NoiseTables) -> Floats:
-    """Compute the degrees of freedom of cells (n_windows, n_tau) from a quick fit of the noise."""
-    chosen, columns, weight, to_samples, diagonal = tables
-    fields = Curves(cells.avar, *cells[5:8], cells.gap_factor)
-    few = Curves(*(np.ascontiguousarray(field[:, chosen]) for field in fields))
-    squares = identify_noise(few, columns[chosen], weight[chosen], to_samples)
-    return np.asarray(cell_freedoms(squares, fields, columns, to_samples, diagonal))
 
 
 def run_units(data: Any, plan: Plan) -> tuple[Any, Any]:

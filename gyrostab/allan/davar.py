@@ -17,11 +17,11 @@ from gyrostab.allan.compute import (
     PLANE_FIELDS,
     compute_unit,
     join_units,
-    make_noise_tables,
     read_spans,
     run_published_method,
     run_units,
 )
+from gyrostab.allan.freedoms import make_noise_tables
 from gyrostab.allan.plan import (
     MOST_CELLS,
     Plan,

@@ -16,7 +16,7 @@ from gyrostab.allan.band_limit import (
     filter_response,
     find_band_limit,
 )
-from gyrostab.allan.plan import thin_factors
+from gyrostab.allan.freedoms import thin_factors
 from gyrostab.allan.window_fit import FitTables, fit_block, fit_tables, run_kernel
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.fit.covariance import STOCHASTIC

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
 from gyrostab.kernels.allan.surface import Unit
@@ -18,9 +17,6 @@ from gyrostab.time.durations import averaging_factors, samples, thin
 #: Largest number of cells (windows times averaging times) of a unit of work, and of a part of a
 #: surface over all axes.
 MOST_CELLS = 2**20
-#: Largest number of averaging times in a fit; more add no information and cost the cube of their
-#: number.
-MOST_TAUS = 48
 #: Default windows [s]; the longest that fits four times into the record is used.
 WINDOWS_S = (600, 300, 120, 60, 30, 20, 10, 5, 2, 1)
 #: Shortest window [samples].
@@ -194,11 +190,3 @@ def units_of_work(n_samples: int, unit: Unit) -> list[slice]:
 def last_sample(windows: slice, unit: Unit) -> int:
     """Find one past the last sample of some windows."""
     return int((windows.stop - 1) * unit.step + unit.window + (1 if unit.angle else 0))
-
-
-def thin_factors(ks: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Choose the averaging factors to fit: all, or `MOST_TAUS` of them, evenly spaced in log."""
-    if ks.size <= MOST_TAUS:
-        return np.arange(ks.size)
-    targets = np.geomspace(ks[0], ks[-1], MOST_TAUS)
-    return np.unique(np.abs(np.log(ks)[:, None] - np.log(targets)[None, :]).argmin(axis=0))

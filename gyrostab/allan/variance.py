@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.kernels.allan.pairs import white_pair_sum
@@ -11,6 +12,9 @@ from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.fit.covariance import product_tables
 from gyrostab.kernels.fit.third_differences import third_columns, third_tables
 from gyrostab.noise import avar_columns, sample_squares
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 
 def variance_columns(variance: str, ks: NDArray[np.int64], rate: float) -> NDArray[np.float64]:

@@ -27,10 +27,9 @@ def demo(*, output: Output = Path("gyrostab-demo"), common: Common = Common()) -
     """
     with show_stages(common) as stage:
         stage("loading the libraries")
-        from gyrostab.allan.compile_fit import compile_fit_ahead
+        _compile_fit_ahead()
         from gyrostab.jobs.demo import format_summary, run_demo
 
-        compile_fit_ahead()
         product, files = run_demo(output, overwrite=common.overwrite, stage=stage)
     print("written:", *(f"  {file}" for file in files), sep="\n", end="\n\n")
     print(format_summary(product))
@@ -68,9 +67,7 @@ def run(
         Print the windows and averaging times, and the time, memory and size of the output as
         estimated from the first part, and write nothing.
     """
-    from gyrostab.allan.compile_fit import compile_fit_ahead
-
-    compile_fit_ahead()
+    _compile_fit_ahead()
     if dry_run:
         from gyrostab.jobs.estimate import estimate_run
 
@@ -144,6 +141,17 @@ def fit(
             overwrite=common.overwrite,
         )
     _print_product(target)
+
+
+def _compile_fit_ahead() -> None:
+    """Compile the kernels of the fit in another process, unless they are compiled already.
+
+    Imports only what shows whether they are, so that it compiles while this process imports.
+    """
+    from gyrostab.kernels.compile_ahead import start_compilation
+    from gyrostab.kernels.fit.least_squares import fit_windows
+
+    start_compilation("gyrostab.allan.compile_fit", fit_windows)
 
 
 def _print_product(target: Path) -> None:

@@ -38,6 +38,9 @@ from gyrostab.kernels.fit.mixture import (
 )
 from gyrostab.kernels.fit.submodels import FIT_FIELDS, average_submodels, make_submodels
 
+#: Sizes as numpy integers: numba compiles `eights` again for each literal.
+_ONE, _STOCHASTIC, _TERMS, _MATRIX, _SCRATCH = (np.int64(size) for size in (1, 4, 5, 25, 75))
+
 
 class _Cells(NamedTuple):
     """What `observe` says of eight windows."""
@@ -84,8 +87,8 @@ def _make_cells(size):  # type: ignore[no-untyped-def]
         eights(WIDTH * size),
         eights(size),
         eights(size),
-        eights(1),
-        eights(5),
+        eights(_ONE),
+        eights(_TERMS),
     )
 
 
@@ -96,9 +99,9 @@ def _make_room(size):  # type: ignore[no-untyped-def]
         units,
         roots,
         augmented,
-        eights(25),
-        eights(5),
-        eights(75),
+        eights(_MATRIX),
+        eights(_TERMS),
+        eights(_SCRATCH),
         eights(4 * size),
         eights(6 * size),
         eights(4 * size),
@@ -150,18 +153,13 @@ def _mirror_triangle(normal):  # type: ignore[no-untyped-def]
             put(normal, 5 * a + b, take(normal, 5 * b + a))
 
 
-@njit(**KERNEL)
-def combine_diagonal(pairs, ramps):  # type: ignore[no-untyped-def]
+def combine_diagonal(pairs: NDArray[np.float64], ramps: NDArray[np.float64]) -> NDArray[np.float64]:
     """Combine the diagonals (4, 4, n_tau) and (4, n_tau) of `product_tables`: (n_tau, 14)."""
-    n_tau = pairs.shape[2]
-    out = np.empty((n_tau, PRODUCTS))
-    for i in range(n_tau):
-        table = 0
-        for a in range(4):
-            for b in range(a, 5):
-                out[i, table] = ramps[a, i] if b == 4 else pairs[a, b, i] * (1.0 if a == b else 2.0)
-                table += 1
-    return out
+    columns: list[NDArray[np.float64]] = []
+    for a in range(4):
+        columns += [pairs[a, b] * (1.0 if a == b else 2.0) for b in range(a, 4)]
+        columns.append(ramps[a])
+    return np.stack(columns, axis=1)
 
 
 @njit(**KERNEL)
@@ -186,8 +184,11 @@ def identify_noise(curves, columns, weight, to_samples):  # type: ignore[no-unty
     """
     n_windows, n_tau = curves.avar.shape
     out = np.empty((n_windows, 5))
-    cells, fit = _make_cells(n_tau), _Fit(eights(5), eights(5), eights(5), eights(4))
-    normal, right, scratch = eights(25), eights(5), eights(75)
+    cells, fit = (
+        _make_cells(n_tau),
+        _Fit(eights(_TERMS), eights(_TERMS), eights(_TERMS), eights(_STOCHASTIC)),
+    )
+    normal, right, scratch = eights(_MATRIX), eights(_TERMS), eights(_SCRATCH)
     trend, valid = np.zeros((n_windows, 6)), np.empty(PLACES, np.int64)
     allowed = np.int64(31 if columns[0, 4] > 0.0 else 15)  # some variances do not see a ramp
     for start in range(0, n_windows, PLACES):
@@ -224,7 +225,7 @@ def cell_freedoms(squares, curves, columns, to_samples, diagonal):  # type: igno
         for w in range(n_windows):
             degrees_of_freedom(squares[w], curves, w, columns, to_samples, diagonal, out[w])
     else:
-        eight_squares, lanes = eights(5), eights(1)
+        eight_squares, lanes = eights(_TERMS), eights(_ONE)
         columns = columns.ravel()
         diagonal = diagonal.ravel()
         for start in range(0, n_windows, PLACES):
@@ -305,7 +306,7 @@ def _normal_equations(augmented, n, normal, right):  # type: ignore[no-untyped-d
 def _refit_windows(allowed, cells, fit, room, tables):  # type: ignore[no-untyped-def]
     """Refit until the covariance is that of the fitted noise; converged fits keep their numbers."""
     squares, terms, basis, state = fit
-    trial, tried = eights(5), eights(5)
+    trial, tried = eights(_TERMS), eights(_TERMS)
     n = cells.inverse.shape[0]
     put(state, 0, 1.0)
     put(state, 1, 0.0)
@@ -432,9 +433,9 @@ def fit_windows(  # type: ignore[no-untyped-def]
     misfit = np.full((n_windows, 2), np.nan)
     dof = np.full((n_windows, n_tau), np.nan)
     cells = _make_cells(size)
-    fit = _Fit(eights(5), eights(5), eights(5), eights(4))
+    fit = _Fit(eights(_TERMS), eights(_TERMS), eights(_TERMS), eights(_STOCHASTIC))
     room = _make_room(size)
-    chi2, valid, squares = eights(1), np.empty(PLACES, np.int64), np.empty(5)
+    chi2, valid, squares = eights(_ONE), np.empty(PLACES, np.int64), np.empty(5)
     submodels, start, form = make_submodels(), np.empty(4), np.empty(10)
     stochastic = allowed & 15
     for first in range(0, n_windows, PLACES):

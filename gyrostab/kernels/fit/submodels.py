@@ -427,10 +427,12 @@ def _judge_term(a, base, low_sigma, room, form, result):  # type: ignore[no-unty
     mean, between = _average_estimates(a, np.int64(0), room)
     _average_forms(a, room, form)
     null, linear, quadratic = _expand_variance(a, base, room, form)
-    present = _best_likelihood(a, 1, room)
+    present = _best_likelihood(a, np.int64(1), room)
     scale = room.scale[a]
     result[1, a] = mean / scale
-    result[2, a] = 2.0 * (present - _best_likelihood(a, 0, room)) if present > -np.inf else 0.0
+    result[2, a] = (
+        2.0 * (present - _best_likelihood(a, np.int64(0), room)) if present > -np.inf else 0.0
+    )
     result[3, a] = (null + between) / scale**2
     result[4, a] = linear / scale
     result[5, a] = quadratic
