@@ -183,7 +183,7 @@ def run_published_method(
     plan: Plan, method: str, *, paper: bool
 ) -> tuple[list[NDArray[Any]], Floats]:
     """Run a published algorithm in memory: fields (axis, time, tau), plane (6, axis, time)."""
-    signal, unit, _, _ = plan
+    signal, unit = plan.signal, plan.unit
     points = unit.window + (0 if paper and not unit.angle else 1)
     all_points = signal.sizes["time"] + (0 if unit.angle or paper else 1)
     n_windows = (all_points - points) // unit.step + (0 if paper else 1)

@@ -301,7 +301,7 @@ def _attach_labels(
     numbers: Sequence[int] | None = None,
 ) -> xr.Dataset:
     cube, plane = ("axis", "time", "tau"), ("axis", "time")
-    signal, unit, rate, _ = plan
+    signal, unit, rate, _, reported = plan
     start, begin = first_stamp(log), 0 if part is None else part.start
     first = (
         begin + np.arange(means.shape[2]) if numbers is None else np.array(numbers)
@@ -311,7 +311,11 @@ def _attach_labels(
     )
     centre = bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) // 2
     variables: dict[str, Any] = {
-        name: (cube, values, attributes(name, variance=VARIANCES[unit.variance].text))
+        name: (
+            cube,
+            values[..., reported],
+            attributes(name, variance=VARIANCES[unit.variance].text),
+        )
         for name, values in zip(CELL_FIELDS, cells, strict=True)
     }
     # In addition to the responses, the fit needs the share of degrees of freedom left by the gaps.
@@ -336,7 +340,7 @@ def _attach_labels(
                 pd.DatetimeIndex(centre.view("datetime64[ns]")),
                 {**attributes("time")},
             ),
-            "tau": ("tau", unit.ks / rate, attributes("tau")),
+            "tau": ("tau", plan.taus, attributes("tau")),
             "time_bounds": (("time", "bnds"), bounds.view("datetime64[ns]")),
         },
         attrs={**log.attrs, **plan.attrs},

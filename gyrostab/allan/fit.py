@@ -498,8 +498,8 @@ def _fit_gls(
         "fit_chi2": (("axis", "time"), parts[4 * n], attributes("fit_chi2")),
         "fit_dof": (("axis", "time"), parts[4 * n + 1], attributes("fit_dof")),
     }
-    # otherwise that of davar, for every averaging time, is kept
-    if chosen.size == surface.sizes["tau"]:
+    # otherwise that of davar is kept, for every averaging time and from more of them
+    if surface.sizes["tau"] == chosen.size > allowed.bit_count():
         edf = np.where(below, surface["edf"].data, fitted[..., 4 * n + 2 :])
         extra["edf"] = (("axis", "time", "tau"), edf, surface["edf"].attrs)
     return _assemble_product(surface, *(parts[i * n : (i + 1) * n] for i in range(4)), extra=extra)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
 from gyrostab.kernels.allan.surface import Unit
@@ -34,6 +36,13 @@ class Plan(NamedTuple):
     unit: Unit
     rate: float
     attrs: dict[str, Any]
+    #: Averaging factors of `unit` that were asked for; the noise is identified from all of them.
+    reported: NDArray[np.int64]
+
+    @property
+    def taus(self) -> NDArray[np.float64]:
+        """Averaging times of the surface [s]."""
+        return np.asarray(self.unit.ks[self.reported] / self.rate)
 
 
 def make_plan(
@@ -55,9 +64,8 @@ def make_plan(
     )
     order = VARIANCES[variance].order
     ks = averaging_factors(taus, rate=rate, window=length, tau_max=tau_max, order=order)
-    shifts = thin(ks) if overlap == "octave" else np.zeros_like(ks)
-    ks = np.unique(ks >> shifts << shifts)
-    shifts = thin(ks) if overlap == "octave" else np.zeros_like(ks)
+    ks, _ = _thin_terms(ks, overlap)
+    asked, (ks, shifts) = ks, _thin_terms(_fill_octaves(ks), overlap)
     unit = Unit(
         length,
         hop,
@@ -76,7 +84,29 @@ def make_plan(
         "method": method, "overlap": overlap, "gaps": gaps, "convention": convention,
         "min_strict": min_strict, "min_coverage": min_coverage, "variance": variance,
     }  # fmt: skip
-    return Plan(signal, unit, rate, attrs)
+    return Plan(signal, unit, rate, attrs, np.searchsorted(ks, asked))
+
+
+def _thin_terms(ks: NDArray[np.int64], overlap: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the averaging factors that are computed, and the powers of two that thin them."""
+    if overlap == "full":
+        return ks, np.zeros_like(ks)
+    shifts = thin(ks)
+    ks = np.unique(ks >> shifts << shifts)
+    return ks, thin(ks)
+
+
+def _fill_octaves(ks: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Add averaging factors until neighbours, from 1 on, are at most an octave apart.
+
+    The degrees of freedom depend on the kind of noise, which a few long averaging times do not
+    show.
+    """
+    added = [[1]]
+    for below, above in zip([1, *ks[:-1].tolist()], ks.tolist(), strict=True):
+        octaves = math.ceil(math.log2(above / below))
+        added.append([round(below * 2.0**i) for i in range(1, octaves)])
+    return np.union1d(ks, np.concatenate(added).astype(np.int64))
 
 
 def choose_window(log: xr.Dataset) -> str:

@@ -41,7 +41,7 @@ def estimate_run(
         log = load_log(paths, **reading)
         plan, parts = make_plan(log, **windows), davar_parts(log, **windows)
         rate = float(log.attrs["sampling_rate_hz"])
-        total, first, tau = parts[-1].stop, parts[0], plan.unit.ks / rate
+        total, first, tau = parts[-1].stop, parts[0], plan.taus
         yield "\n".join(
             [
                 f"record     {log.sizes['time'] / rate:.6g} s at {rate:.6g} Hz, axes "

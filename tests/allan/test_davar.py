@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.allan.davar import davar, davar_part, davar_parts
+from gyrostab.allan.fit import fit_noise
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.allan.blocks import held_points
@@ -545,3 +546,17 @@ def test_trend_is_that_of_a_straight_line_through_the_present_samples(kind, meth
         assert float(surface.window_trend[0, j]) == pytest.approx(slope, rel=1e-6, abs=1e-3)
         share = spread / np.sum((hours[present] - hours[present].mean()) ** 2)
         assert float(surface.trend_response[0, j]) == pytest.approx(share, rel=1e-9)
+
+
+@pytest.mark.parametrize("overlap", ["full", "octave"])
+def test_long_averaging_times_alone_have_the_degrees_of_freedom_of_the_same_noise(overlap):
+    log = log_of(np.random.default_rng(1).standard_normal(120_000))
+    options = {"window": "1min", "step": "1min", "overlap": overlap}
+    few, octaves = (
+        davar(log, taus=["5.12s", "20.48s"], **options),
+        davar(log, taus="octave", tau_max="20.48s", **options),
+    )
+    np.testing.assert_array_equal(few.tau, [5.12, 20.48])
+    for name in ("avar", "edf", "count"):
+        np.testing.assert_allclose(few[name], octaves[name].sel(tau=few.tau), rtol=1e-6)
+    assert fit_noise(few).edf.equals(few.edf)  # two averaging times do not show five terms
