@@ -253,6 +253,43 @@ def test_each_effect_of_a_pair_is_scored_separately():
     assert [row["named"] for row in rows] == [False, True]
 
 
+@pytest.mark.parametrize(
+    ("names", "true", "named", "wrong_names"),
+    [
+        (["temperature_bias"], ["temperature_bias", "shupe"], [True, False], []),
+        (["warm_up"], ["temperature_bias", "shupe"], [True, False], []),
+        (["shupe", "warm_up"], ["temperature_bias", "shupe"], [True, True], []),
+        (["real_motion", "scale_factor"], ["misalignment", "shared_source"], [True, True], []),
+        (
+            ["temperature_bias", "warm_up", "shupe"],
+            ["temperature_bias"],
+            [True],
+            ["warm_up", "shupe"],
+        ),
+        (["warm_up", "temperature_bias"], ["temperature_bias"], [False], ["warm_up"]),
+        (["warm_up", "ageing_bias"], ["temperature_bias"], [True], ["ageing_bias"]),
+    ],
+)
+def test_each_name_counts_for_one_effect(names, true, named, wrong_names):
+    answer = diagnosis(
+        *(identification(name, nats=30.0 - place) for place, name in enumerate(names))
+    )
+    rows = score_case(answer, truth(*true, kind="pair"))
+    assert [row["named"] for row in rows] == named
+    assert rows[0]["wrong_names"] == wrong_names
+    right = [entry["name"] for entry in rows[0]["identifications"] if entry["right"]]
+    assert sorted([*right, *wrong_names]) == sorted(names)
+
+
+def test_alternatives_make_no_name_right():
+    row = score_one(
+        diagnosis(identification("earth_rate", alternatives=["feedback_reset"])),
+        truth("feedback_reset"),
+    )
+    assert (row["named"], row["wrong_names"], row["in_set"]) == (False, ["earth_rate"], True)
+    assert [entry["right"] for entry in row["identifications"]] == [False]
+
+
 def test_accepted_name_in_addition_is_not_wrong():
     row = score_one(
         diagnosis(identification("real_motion", nats=90), identification("misalignment")),
@@ -626,7 +663,8 @@ def test_single_effects_and_shared_source_have_separate_lines():
     half = score_case(
         diagnosis(identification("shupe"), gain=4.0), truth("shupe", "spikes", kind="pair", index=3)
     )
-    table = score_table([*single, *pair, *half]).set_index("quantity")
+    rows = [*single, *pair, *half]
+    table = score_table(rows).set_index("quantity")
     assert table.loc["detected, strength 1.5 or more", ["value", "n"]].tolist() == [
         0.8,
         5,
@@ -638,3 +676,6 @@ def test_single_effects_and_shared_source_have_separate_lines():
     assert table.loc[
         "evidence relative to the oracle, all effects named correctly, median", ["value", "n"]
     ].tolist() == [0.8, 1]
+    assert score_table(rows[::-1]).set_index("quantity").loc[
+        "evidence relative to the oracle, median", ["value", "n"]
+    ].tolist() == [0.5, 2]  # whichever effect of a pair comes first

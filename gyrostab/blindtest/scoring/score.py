@@ -252,12 +252,12 @@ def score_case(
     list of dict
         One row for every true effect, or one row without an effect: ``kind``, ``effect``,
         ``strength``, ``detected``, ``score`` (of `detection_score`), ``named`` (ambiguity
-        sets merged), ``named_exactly``, ``in_set``, ``set_size``, ``wrong`` (number of wrong
-        names), ``unidentified``, ``iou``, ``tau_hit``, ``parameter_scores``, ``gain``, ``oracle``,
-        ``learned`` (the oracle's with fitted noise), ``model_check`` (of `check_model`),
-        ``seconds``, ``identifications`` and more. A name counts once, on however many axes it is
-        identified: with its ``probability``, whether its ambiguity set is ``right``, and whether it
-        is a true name itself (``exact``).
+        sets merged; a name counts for one effect), ``named_exactly``, ``in_set``, ``set_size``,
+        ``wrong`` (number of names without a true effect), ``unidentified``, ``iou``, ``tau_hit``,
+        ``parameter_scores``, ``gain``, ``oracle``, ``learned`` (the oracle's with fitted noise),
+        ``model_check`` (of `check_model`), ``seconds``, ``identifications`` and more. A name counts
+        once, on however many axes it is identified: with its ``probability``, whether it is
+        ``right`` (counts for a true effect), and whether it is a true name itself (``exact``).
 
     Raises
     ------
@@ -268,12 +268,9 @@ def score_case(
     accepted = set(truth["accepted"])
     identifications = _collect_identifications(diagnosis)
     true = [effect["name"] for effect in truth["effects"]]
-    standing = accepted.union(*(merge_ambiguous(name) for name in true)) if true else accepted
-    wrong = [
-        identification["name"]
-        for identification in identifications
-        if not _ambiguity_set(identification) & standing
-    ]
+    matches = _match_names(identifications, true)
+    right = accepted.union(match["name"] for match in matches if match is not None)
+    wrong = [entry for entry in identifications if entry["name"] not in right]
     detected = diagnosis["verdict"] != "no mismatch" or bool(identifications)
     plan = truth.get("plan") or {}
     case = {
@@ -289,7 +286,7 @@ def score_case(
         "detected": detected,
         "score": detection_score(diagnosis),
         "wrong": len(wrong),
-        "wrong_names": wrong,
+        "wrong_names": [entry["name"] for entry in wrong],
         "unidentified": bool(
             detected
             and not wrong
@@ -299,7 +296,7 @@ def score_case(
             {
                 "name": identification["name"],
                 "probability": identification["tables"][0].get("probability"),
-                "right": bool(_ambiguity_set(identification) & standing),
+                "right": identification["name"] in right,
                 "exact": identification["name"] in accepted.union(true),
             }
             for identification in identifications
@@ -324,25 +321,49 @@ def score_case(
             }
         ]
     return [
-        case | _score_effect(diagnosis, identifications, effect, accepted, true)
-        for effect in truth["effects"]
+        case | _score_effect(diagnosis, identifications, effect, match, wrong)
+        for effect, match in zip(truth["effects"], matches, strict=True)
     ]
+
+
+def _match_names(
+    identifications: Sequence[dict[str, Any]], true: Sequence[str]
+) -> list[dict[str, Any] | None]:
+    """Match each true effect to at most one identification, and each of these to one effect.
+
+    Exact names come first, then as many names of the ambiguity sets as possible, the strongest.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    matches: list[dict[str, Any] | None] = [None] * len(true)
+    weights = np.array(
+        [
+            [
+                100.0 * (entry["name"] == name)
+                + 10.0 * (entry["name"] in merge_ambiguous(name))
+                - place / len(identifications)
+                for place, entry in enumerate(identifications)
+            ]
+            for name in true
+        ]
+    ).reshape(len(true), len(identifications))
+    for effect, place in zip(*linear_sum_assignment(weights, maximize=True), strict=True):
+        if weights[effect, place] > 0.0:
+            matches[effect] = identifications[place]
+    return matches
 
 
 def _score_effect(
     diagnosis: Mapping[str, Any],
     identifications: Sequence[Mapping[str, Any]],
     effect: Mapping[str, Any],
-    accepted: set[str],
-    true: Sequence[str],
+    match: Mapping[str, Any] | None,
+    wrong: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
+    """Score a true effect by its match; a wrong name that is stronger comes in its place."""
     name = effect["name"]
-    other_names = accepted.union(
-        *(merge_ambiguous(other) for other in true if other != name)
-    ) - merge_ambiguous(name)
-    mine = [entry for entry in identifications if entry["name"] not in other_names]
-    top = mine[0] if mine else None
-    match = next((entry for entry in mine if entry["name"] in merge_ambiguous(name)), None)
+    top = next((entry for entry in identifications if entry is match or entry in wrong), None)
+    named = match if match is top else None
     row: dict[str, Any] = {
         "effect": name,
         "strength": effect["strength"],
@@ -351,8 +372,8 @@ def _score_effect(
         else None,
         "size": effect["size"],
         "form_differs": effect["form_differs"],
-        "named": bool(top and top["name"] in merge_ambiguous(name)),
-        "named_exactly": bool(top and top["name"] == name),
+        "named": named is not None,
+        "named_exactly": named is not None and named["name"] == name,
         "in_set": name in _ambiguity_set(top) if top else None,
         "set_size": len(_ambiguity_set(top)) if top else None,
         "iou": None,

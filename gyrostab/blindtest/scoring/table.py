@@ -185,16 +185,10 @@ def _parameter_lines(rows: Sequence[Row]) -> list[Line]:
     clear = catalogue_rows(rows, min_strength=CLEAR_STRENGTH)
     scores = [(row, number) for row in clear for number in row["parameter_scores"]]
     coverage = Target("92-98 %", least=0.92, most=0.98)
-    gains = [
-        (row["gain"] / row["oracle"], _all_named(row, rows))
-        for row in first_rows(clear)
-        if row["named"] and _has_gain(row)
-    ]
-    learned = [
-        row["gain"] / row["learned"]
-        for row in first_rows(clear)
-        if row["named"] and _has_gain(row) and row.get("learned", 0.0) > 0
-    ]
+    named_cases = {row["index"] for row in rows if row.get("named")}
+    known = [row for row in first_rows(clear) if row["index"] in named_cases and _has_gain(row)]
+    gains = [(row["gain"] / row["oracle"], _all_named(row, rows)) for row in known]
+    learned = [row["gain"] / row["learned"] for row in known if row.get("learned", 0.0) > 0]
     covered = [number["covered"] for row, number in scores if row["effect"] != "shared_source"]
     return [
         median(
