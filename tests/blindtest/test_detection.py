@@ -64,6 +64,16 @@ def test_curve_goes_from_nothing_to_everything(rows):
     assert own.loc["other", "detected"] == 1.0
 
 
+def test_failed_records_of_noise_are_left_out(rows):
+    failed = [
+        row | {"score": -math.inf, "failed": True} for row in rows if row["kind"] == "counterpart"
+    ]
+    others = [row for row in rows if row["kind"] != "counterpart"]
+    assert detection_shares([*others, *failed]).equals(detection_shares(others))
+    assert roc_curves([*others, *failed]).equals(roc_curves(others))
+    assert counterpart_table(failed).empty
+
+
 def test_few_cases_give_empty_tables():
     assert detection_shares([row(0, "single", 1.0)]).empty
     assert roc_curves([row(0, "null", 1.0)]).empty

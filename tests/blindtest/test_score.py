@@ -597,6 +597,28 @@ def test_only_names_added_by_an_injection_count():
     assert set(main["n"]) == {0}  # excluded from all other figures
 
 
+def test_failed_diagnosis_counts_against_detection_only():
+    truths = [truth(kind="null"), truth("shupe", index=1)]
+    truths += [
+        truth("shupe", kind="degraded_driver", degradation=how, index=index)
+        for index, how in ((2, "withheld"), (3, "noisy"))
+    ]
+    rows = [row for known in truths for row in score_case(diagnosis(), known)]
+    table = score_table([row | {"failed": True} for row in rows]).set_index("quantity")
+    assert table.loc["failed diagnoses", ["value", "n"]].tolist() == [1.0, 4]
+    assert table.loc["detected, strength 1.5 or more", ["value", "n"]].tolist() == [0.0, 1]
+    absent = table.filter(regex="wrong name|false alarms: |any mismatch", axis=0)
+    assert len(absent) == 6
+    assert set(absent["n"]) == {0}
+    copies = injection_rows(injected=["shupe"])
+    for failed, others in (("injected", 0), ("flipped", 0), (None, 1)):
+        lines = injection_table([row | {"failed": row["copy"] == failed} for row in copies])
+        if len(lines):
+            lines = lines.set_index("quantity")["n"]
+            assert lines["injection adds another name"] == others
+            assert lines["injections of strength 1.5 or more: named correctly"] == 1
+
+
 @given(st.integers(0, 60), st.integers(1, 60))
 def test_wilson_matches_scipy(hits, total):
     hits = min(hits, total)

@@ -40,7 +40,8 @@ from gyrostab.store.output import replace_file, write_text
 
 Rows = list[dict[str, Any]]
 
-#: Diagnosis of a case whose diagnosis failed: nothing was detected.
+#: Diagnosis of a case whose diagnosis failed: nothing was detected. `answered_rows` leaves it out
+#: where that would be right.
 _EMPTY_DIAGNOSIS = {
     "verdict": "no mismatch",
     "mismatches": [],

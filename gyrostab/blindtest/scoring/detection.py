@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from gyrostab.blindtest.scoring.proportions import Target, share, share_of
-from gyrostab.blindtest.scoring.score import CATALOGUE_KINDS, drawn_rows, first_rows
+from gyrostab.blindtest.scoring.score import CATALOGUE_KINDS, answered_rows, drawn_rows, first_rows
 from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH
 
 Row = Mapping[str, Any]
@@ -31,7 +31,7 @@ _INTERVAL = (0.025, 0.975)
 
 def _list_comparisons(rows: Sequence[Row]) -> list[tuple[str, str, Array, Array]]:
     """List group of cases, detector, and its scores of the records of noise and of the cases."""
-    noise = [row for row in rows if row["kind"] in ("null", "counterpart")]
+    noise = answered_rows([row for row in rows if row["kind"] in ("null", "counterpart")])
     out = []
     for group, kinds in _GROUPS.items():
         strong = [row for row in rows if row["kind"] in kinds and row["strength"] >= CLEAR_STRENGTH]
@@ -135,12 +135,12 @@ def counterpart_table(rows: Sequence[Row]) -> pd.DataFrame:
     pandas.DataFrame
         Lines as in `score_table`.
     """
-    mine = [row for row in rows if row["kind"] == "counterpart"]
+    mine = answered_rows([row for row in rows if row["kind"] == "counterpart"])
     if not mine:
         return pd.DataFrame()
     cases = {row["index"]: row for row in drawn_rows(rows)}
     pairs = [(cases[row["index"]], row) for row in mine if row["index"] in cases]
-    noise = [row for row in rows if row["kind"] in ("null", "counterpart")]
+    noise = answered_rows([row for row in rows if row["kind"] in ("null", "counterpart")])
     names = [
         (
             identification["name"],

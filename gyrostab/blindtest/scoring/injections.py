@@ -9,6 +9,7 @@ import pandas as pd
 
 from gyrostab.blindtest.generator.catalogue import merge_ambiguous
 from gyrostab.blindtest.scoring.proportions import share
+from gyrostab.blindtest.scoring.score import answered_rows
 from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH, SURE_STRENGTH
 
 Row = Mapping[str, Any]
@@ -20,15 +21,16 @@ def injection_differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
     Returns
     -------
     list of dict
-        ``index``, ``recording``, ``effect``, ``strength``, ``learned_strength`` (in fitted noise;
-        None for truths without it); ``before``: names in the untouched copy;
-        ``there_before``: the effect's ambiguity set is among them; ``named``: it is named in the
-        injected copy; ``others``: other names added by the injection; ``flipped`` and ``reversed``:
-        names added by reversing sign or time, sets merged.
+        ``index``, ``recording``, ``effect``, ``failed`` (its diagnosis), ``strength``,
+        ``learned_strength`` (in fitted noise; None for truths without it); ``before``: names in the
+        untouched copy; ``there_before``: the effect's ambiguity set is among them; ``named``: it is
+        named in the injected copy; ``others``: other names added by the injection; ``flipped`` and
+        ``reversed``: names added by reversing sign or time, sets merged. Injections with a control
+        whose diagnosis failed are left out.
     """
     groups: dict[Any, dict[str, Row]] = {}
     for row in rows:
-        if row["kind"] in ("injected", "control"):
+        if row["kind"] == "injected" or (row["kind"] == "control" and not row.get("failed")):
             groups.setdefault(row["index"], {})[row["copy"]] = row
     out = []
     for index, copies in sorted(groups.items()):
@@ -42,6 +44,7 @@ def injection_differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
                 "index": index,
                 "recording": injected["recording"],
                 "effect": injected["effect"],
+                "failed": injected.get("failed", False),
                 "strength": injected["strength"],
                 "learned_strength": injected["learned_strength"],
                 "before": sorted(_names_given(copies["untouched"])),
@@ -82,7 +85,10 @@ def injection_table(rows: Sequence[Row]) -> pd.DataFrame:
             "correctly",
             (line["named"] for line in new if (line["learned_strength"] or 0.0) >= SURE_STRENGTH),
         ),
-        share("injection adds another name", (bool(line["others"]) for line in differences)),
+        share(
+            "injection adds another name",
+            (bool(line["others"]) for line in answered_rows(differences)),
+        ),
         share("reversing the sign adds a name", (bool(line["flipped"]) for line in differences)),
         share("reversing time adds a name", (bool(line["reversed"]) for line in differences)),
         share(

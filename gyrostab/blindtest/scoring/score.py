@@ -177,6 +177,11 @@ def drawn_rows(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     return [row for row in rows if row["kind"] not in ("counterpart", "injected", "control")]
 
 
+def answered_rows(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Keep the rows whose diagnosis did not fail, as a failure says nothing about false names."""
+    return [row for row in rows if not row.get("failed")]
+
+
 def catalogue_rows(
     rows: Sequence[Mapping[str, Any]], *, min_strength: float = 0.0
 ) -> list[Mapping[str, Any]]:

@@ -21,7 +21,12 @@ from gyrostab.blindtest.scoring.proportions import (
     share_of,
     spread,
 )
-from gyrostab.blindtest.scoring.score import catalogue_rows, drawn_rows, first_rows
+from gyrostab.blindtest.scoring.score import (
+    answered_rows,
+    catalogue_rows,
+    drawn_rows,
+    first_rows,
+)
 
 Row = Mapping[str, Any]
 
@@ -64,11 +69,12 @@ def score_table(rows: Sequence[Row]) -> pd.DataFrame:
 
 
 def _false_alarm_lines(rows: Sequence[Row]) -> list[Line]:
-    nulls = [row for row in rows if row["kind"] == "null"]
+    nulls = answered_rows([row for row in rows if row["kind"] == "null"])
     target = Target("<= 1 %, upper bound <= 2 %", most=0.01, surely=0.02)
     return [
         share_of("false alarms: effect named on a null record", nulls, "identifications", target),
         share_of("null records with any mismatch", nulls, "detected"),
+        share("failed diagnoses", (row.get("failed", False) for row in first_rows(rows))),
     ]
 
 
@@ -118,7 +124,7 @@ def _naming_lines(rows: Sequence[Row]) -> list[Line]:
             "named exactly where the form differs",
             (row["named_exactly"] for row in detected if row["form_differs"]),
         ),
-        share_of("cases with a wrong name", first_rows(clear), "wrong"),
+        share_of("cases with a wrong name", answered_rows(first_rows(clear)), "wrong"),
         share_of("truth in the ambiguity set", claimed, "in_set", at_least(0.97)),
         median(
             "size of the ambiguity set, median",
@@ -170,13 +176,20 @@ def _degraded_driver_lines(rows: Sequence[Row]) -> list[Line]:
         for lost in (True, False)
     )
     return [
-        share_of("driver withheld or substituted: wrong name", gone, "wrong", at_most(0.02)),
+        share_of(
+            "driver withheld or substituted: wrong name",
+            answered_rows(gone),
+            "wrong",
+            at_most(0.02),
+        ),
         share(
             "driver withheld or substituted: unidentified, if detected",
             (row["unidentified"] for row in gone if row["detected"]),
             at_least(0.90),
         ),
-        share_of("driver lagged, noisy, clipped or confounded: wrong name", bent, "wrong"),
+        share_of(
+            "driver lagged, noisy, clipped or confounded: wrong name", answered_rows(bent), "wrong"
+        ),
         share_of("driver lagged, noisy, clipped or confounded: named correctly", bent, "named"),
     ]
 
