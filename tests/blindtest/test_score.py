@@ -20,7 +20,7 @@ from gyrostab.blindtest.scoring.curves import (
     reliability,
 )
 from gyrostab.blindtest.scoring.injections import injection_differences, injection_table
-from gyrostab.blindtest.scoring.proportions import Target, spread, wilson
+from gyrostab.blindtest.scoring.proportions import Target, median, share, spread, wilson
 from gyrostab.blindtest.scoring.score import intersection_over_union, score_case
 from gyrostab.blindtest.scoring.table import list_missed, markdown, score_table
 from gyrostab.errors import SchemaError
@@ -528,14 +528,15 @@ def test_names_given_to_a_single_effect_are_counted():
 
 
 def test_68_percent_of_normal_errors_are_within_one_sigma():
-    line = spread(
-        "errors", np.random.default_rng(0).normal(0, 1, 2000), Target("0.8-1.25", 0.8, 1.25)
-    )
+    target = Target("0.8-1.25", 0.8, 1.25)
+
+    def errors(values) -> list[dict]:
+        return [{"index": place, "pull": value} for place, value in enumerate(values)]
+
+    line = spread("errors", errors(np.random.default_rng(0).normal(0, 1, 2000)), "pull", target)
     assert line["value"] == pytest.approx(1.0, abs=0.06)
     assert line["state"] == "met"
-    assert (
-        spread("errors", [3.0, -3.0, 2.5, 2.8], Target("0.8-1.25", 0.8, 1.25))["state"] == "missed"
-    )
+    assert spread("errors", errors([3.0, -3.0, 2.5, 2.8]), "pull", target)["state"] == "missed"
 
 
 def injection_rows(*, injected=(), untouched=(), flipped=(), turned=()) -> list[dict]:
@@ -617,6 +618,27 @@ def test_failed_diagnosis_counts_against_detection_only():
             lines = lines.set_index("quantity")["n"]
             assert lines["injection adds another name"] == others
             assert lines["injections of strength 1.5 or more: named correctly"] == 1
+
+
+@pytest.mark.parametrize(
+    "read", [lambda rows: share("", rows, "flag"), lambda rows: median("", rows, "size")]
+)
+def test_rows_of_one_record_do_not_narrow_an_interval(read):
+    rng = np.random.default_rng(0)
+    records = [
+        {"index": place, "flag": size > 0.8, "size": size}
+        for place, size in enumerate(rng.normal(0.0, 1.0, 80))
+    ]
+    single, repeated = read(records), read(records * 5)
+    assert repeated["value"] == pytest.approx(single["value"])
+    width, alone = repeated["high"] - repeated["low"], single["high"] - single["low"]
+    assert width == pytest.approx(alone, rel=0.15)
+
+
+def test_share_of_repeated_rows_without_a_flag_has_the_interval_of_the_records():
+    rows = [{"index": place // 5, "flag": False} for place in range(100)]
+    line = share("", rows, "flag")
+    assert (line["n"], line["low"], line["high"]) == (100, *wilson(0, 20))
 
 
 @given(st.integers(0, 60), st.integers(1, 60))

@@ -54,11 +54,11 @@ def draw_completeness(curves: pd.DataFrame) -> Callable[[Path], None]:
 
 
 def _pool_strengths(part: pd.DataFrame) -> pd.DataFrame:
-    """Pool strengths between limits at their weighted geometric mean."""
+    """Pool strengths of one effect between limits at their weighted geometric mean."""
     import numpy as np
     import pandas as pd
 
-    from gyrostab.blindtest.scoring.proportions import share_columns
+    from gyrostab.blindtest.scoring.proportions import wilson
 
     out = []
     for _, group in part.groupby(np.digitize(part["strength"], _POOL_LIMITS)):
@@ -69,7 +69,8 @@ def _pool_strengths(part: pd.DataFrame) -> pd.DataFrame:
         }
         for key in ("detected", "named"):
             hits = round(float((group[key] * group["n"]).sum()))
-            line |= share_columns(key, hits, number)
+            low, high = wilson(hits, number)
+            line |= {key: hits / number, f"{key}_low": low, f"{key}_high": high}
         out.append(line)
     return pd.DataFrame(out)
 

@@ -214,7 +214,7 @@ def _describe_detection(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         "The threshold of each detector is the score that this share of all records of *noise* "
         "(null records and counterparts) exceeds, rounded down to whole records. A record counts "
         "if its strongest effect has strength 1.5 or more. The intervals are those of resampled "
-        "cases and records of noise.",
+        "records, each case together with its counterpart.",
         markdown(shares),
     ]
 

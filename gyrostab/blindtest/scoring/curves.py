@@ -81,11 +81,11 @@ def fitted_noise_curve(rows: Sequence[Row]) -> pd.DataFrame:
 
 
 def _count_shares(part: Sequence[Row]) -> dict[str, Any]:
-    """Return the shares detected and named of some rows, with Wilson's intervals."""
+    """Return the shares detected and named of some rows, with 95 % intervals."""
     line: dict[str, Any] = {"n": len(part)}
     for key in ("detected", "named"):
-        hits = sum(bool(row[_column_of(row, key)]) for row in part)
-        line |= share_columns(key, hits, len(part))
+        counted = [{"index": row["index"], key: row[_column_of(row, key)]} for row in part]
+        line |= share_columns(key, counted, key)
     return line
 
 

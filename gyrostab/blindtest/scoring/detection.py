@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from gyrostab.blindtest.scoring.proportions import Target, share, share_of
+from gyrostab.blindtest.scoring.proportions import Target, resample, share
 from gyrostab.blindtest.scoring.score import CATALOGUE_KINDS, answered_rows, drawn_rows, first_rows
 from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH
 
@@ -24,13 +24,12 @@ _GROUPS = {
     "catalogue": CATALOGUE_KINDS,
     "out of catalogue or degraded driver": ("out_of_catalogue", "degraded_driver"),
 }
-_RESAMPLINGS = 1000
-_SEED = 0  # of the resamplings
-_INTERVAL = (0.025, 0.975)
 
 
-def _list_comparisons(rows: Sequence[Row]) -> list[tuple[str, str, Array, Array]]:
-    """List group of cases, detector, and its scores of the records of noise and of the cases."""
+def _list_comparisons(
+    rows: Sequence[Row],
+) -> list[tuple[str, str, list[Row], Array, NDArray[np.bool_]]]:
+    """List group of cases, detector, rows of noise and cases, their scores, and which are cases."""
     noise = answered_rows([row for row in rows if row["kind"] in ("null", "counterpart")])
     out = []
     for group, kinds in _GROUPS.items():
@@ -38,10 +37,10 @@ def _list_comparisons(rows: Sequence[Row]) -> list[tuple[str, str, Array, Array]
         cases = first_rows(strong)
         if not noise or not cases:
             continue
+        records = [*noise, *cases]
+        is_case = np.arange(len(records)) >= len(noise)
         names = ["diagnosis", *cases[0]["baseline_detectors"]]
-        out += [
-            (group, name, *(_read_scores(part, name) for part in (noise, cases))) for name in names
-        ]
+        out += [(group, name, records, _read_scores(records, name), is_case) for name in names]
     return out
 
 
@@ -55,14 +54,24 @@ def _read_scores(rows: Sequence[Row], detector: str) -> Array:
     )
 
 
-def _shares_detected(noise: Array, cases: Array, rate: float) -> Array:
-    """Compute the share of `cases` above the score that at most `rate` of `noise` exceeds.
+def _share_detected(scores: Array, is_case: NDArray[np.bool_], rate: float) -> float:
+    """Compute the share of cases above the score that at most `rate` of the noise exceeds."""
+    noise, cases = np.sort(scores[~is_case]), scores[is_case]
+    if not noise.size or not cases.size:
+        return math.nan
+    threshold = noise[-1 - math.floor(rate * noise.size + 1e-9)]
+    return float((cases > threshold).mean())
 
-    Both have a leading axis of resamplings, or of one.
-    """
-    allowed = math.floor(rate * noise.shape[1] + 1e-9)
-    threshold = np.sort(noise, axis=1)[:, noise.shape[1] - 1 - allowed]
-    return np.asarray((cases > threshold[:, None]).mean(axis=1))
+
+def _share_columns(
+    records: Sequence[Row], scores: Array, is_case: NDArray[np.bool_], rate: float
+) -> dict[str, float]:
+    label = f"at {100 * rate:g} %"
+    low, high = resample(
+        records, lambda chosen: _share_detected(scores[chosen], is_case[chosen], rate)
+    )
+    value = _share_detected(scores, is_case, rate)
+    return {label: value, f"{label}, low": low, f"{label}, high": high}
 
 
 def detection_shares(rows: Sequence[Row]) -> pd.DataFrame:
@@ -75,29 +84,19 @@ def detection_shares(rows: Sequence[Row]) -> pd.DataFrame:
     -------
     pandas.DataFrame
         ``detector``, ``cases`` (group), ``n``, ``noise`` (number of records), and for each rate the
-        share detected, with the 95 % interval of resampled cases and records of noise. Empty
-        without records of noise.
+        share detected, with the 95 % interval of resampled records (a case and its counterpart
+        together). Empty without records of noise.
     """
-    rng = np.random.default_rng(_SEED)
     lines = []
-    for group, name, noise, cases in _list_comparisons(rows):
+    for group, name, records, scores, is_case in _list_comparisons(rows):
         line: dict[str, Any] = {
             "cases": group,
             "detector": name,
-            "n": cases.size,
-            "noise": noise.size,
+            "n": int(is_case.sum()),
+            "noise": int((~is_case).sum()),
         }
-        resampled_noise, resampled_cases = (
-            values[rng.integers(values.size, size=(_RESAMPLINGS, values.size))]
-            for values in (noise, cases)
-        )
         for rate in FALSE_ALARM_RATES:
-            (value,) = _shares_detected(noise[None], cases[None], rate)
-            low, high = np.quantile(
-                _shares_detected(resampled_noise, resampled_cases, rate), _INTERVAL
-            )
-            label = f"at {100 * rate:g} %"
-            line |= {label: float(value), f"{label}, low": low, f"{label}, high": high}
+            line |= _share_columns(records, scores, is_case, rate)
         lines.append(line)
     return pd.DataFrame(lines)
 
@@ -112,7 +111,8 @@ def roc_curves(rows: Sequence[Row]) -> pd.DataFrame:
         whether this is the threshold of the detector itself, which is score 0.
     """
     lines = []
-    for group, name, noise, cases in _list_comparisons(rows):
+    for group, name, _, scores, is_case in _list_comparisons(rows):
+        noise, cases = scores[~is_case], scores[is_case]
         thresholds = [math.inf, *np.unique(noise)[::-1], -math.inf]
         lines += [
             {
@@ -139,41 +139,41 @@ def counterpart_table(rows: Sequence[Row]) -> pd.DataFrame:
     if not mine:
         return pd.DataFrame()
     cases = {row["index"]: row for row in drawn_rows(rows)}
-    pairs = [(cases[row["index"]], row) for row in mine if row["index"] in cases]
+    pairs: list[Row] = [
+        {**row, "case": cases[row["index"]]} for row in mine if row["index"] in cases
+    ]
     noise = answered_rows([row for row in rows if row["kind"] in ("null", "counterpart")])
-    names = [
-        (
-            identification["name"],
-            {other["name"] for other in counterpart["identifications"]},
-        )
-        for case, counterpart in pairs
-        for identification in case["identifications"]
+    names: list[Row] = [
+        {"index": row["index"], "both": entry["name"] in counterpart_names}
+        for row in pairs
+        for counterpart_names in [{other["name"] for other in row["identifications"]}]
+        for entry in row["case"]["identifications"]
     ]
     return pd.DataFrame(
         [
-            share_of("false alarms: effect named on a counterpart", mine, "identifications"),
-            share_of(
+            share("false alarms: effect named on a counterpart", mine, "identifications"),
+            share(
                 "effect named on a counterpart or a null record",
                 noise,
                 "identifications",
                 Target("<= 1 %, upper bound <= 1.5 %", most=0.01, surely=0.015),
             ),
-            share_of("counterparts with any mismatch", mine, "detected"),
+            share("counterparts with any mismatch", mine, "detected"),
             share(
                 "detected with its effects, and not without them",
-                (case["detected"] and not row["detected"] for case, row in pairs),
+                pairs,
+                lambda row: row["case"]["detected"] and not row["detected"],
             ),
             share(
                 "detected with its effects, and without them too",
-                (case["detected"] and row["detected"] for case, row in pairs),
+                pairs,
+                lambda row: row["case"]["detected"] and row["detected"],
             ),
             share(
                 "detected only without its effects",
-                (row["detected"] and not case["detected"] for case, row in pairs),
+                pairs,
+                lambda row: row["detected"] and not row["case"]["detected"],
             ),
-            share(
-                "names of a case that its counterpart has too",
-                (name in counterpart_names for name, counterpart_names in names),
-            ),
+            share("names of a case that its counterpart has too", names, "both"),
         ]
     )

@@ -78,21 +78,18 @@ def injection_table(rows: Sequence[Row]) -> pd.DataFrame:
     lines = [
         share(
             f"injections of strength {CLEAR_STRENGTH:g} or more: named correctly",
-            (line["named"] for line in new if line["strength"] >= CLEAR_STRENGTH),
+            [line for line in new if line["strength"] >= CLEAR_STRENGTH],
+            "named",
         ),
         share(
             f"injections of {SURE_STRENGTH:g} times the limit in fitted noise or more: named "
             "correctly",
-            (line["named"] for line in new if (line["learned_strength"] or 0.0) >= SURE_STRENGTH),
+            [line for line in new if (line["learned_strength"] or 0.0) >= SURE_STRENGTH],
+            "named",
         ),
-        share(
-            "injection adds another name",
-            (bool(line["others"]) for line in answered_rows(differences)),
-        ),
-        share("reversing the sign adds a name", (bool(line["flipped"]) for line in differences)),
-        share("reversing time adds a name", (bool(line["reversed"]) for line in differences)),
-        share(
-            "effect already named without injection", (line["there_before"] for line in differences)
-        ),
+        share("injection adds another name", answered_rows(differences), "others"),
+        share("reversing the sign adds a name", differences, "flipped"),
+        share("reversing time adds a name", differences, "reversed"),
+        share("effect already named without injection", differences, "there_before"),
     ]
     return pd.DataFrame(lines)

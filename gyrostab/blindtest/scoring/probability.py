@@ -10,29 +10,37 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from gyrostab.blindtest.scoring.proportions import NO_TARGET, Line, Target, make_line, wilson
+from gyrostab.blindtest.scoring.proportions import (
+    NO_TARGET,
+    Line,
+    Target,
+    make_line,
+    resample,
+    share_interval,
+)
 from gyrostab.blindtest.scoring.score import drawn_rows, first_rows
 
 Row = Mapping[str, Any]
 Array = NDArray[np.float64]
 
 _GROUPS = 5  # of about equal size, in the curve and in the calibration error
-_RESAMPLINGS = 1000  # of the identifications, for intervals
+_DRAWS = 1000  # of the outcomes of exact probabilities
 _LEAST_PROBABILITY = 1e-3  # in the log score, which is infinite for a wrong certain answer
-_SEED = 0  # of the resamplings
+_SEED = 0  # of these draws
 _INTERVAL = (0.025, 0.975)
 
 
-def _collect_probabilities(rows: Sequence[Row]) -> tuple[Array, Array]:
-    """Return the probability of each identification, and 1 where its name is right."""
-    pairs = [
-        (identification["probability"], identification["exact"])
+def _collect_probabilities(rows: Sequence[Row]) -> tuple[list[Row], Array, Array]:
+    """Return each identification, its probability, and 1 where its name is right."""
+    entries: list[Row] = [
+        {**identification, "index": row["index"]}
         for row in first_rows(drawn_rows(rows))
         for identification in row["identifications"]
         if identification["probability"] is not None
     ]
+    pairs = [(entry["probability"], entry["exact"]) for entry in entries]
     stated, right = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
-    return stated, right
+    return entries, stated, right
 
 
 def _split_groups(stated: Array) -> list[NDArray[np.intp]]:
@@ -64,12 +72,14 @@ def calibration_curve(rows: Sequence[Row]) -> pd.DataFrame:
     -------
     pandas.DataFrame
         ``stated`` (mean probability of the group), ``n``, ``right``, and ``low`` and ``high``,
-        Wilson's 95 % interval.
+        the ends of its 95 % interval.
     """
-    stated, right = _collect_probabilities(rows)
+    entries, stated, right = _collect_probabilities(rows)
     lines = []
     for group in _split_groups(stated):
-        low, high = wilson(int(right[group].sum()), group.size)
+        low, high = share_interval(
+            [entries[place] for place in group], (right[group] > 0.0).tolist()
+        )
         lines.append(
             {
                 "stated": float(stated[group].mean()),
@@ -92,7 +102,7 @@ def risk_coverage(rows: Sequence[Row]) -> pd.DataFrame:
         ``coverage`` (share of the records with effects that have a name at least as probable) and
         ``risk`` (share of all such names that is wrong).
     """
-    stated, right = _collect_probabilities(rows)
+    _, stated, right = _collect_probabilities(rows)
     thresholds = np.unique(stated)[::-1]
     above = stated >= thresholds[:, None]
     records = first_rows([row for row in drawn_rows(rows) if row["kind"] != "null"])
@@ -118,11 +128,11 @@ def risk_coverage(rows: Sequence[Row]) -> pd.DataFrame:
 
 
 def probability_lines(rows: Sequence[Row]) -> list[Line]:
-    """Make the lines of the calibration, with intervals from resampled identifications.
+    """Make the lines of the calibration, with intervals from resampled records.
 
     A sample of exact probabilities has a calibration error too; a line gives its mean.
     """
-    stated, right = _collect_probabilities(rows)
+    entries, stated, right = _collect_probabilities(rows)
     scores: dict[str, tuple[Callable[[Array, Array], float], Target]] = {
         "probability of a name: expected calibration error": (
             expected_calibration_error,
@@ -139,18 +149,20 @@ def probability_lines(rows: Sequence[Row]) -> list[Line]:
             *(make_line(name, *nothing, target) for name, (_, target) in scores.items()),
             make_line(exact, *nothing, NO_TARGET),
         ]
-    rng = np.random.default_rng(_SEED)
-    chosen = rng.integers(stated.size, size=(_RESAMPLINGS, stated.size))
-    lines = []
-    for name, (score, target) in scores.items():
-        resampled = [score(stated[selection], right[selection]) for selection in chosen]
-        low, high = np.quantile(resampled, _INTERVAL)
-        lines.append(make_line(name, score(stated, right), low, high, stated.size, target))
-    outcomes = (rng.random(chosen.shape) < stated).astype(float)
+
+    def score_line(name: str, score: Callable[[Array, Array], float], target: Target) -> Line:
+        ends = resample(entries, lambda chosen: score(stated[chosen], right[chosen]))
+        return make_line(name, score(stated, right), *ends, stated.size, target)
+
+    draws = np.random.default_rng(_SEED).random((_DRAWS, stated.size))
+    outcomes = (draws < stated).astype(float)
     by_chance = [expected_calibration_error(stated, outcome) for outcome in outcomes]
     low, high = np.quantile(by_chance, _INTERVAL)
     mean = float(np.mean(by_chance))
-    return [*lines, make_line(exact, mean, low, high, stated.size, NO_TARGET)]
+    return [
+        *(score_line(name, *scored) for name, scored in scores.items()),
+        make_line(exact, mean, low, high, stated.size, NO_TARGET),
+    ]
 
 
 def _brier_score(stated: Array, right: Array) -> float:

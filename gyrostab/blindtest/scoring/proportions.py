@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 Line = dict[str, Any]
+Row = Mapping[str, Any]
+#: Key of a value of a row, or function that computes it.
+Read = str | Callable[[Row], Any]
+
+_RESAMPLINGS = 1000
+_SEED = 0  # of the resamplings
+_LEAST_RECORDS = 6  # for an interval from resampled records
 
 
 @dataclass(frozen=True)
@@ -74,10 +82,69 @@ def wilson(hits: int, total: int) -> tuple[float, float]:
     return float(interval.low), float(interval.high)
 
 
-def share_columns(key: str, hits: int, total: int) -> dict[str, float]:
-    """Make the columns of a share and of the ends of its Wilson's interval."""
-    low, high = wilson(hits, total)
-    return {key: hits / total, f"{key}_low": low, f"{key}_high": high}
+def _number_records(rows: Sequence[Row]) -> NDArray[np.intp]:
+    """Number the records of rows; rows of one ``index`` are of one record."""
+    numbers: dict[Any, int] = {}
+    keys = [
+        ("no index", place) if row.get("index") is None else row["index"]
+        for place, row in enumerate(rows)
+    ]
+    return np.array([numbers.setdefault(key, len(numbers)) for key in keys], dtype=np.intp)
+
+
+def resample(
+    rows: Sequence[Row], statistic: Callable[[NDArray[np.intp]], float]
+) -> tuple[float, float]:
+    """Compute the 95 % interval of a statistic of rows, from resampled records.
+
+    Rows of one record are not independent, and are resampled together.
+
+    Parameters
+    ----------
+    rows : sequence of dict
+    statistic : callable
+        Computes a number from the positions of resampled rows.
+    """
+    record = _number_records(rows)
+    count = np.bincount(record)
+    if count.size < _LEAST_RECORDS:
+        return -math.inf, math.inf
+    order, first = np.argsort(record, kind="stable"), np.cumsum(count) - count
+    values = []
+    for chosen in np.random.default_rng(_SEED).integers(
+        count.size, size=(_RESAMPLINGS, count.size)
+    ):
+        size = count[chosen]
+        within = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
+        values.append(statistic(order[np.repeat(first[chosen], size) + within]))
+    low, high = np.nanquantile(values, (0.025, 0.975))
+    return float(low), float(high)
+
+
+def share_interval(rows: Sequence[Row], flags: Sequence[bool]) -> tuple[float, float]:
+    """Compute the 95 % interval of a share of rows: Wilson's, if each is of another record.
+
+    Where no row, or every row, is flagged, resampling shows no scatter, and the interval is
+    Wilson's of as many records.
+    """
+    hits, total = sum(flags), len(flags)
+    records = len(set(_number_records(rows).tolist()))
+    if records == total or hits in (0, total):
+        return wilson(records * hits // max(total, 1), records)
+    outcomes = np.array(flags)
+    low, high = resample(rows, lambda chosen: float(outcomes[chosen].mean()))
+    return max(0.0, low), min(1.0, high)
+
+
+def share_columns(key: str, rows: Sequence[Row], flag: Read) -> dict[str, float]:
+    """Make the columns of a share of rows and of the ends of its interval."""
+    flags = [bool(value) for value in _read_values(rows, flag)]
+    low, high = share_interval(rows, flags)
+    return {key: sum(flags) / len(flags), f"{key}_low": low, f"{key}_high": high}
+
+
+def _read_values(rows: Sequence[Row], read: Read) -> list[Any]:
+    return [row[read] if isinstance(read, str) else read(row) for row in rows]
 
 
 def make_line(
@@ -96,54 +163,40 @@ def make_line(
     }
 
 
-def share(name: str, flags: Iterable[bool], target: Target = NO_TARGET) -> Line:
-    """Make the line of a share of cases, with Wilson's interval."""
-    outcomes = [bool(flag) for flag in flags]
-    hits, total = sum(outcomes), len(outcomes)
-    return make_line(
-        name,
-        hits / total if total else math.nan,
-        *(wilson(hits, total) if total else (math.nan, math.nan)),
-        total,
-        target,
-    )
-
-
-def share_of(
-    name: str, rows: Iterable[Mapping[str, Any]], key: str, target: Target = NO_TARGET
-) -> Line:
-    """Make the line of the share of rows in which a column is true, or not zero or empty."""
-    return share(name, (row[key] for row in rows), target)
-
-
-def median(name: str, values: Iterable[float | None], target: Target = NO_TARGET) -> Line:
-    """Make the line of a median, with its order-statistic interval."""
-    ordered = np.sort([value for value in values if value is not None and math.isfinite(value)])
-    if ordered.size == 0:
+def share(name: str, rows: Sequence[Row], flag: Read, target: Target = NO_TARGET) -> Line:
+    """Make the line of the share of rows in which a value is true, or not zero or empty."""
+    if not rows:
         return make_line(name, math.nan, math.nan, math.nan, 0, target)
-    reach = 0.98 * math.sqrt(ordered.size)
-    low, high = (
-        math.floor((ordered.size - 1) / 2 - reach),
-        math.ceil((ordered.size - 1) / 2 + reach),
-    )
-    ends = (
-        (-math.inf, math.inf)
-        if ordered.size < 6
-        else (ordered[max(0, low)], ordered[min(ordered.size - 1, high)])
-    )
-    return make_line(
-        name, float(np.median(ordered)), float(ends[0]), float(ends[1]), ordered.size, target
-    )
+    value, low, high = share_columns("share", rows, flag).values()
+    return make_line(name, value, low, high, len(rows), target)
 
 
-def spread(name: str, pulls: Iterable[float | None], target: Target = NO_TARGET) -> Line:
+def median(name: str, rows: Sequence[Row], read: Read, target: Target = NO_TARGET) -> Line:
+    """Make the line of a median of the finite values of rows."""
+    return _quantile_line(name, rows, read, 0.5, target)
+
+
+def spread(name: str, rows: Sequence[Row], read: Read, target: Target = NO_TARGET) -> Line:
     """Make the line of the 68 % quantile of normalised errors, 1 where these are right."""
-    sizes = np.abs([pull for pull in pulls if pull is not None and math.isfinite(pull)])
-    if sizes.size == 0:
+    return _quantile_line(name, rows, read, 0.6827, target, size_of=abs)
+
+
+def _quantile_line(
+    name: str,
+    rows: Sequence[Row],
+    read: Read,
+    level: float,
+    target: Target,
+    *,
+    size_of: Callable[[float], float] = float,
+) -> Line:
+    pairs = [
+        (row, size_of(value))
+        for row, value in zip(rows, _read_values(rows, read), strict=True)
+        if value is not None and math.isfinite(value)
+    ]
+    if not pairs:
         return make_line(name, math.nan, math.nan, math.nan, 0, target)
-    value = float(np.quantile(sizes, 0.6827))
-    off = 0.96 / math.sqrt(sizes.size)  # 95 % interval of the share, by the binomial law
-    low, high = (
-        float(np.quantile(sizes, min(max(0.6827 + step, 0.0), 1.0))) for step in (-off, off)
-    )
-    return make_line(name, value, low, high, sizes.size, target)
+    used, sizes = [row for row, _ in pairs], np.array([value for _, value in pairs])
+    low, high = resample(used, lambda chosen: float(np.quantile(sizes[chosen], level)))
+    return make_line(name, float(np.quantile(sizes, level)), low, high, sizes.size, target)

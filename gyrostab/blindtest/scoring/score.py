@@ -178,7 +178,7 @@ def drawn_rows(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
 
 
 def answered_rows(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Keep the rows whose diagnosis did not fail, as a failure says nothing about false names."""
+    """Keep the rows whose diagnosis did not fail: only these show that a name is absent."""
     return [row for row in rows if not row.get("failed")]
 
 

@@ -18,7 +18,6 @@ from gyrostab.blindtest.scoring.proportions import (
     at_most,
     median,
     share,
-    share_of,
     spread,
 )
 from gyrostab.blindtest.scoring.score import (
@@ -72,9 +71,9 @@ def _false_alarm_lines(rows: Sequence[Row]) -> list[Line]:
     nulls = answered_rows([row for row in rows if row["kind"] == "null"])
     target = Target("<= 1 %, upper bound <= 2 %", most=0.01, surely=0.02)
     return [
-        share_of("false alarms: effect named on a null record", nulls, "identifications", target),
-        share_of("null records with any mismatch", nulls, "detected"),
-        share("failed diagnoses", (row.get("failed", False) for row in first_rows(rows))),
+        share("false alarms: effect named on a null record", nulls, "identifications", target),
+        share("null records with any mismatch", nulls, "detected"),
+        share("failed diagnoses", first_rows(rows), lambda row: row.get("failed")),
     ]
 
 
@@ -85,21 +84,22 @@ def _naming_lines(rows: Sequence[Row]) -> list[Line]:
     shown = [row for row in single if (row.get("learned_strength") or 0.0) >= CLEAR_STRENGTH]
     sure = [row for row in catalogue_rows(rows) if _is_sure(row)]
     claimed = [row for row in clear if row["set_size"]]
+    hidden = [row for row in clear if row["kind"] == "sub_threshold"]
     percent = at_least(0.95)
     return [
-        share_of(
+        share(
             "effects of a form that the diagnosis does not fit",
             catalogue_rows(rows),
             "form_differs",
             at_least(0.33),
         ),
-        share_of("detected, strength 1.5 or more", clear, "detected", percent),
-        share_of("detected, single effects", single, "detected"),
-        share_of("detected, single effects of that strength with fitted noise", shown, "detected"),
-        share_of(
+        share("detected, strength 1.5 or more", clear, "detected", percent),
+        share("detected, single effects", single, "detected"),
+        share("detected, single effects of that strength with fitted noise", shown, "detected"),
+        share(
             "detected, 3 times the limit in fitted noise or more", sure, "detected", at_least(0.97)
         ),
-        share_of(
+        share(
             "named correctly, 3 times the limit in fitted noise or more",
             sure,
             "named",
@@ -107,38 +107,35 @@ def _naming_lines(rows: Sequence[Row]) -> list[Line]:
         ),
         share(
             "both effects of a pair named correctly, each of that strength",
-            (all(row["named"] for row in pair) for pair in _sure_pairs(rows)),
+            _sure_pairs(rows),
+            "named",
             at_least(0.80),
         ),
-        share_of("named correctly, of the detected (sets merged)", detected, "named", percent),
+        share("named correctly, of the detected (sets merged)", detected, "named", percent),
         share(
-            "named correctly, single effects",
-            (row["named"] for row in single if row["detected"]),
+            "named correctly, single effects", [row for row in single if row["detected"]], "named"
         ),
         share(
             "named correctly, in pairs and triples",
-            (row["named"] for row in detected if row["kind"] in ("pair", "triple")),
+            [row for row in detected if row["kind"] in ("pair", "triple")],
+            "named",
         ),
-        share_of("named exactly, of the detected", detected, "named_exactly"),
+        share("named exactly, of the detected", detected, "named_exactly"),
         share(
             "named exactly where the form differs",
-            (row["named_exactly"] for row in detected if row["form_differs"]),
+            [row for row in detected if row["form_differs"]],
+            "named_exactly",
         ),
-        share_of("cases with a wrong name", answered_rows(first_rows(clear)), "wrong"),
-        share_of("truth in the ambiguity set", claimed, "in_set", at_least(0.97)),
+        share("cases with a wrong name", answered_rows(first_rows(clear)), "wrong"),
+        share("truth in the ambiguity set", claimed, "in_set", at_least(0.97)),
         median(
             "size of the ambiguity set, median",
-            (row["set_size"] for row in claimed),
+            claimed,
+            "set_size",
             Target("<= 1.5", most=1.5),
         ),
-        share(
-            "sub-threshold: detected",
-            (row["detected"] for row in clear if row["kind"] == "sub_threshold"),
-        ),
-        share(
-            "sub-threshold: named correctly",
-            (row["named"] for row in clear if row["kind"] == "sub_threshold"),
-        ),
+        share("sub-threshold: detected", hidden, "detected"),
+        share("sub-threshold: named correctly", hidden, "named"),
     ]
 
 
@@ -146,13 +143,17 @@ def _is_sure(row: Row) -> bool:
     return bool((row.get("learned_strength") or 0.0) >= SURE_STRENGTH)
 
 
-def _sure_pairs(rows: Sequence[Row]) -> list[list[Row]]:
-    """Return the rows of each pair of strong effects."""
+def _sure_pairs(rows: Sequence[Row]) -> list[Row]:
+    """Return a row for each pair of strong effects, ``named`` if both are."""
     pairs: dict[Any, list[Row]] = {}
     for row in rows:
         if row["kind"] == "pair":
             pairs.setdefault(row["index"], []).append(row)
-    return [pair for pair in pairs.values() if all(_is_sure(row) for row in pair)]
+    return [
+        {**pair[0], "named": all(row["named"] for row in pair)}
+        for pair in pairs.values()
+        if all(_is_sure(row) for row in pair)
+    ]
 
 
 def _out_of_catalogue_lines(rows: Sequence[Row]) -> list[Line]:
@@ -163,9 +164,9 @@ def _out_of_catalogue_lines(rows: Sequence[Row]) -> list[Line]:
     ]
     detected = [row for row in strange if row["detected"]]
     return [
-        share_of("out of catalogue: detected", strange, "detected"),
-        share_of("out of catalogue: unidentified", detected, "unidentified", at_least(0.90)),
-        share_of("out of catalogue: wrong name", detected, "wrong", at_most(0.05)),
+        share("out of catalogue: detected", strange, "detected"),
+        share("out of catalogue: unidentified", detected, "unidentified", at_least(0.90)),
+        share("out of catalogue: wrong name", detected, "wrong", at_most(0.05)),
     ]
 
 
@@ -176,7 +177,7 @@ def _degraded_driver_lines(rows: Sequence[Row]) -> list[Line]:
         for lost in (True, False)
     )
     return [
-        share_of(
+        share(
             "driver withheld or substituted: wrong name",
             answered_rows(gone),
             "wrong",
@@ -184,86 +185,94 @@ def _degraded_driver_lines(rows: Sequence[Row]) -> list[Line]:
         ),
         share(
             "driver withheld or substituted: unidentified, if detected",
-            (row["unidentified"] for row in gone if row["detected"]),
+            [row for row in gone if row["detected"]],
+            "unidentified",
             at_least(0.90),
         ),
-        share_of(
+        share(
             "driver lagged, noisy, clipped or confounded: wrong name", answered_rows(bent), "wrong"
         ),
-        share_of("driver lagged, noisy, clipped or confounded: named correctly", bent, "named"),
+        share("driver lagged, noisy, clipped or confounded: named correctly", bent, "named"),
     ]
 
 
 def _parameter_lines(rows: Sequence[Row]) -> list[Line]:
     clear = catalogue_rows(rows, min_strength=CLEAR_STRENGTH)
-    scores = [(row, number) for row in clear for number in row["parameter_scores"]]
-    coverage = Target("92-98 %", least=0.92, most=0.98)
+    scores: list[Row] = [{**row, **entry} for row in clear for entry in row["parameter_scores"]]
+    pulls = [entry for entry in scores if entry["pull"] is not None]
     named_cases = {row["index"] for row in rows if row.get("named")}
-    known = [row for row in first_rows(clear) if row["index"] in named_cases and _has_gain(row)]
-    gains = [(row["gain"] / row["oracle"], _all_named(row, rows)) for row in known]
-    learned = [row["gain"] / row["learned"] for row in known if row.get("learned", 0.0) > 0]
-    covered = [number["covered"] for row, number in scores if row["effect"] != "shared_source"]
+    known: list[Row] = [
+        {**row, "relative": row["gain"] / row["oracle"]}
+        for row in first_rows(clear)
+        if row["index"] in named_cases and row["oracle"] > 0 and math.isfinite(row["gain"])
+    ]
     return [
         median(
             "overlap in time (IoU), median",
-            (row["iou"] for row in clear),
+            clear,
+            "iou",
             Target(">= 0.7", least=0.7),
         ),
         share(
             "averaging times overlap",
-            (row["tau_hit"] for row in clear if row["tau_hit"] is not None),
+            [row for row in clear if row["tau_hit"] is not None],
+            "tau_hit",
         ),
         share(
             "95 % intervals that contain the truth",
-            (number["covered"] for _, number in scores),
-            coverage,
+            scores,
+            "covered",
+            Target("92-98 %", least=0.92, most=0.98),
         ),
         share(
             "of those, form as fitted",
-            (number["covered"] for row, number in scores if not row["form_differs"]),
+            [entry for entry in scores if not entry["form_differs"]],
+            "covered",
         ),
-        share("of those, without shared_source", covered),
+        share(
+            "of those, without shared_source",
+            [entry for entry in scores if entry["effect"] != "shared_source"],
+            "covered",
+        ),
         *(
             share(
                 f"errors within the {level} % interval of a normal law",
-                (
-                    abs(number["pull"]) <= sigma
-                    for _, number in scores
-                    if number["pull"] is not None
-                ),
+                [{**entry, "within": abs(entry["pull"]) <= sigma} for entry in pulls],
+                "within",
             )
             for level, sigma in _NORMAL_INTERVALS.items()
         ),
         spread(
             "errors in standard errors, 68 % quantile",
-            (number["pull"] for _, number in scores),
+            scores,
+            "pull",
             Target("0.8-1.25", 0.8, 1.25),
         ),
         median(
             "evidence relative to the oracle, median",
-            (gain for gain, _ in gains),
+            known,
+            "relative",
             Target("0.9-1.2", least=0.9, most=1.2),
         ),
         median(
             "evidence relative to the oracle, all effects named correctly, median",
-            (gain for gain, all_named in gains if all_named),
+            [row for row in known if _all_named(row, rows)],
+            "relative",
         ),
         median(
             "evidence relative to the oracle with fitted noise, median",
-            learned,
+            [row for row in known if row.get("learned", 0.0) > 0],
+            lambda row: row["gain"] / row["learned"],
             Target(">= 0.9", least=0.9),
         ),
-        share("evidence at least 0.7 of the oracle", (gain >= 0.7 for gain, _ in gains)),
+        share("evidence at least 0.7 of the oracle", known, lambda row: row["relative"] >= 0.7),
         median(
             "held-out values inside the 95 % band, median",
-            (row["coverage_after"] for row in first_rows(rows)),
+            first_rows(rows),
+            "coverage_after",
             Target("93-97 %", 0.93, 0.97),
         ),
     ]
-
-
-def _has_gain(row: Row) -> bool:
-    return bool(row["oracle"] > 0 and math.isfinite(row["gain"]))
 
 
 def _all_named(row: Row, rows: Sequence[Row]) -> bool:
@@ -275,15 +284,17 @@ def _all_named(row: Row, rows: Sequence[Row]) -> bool:
 
 def _model_lines(rows: Sequence[Row]) -> list[Line]:
     """Make the lines of the models that the diagnoses wrote, if they have an effect."""
-    checks = [row["model_check"] for row in first_rows(rows) if row.get("model_check")]
+    checked = [row for row in first_rows(rows) if row.get("model_check")]
     return [
         share(
             "models that can be simulated, of those with an effect",
-            (check["runs"] for check in checks),
+            checked,
+            lambda row: row["model_check"]["runs"],
         ),
         share(
             "simulated records nearer to the recording with the effects, without refit",
-            (check["runs"] and check["nats"] > 0.0 for check in checks),
+            checked,
+            lambda row: row["model_check"]["runs"] and row["model_check"]["nats"] > 0.0,
             at_least(0.95),
         ),
     ]
@@ -297,11 +308,12 @@ def _baseline_lines(rows: Sequence[Row]) -> list[Line]:
     lines = [
         share(
             label.format(name),
-            (
-                row["baseline_detectors"][name] > 0.0
+            [
+                {**row, "detected": row["baseline_detectors"][name] > 0.0}
                 for row in part
                 if name in row["baseline_detectors"]
-            ),
+            ],
+            "detected",
         )
         for label, part in (
             ("detected by the {}, strength 1.5 or more", clear),
@@ -313,7 +325,8 @@ def _baseline_lines(rows: Sequence[Row]) -> list[Line]:
         lines.append(
             median(
                 f"seconds per case at {rate:g} Hz, median",
-                (row["seconds"] for row in first_rows(rows) if row["rate"] == rate),
+                [row for row in first_rows(rows) if row["rate"] == rate],
+                "seconds",
             )
         )
     return lines
