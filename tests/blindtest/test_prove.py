@@ -19,9 +19,10 @@ import xarray as xr
 
 import gyrostab
 from gyrostab.blindtest.runner.benchmark import Proof
-from gyrostab.blindtest.runner.folder import FIRST_PUBLIC_SEED, case_name, read_sums
+from gyrostab.blindtest.runner.folder import FIRST_PUBLIC_SEED, begin_run, case_name, read_sums
 from gyrostab.blindtest.runner.outcome import page_text, score_rows
 from gyrostab.blindtest.runner.pool import run_in_processes
+from gyrostab.blindtest.runner.steps import draw_case
 from gyrostab.blindtest.scenarios.plan import plan_case
 from gyrostab.blindtest.scoring.table import score_table
 from gyrostab.errors import FormatError, OptionError, OutputError, ResumeError, WorkerError
@@ -428,6 +429,48 @@ def test_folder_with_foreign_files_is_never_emptied(tmp_path):
         with pytest.raises(OutputError, match=r"thesis\.tex"):
             gyrostab.prove(tmp_path, cases=1, **options)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def damage_marker(folder: Path) -> None:
+    (folder / "benchmark.json").write_text("{")
+
+
+def stop_while_drawing(folder: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gyrostab.blindtest.scenarios.commitment.commit_case", os.remove)
+        patch.setattr(shutil, "rmtree", lambda *path, **options: None)  # the process was killed
+        with pytest.raises(TypeError):
+            draw_case(folder, case_name(1, 9), small_plans(1, seed=1)[0])
+    assert list(folder.glob(".*.part"))
+
+
+def stop_while_replacing(folder: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gyrostab.blindtest.runner.folder._remove_path", stop_at_table)
+        with pytest.raises(Stopped):
+            replace_run(folder)
+
+
+def replace_run(folder: Path) -> None:
+    begin_run(folder, {}, {**core._DEFAULTS, "seed": 2}, resume=False, overwrite=True)
+
+
+def stop_at_table(path: Path) -> None:
+    if path.name == "table.md":
+        raise Stopped
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+@pytest.mark.parametrize("break_off", [damage_marker, stop_while_drawing, stop_while_replacing])
+def test_broken_run_can_be_replaced(finished, tmp_path, break_off):
+    folder = shutil.copytree(finished[0], tmp_path / "proof")
+    break_off(folder)
+    (folder / "thesis.tex").write_text("years of work")
+    with pytest.raises(OutputError, match=r"thesis\.tex"):
+        replace_run(folder)
+    (folder / "thesis.tex").unlink()
+    replace_run(folder)
+    assert {path.name for path in folder.rglob("*") if path.is_file()} == {"lock", "benchmark.json"}
 
 
 def test_overwrite_replaces_the_run(small, tmp_path, monkeypatch):

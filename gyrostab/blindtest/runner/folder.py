@@ -177,7 +177,8 @@ def begin_run(
             write_json(directory / "benchmark.json", previous)
         return previous
     directory.mkdir(exist_ok=True)
-    for item in directory.iterdir():
+    # benchmark.json last, as it shows that the rest may be replaced if this is interrupted
+    for item in sorted(directory.iterdir(), key=lambda item: item.name == "benchmark.json"):
         if item.name != "lock":
             _remove_path(item)
     for name in _FOLDERS:
@@ -233,11 +234,20 @@ def _check_is_empty(directory: Path, *, overwrite: bool) -> None:
 
 
 def find_foreign_file(directory: Path) -> str | None:
-    """Find an item in a folder that is not part of a benchmark; None without such an item."""
-    content = read_json(directory / "benchmark.json")
-    ours = isinstance(content, dict) and str(content.get("schema")).startswith("gyrostab.prove/")
+    """Find an item in a folder that is not part of a benchmark; None without such an item.
+
+    A damaged ``benchmark.json`` is that of a benchmark.
+    """
+    marker = directory / "benchmark.json"
+    content = read_json(marker)
+    ours = marker.is_file() and (
+        content is None
+        or (isinstance(content, dict) and str(content.get("schema")).startswith("gyrostab.prove/"))
+    )
     for path in sorted(directory.rglob("*")):
         place = path.relative_to(directory)
+        if ours and any(is_leftover(part) for part in place.parts):
+            continue
         if path.is_symlink() or not (path.is_file() or place.as_posix() in _FOLDERS):
             return str(place)
         is_known = is_lock(path) if str(place) == "lock" else ours and _is_of_benchmark(place)
@@ -247,8 +257,6 @@ def find_foreign_file(directory: Path) -> str | None:
 
 
 def _is_of_benchmark(place: Path) -> bool:
-    if is_leftover(place.name):
-        return True
     return (
         place.name in _FILES
         if len(place.parts) == 1

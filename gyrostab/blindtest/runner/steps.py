@@ -29,7 +29,7 @@ def draw_case(directory: Path, name: str, plan: dict[str, Any], real: Path | Non
     truth = directory / "truth" / f"{name}.json"
     if truth.exists():  # written after the recording
         return fingerprint(truth.read_text(encoding="utf-8"))
-    part = directory / f".{name}.part"
+    part = directory / f".{name}.gyrostab-{name[:8]}.part"
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir()
     try:
