@@ -4,7 +4,7 @@ A mean of known shape, in noise of known density S(f), changes the log-likelihoo
 ``1/2 sum |M(f)|^2 / S(f)``; the limit is where that equals `NATS`. In white noise, for a mean that
 is present for T_on of T, this gives ``a_min = N_s sqrt(2 c / T_eff)``. A change of the log variance
 by v in n samples is worth ``n v^2 / 4``, hence ``2 sqrt(c / n)``; noise common to the axes is worth
-``n / 2 sum of rho^2``.
+about ``n / 2 sum of rho^2``, and more if it is not white.
 
 For a real recording (`Scenario.measured`) the measured noise takes the place of the known one: S(f)
 is its spectrum, lines included; a change of level counts only in the share of white noise in each
@@ -31,6 +31,8 @@ Array = NDArray[np.float64]
 
 #: Log-likelihood at the limit.
 NATS = 5.7
+#: Evidence of one sample that noise alone cannot produce [nats].
+NATS_PER_SAMPLE = math.log(1e3)
 _SPECTRUM_BANDS = 400  # of the spectrum
 _MAX_WHITE_SHARE = 2.0  # of a level; above 1 only because both are estimates
 
@@ -138,8 +140,28 @@ def learned_random_nats(
     )
 
 
+def filtered_density(scenario: Scenario, gain: Array) -> Array:
+    """Compute the density [(deg/h)2/Hz] (axis, frequency) of N behind a filter, and of Q.
+
+    The angle is quantized after the filter.
+
+    Parameters
+    ----------
+    gain : ndarray, shape (frequency,)
+        Power gain at frequencies that divide (0, rate / 2) equally.
+    """
+    f = (np.arange(gain.size) + 0.5) / gain.size * scenario.rate / 2
+    return np.stack(
+        [
+            floor_psd(f, noise={"N": noise["N"]}, rate=scenario.rate) * gain
+            + floor_psd(f, noise={"Q": noise["Q"]}, rate=scenario.rate)
+            for noise in scenario.noise
+        ]
+    )
+
+
 def learned_filter_nats(scenario: Scenario, gain: Array) -> float:
-    """Compute the evidence expected for a filter of all noise over fitted white noise and Q [nats].
+    """Compute the evidence expected for a filter over fitted white noise and Q [nats].
 
     To first order a short filter takes away what a smaller Q takes away. A filter of weight a is
     therefore seen only where Q has less than about 2 a of the variance of a sample.
@@ -150,16 +172,11 @@ def learned_filter_nats(scenario: Scenario, gain: Array) -> float:
         Power gain at frequencies that divide (0, rate / 2) equally.
     """
     f = (np.arange(gain.size) + 0.5) / gain.size * scenario.rate / 2
+    terms = np.stack([floor_psd(f, noise={term: 1.0}, rate=scenario.rate) for term in "NQ"])
     count = float((~scenario.missing).sum())
     return sum(
-        _filter_divergence(
-            floor_psd(f, noise={term: noise.get(term, 0.0) for term in "NQ"}, rate=scenario.rate)
-            * gain,
-            np.stack([floor_psd(f, noise={term: 1.0}, rate=scenario.rate) for term in "NQ"]),
-        )
-        * count
-        / 2
-        for noise in scenario.noise
+        _filter_divergence(density, terms) * count / 2
+        for density in filtered_density(scenario, gain)
     )
 
 
@@ -301,14 +318,32 @@ def variance_nats(scenario: Scenario, ratio: Array, *, quiescent: bool = True) -
     return float((weight * (ratio - 1 - np.log(ratio))).sum()) / 2
 
 
-def shared_size(scenario: Scenario, correlations: Array) -> float:
-    """Compute the size of common white noise from the correlations of the pairs xy, xz, yz."""
-    n = float((~scenario.missing).sum())
-    worth = np.asarray(correlations) ** 2
-    if scenario.measured is not None:  # the coherence falls where an axis has more than white noise
+def shared_size(scenario: Scenario, shares: Array, power: Array) -> float:
+    """Compute the size of noise of one source in the white noise of the axes, of unchanged level.
+
+    In known noise this is the Gaussian divergence from independent white noise. In measured noise
+    only the coherence of the axes counts, which falls where an axis has more than white noise.
+
+    Parameters
+    ----------
+    shares : ndarray, shape (axis,)
+        Correlation of each axis with the source.
+    power : ndarray, shape (frequency,)
+        Density of the source, with mean 1, at frequencies that divide (0, rate / 2) equally, a
+        multiple of `BANDS`.
+    """
+    square = shares**2
+    if scenario.measured is None:
+        joint = np.log1p(power * (square / (1 - square)).sum()).mean()
+        worth = -float(np.log1p(-square).sum() + joint)
+    else:
         part = white_shares(scenario)
-        worth = worth * np.array([(part[i] * part[j]).mean() for i, j in ((0, 1), (0, 2), (1, 2))])
-    return math.sqrt(n * float(worth.sum()) / 2 / NATS)
+        coherent = (power**2).reshape(BANDS, -1).mean(axis=1)
+        worth = sum(
+            float(square[i] * square[j] * (part[i] * part[j] * coherent).mean())
+            for i, j in ((0, 1), (0, 2), (1, 2))
+        )
+    return math.sqrt(float((~scenario.missing).sum()) * max(worth, 0.0) / 2 / NATS)
 
 
 def amplitude_for(

@@ -9,15 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.blindtest.generator import loop
-from gyrostab.blindtest.generator.detection_limits import NATS
+from gyrostab.blindtest.generator.detection_limits import NATS, NATS_PER_SAMPLE
 from gyrostab.blindtest.generator.noise_floor import white_level
 from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario
 from gyrostab.blindtest.generator.shapes import make_variance_effect
 
 Array = NDArray[np.float64]
-
-#: Evidence of one sample that noise alone cannot produce [nats].
-_NATS_PER_SAMPLE = math.log(1e3)
 
 
 def _sample_sd(scenario: Scenario, axis: int) -> float:
@@ -25,7 +22,10 @@ def _sample_sd(scenario: Scenario, axis: int) -> float:
 
 
 def rate_quantization(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
-    """Draw a rate that is rounded or truncated to steps, sized by the white noise the steps add."""
+    """Draw a rate that is rounded or truncated to steps, sized by the white noise the steps add.
+
+    Every sample is on the grid of the steps, which shows them at any size.
+    """
     cut = rng.random() < 0.5
     sd = np.array([_sample_sd(scenario, i) for i in range(len(AXES))])
     effect, step = make_variance_effect(
@@ -47,19 +47,13 @@ def rate_quantization(scenario: Scenario, rng: np.random.Generator, *, strength:
     return replace(effect, after=after, parameters={"step": {"value": step, "unit": "deg/h"}})
 
 
-def _count_stuck_samples(strength: float) -> int:
-    """Compute the number of impossible samples that gives an effect its strength."""
-    return max(2, math.ceil(NATS * strength**2 / _NATS_PER_SAMPLE))
-
-
 def dead_zone(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
     """Draw a closed loop that holds rates near zero at zero, on one axis at zero mean rate."""
     axis = int(rng.integers(3))
-    number = _count_stuck_samples(strength)
-    present = float((~scenario.missing).sum())
+    share = NATS * strength**2 / NATS_PER_SAMPLE / float((~scenario.missing).sum())
     width = (
-        number / present * _sample_sd(scenario, axis) * math.sqrt(math.pi / 2)
-    )  # expected number of normal samples within +- width
+        share * _sample_sd(scenario, axis) * math.sqrt(math.pi / 2)
+    )  # expected share of normal samples within +- width
 
     def after(record: Array) -> Array:
         out = record.copy()
@@ -85,24 +79,22 @@ def dead_zone(scenario: Scenario, rng: np.random.Generator, *, strength: float) 
 def clipping(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
     """Draw a range that clips one axis on one side or both, with a hard edge or a soft knee."""
     axis = int(rng.integers(3))
-    number = _count_stuck_samples(strength)
+    number = max(1, round(NATS * strength**2 / NATS_PER_SAMPLE))
     is_two_sided, soft = bool(rng.random() < 0.5), bool(rng.random() < 0.4)
 
     def after(record: Array) -> Array:
-        out = record.copy()
-        row = np.where(scenario.missing, np.nan, record[axis])
-        ends = np.nanquantile(
-            row, [number / 2 / row.size, 1 - number / (2 if is_two_sided else 1) / row.size]
-        )
-        low = ends[0] if is_two_sided else -np.inf
+        row = record[axis]
+        present = row[np.isfinite(row) & ~scenario.missing]
+        below = number // 2 if is_two_sided else 0
+        ordered, above = np.sort(present), present.size - (number - below)
+        low = ordered[below - 1 : below + 1].mean() if below else -np.inf
+        high = ordered[above - 1 : above + 1].mean()
         if soft:  # compress the last tenth of a standard deviation before the limit
-            knee = 0.1 * _sample_sd(scenario, axis)
-            row = np.where(
-                row > ends[1] - knee,
-                ends[1] - knee / 2 + (row - ends[1] + knee) / 2 - knee / 2,
-                row,
-            )
-        out[axis] = np.clip(row, low, ends[1])
+            bend = high - 0.1 * _sample_sd(scenario, axis)
+            row = np.where(row > bend, (row + bend) / 2, row)
+            high = (high + bend) / 2
+        out = record.copy()
+        out[axis] = np.clip(row, low, high)
         return out
 
     return Effect(
@@ -112,8 +104,8 @@ def clipping(scenario: Scenario, rng: np.random.Generator, *, strength: float) -
         form=("on both sides" if is_two_sided else "above")
         + (", with a soft knee" if soft else ""),
         form_differs=soft,
-        size=strength,
-        nats=NATS * strength**2,
+        size=math.sqrt(number * NATS_PER_SAMPLE / NATS),
+        nats=number * NATS_PER_SAMPLE,
         tau=(1 / scenario.rate, 10 / scenario.rate),
         after=after,
     )

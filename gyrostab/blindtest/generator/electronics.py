@@ -10,13 +10,17 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.signal import lfilter
 
-from gyrostab.blindtest.generator import light, loop, telemetry
+from gyrostab.blindtest.generator import loop, telemetry
 from gyrostab.blindtest.generator.detection_limits import (
     NATS,
+    NATS_PER_SAMPLE,
+    amplitude_for,
+    filtered_density,
     learned_filter_nats,
     shared_size,
 )
 from gyrostab.blindtest.generator.environment import lag
+from gyrostab.blindtest.generator.measured_noise import BANDS
 from gyrostab.blindtest.generator.noise_floor import white_level
 from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario, to_samples
 from gyrostab.blindtest.generator.shapes import (
@@ -29,6 +33,9 @@ from gyrostab.blindtest.generator.shapes import (
 )
 
 Array = NDArray[np.float64]
+
+_FREQUENCIES = 200 * BANDS  # of the spectrum of a source
+_MAX_SHARE = math.sqrt(0.8)  # of a source in the noise of an axis, as an amplitude
 
 
 def spectral_line(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
@@ -145,42 +152,36 @@ def feedback_reset(scenario: Scenario, rng: np.random.Generator, *, strength: fl
         form_differs=True,
         tau=(1 / scenario.rate, 2 / resets),
         ramp=phase,
-        also_accepted=("dead_zone",) if rate < 0.2 else (),
     )
+
+
+def _low_pass(frequency: Array, corner: float) -> Array:
+    """Compute the power gain at frequencies, like `corner` in units of the Nyquist frequency."""
+    return np.asarray(1 / (1 + (frequency / corner) ** 4))
 
 
 def _low_passed(rng: np.random.Generator, size: int, *, corner: float) -> Array:
-    lines = fft.rfft(rng.standard_normal(size)) / np.sqrt(
-        1 + (np.arange(size // 2 + 1) / (corner * size / 2)) ** 4
-    )
+    frequency = np.arange(size // 2 + 1) / (size / 2)
+    lines = fft.rfft(rng.standard_normal(size)) * np.sqrt(_low_pass(frequency, corner))
     common = fft.irfft(lines, size)
     return np.asarray(common / common.std())
-
-
-def _level_below(corner: float) -> float:
-    """Compute the amplitude of `_low_passed` noise far below its corner, where it acts as N."""
-    f = (np.arange(4000) + 0.5) / 4000
-    return float(1 / np.sqrt(np.mean(1 / (1 + (f / corner) ** 4))))
 
 
 def shared_source(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
     """Draw excess noise of one source in all axes; no single axis shows it."""
     coloured = rng.random() < 0.5
-    corner = rng.uniform(0.3, 0.8) if coloured else 1.0
+    corner = rng.uniform(0.3, 0.8) if coloured else math.inf
     shares = rng.choice([-1.0, 1.0], 3) * rng.uniform(0.6, 1.0, 3)
     if rng.random() < 0.3:
         shares[rng.integers(3)] = 0.0
-    pairs = np.array([shares[0] * shares[1], shares[0] * shares[2], shares[1] * shares[2]])
-    rho = min(strength / shared_size(scenario, pairs), 0.8)
-    shares = shares * math.sqrt(rho)
-    common = (
-        _low_passed(rng, scenario.size, corner=corner)
-        if coloured
-        else rng.standard_normal(scenario.size)
-    )
-    below = _level_below(corner) if coloured else 1.0
-    independent = np.stack([rng.standard_normal(scenario.size) for _ in AXES])
-    size = shared_size(scenario, rho * pairs)
+    power = _low_pass((np.arange(_FREQUENCIES) + 0.5) / _FREQUENCIES, corner)
+    power /= power.mean()
+
+    def size_of(level: float) -> float:
+        return shared_size(scenario, min(level, _MAX_SHARE) * shares, power)
+
+    shares = shares * min(amplitude_for(size_of, strength, first=1e-2), _MAX_SHARE)
+    size = shared_size(scenario, shares, power)
     return Effect(
         name="shared_source",
         axes=axes_with_share(shares),
@@ -192,13 +193,15 @@ def shared_source(scenario: Scenario, rng: np.random.Generator, *, strength: flo
         size=size,
         nats=NATS * size**2,
         tau=(1 / scenario.rate, 30.0),
-        white=light.share_source(independent, common, shares=shares),
-        common=shares[:, None] * common,
+        common=shares[:, None] * _low_passed(rng, scenario.size, corner=corner),
         parameters={
-            "correlation": {"value": float(np.abs(rho * pairs).max()), "unit": "1"},
-            "N": {
+            "correlation": {
+                "value": float(np.abs(np.triu(np.outer(shares, shares), 1)).max()),
+                "unit": "1",
+            },
+            "N": {  # far below the corner
                 "values": {
-                    a: abs(float(r)) * n["N"] * below
+                    a: abs(float(r)) * n["N"] * math.sqrt(power[0])
                     for a, r, n in zip(AXES, shares, scenario.noise, strict=True)
                     if r
                 },
@@ -221,16 +224,16 @@ def logger_filter(scenario: Scenario, rng: np.random.Generator, *, strength: flo
         }[kind]
 
     f = (np.arange(200) + 0.5) / 200 * math.pi
+    unfiltered = filtered_density(scenario, np.ones(f.size))
 
     def power_gain(a: float) -> Array:
         response = np.exp(-1j * f[:, None] * np.arange(taps(a).size)) @ taps(a)
         return np.asarray(np.maximum(np.abs(response) ** 2, 1e-12))
 
     def ratio(a: float) -> Array:
-        gain = power_gain(a)
-        return np.asarray(
-            np.tile(gain / np.exp(np.log(gain).mean()), (3, 1, 1))
-        )  # the level before the filter is unknown
+        change = filtered_density(scenario, power_gain(a)) / unfiltered
+        mean = np.exp(np.log(change).mean(axis=1, keepdims=True))
+        return np.asarray((change / mean)[:, None, :])  # the level before the filter is unknown
 
     effect, amplitude = make_variance_effect(
         scenario,
@@ -315,19 +318,12 @@ def spikes(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> 
 
 def held_samples(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
     """Draw repeated frames or samples; few suffice, as noise alone never repeats a value."""
-    frame = max(3, int(rng.uniform(0.05, 0.4) * scenario.rate))
+    samples = max(1, round(NATS * strength**2 / NATS_PER_SAMPLE))
+    number = max(1, round(samples / max(3, int(rng.uniform(0.05, 0.4) * scenario.rate))))
+    frame = max(1, round(samples / number))
     hold = bool(rng.random() < 0.6)
-    number = max(1, min(round(NATS / math.log(1e3) * strength**2) + 1, scenario.size // frame // 8))
-    seed = int(rng.integers(2**31))
-    pairs = number * (frame if hold else 1)
-    starts = telemetry.repeat_frames(
-        np.random.default_rng(seed),
-        np.zeros((1, scenario.size)),
-        number=number,
-        frame=frame,
-        hold=hold,
-    )[1]
-    starts = starts[~scenario.missing[starts]]
+    starts = telemetry.choose_frames(rng, scenario.missing, number=number, frame=frame)
+    nats = starts.size * frame * NATS_PER_SAMPLE
     hours = float((~scenario.missing).sum()) / scenario.rate / 3600.0
     held = {
         "per_hour": {"value": starts.size / hours, "unit": "1/h"},
@@ -337,14 +333,12 @@ def held_samples(scenario: Scenario, rng: np.random.Generator, *, strength: floa
         name="held_samples",
         axes=AXES,
         driver=None,
-        form=f"{number} frames of {frame} samples " + ("held" if hold else "sent twice"),
+        form=f"{starts.size} frames of {frame} samples " + ("held" if hold else "sent twice"),
         form_differs=not hold,
-        size=strength,
-        nats=float(pairs) * math.log(1e3),
+        size=math.sqrt(nats / NATS),
+        nats=nats,
         tau=(1 / scenario.rate, 2 * frame / scenario.rate),
-        after=lambda record: telemetry.repeat_frames(
-            np.random.default_rng(seed), record, number=number, frame=frame, hold=hold
-        )[0],
+        after=lambda record: telemetry.repeat_frames(record, starts, frame=frame, hold=hold),
         parameters={
             "number": {"value": int(starts.size), "unit": "1"},
             "frame": {"value": frame, "unit": "1"},

@@ -1,4 +1,4 @@
-"""Noise from light: shot, thermal and excess noise, loss of light, and a shared source."""
+"""Noise from light: shot, thermal and excess noise, and loss of light."""
 
 from __future__ import annotations
 
@@ -92,31 +92,4 @@ def loss_db(
     warm = np.asarray(temperature) - 40.0
     return np.asarray(
         per_kelvin * warm + curvature * warm**2 + per_hour * np.asarray(hours) ** power
-    )
-
-
-def share_source(independent: Array, common: Array, *, shares: Array) -> Array:
-    """Replace a part of each axis's white noise by that of a common source, at unchanged level.
-
-    Parameters
-    ----------
-    independent : ndarray, shape (axis, time)
-        Independent noise of the axes, any unit.
-    common : ndarray, shape (time,)
-        Noise of the source, of unit variance.
-    shares : ndarray, shape (axis,)
-        Correlation of each axis with the source, between -1 and 1; the sign is that of its
-        modulation.
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(0)
-    >>> independent, common = rng.normal(size=(2, 100_000)), rng.normal(size=100_000)
-    >>> noise = share_source(independent, common, shares=np.array([0.5, -0.5]))
-    >>> round(float(np.corrcoef(noise)[0, 1]), 2)
-    -0.25
-    """
-    level = independent.std(axis=1, keepdims=True)
-    return np.asarray(
-        np.sqrt(1 - shares**2)[:, None] * independent + shares[:, None] * level * common
     )

@@ -47,14 +47,12 @@ def draw_base_noise(
 ) -> Array:
     """Draw the base noise (axis, time) [deg/h], with the white noise that the effects imply."""
     rows = []
-    instead = next((effect.white for effect in effects if effect.white is not None), None)
     for i, noise in enumerate(scenario.noise):
         white = rng.standard_normal(scenario.size)
-        white = (
-            (white if instead is None else instead[i])
-            * floor.white_level(noise["N"])
-            * math.sqrt(scenario.rate)
-        )
+        for effect in effects:
+            if effect.common is not None:  # in place of as much of the noise of the axis
+                white = math.sqrt(1 - effect.common[i].var()) * white + effect.common[i]
+        white = white * floor.white_level(noise["N"]) * math.sqrt(scenario.rate)
         for effect in effects:
             if effect.variance is not None and np.any(effect.variance[i] != 1):
                 white = white * np.sqrt(to_samples(scenario, effect.variance[i]))

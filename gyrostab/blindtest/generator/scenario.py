@@ -70,12 +70,12 @@ class Effect:
     """Contribution of one effect to the record, and its ground truth.
 
     `mean` (axis, time) [deg/h] is added; `variance` (axis, second) multiplies the white noise;
-    `extra` (axis, time) [deg/h] is added noise; `white` (axis, time), of unit variance, replaces
-    the white noise, and `common` is its part shared by the axes; `after` is applied to the finished
-    record; `size` is in units of the closed-form limit; `nats` is the evidence expected with the
-    truth known, and `learned_nats` over fitted noise where `mean` is not known, but random;
-    `form_differs` is set where the diagnosis fits another form; `also_accepted` holds
-    further names that are right for this case.
+    `extra` (axis, time) [deg/h] is added noise; `common` (axis, time), shared by the axes, replaces
+    as much of their white noise, in units of it; `after` is applied to the finished record; `size`
+    is in units of the closed-form limit; `nats` is the evidence expected with the truth known, and
+    `learned_nats` over fitted noise where `mean` is not known, but random; `form_differs` is set
+    where the diagnosis fits another form; `also_accepted` holds further names that are right for
+    this case.
     """
 
     name: str
@@ -91,7 +91,6 @@ class Effect:
     mean: Array | None = None
     variance: Array | None = None
     extra: Array | None = None
-    white: Array | None = None
     common: Array | None = None
     after: Callable[[Array], Array] | None = None
     ramp: Array | None = None

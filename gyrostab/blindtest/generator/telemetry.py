@@ -129,36 +129,45 @@ def flip_bits(
     return after, where
 
 
-def repeat_frames(
-    rng: np.random.Generator, values: Array, *, number: int, frame: int, hold: bool
-) -> tuple[Array, NDArray[np.int64]]:
-    """Overwrite `number` frames by a repeat of the previous frame, or of its last sample.
+def choose_frames(
+    rng: np.random.Generator, missing: NDArray[np.bool_], *, number: int, frame: int
+) -> NDArray[np.int64]:
+    """Choose at most `number` frames of `frame` samples that are complete, like the one before.
+
+    At most one frame in eight is chosen. Return the first sample of each.
+
+    Examples
+    --------
+    >>> missing = np.arange(80) < 30
+    >>> choose_frames(np.random.default_rng(0), missing, number=1, frame=5) >= 35
+    array([ True])
+    """
+    whole = ~missing[: missing.size // frame * frame].reshape(-1, frame).any(axis=1)
+    frames = np.flatnonzero(whole[1:] & whole[:-1]) + 1
+    chosen = rng.choice(frames, min(number, max(1, frames.size // 8)), replace=False)
+    return np.sort(chosen) * frame
+
+
+def repeat_frames(values: Array, starts: NDArray[np.int64], *, frame: int, hold: bool) -> Array:
+    """Overwrite frames by a repeat of the previous frame, or of its last sample.
 
     Parameters
     ----------
     values : ndarray, shape (axis, time)
+    starts : ndarray
+        First sample of each frame.
     frame : int
         Samples of a frame.
     hold : bool
         Whether to hold the last sample instead of repeating the frame.
 
-    Returns
-    -------
-    values, where
-        Values after the change, and the first sample of every overwritten frame.
-
     Examples
     --------
-    >>> rng, values = np.random.default_rng(0), np.arange(40.0)[None]
-    >>> after, where = repeat_frames(rng, values, number=1, frame=5, hold=True)
-    >>> len(set(after[0, where[0]: where[0] + 5].tolist()))
-    1
+    >>> repeat_frames(np.arange(8.0)[None], np.array([4]), frame=2, hold=True)
+    array([[0., 1., 2., 3., 3., 3., 6., 7.]])
     """
     after = values.copy()
-    frames = np.sort(rng.choice(np.arange(1, values.shape[1] // frame), number, replace=False))
-    for k in frames:
-        past = (
-            after[:, k * frame - 1 : k * frame] if hold else after[:, (k - 1) * frame : k * frame]
-        )
-        after[:, k * frame : (k + 1) * frame] = past
-    return after, frames * frame
+    for start in starts:
+        past = after[:, start - 1 : start] if hold else after[:, start - frame : start]
+        after[:, start : start + frame] = past
+    return after

@@ -37,6 +37,7 @@ INCOMPATIBLE = (
     {"rate_quantization", "spikes"},
     {"rate_quantization", "held_samples"},
     {"clipping", "spikes"},
+    {"dead_zone", "misalignment"},
     {"gauss_markov", "telegraph"},
 )
 
