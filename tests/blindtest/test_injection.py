@@ -220,3 +220,12 @@ def test_an_injection_stays_on_the_grid_of_the_recording(effect: str) -> None:
     log = make_log(step * np.rint(white(4) / step), {}, start=0, rate=RATE)
     values = inject_effect(log, effect, 8.0, np.random.default_rng(2))["injected"][0]["rate"].values
     assert np.abs(values / step - np.rint(values / step)).max() < 1e-6
+
+
+def test_truth_of_an_injection_has_the_axes_of_the_log() -> None:
+    log = make_log(white(3)[:1], {}, start=0, rate=RATE).assign_coords(axis=["z"])
+    copies = inject_effect(log, "vibration_rectification", 8.0, np.random.default_rng(4))
+    (effect,) = copies["injected"][1]["effects"]
+    assert effect["axes"] == list(effect["waveform_10s"]) == ["z"]
+    assert list(effect["parameters"]["sensitivity"]["values"]) == ["z"]
+    assert {tuple(truth["noise"]) for _, truth in copies.values()} == {("z",)}

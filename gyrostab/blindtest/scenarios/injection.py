@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -16,7 +17,13 @@ from gyrostab.blindtest.generator.detection_limits import white_shares
 from gyrostab.blindtest.generator.measured_noise import BANDS, MeasuredNoise, measure_noise
 from gyrostab.blindtest.generator.noise_floor import white_level
 from gyrostab.blindtest.generator.record import add_channels, make_channels, make_gap_variables
-from gyrostab.blindtest.generator.scenario import Effect, Scenario, draw_scenario, to_samples
+from gyrostab.blindtest.generator.scenario import (
+    AXES,
+    Effect,
+    Scenario,
+    draw_scenario,
+    to_samples,
+)
 from gyrostab.blindtest.scenarios.case import describe_truth
 from gyrostab.blindtest.scoring.baseline_detectors import allan_variance, octaves
 from gyrostab.errors import OptionError
@@ -201,11 +208,11 @@ def inject_effect(
         for name, channel in make_channels(scenario, [made], rng).items()
         if name not in log.variables
     }
-    names = dict(zip("xyz", axes, strict=False))
-    truth = describe_truth(scenario, [made], strengths=[strength])
-    for table in truth["effects"]:
-        table["axes"] = [names[axis] for axis in table["axes"] if axis in names]
-    control_truth = describe_truth(scenario, [], strengths=[])
+    names = dict(zip(AXES, axes, strict=False))
+    truth, control_truth = (
+        _rename_axes(describe_truth(scenario, effects, strengths=[strength] * len(effects)), names)
+        for effects in ([made], [])
+    )
     copies = {
         "injected": injected,
         "untouched": record,
@@ -223,6 +230,27 @@ def inject_effect(
         )
         for name, values in copies.items()
     }
+
+
+def _rename_axes(truth: dict[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
+    """Rename the axes of a truth to those of the log, and leave out others."""
+
+    def rename(values: Mapping[str, Any]) -> dict[str, Any]:
+        return {names[axis]: value for axis, value in values.items() if axis in names}
+
+    effects = [
+        effect
+        | {
+            "axes": [names[axis] for axis in effect["axes"] if axis in names],
+            "waveform_10s": rename(effect["waveform_10s"]),
+            "parameters": {
+                name: entry | ({"values": rename(entry["values"])} if "values" in entry else {})
+                for name, entry in effect["parameters"].items()
+            },
+        }
+        for effect in truth["effects"]
+    ]
+    return truth | {"effects": effects, "noise": rename(truth["noise"])}
 
 
 def _draw_effect(
