@@ -34,7 +34,6 @@ UNITS = {
     "rotation_rate": "degree s-1",
     "supply_voltage": "V",
     "light_power": "W",
-    "pressure": "Pa",
     "accel_x": "g",
     "accel_y": "g",
     "accel_z": "g",

@@ -63,9 +63,8 @@ def decimator_taps(rate: float, kind: str) -> Array:
     ----------
     rate : float
         Rate of the log [Hz], a divisor of `FAST_HZ`.
-    kind : {"point", "dump", "cic2", "cic3", "fir"}
-        Every n-th value, integrate and dump, two or three of these in series, or a short windowed
-        sinc.
+    kind : {"point", "dump", "cic2", "fir"}
+        Every n-th value, integrate and dump, two of these in series, or a short windowed sinc.
 
     Examples
     --------
@@ -79,10 +78,7 @@ def decimator_taps(rate: float, kind: str) -> Array:
     if kind == "fir":
         taps = np.asarray(signal.firwin(3 * factor + 1, 0.42 * rate, fs=FAST_HZ, window="hamming"))
         return np.asarray(taps / taps.sum())
-    taps = box
-    for _ in range({"dump": 0, "cic2": 1, "cic3": 2}[kind]):
-        taps = np.convolve(taps, box)
-    return taps
+    return box if kind == "dump" else np.convolve(box, box)
 
 
 def decimate(x: Array, *, rate: float, kind: str) -> Array:
