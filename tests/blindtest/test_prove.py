@@ -13,19 +13,29 @@ import time
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
 
 import gyrostab
+from gyrostab.blindtest.generator.record import make_log
 from gyrostab.blindtest.runner.benchmark import Proof
 from gyrostab.blindtest.runner.folder import FIRST_PUBLIC_SEED, begin_run, case_name, read_sums
-from gyrostab.blindtest.runner.outcome import page_text, score_rows
+from gyrostab.blindtest.runner.outcome import _thin_out, page_text, score_rows
 from gyrostab.blindtest.runner.pool import run_in_processes
-from gyrostab.blindtest.runner.steps import draw_case
+from gyrostab.blindtest.runner.steps import diagnose_case, draw_case
 from gyrostab.blindtest.scenarios.plan import plan_case
+from gyrostab.blindtest.scenarios.real import RECORDINGS
 from gyrostab.blindtest.scoring.table import score_table
-from gyrostab.errors import FormatError, OptionError, OutputError, ResumeError, WorkerError
+from gyrostab.errors import (
+    FormatError,
+    GyrostabError,
+    OptionError,
+    OutputError,
+    ResumeError,
+    WorkerError,
+)
 from tests.support.command_line import call
 
 core = importlib.import_module("gyrostab.blindtest.runner.benchmark")
@@ -351,7 +361,7 @@ def test_run_without_real_recordings_says_so(small, tmp_path, monkeypatch):
     monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: NothingFound())
     messages: list[str] = []
     gyrostab.prove(tmp_path / "proof", cases=1, seed=8, nulls=100, workers=0, say=messages.append)
-    assert "no injections into real recordings" in messages[0]
+    assert "no injections into real recordings: too few cases" in messages[0]
     assert (
         "the folder of the real recordings was not given"
         in (tmp_path / "proof" / "table.md").read_text()
@@ -360,10 +370,25 @@ def test_run_without_real_recordings_says_so(small, tmp_path, monkeypatch):
 
 def test_missing_real_recordings_are_reported(small, tmp_path, monkeypatch):
     monkeypatch.setattr(core, "_CASES_PER_INJECTION", 1)
-    with pytest.raises(FormatError, match="nowhere"):
+    nowhere = tmp_path / "nowhere"
+    with pytest.raises(FormatError, match=r"nowhere: has no fog-blueseis-ramp/fog_ramp\.csv\.gz"):
+        gyrostab.prove(tmp_path / "proof", cases=1, seed=8, nulls=100, workers=0, real=nowhere)
+    assert not list(tmp_path.iterdir())
+    for entry in RECORDINGS.values():
+        (nowhere / entry.file).parent.mkdir(parents=True)
+        (nowhere / entry.file).write_text("")
+    messages: list[str] = []
+    with pytest.raises(GyrostabError):
         gyrostab.prove(
-            tmp_path / "proof", cases=1, seed=8, nulls=100, workers=0, real=tmp_path / "nowhere"
+            tmp_path / "proof",
+            cases=1,
+            seed=8,
+            nulls=100,
+            workers=0,
+            real=nowhere,
+            say=messages.append,
         )
+    assert "--real DIR\nand 1 injections" in messages[0]
     with pytest.raises(ResumeError, match="give their folder again"):
         gyrostab.prove(tmp_path / "proof", workers=0, resume=True)
 
@@ -386,6 +411,7 @@ def test_wrong_names_on_null_records_are_listed():
     }
     rows = score_rows({"abc": identification}, {"abc": truth}, {"abc": {}})
     job = {
+        "injected": 2,
         "cases": 1,
         "seed": FIRST_PUBLIC_SEED + 1,
         "nulls": 100,
@@ -397,9 +423,51 @@ def test_wrong_names_on_null_records_are_listed():
     table = score_table(rows)
     text = page_text(rows, table, job=job, commitment="0" * 64, failed={})
     assert "abc (null, 10 Hz, 10 min, 0 % lost): no effect; named shupe" in text
+    assert "--real DIR`" in text
     assert "not for publication" not in text
     assert "The code changed 1 times" in text
     assert "false alarms: effect named on a null record: 1 " in text
+
+
+def test_a_wrong_name_is_listed_with_all_effects_of_its_record():
+    effect = {"strength": 2.0, "size": 2.0, "form_differs": False, "expected_nats": 20.0}
+    effect |= {"tau_min_s": 1.0, "tau_max_s": 9.0, "localised": False, "parameters": {}}
+    truth = {
+        "effects": [effect | {"name": name} for name in ("shupe", "spikes")],
+        "accepted": [],
+        "plan": {"index": 0, "kind": "pair"},
+        "sampling_rate_hz": 10.0,
+        "seconds": 600.0,
+        "missing_share": 0.0,
+    }
+    answer = json.loads(NamedAlways().to_json())
+    rows = score_rows({"abc": answer}, {"abc": truth}, {"abc": {}})
+    job = dict.fromkeys(("injected", "cases", "seed", "nulls", "counterparts"), 1)
+    job |= {"code": ["a"], "begun": "now", "machine": "any"}
+    text = page_text(rows, score_table(rows), job=job, commitment="", failed={})
+    assert text.replace("\n ", "").count("shupe at 2 and spikes at 2; named spectral_line") == 1
+
+
+def test_risk_curve_keeps_both_ends():
+    risk = pd.DataFrame({"least": [1.0 - place / 100 for place in range(32)]})
+    kept = _thin_out(risk)["least"]
+    assert (len(kept), kept.iloc[0], kept.iloc[-1]) == (10, 1.0, risk["least"].iloc[-1])
+    assert len(_thin_out(risk[:3])) == 3
+    assert _thin_out(risk[:0]).empty
+
+
+def test_a_model_that_cannot_be_checked_is_no_failed_diagnosis(tmp_path, monkeypatch):
+    class Found(NamedAlways):
+        model: ClassVar = {"noise": {}, "effect": [{}]}
+        content: ClassVar = {}
+
+    recording = make_log(np.zeros((3, 100)), {}, start=0, rate=10.0)
+    monkeypatch.setattr("gyrostab.jobs.load_log", lambda paths: recording)
+    monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: Found())
+    target, failed = tmp_path / "good.json", tmp_path / "failed.txt"
+    assert diagnose_case(tmp_path / "0123456789ab.nc", target, failed, 100)
+    check = json.loads(target.read_text())["model_check"]
+    assert check == {"runs": False, "reason": "KeyError: 'baseline'"}
 
 
 # -----------------------------------------------------------------------------------------------
@@ -412,6 +480,7 @@ def test_invalid_options_leave_nothing_behind(tmp_path):
         ({"seed": -1}, "seed=-1"),
         ({"nulls": 20}, "nulls=20"),
         ({"counterparts": -1}, "counterparts=-1"),
+        ({"workers": -1}, "workers=-1"),
     ):
         with pytest.raises(OptionError, match=complaint):
             gyrostab.prove(tmp_path / "proof", **options)

@@ -19,7 +19,7 @@ from gyrostab.blindtest.runner.folder import (
 )
 from gyrostab.blindtest.runner.pool import run_in_processes
 from gyrostab.blindtest.runner.steps import compare_case, diagnose_case, draw_case
-from gyrostab.errors import ResumeError
+from gyrostab.errors import OptionError, ResumeError
 from gyrostab.store.output import resolve_link
 
 if TYPE_CHECKING:
@@ -102,6 +102,8 @@ def prove(
 
     Raises
     ------
+    OptionError
+        When a number is out of range.
     OutputError
         When the folder is not empty, or cannot be created.
     ResumeError
@@ -116,9 +118,12 @@ def prove(
     >>> proof = gyrostab.prove("proof", cases=20)  # doctest: +SKIP
     >>> print(proof.table)  # doctest: +SKIP
     """
+    from gyrostab.blindtest.scenarios.real import check_recordings
     from gyrostab.jobs import lock_job
     from gyrostab.progress import no_stage
 
+    if workers is not None and workers < 0:
+        raise OptionError(f"workers={workers}: give a number of processes, or 0 for this process")
     folder, stage, tell = resolve_link(directory), progress or no_stage, say or (lambda text: None)
     injected = 0 if real is None else (cases or _DEFAULTS["cases"]) // _CASES_PER_INJECTION
     fresh = {
@@ -127,7 +132,9 @@ def prove(
         "injected": injected,
     }
     requested = {"cases": cases, "seed": seed, "nulls": nulls, "counterparts": counterparts}
-    inspect_folder(folder, requested, fresh, resume=resume, overwrite=overwrite)
+    previous, _ = inspect_folder(folder, requested, fresh, resume=resume, overwrite=overwrite)
+    if real is not None and (previous or fresh)["injected"]:
+        check_recordings(Path(real))
     with lock_job(folder):
         job = begin_run(folder, requested, fresh, resume=resume, overwrite=overwrite)
         tell(_describe_run(job, folder))
@@ -167,12 +174,13 @@ def _describe_run(job: dict[str, Any], folder: Path) -> str:
     for name in ("nulls", "counterparts"):
         text += f" --{name} {job[name]}" if job[name] != _DEFAULTS[name] else ""
     if job["injected"]:
+        text += " --real DIR"
         text += f"\nand {job['injected']} injections into real recordings, with three controls each"
     else:
-        text += (
-            "\nno injections into real recordings: there is one for every "
-            f"{_CASES_PER_INJECTION} cases if their folder is given"
-        )
+        few = job["cases"] < _CASES_PER_INJECTION
+        text += "\nno injections into real recordings: "
+        text += "too few cases" if few else "their folder was not given (--real DIR)"
+        text += f"; there is one for every {_CASES_PER_INJECTION} cases"
     done = len(list((folder / "diagnoses").glob("*.json")))
     return text + (f"\n{done} cases are diagnosed already" if done else "")
 

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from gyrostab.blindtest.runner.figures import (
@@ -57,7 +58,7 @@ _HEADLINES = (
     "detected, 3 times the limit in fitted noise or more",
     "named correctly, 3 times the limit in fitted noise or more",
     "both effects of a pair named correctly, each of that strength",
-    "cases with a wrong name",
+    "cases with a wrong name, strength 1.5 or more",
     "out of catalogue: unidentified",
     "95 % intervals that contain the truth",
     "probability of a name: expected calibration error",
@@ -173,7 +174,7 @@ def page_text(
         *_describe_counterparts(rows),
         "### Wrong names",
         _format_list(
-            [_describe_wrong_name(row) for row in first_rows(drawn) if row["wrong"]], "none"
+            [_describe_wrong_name(row, drawn) for row in first_rows(drawn) if row["wrong"]], "none"
         ),
         "### Undetected effects of strength 1.5 or more",
         _format_list(
@@ -195,9 +196,9 @@ def page_text(
 
 
 def _thin_out(risk: pd.DataFrame) -> pd.DataFrame:
-    """Keep about ten lines of a risk-coverage curve, the last among them."""
-    every = max(1, math.ceil(len(risk) / 10))
-    return risk[::-1][::every][::-1]
+    """Keep about ten lines of a risk-coverage curve, with the first and the last."""
+    places = np.linspace(0, len(risk) - 1, min(len(risk), 10))
+    return risk.iloc[places.round().astype(int)]
 
 
 def _select_headlines(rows: Sequence[Mapping[str, Any]], table: pd.DataFrame) -> pd.DataFrame:
@@ -224,7 +225,7 @@ def _describe_counterparts(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     if not len(table):
         return ["None in this run."]
     named = [
-        _describe_wrong_name(row)
+        _describe_wrong_name(row, [row])
         for row in rows
         if row["kind"] == "counterpart" and row["wrong_names"]
     ]
@@ -300,6 +301,7 @@ def _describe_run(
     numbers = ", ".join(f"{number} {kind}" for kind, number in kinds.items())
     options = ("cases", "seed", "nulls", "counterparts")
     repeat = " ".join(["gyrostab prove", *(f"--{name} {job[name]}" for name in options)])
+    repeat += " --real DIR" if job["injected"] else ""
     lines = [
         f"{job['cases']} cases ({numbers}); begun {job['begun']}; {job['machine']}; "
         f"code {' then '.join(job['code'])}.",
@@ -320,20 +322,23 @@ def _describe_run(
     return "  \n".join(_wrap_text(line) for line in lines)
 
 
-def _describe_case(row: Mapping[str, Any]) -> str:
-    content = f"{row['effect']} at {row['strength']:g}" if row["effect"] else "no effect"
+def _describe_case(row: Mapping[str, Any], effects: Sequence[Mapping[str, Any]]) -> str:
+    content = " and ".join(
+        f"{effect['effect']} at {effect['strength']:g}" for effect in effects if effect["effect"]
+    )
     driver = f", driver {row['degradation']}" if row["degradation"] else ""
     record = f"{row['rate']:g} Hz, {row['length'] / 60:.0f} min, {100 * row['missing']:.0f} % lost"
-    return f"{row['name']} ({row['kind']}{driver}, {record}): {content}"
+    return f"{row['name']} ({row['kind']}{driver}, {record}): {content or 'no effect'}"
 
 
-def _describe_wrong_name(row: Mapping[str, Any]) -> str:
-    return f"{_describe_case(row)}; named {', '.join(row['wrong_names'])}"
+def _describe_wrong_name(row: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
+    effects = [other for other in rows if other["name"] == row["name"]]
+    return f"{_describe_case(row, effects)}; named {', '.join(row['wrong_names'])}"
 
 
 def _describe_miss(row: Mapping[str, Any]) -> str:
     reason = "its diagnosis failed" if row["failed"] else "nothing was detected"
-    return f"{_describe_case(row)}; {reason}"
+    return f"{_describe_case(row, [row])}; {reason}"
 
 
 def _format_list(lines: Sequence[str], none: str) -> str:

@@ -71,11 +71,14 @@ def _check_model(log: xr.Dataset, diagnosis: Any) -> dict[str, Any]:
     """Compare a recording with its model and with the noise that was calibrated first."""
     from gyrostab.blindtest.scoring.resimulation import check_model
 
-    calibrated = {
-        axis: {term: entry["value"] for term, entry in terms.items()}
-        for axis, terms in diagnosis.content["baseline"]["noise"].items()
-    }
-    return check_model(log.compute(), diagnosis.model, calibrated)
+    try:
+        calibrated = {
+            axis: {term: entry["value"] for term, entry in terms.items()}
+            for axis, terms in diagnosis.content["baseline"]["noise"].items()
+        }
+        return check_model(log.compute(), diagnosis.model, calibrated)
+    except Exception as error:  # the diagnosis is good, but not its model
+        return {"runs": False, "reason": f"{type(error).__name__}: {error}"}
 
 
 def compare_case(recording: Path, truth: dict[str, Any], target: Path) -> dict[str, float]:

@@ -11,6 +11,7 @@ import xarray as xr
 
 from gyrostab.blindtest.generator.scenario import stream
 from gyrostab.blindtest.scenarios.injection import inject_effect
+from gyrostab.errors import FormatError
 
 #: The injected recording, and its controls.
 COPIES = ("injected", "untouched", "flipped", "reversed")
@@ -101,6 +102,16 @@ def plan_injections(number: int, *, seed: int) -> list[dict[str, Any]]:
             for copy in COPIES
         ]
     return out
+
+
+def check_recordings(folder: Path) -> None:
+    """Raise `FormatError` unless a folder has all real recordings."""
+    for entry in RECORDINGS.values():
+        if not (folder / entry.file).is_file():
+            raise FormatError(
+                f"{folder}: has no {entry.file}, which injections need; "
+                "give the folder of the real recordings with --real DIR, or none"
+            )
 
 
 def _read_piece(recording: str, folder: Path, part: float) -> xr.Dataset:

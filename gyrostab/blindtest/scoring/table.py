@@ -126,7 +126,11 @@ def _naming_lines(rows: Sequence[Row]) -> list[Line]:
             [row for row in detected if row["form_differs"]],
             "named_exactly",
         ),
-        share("cases with a wrong name", answered_rows(first_rows(clear)), "wrong"),
+        share(
+            "cases with a wrong name, strength 1.5 or more",
+            answered_rows(first_rows(clear)),
+            "wrong",
+        ),
         share("truth in the ambiguity set", claimed, "in_set", at_least(0.97)),
         median(
             "size of the ambiguity set, median",
