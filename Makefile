@@ -79,8 +79,8 @@ bench: $(VENV)/.installed-test  ## measure docs/performance.md and docs/scaling.
 	$(BIN)/python benchmarks/end_to_end.py --output docs/performance.md
 	$(BIN)/python benchmarks/scaling.py --output docs/scaling.md
 
-prove: $(VENV)/.installed-test  ## the published blind test (CASES=400 NULLS=400 PROOF=proof); takes hours, can be stopped and repeated
-	$(BIN)/gyrostab prove --resume -o $(PROOF) $(if $(wildcard $(PROOF)/benchmark.json),,--cases $(CASES) --nulls $(NULLS))
+prove: $(VENV)/.installed-test  ## the published blind test (CASES=400 NULLS=400 PROOF=proof; injections from GYROSTAB_RECORDINGS); takes hours, can be stopped and repeated
+	$(BIN)/gyrostab prove --resume -o $(PROOF) $(if $(wildcard $(PROOF)/benchmark.json),,--cases $(CASES) --nulls $(NULLS) --counterparts 1)
 	$(BIN)/python benchmarks/publish_proof.py $(PROOF)
 
 prove-quick: $(VENV)/.installed  ## a short blind test with a fresh seed, which is printed
