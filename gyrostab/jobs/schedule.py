@@ -105,8 +105,8 @@ def _open_processes(count: int) -> Iterator[Pool]:
         count, mp_context=spawn, initializer=_begin_process, initargs=(watched_end,)
     )
     try:
-        submit: Any = partial(executor.submit, _call_with_warnings)
-        yield Pool(submit, lambda: count, True, _identity)
+        submit: Any = executor.submit
+        yield Pool(partial(submit, _call_with_warnings), lambda: count, True, _identity)
     except KeyboardInterrupt:
         own_end.close()
         raise

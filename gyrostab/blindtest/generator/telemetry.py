@@ -142,7 +142,7 @@ def choose_frames(
     >>> choose_frames(np.random.default_rng(0), missing, number=1, frame=5) >= 35
     array([ True])
     """
-    whole = ~missing[: missing.size // frame * frame].reshape(-1, frame).any(axis=1)
+    whole = ~np.any(missing[: missing.size // frame * frame].reshape(-1, frame), axis=1)
     frames = np.flatnonzero(whole[1:] & whole[:-1]) + 1
     chosen = rng.choice(frames, min(number, max(1, frames.size // 8)), replace=False)
     return np.sort(chosen) * frame

@@ -354,7 +354,7 @@ def _match_names(
     ).reshape(len(true), len(identifications))
     for effect, place in zip(*linear_sum_assignment(weights, maximize=True), strict=True):
         if weights[effect, place] > 0.0:
-            matches[effect] = identifications[place]
+            matches[effect] = identifications[int(place)]
     return matches
 
 
