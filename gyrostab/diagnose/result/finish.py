@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial
+from itertools import compress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -190,9 +191,13 @@ def measure_evidence(
         identifications.state.settings,
     )
 
-    def train(chosen: Identifications, known: NDArray[np.bool_]) -> xr.Dataset:
+    def train(
+        chosen: Identifications, known: NDArray[np.bool_], is_left_out: Sequence[bool] = ()
+    ) -> xr.Dataset:
         noise = recalibrate(chosen, baseline, first, known)
-        return predict_baseline(with_noise(chosen, noise), noise, known)
+        renewed = with_noise(chosen, noise)
+        left_out = tuple(compress(renewed.identified, is_left_out))
+        return predict_baseline(renewed, noise, known, left_out=left_out)
 
     before = (
         partial(expected_baseline, without_telegraph, baseline)
@@ -201,20 +206,27 @@ def measure_evidence(
     )
     after = partial(train, judged) if judged.identified else before
     with_phase_locked = partial(train, without_telegraph) if identified else before
-    lasting = tuple(
+    settings = identifications.state.settings
+    known = select_forecast_start(blocks)
+    begun = tuple(
         identification
         for identification in judged.identified
-        if _can_be_forecast(identification, blocks, identifications.state.settings)
+        if active_blocks(identification, blocks, settings=settings)[known].any()
     )
+    # what is over later is not forecast, but is in the blocks that the noise is calibrated on
+    is_over = [not _can_be_forecast(identification, blocks, settings) for identification in begun]
+    has_forecast = not all(is_over)
     evidence = held_out(
         clean,
         before,
         after,
         more_gain=count_nats + telegraph_nats + phase_locked_nats,
         shown=with_phase_locked if phase_locked_nats else None,
-        forecast=partial(train, replace(judged, identified=lasting)) if lasting else before,
+        forecast=partial(train, replace(judged, identified=begun), is_left_out=is_over)
+        if has_forecast
+        else before,
     )
-    if not lasting:
+    if not has_forecast:
         evidence["forecast_gain"] = np.nan  # no effect can be forecast
     return evidence
 
@@ -222,7 +234,7 @@ def measure_evidence(
 def _can_be_forecast(
     identification: Identification, blocks: xr.Dataset, settings: Settings
 ) -> bool:
-    """Return whether an effect acts both before and after the time that a forecast begins from.
+    """Return whether an effect that acts before a forecast begins can be forecast.
 
     The size of an event in the last part is unknown before, also where it is one of several jumps,
     and an event that is over does not affect the last part. Sample counts are in neither means nor
@@ -236,7 +248,7 @@ def _can_be_forecast(
         is_step(component) and (np.ptp(component.variant.design[..., known], axis=-1) == 0.0).any()
         for component in identification.components
     )
-    return bool(acts[known].any() and acts[~known].any() and not has_later_step)
+    return bool(acts[~known].any() and not has_later_step)
 
 
 def _attributed_mismatches(

@@ -21,6 +21,7 @@ from gyrostab.diagnose.estimate.joint_fit import Estimate, Fitted, fit_identific
 from gyrostab.diagnose.estimate.upper_limits import mixture_limit
 from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.predict.candidates import Candidate, Component
+from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.result import finish as conclude
 from gyrostab.diagnose.result.mismatch_tables import unidentified_mismatches
 from gyrostab.diagnose.result.record_text import summary
@@ -286,6 +287,41 @@ def test_only_lasting_effects_are_forecast(points: list[list[float]], has_foreca
     assert held["log_likelihood_gain"] > 0.0
     if has_forecast:
         assert held["forecast_gain"] > 0.0
+
+
+def test_noise_that_is_over_does_not_spoil_the_forecast_of_another_effect():
+    """The forecast begins from noise that was calibrated with the vibration in its model."""
+    shaken = {
+        "profile": "vibration",
+        "points": [[0, 0.02], [300, 0.02], [301, 3.0], [600, 3.0], [601, 0.02], [1800, 0.02]],
+    }
+    heat = {
+        "profile": "ramps",
+        "channel": "temperature",
+        "unit": "degC",
+        "points": [[300 * place, 20 + 40 * (place % 2)] for place in range(7)],
+    }
+    blocks = reduce_simulation(
+        {"name": "vibration_noise", "white": 0.02, "axes": ["x"]},
+        {"name": "temperature_noise", "linear": 0.1, "axes": ["x"]},
+        axes=("x",),
+        environment=[shaken, heat],
+    )
+    baseline = calibrate_noise(blocks)
+    vibration, warmth = (
+        identify_by_hand(blocks, baseline, name, "power", (column,), **values)
+        for name, column, values in (
+            ("vibration_noise", "white", {"exponent": 1.0}),
+            ("temperature_noise", "linear", {}),
+        )
+    )
+    both = replace(
+        vibration,
+        identified=(*vibration.identified, *warmth.identified),
+        state=condition_on(vibration.state, list(warmth.identified[0].components)),
+    )
+    held = conclude.measure_evidence(blocks, baseline, both, fit_identifications(both, baseline))
+    assert held["forecast_gain"] > 0.0
 
 
 @pytest.mark.slow
