@@ -33,14 +33,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import pandas as pd
 import xarray as xr
 
 from gyrostab.allan.davar import davar
 from gyrostab.allan.fit import fit_noise
 from gyrostab.allan.summary import FitSummary, summarise_fit, summarise_terms
-from gyrostab.errors import SchemaError
+from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
+from gyrostab.ingest.uniform import cut_log
 from gyrostab.noise import LAWS
 from gyrostab.schema import check_product, texts
 from gyrostab.store.output import new_output
@@ -59,6 +61,10 @@ KEYS = {
 ACCELEROMETER_KEYS = {
     "accelerometer_noise_density": ("N", _GRAVITY * math.sqrt(HOUR), "m/s^2/sqrt(Hz)"),
     "accelerometer_random_walk": ("K", _GRAVITY / math.sqrt(HOUR), "m/s^3/sqrt(Hz)"),
+}
+_ACCELEROMETER_NAMES = {
+    "accelerometer_noise_density": "velocity random walk",
+    "accelerometer_random_walk": "acceleration random walk",
 }
 
 
@@ -90,6 +96,15 @@ def convert_terms(
 
 def _fit_accelerometers(log: xr.Dataset, product: xr.Dataset) -> xr.Dataset:
     """Fit the noise of the accelerometers of a log in the windows of a product, in g for deg/h."""
+    rate = float(log.attrs["sampling_rate_hz"])
+    sample = np.timedelta64(round(1e9 / rate), "ns")
+    bounds = product["time_bounds"].values
+    # half a sample, because times are rounded to nanoseconds
+    ends = {"time_from": bounds.min() - sample // 2, "time_to": bounds.max() - sample // 2}
+    try:
+        log = cut_log(log, **ends)
+    except OptionError as error:
+        raise SchemaError(f"the log does not cover the windows of the product: {error}") from error
     names = [
         name
         for name in ("accel_x", "accel_y", "accel_z")
@@ -103,12 +118,17 @@ def _fit_accelerometers(log: xr.Dataset, product: xr.Dataset) -> xr.Dataset:
     signals = [log[name].chunk(time=_SAMPLES_READ) for name in names]
     accelerations = make_log(
         xr.concat(signals, axes, combine_attrs="drop").data,
-        rate=float(log.attrs["sampling_rate_hz"]),
+        rate=rate,
+        start=log["time"].isel(time=0).values,
         unit="deg/h",
         axis=list(axes),
     )
     window, step = (f"{product.attrs[name]}s" for name in ("window_s", "step_s"))
-    return fit_noise(davar(accelerations, window=window, step=step))
+    fitted = fit_noise(davar(accelerations, window=window, step=step))
+    has_samples = (product["window_coverage"] > 0.0).any("axis").values
+    times = product["time"].values[has_samples]
+    place = fitted.get_index("time").get_indexer(times, method="nearest", tolerance=sample)
+    return fitted.isel(time=place[place >= 0])
 
 
 def to_kalibr(
@@ -143,7 +163,8 @@ def to_kalibr(
     Raises
     ------
     SchemaError
-        When `product` is not a product, or has no sampling rate, or `log` has no accelerometer.
+        When `product` is not a product, or has no sampling rate, or `log` has no accelerometer or
+        does not cover the product.
     OutputError
         When the file exists, or cannot be written.
     """
@@ -211,13 +232,14 @@ def _find_worst(values: list[KalibrValue]) -> KalibrValue:
 
 def _format_entry(key: str, value: KalibrValue, *, indent: str) -> list[str]:
     symbol, _, unit = (KEYS | ACCELEROMETER_KEYS)[key]
+    name = _ACCELEROMETER_NAMES.get(key, LAWS[symbol].name)
     comment = {
-        "observed": f"{unit}; {symbol}, {LAWS[symbol].name}, "
+        "observed": f"{unit}; {symbol}, {name}, "
         f"observed in {100 * value.share:.0f} % of the windows",
-        "upper_limit_only": f"{unit}; 95 % UPPER LIMIT of {symbol} ({LAWS[symbol].name}), "
+        "upper_limit_only": f"{unit}; 95 % UPPER LIMIT of {symbol} ({name}), "
         f"in {100 * value.share:.0f} % of the windows",
         "not_observable": f"{unit}; not observable in any window: "
-        f"a longer --window may show {symbol} ({LAWS[symbol].name})",
+        f"a longer --window may show {symbol} ({name})",
     }[value.meaning]
     number = "null" if math.isnan(value.value) else f"{value.value:.6e}"
     return [f"{indent}{key}: {number}  # {comment}", f"{indent}{key}_meaning: {value.meaning}"]

@@ -11,6 +11,7 @@ import xarray as xr
 import gyrostab
 from gyrostab.cli import main
 from gyrostab.errors import OutputError, SchemaError
+from gyrostab.ingest.uniform import cut_log
 from gyrostab.io.datasets import to_netcdf
 from gyrostab.io.kalibr import ACCELEROMETER_KEYS, KEYS, convert_terms, to_kalibr
 from gyrostab.io.kalibr import _fit_accelerometers as fit_accelerometers
@@ -194,14 +195,42 @@ class TestAccelerometers:
         steps = np.random.default_rng(2).normal(0.0, walk / math.sqrt(rate), 40_000)
         acceleration = np.cumsum(steps) / 9.80665
         log = gyrostab.make_log(
-            np.zeros(40_000), rate=rate, unit="deg/h", channels={"accel_y": (acceleration, "g")}
+            np.random.default_rng(3).normal(size=40_000),
+            rate=rate,
+            unit="deg/h",
+            channels={"accel_y": (acceleration, "g")},
         )
-        product = xr.Dataset(attrs={"window_s": 1000.0, "step_s": 500.0})
+        product = gyrostab.fit_noise(gyrostab.davar(log, window="1000s", step="500s"))
         terms = convert_terms(fit_accelerometers(log, product), ACCELEROMETER_KEYS)
         assert terms["y"]["accelerometer_random_walk"].value == pytest.approx(walk, rel=0.05)
 
-    def test_slow_or_missing_channels_are_named(self, product, tmp_path):
-        log = make_accelerometers(samples=2_000).drop_vars(["accel_x", "accel_z"])
+    @pytest.mark.parametrize("cut", [{"time_from": "200s"}, {"exclude": "0s/190s"}])
+    def test_only_windows_of_the_product_count(self, tmp_path, cut):
+        """The tool is shaken for 190 s, which the product leaves out."""
+        log = make_accelerometers(samples=30_000)
+        for name in ("accel_x", "accel_z"):
+            log[name][:19_000] *= 100.0
+        product = gyrostab.fit_noise(gyrostab.davar(cut_log(log, **cut), window="10s"))
+        path = to_kalibr(product, tmp_path / "imu.yaml", log=log)
+        density = float(parse(path)["accelerometer_noise_density"])
+        assert density == pytest.approx(2e-4, rel=0.05)
+        (line,) = (
+            line
+            for line in path.read_text().splitlines()
+            if line.startswith("accelerometer_noise_density:")
+        )
+        assert "velocity random walk" in line
+
+    def test_another_log_is_refused(self, tmp_path):
+        log = make_accelerometers(samples=4_000)
+        product = gyrostab.fit_noise(gyrostab.davar(log, window="10s"))
+        with pytest.raises(SchemaError, match="does not cover"):
+            to_kalibr(product, tmp_path / "imu.yaml", log=log.isel(time=slice(2_000)))
+
+    def test_slow_or_missing_channels_are_named(self, tmp_path):
+        log = make_accelerometers(samples=2_000)
+        product = gyrostab.fit_noise(gyrostab.davar(log, window="10s"))
+        log = log.drop_vars(["accel_x", "accel_z"])
         with pytest.raises(SchemaError, match="accel_x, accel_y or accel_z"):
             to_kalibr(product, tmp_path / "imu.yaml", log=log)
 
