@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -119,3 +122,14 @@ def test_a_decrease_and_a_channel_called_a_rate_are_described_as_what_they_are()
     assert judge_product(product)[0] == (
         "N is smaller by a factor of 5 on x while flow rate is high."
     )
+
+
+@pytest.mark.parametrize("term", "BKR")
+def test_page_on_windows_has_the_sizes_that_half_of_them_observe(term):
+    page = Path(__file__).parents[2] / "docs/how-to/choose-the-window.md"
+    (row,) = (
+        line for line in page.read_text(encoding="utf-8").splitlines() if f" {term} [" in line
+    )
+    assert f"from {smallest_observable(3600.0, 1.0)[term]:g} N /" in row
+    size, hours = map(float, re.search(rf"{term} = ([\d.]+) .*W = ([\d.]+) h", row).groups())
+    assert smallest_observable(hours * 3600.0, 0.01)[term] == pytest.approx(size, rel=0.03)
