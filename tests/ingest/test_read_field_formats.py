@@ -114,8 +114,8 @@ def test_the_checksum_is_that_of_a_message_of_a_sensor() -> None:
     assert crc32_mpeg2(message[None, :-4]) == message[-4:].view(">u4")
 
 
-@pytest.mark.parametrize("sensor", ["kvh-a", "stim300-a5"])
-def test_messages_of_known_sensors(tmp_path: Path, sensor: str) -> None:
+@pytest.mark.parametrize(("sensor", "option"), [("kvh-a", "start"), ("stim300-a5", "epoch")])
+def test_messages_of_known_sensors(tmp_path: Path, sensor: str, option: str) -> None:
     if sensor == "kvh-a":
         messages = [kvh_message(n, RATES[:, n % ROWS] * 1e-3, 40) for n in range(300)]
         options: dict[str, Any] = {"unit": {"gyro": "deg/s", "temperature": "degC"}}
@@ -127,7 +127,7 @@ def test_messages_of_known_sensors(tmp_path: Path, sensor: str) -> None:
     stream = b"".join([b"\xfe\x81", *messages[:100], *messages[100 + lost : 140], bytes(broken)])
     path = tmp_path / "log.bin"
     path.write_bytes(stream + b"\r\n".join(messages[141:]) + messages[0][:20])
-    raw = read_log(path, rate=250.0, epoch="2026-03-01", **options)
+    raw = read_log(path, rate=250.0, **{option: "2026-03-01"}, **options)
     numbers = np.r_[0:100, 100 + lost : 140, 141:300]
     scale = 3.6 if sensor == "kvh-a" else 3600 / 2**14
     np.testing.assert_allclose(raw.rate, RATES[:, numbers % ROWS] * scale, rtol=1e-6)
@@ -135,6 +135,7 @@ def test_messages_of_known_sensors(tmp_path: Path, sensor: str) -> None:
     assert np.array_equal(since, numbers * 4_000_000)
     assert (raw.temperature.values == 40.0).all()
     assert any(sensor in note for note in raw.attrs["notes"])
+    assert not any("--start is not used" in note for note in raw.attrs["notes"])
     assert any(f"{lost + 1} messages were lost" in note for note in raw.attrs["notes"])
     gaps = gap_table(regularise(raw))
     assert gaps["samples"].tolist() == [lost, 1]

@@ -7,6 +7,7 @@ time follows from it and ``--rate``, and lost messages are gaps.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -61,18 +62,30 @@ def list_layouts(paths: Iterable[Path]) -> list[Path]:
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Summarise fields, number of records, and first and last stamps; searches all messages."""
-    table, notes = _make_table(path, options, needs_rate=False)
+    layout = find_layout(path)
+    options = _date_first_message(layout, options)
+    table, notes = _make_table(path, layout, options, needs_rate=False)
     return scan_tables(path, "binary", [table], options, notes)
 
 
 def read(path: Path, options: ReadOptions) -> xr.Dataset:
     """Return the raw log of a binary file; see `gyrostab.ingest.read_log`."""
-    table, notes = _make_table(path, options, needs_rate=True)
+    layout = find_layout(path)
+    options = _date_first_message(layout, options)
+    table, notes = _make_table(path, layout, options, needs_rate=True)
     return read_tables(path, [table], options, notes=notes)
 
 
-def _make_table(path: Path, options: ReadOptions, *, needs_rate: bool) -> tuple[Table, list[str]]:
-    layout = find_layout(path)
+def _date_first_message(layout: Layout, options: ReadOptions) -> ReadOptions:
+    """Count numbered messages from ``--start``, as their first one is at zero."""
+    if options.epoch is not None or layout.counter is None:
+        return options
+    return replace(options, start=None, epoch=options.start)
+
+
+def _make_table(
+    path: Path, layout: Layout, options: ReadOptions, *, needs_rate: bool
+) -> tuple[Table, list[str]]:
     rows, extra_bytes = divmod(path.stat().st_size - layout.header, layout.size)
     starts = None
     if layout.sync and rows > 0:
@@ -116,7 +129,7 @@ def _count_time(
     if options.rate is None:
         raise OptionError(
             f"{path.name}: the messages of {layout.place} are numbered; give their rate with "
-            f"--rate HZ (and the time of the first with --epoch){layout.note and '; '}{layout.note}"
+            f"--rate HZ (and the time of the first with --start){layout.note and '; '}{layout.note}"
         )
     counts = unwrap_counter(fetch(counter, 0, rows), counter.turn)
     steps, times = np.unique(np.diff(counts), return_counts=True)
