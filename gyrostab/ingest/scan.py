@@ -66,8 +66,8 @@ def scan(paths: Sequence[str | Path] | str | Path, **reading: Any) -> pd.DataFra
     -------
     pandas.DataFrame
         Columns of `COLUMNS`: file, format, start and end (UTC), span [s], sampling rate [Hz], axes,
-        channels, rows, number of gaps, share of missing samples, and notes ("odd"; for a file that
-        cannot be read, the reason).
+        channels, rows of the whole file, number of gaps in the file, share of missing samples, and
+        notes ("odd"; for a file that cannot be read, the reason).
 
     Raises
     ------

@@ -91,7 +91,7 @@ def open_fleet(folder: Path) -> xr.Dataset | None:
     for path in paths:
         if folder in path.parents:
             with from_disk(open_stored(path, lazy=False), str(path)) as product:
-                names = [name for name, item in product.data_vars.items() if "time" in item.dims]
+                names = [name for name, item in product.variables.items() if "time" in item.dims]
                 products.append(product[names].isel(tau=slice(-1, None)).load())
     if not products:
         return None

@@ -201,11 +201,13 @@ def test_a_run_that_failed_has_no_report(archive, tmp_path):
 
 
 def test_survey_terms_are_those_of_the_windows_of_all_runs(done, tmp_path, capsys):
+    runs = [open_product(done / "tool 1" / f"run {name}.nc").load() for name in ("a", "<b>")]
+    bounds = np.concatenate([run["time_bounds"].values for run in runs])
+    start, end = (np.datetime_as_string(time, "s") for time in (bounds.min(), bounds.max()))
     for folder in (done, done / "tool 1"):
         call = ["export", str(folder), "--format", "iscwsa", "-o", str(tmp_path / "tool.csv")]
         assert main([*call, "--overwrite"]) == 0
-        assert f"from 2 runs of {folder.name}, " in capsys.readouterr().out
-    runs = [open_product(done / "tool 1" / f"run {name}.nc").load() for name in ("a", "<b>")]
+        assert f"from 2 runs of {folder.name}, {start} to {end}." in capsys.readouterr().out
     noise = np.concatenate([run["N"].values[0] for run in runs])
     terms = pd.read_csv(tmp_path / "tool.csv", comment="#").set_index("code")
     assert terms.loc["GXY-GRW", "value"] == pytest.approx(np.nanmedian(noise))
