@@ -14,6 +14,7 @@ import pandas as pd
 import xarray as xr
 
 from gyrostab.errors import GyrostabError
+from gyrostab.store.remote import given_name
 
 if TYPE_CHECKING:
     from gyrostab.ingest.guess import Guess
@@ -144,7 +145,7 @@ def scan_and_inspect(
             error.args = (str(error).removesuffix(scan_advice(path)),)
             errors.append(error)
             inspected_file = _inspect_once(path, reading, inspected) if inspect else None
-            rows.append({"file": str(path), "odd": str(error)})
+            rows.append({"file": given_name(path), "odd": str(error)})
             if inspected_file is not None:
                 rows[-1].update(format=inspected_file.inspection.summary.format)
                 rows[-1].update(
@@ -284,7 +285,7 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
         note.removeprefix(f"{path.name}: ") for note in [*summary.notes, *texts(log, "notes")]
     )
     return {
-        "file": str(path),
+        "file": given_name(path),
         "format": summary.format,
         "start": start,
         "end": end,

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from gyrostab.store.remote import given_name
+
 if TYPE_CHECKING:
     from gyrostab.ingest.scan import InspectedFile
 
@@ -32,7 +34,7 @@ def next_command(paths: Sequence[str | Path], options: dict[str, Any]) -> str:
     number, target = 2, Path("product.nc")
     while target.exists():
         number, target = number + 1, Path(f"product_{number}.nc")
-    words = ["gyrostab", "run", *map(str, paths), "-o", str(target)]
+    words = ["gyrostab", "run", *map(given_name, paths), "-o", str(target)]
     for name, value in options.items():
         flag = _FLAGS.get(name, f"--{name.replace('_', '-')}")
         if isinstance(value, Mapping):
@@ -188,8 +190,9 @@ def print_inspection(inspected: InspectedFile) -> None:
         )
     if inspected.error is not None and guess.axes:
         lines.append(f"not readable by this guess: {inspected.error}")
+    name = given_name(inspected.paths[0])
     if not sys.stdout.isatty():
-        print(f"# {inspected.paths[0]}: {len(rows)} columns, {inspected.inspection.rows} rows")
+        print(f"# {name}: {len(rows)} columns, {inspected.inspection.rows} rows")
         for row in [INSPECTION_COLUMNS, *rows]:
             print("# " + "\t".join(row))
         _print_wrapped(lines)
@@ -201,7 +204,7 @@ def print_inspection(inspected: InspectedFile) -> None:
         headings,
         [tuple(map(escape, row)) for row in rows],
         right=headings[2:-1],
-        title=escape(f"{inspected.paths[0]}: {inspected.inspection.rows:,} rows"),
+        title=escape(f"{name}: {inspected.inspection.rows:,} rows"),
     )
     _print_wrapped(lines)
 

@@ -45,6 +45,17 @@ def find_url(path: str | os.PathLike[str]) -> str | None:
     return None if match is None else f"{match[1]}://{match[2]}"
 
 
+def given_name(path: str | os.PathLike[str]) -> str:
+    """Return the address that a path is, or the local path as it was given.
+
+    Examples
+    --------
+    >>> given_name(Path("s3://bucket/log.zarr")), given_name(Path("log.csv"))
+    ('s3://bucket/log.zarr', 'log.csv')
+    """
+    return find_url(path) or os.fspath(path)
+
+
 def full_name(path: str | os.PathLike[str]) -> str:
     """Return the address that a path is, or the absolute local path.
 

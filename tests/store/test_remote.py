@@ -131,6 +131,15 @@ def test_files_of_other_formats_are_copied_and_read(log, tmp_path, serve_folder)
         load_log([f"{address}/none.csv"])
 
 
+def test_scan_prints_addresses_as_they_were_given(log, tmp_path, serve_folder, capsys):
+    to_netcdf(log, tmp_path / "log.nc")
+    address = f"{serve_folder(tmp_path)}/log.nc"
+    assert main(["scan", address]) == 0
+    shown = capsys.readouterr()
+    assert shown.out.splitlines()[1].startswith(f"{address}\t")
+    assert f"gyrostab run {address} -o " in shown.err
+
+
 def test_what_cannot_be_done_is_said(log, monkeypatch):
     with pytest.raises(OutputError, match=r"only a Zarr store \(.zarr\) is written"):
         to_netcdf(log, "memory://archive/log.nc")

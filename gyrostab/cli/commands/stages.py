@@ -60,8 +60,8 @@ def run(
     Parameters
     ----------
     logs
-        One or more logs, in any order: files, patterns (run7/*.csv), addresses, and folders that are
-        one log (Zarr, ROS 2 bags).
+        One or more logs, in any order: files, patterns (run7/*.csv), addresses, and folders that
+        are one log (Zarr, ROS 2 bags).
     output
         NetCDF file or Zarr store (.zarr) to write; a Zarr store also at an address, s3://...
     dry_run
