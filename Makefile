@@ -32,7 +32,7 @@ $(VENV)/.installed-lint: $(VENV)/.installed-test
 	$(BIN)/pip install --quiet --disable-pip-version-check -e ".[test,lint]"
 	touch $@
 
-demo: $(VENV)/.installed  ## install, simulate a day of a gyro, and run the main job on it
+demo: $(VENV)/.installed  ## install, and run the main job on the shipped log, a simulated day
 	$(BIN)/gyrostab demo -o $(OUT) --overwrite
 
 test: $(VENV)/.installed-test  ## install, and run the tests

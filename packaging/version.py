@@ -1,7 +1,8 @@
-"""The version: from the tag in git; without one, that of the newest release in the changelog.
+"""The version: from the tag in git; without one, from the newest release in the changelog.
 
 hatchling reads it while it builds (`tool.hatch.version` in pyproject.toml). A commit after the tag
-``v0.2.0`` is ``0.2.1.dev5+g0123abc``. A source archive carries its version in ``PKG-INFO``.
+``v0.2.0`` is ``0.2.1.dev5+g0123abc``; without git, unreleased changes are ``0.2.1.dev0``. A source
+archive carries its version in ``PKG-INFO``.
 """
 
 from __future__ import annotations
@@ -26,7 +27,11 @@ def find_version(root: Path = ROOT) -> str:
             return f"{major}.{minor}.{patch}"
         return f"{major}.{minor}.{int(patch) + 1}.dev{commits}+{commit}"
     changelog = (root / "CHANGELOG.md").read_text(encoding="utf-8")
-    return re.search(r"^## \[(\d+\.\d+\.\d+)\] - ", changelog, re.MULTILINE)[1]
+    released = re.search(r"^## \[(\d+)\.(\d+)\.(\d+)\] - ", changelog, re.MULTILINE)
+    major, minor, patch = released.groups()
+    if re.search(r"^- ", changelog[: released.start()], re.MULTILINE):
+        return f"{major}.{minor}.{int(patch) + 1}.dev0"
+    return f"{major}.{minor}.{patch}"
 
 
 def _describe_tag(root: Path) -> str:

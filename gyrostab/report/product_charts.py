@@ -229,7 +229,7 @@ def _draw_coefficients(product: xr.Dataset, gaps: list[dict[str, Any]]) -> go.Fi
 def _add_coefficient(
     figure: go.Figure, product: xr.Dataset, symbol: str, panel: str, label: str
 ) -> None:
-    """Add estimates as points with standard errors, and upper limits as open triangles."""
+    """Add estimates as points with standard errors, and upper limits as open arrows."""
     state = product["observable"].sel(term=symbol).values
     figure.layout[panel.replace("y", "yaxis")].update(_scale_of(product, symbol))
     for row, name in enumerate(axis_names(product)):

@@ -90,12 +90,14 @@ def test_the_fit_can_start_at_a_longer_averaging_time(log, tmp_path):
     assert float(late["N"][0, 0]) == pytest.approx(N_TRUE, rel=0.2)
 
 
-def test_the_stages_one_by_one_give_the_same_product(log, product, tmp_path):
-    assert call("ingest", log, "-o", tmp_path / "log.nc") == 0
-    assert call("davar", tmp_path / "log.nc", "-o", tmp_path / "davar.nc", *WINDOW) == 0
-    assert call("fit", tmp_path / "davar.nc", "-o", tmp_path / "product.nc") == 0
-    assert open_surface(tmp_path / "davar.nc").sizes["axis"] == 2
-    whole, staged = open_product(product), open_product(tmp_path / "product.nc")
+@pytest.mark.parametrize("suffix", ["nc", "zarr"])
+def test_the_stages_one_by_one_give_the_same_product(log, product, tmp_path, suffix):
+    stored, surface, fitted = (tmp_path / f"{name}.{suffix}" for name in ("log", "davar", "fitted"))
+    assert call("ingest", log, "-o", stored) == 0
+    assert call("davar", stored, "-o", surface, *WINDOW) == 0
+    assert call("fit", surface, "-o", fitted) == 0
+    assert open_surface(surface).sizes["axis"] == 2
+    whole, staged = open_product(product), open_product(fitted)
     for name in ("avar", "count", "window_mean", "Q", "N", "B", "K", "R", "N_stderr", "K_upper"):
         xr.testing.assert_allclose(staged[name], whole[name], rtol=1e-9)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import re
-import shutil
 import subprocess
 import tomllib
 from pathlib import Path
@@ -45,7 +44,9 @@ def version_module() -> ModuleType:
 
 
 def test_versions_agree(recipe, version_module, tmp_path: Path) -> None:
-    shutil.copy(ROOT / "CHANGELOG.md", tmp_path)
+    """Apart from what the changelog has of the next version."""
+    _, *releases = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").split("\n## [")[1:]
+    (tmp_path / "CHANGELOG.md").write_text(f"## [{releases[0]}", encoding="utf-8")
     version = version_module.find_version(tmp_path)
     assert recipe["package"]["version"] == version
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
@@ -59,6 +60,9 @@ def test_version_from_tag_changelog_or_source_archive(version_module, tmp_path: 
 
     (tmp_path / "CHANGELOG.md").write_text("## [Unreleased]\n## [1.2.3] - 2026-01-01\n")
     assert version_module.find_version(tmp_path) == "1.2.3"
+    (tmp_path / "CHANGELOG.md").write_text("## [Unreleased]\n- New.\n## [1.2.3] - 2026-01-01\n")
+    assert version_module.find_version(tmp_path) == "1.2.4.dev0"
+    (tmp_path / "CHANGELOG.md").write_text("## [Unreleased]\n## [1.2.3] - 2026-01-01\n- Old.\n")
     run_git("init", "--quiet")
     run_git("commit", "--quiet", "--allow-empty", "-m", "first")
     assert version_module.find_version(tmp_path) == "1.2.3"

@@ -116,8 +116,8 @@ def diagnose(
         detected automatically). With --simulation, it calibrates the level of the simulated noise
         by one factor per axis.
     block
-        Length of the blocks in which statistics are computed (default: 20s, less for short
-        records).
+        Length of the blocks in which statistics are computed (default: 20s, less in short
+        records, more in records above 5.6h).
     level
         False-alarm probability: how often anything is reported for a recording of noise alone.
     nulls

@@ -104,7 +104,7 @@ def davar(
     logs
         Log written by gyrostab ingest, or logs in any supported format.
     output
-        NetCDF file to write.
+        NetCDF file or Zarr store (.zarr) to write.
     """
     print(_run_job(logs, output, windows, reading, running, common, surface_only=True))
 
@@ -127,20 +127,18 @@ def fit(
     surface
         File written by gyrostab davar.
     output
-        NetCDF file to write.
+        NetCDF file or Zarr store (.zarr) to write.
     """
     from gyrostab.allan.fit import fit_noise
-    from gyrostab.io.datasets import open_surface, to_netcdf
+    from gyrostab.io.datasets import open_surface, to_netcdf, to_zarr
     from gyrostab.store.output import check_output
 
-    target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite)
+    target = check_output(output, suffixes=[".nc", ".zarr"], overwrite=common.overwrite)
+    write = to_zarr if target.suffix.lower() == ".zarr" else to_netcdf
     with show_stages(common) as stage:
         stage("fitting", 0)
-        to_netcdf(
-            fit_noise(open_surface(surface), **fitting.options()),
-            target,
-            overwrite=common.overwrite,
-        )
+        product = fit_noise(open_surface(surface), **fitting.options())
+        write(product, target, overwrite=common.overwrite)
     _print_product(target)
 
 
