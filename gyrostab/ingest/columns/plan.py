@@ -66,6 +66,7 @@ def plan_columns(
     rising: Callable[[int], bool] | None = None,
     above: Sequence[str] = (),
     is_filled: Callable[[int], bool] | None = None,
+    word_in: Callable[[int], str] | None = None,
     coded: Mapping[int, str] | None = None,
 ) -> Plan:
     """Determine the role and unit of each column.
@@ -90,6 +91,8 @@ def plan_columns(
         Lines above the header, which may identify the program that wrote the file.
     is_filled : callable, optional
         Returns whether any of the first cells of a column is filled.
+    word_in : callable, optional
+        Returns the first of the cells of a column that holds no number, or nothing.
     coded : mapping of int to str, optional
         Roles of columns by a code of the format, in the form of ``--map``, which overrules them.
 
@@ -103,7 +106,7 @@ def plan_columns(
     preset = PresetMatch("")
     if not any(AXIS_PATTERN.match(name.lower()) for _, name in split):  # named gyro_x ... already
         preset = find_preset(path, split, above=above, is_filled=is_filled)
-    draft = PlanDraft(path, options, rising)
+    draft = PlanDraft(path, options, rising, word_in)
     named = name_columns(
         draft,
         headers,

@@ -50,8 +50,15 @@ class Column:
 class PlanDraft:
     """Columns, notes and problems of a plan while it is being made."""
 
-    def __init__(self, path: Path, options: ReadOptions, rising: Callable[[int], bool] | None):
+    def __init__(
+        self,
+        path: Path,
+        options: ReadOptions,
+        rising: Callable[[int], bool] | None,
+        word_in: Callable[[int], str] | None = None,
+    ):
         self.path, self.options = path, options
+        self.word_in = word_in or (lambda source: "")
         self.knows_rising = rising is not None
         self.rising = rising or (lambda source: True)
         self.columns: list[Column] = []

@@ -165,11 +165,16 @@ def _time_unit(draft: PlanDraft, column: Header) -> TimeUnit | None:
     keys = [column.name, column.key, column.header, "time"]
     text = draft.find_unit(column, keys, written, is_time_unit, prefer_given=column.unit is None)
     if text is None:
+        word = draft.word_in(column.source)
         draft.refuse(
             MissingUnitError,
-            f"the time column {column.header!r} carries no unit, and holds no dates in a form "
-            "that is known (2026-05-01T08:00:00, 01.05.2026 8:00:00); give the unit of numbers "
-            "with --unit time=s (or ms, us, ns)",
+            f"the time column {column.header!r} holds {word!r}, which is neither a number nor a "
+            "date in a form that is read; write the year with four digits and a zone as an offset, "
+            "for instance 2026-05-01T08:00:00-06:00, 01.05.2026 8:00:00, 01-May-2026 08:00:00 or "
+            "05/20/2026 8:00:00 AM"
+            if word
+            else f"the time column {column.header!r} carries no unit, and holds no dates; give the "
+            "unit of numbers with --unit time=s (or ms, us, ns)",
         )
         return None
     try:

@@ -144,8 +144,22 @@ def _plan_file(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
         rising=partial(_is_rising, layout),
         above=layout.above,
         is_filled=lambda column: any(row[column].strip().lower() not in VOID_CELLS for row in rows),
+        word_in=partial(_find_word, layout),
     )
     return layout, plan
+
+
+def _find_word(layout: Layout, column: int) -> str:
+    """Return the first cell of a column that holds no number, cut to 60; empty without one."""
+    cells = (row[column].strip()[:60] for row in layout.full_samples)
+    return next(
+        (
+            cell
+            for cell in cells
+            if cell.lower() not in VOID_CELLS and not is_number(cell, comma=layout.decimal_comma)
+        ),
+        "",
+    )
 
 
 def _duration_units(layout: Layout) -> dict[int, str]:

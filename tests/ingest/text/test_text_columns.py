@@ -264,6 +264,18 @@ def test_keys_of_columns_are_unique() -> None:
             r"time column 'time' carries no unit.*--unit time=s",
         ),
         (
+            "time,gyro_x [deg/h]\n05/20/26 08:00:00,1\n05/20/26 08:00:01,2\n",
+            {},
+            MissingUnitError,
+            r"holds '05/20/26 08:00:0.', which is .*year with four digits",
+        ),
+        (
+            "time,gyro_x [deg/h]\n2026-05-20 08:00:00 CST,1\n2026-05-20 08:00:01 CST,2\n",
+            {},
+            MissingUnitError,
+            r"holds '2026-05-20 08:00:0. CST', which is .*a zone as an offset",
+        ),
+        (
             "time,gyro_x [deg/h]\n0,1\n1,2\n",
             {"unit": {"time": "parsec"}},
             UnitError,
