@@ -13,6 +13,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import gyrostab
@@ -131,6 +132,15 @@ def test_the_python_reader(folder, text):
         [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=True
     )
     assert float(done.stdout) == pytest.approx(wanted(folder / "product.nc"))
+
+
+def test_the_table_for_excel(folder, text, monkeypatch):
+    monkeypatch.chdir(folder)
+    exec(re.search(r"^    (product = .*\n)    (product\[.*)$", text, re.M).expand(r"\1\2"))
+    table = pd.read_csv("coefficients.csv")
+    product = gyrostab.open_product("product.nc")
+    assert len(table) == product.sizes["axis"] * product.sizes["time"]
+    np.testing.assert_array_equal(table["N"], product["N"].values.ravel())
 
 
 @pytest.mark.parametrize(
