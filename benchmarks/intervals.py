@@ -2,7 +2,7 @@
 
 Many records are fitted whose statistics are drawn from their laws.
 
-    python benchmarks/intervals.py --output docs/diagnosis.md
+    python benchmarks/intervals.py --output docs/diagnosis-method.md
 
 Every record is an hour of a good gyro, three axes at 10 Hz: its block statistics are those of
 noise, to which an effect is added; the fit knows the effect, not its size, and has the noise free.
