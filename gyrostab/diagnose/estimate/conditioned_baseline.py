@@ -18,7 +18,7 @@ from gyrostab.diagnose.identify.identification import (
     conditioned_states,
 )
 from gyrostab.diagnose.predict.candidates import Component
-from gyrostab.diagnose.predict.condition import MIN_POWER_RATIO, power_shares
+from gyrostab.diagnose.predict.condition import fit_powers
 from gyrostab.diagnose.predict.filter_response import band_shape_factor
 from gyrostab.diagnose.predict.linear_model import (
     State,
@@ -80,7 +80,7 @@ def predict_baseline(
             known_of += [any(identification is other for other in left_out)] * (
                 len(columns) - len(known_of)
             )
-    weight = _powers_without(state, baseline, is_left_out)
+    weight = _powers_without(state, is_left_out)
     state = replace(state, blocks=usable_blocks, masked=identifications.state.masked)
     mean = baseline["known_mean"].values.copy()
     for row, axis in enumerate(state.axes):
@@ -120,17 +120,14 @@ def predict_baseline(
 
 
 def _powers_without(
-    state: State, baseline: xr.Dataset, is_left_out: Mapping[tuple[str, str], Sequence[bool]]
+    state: State, is_left_out: Mapping[tuple[str, str], Sequence[bool]]
 ) -> NDArray[np.float64]:
     """Return the expected powers without some of the columns in the model."""
     weight = state.weight.copy()
-    min_power = MIN_POWER_RATIO * baseline["spectrum"].values
     for row, axis in enumerate(state.axes):
         chosen = np.array(is_left_out.get(("power", axis), []), np.bool_)
         if chosen.any():
-            weight[row] = np.maximum(
-                weight[row] - power_shares(state, axis)[chosen].sum(axis=0), min_power[row]
-            )
+            weight[row] = fit_powers(state, axis, chosen)
     return weight
 
 

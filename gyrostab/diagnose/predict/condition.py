@@ -72,27 +72,22 @@ def refit_weights(state: State) -> State:
     """Set the weights by a fit of all given power columns (Fisher scoring, gamma likelihood)."""
     weight = state.weight.copy()
     for row, axis in enumerate(state.axes):
-        named = state.given.get(("power", axis))
-        if named:
-            weight[row] = _fit_powers(
-                state,
-                row,
-                axis,
-                np.stack([np.broadcast_to(column, weight.shape[1:]) for column in named], axis=-1),
-            )[0]
+        if state.given.get(("power", axis)):
+            weight[row] = fit_powers(state, axis)
     return replace(
         state, weight=weight, blocks=drop_changed_tails(state.blocks, weight, state.settings)
     )
 
 
-def power_shares(state: State, axis: str) -> Array:
-    """Return the fitted contribution of each power column of an axis, (column, block, band)."""
+def fit_powers(state: State, axis: str, left_out: NDArray[np.bool_] | None = None) -> Array:
+    """Fit the powers of an axis, (block, band), and leave some of its power columns out of them."""
     row, shape = state.axes.index(axis), state.weight.shape[1:]
-    named = [np.broadcast_to(column, shape) for column in state.given.get(("power", axis), [])]
-    if not named:
-        return np.empty((0, *shape))
-    sizes = _fit_powers(state, row, axis, np.stack(named, axis=-1))[1]
-    return np.stack([size * column for size, column in zip(sizes, named, strict=True)])
+    columns = [np.broadcast_to(column, shape) for column in state.given[("power", axis)]]
+    named = np.stack(columns, axis=-1)
+    expected, fitted, sizes = _fit_columns(state, row, axis, named)
+    if left_out is not None:
+        fitted = fitted - named[..., left_out] @ sizes[left_out]
+    return np.maximum(fitted, MIN_POWER_RATIO * expected)
 
 
 def drop_changed_tails(
@@ -127,8 +122,8 @@ def drop_changed_tails(
 _ROUNDS = 4  # steps of Fisher scoring
 
 
-def _fit_powers(state: State, row: int, axis: str, named: Array) -> tuple[Array, Array]:
-    """Fit the powers of an axis; return them and the sizes of the named columns."""
+def _fit_columns(state: State, row: int, axis: str, named: Array) -> tuple[Array, Array, Array]:
+    """Fit the powers of an axis; return them before and after, and sizes of the named columns."""
     expected = axis_values(state.baseline, "spectrum", axis)
     level, precision = noise_columns(state.baseline, axis=axis)
     columns = np.concatenate([level * expected[..., None], named], axis=-1).reshape(
@@ -151,5 +146,6 @@ def _fit_powers(state: State, row: int, axis: str, named: Array) -> tuple[Array,
         normal += 1e-9 * np.diag(np.maximum(np.diagonal(normal), 1e-300))
         moved = columns.T @ (w * np.where(good, power - expected.ravel(), 0.0))
         sizes = np.linalg.solve(normal, moved)
-        fitted = np.maximum(expected.ravel() + columns @ sizes, MIN_POWER_RATIO * expected.ravel())
-    return np.asarray(fitted.reshape(expected.shape)), (sizes / size)[level.shape[2] :]
+        power_fitted = expected.ravel() + columns @ sizes
+        fitted = np.maximum(power_fitted, MIN_POWER_RATIO * expected.ravel())
+    return expected, power_fitted.reshape(expected.shape), (sizes / size)[level.shape[2] :]
