@@ -18,6 +18,8 @@ _PARTS = {2: "half", 3: "a third"}
 _SAMPLE_COUNT = re.compile(r"^\s*(\d{1,18})\s*samples?\s*$", re.ASCII)
 _COUNT = re.compile(r"^\d{1,18}$", re.ASCII)
 _NUMBER = re.compile(r"^\s*[-+]?(\d+(\.\d*)?|\.\d+)(e[-+]?\d+)?\s*$", re.IGNORECASE)
+#: Numbers that pandas joins: "1,5min" would be 15 minutes.
+_JOINED = re.compile(r"\d\s*,\s*\d|\d\s+\d|\.\d*\.")
 
 
 def duration_seconds(
@@ -42,7 +44,10 @@ def duration_seconds(
         if isinstance(value, str):
             if _is_bare_number(value) and not (zero and float(value) == 0.0):
                 raise OptionError(f"{option} {value!r} has no unit; write for instance {example}")
-            seconds = pd.Timedelta(re.sub(r"(?<=[\d ])m$", "min", value.strip())).value / 1e9
+            if _JOINED.search(value):
+                raise ValueError("numbers without a unit between them")
+            text = re.sub(r"(?<=[\d ])m$", "min", value.strip().replace("μ", "µ"))
+            seconds = pd.Timedelta(text).value / 1e9
         elif _is_bare_number(value):
             seconds = float(value)
         else:
@@ -66,10 +71,10 @@ def format_duration(seconds: float, space: str = "") -> str:
     >>> format_duration(90.0), format_duration(0.25), format_duration(7200, " ")
     ('1.5min', '0.25s', '2 h')
     """
-    for size, name in ((86400, "d"), (3600, "h"), (60, "min")):
-        if seconds >= size:
-            return f"{seconds / size:.4g}{space}{name}"
-    return f"{seconds:.3g}{space}s"
+    units = ((86400, "d"), (3600, "h"), (60, "min"))
+    size, name = next((unit for unit in units if seconds >= unit[0]), (1, "s"))
+    rounded = float(f"{seconds / size:.{3 if size == 1 else 4}g}")
+    return f"{np.format_float_positional(rounded, trim='-')}{space}{name}"
 
 
 def samples(value: Any, rate: float, option: str) -> int:

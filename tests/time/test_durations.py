@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.errors import OptionError
-from gyrostab.time.durations import averaging_factors, duration_seconds, samples
+from gyrostab.time.durations import averaging_factors, duration_seconds, format_duration, samples
 
 
 @given(window=st.integers(2, 3000), taus=st.integers(1, 10**20))
@@ -57,3 +57,22 @@ def test_tau_max_limits_a_list():
 def test_averaging_times_of_another_type_are_refused_clearly(taus):
     with pytest.raises(OptionError, match="give a number of averaging times above 0"):
         averaging_factors(taus, rate=100.0, window=1000)
+
+
+@pytest.mark.parametrize("text", ["1,5min", "1, 5 min", "1 5min", "1.5.3s", "1 00:00:05"])
+def test_numbers_without_a_unit_between_them_are_refused(text):
+    with pytest.raises(OptionError, match="is not a duration"):
+        duration_seconds(text, "window")
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("1 day, 2:00:00", 93600.0), ("2h,30min", 9000.0), ("1.5h 2.5min", 5550.0), ("10μs", 1e-5)],
+)
+def test_durations_of_several_units_are_read(text, seconds):
+    assert duration_seconds(text, "window") == seconds
+
+
+@pytest.mark.parametrize("seconds", [1e-5, 0.25, 59.9996, 90.0, 7200.0, 14288.4 * 86400, 1e9])
+def test_a_formatted_duration_is_one_that_options_take(seconds):
+    assert duration_seconds(format_duration(seconds), "window") == pytest.approx(seconds, rel=5e-4)

@@ -120,9 +120,9 @@ def cut_log(
     low = 0 if time_from is None else clock.sample_of(time_from, "--from", last=grid.size - 1)
     high = grid.size if time_to is None else clock.sample_of(time_to, "--to", last=grid.size)
     if low >= high:
-        raise OptionError(
-            f"nothing is left between --from {time_from} and --to {time_to}; {clock.describe()}"
-        )
+        ends = (("--from", time_from), ("--to", time_to))
+        given = " and ".join(f"{option} {end}" for option, end in ends if end is not None)
+        raise OptionError(f"nothing is left with {given}; {clock.describe()}")
     excluded = _merge_spans([clock.span_of(span, low, high) for span in spans])
     runs = _kept_runs(low, high, excluded)
     if not len(runs):
