@@ -26,6 +26,7 @@ from gyrostab.schema import SIGNAL_LONG_NAMES, SIGNAL_UNITS, texts
 from gyrostab.store.private import is_in_memory
 from gyrostab.store.read import MIN_LAZY_VALUES, make_variable_lazy
 from gyrostab.store.write import declare_counts
+from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import HOUR, Unit, known_units, parse_unit
 
 #: An option of a command with its value, as messages on files advise it.
@@ -343,7 +344,7 @@ def from_dataarray(
         raw = (
             log.drop_vars("time")
             .rename_dims(time="row")
-            .assign_coords(time=("row", stamps.astype("datetime64[ns]")))
+            .assign_coords(time=("row", to_nanoseconds(stamps).view("datetime64[ns]")))
         )
         with _keyword_advice():
             regular_log = regularise(

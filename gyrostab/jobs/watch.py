@@ -48,6 +48,7 @@ from gyrostab.store.remote import find_url
 from gyrostab.store.system import release_memory, return_large_arrays
 from gyrostab.time.durations import duration_seconds, samples
 from gyrostab.time.grid import first_stamp, grid_times
+from gyrostab.time.stamps import to_nanoseconds
 
 #: Attribute of the product with the options that made it.
 _OPTIONS = "gyrostab_watch"
@@ -394,7 +395,7 @@ def _hash_samples(log: xr.Dataset, span: tuple[int, int], common: str) -> bytes:
     for name in [signal_name(log), *log_channels(log)]:
         variable, (begin, end) = log.variables[name], span
         if variable.dims[-1] != "time":
-            stamps = log.variables[f"time_{name}"].values.astype("datetime64[ns]").view(np.int64)
+            stamps = to_nanoseconds(log.variables[f"time_{name}"].values)
             begin, end = np.searchsorted(stamps, grid_times(start, rate, np.array(span))).tolist()
             total.update(stamps[begin:end].tobytes())
         source = find_source(variable.data)

@@ -299,4 +299,4 @@ def decode_stamps(variable: xr.Variable, attrs: dict[Any, Any] | None = None) ->
         "calendar": attrs.get("calendar", "standard"),
     }
     decoded = xr.decode_cf(xr.Dataset({"stamps": timed})).variables["stamps"].load()
-    return decoded.astype("datetime64[ns]")
+    return decoded.copy(data=to_nanoseconds(decoded.values).view("datetime64[ns]"))

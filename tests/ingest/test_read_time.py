@@ -19,7 +19,7 @@ from pyarrow import parquet
 
 from gyrostab.errors import FormatError, OptionError, UnitError
 from gyrostab.ingest import read_log, scan_file
-from gyrostab.ingest.columns.stamps import NAT, dates_to_ns, integers_to_ns, parse_time_unit
+from gyrostab.ingest.columns.stamps import NAT, integers_to_ns, parse_time_unit
 from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.time.grid import stamp_ns
 
@@ -94,17 +94,6 @@ def test_dates_of_every_unit_of_parquet(tmp_path, unit):
         pa.table({"time": zoned, "gyro_x [deg/h]": np.arange(ROWS)}), tmp_path / "zoned.parquet"
     )
     np.testing.assert_array_equal(read_log(tmp_path / "zoned.parquet").time.values, stamps)
-
-
-@pytest.mark.parametrize("unit", ["D", "s", "ms", "us", "Y"])
-@pytest.mark.parametrize("order", ["<", ">"])
-def test_dates_are_never_wrapped_around(unit, order):
-    stamps = np.array(
-        ["1500-01-01", "2026-01-01", "2300-01-01", "NaT"], dtype="datetime64[s]"
-    ).astype(f"{order}M8[{unit}]")
-    known = 1_767_225_600 * 10**9
-    assert dates_to_ns(stamps).tolist() == [NAT, known, NAT, NAT]
-    assert dates_to_ns(stamps[1:2].astype(f"{order}M8[ns]")).tolist() == [known]
 
 
 SAME_INSTANT = [

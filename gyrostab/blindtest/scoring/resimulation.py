@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from gyrostab.errors import GyrostabError
+from gyrostab.time.stamps import to_nanoseconds
 
 Array = NDArray[np.float64]
 _RECORDS = 8  # simulated with and without effects; limits time
@@ -294,13 +295,13 @@ def _channels_at_samples(log: xr.Dataset) -> dict[str, Array]:
     """Return the channels with a value for each sample of the rate, whatever their stamps."""
     from gyrostab.schema import log_channels
 
-    at = log["time"].values.astype("datetime64[ns]").astype(np.int64)
+    at = to_nanoseconds(log["time"].values)
     channels = {}
     for name in log_channels(log):
         channel = log[name]
         if channel.ndim != 1 or channel.size < _MIN_CHANNEL_SHARE * at.size:
             continue
-        stamps = channel[channel.dims[0]].values.astype("datetime64[ns]").astype(np.int64)
+        stamps = to_nanoseconds(channel[channel.dims[0]].values)
         nearest = np.clip(np.searchsorted(stamps, at), 1, stamps.size - 1)
         nearest -= at - stamps[nearest - 1] < stamps[nearest] - at
         channels[name] = channel.values.astype(np.float64)[nearest]

@@ -155,27 +155,6 @@ def _epoch_ns(text: str, since: str, calendar: str | None) -> int:
     return int(days) * 86400 * 10**9 + nanoseconds
 
 
-def dates_to_ns(dates: NDArray[Any]) -> NDArray[np.int64]:
-    """Convert datetime64 of any unit to nanoseconds since 1970.
-
-    Dates that exceed 64 bits (before 1678, after 2262) become `NAT`; numpy would wrap them around
-    without an error.
-
-    Examples
-    --------
-    >>> dates_to_ns(np.array(["1500-01-01", "1970-01-02"], dtype="datetime64[us]")).tolist()
-    [-9223372036854775808, 86400000000000]
-    """
-    native = dates.astype(dates.dtype.newbyteorder("="), copy=False)
-    low, high = (
-        np.datetime64(day, "D").astype(native.dtype) for day in ("1677-09-22", "2262-04-11")
-    )
-    outside = (native < low) | (native > high)
-    if native.dtype == np.dtype("datetime64[ns]") or not outside.any():
-        return native.astype("datetime64[ns]").view(np.int64)
-    return to_nanoseconds(np.where(outside, np.datetime64("NaT"), native))
-
-
 def read_stamps(raw: xr.Dataset, begin: int, end: int) -> NDArray[np.int64]:
     """Read the stamps of rows of a raw log [ns since 1970], `NAT` where unreadable."""
     stamps = read_slice(raw["time"].data, max(begin, 0), min(end, raw.sizes["row"]))
@@ -187,7 +166,7 @@ def texts_to_ns(texts: Sequence[Any] | NDArray[Any]) -> NDArray[np.int64]:
     stamps = pd.to_datetime(
         pd.Series(list(texts), dtype=object), format="ISO8601", utc=True, errors="coerce"
     )
-    return dates_to_ns(stamps.dt.tz_convert(None).to_numpy())
+    return to_nanoseconds(stamps.dt.tz_convert(None).to_numpy(), far_as_nat=True)
 
 
 def integers_to_ns(values: NDArray[np.int64], unit: TimeUnit, epoch: int) -> NDArray[np.int64]:

@@ -15,10 +15,11 @@ from gyrostab.ingest.columns.pieces import EvenStampsPiece, FilePiece
 from gyrostab.ingest.columns.plan import Plan
 from gyrostab.ingest.columns.plan_draft import Column
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
-from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, dates_to_ns, numbers_to_ns
+from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, numbers_to_ns
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.store.row_inspection import inspect_rows
 from gyrostab.store.threads import map_in_order
+from gyrostab.time.stamps import to_nanoseconds
 
 #: Largest number of rows, and of bytes of all columns, that are converted at one time.
 BATCH_ROWS = 2**20
@@ -57,7 +58,7 @@ def to_stamps(values: Any, column: Column, options: ReadOptions) -> NDArray[np.i
     array = np.ma.getdata(values) if mask is not None else np.asarray(values)
     unit = column.time_unit
     if array.dtype.kind == "M":
-        stamps = dates_to_ns(array)
+        stamps = to_nanoseconds(array, far_as_nat=True)
     elif unit is None or array.dtype.kind not in "iuf":
         stamps = cells_to_ns(
             ["" if value is None else str(value) for value in array],

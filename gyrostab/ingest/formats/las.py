@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.headers import is_time_unit
-from gyrostab.ingest.columns.stamps import dates_to_ns, floats_to_ns, parse_time_unit
+from gyrostab.ingest.columns.stamps import floats_to_ns, parse_time_unit
 from gyrostab.ingest.columns.typed import holds_dates
 from gyrostab.ingest.formats.recognise import read_head
 from gyrostab.ingest.formats.tables import (
@@ -29,6 +29,7 @@ from gyrostab.ingest.formats.tables import (
     sliced,
 )
 from gyrostab.ingest.options import ReadOptions
+from gyrostab.time.stamps import to_nanoseconds
 
 # Date fields in units of curves -> codes of `datetime.strptime`.
 _DATE_CODES = {"yyyy": "%Y", "yy": "%y", "mmm": "%b", "mm": "%m", "dd": "%d"}
@@ -102,8 +103,8 @@ def _to_stamps(
             f"{path.name}: the order of day and month in the curve {name} ({days[0]!r}) is not "
             f"clear; {fix}"
         )
-    start = dates_to_ns(
-        pd.to_datetime(pd.Series(days), format=order, errors="coerce").to_numpy()
+    start = to_nanoseconds(
+        pd.to_datetime(pd.Series(days), format=order, errors="coerce").to_numpy(), far_as_nat=True
     ).view("datetime64[ns]")
     clock = pd.Series(times)
     if clock.dtype.kind not in "iuf":

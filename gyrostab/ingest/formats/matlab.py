@@ -26,7 +26,6 @@ from gyrostab.ingest.columns.headers import (
     TIME_PATTERN,
     is_time_unit,
 )
-from gyrostab.ingest.columns.stamps import dates_to_ns
 from gyrostab.ingest.formats.matlab5 import check_structure
 from gyrostab.ingest.formats.packing import ATTRIBUTES
 from gyrostab.ingest.formats.stored import StoredColumn, StoredTable, plan_stored
@@ -35,6 +34,7 @@ from gyrostab.ingest.limits import check_chunk
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.store.hdf5_heaps import check_global_heaps
 from gyrostab.store.rows import LibraryRows, hdf5_rows
+from gyrostab.time.stamps import to_nanoseconds
 
 HDF_SUFFIXES = (".h5", ".hdf5")
 _PLAIN_ARRAYS = (
@@ -250,7 +250,7 @@ def _make_column(
 ) -> Iterator[tuple[int, StoredColumn]]:
     """Yield length and column of numbers; dates and durations become nanoseconds."""
     if values.dtype.kind == "M":
-        values, unit = dates_to_ns(values), "nanoseconds since 1970-01-01"
+        values, unit = to_nanoseconds(values, far_as_nat=True), "nanoseconds since 1970-01-01"
     elif values.dtype.kind == "m":
         values, unit = values.astype("timedelta64[ns]").view(np.int64), "ns"
     if values.dtype.kind in "biuf":

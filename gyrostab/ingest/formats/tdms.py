@@ -17,7 +17,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.stamps import NAT, dates_to_ns
+from gyrostab.ingest.columns.stamps import NAT
 from gyrostab.ingest.formats.recognise import begins_like
 from gyrostab.ingest.formats.tables import (
     NO_NAME,
@@ -30,6 +30,7 @@ from gyrostab.ingest.formats.tables import (
     sliced,
 )
 from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.time.stamps import to_nanoseconds
 
 _FIRST_DATE = np.datetime64(
     "1950-01-01", "us"
@@ -79,7 +80,7 @@ def _waveform_clock(path: Path, channel: Any) -> tuple[float, Any] | None:
         if start is None or np.datetime64(start, "us") < _FIRST_DATE
         else np.datetime64(start, "us")
     )
-    began = 0 if start is None else int(dates_to_ns(np.array(start)))
+    began = 0 if start is None else int(to_nanoseconds(np.array(start), far_as_nat=True))
     if began == NAT:
         raise FormatError(
             f"{path.name}: channel {channel.name!r} begins at {start}, which is after the "
