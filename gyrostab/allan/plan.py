@@ -164,7 +164,7 @@ def _check_choices(*, method: str, gaps: str, overlap: str, convention: str, var
 
 
 def _select_axes(signal: xr.DataArray, axis: str | Sequence[str]) -> xr.DataArray:
-    axes = [axis] if isinstance(axis, str) else list(axis)
+    axes = [axis] if isinstance(axis, str) else list(dict.fromkeys(axis))
     available = [str(name) for name in signal["axis"].values]
     unknown = [name for name in axes if name not in available]
     if unknown or not axes:

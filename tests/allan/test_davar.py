@@ -298,6 +298,8 @@ class TestInvariance:
         together = davar(log_of(x), window="1000samples")
         single = davar(log_of(x), window="1000samples", axis="y")
         xr.testing.assert_identical(together.avar.sel(axis=["y"]), single.avar)
+        named_twice = davar(log_of(x), window="1000samples", axis=["y", "y"])
+        xr.testing.assert_identical(named_twice.avar, single.avar)
 
     def test_scaling_and_constant(self):
         x = np.random.default_rng(11).standard_normal(5000)
