@@ -27,12 +27,15 @@ from gyrostab.time.stamps import to_nanoseconds
 NANOSECONDS = 10**9
 #: Stamps are integer nanoseconds: at a higher rate, several samples would share one.
 MAX_RATE_HZ = 1e9
+#: At a lower rate, one period could exceed 64-bit nanoseconds, which hold 292 years.
+MIN_RATE_HZ = 1e-9
 
 _CLOCK = r"(\d{1,2})(?::(\d{1,2})(?::(\d{1,2})(?:[.,](\d+))?)?)?"
 _ZONE = r"\s*(Z|UTC|GMT|[+-]\d{1,2}(?::?\d{2})?)?"
 _INSTANT = re.compile(
     rf"(\d{{4}}|1(?=-0?1-))-(\d{{1,2}})-(\d{{1,2}})(?:[T ]\s*{_CLOCK}{_ZONE})?", re.IGNORECASE
 )
+_OFFSET = re.compile(r"(.*\d[T ].*?)\s*(Z|UTC|[+-]\d\d(?::?\d\d)?)")
 _COMPACT_INSTANT = re.compile(
     rf"(\d{{4}})(\d\d)(\d\d)(?:[T ](\d\d)(\d\d)(\d\d)(?:[.,](\d+))?{_ZONE})?", re.IGNORECASE
 )
@@ -102,9 +105,11 @@ def stamp_ns(start: Any, name: str = "start") -> int:
             stamp = _parse_stamp_ns(start)
         else:
             time = pd.Timestamp(start)
-            if pd.isna(time):
+            if pd.isna(time) or isinstance(start, float | np.floating):
                 raise ValueError("no time")
             stamp = int((time.tz_convert(None) if time.tzinfo else time).as_unit("ns").value)
+    except pd.errors.OutOfBoundsDatetime:
+        stamp = 2**63
     except (ValueError, TypeError, OverflowError, AttributeError) as error:
         example = "2026-11-20T14:00:00 (UTC)"
         raise OptionError(
@@ -124,18 +129,18 @@ def check_rate(rate: float, name: str) -> None:
     Raises
     ------
     OptionError
-        When it is not above 0 and at most `MAX_RATE_HZ`.
+        When it is not between `MIN_RATE_HZ` and `MAX_RATE_HZ`.
 
     Examples
     --------
     >>> check_rate(0.0, "--rate")
     Traceback (most recent call last):
-    gyrostab.errors.OptionError: --rate 0: give the sampling rate in Hz, a number above 0 and at...
+    gyrostab.errors.OptionError: --rate 0: give the sampling rate in Hz, a number from 1e-09 to ...
     """
-    if not 0 < rate <= MAX_RATE_HZ:  # false for nan too
+    if not MIN_RATE_HZ <= rate <= MAX_RATE_HZ:  # false for nan too
         raise OptionError(
             f"{name} {rate:g}: give the sampling rate in Hz, "
-            f"a number above 0 and at most {MAX_RATE_HZ:g}"
+            f"a number from {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g}"
         )
 
 
@@ -206,7 +211,11 @@ def grid_times(start: int, rate: float, index: Any) -> NDArray[np.int64]:
 def grid_index(start: int, rate: float, stamps: Any) -> NDArray[np.float64]:
     """Compute the positions of `stamps` [ns since 1970] on the grid, in fractional samples."""
     nanoseconds, fraction = period_ns(rate)
-    return np.asarray((np.asarray(stamps, dtype=np.int64) - start) / (nanoseconds + fraction))
+    stamps = np.asarray(stamps, dtype=np.int64)
+    since = np.asarray(stamps - start)
+    has_wrapped = (since < 0) != (stamps < start)
+    since = np.where(has_wrapped, stamps - float(start), since) if has_wrapped.any() else since
+    return np.asarray(since / (nanoseconds + fraction))
 
 
 def first_stamp(log: xr.Dataset) -> int:
@@ -250,6 +259,10 @@ class _GridTransform(CoordinateTransform):
     def equals(self, other: CoordinateTransform, *, exclude: frozenset[Any] | None = None) -> bool:
         return isinstance(other, _GridTransform) and self._key() == other._key()
 
+    def shares_grid(self, other: _GridTransform) -> bool:
+        """Whether both are parts of a grid, apart from the sample at which they begin."""
+        return (self.start, self.rate, self.stride) == (other.start, other.rate, other.stride)
+
     def _key(self) -> tuple[Any, ...]:
         return (self.start, self.rate, self.first, self.stride, self.size)
 
@@ -278,6 +291,20 @@ class _GridTransform(CoordinateTransform):
         return bool(np.array_equal(own_stamps, other_stamps))
 
 
+def _span_of(bound: Any) -> tuple[np.datetime64, np.datetime64]:
+    """Return the first and last nanosecond, UTC, of a time or of what a text names."""
+    if isinstance(bound, str):  # "T12:00:03" ends with that second
+        match = _OFFSET.fullmatch(bound.strip())
+        period = pd.Period(match[1] if match else bound)
+        zone = pd.Timestamp(f"1970-01-01T00:00{match[2] if match else 'Z'}").utcoffset()
+        ends = period.start_time - zone, period.end_time - zone
+    else:
+        time = pd.Timestamp(bound)
+        ends = (time.tz_convert(None) if time.tzinfo else time,) * 2
+    first, last = (end.as_unit("ns").to_datetime64() for end in ends)
+    return first, last
+
+
 def _wrap_positions(positions: dict[Any, Any]) -> Any:
     """Wrap positions by dimension as xarray expects them; it does not export the class."""
     return type(xr.indexes.PandasIndex([0], "n").sel({"n": 0}))(positions)
@@ -299,9 +326,10 @@ class TimeGridIndex(CoordinateTransformIndex):
         return self.transform.rate / self.transform.stride
 
     def isel(self, indexers: Mapping[Any, Any]) -> TimeGridIndex | None:
-        """Keep the index for slices; other selections get an ordinary coordinate."""
+        """Keep the index for slices forward; other selections get an ordinary coordinate."""
         part = indexers[self.transform.dims[0]]
-        return type(self)(self.transform.cut(part)) if isinstance(part, slice) else None
+        is_forward = isinstance(part, slice) and (part.step is None or part.step > 0)
+        return type(self)(self.transform.cut(part)) if is_forward else None
 
     @classmethod
     def concat(cls, indexes: Sequence[Any], dim: Any, positions: Any = None) -> Any:
@@ -317,61 +345,96 @@ class TimeGridIndex(CoordinateTransformIndex):
         stamps = [index.to_pandas_index() for index in indexes]
         return xr.indexes.PandasIndex(stamps[0].append(stamps[1:]), dim)
 
+    def join(self, other: Any, how: str = "inner") -> Any:
+        """Return the common or united axis; it is computed if both are parts of one grid."""
+        own, another = self.transform, other.transform
+        shift, rest = divmod(another.first - own.first, own.stride)
+        if not rest and own.shares_grid(another):
+            begins, ends = (0, shift), (own.size, shift + another.size)
+            if how == "inner":
+                return type(self)(own.select(range(max(begins), min(ends))))
+            if max(begins) <= min(ends):
+                return type(self)(own.select(range(min(begins), max(ends))))
+        stamps = self.to_pandas_index(), other.to_pandas_index()
+        joined = stamps[0].union(stamps[1]) if how == "outer" else stamps[0].intersection(stamps[1])
+        return xr.indexes.PandasIndex(joined, own.dims[0])
+
+    def reindex_like(self, other: Any, method: Any = None, tolerance: Any = None) -> dict[Any, Any]:
+        """Find the positions of the stamps of another index, -1 where there is none."""
+        positions, is_found = self._find_stamps(other.to_pandas_index().values, method, tolerance)
+        return {self.transform.dims[0]: np.where(is_found, positions, -1)}
+
     def sel(self, labels: dict[Any, Any], method: Any = None, tolerance: Any = None) -> Any:
         """Find positions of stamps (exact or nearest), of a day, or of slices with both ends."""
-        (name,) = self.transform.coord_names
+        (name,), (dim,) = self.transform.coord_names, self.transform.dims
         label = labels[name]
-        dim = self.transform.dims[0]
         if isinstance(label, slice):
             return _wrap_positions({dim: self._find_slice(label)})
-        if isinstance(label, str) and method is None and len(label) < len("2000-01-01T00:00:00"):
-            # "2026-11-20" or "2026-11-20T14": the whole day or hour, as in pandas
-            period = pd.Period(label)
-            return _wrap_positions(
-                {dim: self._find_slice(slice(period.start_time, period.end_time))}
+        if isinstance(label, str) and method is None:
+            first, last = _span_of(label)
+            if last - first > np.timedelta64(1, "s"):
+                # "2026-11-20" or "2026-11-20T14": the whole day or hour, as in pandas
+                return _wrap_positions({dim: self._find_slice(slice(first, last))})
+        if isinstance(label, str | date):  # also a pandas.Timestamp
+            found = np.asarray(_span_of(label)[0])
+        else:
+            found = np.asarray(getattr(label, "values", label))
+        if found.dtype.kind == "b":
+            positions = found
+        else:
+            if found.dtype.kind in "iufc":
+                raise KeyError(f"{label} is not a time")
+            positions, is_found = self._find_stamps(
+                found.astype("datetime64") if found.dtype.kind in "USO" else found,
+                method,
+                tolerance,
             )
-        stamps = np.asarray(getattr(label, "values", label)).astype("datetime64[ns]")
-        position = self.transform.reverse({name: stamps})[dim]
-        nearest = np.rint(position).astype(np.int64)
+            if not np.all(is_found):
+                where = "near" if tolerance is None else f"within {tolerance} of"
+                raise KeyError(
+                    f"no sample exactly at {label}; use method='nearest' or a slice"
+                    if method is None
+                    else f"no sample {where} {label}"
+                )
+        if isinstance(label, xr.DataArray | xr.Variable):
+            return _wrap_positions({dim: xr.Variable(label.dims, positions)})
+        return _wrap_positions({dim: int(positions) if positions.ndim == 0 else positions})
+
+    def _find_stamps(
+        self, stamps: NDArray[Any], method: Any, tolerance: Any
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Find the nearest samples of stamps, and whether each is exact or near enough."""
         if method not in (None, "nearest"):
             raise ValueError(
                 f"a uniform time axis selects with method='nearest' or exactly, not {method!r}"
             )
-        outside = (nearest < 0) | (nearest >= self.transform.size)
+        (name,), (dim,) = self.transform.coord_names, self.transform.dims
+        position = np.rint(self.transform.reverse({name: stamps})[dim])
+        nearest = np.clip(position, 0, max(self.transform.size - 1, 0)).astype(np.int64)
+        miss = np.abs(self.transform.forward({dim: nearest})[name] - stamps)
         if method is None:
-            exact = self.transform.forward({dim: nearest})[name] == stamps
-            if np.any(outside | ~exact):
-                raise KeyError(f"no sample exactly at {label}; use method='nearest' or a slice")
-        nearest = np.clip(nearest, 0, self.transform.size - 1)
-        if tolerance is not None:
-            miss = np.abs(self.transform.forward({dim: nearest})[name] - stamps)
-            if np.any(miss > pd.Timedelta(tolerance).to_timedelta64()):
-                raise KeyError(f"no sample within {tolerance} of {label}")
-        if isinstance(label, xr.DataArray | xr.Variable):
-            return _wrap_positions({dim: xr.Variable(label.dims, nearest)})
-        return _wrap_positions({dim: int(nearest) if nearest.ndim == 0 else nearest})
+            most = np.timedelta64(0, "ns")
+        elif tolerance is not None:
+            most = pd.Timedelta(tolerance).to_timedelta64()
+        else:
+            return nearest, ~np.isnat(stamps)
+        return nearest, (miss <= most) & (self.transform.size > 0)
 
     def _find_slice(self, label: slice) -> slice:
         (name,), (dim,) = self.transform.coord_names, self.transform.dims
+        size = self.transform.size
 
         def edge(bound: Any, side: str) -> int | None:
             if bound is None:
                 return None
-            is_period_end = (
-                side == "right"
-                and isinstance(bound, str)
-                and not re.search(r"(Z|[+-]\d\d:?\d\d)$", bound)
-            )
-            # "T12:00:03" ends with that second
-            time = pd.Period(bound).end_time if is_period_end else pd.Timestamp(bound)
-            stamp = (time.tz_convert(None) if time.tzinfo else time).as_unit("ns").to_datetime64()
-            guess = int(np.floor(self.transform.reverse({name: stamp})[dim])) - 1
-            while guess < self.transform.size:  # at most three steps: only rounding is missing
+            stamp = _span_of(bound)[0 if side == "left" else 1]
+            guess = int(np.clip(self.transform.reverse({name: stamp})[dim], 1, size + 1)) - 1
+            while guess < size:  # at most three steps: only rounding is missing
                 grid_stamp = self.transform.forward({dim: guess})[name]
                 if grid_stamp > stamp or (grid_stamp == stamp and side == "left"):
                     break
                 guess += 1
-            return max(0, min(guess, self.transform.size))
+            return min(guess, size)
 
         return slice(edge(label.start, "left"), edge(label.stop, "right"), label.step)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from datetime import datetime
 from fractions import Fraction
 
 import numpy as np
@@ -74,6 +75,8 @@ class TestIndex:
             ("2026-11-21T00:00:00", "2026-11-21T00:00:03"),
             (None, "2026-11-20T23:59:59.5"),
             ("2026-11-21", None),
+            ("1700", "2200"),
+            (pd.Timestamp("2026-11-21T00:00:01"), pd.Timestamp("2026-11-21T00:00:02")),
             (None, log.time.values[4]),
             (log.time.values[4], log.time.values[8]),
         ):
@@ -84,6 +87,30 @@ class TestIndex:
         assert float(log.x.sel(time=stamp + np.timedelta64(10**6, "ns"), method="nearest")) == 777
         np.testing.assert_array_equal(log.x.sel(time=log.time.values[[5, 9]]), [5, 9])
         np.testing.assert_array_equal(log.x.sel(time=log.time[[5, 9]], method="nearest"), [5, 9])
+        assert float(log.x.sel(time=pd.Timestamp(stamp))) == 777
+        np.testing.assert_array_equal(log.x.sel(time=log.x > 2990), np.arange(2991.0, 3000))
+        assert float(log.x.sel(time="1700", method="nearest")) == 0
+
+    @pytest.mark.parametrize(
+        ("zone", "hours"), [("Z", 0), ("+00", 0), ("+02", 2), ("+0200", 2), ("-05:30", -5.5)]
+    )
+    def test_labels_with_an_offset_select_as_pandas_does(self, log, zone, hours):
+        frame = log.x.to_series().tz_localize("UTC")
+        first, last = (
+            f"{pd.Timestamp(text) + pd.Timedelta(hours=hours):%Y-%m-%dT%H:%M:%S}{zone}"
+            for text in ("2026-11-21T00:00:01", "2026-11-21T00:00:03")
+        )
+        expected = frame.loc[first:last]
+        assert expected.size == 900
+        np.testing.assert_array_equal(log.x.sel(time=slice(first, last)), expected)
+        minute = f"{first[:16]}{zone}"
+        np.testing.assert_array_equal(log.x.sel(time=minute), frame.loc[minute])
+
+    def test_a_reversed_axis_is_not_sliced_wrongly(self, log):
+        backwards = log.isel(time=slice(None, None, -1))
+        stamps = log.time.values
+        part = backwards.x.sel(time=slice(stamps[20], stamps[10]))
+        np.testing.assert_array_equal(part, np.arange(20.0, 9.0, -1))
 
     def test_labels_that_are_not_there_are_refused(self, log):
         off = log.time.values[5] + np.timedelta64(1, "ns")
@@ -93,6 +120,33 @@ class TestIndex:
             log.sel(time=off, method="nearest", tolerance="0ns")
         with pytest.raises(ValueError, match="nearest"):
             log.sel(time=off, method="ffill")
+        with pytest.raises(KeyError, match="no sample near NaT"):
+            log.sel(time=np.datetime64("NaT"), method="nearest")
+        with pytest.raises(KeyError, match="5 is not a time"):
+            log.sel(time=5)
+
+    @pytest.mark.parametrize(
+        ("one", "two", "is_computed"),
+        [
+            (slice(0, 20), slice(10, 40), True),
+            (slice(0, 20), slice(20, 40), True),
+            (slice(0, 20), slice(30, 40), False),
+            (slice(0, 60, 3), slice(6, 90, 3), True),
+            (slice(0, 60, 3), slice(0, 60, 2), False),
+        ],
+    )
+    def test_parts_of_a_grid_align_as_ordinary_axes_do(self, log, one, two, is_computed):
+        plain = log.to_dataframe().to_xarray()
+        for how in ("inner", "outer", "left", "right"):
+            got = xr.align(log.isel(time=one), log.isel(time=two), join=how)
+            expected = xr.align(plain.isel(time=one), plain.isel(time=two), join=how)
+            for mine, theirs in zip(got, expected, strict=True):
+                np.testing.assert_array_equal(mine.time.values, theirs.time.values)
+                np.testing.assert_array_equal(mine.x, theirs.x)
+        united = xr.align(log.isel(time=one), log.isel(time=two), join="outer")[0]
+        assert isinstance(united.xindexes["time"], TimeGridIndex) == is_computed
+        total = log.isel(time=one) + log.isel(time=two)
+        np.testing.assert_array_equal(total.x, (plain.isel(time=one) + plain.isel(time=two)).x)
 
     def test_it_survives_pickling_copying_alignment_and_arithmetic(self, log):
         restored = pickle.loads(pickle.dumps(log))
@@ -105,9 +159,23 @@ class TestIndex:
         assert log.to_dataframe().index[-1] == pd.Timestamp(log.time.values[-1])
 
 
-def test_a_start_that_is_no_time_is_refused():
-    with pytest.raises(OptionError, match="start 'soon' is not a date and time"):
-        make_log(np.zeros(3), rate=1.0, unit="deg/h", start="soon")
+@pytest.mark.parametrize(
+    ("start", "words"),
+    [
+        ("soon", "start 'soon' is not a date and time"),
+        (1.5e9, "is not a date and time"),
+        (datetime(2300, 1, 1), "is outside the years 1678 to 2262"),
+    ],
+)
+def test_a_start_that_is_no_time_is_refused(start, words):
+    with pytest.raises(OptionError, match=words):
+        make_log(np.zeros(3), rate=1.0, unit="deg/h", start=start)
+
+
+@pytest.mark.parametrize("rate", [0.0, 1e-12, 2e9, np.nan])
+def test_a_rate_beyond_64_bit_nanoseconds_is_refused(rate):
+    with pytest.raises(OptionError, match="a number from 1e-09 to 1e"):
+        make_log([1.0], rate=rate, unit="deg/h")
 
 
 def test_a_start_with_an_offset_is_utc_in_the_log():
