@@ -8,6 +8,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Protocol
 
+from gyrostab.time.durations import format_duration
+
+#: Time between two lines of progress away from a terminal [s].
+_LINE_INTERVAL_S = 60.0
 _COMPILING = "compiling, once after installation"
 #: Events of numba: it compiles, or `gyrostab.kernels.compile_ahead` waits for another process.
 _COMPILER_EVENTS = ("numba:compile", "gyrostab:compile")
@@ -106,8 +110,8 @@ def _format_speed(amount: float, seconds: float, unit: str) -> str:
 
 @contextmanager
 def _show_lines() -> Iterator[Stage]:
-    """Show a line at the beginning of each stage, and one at the end."""
-    begun = since = time.perf_counter()
+    """Show a line at the beginning of each stage, one per minute within it, and one at the end."""
+    begun = since = printed = time.perf_counter()
     current, first, amount, worked = "", 0, 0, ""
     announced = False
 
@@ -118,7 +122,7 @@ def _show_lines() -> Iterator[Stage]:
             print(f"{_COMPILING} ...", file=sys.stderr, flush=True)
 
     def stage(label: str, total: int = 0, done: int | None = None, unit: str = "samples") -> None:
-        nonlocal since, current, first, amount, worked
+        nonlocal since, printed, current, first, amount, worked
         now = time.perf_counter()
         watch()
         if label != current:
@@ -128,7 +132,11 @@ def _show_lines() -> Iterator[Stage]:
                 seconds = max(now - since, 1e-9)
                 speed = _format_speed(amount, seconds, "samples")
                 worked = f" ({current}: {amount:,} samples in {seconds:.1f} s, {speed})"
-            since, current, first, amount = now, label, done or 0, 0
+            since, printed, current, first, amount = now, now, label, done or 0, 0
+        if done is not None and first < done and now - printed > _LINE_INTERVAL_S:
+            printed = now
+            left = format_duration(round((now - since) / (done - first) * (total - done)), " ")
+            print(f"{label} {done:,} of {total:,} {unit}, {left} left", file=sys.stderr, flush=True)
         if unit == "samples":
             amount = total - first  # without what an earlier run has done
 

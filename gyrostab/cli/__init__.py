@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import os
 import pkgutil
 import sys
 from collections.abc import Sequence
@@ -51,6 +52,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     >>> main(["fit", "davar.nc"])
     2
     """
+    for stream in ("stdout", "stderr"):
+        if getattr(sys, stream) is None:  # closed by the shell: gyrostab run ... 2>&-
+            setattr(sys, stream, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
     tokens = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in tokens
     # abandoned tasks of zarr would print tracebacks
@@ -73,6 +77,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of the output, for instance `head`, has ended
         sys.stderr.close()
         return 0
+    except SystemExit as stop:  # of rich, which prints the help
+        if isinstance(stop.__context__, BrokenPipeError):
+            return 0
+        raise
     except Exception as error:
         if debug:
             raise

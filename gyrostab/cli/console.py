@@ -48,13 +48,13 @@ def read_config(tokens: Sequence[str], commands: Collection[str]) -> Any:
     if name is None:
         return None
     table = read_toml(Path(name))
-    unknown = [
-        key for key, value in table.items() if isinstance(value, dict) and key not in commands
-    ]
-    if unknown:
-        raise OptionError(
-            f"{name}: table [{unknown[0]}] is not a command; the commands are {', '.join(commands)}"
-        )
+    for key, value in table.items():
+        if isinstance(value, dict) and key not in commands:
+            raise OptionError(
+                f"{name}: table [{key}] is not a command; the commands are {', '.join(commands)}"
+            )
+        if not isinstance(value, dict) and key in commands:
+            raise OptionError(f"{name}: {key} is a command; give its options in a table [{key}]")
 
     def apply(current: Any, path: tuple[str, ...], arguments: Any) -> None:
         from cyclopts.config import Dict

@@ -20,6 +20,21 @@ _FITTING = Group("Fitting options", sort_key=3)
 _RUNNING = Group("Running options", sort_key=4)
 _SURVEY = Group("Survey options (iscwsa)", sort_key=4)
 _COMMON = Group("Common options", sort_key=5)
+
+
+def _parse_integer(_: Any, tokens: Sequence[Any]) -> int:
+    """Parse a whole number; without this, 1.5 would be cut to 1."""
+    try:
+        return int(tokens[0].value)
+    except ValueError:
+        raise ValueError("give a whole number") from None
+
+
+def whole_number(least: int, metavar: str = "N") -> Parameter:
+    """Make the declaration of an option that is a whole number from `least` up."""
+    return Parameter(metavar=metavar, validator=Number(gte=least), converter=_parse_integer)
+
+
 Flag = Annotated[bool, Parameter(negative=(), show_default=False)]
 
 
@@ -156,7 +171,8 @@ class Windows:
         Averaging times: their number, evenly spaced on a logarithmic scale; octave (1, 2, 4, ...
         samples); all; or a list, 0.1s,1s,10s.
     tau_max
-        Longest averaging time, at most half of the window (default: one third of the window).
+        Longest averaging time, at most half of the window, or a third for hadamard and modified
+        (default: two thirds of that).
     overlap
         full uses all second differences. octave uses fewer of them at long averaging times: faster
         on long windows, 1 % more scatter.
@@ -299,7 +315,7 @@ class Common:
     """
 
     config: Annotated[Path | None, Parameter(metavar="FILE.toml")] = None
-    workers: Annotated[int | None, Parameter(metavar="N", validator=Number(gte=1))] = None
+    workers: Annotated[int | None, whole_number(1)] = None
     overwrite: Flag = False
     quiet_progress: Flag = False
     debug: Flag = False

@@ -120,12 +120,17 @@ def to_iscwsa(
     OutputError
         When the file exists, or cannot be written.
     """
+    _check_course(running_speed, continuous_from)
     path = check_output(path, suffixes=list(SUFFIXES), overwrite=overwrite)
     model = survey_terms(product, **options)
     if path.suffix.lower() == ".csv":
         text = _make_table(model)
     else:
-        _check_speed(model, running_speed)
+        if running_speed is None and model.tool == "z":
+            raise OptionError(
+                "a tool with a z gyro alone surveys continuously; give its speed along the hole in "
+                "m/s with --running-speed"
+            )
         make = {".json": _make_json, ".xml": _make_witsml}[path.suffix.lower()]
         text = make(model, path.stem, running_speed, continuous_from)
     with new_output(path, overwrite=overwrite) as temporary:
@@ -133,11 +138,10 @@ def to_iscwsa(
     return model
 
 
-def _check_speed(model: SurveyModel, running_speed: float | None) -> None:
-    if running_speed is None and model.tool == "z":
+def _check_course(running_speed: float | None, continuous_from: float) -> None:
+    if not 0.0 <= continuous_from <= 90.0:  # false for nan too
         raise OptionError(
-            "a tool with a z gyro alone surveys continuously; give its speed along the hole in m/s "
-            "with --running-speed"
+            f"--continuous-from {continuous_from!r} is not an inclination from 0 to 90 degrees"
         )
     if running_speed is not None and not 0.0 < running_speed < math.inf:
         raise OptionError(f"--running-speed {running_speed!r} is not a speed above zero, in m/s")

@@ -40,8 +40,9 @@ _PIECE = 2**13
 
 def stream(seed: int, *names: str | int) -> np.random.Generator:
     """Random numbers that belong to a seed and some names."""
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise OptionError(f"seed={seed!r}: give a whole number from 0 up")
+    is_integer = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
+    if not (is_integer and 0 <= seed < 2**63):  # files hold it as an integer of 64 bits
+        raise OptionError(f"seed={seed!r}: give a whole number from 0 to 2**63 - 1")
     return np.random.default_rng([seed, *(zlib.crc32(str(name).encode()) for name in names)])
 
 

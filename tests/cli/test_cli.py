@@ -23,6 +23,7 @@ from gyrostab.__main__ import main as start
 from gyrostab.cli import app
 from gyrostab.ingest.make_log import make_log
 from gyrostab.io.datasets import open_log, open_product, open_surface, to_netcdf
+from gyrostab.progress import show_progress
 from tests.support.command_line import N_TRUE, WINDOW, call, stopped, write_log
 
 COMMANDS = (
@@ -214,6 +215,8 @@ def test_config_gives_defaults_and_the_command_line_wins(log, tmp_path):
         ("[rum]\n", r"\[rum\]"),
         ("[run\n", "not a TOML file"),
         ("[run]\nrate = 'x'\n", "rate"),
+        ("run = 5\n", r"run is a command; give its options in a table \[run\]"),
+        ("workers = 1.5\n", "workers.*give a whole number"),
     ],
 )
 def test_config_with_a_slip_of_the_pen(text, expected, log, tmp_path, capfd):
@@ -289,6 +292,25 @@ def test_completion_is_installed_in_the_shell_of_the_user(tmp_path):
 def test_version(capsys):
     assert call("--version") == 0
     assert re.fullmatch(r"\d+\.\d+\.\d+\S*\n", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("command", [["--version"], ["run", "--help"]])
+def test_a_reader_that_has_ended_is_no_error(command):
+    reader, writer = os.pipe()
+    os.close(reader)
+    code = "import sys; from gyrostab.__main__ import main; sys.exit(main())"
+    ended = subprocess.run(
+        [sys.executable, "-c", code, *command], stdout=writer, stderr=subprocess.PIPE
+    )
+    os.close(writer)
+    assert (ended.returncode, ended.stderr) == (0, b"")
+
+
+def test_closed_standard_streams_are_no_error(log, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "stderr", None)
+    monkeypatch.setattr(sys, "stdout", None)
+    assert call("ingest", log, "-o", tmp_path / "log.nc") == 0
+    assert call("scan", tmp_path / "nothing.csv") == 2
 
 
 def test_no_command_shows_the_help(capsys):
@@ -375,6 +397,18 @@ def test_progress_is_a_plain_line_per_stage_away_from_a_terminal(log, tmp_path, 
     assert re.search(r"computing: 12,000 samples in \d+\.\d s, \d+\.\d\d Msamples/s", last)
     assert call("run", log, "-o", tmp_path / "b.nc", *WINDOW, "--quiet-progress") == 0
     assert "done in" not in capfd.readouterr().err
+
+
+def test_a_long_stage_has_lines_of_progress(monkeypatch, capsys):
+    clock = iter(float(second) for second in range(0, 1000, 50))
+    monkeypatch.setattr("gyrostab.progress.time.perf_counter", lambda: next(clock))
+    with show_progress() as stage:
+        for done in range(1, 5):
+            stage("diagnosing", 40, done, "cases")
+    assert capsys.readouterr().err.splitlines()[:-1] == [
+        "diagnosing ...",
+        "diagnosing 3 of 40 cases, 30.83 min left",
+    ]
 
 
 def test_progress_is_a_bar_on_a_terminal(log, tmp_path):

@@ -240,6 +240,9 @@ def test_every_exported_code_has_a_weight(tmp_path):
         ("xy", "tool.yaml", {}, OptionError),
         ("z", "tool.json", {}, OptionError),
         ("xy", "tool.json", {"running_speed": 0.0}, OptionError),
+        ("xy", "tool.csv", {"running_speed": math.nan}, OptionError),
+        ("xy", "tool.csv", {"continuous_from": math.nan}, OptionError),
+        ("xy", "tool.csv", {"continuous_from": 200.0}, OptionError),
         ("xy", "nowhere/tool.json", {}, OutputError),
     ],
 )

@@ -3,30 +3,23 @@
 from __future__ import annotations
 
 import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from cyclopts import Parameter
-from cyclopts.validators import Number
 
 from gyrostab.cli.frame import app, show_stages
-from gyrostab.cli.options import Common, Flag
-from gyrostab.units import HOUR
-
-_PROGRESS_INTERVAL_S = 60.0  # between two lines of progress without a terminal
+from gyrostab.cli.options import Common, Flag, whole_number
 
 
 @app.command(sort_key=14, help_epilogue="")
 def prove(
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"], metavar="DIR")] = Path("proof"),
-    cases: Annotated[int | None, Parameter(metavar="N", validator=Number(gte=1))] = None,
-    seed: Annotated[int | None, Parameter(metavar="N", validator=Number(gte=0))] = None,
-    nulls: Annotated[int | None, Parameter(metavar="N", validator=Number(gte=100))] = None,
-    counterparts: Annotated[int | None, Parameter(metavar="N", validator=Number(gte=0))] = None,
+    cases: Annotated[int | None, whole_number(1)] = None,
+    seed: Annotated[int | None, whole_number(0)] = None,
+    nulls: Annotated[int | None, whole_number(100)] = None,
+    counterparts: Annotated[int | None, whole_number(0)] = None,
     real: Annotated[Path | None, Parameter(metavar="DIR", env_var="GYROSTAB_RECORDINGS")] = None,
     resume: Flag = False,
     common: Common = Common(),
@@ -72,10 +65,7 @@ def prove(
             file=sys.stderr,
         )
     try:
-        with (
-            show_stages(common) as stage,
-            _print_progress(stage, quiet=common.quiet_progress) as report,
-        ):
+        with show_stages(common) as stage:
             proof = run_benchmark(
                 output,
                 cases=cases,
@@ -86,7 +76,7 @@ def prove(
                 real=real,
                 resume=resume,
                 overwrite=common.overwrite,
-                progress=report,
+                progress=stage,
                 say=say,
             )
     except KeyboardInterrupt:
@@ -102,39 +92,3 @@ def prove(
             sep="\n",
         )
     print("\nwritten:", *(f"  {file}" for file in proof.files), sep="\n")
-
-
-@contextmanager
-def _print_progress(stage: Any, *, quiet: bool) -> Iterator[Any]:
-    """Print a line of progress now and then where a bar cannot be drawn."""
-    if quiet or sys.stderr.isatty():
-        yield stage
-        return
-    now: dict[str, Any] = {"label": "", "first": 0, "begun": 0.0, "printed": 0.0}
-
-    def report(label: str, total: int = 0, done: int | None = None, unit: str = "samples") -> None:
-        stage(label, total, done, unit)
-        clock = time.monotonic()
-        if label != now["label"]:
-            now.update(label=label, first=done or 0, begun=clock, printed=clock)
-        worked = (done or 0) - now["first"]
-        if worked and total and clock - now["printed"] > _PROGRESS_INTERVAL_S:
-            now["printed"] = clock
-            remaining = (clock - now["begun"]) / worked * (total - (done or 0))
-            print(
-                f"{label} {done} of {total} {unit}, {_format_duration(remaining)} left",
-                file=sys.stderr,
-                flush=True,
-            )
-
-    yield report
-
-
-def _format_duration(seconds: float) -> str:
-    return (
-        f"{seconds / HOUR:.1f} h"
-        if seconds > 5400
-        else f"{seconds / 60:.0f} min"
-        if seconds > 90
-        else f"{seconds:.0f} s"
-    )

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from gyrostab.cli.frame import Output, app, show_stages
-from gyrostab.cli.options import Common, Reading
+from gyrostab.cli.options import Common, Reading, whole_number
 from gyrostab.errors import OptionError
 
 
@@ -21,7 +21,7 @@ def simulate(
     output: Output,
     duration: Annotated[str | None, Parameter(metavar="DURATION")] = None,
     like: Annotated[list[Path] | None, Parameter(metavar="RECORDING", negative=())] = None,
-    seed: Annotated[int | None, Parameter(metavar="N")] = None,
+    seed: Annotated[int | None, whole_number(0)] = None,
     stamps: bool | None = None,
     reading: Reading = Reading(),
     common: Common = Common(),
@@ -87,8 +87,8 @@ def diagnose(
     quiet: Annotated[list[str] | None, Parameter(metavar="START/END", negative=())] = None,
     block: Annotated[str | None, Parameter(metavar="DURATION")] = None,
     level: Annotated[float, Parameter(validator=Number(gt=0, lt=0.5))] = 0.01,
-    nulls: Annotated[int, Parameter(validator=Number(gte=100))] = 400,
-    seed: Annotated[int, Parameter(metavar="N", validator=Number(gte=0))] = 0,
+    nulls: Annotated[int, whole_number(100)] = 400,
+    seed: Annotated[int, whole_number(0)] = 0,
     reading: Reading = Reading(),
     common: Common = Common(),
 ) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from gyrostab.cli.frame import Output, app
-from gyrostab.cli.options import Common, Fitting, Reading, Windows
+from gyrostab.cli.options import Common, Fitting, Reading, Windows, whole_number
 
 if TYPE_CHECKING:
     from gyrostab.jobs.alarms import Alarm
@@ -25,7 +25,7 @@ def watch(
     alarm: Annotated[list[str] | None, Parameter(metavar="LIMIT", negative=())] = None,
     lateness: Annotated[str | None, Parameter(metavar="DURATION")] = None,
     idle: Annotated[str | None, Parameter(metavar="DURATION")] = None,
-    serve: Annotated[int | None, Parameter(metavar="PORT")] = None,
+    serve: Annotated[int | None, whole_number(0, "PORT")] = None,
     windows: Windows = Windows(),
     fitting: Fitting = Fitting(),
     reading: Reading = Reading(),
