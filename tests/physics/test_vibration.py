@@ -67,7 +67,8 @@ def test_a_wide_band_has_unit_variance_and_its_density(low, high, rate):
 
 @pytest.mark.parametrize("average", [False, True], ids=["point", "average"])
 @pytest.mark.parametrize(
-    ("frequency", "quality", "rate"), [(27.0, 12.0, 10.0), (27.0, 0.7, 100.0), (0.3, 20.0, 400.0)]
+    ("frequency", "quality", "rate"),
+    [(27.0, 12.0, 10.0), (27.0, 0.7, 100.0), (0.3, 20.0, 400.0), (1e-5, 0.7, 100.0)],
 )
 def test_samples_of_an_oscillator_have_its_folded_density(frequency, quality, rate, average):
     reading = oscillator(frequency, quality, rate, average=average)
@@ -76,6 +77,12 @@ def test_samples_of_an_oscillator_have_its_folded_density(frequency, quality, ra
         lambda g: oscillator_psd(g, frequency, quality), f, rate, 1e5, average=average
     )
     np.testing.assert_allclose(density_of_reading(reading, f, rate), expected, rtol=2e-3)
+
+
+def test_a_slow_process_has_no_noise_far_above_it():
+    f = np.array([1.4e-3, 30.0])
+    slow, fast = density_of_reading(band(1e-3, 2e-3, 100.0, average=True), f, 100.0)
+    assert fast < 1e-30 * slow
 
 
 @pytest.mark.parametrize(

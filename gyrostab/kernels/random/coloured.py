@@ -30,6 +30,8 @@ ORDER = 6
 #: Ratio of the edges above which the sections of a band are paired and scaled: one after the other
 #: in the order of frequency, they attenuate the noise between them below the rounding error.
 WIDE = 100.0
+#: Change of the state in a sample below which differences of its moments lose their digits.
+_SLOW = 1e-2
 
 
 class Reading(NamedTuple):
@@ -81,14 +83,38 @@ def _factor_covariance(covariance: Array) -> Array:
     return np.ascontiguousarray(np.asarray(np.linalg.qr(root.T, mode="r")).T)
 
 
-def _make_reading(a: Array, covariance: Array, c: Array, rate: float, *, average: bool) -> Reading:
-    """Sample a stationary process with state matrix `a` [s-1] and the output `c` at `rate` [Hz]."""
+def _integrate_moments(a: Array, b: Array, c: Array, rate: float) -> tuple[Array, Array]:
+    """Integrate over a slow sample: mean of the output by state, covariance of the fresh parts.
+
+    Nothing is subtracted, but the inverse of the transition must be of moderate size (Van Loan).
+    """
+    size = c.size
+    change, drive = np.zeros((size + 1, size + 1)), np.append(b, 0.0)
+    change[:size, :size], change[size, :size] = a / rate, c
+    scale = b @ b / rate  # the exponential is exact to its norm only
+    block = np.block(
+        [[-change, np.outer(drive, drive) / (b @ b)], [np.zeros_like(change), change.T]]
+    )
+    exponential = expm(block)
+    step = exponential[size + 1 :, size + 1 :].T
+    return step[size, :size], scale * step @ exponential[: size + 1, size + 1 :]
+
+
+def _make_reading(
+    a: Array, b: Array, covariance: Array, c: Array, rate: float, *, average: bool
+) -> Reading:
+    """Sample a stationary process with state matrix `a` [s-1] and the output `c` at `rate` [Hz].
+
+    `b` is the gain of the white noise, of density 1, that drives the state.
+    """
     size = c.size
     step = expm(a / rate)
     total = np.zeros((size + 1, size + 1))
     total[:size, :size] = covariance - step @ covariance @ step.T
     read = c
-    if average:
+    if average and np.linalg.norm(a) < _SLOW * rate:
+        read, total = _integrate_moments(a, b, c, rate)
+    elif average:
         once = np.linalg.solve(a, step - np.eye(size)) * rate
         twice = 2.0 * rate * np.linalg.solve(a, once - np.eye(size))
         read = c @ once
@@ -118,8 +144,9 @@ def oscillator(frequency: float, quality: float, rate: float, *, average: bool =
         Read the mean over each sample instead of the value at its beginning.
     """
     omega = 2.0 * math.pi * frequency
-    a, _, _ = _chain_sections([_Section(omega, omega / quality, True)])
-    return _make_reading(a, np.eye(2), np.array([0.0, 1.0]), rate, average=average)
+    a, _, c = _chain_sections([_Section(omega, omega / quality, True)])
+    b = np.array([0.0, math.sqrt(2.0 * omega / quality)])
+    return _make_reading(a, b, np.eye(2), c, rate, average=average)
 
 
 def _band_sections(low: float, high: float) -> list[_Section]:
@@ -173,7 +200,7 @@ def band(
         b[end - 1] /= scale
     covariance = solve_continuous_lyapunov(a, -np.outer(b, b))
     power = covariance[size - 1, size - 1]  # of the band before the mount
-    return _make_reading(a, covariance / power, c, rate, average=average)
+    return _make_reading(a, b / math.sqrt(power), covariance / power, c, rate, average=average)
 
 
 class Process(NamedTuple):
