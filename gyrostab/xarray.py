@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -127,12 +128,23 @@ class GyrostabBackend(BackendEntrypoint):
     ) -> dict[str, xr.Dataset]:
         """Open the products in a folder of ``gyrostab fleet``, by the names of their runs."""
         folder = Path(filename_or_obj)
-        groups = {"/": xr.Dataset()}
-        for path in sorted(folder.rglob("*.nc")):
-            name = path.relative_to(folder).as_posix().removesuffix(".nc")
-            groups[f"/{name}"] = self.open_dataset(
-                path, drop_variables=drop_variables, strict=strict
+        paths = sorted(folder.rglob("*.nc"))
+        if not paths:
+            from gyrostab.errors import FormatError
+
+            raise FormatError(
+                f"{folder}: not a folder with products (.nc) of gyrostab fleet; engine='zarr' "
+                "opens those of a Zarr store, and xarray.open_dataset opens one file"
             )
+        groups = {"/": xr.Dataset()}
+        with ExitStack() as on_error:
+            for path in paths:
+                name = path.relative_to(folder).as_posix().removesuffix(".nc")
+                groups[f"/{name}"] = self.open_dataset(
+                    path, drop_variables=drop_variables, strict=strict
+                )
+                on_error.callback(groups[f"/{name}"].close)
+            on_error.pop_all()
         return groups
 
     def open_datatree(  # type: ignore[override]

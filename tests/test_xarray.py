@@ -191,6 +191,12 @@ def test_other_files_are_refused(tmp_path):
         xr.open_dataset(tmp_path / "other.nc", engine="gyrostab")
     with pytest.raises(FormatError, match="there is no such file"):
         xr.open_dataset(tmp_path / "nothing.nc", engine="gyrostab")
+    (tmp_path / "fleet.zarr").mkdir()
+    for name in ("nothing", "other.nc", "fleet.zarr"):
+        with pytest.raises(FormatError, match=f"{name}: not a folder with products"):
+            xr.open_datatree(tmp_path / name, engine="gyrostab")
+    with pytest.raises(FormatError, match=r"other\.nc: holds no log"):
+        xr.open_datatree(tmp_path, engine="gyrostab")
 
 
 # ------------------------------------------------------------------------------
