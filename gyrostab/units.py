@@ -132,6 +132,7 @@ _add_unit("magnetic", 1e3, "mT", "millitesla")
 _add_unit("magnetic", 1e6, "T", "tesla")
 _add_unit("magnetic", 100.0, "G", "gauss", "Gs")
 _add_unit("magnetic", 0.1, "mG", "milligauss", "mgauss")
+_add_unit("magnetic", 1e-4, "uG", "µG", "microgauss")
 _add_unit("number", 1.0, "1", "-", "count", "")
 
 # Products of powers of angle, time and length: name -> (dimension, numerator, denominator), in
@@ -221,13 +222,13 @@ def parse_unit(text: str, quantity: str | None = None) -> Unit:
     definition = _find_unit(match.group(2), quantity) if match else None
     if match and definition is not None:
         kind, factor, offset = definition
-        scale = float(match.group(1))
-        if scale == 0.0 or not math.isfinite(scale):
+        factor *= float(match.group(1))
+        if factor == 0.0 or not math.isfinite(factor):
             raise UnitError(
                 f"unit {text!r}: the factor {match.group(1)} is not usable; "
                 "give a finite number other than 0"
             )
-        return Unit(text, kind, factor * scale, offset)
+        return Unit(text, kind, factor, offset)
     raise UnitError(
         f"unit {text!r} is not known; known are, for instance, {known_units('rate')} for gyro axes"
     )
@@ -295,12 +296,18 @@ def _find_unit(text: str, quantity: str | None) -> tuple[str, float, float] | No
     if exact is not None and quantity in (None, exact[0]):
         return exact
     plain = _fold_spelling(text)
-    if quantity is not None and (definition := _PLAIN.get((quantity, plain))):
+    if quantity is not None and (definition := _find_plain(text, plain, quantity)):
         return definition
     if exact is not None or len(plain) < 2:  # a single letter means what its case says
         return exact
-    candidates = {candidate for kind in INNER if (candidate := _PLAIN.get((kind, plain)))}
+    candidates = {candidate for kind in INNER if (candidate := _find_plain(text, plain, kind))}
     return candidates.pop() if len(candidates) == 1 else None
+
+
+def _find_plain(text: str, plain: str, quantity: str) -> tuple[str, float, float] | None:
+    """Find a spelling without case and blanks; ``MW`` may be milli or mega, and is refused."""
+    is_prefixed = text.strip().startswith("M") and (quantity, plain[1:]) in _PLAIN
+    return None if is_prefixed else _PLAIN.get((quantity, plain))
 
 
 def known_units(quantity: str) -> str:
