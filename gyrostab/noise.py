@@ -196,15 +196,15 @@ def sampled_psd(symbol: str, frequency: Any, rate: float) -> NDArray[np.float64]
     array([3600., 3600.])
     """
     f = np.asarray(frequency, np.float64)
-    cycles = 2.0 * math.pi * f / rate
+    chord = (2.0 * np.sin(math.pi * f / rate)) ** 2  # 2 - 2 cos, without losing digits
     if symbol == "Q":
-        shape = (2.0 * np.sin(math.pi * f / rate)) ** 2 * rate
+        shape = chord * rate
     elif symbol == "N":
         shape = np.ones(f.shape)
     elif symbol == "B":
         shape = 1.0 / (2.0 * math.pi * f)
     elif symbol == "K":
-        shape = (2.0 + np.cos(cycles)) / (6.0 * (1.0 - np.cos(cycles))) / rate**2
+        shape = (1.0 - chord / 6.0) / chord / rate**2
     else:
         raise ValueError(f"no density for the term {symbol!r}")
     return np.asarray(LAWS[symbol].seconds_factor * shape)

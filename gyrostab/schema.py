@@ -347,6 +347,11 @@ def _check_tau(surface: xr.Dataset) -> None:
     rate = surface.attrs.get("sampling_rate_hz")
     if rate is None or "tau" not in surface.variables:
         return
+    if not isinstance(rate, int | float | np.number):
+        raise SchemaError(
+            f"sampling_rate_hz of the surface is {rate!r}, not a number of Hz; "
+            "set it with .assign_attrs(sampling_rate_hz=...)"
+        )
     factors = np.asarray(surface.variables["tau"].values, dtype=np.float64) * float(rate)
     whole_factors = np.rint(factors)
     if (

@@ -165,6 +165,12 @@ def test_sampled_psd_holds_the_folded_part(term):
     np.testing.assert_allclose(sampled_psd(term, f, rate), folded, rtol=1e-4)
 
 
+def test_sampled_psd_is_exact_far_below_the_rate():
+    f = np.array([1e-9, 1e-7]) * 100.0
+    expected = 1 / (HOUR * (2 * np.pi * f) ** 2)
+    np.testing.assert_allclose(sampled_psd("K", f, 100.0), expected, rtol=1e-12)
+
+
 def test_a_ramp_has_no_psd():
     with pytest.raises(ValueError, match="no density for the term 'R'"):
         sampled_psd("R", [1.0], 100.0)

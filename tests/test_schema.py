@@ -40,6 +40,10 @@ def product() -> xr.Dataset:
             lambda p: p.assign(fit_tau_min=p.N.drop_attrs()),
             "concatenated along 'time'.*data_vars='minimal'",
         ),
+        (
+            lambda p: p.assign_attrs(sampling_rate_hz="20 Hz"),
+            "sampling_rate_hz .* is '20 Hz', not a number",
+        ),
     ],
 )
 def test_what_is_not_a_product_is_refused_with_advice(
