@@ -287,12 +287,10 @@ def mean_dead_band_distance(
     array([ 2.19, -1.25])
     """
     at, line = _polygon_corners(value_times, values, begin, end)
-    # the slider starts and stops between the corners of the polygon
-    corner = np.arange(8 * (at.size - 1) + 1) / 8.0
-    at, line = (
-        np.interp(corner, np.arange(at.size), at),
-        np.interp(corner, np.arange(at.size), line),
-    )
-    slider, _ = apply_dead_band(line, width, float(line[0]))
-    total = _integrate_polygon(at, line - slider)
+    distance = line - apply_dead_band(line, width, float(line[0]))[0]
+    # between two corners the distance changes as T does, until it pushes the output
+    change, growth = np.diff(line), np.diff(distance)
+    share = np.divide(growth, change, out=np.zeros(change.size), where=change != 0.0)
+    means = distance[1:] - share * growth / 2.0
+    total = np.concatenate([[0.0], np.cumsum(means * np.diff(at))])
     return _average_growth(at, total, begin, end)

@@ -15,7 +15,7 @@ from scipy.linalg import solve_banded
 
 from gyrostab.allan.davar import davar
 from gyrostab.errors import OptionError
-from gyrostab.kernels.thermal import apply_dead_band, slab
+from gyrostab.kernels.thermal import apply_dead_band, mean_dead_band_distance, slab
 from gyrostab.noise import LAWS
 from gyrostab.physics.registry import effects, make_effect
 from gyrostab.simulate import environment as env
@@ -388,6 +388,18 @@ def test_dead_band_is_independent_of_speed_and_forgets_overrun_reversals(values,
     assert apply_dead_band(np.array([*values, high]), width, values[0])[1] == pytest.approx(
         high - width
     )
+
+
+@pytest.mark.parametrize("width", [0.03, 2.5, 40.0])
+def test_mean_distance_from_a_dead_band_of_any_width(width):
+    times, values = np.array([0.0, 10.0, 20.0, 30.0]), np.array([0.0, 10.0, -7.0, -7.0])
+    begin, end = np.array([0.0, 4.0, 20.0]), np.array([4.0, 20.0, 30.0])
+    fine = np.linspace(0.0, 30.0, 300_001)
+    line = np.interp(fine, times, values)
+    distance = line - apply_dead_band(line, width, 0.0)[0]
+    expected = [distance[(fine >= a) & (fine < b)].mean() for a, b in zip(begin, end, strict=True)]
+    got = mean_dead_band_distance(times, values, begin, end, width)
+    np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-6)
 
 
 # --------------------------------------------------------------------------------
