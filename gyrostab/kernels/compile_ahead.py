@@ -35,8 +35,11 @@ def start_compilation(module: str, kernel: Any) -> None:
     """
     stats = getattr(kernel, "stats", None)  # absent where numba is switched off
     folder = stats and stats.cache_path
-    pattern = f"*.{kernel.__name__}-*.py{sys.version_info[0]}{sys.version_info[1]}.nbi"
-    if not folder or (os.cpu_count() or 1) < 2 or any(Path(folder).glob(pattern)):
+    if not folder or (os.cpu_count() or 1) < 2:
+        return
+    line = kernel.py_func.__code__.co_firstlineno  # files of an earlier source have another
+    version = f"py{sys.version_info[0]}{sys.version_info[1]}"
+    if any(Path(folder).glob(f"*.{kernel.__name__}-{line}.{version}.nbi")):
         return
     nothing = subprocess.DEVNULL
     command = [sys.executable, "-P", "-m", module]

@@ -29,12 +29,15 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def kernel_with_cache(folder: Path) -> SimpleNamespace:
-    return SimpleNamespace(__name__="solve", stats=SimpleNamespace(cache_path=str(folder)))
+    function = SimpleNamespace(__code__=SimpleNamespace(co_firstlineno=12))
+    stats = SimpleNamespace(cache_path=str(folder))
+    return SimpleNamespace(__name__="solve", py_func=function, stats=stats)
 
 
 def test_a_process_is_started_and_awaited_with_notice(
     module: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    (tmp_path / f"solvers.solve-11.{VERSION}.nbi").touch()  # of an earlier source
     start_compilation("slow_module", kernel_with_cache(tmp_path))
     assert not module.exists()
     with show_progress() as stage, event.install_recorder(WAITING) as recorder:
