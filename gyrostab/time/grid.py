@@ -376,16 +376,16 @@ class TimeGridIndex(CoordinateTransformIndex):
                 # "2026-11-20" or "2026-11-20T14": the whole day or hour, as in pandas
                 return _wrap_positions({dim: self._find_slice(slice(first, last))})
         if isinstance(label, str | date):  # also a pandas.Timestamp
-            found = np.asarray(_span_of(label)[0])
+            times = np.asarray(_span_of(label)[0])
         else:
-            found = np.asarray(getattr(label, "values", label))
-        if found.dtype.kind == "b":
-            positions = found
+            times = np.asarray(getattr(label, "values", label))
+        if times.dtype.kind == "b":
+            positions = times
         else:
-            if found.dtype.kind in "iufc":
+            if times.dtype.kind in "iufc":
                 raise KeyError(f"{label} is not a time")
             positions, is_found = self._find_stamps(
-                found.astype("datetime64") if found.dtype.kind in "USO" else found,
+                times.astype("datetime64") if times.dtype.kind in "USO" else times,
                 method,
                 tolerance,
             )
