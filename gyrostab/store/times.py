@@ -191,7 +191,7 @@ def _parse_grid(text: Any) -> dict[str, Any]:
     if wrong:
         raise ValueError(f"no {' and no '.join(wrong)}")
     rate, size, stride = rule["rate_hz"], rule["size"], rule["stride"]
-    if not (0 < rate < math.inf and size >= 0 and stride != 0):
+    if not (0 < rate < math.inf and size >= 0 and stride > 0):
         raise ValueError(f"{text}")
     ends = (rule["first"] + stride * n for n in (0, max(size, 1) - 1))
     if any(abs(rule["start_ns"] + n * 1e9 / rate) >= 2.0**63 for n in ends):

@@ -9,7 +9,7 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.errors import OptionError, SchemaError, TimeError
+from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.concat.lazy import chunk_of, place_in_memory, place_on_grid
 from gyrostab.ingest.gap_table import (
     END,
@@ -94,8 +94,6 @@ def grid_of(log: xr.Dataset, nominal: float | None = None) -> tuple[UniformGrid,
     """Return the grid of a log's time, and whether its time axis is computed."""
     index, size = log.xindexes.get("time"), log.sizes["time"]
     if isinstance(index, TimeGridIndex):
-        if index.rate < 0:
-            raise TimeError("the time of the log runs backwards; sort it: log.sortby('time')")
         return UniformGrid(
             index.start, index.rate, size, np.array([[0, 0, size]], dtype=np.int64)
         ), True
