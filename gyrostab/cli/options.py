@@ -27,7 +27,7 @@ def _parse_integer(_: Any, tokens: Sequence[Any]) -> int:
     try:
         return int(tokens[0].value)
     except ValueError:
-        raise ValueError("give a whole number") from None
+        raise ValueError(f"{tokens[0].value} (give a whole number).") from None
 
 
 def whole_number(least: int, metavar: str = "N") -> Parameter:
