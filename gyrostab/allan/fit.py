@@ -153,7 +153,7 @@ def refit(product: xr.Dataset, **options: Any) -> xr.Dataset:
         if attribute in product.attrs
     }
     if "fit_tau_min" in product and "tau_min" not in options:
-        stored_options.update(tau_min=None, bands=_stored_bands(product))
+        stored_options["bands"] = _stored_bands(product)
     if "window_trend" not in product:  # of an earlier version: without the ramp
         none = xr.zeros_like(product["window_mean"])
         product = product.assign(window_trend=none, trend_response=none)

@@ -420,6 +420,14 @@ def test_averaging_times_with_a_disturbance_can_be_left_out():
         fit_noise(surface, tau_min="2h")
 
 
+def test_windows_fitted_again_keep_the_averaging_times_of_the_product():
+    """A tone lies below ``tau_min``, so that only a fit from there on describes the windows."""
+    x = white(np.random.default_rng(12), 3, 4000, N=0.01, rate=RATE)
+    surface = windows_of(x + 20.0 * np.sin(2 * np.pi * 30.0 * np.arange(4000) / RATE), taus=60)
+    product = fit_noise(surface, tau_min=1.0, observed_only=False)
+    xr.testing.assert_identical(fit.refit(product), product)
+
+
 def test_window_without_data_is_not_observable():
     x = np.random.default_rng(10).standard_normal((3, 1000))
     x[1] = np.nan
