@@ -58,7 +58,8 @@ def measure(x: np.ndarray, taus: int, repeats: int) -> tuple[int, list[float]]:
     surface = davar(make_log(x, rate=RATE, unit="deg/h"), window="5min", step="15s", taus=taus)
     cells, ks, rate, window = fit._fit_inputs(surface)
     flat = [np.ascontiguousarray(cell.reshape(-1, ks.size), dtype=np.float64) for cell in cells[:5]]
-    trends = [cell.reshape(-1) for cell in cells[5:]]
+    trend, *responses, exact = (cell.reshape(-1) for cell in cells[5:])
+    trends = [trend, np.stack(responses, axis=-1), exact]
     shifts = np.zeros_like(ks)
     tables = window_fit.fit_tables(tuple(ks.tolist()), tuple(shifts.tolist()), rate, window)
     noise_tables = (tables.columns, tables.weight, tables.to_samples)

@@ -100,6 +100,18 @@ VARIABLES: dict[str, dict[str, Any]] = {
     "trend_response": _make_attrs(
         "variance of window_trend under white noise, as a share of that of a window without gaps"
     ),
+    "trend_quantization_response": _make_attrs(
+        "variance of window_trend under quantization noise, as a share of that of a window without "
+        "gaps"
+    ),
+    "trend_flicker_response": _make_attrs(
+        "variance of window_trend under bias instability, as a share of that of a window without "
+        "gaps"
+    ),
+    "trend_walk_response": _make_attrs(
+        "variance of window_trend under rate random walk, as a share of that of a window without "
+        "gaps"
+    ),
     "outlier_count": _make_attrs("single samples of the window that are far from both neighbours"),
     "gap_edge_ratio": _make_attrs("scatter of the samples next to gaps over that of the others"),
     "window_coverage": _make_attrs("share of the window's samples that are present"),

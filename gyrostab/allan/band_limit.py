@@ -120,7 +120,7 @@ def find_band_limit(
     tau: Array,
     cells: Sequence[Array],
     trend: Array,
-    trend_response: Array,
+    trend_responses: Array,
     *,
     allowed: int,
     columns: Array,
@@ -140,8 +140,8 @@ def find_band_limit(
         Averaging times [s].
     cells : sequence of ndarray (n_windows, n_tau)
         Allan variance, NaN where missing, responses of N, Q and R, and gap factor.
-    trend, trend_response : ndarray (n_windows,)
-        Trend of the windows and its response to gaps.
+    trend : ndarray (n_windows,); trend_responses : ndarray (n_windows, 4)
+        Trend of the windows, and the responses of its variance to gaps.
     allowed : int
         Set of the terms to fit; without N there is no limit.
     columns : ndarray (n_tau, 5)
@@ -155,7 +155,7 @@ def find_band_limit(
         The time constant is rounded to three digits.
     """
     unlimited = BandLimit(float(tau[0]), 0.0)
-    mean = _average_windows(cells, trend, trend_response) if allowed & _N_BIT else None
+    mean = _average_windows(cells, trend, trend_responses) if allowed & _N_BIT else None
     if mean is None:
         return unlimited
     if not _fit_from(tau, mean, 0, np.zeros(1), allowed, fit)[2] < _NULL_PROBABILITY:
@@ -183,15 +183,15 @@ def _round_number(value: float) -> float:
 
 
 class _Mean(NamedTuple):
-    """Average of windows: rows as of a window, trend and its response, number of windows."""
+    """Average of windows: rows as of a window, trend and its responses, number of windows."""
 
     rows: list[Array]
     trend: float
-    response: float
+    responses: Array
     windows: int
 
 
-def _average_windows(cells: Sequence[Array], trend: Array, response: Array) -> _Mean | None:
+def _average_windows(cells: Sequence[Array], trend: Array, responses: Array) -> _Mean | None:
     """Average the windows without motion, each over its variance at the shortest averaging time."""
     level = cells[0][:, 0]
     used = np.flatnonzero(np.isfinite(level) & (level > 0))
@@ -212,7 +212,7 @@ def _average_windows(cells: Sequence[Array], trend: Array, response: Array) -> _
     rows[0][count == 0] = np.nan
     rows[4] *= count / used.size
     slope = np.sqrt(np.mean(trend[used] ** 2 / level[used]))
-    return _Mean(rows, float(slope), float(np.mean(response[used])), used.size)
+    return _Mean(rows, float(slope), responses[used].mean(axis=0), used.size)
 
 
 def _fit_constants(
@@ -222,8 +222,8 @@ def _fit_constants(
     rows = [np.tile(values, (constants.size, 1)) for values in mean.rows]
     rows[0][:, :start] = np.nan
     rows[1] *= filter_response(tau, constants[:, None])
-    every = np.ones(constants.size)
-    squares, misfit = fit(rows, mean.trend * every, mean.response * every, terms)
+    responses = np.tile(mean.responses, (constants.size, 1))
+    squares, misfit = fit(rows, np.full(constants.size, mean.trend), responses, terms)
     return squares, misfit[:, 0] * mean.windows, misfit[:, 1]
 
 

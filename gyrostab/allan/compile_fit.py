@@ -25,7 +25,7 @@ def compile_fit() -> None:
     fit_block(
         [avar, ones, ones, ones, ones],
         zero,
-        zero + 1.0,
+        np.ones((2, 4)),
         zero,
         fit_tables(factors, shifts, rate, window),
         white_error=zero,

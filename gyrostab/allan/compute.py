@@ -36,12 +36,19 @@ Floats = NDArray[np.float64]
 CELL_FIELDS = (*Cells._fields, "edf")
 #: Types of the variables that are not float64.
 FIELD_TYPES = {"count": np.int64, "estimator": np.int8, "outlier_count": np.int64}
+#: Variance of the trend of a window under Q, N, B and K, as shares of that without gaps.
+TREND_RESPONSES = (
+    "trend_quantization_response",
+    "trend_response",
+    "trend_flicker_response",
+    "trend_walk_response",
+)
 #: Variables by axis and window, in the order in which `compute_unit` returns them.
 PLANE_FIELDS = (
     "window_mean",
     "window_coverage",
     "window_trend",
-    "trend_response",
+    *TREND_RESPONSES,
     "outlier_count",
     "gap_edge_ratio",
 )
@@ -79,7 +86,7 @@ def read_spans(
 def compute_unit(
     x: NDArray[np.generic], unit: Unit, tables: NoiseTables, space: Workspace | None = None
 ) -> tuple[list[Floats], Floats]:
-    """Compute one unit: the fields of the cells, see `Cells`, and plane fields (6, n_windows)."""
+    """Compute one unit: the fields of the cells, see `Cells`, and plane fields (9, n_windows)."""
     cells, means = surface_unit(x, unit, space)
     # angles are in degree, so their slopes in degree per second
     scale = HOUR if unit.angle else 1.0
@@ -100,7 +107,7 @@ def _stack_unit(x: NDArray[np.generic], unit: Unit, tables: NoiseTables) -> tupl
 def join_units(
     results: Sequence[tuple[list[Floats], Floats]], n_axes: int
 ) -> tuple[list[NDArray[Any]], Floats]:
-    """Join units, axis by axis: fields (axis, time, tau), plane fields (6, axis, time).
+    """Join units, axis by axis: fields (axis, time, tau), plane fields (9, axis, time).
 
     A field that is the same in all windows is stored once, and repeated as a view.
     """
@@ -127,7 +134,7 @@ def _join_field(parts: list[Floats], sizes: list[int], n_axes: int, kind: Any) -
 def _describe_windows(
     x: NDArray[np.generic], unit: Unit, windows: int | None = None
 ) -> NDArray[np.float64]:
-    """Compute the plane fields from the trend on, (4, n_windows)."""
+    """Compute the plane fields from the trend on, (7, n_windows)."""
     x = convert_to_native(x)
     count = (x.size - unit.window - unit.angle) // unit.step + 1 if windows is None else windows
     first = np.arange(count) * unit.step
@@ -143,7 +150,7 @@ def _trend_scale(unit: Unit) -> float:
 
 
 def run_units(data: Any, plan: Plan) -> tuple[Any, Any]:
-    """Run the units of work: fields (axis, time, tau), plane fields (6, axis, time).
+    """Run the units of work: fields (axis, time, tau), plane fields (9, axis, time).
 
     The results are dask arrays if `data` is one.
     """
@@ -182,7 +189,7 @@ def run_units(data: Any, plan: Plan) -> tuple[Any, Any]:
 def run_published_method(
     plan: Plan, method: str, *, paper: bool
 ) -> tuple[list[NDArray[Any]], Floats]:
-    """Run a published algorithm in memory: fields (axis, time, tau), plane (6, axis, time)."""
+    """Run a published algorithm in memory: fields (axis, time, tau), plane (9, axis, time)."""
     signal, unit = plan.signal, plan.unit
     points = unit.window + (0 if paper and not unit.angle else 1)
     all_points = signal.sizes["time"] + (0 if unit.angle or paper else 1)

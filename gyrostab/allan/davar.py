@@ -120,7 +120,8 @@ def davar(
     xarray.Dataset
         ``avar, count, coverage, edf, estimator, white_response, quantization_response,
         ramp_response, difference_trend (axis, time, tau)``, ``window_mean, window_coverage,
-        window_trend, trend_response, outlier_count, gap_edge_ratio (axis, time)``, and every
+        window_trend, trend_response, trend_quantization_response, trend_flicker_response,
+        trend_walk_response, outlier_count, gap_edge_ratio (axis, time)``, and every
         channel of the log averaged over each window; ``time`` is the centre of the window, with
         ``time_bounds``; ``tau`` [s]. Units are attributes of the variables.
 

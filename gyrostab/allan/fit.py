@@ -16,6 +16,7 @@ from gyrostab.allan.band_limit import (
     filter_response,
     find_band_limit,
 )
+from gyrostab.allan.compute import TREND_RESPONSES
 from gyrostab.allan.freedoms import thin_factors
 from gyrostab.allan.window_fit import FitTables, fit_block, fit_tables, run_kernel
 from gyrostab.errors import OptionError, SchemaError
@@ -286,17 +287,18 @@ def find_bands(
     def fit(
         rows: list[NDArray[np.float64]],
         trend: NDArray[np.float64],
-        response: NDArray[np.float64],
+        responses: NDArray[np.float64],
         allowed: int,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        result, misfit, _ = run_kernel(rows, trend, response, 0.0 * trend, tables, allowed)
+        result, misfit, _ = run_kernel(rows, trend, responses, 0.0 * trend, tables, allowed)
         return result[:, FIT_FIELDS.index("square")], misfit
 
     return {
         axis: find_band_limit(
             tau[chosen],
             [cell[row][:, chosen] for cell in cells[:5]],
-            *(cell[row, :, 0] for cell in cells[5:7]),
+            cells[5][row, :, 0],
+            np.stack([cell[row, :, 0] for cell in cells[6:10]], axis=-1),
             allowed=_bits(fitted_terms),
             columns=tables.columns,
             fit=fit,
@@ -373,7 +375,7 @@ def _fit_inputs(
 ) -> tuple[list[Any], NDArray[np.int64], float, int]:
     """Collect the cells as (axis, time, tau) arrays, averaging factors, rate and window length.
 
-    Trend and its response follow, and whether its product with the noise is removed (axis, time,
+    Trend and its responses follow, and whether its product with the noise is removed (axis, time,
     1). The line of slope b through a window of which the second differences show the slope s adds
     ``b (2 s - b) tau^2 / 2`` to the Allan variance. Without gaps s is near b, and its scatter is
     known (`gyrostab.kernels.fit.trend`). Through gaps it is not, but s is measured, and what
@@ -387,14 +389,15 @@ def _fit_inputs(
             f"the surface lacks the attribute {missing}; it is not what gyrostab.davar writes"
         ) from missing
     ks = np.round(np.asarray(surface["tau"].values) * rate).astype(np.int64)
-    if "ramp_response" not in surface:  # written by a version that took it as 1
-        surface = surface.assign(ramp_response=xr.ones_like(surface["white_response"]))
-    absent = [name for name in _FIT_VARIABLES if name not in surface]
+    absent = [name for name in _FIT_VARIABLES if name not in {*surface, *_LATER_VARIABLES}]
     if absent:
         raise SchemaError(
             f"the surface lacks {absent}, which the fit needs to account for gaps and ramps; make "
             "it with gyrostab.davar"
         )
+    for name, similar in _LATER_VARIABLES.items():  # written by a version that took it as 1
+        if name not in surface:
+            surface = surface.assign({name: xr.ones_like(surface[similar])})
     cells = [surface[name].data for name in _FIT_VARIABLES]
     cells[5:] = [plane[..., None] for plane in cells[5:]]
     if "difference_trend" in surface and allowed >> STOCHASTIC & 1:
@@ -407,7 +410,7 @@ def _fit_inputs(
     return [*cells, exact], ks, rate, window
 
 
-#: Variables of a surface that a fit uses: by averaging time, and the last two by window.
+#: Variables of a surface that a fit uses: by averaging time, and those of the trend by window.
 _FIT_VARIABLES = (
     "avar",
     "white_response",
@@ -415,8 +418,15 @@ _FIT_VARIABLES = (
     "ramp_response",
     "gap_factor",
     "window_trend",
-    "trend_response",
+    *TREND_RESPONSES,
 )
+#: Those that the first versions did not write, and others with their dimensions.
+_LATER_VARIABLES = {
+    "ramp_response": "white_response",
+    "trend_quantization_response": "trend_response",
+    "trend_flicker_response": "trend_response",
+    "trend_walk_response": "trend_response",
+}
 
 
 def _prepare_fit(
@@ -458,16 +468,17 @@ def _fit_gls(
             np.ascontiguousarray(a[..., chosen].reshape(-1, chosen.size), dtype=np.float64)
             for a in arrays[:5]
         ]
-        trend, response, exact, filtered, white_error = (
+        trend, *shares, exact, filtered, white_error = (
             np.asarray(a, dtype=np.float64).reshape(-1) for a in arrays[5:]
         )
+        responses = np.stack(shares, axis=-1)
         fitted = np.empty((filtered.size, width))
         for rows, terms in ((filtered == 0, allowed), (filtered > 0, allowed & ~_bits("Q"))):
             if rows.any():
                 fitted[rows] = fit_block(
                     [a[rows] for a in flat],
                     trend[rows],
-                    response[rows],
+                    responses[rows],
                     exact[rows],
                     tables,
                     white_error=white_error[rows],

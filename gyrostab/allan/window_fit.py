@@ -124,7 +124,7 @@ def fit_tables(
 def fit_block(
     flat: list[NDArray[np.float64]],
     trend: NDArray[np.float64],
-    response: NDArray[np.float64],
+    responses: NDArray[np.float64],
     exact: NDArray[np.float64],
     tables: FitTables,
     *,
@@ -134,10 +134,11 @@ def fit_block(
 ) -> NDArray[np.float64]:
     """Fit windows: coefficients, errors, limits, observability, chi2, dof and edf as columns.
 
-    `exact` is 1 where the product of ramp and noise is removed from the cells, else 0;
+    `responses` (n_windows, 4) is the variance of the trend under Q, N, B and K, as a share of that
+    without gaps. `exact` is 1 where the product of ramp and noise is removed from the cells, else 0;
     `white_error` is the relative error of N that a window does not show.
     """
-    result, misfit, dof = run_kernel(flat, trend, response, exact, tables, allowed)
+    result, misfit, dof = run_kernel(flat, trend, responses, exact, tables, allowed)
     field = {name: result[:, i] for i, name in enumerate(FIT_FIELDS)}
     for name in ("variance_square", "low_square"):
         field[name][:, TERMS.index("N")] += (2.0 * white_error) ** 2
@@ -162,7 +163,7 @@ def fit_block(
 def run_kernel(
     flat: list[NDArray[np.float64]],
     trend: NDArray[np.float64],
-    response: NDArray[np.float64],
+    responses: NDArray[np.float64],
     exact: NDArray[np.float64],
     tables: FitTables,
     allowed: int,
@@ -172,8 +173,7 @@ def run_kernel(
     pairs, ramps = tables.pairs, tables.ramps
     if allowed >> STOCHASTIC & 1:
         pairs, ramps = tables.trend.pairs, tables.trend.ramps
-        trends[:, :STOCHASTIC] = tables.trend_variance
-        trends[:, TERMS.index("N")] *= response
+        trends[:, :STOCHASTIC] = tables.trend_variance * responses
         trends[:, STOCHASTIC] = trend**2
         trends[:, STOCHASTIC + 1] = 1.0 - exact
         trends = np.nan_to_num(trends)

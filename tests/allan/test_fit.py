@@ -545,12 +545,13 @@ def cells_of(surface):
     cells, ks, rate, window = fit._fit_inputs(surface)
     tables = window_fit.fit_tables(tuple(ks.tolist()), (0,) * ks.size, rate, window)
     flat = [np.ascontiguousarray(cell[0], dtype=np.float64) for cell in cells[:5]]
-    return flat, *(cell[0, :, 0] for cell in cells[5:]), tables
+    trend, *responses, exact = (cell[0, :, 0] for cell in cells[5:])
+    return flat, trend, np.stack(responses, axis=-1), exact, tables
 
 
-def plain_fits(flat, trend, response, exact, tables):
+def plain_fits(flat, trend, responses, exact, tables):
     for w in range(trend.size):
-        trends = tables.trend_variance * [1, response[w], 1, 1]
+        trends = tables.trend_variance * responses[w]
         trends = np.append(trends, [trend[w] ** 2, 1 - exact[w]])
         yield fit_window_plainly(*(cell[w] for cell in flat), trends, tables)
 
@@ -752,6 +753,22 @@ def test_ramp_through_gaps_changes_only_the_ramp():
     np.testing.assert_allclose(many.N, few.N, rtol=0.01)
     np.testing.assert_allclose(many.window_trend - few.window_trend, 49_500.0, rtol=1e-9)
     assert (many.observable.sel(term="R") == 2).all()
+
+
+@pytest.mark.parametrize("kind", ["random walk", "flicker", "quantization"])
+def test_trend_of_noise_through_gaps_is_no_ramp(kind):
+    """The variance of the trend depends on where the samples are missing, and on the noise."""
+    rng = np.random.default_rng([43, len(kind)])
+    x = white(rng, 200, 2000, N=0.01, rate=RATE)
+    if kind == "quantization":  # whose errors at both ends of a gap do not cancel
+        x = lose(rng, x + quantization(rng, 200, 2000, Q=2.0, rate=RATE), 0.1, 1)
+    else:
+        noise = random_walk(rng, 200, 2000, K=400.0, rate=RATE)
+        x += noise if kind == "random walk" else flicker(rng, 200, 2000, B=3.0)
+        x[:, 600:] = np.nan
+    product = fit_noise(windows_of(x, taus=24), tau_min="all", observed_only=False)
+    assert float((product.observable.sel(term="R") == 2).mean()) <= 0.03
+    assert float((product.R <= NORMAL_95 * product.R_stderr).mean()) >= 0.94
 
 
 @pytest.mark.parametrize("block", [5, 50])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -9,9 +11,13 @@ from numpy.typing import NDArray
 from gyrostab.kernels.allan.blocks import windows_from_blocks
 from gyrostab.kernels.allan.intervals import valid_intervals
 from gyrostab.kernels.compiled import INNER, KERNEL
+from gyrostab.kernels.fit.trend import angle_covariances
 
 #: Moments of a block: present samples, their places, squares of these, rates, rates times places.
 _MOMENTS = 5
+#: Parts of a window in which the present samples are counted for noise that varies slowly (B, K):
+#: its variances are then within 1 %, and 5 % where only a tenth of the window is present.
+_PARTS = 64
 
 
 @njit(**INNER)
@@ -60,16 +66,16 @@ def window_trends(
 
     Returns
     -------
-    ndarray (2, n_windows)
+    ndarray (5, n_windows)
         Slope per sample [unit of the rate; for angles: of the angle per sample]; variance of that
-        slope under white noise, relative to a window without gaps. NaN where fewer than two
+        slope under Q, N, B and K, relative to a window without gaps. NaN where fewer than two
         samples are present.
     """
     finite = np.isfinite(x)
     present = finite[1:] & finite[:-1] if angle else finite
     first = int(np.argmax(present))
     if not present[first]:
-        return np.full((2, n_windows), np.nan)
+        return np.full((5, n_windows), np.nan)
     base = float(x[first + 1]) - float(x[first]) if angle else float(x[first])
     heads, tails = _block_moments(x, angle, base, window, step, n_windows)
     moments = np.empty((n_windows, _MOMENTS))
@@ -78,7 +84,79 @@ def window_trends(
     with np.errstate(invalid="ignore", divide="ignore"):
         spread = np.where(count > 1, square - place**2 / count, np.nan)
         slope = (product - place * rate / count) / spread
-    return np.stack([slope, window * (window**2 - 1.0) / 12.0 / spread])
+        white = window * (window**2 - 1.0) / 12.0 / spread
+        out = np.stack([slope, *np.ones((4, n_windows))])
+        out[2] = white
+        lossy = np.flatnonzero(count < window)
+        if lossy.size:
+            starts, centre = lossy * step, place[lossy] / count[lossy]
+            edges = _edge_response(present, starts, window, count[lossy], centre)
+            slow = _slow_responses(present, starts, window)
+            out[1:, lossy] = white[lossy] ** 2 * [edges, 1.0 / white[lossy], *slow]
+    return out
+
+
+def _edge_response(
+    present: NDArray[np.bool_],
+    starts: NDArray[np.int64],
+    window: int,
+    count: NDArray[np.float64],
+    centre: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Sum the squared weights of the angles in the slope of each window, over those without gaps.
+
+    Inside a run of rates the weights of neighbours differ by one; at its edges they remain.
+    """
+    stops = starts + window
+    inner_starts = np.flatnonzero(present[1:] & ~present[:-1]) + 1
+    inner_lasts = np.flatnonzero(present[:-1] & ~present[1:])
+    edges, squares = np.zeros((2, starts.size))
+    for bounds in (starts, stops - 1):
+        edges += present[bounds]
+        squares += present[bounds] * (bounds - centre) ** 2
+    for places, low in ((inner_starts, starts + 1), (inner_lasts, starts)):
+        between = np.stack([np.searchsorted(places, low), np.searchsorted(places, low + window - 1)])
+        number = between[1] - between[0]
+        padded = np.append(places, 0).astype(np.float64)
+        sums, square_sums = (
+            np.where(number > 0, np.add.reduceat(padded**power, between.T.ravel())[::2], 0.0)
+            for power in (1, 2)
+        )
+        edges += number
+        squares += square_sums - 2.0 * centre * sums + number * centre**2
+    return (squares + count - 0.5 * edges) / (0.5 * (window**2 - 1.0))
+
+
+def _slow_responses(
+    present: NDArray[np.bool_], starts: NDArray[np.int64], window: int
+) -> NDArray[np.float64]:
+    """Compute the variance of ``sum (place - mean place) rate`` under B and K, (2, n_windows).
+
+    Relative to a window without gaps.
+    """
+    edges, covariances = _part_covariances(window)
+    middles = 0.5 * (edges[1:] + edges[:-1] - 1.0)
+    sums = np.zeros(present.size + 1, dtype=np.int32)
+    np.cumsum(present, out=sums[1:], dtype=np.int32)
+    counts = np.vstack([np.diff(sums[starts[:, None] + edges], axis=1), np.diff(edges)])
+    centres = counts @ middles / counts.sum(axis=1)
+    weights = (counts * (middles - centres[:, None]))[:, None, :]
+    # a product for each window, so that none depends on the others
+    variances = [(weights @ covariance @ weights.mT)[:, 0, 0] for covariance in covariances]
+    return np.array([variance[:-1] / variance[-1] for variance in variances])
+
+
+@lru_cache(maxsize=4)
+def _part_covariances(window: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Divide a window; covariance of the mean rates of its parts under B and K, (2, parts, parts).
+
+    Apart from what is common to all rates.
+    """
+    parts = min(_PARTS, window)
+    edges = np.arange(parts + 1) * window // parts
+    lengths = np.diff(edges)
+    angles = np.array(angle_covariances(np.abs(edges[:, None] - edges).astype(np.float64))[2:])
+    return edges, np.diff(np.diff(angles, axis=1), axis=2) / np.outer(lengths, lengths)
 
 
 @njit(**INNER)

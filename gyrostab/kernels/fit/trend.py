@@ -29,7 +29,7 @@ class TrendTables(NamedTuple):
     ramps: NDArray[np.float64]
 
 
-def _autocovariances(lags: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+def angle_covariances(lags: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """Compute the generalised autocovariance of the angle under Q, N, B and K."""
     square = lags * lags
     flicker = square * np.log(np.maximum(lags, 1.0)) / (2.0 * math.pi)
@@ -45,7 +45,7 @@ def _slope_covariances(window: int) -> tuple[NDArray[np.float64], NDArray[np.flo
     end = 0.5 * (window - 1.0) / spread
     angle = np.arange(window + 1)
     out = np.empty((STOCHASTIC, window + 1))
-    for term, covariance in enumerate(_autocovariances(np.arange(window + 1.0))):
+    for term, covariance in enumerate(angle_covariances(np.arange(window + 1.0))):
         sums = np.concatenate([[0.0], np.cumsum(covariance)])
         inner = sums[angle] + sums[window - angle] - covariance[0]
         out[term] = end * (covariance + covariance[::-1]) - inner / spread
