@@ -135,8 +135,8 @@ def fit_block(
     """Fit windows: coefficients, errors, limits, observability, chi2, dof and edf as columns.
 
     `responses` (n_windows, 4) is the variance of the trend under Q, N, B and K, as a share of that
-    without gaps. `exact` is 1 where the product of ramp and noise is removed from the cells, else 0;
-    `white_error` is the relative error of N that a window does not show.
+    without gaps. `exact` is 1 where the product of ramp and noise is removed from the cells, else
+    0; `white_error` is the relative error of N that a window does not show.
     """
     result, misfit, dof = run_kernel(flat, trend, responses, exact, tables, allowed)
     field = {name: result[:, i] for i, name in enumerate(FIT_FIELDS)}

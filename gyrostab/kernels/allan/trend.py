@@ -115,7 +115,9 @@ def _edge_response(
         edges += present[bounds]
         squares += present[bounds] * (bounds - centre) ** 2
     for places, low in ((inner_starts, starts + 1), (inner_lasts, starts)):
-        between = np.stack([np.searchsorted(places, low), np.searchsorted(places, low + window - 1)])
+        between = np.stack(
+            [np.searchsorted(places, low), np.searchsorted(places, low + window - 1)]
+        )
         number = between[1] - between[0]
         padded = np.append(places, 0).astype(np.float64)
         sums, square_sums = (

@@ -47,9 +47,7 @@ def test_variance_of_the_trend_through_gaps_is_the_sum_over_all_pairs(name, kind
     if kind == "angle":
         x = np.append(x, 0.0)
         present = np.isfinite(x[1:]) & np.isfinite(x[:-1])
-    got = window_trends(
-        x, angle=kind == "angle", window=WINDOW, step=STEP, n_windows=WINDOWS
-    )
+    got = window_trends(x, angle=kind == "angle", window=WINDOW, step=STEP, n_windows=WINDOWS)
     whole = slope_variances(np.ones(WINDOW, bool))
     for j in range(WINDOWS):
         expected = slope_variances(present[STEP * j :][:WINDOW]) / whole
