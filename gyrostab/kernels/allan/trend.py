@@ -157,7 +157,8 @@ def _part_covariances(window: int) -> tuple[NDArray[np.int64], NDArray[np.float6
     parts = min(_PARTS, window)
     edges = np.arange(parts + 1) * window // parts
     lengths = np.diff(edges)
-    angles = np.array(angle_covariances(np.abs(edges[:, None] - edges).astype(np.float64))[2:])
+    lags = np.abs(edges[:, None] - edges).astype(np.float64)
+    angles = np.stack([angle_covariances(term, lags) for term in (2, 3)])
     return edges, np.diff(np.diff(angles, axis=1), axis=2) / np.outer(lengths, lengths)
 
 

@@ -111,10 +111,9 @@ def _add_quantization(window, k1, k2, thin, logarithm, products, means):  # type
 
 
 @njit(**INNER)
-def _difference_covariances(k, logarithm, out):  # type: ignore[no-untyped-def]
-    """Compute second differences at distance k of three autocovariances; lag 0 is in the middle."""
-    middle = out.shape[1] // 2
-    for lag in range(middle + 1):
+def _difference_covariances(k, zero, logarithm, out):  # type: ignore[no-untyped-def]
+    """Compute second differences at distance k of three autocovariances; column `zero` is lag 0."""
+    for lag in range(out.shape[1] - zero):
         white = 0.0
         flicker = 0.0
         walk = 0.0
@@ -125,13 +124,14 @@ def _difference_covariances(k, logarithm, out):  # type: ignore[no-untyped-def]
             white += weight * t
             flicker += weight * square * logarithm[t]
             walk += weight * square * t
-        out[0, middle + lag] = out[0, middle - lag] = -0.5 * white
-        out[1, middle + lag] = out[1, middle - lag] = _FLICKER_FACTOR * flicker
-        out[2, middle + lag] = out[2, middle - lag] = walk / 12.0
+        mirrored = zero + (lag if lag > zero else -lag)
+        out[0, zero + lag] = out[0, mirrored] = -0.5 * white
+        out[1, zero + lag] = out[1, mirrored] = _FLICKER_FACTOR * flicker
+        out[2, zero + lag] = out[2, mirrored] = walk / 12.0
 
 
 @njit(fastmath=REORDER, **INNER)
-def _add_every(window, k1, k2, differences, products, means):  # type: ignore[no-untyped-def]
+def _add_every(window, k1, k2, zero, differences, products, means):  # type: ignore[no-untyped-def]
     """What `_add_smooth` adds where it takes every lag, from `_difference_covariances` of k1 <= k2.
 
     Covariances and numbers of pairs are even about the lag k1 - k2, so half of the lags are enough.
@@ -140,7 +140,7 @@ def _add_every(window, k1, k2, differences, products, means):  # type: ignore[no
     terms = float(window - 2 * k1 + 1)
     apart = float(k2 - k1)
     reach = min(2 * (k1 + k2), window)
-    centre = np.uint64(differences.shape[1] // 2)
+    centre = np.uint64(zero)
     lower, upper = centre - np.uint64(k2), centre + np.uint64(k2)
     white, flicker, walk = differences[0], differences[1], differences[2]
     n = b = k = nn = bb = kk = nb = nk = bk = 0.0
@@ -169,12 +169,12 @@ def _add_every(window, k1, k2, differences, products, means):  # type: ignore[no
 
 
 @njit(**INNER)
-def _sum_pairs(window, k1, k2, thin, logarithm, differences, products, means):  # type: ignore[no-untyped-def]
+def _sum_pairs(window, k1, k2, thin, logarithm, zero, differences, products, means):  # type: ignore[no-untyped-def]
     """Average the products ``r_a r_b`` and values ``r_a`` over all pairs of terms."""
     products[:] = 0.0
     means[:] = 0.0
     if differences.size:
-        _add_every(window, k1, k2, differences, products, means)
+        _add_every(window, k1, k2, zero, differences, products, means)
     else:
         _add_smooth(window, k1, k2, logarithm, products, means)
     _add_quantization(window, k1, k2, thin, logarithm, products, means)
@@ -185,6 +185,12 @@ def _sum_pairs(window, k1, k2, thin, logarithm, differences, products, means):  
             products[a, b] /= pairs
 
 
+@njit(**INNER)
+def _reached_lags(window, longest):  # type: ignore[no-untyped-def]
+    """Number of lags, from 0, at which `_add_every` needs the covariances."""
+    return min(2 * (longest + 2 * _LAG_STEPS), window) + longest + 1
+
+
 @njit(**KERNEL)
 def _fill_tables(window, ks, shifts, diagonal, logarithm):  # type: ignore[no-untyped-def]
     """Fill `product_tables`, or only the diagonals (4, 4, n_tau, 1) and (4, n_tau, 1)."""
@@ -193,15 +199,17 @@ def _fill_tables(window, ks, shifts, diagonal, logarithm):  # type: ignore[no-un
     products = np.zeros((STOCHASTIC, STOCHASTIC, n_tau, width))
     means = np.zeros((STOCHASTIC, n_tau, width))
     pair_products, mean = np.empty((STOCHASTIC, STOCHASTIC)), np.empty(STOCHASTIC)
-    widest = 2 * ks[-1] + min(4 * ks[-1], window) + 1
-    room = np.empty((3, 0 if diagonal else 2 * widest + 1))
+    zero, lags = ks[-1], _reached_lags(window, ks[-1])
+    room = np.empty((3, 0 if diagonal else zero + lags))
     for i in range(n_tau):
         differences = room if ks[i] < 2 * _LAG_STEPS else room[:, :0].copy()
         if differences.size:
-            _difference_covariances(ks[i], logarithm, differences)
+            _difference_covariances(ks[i], zero, logarithm, differences)
         for j in range(i, i + 1 if diagonal else n_tau):
             thin = 1 << min(shifts[i], shifts[j])
-            _sum_pairs(window, ks[i], ks[j], thin, logarithm, differences, pair_products, mean)
+            _sum_pairs(
+                window, ks[i], ks[j], thin, logarithm, zero, differences, pair_products, mean
+            )
             row, column = (i, 0) if diagonal else (j, i)
             for a in range(STOCHASTIC):
                 means[a, i, 0 if diagonal else j] = means[a, row, column] = mean[a]
@@ -236,14 +244,15 @@ def product_tables(
         ``D[a]``, such that a rate that grows by rho per sample adds ``rho^2 sum_a s[a] D[a]``.
     """
     factors = ks.astype(np.float64)
-    products, means = _fill_tables(window, ks, shifts, diagonal, _log_lags(window))
+    products, means = _fill_tables(window, ks, shifts, diagonal, _log_lags(window, int(ks[-1])))
     if diagonal:
         return 2.0 * products[..., 0], 2.0 * factors**2 * means[..., 0]
     return 2.0 * products, 2.0 * factors[:, None] * factors * means
 
 
-def _log_lags(window: int) -> NDArray[np.float64]:
+def _log_lags(window: int, longest: int) -> NDArray[np.float64]:
     """``ln t`` for every lag that can occur, 0 at t = 0."""
-    t = np.arange(5 * window + 2, dtype=np.float64)
+    lags = max(window, _reached_lags.py_func(window, longest) + 2 * _LAG_STEPS)
+    t = np.arange(lags + 1, dtype=np.float64)
     t[0] = 1.0
-    return np.log(t)
+    return np.log(t, out=t)

@@ -12,8 +12,6 @@ autocovariance G of the running sum follows from that of the angle, R = -(second
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -21,6 +19,7 @@ from numpy.typing import NDArray
 from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.compiled import INNER, KERNEL
 from gyrostab.kernels.fit.covariance import STOCHASTIC
+from gyrostab.kernels.fit.trend import angle_covariances
 
 #: Lags are taken in steps of this share of the shorter factor.
 _LAG_STEPS = 32
@@ -30,23 +29,32 @@ _WEIGHTS = (-1.0, 3.0, -3.0, 1.0)
 def _autocovariances(lags: int, *, summed: bool) -> NDArray[np.float64]:
     """Compute the generalised autocovariances of Q, N, B and K, (4, lags)."""
     t = np.arange(lags, dtype=np.float64)
-    flicker = t**2 * np.log(np.maximum(t, 1.0)) / (2.0 * math.pi)
+    out = np.empty((STOCHASTIC, lags))
     if not summed:
-        return np.stack([t == 0, -0.5 * t, flicker, t**3 / 12.0])
-    flicker = np.concatenate([[0.0, 0.0], -np.cumsum(np.cumsum(flicker[1:-1]))])
-    walk = -(t**5 - 5.0 / 3.0 * t**3 + 2.0 / 3.0 * t) / 240.0
-    return np.stack([-0.5 * t, (t**3 - t) / 12.0, flicker, walk])
+        for term, row in enumerate(out):
+            row[:] = angle_covariances(term, t)
+        return out
+    out[0] = -0.5 * t
+    out[1] = (t**3 - t) / 12.0
+    flicker = angle_covariances(2, t)
+    out[2, :2] = 0.0
+    out[2, 2:] = -np.cumsum(np.cumsum(flicker[1:-1]))
+    out[3] = -(t**5 - 5.0 / 3.0 * t**3 + 2.0 / 3.0 * t) / 240.0
+    return out
 
 
 @njit(**INNER)
 def _cross_covariances(k, table, out):  # type: ignore[no-untyped-def]
-    """Compute the covariance of an angle with a third difference, l samples later (row l)."""
+    """Compute the covariance of an angle with a third difference, l samples later (row l).
+
+    Row 0 is in the middle. Lags beyond the table are none between the angles of a window.
+    """
     middle = out.shape[0] // 2
     for row in range(out.shape[0]):
         for a in range(STOCHASTIC):
             out[row, a] = 0.0
         for i in range(4):
-            t = abs(row - middle - i * k)
+            t = min(abs(row - middle - i * k), table.shape[1] - 1)
             for a in range(STOCHASTIC):
                 out[row, a] += _WEIGHTS[i] * table[a, t]
 
@@ -116,7 +124,7 @@ def _fill_tables(window, ks, shifts, summed, diagonal, table):  # type: ignore[n
     products = np.zeros((STOCHASTIC, STOCHASTIC, n_tau, width))
     means = np.zeros((STOCHASTIC, n_tau, width))
     pair_products, mean = np.empty((STOCHASTIC, STOCHASTIC)), np.empty(STOCHASTIC)
-    r, room = np.empty(STOCHASTIC), np.empty((2 * (table.shape[1] - 3 * ks[-1]) - 1, STOCHASTIC))
+    r, room = np.empty(STOCHASTIC), np.empty((2 * table.shape[1] - 1, STOCHASTIC))
     for i in range(n_tau):
         last = i + 1 if diagonal else n_tau
         reach = 2 * (3 * (ks[i] + ks[last - 1]) + 2 + min(3 * (ks[i] + ks[last - 1]), window))
@@ -151,7 +159,7 @@ def third_tables(
         As for `product_tables`; averaging factors are at most ``(window + 1) // 3``.
     """
     summed = VARIANCES[variance].summed
-    table = _autocovariances(9 * int(ks[-1]) + window + 8, summed=summed)
+    table = _autocovariances(window + 2, summed=summed)
     products, means = _fill_tables(window, ks, shifts, summed, diagonal, table)
     factors = ks.astype(np.float64)
     ramp_response = 1.0 if summed else 0.0  # a third difference of the angle does not see a ramp

@@ -29,27 +29,46 @@ class TrendTables(NamedTuple):
     ramps: NDArray[np.float64]
 
 
-def angle_covariances(lags: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Compute the generalised autocovariance of the angle under Q, N, B and K."""
-    square = lags * lags
-    flicker = square * np.log(np.maximum(lags, 1.0)) / (2.0 * math.pi)
-    return [np.where(lags == 0, 1.0, 0.0), -0.5 * lags, flicker, square * lags / 12.0]
+def angle_covariances(term: int, lags: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Compute the generalised autocovariance of the angle under Q, N, B or K (0 to 3)."""
+    if term == 0:
+        return np.where(lags == 0, 1.0, 0.0)
+    if term == 1:
+        return -0.5 * lags
+    out = np.maximum(lags, 1.0) if term == 2 else lags * lags
+    if term == 2:
+        np.log(out, out=out)
+        out *= lags * lags
+        out /= 2.0 * math.pi
+    else:
+        out *= lags
+        out /= 12.0
+    return out
 
 
 def _slope_covariances(window: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Compute the covariance of each angle with the slope (4, window + 1), and that of the slope.
+    """Compute the covariance of each angle with the slope (4, window + 2), and that of the slope.
 
-    The slope weights the angles by -1/S, and by (W - 1) / 2S at both ends, S = W (W^2 - 1) / 12.
+    A zero precedes those of the angles, for sums of them. The slope weights the angles by -1/S, and
+    by (W - 1) / 2S at both ends, S = W (W^2 - 1) / 12. Arrays are changed in place: those of a long
+    window fill the memory.
     """
     spread = window * (window**2 - 1.0) / 12.0
     end = 0.5 * (window - 1.0) / spread
-    angle = np.arange(window + 1)
-    out = np.empty((STOCHASTIC, window + 1))
-    for term, covariance in enumerate(angle_covariances(np.arange(window + 1.0))):
-        sums = np.concatenate([[0.0], np.cumsum(covariance)])
-        inner = sums[angle] + sums[window - angle] - covariance[0]
-        out[term] = end * (covariance + covariance[::-1]) - inner / spread
-    variance = end * (out[:, 0] + out[:, -1]) - out[:, 1:-1].sum(axis=1) / spread
+    lags = np.arange(window + 1.0)
+    out, sums = np.zeros((STOCHASTIC, window + 2)), np.zeros(window + 2)
+    for term, row in enumerate(out[:, 1:]):
+        covariance = angle_covariances(term, lags)
+        np.cumsum(covariance, out=sums[1:])
+        np.add(covariance, covariance[::-1], out=row)
+        row *= end
+        first = covariance[0]
+        np.add(sums[:-1], sums[-2::-1], out=covariance)
+        covariance -= first
+        covariance /= spread
+        row -= covariance
+        del covariance  # before the next one is made
+    variance = end * (out[:, 1] + out[:, -1]) - out[:, 2:-1].sum(axis=1) / spread
     return out, variance
 
 
@@ -75,7 +94,7 @@ def detrend_tables(
         The variances are modified Allan variances, of third differences of the sum of the angle.
     """
     angles, variance = _slope_covariances(window)
-    sums = np.pad(angles.cumsum(axis=1), ((0, 0), (1, 0))) if summed else angles
+    sums = np.cumsum(angles, axis=1, out=angles) if summed else angles[:, 1:]
     products = np.empty((STOCHASTIC, STOCHASTIC, ks.size))
     means = np.empty((STOCHASTIC, ks.size))
     for i, k in enumerate(ks):

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
 from gyrostab.kernels.fit.covariance import product_tables
+from gyrostab.kernels.fit.third_differences import third_tables
 from gyrostab.kernels.fit.trend import detrend_tables
 
 WINDOW, KS = 90, np.array([1, 3, 8, 20])
@@ -54,3 +57,21 @@ def test_tables_are_those_of_the_quadratic_forms(term):
                 rel=1e-3,
                 abs=1e-3 * np.sqrt(tables.ramps[term, i, i] * tables.ramps[term, j, j]),
             ), (i, j)
+
+
+def test_tables_of_a_long_window_need_less_than_100_bytes_a_sample():
+    ks = np.array([1, 100, 2**16])
+    calls = {
+        "pairs": lambda window: product_tables(window, ks, 0 * ks, diagonal=True),
+        "third": lambda window: third_tables("modified", window, ks, 0 * ks, diagonal=True),
+        "trend": lambda window: detrend_tables(
+            window, ks, np.ones((4, 4, ks.size, ks.size)), np.ones((4, ks.size, ks.size))
+        ),
+    }
+    for name, call in calls.items():
+        call(int(3 * ks[-1]))  # compiles
+        tracemalloc.start()
+        call(2**18)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 100 * 2**18, (name, peak / 2**18)
