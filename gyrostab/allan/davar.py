@@ -231,7 +231,8 @@ def davar_part(
     Raises
     ------
     OptionError
-        If the options do not fit, or the method is not that of the block sums.
+        If the options do not fit, the part has no window, or the method is not that of the block
+        sums.
 
     Examples
     --------
@@ -245,11 +246,12 @@ def davar_part(
     plan = _plan_blocks(log, options)
     data, unit = plan.signal.data, plan.unit
     tables = make_noise_tables(plan)
-    units = [
-        windows
-        for windows in units_of_work(data.shape[1], unit)
-        if windows.start < part.stop and windows.stop > part.start
-    ]
+    units = units_of_work(data.shape[1], unit)
+    first, stop, hop = part.indices(units[-1].stop)
+    if first >= stop or hop != 1:
+        raise OptionError(f"part={part}: give a slice of windows 0 to {units[-1].stop - 1}")
+    part = slice(first, stop)
+    units = [windows for windows in units if windows.start < stop and windows.stop > first]
     spans = [(windows.start * unit.step, last_sample(windows, unit)) for windows in units]
     space = space or Workspace()
     results = [compute_unit(x, unit, tables, space) for x in read_spans(data, spans, space)]

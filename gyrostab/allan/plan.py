@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -55,6 +56,13 @@ def make_plan(
     _check_choices(
         method=method, gaps=gaps, overlap=overlap, convention=convention, variance=variance
     )
+    # with min_strict above 1, all cells are of cluster means
+    for option, share, most in (
+        ("min_strict", min_strict, np.inf),
+        ("min_coverage", min_coverage, 1.0),
+    ):
+        if not (isinstance(share, Real) and 0.0 <= share <= most):
+            raise OptionError(f"{option}={share!r}: give a share from 0 to 1")
     name = signal_name(log)
     signal = log[name] if axis is None else _select_axes(log[name], axis)
     rate = float(log.attrs["sampling_rate_hz"])

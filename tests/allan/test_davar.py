@@ -252,6 +252,26 @@ class TestInvariance:
         units_together = davar_part(log, part=slice(0, whole.sizes["time"]), space=space, **options)
         xr.testing.assert_identical(units_together.avar, whole.avar)
 
+    @pytest.mark.parametrize(
+        ("part", "windows"),
+        [
+            (slice(None, 3), [0, 1, 2]),
+            (slice(9, None), [9, 10, 11, 12]),
+            (slice(-2, 100), [11, 12]),
+            (slice(100, 101), []),
+            (slice(0, 0), []),
+            (slice(0, 4, 2), []),
+        ],
+    )
+    def test_a_part_is_a_slice_of_the_windows(self, part, windows):
+        log, options = log_of(np.arange(1600.0) % 7), {"window": "400samples", "step": "100samples"}
+        if not windows:
+            with pytest.raises(OptionError, match="give a slice of windows 0 to 12"):
+                davar_part(log, part=part, **options)
+            return
+        expected = davar(log, **options).isel(time=windows)
+        xr.testing.assert_identical(davar_part(log, part=part, **options), expected)
+
     def test_every_thread_has_a_separate_workspace(self):
         spaces = Workspaces()
         with ThreadPoolExecutor(1) as pool:
@@ -474,6 +494,10 @@ class TestLabels:
             ({"window": "10s", "axis": "q"}, "axis 'q' is not in the log; it has x"),
             ({"window": "10s", "method": "magic"}, "direct"),
             ({"window": "10s", "convention": "paper"}, "method='direct'"),
+            ({"window": "10s", "min_strict": "0.3"}, "min_strict='0.3': give a share from 0 to 1"),
+            ({"window": "10s", "min_strict": -0.1}, "min_strict=-0.1"),
+            ({"window": "10s", "min_coverage": 5}, "min_coverage=5"),
+            ({"window": "10s", "min_coverage": np.nan}, "min_coverage=nan"),
         ],
     )
     def test_wrong_options_are_explained(self, options, words):

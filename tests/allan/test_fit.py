@@ -447,6 +447,8 @@ def test_two_averaging_times_cannot_tell_five_terms_apart():
     )
     assert (chosen.observable.sel(term="N") == OBSERVABLE.index("observed")).all()
     assert (chosen.observable.sel(term="Q") == OBSERVABLE.index("not_observable")).all()
+    one = windows_of(np.random.default_rng(11).standard_normal((3, 1000)), taus=[0.01])
+    assert (fit_noise(one).fit_dof == 0).all()
 
 
 def test_a_lazy_surface_stays_lazy_and_fits_the_same():

@@ -453,6 +453,7 @@ def fit_windows(  # type: ignore[no-untyped-def]
             misfit[w, 0], misfit[w, 1] = chi2[0, place], valid[place]
             for a in range(4):
                 misfit[w, 1] -= 1.0 if fit.terms[a, place] > 0.5 else 0.0
+            misfit[w, 1] = max(misfit[w, 1], 0.0)  # also with more terms than cells
             _take_window(place, fit, cells, room, submodels, start)
             average_submodels(
                 allowed, start, cells.trend[4, place], low_sigma, submodels, form, result[w]

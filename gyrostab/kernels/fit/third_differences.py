@@ -47,7 +47,7 @@ def _autocovariances(lags: int, *, summed: bool) -> NDArray[np.float64]:
 def _cross_covariances(k, table, out):  # type: ignore[no-untyped-def]
     """Compute the covariance of an angle with a third difference, l samples later (row l).
 
-    Row 0 is in the middle. Lags beyond the table are none between the angles of a window.
+    Row 0 is in the middle. No two angles of a window have a lag beyond the table.
     """
     middle = out.shape[0] // 2
     for row in range(out.shape[0]):
