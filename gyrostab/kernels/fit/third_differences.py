@@ -12,6 +12,8 @@ autocovariance G of the running sum follows from that of the angle, R = -(second
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -24,6 +26,8 @@ from gyrostab.kernels.fit.trend import angle_covariances
 #: Lags are taken in steps of this share of the shorter factor.
 _LAG_STEPS = 32
 _WEIGHTS = (-1.0, 3.0, -3.0, 1.0)
+#: Lag over k from which a third difference is taken as a derivative, which is then good to 1e-8.
+_FAR = 1e4
 
 
 def _autocovariances(lags: int, *, summed: bool) -> NDArray[np.float64]:
@@ -44,19 +48,39 @@ def _autocovariances(lags: int, *, summed: bool) -> NDArray[np.float64]:
 
 
 @njit(**INNER)
-def _cross_covariances(k, table, out):  # type: ignore[no-untyped-def]
+def _cross_covariances(k, table, summed, out):  # type: ignore[no-untyped-def]
     """Compute the covariance of an angle with a third difference, l samples later (row l).
 
     Row 0 is in the middle. No two angles of a window have a lag beyond the table.
     """
     middle = out.shape[0] // 2
     for row in range(out.shape[0]):
+        distance = row - middle - 1.5 * k
+        if abs(distance) > _FAR * k:
+            _derivative_covariances(k, distance, summed, out[row])
+            continue
         for a in range(STOCHASTIC):
             out[row, a] = 0.0
         for i in range(4):
             t = min(abs(row - middle - i * k), table.shape[1] - 1)
             for a in range(STOCHASTIC):
                 out[row, a] += _WEIGHTS[i] * table[a, t]
+
+
+@njit(**INNER)
+def _derivative_covariances(k, distance, summed, out):  # type: ignore[no-untyped-def]
+    """Compute it far away, -k^3 times the third derivative: differences would cancel."""
+    t = abs(distance)
+    cube = float(k) ** 3 if distance > 0.0 else -(float(k) ** 3)
+    out[0] = 0.0
+    if summed:
+        out[1] = -0.5 * cube
+        out[2] = cube * t * (2.0 * math.log(t) + 1.0) / (2.0 * math.pi)
+        out[3] = cube * (t * t / 4.0 + k * k / 16.0 - 1.0 / 24.0)
+    else:
+        out[1] = 0.0
+        out[2] = -cube / (math.pi * t)
+        out[3] = -0.5 * cube
 
 
 @njit(**INNER)
@@ -129,7 +153,7 @@ def _fill_tables(window, ks, shifts, summed, diagonal, table):  # type: ignore[n
         last = i + 1 if diagonal else n_tau
         reach = 2 * (3 * (ks[i] + ks[last - 1]) + 2 + min(3 * (ks[i] + ks[last - 1]), window))
         crossed = room[: min(reach, room.shape[0] - 1) + 1]
-        _cross_covariances(ks[i], table, crossed)
+        _cross_covariances(ks[i], table, summed, crossed)
         for j in range(i, last):
             thin = 1 << min(shifts[i], shifts[j])
             _sum_pairs(window, ks[i], ks[j], thin, summed, crossed, r, pair_products, mean)
