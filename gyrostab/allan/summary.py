@@ -20,7 +20,7 @@ from gyrostab.wording import format_share
 #: describe the record.
 _MAX_TRIED_WINDOWS = 24
 #: Share of failing windows up to which nothing is reported: a window that the terms do describe
-#: fails in 0.1 to 2 % of cases (docs/method.md), and one of a few windows is not evidence.
+#: fails in 0.1 to 1 % of cases (docs/method.md), and one of a few windows is not evidence.
 _MAX_FAILING_SHARE = 0.05
 #: Smallest ratio of longest to shortest averaging time: over a decade, the Allan variances of
 #: neighbouring terms, whose slopes differ by one, diverge by a factor of ten.
