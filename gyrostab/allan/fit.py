@@ -84,8 +84,9 @@ def fit_noise(
         without the term would do that in 1 % of windows, at most 3 %). No term is observed in a
         window that the five terms do not describe: see `is_described`. ``edf`` is that of the
         fitted noise if all averaging times are fitted, else (with more than 48 of them, or with
-        `tau_min` or `tau_max`) that of the surface. Per axis: ``fit_tau_min``, the shortest averaging time of the fit [s], and
-        ``filter_time_constant`` [s], 0 if no filter was found; with a filter, Q is not observable.
+        `tau_min` or `tau_max`) that of the surface. Per axis: ``fit_tau_min``, the shortest
+        averaging time of the fit [s], and ``filter_time_constant`` [s], 0 if no filter was found;
+        with a filter, Q is not observable.
 
     Raises
     ------
