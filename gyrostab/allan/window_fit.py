@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from gyrostab.kernels.fit.least_squares import combine_diagonal, fit_windows
 from gyrostab.kernels.fit.limits import cell_limits, estimate_bounds
 from gyrostab.kernels.fit.mixture import Curves
 from gyrostab.kernels.fit.submodels import FIT_FIELDS
-from gyrostab.kernels.fit.trend import detrend_tables
+from gyrostab.kernels.fit.trend import TrendTables, detrend_tables
 from gyrostab.noise import NORMAL_95, TERMS, sample_squares
 from gyrostab.units import HOUR
 
@@ -73,12 +73,10 @@ class FitTables:
         self.pairs, self.ramps = covariance_tables(variance, window, ks, shifts)
         diagonal = np.einsum("abii->abi", self.pairs)
         self.diagonal = combine_diagonal(diagonal, np.einsum("aii->ai", self.ramps))
-        summed = VARIANCES[variance].summed
-        self.trend = detrend_tables(window, ks, self.pairs, self.ramps, summed=summed)
-        #: Variance of the trend of a window per squared coefficient [degree2 hour-4].
-        self.trend_variance = (
-            self.trend.variance * self.to_samples[:STOCHASTIC] * (rate * HOUR) ** 2
+        self._detrend = partial(
+            detrend_tables, window, ks, self.pairs, self.ramps, summed=VARIANCES[variance].summed
         )
+        self._rate = rate
         self.weight = white_freedoms(variance, window, ks, diagonal)
         term_variance = np.einsum("aaii,a->ai", self.pairs, self.to_samples[:STOCHASTIC] ** 2)
         #: Degrees of freedom of a cell in which a term is alone, (term, tau); a ramp alone does not
@@ -88,6 +86,16 @@ class FitTables:
         )
         self.ks = ks.astype(np.float64)
         self.quantile = quantile_curve(0.05)
+
+    @cached_property
+    def trend(self) -> TrendTables:
+        """Tables of the variances less their trend, which only a fit of R needs."""
+        return self._detrend()
+
+    @property
+    def trend_variance(self) -> NDArray[np.float64]:
+        """Variance of the trend of a window per squared coefficient [degree2 hour-4]."""
+        return self.trend.variance * self.to_samples[:STOCHASTIC] * (self._rate * HOUR) ** 2
 
 
 def quantile_curve(level: float) -> tuple[float, float, NDArray[np.float64]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from copy import copy
 
 import dask.array as da
 import numpy as np
@@ -598,7 +598,8 @@ def test_a_covariance_that_is_not_positive_definite_is_widened_only_where_it_mus
     scale = np.sqrt(np.diag(pairs[3, 3]))
     values, vectors = np.linalg.eigh(pairs[3, 3] / np.outer(scale, scale))
     pairs[3, 3] -= (values[0] + 2e-5) * np.outer(vectors[:, 0] * scale, vectors[:, 0] * scale)
-    damaged = SimpleNamespace(**{**vars(tables), "trend": tables.trend._replace(pairs=pairs)})
+    damaged = copy(tables)
+    damaged.trend = tables.trend._replace(pairs=pairs)
     _, misfit, _ = window_fit.run_kernel(flat, *trends, damaged, 31)
     widened = 0
     for w, plain in enumerate(plain_fits(flat, *trends, damaged)):
@@ -691,6 +692,13 @@ def test_table_of_products_is_the_sum_over_all_pairs_of_terms():
             walk_part = first @ spread @ second.T / (2.0 * ks[i] * ks[j])
             assert got[3, 3, i, j] == pytest.approx(2 * np.mean(walk_part**2), rel=1e-9)
             assert got[1, 3, i, j] == pytest.approx(2 * np.mean(white_part * walk_part), rel=1e-9)
+
+
+@pytest.mark.parametrize(("variance", "terms"), [("hadamard", "QNBKR"), ("avar", "QNBK")])
+def test_a_fit_without_a_ramp_needs_no_tables_of_trends(monkeypatch, variance, terms):
+    monkeypatch.setattr(window_fit, "detrend_tables", lambda *_, **__: pytest.fail("made"))
+    surface = windows_of(np.random.default_rng(15).standard_normal((3, 907)), variance=variance)
+    assert (fit_noise(surface, terms=terms).observable.sel(term="R") == 0).all()
 
 
 def test_every_variable_has_a_unit():
