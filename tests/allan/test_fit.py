@@ -781,6 +781,21 @@ def test_trend_of_noise_through_gaps_is_no_ramp(kind):
     assert float((NORMAL_95 * product.R_stderr >= product.R).mean()) >= 0.94
 
 
+def test_angles_on_both_sides_of_a_gap_give_its_rate():
+    """Errors of an angle cancel in the trend, so that a lost angle adds hardly any scatter."""
+    rng = np.random.default_rng(44)
+    angle = np.cumsum(white(rng, 1, 200_000, N=0.002, rate=RATE)[0]) / RATE / 3600
+    angle += np.degrees(2e-6) * rng.standard_normal(angle.size)
+    angle[rng.random(angle.size) < 0.1] = np.nan
+    log = make_log(angle, rate=RATE, unit="deg", kind="angle")
+    surface = davar(log, window="2000samples", step="2000samples", taus=24)
+    assert float(surface.trend_quantization_response.max()) < 1.2
+    product = fit_noise(surface, tau_min="all")
+    assert float((chi2.sf(product.fit_chi2, product.fit_dof) < 1e-3).mean()) <= 0.02
+    assert (product.observable.sel(term=["B", "K", "R"]) < 2).mean() > 0.98
+    np.testing.assert_allclose(product.Q.mean(), 2.0, rtol=0.02)
+
+
 @pytest.mark.parametrize("block", [5, 50])
 def test_strong_ramp_fits_in_windows_with_gaps(block):
     """Lost samples move the centres of clusters; the ramp response accounts for that."""

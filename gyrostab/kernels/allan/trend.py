@@ -53,7 +53,10 @@ def _block_moments(x, angle, base, window, step, n_windows):  # type: ignore[no-
 def window_trends(
     x: NDArray[np.generic], *, angle: bool, window: int, step: int, n_windows: int
 ) -> NDArray[np.float64]:
-    """Fit a straight line to the present rates of each window.
+    """Fit a straight line to the rates of each window.
+
+    The rate over a gap of angles is the difference of those on both sides, with the weight of all
+    samples between them.
 
     Parameters
     ----------
@@ -69,41 +72,112 @@ def window_trends(
     ndarray (5, n_windows)
         Slope per sample [unit of the rate; for angles: of the angle per sample]; variance of that
         slope under Q, N, B and K, relative to a window without gaps. NaN where fewer than two
-        samples are present.
+        rates are present.
     """
     finite = np.isfinite(x)
     present = finite[1:] & finite[:-1] if angle else finite
-    first = int(np.argmax(present))
-    if not present[first]:
+    if np.count_nonzero(finite) < 2:
         return np.full((5, n_windows), np.nan)
+    first, starts = int(np.argmax(present)), np.arange(n_windows) * step
+    held = None
+    if angle and not finite.all():
+        held = _HeldAngles(np.flatnonzero(finite), starts, window)
+        x = np.interp(np.arange(x.size), held.places, x[held.places], left=np.nan, right=np.nan)
+        first = first if present[first] else int(held.places[0])
     base = float(x[first + 1]) - float(x[first]) if angle else float(x[first])
     heads, tails = _block_moments(x, angle, base, window, step, n_windows)
     moments = np.empty((n_windows, _MOMENTS))
     windows_from_blocks(heads, tails, np.full(_MOMENTS, window // step), moments)
+    if held is not None:
+        held.remove_partial(moments, x, base)
     count, place, square, rate, product = moments.T
+    rates = count if held is None else held.last - held.first
     with np.errstate(invalid="ignore", divide="ignore"):
-        spread = np.where(count > 1, square - place**2 / count, np.nan)
+        spread = np.where(rates > 1, square - place**2 / count, np.nan)
         slope = (product - place * rate / count) / spread
         white = window * (window**2 - 1.0) / 12.0 / spread
         out = np.stack([slope, *np.ones((4, n_windows))])
         out[2] = white
-        lossy = np.flatnonzero(count < window)
+        lossy = np.flatnonzero(rates < window)
         if lossy.size:
-            starts, centre = lossy * step, place[lossy] / count[lossy]
-            edges = _edge_response(present, starts, window, count[lossy], centre)
-            slow = _slow_responses(present, starts, window)
+            starts, centre = starts[lossy], place[lossy] / count[lossy]
+            if held is None:
+                edges = _edge_squares(present, starts, window, count[lossy], centre)
+                parts = _count_parts(present, starts, window)
+            else:
+                edges, parts = held.edge_squares(lossy, centre), held.count_parts(lossy)
+            edges /= 0.5 * (window**2 - 1.0)
+            slow = _slow_responses(*parts, window)
             out[1:, lossy] = white[lossy] ** 2 * [edges, 1.0 / white[lossy], *slow]
     return out
 
 
-def _edge_response(
+class _HeldAngles:
+    """Angles that are present, the rates between them, and those of each window."""
+
+    def __init__(self, places: NDArray[np.int64], starts: NDArray[np.int64], window: int) -> None:
+        self.places, self.starts, self.window = places, starts, window
+        most = places.size - 1
+        self.first = np.minimum(np.searchsorted(places, starts), most)
+        self.last = np.searchsorted(places, starts + window, side="right") - 1
+        self.last = np.maximum(self.last, self.first)
+        #: Samples between an angle and the next, and their mean place.
+        self.apart = np.diff(places)
+        self.middles = places[:-1] + 0.5 * (self.apart - 1.0)
+
+    def remove_partial(
+        self, moments: NDArray[np.float64], x: NDArray[np.float64], base: float
+    ) -> None:
+        """Remove what lies between an angle in a window and one outside it, from samples of `x`.
+
+        The spread of places between two angles is removed, too, because only their mean is known.
+        """
+        low, high = self.places[self.first], self.places[self.last]
+        stops = self.starts + self.window
+        for start, end, at in ((self.starts, low, low - 1), (high, stops, high)):
+            at = np.clip(at, 0, x.size - 2)
+            length, rate = end - start, x[at + 1] - x[at] - base
+            partial = (length > 0) & np.isfinite(rate)
+            length, rate, place = length[partial], rate[partial], 0.5 * (start + end - 1)[partial]
+            square = place**2 + (length**2.0 - 1.0) / 12.0
+            means = [np.ones(length.size), place, square, rate, rate * place]
+            moments[partial] -= length[:, None] * np.stack(means, axis=1)
+        spreads = np.cumsum(np.append(0.0, self.apart * (self.apart**2.0 - 1.0) / 12.0))
+        moments[:, 2] -= spreads[self.last] - spreads[self.first]
+        moments[self.last == self.first] = 0.0
+
+    def edge_squares(
+        self, windows: NDArray[np.int64], centre: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Do what `_edge_squares` does: the weights of neighbours are their middles' distance."""
+        squares = np.cumsum(np.append(0.0, np.diff(self.middles) ** 2))
+        first = np.minimum(self.first[windows], squares.size - 1)
+        last = np.maximum(self.last[windows] - 1, first)
+        ends = (self.middles[first] - centre) ** 2 + (self.middles[last] - centre) ** 2
+        return np.asarray(ends + squares[last] - squares[first])
+
+    def count_parts(
+        self, windows: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Do what `_count_parts` does, with the samples between two angles at their middle."""
+        edges, _ = _part_covariances(self.window)
+        sums = np.zeros(self.places[-1] + 1)
+        np.cumsum(np.repeat(self.middles, self.apart), out=sums[self.places[0] + 1 :])
+        low, high = (self.places[at[windows], None] for at in (self.first, self.last))
+        starts = self.starts[windows, None]
+        bounds = np.clip(starts + edges, low, high)
+        counts = np.diff(bounds, axis=1).astype(np.float64)
+        return counts, np.diff(sums[bounds], axis=1) - starts * counts
+
+
+def _edge_squares(
     present: NDArray[np.bool_],
     starts: NDArray[np.int64],
     window: int,
     count: NDArray[np.float64],
     centre: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Sum the squared weights of the angles in the slope of each window, over those without gaps.
+    """Sum the squared weights of the angles in ``sum (place - centre) rate`` of each window.
 
     Inside a run of rates the weights of neighbours differ by one; at its edges they remain.
     """
@@ -126,23 +200,33 @@ def _edge_response(
         )
         edges += number
         squares += square_sums - 2.0 * centre * sums + number * centre**2
-    return (squares + count - 0.5 * edges) / (0.5 * (window**2 - 1.0))
+    return squares + count - 0.5 * edges
+
+
+def _count_parts(
+    present: NDArray[np.bool_], starts: NDArray[np.int64], window: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Count the samples in each part of each window, and sum their places as if evenly spread."""
+    edges, _ = _part_covariances(window)
+    sums = np.zeros(present.size + 1, dtype=np.int32)
+    np.cumsum(present, out=sums[1:], dtype=np.int32)
+    counts = np.diff(sums[starts[:, None] + edges], axis=1).astype(np.float64)
+    return counts, counts * (0.5 * (edges[1:] + edges[:-1] - 1.0))
 
 
 def _slow_responses(
-    present: NDArray[np.bool_], starts: NDArray[np.int64], window: int
+    counts: NDArray[np.float64], places: NDArray[np.float64], window: int
 ) -> NDArray[np.float64]:
     """Compute the variance of ``sum (place - mean place) rate`` under B and K, (2, n_windows).
 
-    Relative to a window without gaps.
+    Relative to a window without gaps. `counts` and sums of `places` are (n_windows, parts).
     """
     edges, covariances = _part_covariances(window)
-    middles = 0.5 * (edges[1:] + edges[:-1] - 1.0)
-    sums = np.zeros(present.size + 1, dtype=np.int32)
-    np.cumsum(present, out=sums[1:], dtype=np.int32)
-    counts = np.vstack([np.diff(sums[starts[:, None] + edges], axis=1), np.diff(edges)])
-    centres = counts @ middles / counts.sum(axis=1)
-    weights = (counts * (middles - centres[:, None]))[:, None, :]
+    whole = np.diff(edges).astype(np.float64)
+    counts = np.vstack([counts, whole])
+    places = np.vstack([places, whole * 0.5 * (edges[1:] + edges[:-1] - 1.0)])
+    centres = places.sum(axis=1) / counts.sum(axis=1)
+    weights = (places - centres[:, None] * counts)[:, None, :]
     # a product for each window, so that none depends on the others
     variances = [(weights @ covariance @ weights.mT)[:, 0, 0] for covariance in covariances]
     return np.array([variance[:-1] / variance[-1] for variance in variances])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -19,11 +21,21 @@ def rate_covariances(size):
     return [np.diff(np.diff(angle.astype(float), axis=0), axis=1) for angle in angles]
 
 
-def slope_variances(present):
-    places = np.flatnonzero(present)
-    weights = np.zeros(present.size)
-    weights[places] = (places - places.mean()) / np.sum((places - places.mean()) ** 2)
-    return np.array([weights @ spread @ weights for spread in rate_covariances(present.size)])
+def slope_weights(places):
+    """Weights of the rates from their places, NaN where missing."""
+    line = np.nan_to_num(places - np.nanmean(places))
+    return line / np.sum(line**2)
+
+
+def rate_places(finite, kind):
+    """Places of the rates; those between two angles are at their middle."""
+    places = np.where(finite, np.arange(finite.size, dtype=float), np.nan)
+    if kind == "angle":
+        held = np.flatnonzero(finite)
+        places = np.full(finite.size - 1, np.nan)
+        for first, last in pairwise(held):
+            places[first:last] = 0.5 * (first + last - 1)
+    return places
 
 
 def masks():
@@ -39,20 +51,26 @@ def masks():
 
 @pytest.mark.parametrize("kind", ["rate", "angle"])
 @pytest.mark.parametrize("name", masks())
-def test_variance_of_the_trend_through_gaps_is_the_sum_over_all_pairs(name, kind):
-    """Exact for Q and N."""
-    rng = np.random.default_rng(2)
-    present = masks()[name]
-    x = np.where(present, rng.standard_normal(SIZE), np.nan)
-    if kind == "angle":
-        x = np.append(x, 0.0)
-        present = np.isfinite(x[1:]) & np.isfinite(x[:-1])
+def test_trend_through_gaps_and_its_variance_are_the_sums_over_all_rates(name, kind):
+    """Exact for Q and N. Angles outside a window do not count."""
+    x = 3.0 + np.random.default_rng(2).standard_normal(SIZE)
+    x = np.where(masks()[name], x if kind == "rate" else np.cumsum(x), np.nan)
+    x = np.append(x, 7.0) if kind == "angle" else x
     got = window_trends(x, angle=kind == "angle", window=WINDOW, step=STEP, n_windows=WINDOWS)
-    whole = slope_variances(np.ones(WINDOW, bool))
+    spreads = rate_covariances(WINDOW)
+    whole = slope_weights(np.arange(WINDOW))
     for j in range(WINDOWS):
-        expected = slope_variances(present[STEP * j :][:WINDOW]) / whole
-        np.testing.assert_allclose(got[1:3, j], expected[:2], rtol=1e-9)
-        np.testing.assert_allclose(got[3:, j], expected[2:], rtol=0.02)
+        part = x[STEP * j :][: WINDOW + (kind == "angle")]
+        held = np.flatnonzero(np.isfinite(part))
+        if kind == "angle":
+            rates = np.diff(np.interp(np.arange(part.size), held, part[held]))
+        else:
+            rates = np.nan_to_num(part)
+        weights = slope_weights(rate_places(np.isfinite(part), kind))
+        assert got[0, j] == pytest.approx(weights @ rates, rel=1e-9, abs=1e-12)
+        ratios = [weights @ spread @ weights / (whole @ spread @ whole) for spread in spreads]
+        np.testing.assert_allclose(got[1:3, j], ratios[:2], rtol=1e-9)
+        np.testing.assert_allclose(got[3:, j], ratios[2:], rtol=0.02)
 
 
 def test_trend_of_a_window_without_gaps_has_the_variance_of_the_tables():
