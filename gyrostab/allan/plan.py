@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,7 +60,7 @@ def make_plan(
         ("min_strict", min_strict, np.inf),
         ("min_coverage", min_coverage, 1.0),
     ):
-        if not (isinstance(share, Real) and 0.0 <= share <= most):
+        if not (isinstance(share, int | float) and 0.0 <= share <= most):
             raise OptionError(f"{option}={share!r}: give a share from 0 to 1")
     name = signal_name(log)
     signal = log[name] if axis is None else _select_axes(log[name], axis)

@@ -119,7 +119,7 @@ def _fit_accelerometers(log: xr.Dataset, product: xr.Dataset) -> xr.Dataset:
     accelerations = make_log(
         xr.concat(signals, axes, combine_attrs="drop").data,
         rate=rate,
-        start=log["time"].isel(time=0).values,
+        start=str(log["time"].isel(time=0).values),
         unit="deg/h",
         axis=list(axes),
     )

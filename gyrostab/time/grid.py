@@ -296,7 +296,7 @@ def _span_of(bound: Any) -> tuple[np.datetime64, np.datetime64]:
     if isinstance(bound, str):  # "T12:00:03" ends with that second
         match = _OFFSET.fullmatch(bound.strip())
         period = pd.Period(match[1] if match else bound)
-        zone = pd.Timestamp(f"1970-01-01T00:00{match[2] if match else 'Z'}").utcoffset()
+        zone: Any = pd.Timestamp(f"1970-01-01T00:00{match[2] if match else 'Z'}").utcoffset()
         ends = period.start_time - zone, period.end_time - zone
     else:
         time = pd.Timestamp(bound)
@@ -376,7 +376,7 @@ class TimeGridIndex(CoordinateTransformIndex):
                 # "2026-11-20" or "2026-11-20T14": the whole day or hour, as in pandas
                 return _wrap_positions({dim: self._find_slice(slice(first, last))})
         if isinstance(label, str | date):  # also a pandas.Timestamp
-            times = np.asarray(_span_of(label)[0])
+            times: NDArray[Any] = np.asarray(_span_of(label)[0])
         else:
             times = np.asarray(getattr(label, "values", label))
         if times.dtype.kind == "b":
@@ -413,7 +413,7 @@ class TimeGridIndex(CoordinateTransformIndex):
         nearest = np.clip(position, 0, max(self.transform.size - 1, 0)).astype(np.int64)
         miss = np.abs(self.transform.forward({dim: nearest})[name] - stamps)
         if method is None:
-            most = np.timedelta64(0, "ns")
+            most: np.timedelta64 = np.timedelta64(0, "ns")
         elif tolerance is not None:
             most = pd.Timedelta(tolerance).to_timedelta64()
         else:

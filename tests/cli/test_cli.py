@@ -216,7 +216,7 @@ def test_config_gives_defaults_and_the_command_line_wins(log, tmp_path):
         ("[run\n", "not a TOML file"),
         ("[run]\nrate = 'x'\n", "rate"),
         ("run = 5\n", r"run is a command; give its options in a table \[run\]"),
-        ("workers = 1.5\n", r"workers: 1\.5 .give a whole number.\. See"),
+        ("workers = 1.5\n", r"workers\]: 1\.5 .give a whole number.\. See"),
     ],
 )
 def test_config_with_a_slip_of_the_pen(text, expected, log, tmp_path, capfd):

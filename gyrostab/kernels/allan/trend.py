@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -51,7 +52,7 @@ def _block_moments(x, angle, base, window, step, n_windows):  # type: ignore[no-
 
 
 def window_trends(
-    x: NDArray[np.generic], *, angle: bool, window: int, step: int, n_windows: int
+    x: NDArray[Any], *, angle: bool, window: int, step: int, n_windows: int
 ) -> NDArray[np.float64]:
     """Fit a straight line to the rates of each window.
 
