@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.posterior import visible_coefficients
-from gyrostab.diagnose.evidence.held_out import mean_factors
+from gyrostab.diagnose.evidence.held_out import noise_weight
 from gyrostab.diagnose.evidence.products import mean_products
 from gyrostab.diagnose.identify.identification import Identification, components_of
 from gyrostab.diagnose.predict.condition import mean_columns
@@ -47,34 +46,25 @@ def with_neighbouring_variants(
     return state
 
 
-def excess_low_frequency_noise(state: State, axis: str, folds: xr.DataArray) -> float:
+def excess_low_frequency_noise(state: State, axis: str) -> float:
     """Return the evidence [nats] of free random walk and flicker over the calibrated ones.
 
-    All identified effects are in the model. It is zero where the free noise is the weaker: a
-    calibration on blocks with an effect takes the effect for noise.
+    All identified effects are in the model. It is zero where the record shows less slow noise than
+    calibrated: a calibration on blocks with an effect takes the effect for noise.
     """
-    given_columns = state.given_to("mean", axis)
-    columns = [np.linspace(-1.0, 1.0, state.blocks.sizes["block"])] if given_columns is None else []
-    evidence, strength = [], []
     span = state.blocks.sizes["block"] * float(state.blocks.attrs["block_s"])
     slow = (
         axis_values(state.baseline, "grid_K", axis) ** 2 * span / HOUR
         + axis_values(state.baseline, "grid_B", axis) ** 2
     )
-    for tier in ("free", "calibrated"):
-        evidence.append(
-            mean_factors(
-                state.blocks,
-                state.baseline,
-                [],
-                axis=axis,
-                tier=tier,
-                given=given_columns,
-                folds=folds,
-            )[0, 0, 0]
-        )
-        strength.append(float(mean_mixture(state, axis, columns, tier=tier).weights() @ slow))
-    return float(evidence[0] - evidence[1]) if strength[0] > strength[1] else 0.0
+    free, calibrated = (mean_mixture(state, axis, [], tier=tier) for tier in ("free", "calibrated"))
+    free_prior, calibrated_prior = (
+        noise_weight(state.baseline, axis, tier) for tier in ("free", "calibrated")
+    )
+    free_sum, calibrated_sum = map(np.logaddexp.reduce, (free_prior, calibrated_prior))
+    if free.weights() @ slow <= np.exp(calibrated_prior - calibrated_sum) @ slow:
+        return 0.0
+    return float((free.evidence - free_sum) - (calibrated.evidence - calibrated_sum))
 
 
 def variance_fluctuation(state: State, axis: str) -> float:

@@ -81,9 +81,7 @@ def _withdraw_in_means(
     )
     if has_alternative or has_shape:
         return remaining, []
-    excess_nats = excess_low_frequency_noise(
-        with_neighbouring_variants(state, on_axis, axis), axis, examination.folds
-    )
+    excess_nats = excess_low_frequency_noise(with_neighbouring_variants(state, on_axis, axis), axis)
     weak, strength = _find_weak(examination, on_axis, excess_nats)
     if (
         not weak
