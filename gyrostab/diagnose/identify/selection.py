@@ -69,7 +69,7 @@ def select_effects(
     state = examination.state_with([*identified, *unidentified])
     remaining, withdrawn = withdraw_effects(examination, state, identified, unidentified)
     unidentified += withdrawn
-    if len(remaining) < len(identified) or withdrawn:
+    if withdrawn or [*map(id, remaining)] != [*map(id, identified)]:
         state = examination.state_with([*remaining, *unidentified])
     remaining = sorted(remaining, key=lambda identification: -identification.evidence_nats)
     is_unchanged = _variants_by_row(selected) == _variants_by_row([*remaining, *unidentified])

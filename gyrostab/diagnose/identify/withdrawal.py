@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from gyrostab.diagnose.identify.completeness import (
     excess_low_frequency_noise,
     variance_fluctuation,
     with_neighbouring_variants,
 )
+from gyrostab.diagnose.identify.components import split_layers, sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identification import (
     Identification,
@@ -66,11 +68,8 @@ def _withdraw_in_means(
     axis: str,
 ) -> tuple[list[Identification], list[Unidentified]]:
     """Withdraw effects on the means of an axis that leave more slow noise than calibrated."""
+    remaining = _without_part_of_drift(remaining, unidentified, axis, examination.threshold)
     on_axis = _identified_on(remaining, axis, in_means=True)
-    part_of_drift = _find_part_of_drift(on_axis, unidentified, axis)
-    remaining = [
-        identification for identification in remaining if identification not in part_of_drift
-    ]
     has_alternative = any(
         selection.generic in (*_DRIFTS, "~S(f)", "~cov") and axis in selection.axes
         for selection in unidentified
@@ -142,20 +141,43 @@ def _identified_on(
     ]
 
 
-def _find_part_of_drift(
-    on_axis: Sequence[Identification], unidentified: Sequence[Unidentified], axis: str
+def _without_part_of_drift(
+    identified: Sequence[Identification],
+    unidentified: Sequence[Unidentified],
+    axis: str,
+    threshold: float,
 ) -> list[Identification]:
-    """Return effects without a channel that explain less than an unidentified drift of the axis.
+    """Return effects without what an unidentified drift of an axis may be there.
 
-    They may be a piece of that drift.
+    An effect without a channel that explains less there may be a piece of the drift. It stays on
+    other axes where it reaches the threshold.
     """
     drifts = [selection for selection in unidentified if selection.generic in _DRIFTS]
     drift_nats = sum(_evidence_on(selection, axis) for selection in drifts)
-    return [
-        identification
-        for identification in on_axis
-        if not any(identification.driver) and _evidence_on(identification, axis) < drift_nats
-    ]
+    remaining = []
+    for identification in identified:
+        is_part = not any(identification.driver) and any(
+            component.statistic.is_linear_in_means and component.row == (axis,)
+            for component in identification.components
+        )
+        if not is_part or _evidence_on(identification, axis) >= drift_nats:
+            remaining.append(identification)
+            continue
+        elsewhere = [
+            component for component in identification.components if axis not in component.row
+        ]
+        evidence_nats = sum(max(sum_evidence(layer), 0.0) for layer in split_layers(elsewhere))
+        if evidence_nats >= threshold:
+            axes = tuple(name for name in identification.axes if name != axis)
+            remaining.append(
+                replace(
+                    identification,
+                    components=tuple(elsewhere),
+                    axes=axes,
+                    evidence_nats=evidence_nats,
+                )
+            )
+    return remaining
 
 
 def _evidence_on(selection: Selection, axis: str) -> float:

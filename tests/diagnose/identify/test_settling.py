@@ -13,12 +13,19 @@ from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify import selection as selecting
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.identification import Identification, Unidentified
+from gyrostab.diagnose.identify.identification import (
+    Identification,
+    Unidentified,
+    find_unidentified,
+    make_identification,
+)
 from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
 from gyrostab.diagnose.identify.settling import prune_selections, settle_selections
-from gyrostab.diagnose.identify.withdrawal import _find_part_of_drift, withdraw_effects
+from gyrostab.diagnose.identify.withdrawal import _without_part_of_drift, withdraw_effects
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.ingest.make_log import make_log
 
 MODEL = {"noise": {"N": 0.003, "K": 0.005}, "log": {"axes": ["x"]}}
@@ -77,15 +84,31 @@ def test_an_effect_stays_beside_an_unidentified_burst():
     assert withdraw_effects(examination, state, named, others) == (named, [])
 
 
-@pytest.mark.parametrize(("on_axis", "is_part"), [(3.5, False), (60.0, True)])
-def test_a_drift_of_another_axis_takes_nothing(on_axis, is_part):
-    def selection(evidence, **more):
-        components = [SimpleNamespace(row=(axis,), evidence_nats=n) for axis, n in evidence.items()]
-        return SimpleNamespace(components=components, axes=tuple(evidence), **more)
+def _explain(effect, statistic, evidence):
+    """Return the components of a selection with this evidence on each axis."""
+    candidate = Candidate(effect, find_statistic(statistic), (), ())
+    variant = Variant({}, ("0",), np.empty(0))
+    return [Component(candidate, variant, (axis,), nats) for axis, nats in evidence.items()]
 
-    jump = selection({"x": 50.0}, driver=(), evidence_nats=50.0)
-    drift = selection({"x": on_axis, "y": 201.0}, generic="~bias(t)", evidence_nats=201.0 + on_axis)
-    assert _find_part_of_drift([jump], [drift], "x") == [jump] * is_part
+
+@pytest.mark.parametrize(
+    ("jump_nats", "on_x", "remaining_axes"),
+    [
+        ({"x": 50.0}, 3.5, [("x",)]),
+        ({"x": 50.0}, 60.0, []),
+        ({"x": 50.0, "z": 200.0}, 60.0, [("z",)]),
+        ({"x": 50.0, "z": 7.0}, 60.0, []),  # not enough on the other axis alone
+    ],
+)
+def test_a_drift_takes_only_what_it_explains_on_its_axis(jump_nats, on_x, remaining_axes):
+    jump = make_identification(_explain("bias_jump", "mean", jump_nats), 8.0)
+    parts = _explain("~bias(t)", "mean", {"x": on_x, "y": 201.0})
+    drift = find_unidentified("~bias(t)", parts, 8.0, [])
+    remaining = _without_part_of_drift([jump], [drift], "x", 8.0)
+    assert [identification.axes for identification in remaining] == remaining_axes
+    for identification in remaining:
+        assert identification.evidence_nats == sum(jump_nats[axis] for axis in identification.axes)
+        assert {component.row for component in identification.components} == {identification.axes}
 
 
 def test_rejected_channels_do_not_use_up_the_number_of_effects(monkeypatch):
