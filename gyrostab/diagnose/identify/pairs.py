@@ -21,7 +21,7 @@ def find_pair(
     components: Mapping[str, list[Component]],
     required: Mapping[str, float],
     state: State,
-) -> tuple[str, list[Component], State] | None:
+) -> list[tuple[str, list[Component], State]]:
     """Find two effects that together explain more than the nuisance alternative.
 
     Two jumps are such a pair if the alternative is a course of levels. An alternative of any form
@@ -29,8 +29,8 @@ def find_pair(
     the lower one of both orders: an effect that is fitted alone to both may have a form that the
     second one has to undo.
 
-    Returns the key of the stronger effect, what it explains with the other in the model, and the
-    state with that other one.
+    Returns the key of each, what it explains with the other in the model, and the state with that
+    other one; nothing without such a pair.
     """
     alternative = components[passing[0]]
     is_course = alternative[0].statistic.is_switching  # of levels, as jumps make it
@@ -60,9 +60,14 @@ def find_pair(
     }
     best = max(pairs, key=lambda pair: pairs[pair], default=None)
     if best is None or pairs[best] <= sum_evidence(alternative):
-        return None
-    with_other, components_beside = companions[best[1]]
-    return best[0], components_beside[best[0]], with_other
+        return []
+    first, second = best
+    with_second, beside_second = companions[second]
+    found = beside_second[first]
+    with_first, beside_first = _find_beside(examination, [second], found, required[first], state)
+    if second not in beside_first:
+        return []
+    return [(first, found, with_second), (second, beside_first[second], with_first)]
 
 
 def _find_beside(

@@ -96,24 +96,23 @@ def _select_all(examination: Examination) -> tuple[list[Selection], list[Candida
     }
     effects_left, lines_left = MAX_EFFECTS, MAX_LINES
     all_evidence: list[CandidateEvidence] = []
-    while effects_left:
+    while effects_left > 0:
         known_evidence = reusable_evidence(all_evidence, previous, state)
         all_evidence, previous = score_candidates(examination, state, barred, known_evidence), state
         selected = _select_next(examination, all_evidence, state, chosen)
         if selected is None:
             return chosen, all_evidence
-        selection, rejected = selected
+        selections, rejected = selected
         barred |= rejected
-        if selection is None:
-            continue
-        if are_lines(selection.components):
-            lines_left -= 1
-            barred |= set() if lines_left else {PLAIN_LINE}
-        else:
-            effects_left -= 1
-        chosen = add_identification(chosen, selection)
-        barred |= _explained_count_keys(examination, selection)
-        state = condition_on(state, list(selection.components))
+        for selection in selections:
+            if are_lines(selection.components):
+                lines_left -= 1
+                barred |= set() if lines_left > 0 else {PLAIN_LINE}
+            else:
+                effects_left -= 1
+            chosen = add_identification(chosen, selection)
+            barred |= _explained_count_keys(examination, selection)
+            state = condition_on(state, list(selection.components))
     return chosen, []
 
 
@@ -188,10 +187,10 @@ def _select_next(
     all_evidence: list[CandidateEvidence],
     state: State,
     chosen: Sequence[Selection],
-) -> tuple[Selection | None, set[str]] | None:
-    """Select the next effect, or the nuisance alternative that explains more.
+) -> tuple[list[Selection], set[str]] | None:
+    """Select the next effect or pair of effects, or the nuisance alternative that explains more.
 
-    Returns the selection, or None when only effects passed that fail the time-shift test, and the
+    Returns the selections, none when only effects passed that fail the time-shift test, and the
     keys that fail it; None instead of both when nothing passes.
     """
     settings = examination.settings
@@ -209,10 +208,16 @@ def _select_next(
     if not passing:
         return None
     rivals = order_rivals(passing, components, state, examination)
-    pair = None if rivals else find_pair(examination, passing, components, required, state)
-    if pair is not None:
-        key, components[key], state = pair
-        rivals = [key]
+    pair = [] if rivals else find_pair(examination, passing, components, required, state)
+    if pair:
+        failed = {
+            key
+            for key, found, with_other in pair
+            if not passes_time_shift_test(found, with_other, examination.folds).passed
+        }
+        if failed:
+            return [], failed
+        return [make_identification(found, required[key]) for key, found, _ in pair], set()
     rejected: set[str] = set()
     for key in rivals:
         if passes_time_shift_test(components[key], state, examination.folds).passed:
@@ -225,16 +230,16 @@ def _select_next(
                 and sum_evidence(components[other]) >= min_nats
             ]
             identification = make_identification(components[key], required[key], alternatives=close)
-            return identification, rejected
+            return [identification], rejected
         rejected.add(key)
     if rejected:
-        return None, rejected
+        return [], rejected
     alternative = passing[0]
     effects = [key for key in passing if not key.startswith("~")]
     nearest = [components[key][0].candidate.effect for key in effects[:3]]
-    return find_unidentified(
-        alternative, components[alternative], required[alternative], nearest
-    ), set()
+    return [
+        find_unidentified(alternative, components[alternative], required[alternative], nearest)
+    ], set()
 
 
 def _variants_by_row(chosen: Sequence[Selection]) -> set[tuple[str, tuple[str, ...], int]]:

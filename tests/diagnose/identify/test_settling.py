@@ -111,12 +111,26 @@ def test_a_drift_takes_only_what_it_explains_on_its_axis(jump_nats, on_x, remain
         assert {component.row for component in identification.components} == {identification.axes}
 
 
+def test_both_of_a_pair_are_selected_at_once():
+    """Neither explains more than a course of levels while the other is not in the model."""
+    second = np.arange(BLOCKS * 20)
+    values = 0.18 * np.random.default_rng(1).standard_normal(second.size)
+    values += 0.3 * ((second >= 1000) & (second < 2200))
+    examination = _examine(values, 1.0, {}, ("bias_jump", "~levels"))
+    evidence = selecting.score_candidates(examination, examination.start, ())
+    selections, failed = selecting._select_next(examination, evidence, examination.start, [])
+    (first, other) = (selection.components for selection in selections)
+    at = sorted(component.variant.values["at"] for component in (*first, *other))
+    assert at == pytest.approx([1000.0, 2200.0], abs=20.0)
+    assert not failed
+
+
 def test_rejected_channels_do_not_use_up_the_number_of_effects(monkeypatch):
     rounds = iter(range(100))
 
     def select_next(*_):
         number = next(rounds)
-        return (None, {f"channel {number}"}) if number < 2 * selecting.MAX_EFFECTS else None
+        return ([], {f"channel {number}"}) if number < 2 * selecting.MAX_EFFECTS else None
 
     monkeypatch.setattr(selecting, "_select_next", select_next)
     monkeypatch.setattr(selecting, "score_candidates", lambda *_: [])
