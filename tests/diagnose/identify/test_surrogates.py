@@ -5,14 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify import surrogates
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.ingest.make_log import make_log
 from gyrostab.simulate import simulate
-from tests.support.candidates import select_candidate
+from tests.support.candidates import find_components, select_candidate
 
 
 def _run_time_shift_test(sensitivity: float, period: float) -> tuple[bool, float]:
@@ -58,3 +61,28 @@ def test_unrelated_channel_fails():
     beats, p_value, _ = _run_time_shift_test(0.0, 1300.0)
     assert not beats
     assert p_value > 0.01
+
+
+def test_an_unrelated_channel_is_no_better_than_its_surrogates(monkeypatch):
+    """An unrelated channel explains as much as half of its surrogates, whatever time constants are
+    tried."""
+    monkeypatch.setattr(surrogates, "TIME_SHIFTS", 60)
+    model = {"noise": {"N": 0.003, "B": 0.004, "K": 0.02}, "log": {"axes": ["x"]}}
+
+    def p_value(seed: int) -> float:
+        rng = np.random.default_rng(seed)
+
+        def wander() -> np.ndarray:
+            course = np.convolve(rng.standard_normal(9599), np.hanning(600), "valid")
+            return (course - course.mean()) / course.std()
+
+        rate = 0.4 * rng.standard_normal(9000) + 0.05 * wander()
+        channels = {"temperature": (40.0 + 5.0 * wander(), "degC")}
+        blocks = reduce_log(make_log(rate, rate=5.0, unit="deg/h", channels=channels, axis=["x"]))
+        state = initial_state(blocks, baseline_from_model(blocks, model))
+        known, _ = effect_candidates(blocks, state.baseline["coefficient"])
+        shupe = select_candidate(known, "shupe", "mean")
+        components = find_components([shupe], state)[shupe.key]
+        return passes_time_shift_test(components, state, fold_blocks(blocks)).p_value
+
+    assert np.mean([p_value(seed) for seed in range(4, 9)]) > 0.4
