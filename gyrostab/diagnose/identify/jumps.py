@@ -101,7 +101,12 @@ def scatter_nats(components: Sequence[Component], state: State) -> float:
         With all other effects in the model.
     """
     jumps = [component for component in components if is_free_jump(component, state)]
-    scatter = -sum(_evidence_in_scatter(component, state) for component in jumps)
+    if not jumps:
+        return 0.0
+    evidence = sum(_evidence_in_scatter(component, state) for component in jumps)
+    # the search of the instant counts once: on other axes it is the same
+    search = np.log(len(jumps[0].candidate.variants)) + (len(jumps) - 1) * np.log(2.0)
+    scatter = float(search - evidence)
     return scatter if scatter >= state.settings.ambiguous_nats else 0.0
 
 
@@ -124,14 +129,7 @@ def _evidence_in_scatter(component: Component, state: State) -> float:
     wide = max(abs(float(size[0])), float(np.sqrt(covariance[0, 0]))) * float(
         np.ptp(component.variant.design)
     )
-    instants = np.log(len(component.candidate.variants))
-    return float(
-        np.logaddexp.reduce(with_jump)
-        - np.logaddexp.reduce(without)
-        - np.log(wide)
-        - 0.5
-        - instants
-    )
+    return float(np.logaddexp.reduce(with_jump) - np.logaddexp.reduce(without) - np.log(wide) - 0.5)
 
 
 def _possible_variances(component: Component, state: State) -> list[Array]:

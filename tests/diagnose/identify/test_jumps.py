@@ -12,7 +12,7 @@ from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identifiability import is_physical
-from gyrostab.diagnose.identify.jumps import gradual_nats, is_free_jump
+from gyrostab.diagnose.identify.jumps import gradual_nats, is_free_jump, scatter_nats
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -53,6 +53,20 @@ def test_gradual_change_is_not_a_jump(way: float, size: float, jump: bool) -> No
     assert all(is_free_jump(component, state) for component in components)
     assert (gradual_nats(components, state) == 0.0) == jump
     assert bool(is_physical(components, state)) == jump
+
+
+def test_an_instant_that_axes_share_is_searched_once() -> None:
+    """A jump that is weak on each of six axes is no scatter of their means."""
+    axes = list("uvwxyz")
+    second = np.arange(9_000) / 5.0
+    noise = np.random.default_rng(0).standard_normal((len(axes), second.size))
+    rate = 0.003 * 60.0 * np.sqrt(5.0) * noise + 0.07 * (second >= 800.0)
+    blocks = reduce_log(make_log(rate, rate=5.0, unit="deg/h", axis=axes))
+    jumps, state = try_jumps(blocks, baseline_from_model(blocks, MODEL | {"log": {"axes": axes}}))
+    components = find_components([jumps], state)[jumps.key]
+    assert len(components) == len(axes)
+    assert sum_evidence(components) > 15.0
+    assert scatter_nats(components, state) == 0.0
 
 
 def test_jump_at_a_restart_may_settle() -> None:
