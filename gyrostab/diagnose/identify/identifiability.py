@@ -128,7 +128,7 @@ def _find_other_form(component: Component, state: State) -> tuple[str, float] | 
 
 def _is_possible(component: Component, state: State) -> bool:
     """Return whether physics allows the size of a component, and its cause is present."""
-    from gyrostab.diagnose.predict.sizes import component_mixture, component_size
+    from gyrostab.diagnose.predict.sizes import component_size
 
     effect, statistic = component.candidate.effect, component.statistic
     if (
@@ -148,16 +148,8 @@ def _is_possible(component: Component, state: State) -> bool:
         and _rotation_share(component, state) > state.settings.max_misalignment_share
     ):
         return False
-    if (
-        effect == "fringe_hop"
-        and abs(component_size(component, state)[0]) * np.abs(component.variant.design).max()
-        < state.settings.min_fringe_step
-    ):
-        return False
-    largest = largest_size(effect, state.settings)
-    if np.isfinite(largest) and component.variant.columns[0] != "any":
-        return bool(np.abs(component_mixture(component, state).moments()[0]).max() <= largest)
-    if statistic.is_linear_in_means and not _is_in_range(component, state):
+    has_limit = np.isfinite(largest_size(effect, state.settings))
+    if (statistic.is_linear_in_means or has_limit) and not _is_in_range(component, state):
         return False
     if statistic.is_power and not _is_above_least(component, state):
         return False
@@ -169,19 +161,20 @@ def _is_possible(component: Component, state: State) -> bool:
 
 
 def _is_in_range(component: Component, state: State) -> bool:
-    """Return whether the sizes of a mean can lie in the ranges that the registry allows."""
+    """Return whether the sizes can lie in the ranges that the registry and the settings allow."""
     from gyrostab.diagnose.predict.sizes import component_mixture
 
+    effect, columns = component.candidate.effect, component.variant.columns
+    plausible = largest_size(effect, state.settings)
     largest = {
-        item.name: max(abs(item.low), abs(item.high))
-        for item in effects()[component.candidate.effect].parameters()
+        item.name: min(max(abs(item.low), abs(item.high)), plausible)
+        for item in effects()[effect].parameters()
     }
     sizes, covariance = component_mixture(component, state).moments()
     smallest_sizes = np.abs(sizes) - state.settings.clear_sigma * np.sqrt(np.diagonal(covariance))
-    return all(
-        size <= largest.get(name, np.inf)
-        for name, size in zip(component.variant.columns, smallest_sizes, strict=True)
-    )
+    limits = [largest.get(name, np.inf) for name in columns]
+    # the parts of a complex size have the limit of its column
+    return bool((smallest_sizes <= np.repeat(limits, sizes.size // len(columns))).all())
 
 
 def _is_above_least(component: Component, state: State) -> bool:

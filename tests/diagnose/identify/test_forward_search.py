@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,13 +13,17 @@ from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks, fold_subsets
 from gyrostab.diagnose.evidence.sample_counts import expected_counts, sample_count_evidence
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence
 from gyrostab.diagnose.identify.forward_search import name_effects, tail_level
-from gyrostab.diagnose.identify.identifiability import is_physical
+from gyrostab.diagnose.identify.identifiability import _is_possible, is_physical
 from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
-from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict import sizes
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.search import combine_rows
+from gyrostab.diagnose.predict.sizes import Mixture
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.settings import Settings
+from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.ingest.make_log import make_log
 from tests.support.candidates import select_candidate
 from tests.support.named import WORLD, nulls, record
@@ -80,11 +84,11 @@ def test_chance_on_another_axis_does_not_veto_an_effect(shaken, monkeypatch):
         if component.candidate.statistic.name == "power"
     )
     elsewhere = [replace(component, row=(axis,)) for axis in "yz"]
-    sizes = {"x": 1.0, "y": -0.1, "z": 0.1}
+    size_by_axis = {"x": 1.0, "y": -0.1, "z": 0.1}
     monkeypatch.setattr(
-        sys.modules["gyrostab.diagnose.predict.sizes"],
+        sizes,
         "component_size",
-        lambda component, state: (sizes[component.row[0]], 0.01),
+        lambda component, state: (size_by_axis[component.row[0]], 0.01),
     )
     assert is_physical([component, *elsewhere], state) == [component, elsewhere[1]]
 
@@ -103,6 +107,22 @@ def test_sizes_outside_the_registry_are_rejected(shaken):
             is_physical([component], replace(state, blocks=state.blocks.assign(mean=mean)))
             == answer
         )
+
+
+@pytest.mark.parametrize(("statistic", "parts"), [("mean", 1), ("rotation_order", 2)])
+@pytest.mark.parametrize(
+    ("size", "error", "answer"), [(14.0, 1.0, True), (21.0, 1.0, True), (30.0, 1.0, False)]
+)
+def test_a_size_is_impossible_only_beyond_its_error(
+    monkeypatch, statistic, parts, size, error, answer
+):
+    """The largest earth rate is 20 deg/h."""
+    variant = Variant({}, ("rate",), np.ones((1, 1, 3)))
+    candidate = Candidate("earth_rate", find_statistic(statistic), (), (variant,))
+    mixture = Mixture(np.zeros(1), np.full((1, parts), size), error**2 * np.eye(parts)[None])
+    monkeypatch.setattr(sizes, "component_mixture", lambda component, state: mixture)
+    state = SimpleNamespace(settings=Settings())
+    assert _is_possible(Component(candidate, variant, ("x",), 50.0), state) == answer
 
 
 @pytest.mark.slow
