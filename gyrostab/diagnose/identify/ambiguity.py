@@ -7,8 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from gyrostab.diagnose.identify.examination import Examination
+from gyrostab.diagnose.identify.jumps import is_step
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.reduce.zero_bin import possibly_truncated_axes
 
 #: Effect -> effects that look the same in block statistics, whatever the excitation.
@@ -45,6 +47,13 @@ def find_equivalent_effects(
         for component in components
     ):
         out.append("rate_quantization")  # truncation towards zero makes the zero bin twice as wide
+    if effect == "bias_jump" and any(
+        is_step(component)
+        and np.abs(component_mixture(component, state).moments()[0]).max()
+        >= state.settings.min_fringe_step
+        for component in components
+    ):
+        out.append("fringe_hop")
     if effect == "telegraph" and not any(
         component.statistic.is_switching for component in components
     ):

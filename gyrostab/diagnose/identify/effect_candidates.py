@@ -34,7 +34,11 @@ from gyrostab.units import HOUR
 Array = NDArray[Any]
 _MAX_VALUES = 60  # of a nuisance parameter; limits time
 _MAX_VARIANTS = 200  # of a candidate; limits time
-_SAME_DESIGN = {"fringe_hop": "bias_jump"}  # effects with the same design; the size decides
+#: Effect -> why it is not tried, because another has the same design.
+_SAME_DESIGN = {
+    "fringe_hop": "not identifiable: it has the form of a bias jump; compare the size of the jump "
+    "with the rate of one fringe"
+}
 
 
 def effect_candidates(
@@ -72,6 +76,7 @@ def effect_candidates(
     reasons: dict[str, str] = {}
     for name, kind in effects().items():
         if name in _SAME_DESIGN:
+            reasons[name] = _SAME_DESIGN[name]
             continue
         built: list[Candidate] = []
         reason = ""

@@ -9,6 +9,7 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.core import diagnose
+from gyrostab.diagnose.identify.ambiguity import find_equivalent_effects
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identifiability import is_physical
@@ -87,6 +88,17 @@ def test_jump_at_a_restart_may_settle() -> None:
         False,
         True,
     ]
+
+
+@pytest.mark.parametrize(("size", "others"), [(10.0, []), (4.8e6, ["fringe_hop"])])
+def test_a_jump_of_a_fringe_may_be_a_fringe_hop(size: float, others: list[str]) -> None:
+    second = np.arange(3_000) / 5.0
+    noise = np.random.default_rng(4).standard_normal((2, second.size))
+    rate = 0.4 * noise + size * (second >= 300.0) * [[1.0], [0.0]]
+    blocks = reduce_log(make_log(rate, rate=5.0, unit="deg/h"))
+    jumps, state = try_jumps(blocks, baseline_from_model(blocks, MODEL))
+    components = find_components([jumps], state)[jumps.key]
+    assert find_equivalent_effects("bias_jump", components, state) == others
 
 
 def drifting_log(seed: int, steps: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> xr.Dataset:
