@@ -25,6 +25,9 @@ Array = NDArray[np.float64]
 #: normal law in standard deviations: 2 * 0.3186.
 CORE_SHARE, CORE_WIDTH_SIGMA = 0.25, 0.637
 MAD_TO_SIGMA = 1.4826  # median absolute deviation of a normal law
+#: Scatter of equal means, over the range of the samples, and scatter by errors of rounding alone. A
+#: few samples one quantization step away from all others are no motion.
+EQUAL_SCATTER, ROUNDING = 1e-3, 1e-9
 REST_ROUNDS = 3  # in which centre and scatter at rest are refined
 _KEPT_STATISTICS = ("mean", "power", "cross")
 
@@ -44,27 +47,35 @@ def moving_blocks(blocks: xr.Dataset, *, settings: Settings = DEFAULTS) -> NDArr
     >>> moving_blocks(reduce_log(make_log(rate, rate=100.0, unit="deg/h"), block="5s")).sum(axis=1)
     array([ 0, 24])
     """
-    means = blocks["mean"].values
-    return np.stack([_moving_blocks_of_axis(row, settings) for row in means])
+    span = _sample_range(blocks)
+    return np.stack(
+        [_moving_blocks_of_axis(mean, span, settings) for mean in blocks["mean"].values]
+    )
 
 
-def _moving_blocks_of_axis(mean: Array, settings: Settings) -> NDArray[np.bool_]:
-    """Find the moving blocks of one axis."""
+def _sample_range(blocks: xr.Dataset) -> float:
+    """Return the distance of the largest sample of the record from the smallest."""
+    return float(np.ptp(blocks["range_end"].values))
+
+
+def _moving_blocks_of_axis(mean: Array, span: float, settings: Settings) -> NDArray[np.bool_]:
+    """Find the moving blocks of one axis of a record whose samples have the range `span`."""
     good = np.isfinite(mean)
     nothing = np.zeros(mean.size, np.bool_)
     min_blocks = max(settings.min_rest_blocks, (1.0 - settings.max_moving_share) * good.sum())
     if good.sum() < min_blocks:
         return nothing
     centre, scale = _find_rest_level(mean[good])
+    scale = _without_zero(scale, span)
     away = np.abs(mean - centre)
     is_at_rest = good & (away <= settings.rest_sigma * scale)
     for _ in range(REST_ROUNDS):
         if is_at_rest.sum() < min_blocks:
             return nothing
         away = np.abs(mean - np.median(mean[is_at_rest]))
-        scale = MAD_TO_SIGMA * float(np.median(away[is_at_rest]))
+        scale = _without_zero(MAD_TO_SIGMA * float(np.median(away[is_at_rest])), span)
         is_at_rest = good & (away <= settings.rest_sigma * scale)
-    if not scale > 0.0 or not np.nanmax(away) > settings.motion_sigma * scale:
+    if not np.nanmax(away) > settings.motion_sigma * scale:
         return nothing
     is_moving = good & ~is_at_rest
     if is_moving.sum() < 2:  # a motion lasts; a single block is an outlier
@@ -80,6 +91,11 @@ def _moving_blocks_of_axis(mean: Array, settings: Settings) -> NDArray[np.bool_]
         and np.count_nonzero(~is_near_motion) >= settings.min_rest_blocks
     )
     return out if has_rest else nothing
+
+
+def _without_zero(scale: float, span: float) -> float:
+    """Return a scatter at rest, or a part of the range of the samples if all means are equal."""
+    return scale if scale > ROUNDING * span else EQUAL_SCATTER * span
 
 
 def _find_rest_level(mean: Array) -> tuple[float, float]:
@@ -113,6 +129,7 @@ def unexplained_motion(
         for axis in component.row
     }
     moving = moving_blocks(blocks, settings=settings)
+    span = _sample_range(blocks)
     for row, axis in enumerate(map(str, blocks["axis"].values)):
         axis_components = [
             component
@@ -130,6 +147,7 @@ def unexplained_motion(
                 axis_values(blocks, "mean", axis),
                 moving[row],
                 np.stack(columns, axis=1),
+                span,
                 settings,
                 has_form=not any(component.statistic.is_switching for component in axis_components),
             )
@@ -142,6 +160,7 @@ def _is_explained(
     mean: Array,
     moving: NDArray[np.bool_],
     columns: Array,
+    span: float,
     settings: Settings,
     *,
     has_form: bool,
@@ -157,7 +176,7 @@ def _is_explained(
     design /= np.maximum(np.abs(design).max(axis=0), 1e-300)
     size, *_ = np.linalg.lstsq(design, mean[good], rcond=None)
     residual = mean[good] - design @ size
-    if not has_form and _moving_blocks_of_axis(residual, settings).any():
+    if not has_form and _moving_blocks_of_axis(residual, span, settings).any():
         return False
     away = mean[good] - np.median(mean[good & ~moving])
     is_moving = moving[good]

@@ -16,6 +16,7 @@ from gyrostab.diagnose.reduce.block_statistics import measured, reduce_log
 from gyrostab.diagnose.result.mismatch_tables import motion_mismatches
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.errors import SchemaError
+from gyrostab.ingest.make_log import make_log
 from gyrostab.simulate import simulate
 
 N = 0.01
@@ -63,6 +64,18 @@ def test_moving_blocks_of_a_rotating_axis_are_found(reduced):
     assert abs(inside[0] - BEGIN / length) <= 3
     assert abs(inside[-1] + 1 - END / length) <= 3
     assert np.diff(inside).max() == 1
+
+
+@pytest.mark.parametrize("share", [0.0, 1e-3])
+def test_motion_is_found_where_all_means_at_rest_are_equal(share):
+    """Few samples a quantization step away from all others are no motion."""
+    rng = np.random.default_rng(1)
+    rate = (rng.random((1, 12_000)) < share).astype(float)
+    assert not moving_blocks(reduce_log(make_log(rate, rate=10.0, unit="deg/h"))).any()
+    rate[0, 4000:6000] += 500.0 + rng.standard_normal(2000)
+    moving = moving_blocks(reduce_log(make_log(rate, rate=10.0, unit="deg/h")))[0]
+    assert moving[32:46].all()
+    assert not moving[:28].any()
 
 
 def test_axis_that_mostly_rotates_has_no_rest(turning):
