@@ -307,7 +307,9 @@ def quantization_step(values: Array) -> float:
             fine = 8.0 * resolution * size
             distances = np.diff(kept_levels)
             distances = distances[distances > fine]
-            if distances.size and (is_double or distances.size <= 0.8 * finite.size):
+            if distances.size == 1 < kept_levels.size - 1:
+                continue  # a jump, beside which the resolution hides all other distances
+            if distances.size and (is_double or kept_levels.size <= 0.8 * finite.size):
                 step = _common_divisor(distances, fine)
                 if (
                     step > 0.0

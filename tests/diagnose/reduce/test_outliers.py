@@ -7,7 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gyrostab.diagnose.reduce.outliers import EXPECTED_FALSE_OUTLIERS, count_outliers, find_peaks
+from gyrostab.diagnose.reduce.outliers import (
+    EXPECTED_FALSE_OUTLIERS,
+    count_outliers,
+    find_peaks,
+    quantization_step,
+)
 from gyrostab.kernels.spectra.outliers import HISTOGRAM, departures
 
 SIZE, BLOCK, RATE = 18_000, 180, 10.0  # half an hour
@@ -172,3 +177,19 @@ def test_bit_errors_in_bursts_are_not_noise():
     number, _ = counted(x)
     assert number[40] >= 11
     assert number.sum() <= 14
+
+
+@pytest.mark.parametrize("jump", [1e4, 1e6, 1e9])
+@pytest.mark.parametrize("step", [0.0, 0.01])
+def test_a_large_jump_is_not_the_quantization_step(jump, step):
+    noise = 0.6 * np.random.default_rng(1).standard_normal(5000)
+    values = np.round(noise / step) * step if step else noise
+    values[2000:] += jump
+    assert quantization_step(values) == pytest.approx(step, rel=1e-3)
+
+
+@pytest.mark.parametrize("spread", [0.3, 10.0])
+def test_step_of_differences_of_angles_is_found(spread):
+    """The differences of equal angles are equal but for rounding."""
+    angle = np.round(np.cumsum(spread * np.random.default_rng(1).standard_normal(5000) + 0.37))
+    assert quantization_step(np.diff(angle * 1e-3)) == pytest.approx(1e-3)
