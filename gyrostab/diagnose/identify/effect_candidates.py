@@ -32,8 +32,6 @@ from gyrostab.physics.registry import effects
 from gyrostab.units import HOUR
 
 Array = NDArray[Any]
-_MAX_VALUES = 60  # of a nuisance parameter; limits time
-_MAX_VARIANTS = 200  # of a candidate; limits time
 #: Effect -> why it is not tried, because another has the same design.
 _SAME_DESIGN = {
     "fringe_hop": "not identifiable: it has the form of a bias jump; compare the size of the jump "
@@ -204,9 +202,7 @@ def _nuisance_grid(kind: type[Effect], windows: Windows) -> Iterator[dict[str, A
     """Yield values of the nuisance parameters and choices."""
     try:
         grid: dict[str, Sequence[Any]] = {
-            name: select_step_times(values, windows)
-            if name == TIME_PARAMETER
-            else _thin_out(values, _MAX_VALUES)
+            name: select_step_times(values, windows) if name == TIME_PARAMETER else values
             for name, values in kind.example().nuisance(windows).items()
         }
     except KeyError:
@@ -216,19 +212,11 @@ def _nuisance_grid(kind: type[Effect], windows: Windows) -> Iterator[dict[str, A
     if known_points:
         yield from (dict(point) for point in known_points)
         return
-    points = list(product(*grid.values()))
-    max_points = max(_MAX_VARIANTS, len(grid.get(TIME_PARAMETER, ())))
-    for point in points[:: max(1, -(-len(points) // max_points))]:
+    for point in product(*grid.values()):
         yield {
             name: value if isinstance(value, str) else float(value)
             for name, value in zip(grid, point, strict=True)
         }
-
-
-def _thin_out(values: Array, max_count: int) -> list[Any]:
-    """Select at most `max_count` values at equal steps."""
-    every = max(1, -(-len(values) // max_count))
-    return list(values[every // 2 :: every])
 
 
 def largest_size(effect: str, settings: Settings) -> float:

@@ -57,6 +57,13 @@ def test_every_effect_is_tried_or_has_a_reason(tried_effects):
         assert reason.startswith("not identifiable: ")
 
 
+def test_grids_are_small_enough_to_try_all_points(tried_effects):
+    """Only the instants of a step are selected."""
+    for candidate in tried_effects[0]:
+        if not any("at" in variant.values for variant in candidate.variants):
+            assert len(candidate.variants) <= 200, candidate.key
+
+
 @pytest.mark.parametrize(
     ("effect", "statistics"),
     [
