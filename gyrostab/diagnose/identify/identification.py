@@ -72,8 +72,8 @@ class Identifications:
 
     identified: tuple[Identification, ...]  # the strongest first
     unknown: tuple[Unidentified, ...]
-    #: Evidence that noise alone exceeds, in any effect, axis and grid point, with the false-alarm
-    #: probability [nats].
+    #: Evidence that noise alone exceeds, in any effect or nuisance alternative, axis and point of
+    #: the grid, with the false-alarm probability [nats].
     threshold: float
     null_best: Array  # best evidence in each null record, sorted [nats]
     reasons: dict[str, str]  # effect -> why this record cannot show it
