@@ -22,12 +22,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
-from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
+from gyrostab.diagnose.statistics.candidates import effect_candidates
 from tests.support.candidates import make_identifications, select_candidate
 from tests.support.named import COEFFICIENT, record
 

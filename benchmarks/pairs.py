@@ -28,7 +28,6 @@ from gyrostab.blindtest.scenarios.plan import INCOMPATIBLE
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.known_lines import remove_known_lines
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
@@ -37,6 +36,7 @@ from gyrostab.diagnose.nulls.records import repeatable_null_records
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.aligned_channels import align_channels
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.statistics.candidates import effect_candidates
 
 NULLS = 100
 MEMBERS = {"null": (), "first": (0,), "second": (1,), "both": (0, 1)}

@@ -19,16 +19,18 @@ from gyrostab.diagnose.baseline.from_simulation import baseline_from_simulation
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion
 from gyrostab.diagnose.baseline.known_lines import remove_known_lines
 from gyrostab.diagnose.estimate.conditioned_baseline import expected_baseline, without_expected
+from gyrostab.diagnose.estimate.forms import settle_forms
 from gyrostab.diagnose.estimate.recalibrate import remove_fast_switching
+from gyrostab.diagnose.estimate.unexplained_motion import unexplained_motion
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identification import components_of
-from gyrostab.diagnose.identify.moving_axes import unexplained_motion, without_motion
 from gyrostab.diagnose.inputs import check_options, read_simulation, varying_axes
 from gyrostab.diagnose.locate.mismatches import locate_mismatches
 from gyrostab.diagnose.nulls.records import repeatable_null_records
 from gyrostab.diagnose.nulls.scores import null_scores
 from gyrostab.diagnose.reduce.aligned_channels import align_channels
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.reduce.moving_blocks import without_motion
 from gyrostab.diagnose.result.attribution import drop_expected
 from gyrostab.diagnose.result.diagnosis import Diagnosis
 from gyrostab.diagnose.result.finish import finish_diagnosis
@@ -197,7 +199,7 @@ def _compare_blocks(task: Task, blocks: xr.Dataset, baseline: xr.Dataset) -> Com
     null = null_scores(baseline, records(), settings=task.settings)
     task.progress("naming", 0)
     known_effects = task.simulation.effects if isinstance(task.simulation, Model) else ()
-    identifications = name_effects(
+    named = name_effects(
         blocks_without_lines,
         baseline,
         records(),
@@ -207,6 +209,7 @@ def _compare_blocks(task: Task, blocks: xr.Dataset, baseline: xr.Dataset) -> Com
         progress=task.progress,
         settings=task.settings,
     )
+    identifications = settle_forms(named, baseline)
     expected = identifications.expected
     conditioned_baseline = expected_baseline(identifications, baseline)
     at_rest = (

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion
 from gyrostab.diagnose.baseline.known_lines import remove_known_lines
 from gyrostab.diagnose.identify.identification import Identifications
-from gyrostab.diagnose.identify.moving_axes import without_motion
 from gyrostab.diagnose.nulls.scores import NullScores
+from gyrostab.diagnose.reduce.moving_blocks import without_motion
 from gyrostab.diagnose.settings import Settings
 from gyrostab.progress import Stage
 from gyrostab.simulate.model import Model

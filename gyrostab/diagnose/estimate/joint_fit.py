@@ -11,13 +11,13 @@ import numpy as np
 import xarray as xr
 from scipy.special import ndtr, ndtri
 
+from gyrostab.diagnose.estimate.filter_sizes import fit_filter_sizes
 from gyrostab.diagnose.estimate.split_components import split_harmonics, split_steps
 from gyrostab.diagnose.identify.identification import (
     Identification,
     Identifications,
 )
 from gyrostab.diagnose.identify.jumps import is_step
-from gyrostab.diagnose.identify.logger_filters import fit_filter_sizes
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.reduce.zero_bin import truncated_axes

@@ -28,11 +28,15 @@ from gyrostab.diagnose.baseline.posterior import (
 from gyrostab.diagnose.baseline.predicted_effects import find_drivers
 from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_identifications
 from gyrostab.diagnose.evidence.wandering import expected_processes
-from gyrostab.diagnose.identify.identification import Identifications, condition_on_selections
-from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.identify.identification import (
+    Identifications,
+    components_of,
+    condition_on_selections,
+)
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import State, spread_by_gaps
-from gyrostab.diagnose.predict.windows import make_windows
+from gyrostab.diagnose.predict.windows import make_windows, rebuild_variant
 from gyrostab.diagnose.reduce.block_statistics import MIN_BLOCKS
 from gyrostab.physics.base import Effect
 
@@ -385,4 +389,43 @@ def _average_groups(
         free_columns=free,
         precision=precision,
         start=flat[3],
+    )
+
+
+def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identifications:
+    """Return the identifications with designs for another noise.
+
+    A share of N^2 is a share of the new one.
+    """
+    blocks = identifications.state.blocks
+    candidates: dict[int, Candidate] = {}  # by the identity of the old one
+    variants: dict[int, Variant] = {}
+    for component in components_of(identifications.identified):
+        old = component.candidate
+        if old.statistic.is_power and id(old) not in candidates:
+            made = tuple(
+                rebuild_variant(old, variant, blocks, baseline["coefficient"]) or variant
+                for variant in old.variants
+            )
+            candidates[id(old)] = replace(old, variants=made)
+            variants |= zip(map(id, old.variants), made, strict=True)
+
+    def renew(component: Component) -> Component:
+        if id(component.candidate) not in candidates:
+            return component
+        return replace(
+            component,
+            candidate=candidates[id(component.candidate)],
+            variant=variants[id(component.variant)],
+        )
+
+    return replace(
+        identifications,
+        identified=tuple(
+            replace(identification, components=tuple(map(renew, identification.components)))
+            for identification in identifications.identified
+        ),
+        candidates=tuple(
+            candidates.get(id(candidate), candidate) for candidate in identifications.candidates
+        ),
     )

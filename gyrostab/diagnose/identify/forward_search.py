@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.baseline.quantization_grid import rounded_rates
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence, ExpectedCounts, has_coarse_grid
-from gyrostab.diagnose.identify.effect_candidates import effect_candidates
-from gyrostab.diagnose.identify.equivalents import settle_forms
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.expected import identify_expected_effects
 from gyrostab.diagnose.identify.identification import Identifications
@@ -23,6 +21,7 @@ from gyrostab.diagnose.predict.candidates import Candidate
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.search import compute_evidence, evidence_by_effect
 from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.diagnose.statistics.wording import COARSE_ANGLE_GRID
 from gyrostab.physics.base import Effect
 from gyrostab.progress import Stage, no_stage
@@ -82,7 +81,7 @@ def name_effects(
         known, Examination(candidates, folds, count_evidence, threshold, start)
     )
     identified, unidentified, rejected, state = select_effects(examination)
-    identifications = Identifications(
+    return Identifications(
         tuple(identified),
         tuple(unidentified),
         threshold,
@@ -94,7 +93,6 @@ def name_effects(
         examination.expected,
         tuple(rejected),
     )
-    return settle_forms(identifications, baseline)
 
 
 def _score_null_records(

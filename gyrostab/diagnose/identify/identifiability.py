@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.identify.effect_candidates import largest_size
 from gyrostab.diagnose.identify.jumps import event_nats, gradual_nats, scatter_nats
 from gyrostab.diagnose.identify.levels import further_level_nats, unequal_levels_nats
 from gyrostab.diagnose.identify.logger_filters import separate_axes_nats
@@ -17,6 +16,7 @@ from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.reduce.block_statistics import measured
+from gyrostab.diagnose.statistics.candidates import largest_size
 from gyrostab.physics.registry import effects
 
 Array = NDArray[np.float64]

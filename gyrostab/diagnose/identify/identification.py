@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.components import are_lines, axes_of, sum_evidence
-from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
+from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.condition import condition_on_components, refit_weights
 from gyrostab.diagnose.predict.linear_model import State, initial_state
-from gyrostab.diagnose.predict.windows import rebuild_variant
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
 Array = NDArray[np.float64]
@@ -133,30 +132,6 @@ def conditioned_states(start: State, chosen: Sequence[Selection]) -> Iterator[St
         if not all(of_lines[number : number + 2]) or number + 1 == len(chosen):
             state = refit_weights(state)
         yield state
-
-
-def remove_phase_locked(
-    identifications: Identifications, blocks: xr.Dataset
-) -> tuple[Identifications, float]:
-    """Drop phase-locked components and slow sines, and return their held-out evidence [nats].
-
-    The band powers show how large such a component is, but not its phase. In them it would gain a
-    small part of its evidence, and lose in every band that it leaves. Therefore its own statistic
-    alone counts, and the powers of both models are without it.
-    """
-    identified, evidence_nats = [], 0.0
-    for identification in identifications.identified:
-        locked: list[Component] = []
-        rest: list[Component] = []
-        for component in identification.components:
-            is_locked = component.statistic.is_only_in_phase(component, blocks)
-            (locked if is_locked else rest).append(component)
-        evidence_nats += sum(component.evidence_nats for component in locked)
-        if rest:
-            identified.append(
-                replace(identification, components=tuple(rest)) if locked else identification
-            )
-    return replace(identifications, identified=tuple(identified)), evidence_nats
 
 
 def add_identification(chosen: Sequence[Selection], addition: Selection) -> list[Selection]:
@@ -301,42 +276,3 @@ def form_error(
             share = settings.spectrum_error_share if of_spectrum else settings.form_error_share
             error += share * component.evidence_nats if affected_candidates else 0.0
     return error
-
-
-def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identifications:
-    """Return the identifications with designs for another noise.
-
-    A share of N^2 is a share of the new one.
-    """
-    blocks = identifications.state.blocks
-    candidates: dict[int, Candidate] = {}  # by the identity of the old one
-    variants: dict[int, Variant] = {}
-    for component in components_of(identifications.identified):
-        old = component.candidate
-        if old.statistic.is_power and id(old) not in candidates:
-            made = tuple(
-                rebuild_variant(old, variant, blocks, baseline["coefficient"]) or variant
-                for variant in old.variants
-            )
-            candidates[id(old)] = replace(old, variants=made)
-            variants |= zip(map(id, old.variants), made, strict=True)
-
-    def renew(component: Component) -> Component:
-        if id(component.candidate) not in candidates:
-            return component
-        return replace(
-            component,
-            candidate=candidates[id(component.candidate)],
-            variant=variants[id(component.variant)],
-        )
-
-    return replace(
-        identifications,
-        identified=tuple(
-            replace(identification, components=tuple(map(renew, identification.components)))
-            for identification in identifications.identified
-        ),
-        candidates=tuple(
-            candidates.get(id(candidate), candidate) for candidate in identifications.candidates
-        ),
-    )

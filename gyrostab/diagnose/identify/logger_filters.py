@@ -2,29 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.baseline.expected_statistics import band_columns, common_variance
-from gyrostab.diagnose.baseline.posterior import Fit, fit_squares
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
-from gyrostab.diagnose.predict.filter_response import band_response
-from gyrostab.diagnose.predict.linear_model import State, unspread_share
+from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_size, disagreement_nats
-from gyrostab.diagnose.settings import INTERVAL_TAILS
-from gyrostab.noise import NORMAL_95
-from gyrostab.physics.registry import effects
 
 Array = NDArray[np.float64]
-ZOOM_POINTS, ZOOM_STEPS = 21, 4  # of the refinement of a cutoff on its grid
-GRID_REACH = 0.25  # distance in ln(cutoff) of one place on the grid of filters
-MIN_ELSEWHERE_SHARE = 0.02  # of the probability, from which on other places widen the interval
 
 
 def without_slopes(
@@ -85,167 +75,3 @@ def separate_axes_nats(components: Sequence[Component], state: State) -> float:
     nats = disagreement_nats(share, error**-2.0)
     allowed = state.settings.reject_nats + state.settings.spectrum_error_share * evidence
     return nats if nats > allowed else 0.0
-
-
-def fit_filter_sizes(
-    components: Sequence[Component], state: State
-) -> tuple[dict[str, tuple[float, ...]], dict[str, float]]:
-    """Fit the cutoff or length of a filter to the powers of all its axes, with free noise.
-
-    If several filters fit about as well, the one that needs least angle quantization is taken: a
-    low-pass at far too low a cutoff with much of it passes what an average of two samples does.
-
-    Returns
-    -------
-    sizes : dict of str to (float, float) or (float, float, float, float)
-        The parameter that is measured with its standard error, and with the ends of its 95 %
-        interval where several places of the grid fit.
-    other_values : dict of str to float
-        Order, and how the samples are made.
-    """
-    kind = effects()[components[0].candidate.effect]
-    fits = [_average_powers(component.row[0], state) for component in components]
-
-    def fits_behind(values: Mapping[str, Any]) -> list[Fit]:
-        filtered = (
-            band_columns(state.blocks)
-            * band_response(kind.example(**values), state.blocks)[:, None]
-        )
-        return [fit._replace(columns=mixing @ filtered) for fit, mixing in fits]
-
-    def likelihood(values: Mapping[str, Any]) -> float:
-        return sum(map(_max_log_likelihood, fits_behind(values)))
-
-    def quantization(values: Mapping[str, Any]) -> float:
-        return sum(float(fit_squares(fit)[0][0]) for fit in fits_behind(values))
-
-    family = [
-        variant.values
-        for variant in components[0].candidate.variants
-        if components[0].statistic.is_filter(variant)
-    ]
-    log = [likelihood(values) for values in family]
-    close = [
-        values
-        for values, log_likelihood in zip(family, log, strict=True)
-        if log_likelihood > max(log) - state.settings.ambiguous_nats
-    ]
-    best = min(close, key=quantization)
-    name = "cutoff" if best["cutoff"] else "length"
-    other_values = {key: float(value) for key, value in best.items() if key != name}
-    if name == "length" and best["instrument"] == 1.0:
-        return {name: (float(best[name]), 0.0)}, other_values  # a count of samples
-    grid = sorted(
-        {
-            float(values[name])
-            for values in family
-            if all(values[key] == best[key] for key in other_values)
-        }
-    )
-    refined = _refine_on_grid(
-        grid, float(best[name]), lambda value: likelihood({**best, name: value})
-    )
-    return {
-        name: _widen_interval(
-            refined,
-            [
-                (float(values[name]), log_likelihood)
-                for values, log_likelihood in zip(family, log, strict=True)
-                if values[name]
-            ],
-        )
-    }, other_values
-
-
-def _refine_on_grid(
-    grid: Sequence[float], start: float, likelihood: Callable[[float], float]
-) -> tuple[float, float]:
-    """Return mean and standard deviation of a parameter about the best point of its grid."""
-    place = grid.index(start)
-    low, high = grid[max(place - 1, 0)], grid[min(place + 1, len(grid) - 1)]
-    mean, sd = start, (high - low) / 4.0
-    for _ in range(ZOOM_STEPS):
-        values = np.linspace(low, high, ZOOM_POINTS)
-        log = np.array([likelihood(value) for value in values])
-        weight = np.exp(log - log.max())
-        weight /= weight.sum()
-        mean = float(weight @ values)
-        sd = max(float(np.sqrt(weight @ (values - mean) ** 2)), 0.3 * (values[1] - values[0]))
-        low, high = max(mean - 5.0 * sd, low), min(mean + 5.0 * sd, high)
-    return mean, sd
-
-
-def _widen_interval(
-    refined: tuple[float, float], tried: Sequence[tuple[float, float]]
-) -> tuple[float, ...]:
-    """Return a parameter with its error, and its 95 % interval if several filters fit.
-
-    With free noise that rises with frequency, a low-pass at a low cutoff does what a weak one at a
-    high cutoff does. Other orders, and samples that are picked, have other cutoffs.
-
-    Parameters
-    ----------
-    refined : (float, float)
-        Mean and standard deviation about the best place.
-    tried : sequence of (float, float)
-        Values of all filters of the family, evenly spread in their logarithm, and their log
-        likelihoods.
-    """
-    value, log = (np.array(column) for column in zip(*sorted(tried), strict=True))
-    share = np.exp(log - np.logaddexp.reduce(log))
-    mean, sd = refined
-    is_near = np.abs(np.log(value / mean)) <= max(GRID_REACH, 2.0 * sd / mean)
-    if share[~is_near].sum() < MIN_ELSEWHERE_SHARE:
-        return refined
-    below, above = share.cumsum(), share[::-1].cumsum()[::-1]
-    low = min(float(value[below >= INTERVAL_TAILS[0]].min()), mean - NORMAL_95 * sd)
-    high = max(float(value[above >= INTERVAL_TAILS[0]].max()), mean + NORMAL_95 * sd)
-    return mean, (high - low) / (2.0 * NORMAL_95), low, high
-
-
-def _average_powers(axis: str, state: State) -> tuple[Fit, Array]:
-    """Average the powers of an axis over the record, with free noise and effects.
-
-    The second result is how gaps mix the bands of the noise.
-    """
-    blocks = state.blocks
-    row = state.axes.index(axis)
-    power, shape = (blocks[name].values[row] for name in ("power", "shape"))
-    use = np.where(
-        np.isfinite(power) & np.isfinite(shape) & ~state.masked[row][:, None], shape, 0.0
-    )
-    total = np.maximum(use.sum(axis=0), 1e-300)
-    common, shape_alone = (values[row] for values in common_variance(blocks))
-    block_shape = np.nansum(shape_alone, axis=1)
-    share = min(
-        1.0,
-        float((block_shape / (1.0 + common * block_shape)).sum() / max(np.nansum(shape), 1e-300)),
-    )
-
-    def mean(values: Array) -> Array:
-        return np.asarray(
-            (use * np.nan_to_num(np.broadcast_to(values, use.shape))).sum(axis=0) / total
-        )
-
-    unspread = mean(unspread_share(blocks)[row, :, None])
-    width = (blocks["band_high"] - blocks["band_low"]).values
-    mixing = np.diag(unspread) + np.outer(1.0 - unspread, width / width.sum())
-    effect_columns = [mean(column) for column in state.given.get(("power", axis), [])]
-    free = (
-        np.stack([column / max(np.abs(column).max(), 1e-300) for column in effect_columns], axis=1)
-        if effect_columns
-        else None
-    )
-    return Fit(
-        mean(power),
-        mixing @ band_columns(blocks),
-        total * share,
-        free_columns=free,
-        start=mean(state.weight[row]),
-    ), mixing
-
-
-def _max_log_likelihood(fit: Fit) -> float:
-    """Return the largest log likelihood of the powers over the noise."""
-    expected = fit_squares(fit)[2]
-    return float(-(fit.weight * (np.log(expected) + fit.power / expected)).sum())

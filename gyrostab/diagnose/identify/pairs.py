@@ -63,11 +63,13 @@ def find_pair(
         return []
     first, second = best
     with_second, beside_second = companions[second]
-    found = beside_second[first]
-    with_first, beside_first = _find_beside(examination, [second], found, required[first], state)
+    first_components = beside_second[first]
+    with_first, beside_first = _find_beside(
+        examination, [second], first_components, required[first], state
+    )
     if second not in beside_first:
         return []
-    return [(first, found, with_second), (second, beside_first[second], with_first)]
+    return [(first, first_components, with_second), (second, beside_first[second], with_first)]
 
 
 def _find_beside(

@@ -212,12 +212,15 @@ def _select_next(
     if pair:
         failed = {
             key
-            for key, found, with_other in pair
-            if not passes_time_shift_test(found, with_other, examination.folds).passed
+            for key, effect_components, with_other in pair
+            if not passes_time_shift_test(effect_components, with_other, examination.folds).passed
         }
         if failed:
             return [], failed
-        return [make_identification(found, required[key]) for key, found, _ in pair], set()
+        return [
+            make_identification(effect_components, required[key])
+            for key, effect_components, _ in pair
+        ], set()
     rejected: set[str] = set()
     for key in rivals:
         if passes_time_shift_test(components[key], state, examination.folds).passed:

@@ -4,28 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-from gyrostab.diagnose.predict.candidates import Component, Variant
+from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import compute_evidence
-from gyrostab.diagnose.predict.windows import (
-    driver_names,
-    fill_linearly,
-    make_windows,
-    rebuild_variant,
-)
-from gyrostab.diagnose.reduce.block_statistics import measured
-from gyrostab.physics.prediction import Windows
+from gyrostab.diagnose.predict.windows import FOLLOWING_AXES, make_surrogates, max_correlation
 
 #: Number of time-shifted surrogates: two of them make the allowed share of 1 %.
 TIME_SHIFTS = 200
 SHIFT_RANGE = (0.05, 0.95)  # of the record
-_FOLLOWING_AXES = ("misalignment",)  # effects that follow the means of other axes
 
 
 class TimeShifts(NamedTuple):
@@ -72,10 +63,10 @@ def passes_time_shift_test(
     valid = np.ones(shifts.size, np.bool_)
     limit = state.settings.surrogate_correlation
     for component in following_components:
-        surrogates = _make_surrogates(component, state, shifts)
+        surrogates = make_surrogates(component, state.blocks, state.baseline["coefficient"], shifts)
         row = state.axes.index(component.row[0])
         for number, surrogate in enumerate(surrogates):
-            if surrogate is None or _max_correlation(surrogate, component.variant, row) > limit:
+            if surrogate is None or max_correlation(surrogate, component.variant, row) > limit:
                 valid[number] = False
         chosen = [
             surrogate if surrogate is not None else component.variant for surrogate in surrogates
@@ -106,51 +97,5 @@ def _follows_channel(component: Component) -> bool:
     if not (component.statistic.is_linear_in_means or component.statistic.is_power):
         return False
     return any(component.candidate.driver) or (
-        component.statistic.is_linear_in_means and component.candidate.effect in _FOLLOWING_AXES
+        component.statistic.is_linear_in_means and component.candidate.effect in FOLLOWING_AXES
     )
-
-
-def _make_surrogates(
-    component: Component, state: State, shifts: NDArray[np.int64]
-) -> list[Variant | None]:
-    """Return the variant for channels that are rotated in time by each shift, end to start."""
-    candidate, blocks = component.candidate, state.blocks
-    drivers = driver_names(candidate)
-    windows = make_windows(blocks, drivers)
-    channels = {inner: blocks[f"channel_{name}"].values for inner, name in drivers.items()}
-    means = measured(blocks, "mean").values
-
-    def shift_windows(shift: int) -> Windows:
-        def rotate(values: NDArray[Any]) -> NDArray[Any]:
-            return np.roll(values, shift, axis=0)
-
-        shifted = replace(
-            windows,
-            drivers={inner: fill_linearly(rotate(values)) for inner, values in channels.items()},
-            fine={inner: rotate(values) for inner, values in windows.fine.items()},
-        )
-        if candidate.effect not in _FOLLOWING_AXES:
-            return shifted
-        rotated_means = (fill_linearly(rotate(mean)) for mean in means)
-        return replace(shifted, own=dict(zip(windows.axes, rotated_means, strict=True)))
-
-    coefficient = state.baseline["coefficient"]
-    return [
-        rebuild_variant(
-            candidate, component.variant, blocks, coefficient, shift_windows(int(shift))
-        )
-        for shift in shifts
-    ]
-
-
-def _max_correlation(surrogate: Variant, true: Variant, row: int) -> float:
-    """Return the largest correlation of the columns over time, of either sign."""
-
-    def flat(design: NDArray[Any]) -> NDArray[Any]:
-        rows = design[:, row if design.shape[1] > 1 else 0]
-        rows = rows.reshape(rows.shape[0], rows.shape[1], -1).mean(axis=-1)
-        return np.asarray(rows - rows.mean(axis=1, keepdims=True))
-
-    a, b = flat(surrogate.design), flat(true.design)
-    size = np.sqrt((a**2).sum(axis=1) * (b**2).sum(axis=1))
-    return float(np.max(np.abs((a * b).sum(axis=1)) / np.where(size > 0, size, 1.0)))

@@ -15,7 +15,6 @@ from gyrostab.diagnose.evidence.telegraph import telegraph_evidence
 from gyrostab.diagnose.identify.components import axes_of, evidence_of
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identification import (
-    Identifications,
     Selection,
     components_of,
 )
@@ -222,24 +221,4 @@ def renew_component(components: Sequence[Component], component: Component) -> Co
             if other.statistic.is_switching and other.row == component.row
         ),
         fresh,
-    )
-
-
-def remove_telegraph_bias(identifications: Identifications) -> tuple[Identifications, float]:
-    """Drop the telegraph biases, and return their evidence [nats].
-
-    No held-out data show the course of one.
-    """
-    switching = [
-        identification
-        for identification in identifications.identified
-        if any(component.statistic.is_switching for component in identification.components)
-    ]
-    identified = tuple(
-        identification
-        for identification in identifications.identified
-        if identification not in switching
-    )
-    return replace(identifications, identified=identified), sum(
-        identification.evidence_nats for identification in switching
     )

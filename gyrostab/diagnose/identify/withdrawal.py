@@ -5,11 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from gyrostab.diagnose.identify.completeness import (
-    excess_low_frequency_noise,
-    variance_fluctuation,
-    with_neighbouring_variants,
-)
 from gyrostab.diagnose.identify.components import split_layers, sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identification import (
@@ -20,6 +15,11 @@ from gyrostab.diagnose.identify.identification import (
     find_unidentified,
 )
 from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.statistics.left_structure import (
+    excess_low_frequency_noise,
+    variance_fluctuation,
+    with_neighbouring_variants,
+)
 
 #: Effects that change the white variance of the means, which the calibration then misjudges.
 _SPECTRAL_SHAPES = ("logger_filter", "held_samples", "gauss_markov", "telegraph")
@@ -80,7 +80,9 @@ def _withdraw_in_means(
     )
     if has_alternative or has_shape:
         return remaining, []
-    excess_nats = excess_low_frequency_noise(with_neighbouring_variants(state, on_axis, axis), axis)
+    excess_nats = excess_low_frequency_noise(
+        with_neighbouring_variants(state, components_of(on_axis), axis), axis
+    )
     weak, strength = _find_weak(examination, on_axis, excess_nats)
     if (
         not weak

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.predict.candidates import Candidate, Prospect, Variant
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect, Variant
 from gyrostab.diagnose.predict.step_times import power_on_times
 from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.physics.base import Effect
@@ -20,6 +20,7 @@ from gyrostab.physics.registry import effects
 Array = NDArray[Any]
 #: Nuisance parameter that is a time.
 TIME_PARAMETER = "at"
+FOLLOWING_AXES = ("misalignment",)  # effects that follow the means of other axes
 _MAX_DESIGN_DIFFERENCE = 1e-3  # of its size, up to which designs are equal; design choice
 
 
@@ -195,3 +196,51 @@ def weigh_by_time(variants: tuple[Variant, ...], windows: Windows) -> tuple[Vari
         replace(variant, weight=float(share))
         for variant, share in zip(variants, weight, strict=True)
     )
+
+
+def make_surrogates(
+    component: Component,
+    blocks: xr.Dataset,
+    coefficient: xr.DataArray,
+    shifts: NDArray[np.int64],
+) -> list[Variant | None]:
+    """Return the variant for channels that are rotated in time by each shift, end to start."""
+    candidate = component.candidate
+    drivers = driver_names(candidate)
+    windows = make_windows(blocks, drivers)
+    channels = {inner: blocks[f"channel_{name}"].values for inner, name in drivers.items()}
+    means = measured(blocks, "mean").values
+
+    def shift_windows(shift: int) -> Windows:
+        def rotate(values: NDArray[Any]) -> NDArray[Any]:
+            return np.roll(values, shift, axis=0)
+
+        shifted = replace(
+            windows,
+            drivers={inner: fill_linearly(rotate(values)) for inner, values in channels.items()},
+            fine={inner: rotate(values) for inner, values in windows.fine.items()},
+        )
+        if candidate.effect not in FOLLOWING_AXES:
+            return shifted
+        rotated_means = (fill_linearly(rotate(mean)) for mean in means)
+        return replace(shifted, own=dict(zip(windows.axes, rotated_means, strict=True)))
+
+    return [
+        rebuild_variant(
+            candidate, component.variant, blocks, coefficient, shift_windows(int(shift))
+        )
+        for shift in shifts
+    ]
+
+
+def max_correlation(surrogate: Variant, true: Variant, row: int) -> float:
+    """Return the largest correlation of the columns over time, of either sign."""
+
+    def flat(design: NDArray[Any]) -> NDArray[Any]:
+        rows = design[:, row if design.shape[1] > 1 else 0]
+        rows = rows.reshape(rows.shape[0], rows.shape[1], -1).mean(axis=-1)
+        return np.asarray(rows - rows.mean(axis=1, keepdims=True))
+
+    a, b = flat(surrogate.design), flat(true.design)
+    size = np.sqrt((a**2).sum(axis=1) * (b**2).sum(axis=1))
+    return float(np.max(np.abs((a * b).sum(axis=1)) / np.where(size > 0, size, 1.0)))

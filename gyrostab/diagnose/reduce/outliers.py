@@ -308,7 +308,7 @@ def quantization_step(values: Array) -> float:
             distances = np.diff(kept_levels)
             distances = distances[distances > fine]
             if distances.size == 1 < kept_levels.size - 1:
-                continue  # a jump, beside which the resolution hides all other distances
+                continue  # the resolution hides all distances but a jump
             if distances.size and (is_double or kept_levels.size <= 0.8 * finite.size):
                 step = _common_divisor(distances, fine)
                 if (

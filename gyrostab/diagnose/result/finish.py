@@ -19,17 +19,15 @@ from gyrostab.diagnose.estimate.conditioned_baseline import (
     predict_baseline,
 )
 from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_expected, fit_identifications
-from gyrostab.diagnose.estimate.recalibrate import recalibrate, refer_to_kept_noise
+from gyrostab.diagnose.estimate.recalibrate import recalibrate, refer_to_kept_noise, with_noise
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
 from gyrostab.diagnose.identify.identification import (
     Identification,
     Identifications,
     components_of,
-    remove_phase_locked,
-    with_noise,
 )
 from gyrostab.diagnose.identify.jumps import is_step
-from gyrostab.diagnose.identify.switching import remove_telegraph_bias
+from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.channel_use import unused_channels
 from gyrostab.diagnose.result.attribution import active_blocks, attribute_mismatches
 from gyrostab.diagnose.result.content import HELD_OUT, SCHEMA, check_diagnosis
@@ -177,7 +175,7 @@ def measure_evidence(
     The likelihood of `held_out` is that of means, powers and cross-spectra. Sample counts,
     telegraph biases and phase-locked components are in none of these: their evidence is added.
     """
-    without_telegraph, telegraph_nats = remove_telegraph_bias(identifications)
+    without_telegraph, telegraph_nats = _remove_telegraph_bias(identifications)
     judged, phase_locked_nats = remove_phase_locked(without_telegraph, blocks)
     identified = without_telegraph.identified
     count_nats = sum(
@@ -229,6 +227,50 @@ def measure_evidence(
     if not has_forecast:
         evidence["forecast_gain"] = np.nan  # no effect can be forecast
     return evidence
+
+
+def _remove_telegraph_bias(identifications: Identifications) -> tuple[Identifications, float]:
+    """Drop the telegraph biases, and return their evidence [nats].
+
+    No held-out data show the course of one.
+    """
+    switching = [
+        identification
+        for identification in identifications.identified
+        if any(component.statistic.is_switching for component in identification.components)
+    ]
+    identified = tuple(
+        identification
+        for identification in identifications.identified
+        if identification not in switching
+    )
+    return replace(identifications, identified=identified), sum(
+        identification.evidence_nats for identification in switching
+    )
+
+
+def remove_phase_locked(
+    identifications: Identifications, blocks: xr.Dataset
+) -> tuple[Identifications, float]:
+    """Drop phase-locked components and slow sines, and return their held-out evidence [nats].
+
+    The band powers show how large such a component is, but not its phase. In them it would gain a
+    small part of its evidence, and lose in every band that it leaves. Therefore its own statistic
+    alone counts, and the powers of both models are without it.
+    """
+    identified, evidence_nats = [], 0.0
+    for identification in identifications.identified:
+        locked: list[Component] = []
+        rest: list[Component] = []
+        for component in identification.components:
+            is_locked = component.statistic.is_only_in_phase(component, blocks)
+            (locked if is_locked else rest).append(component)
+        evidence_nats += sum(component.evidence_nats for component in locked)
+        if rest:
+            identified.append(
+                replace(identification, components=tuple(rest)) if locked else identification
+            )
+    return replace(identifications, identified=tuple(identified)), evidence_nats
 
 
 def _can_be_forecast(

@@ -12,16 +12,16 @@ from hypothesis import strategies as st
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
+from gyrostab.diagnose.estimate.forms import settle_forms
 from gyrostab.diagnose.estimate.joint_fit import _make_estimate, fit_identifications
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
-from gyrostab.diagnose.identify.effect_candidates import effect_candidates
-from gyrostab.diagnose.identify.equivalents import settle_forms
 from gyrostab.diagnose.identify.identification import Identification, Identifications
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.settings import DEFAULTS
+from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.diagnose.statistics.spectral_line import estimate_line, line_quality
 from gyrostab.simulate import simulate
 from tests.support.candidates import make_identifications, select_candidate

@@ -14,18 +14,18 @@ from gyrostab.diagnose.baseline.calibrate import (
     calibrate_noise,
 )
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
+from gyrostab.diagnose.estimate.forms import settle_forms
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
-from gyrostab.diagnose.estimate.recalibrate import recalibrate
+from gyrostab.diagnose.estimate.recalibrate import recalibrate, with_noise
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
-from gyrostab.diagnose.identify.effect_candidates import effect_candidates
-from gyrostab.diagnose.identify.equivalents import settle_forms
-from gyrostab.diagnose.identify.identification import Identification, with_noise
+from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result import finish as conclude
 from gyrostab.diagnose.settings import DEFAULTS
+from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.simulate import simulate
 from tests.support.candidates import make_identifications, select_candidate
 

@@ -12,11 +12,11 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks, fold_subsets
 from gyrostab.diagnose.evidence.held_out import mean_factors, noise_columns
 from gyrostab.diagnose.evidence.products import WIDTHS, held_out_evidence
-from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence, evidence_by_effect
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.regression.state_space import flicker_states

@@ -13,7 +13,6 @@ from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence, line_skirt
 from gyrostab.diagnose.identify import selection
 from gyrostab.diagnose.identify.components import group_components, merge_lines
-from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identification import Identification, add_identification, form_error
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
@@ -23,6 +22,7 @@ from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence, reusable_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics import find_statistic
+from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.diagnose.statistics.spectral_line import estimate_line
 from gyrostab.ingest.make_log import make_log
 from tests.support.candidates import find_components

@@ -9,9 +9,9 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.identify.components import sum_evidence
-from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.simulate import simulate
 from tests.support.candidates import find_components
 

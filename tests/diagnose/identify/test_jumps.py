@@ -11,12 +11,12 @@ from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.identify.ambiguity import find_equivalent_effects
 from gyrostab.diagnose.identify.components import sum_evidence
-from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identifiability import is_physical
 from gyrostab.diagnose.identify.jumps import gradual_nats, is_free_jump, scatter_nats
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.ingest.make_log import make_log
 from tests.support.candidates import find_components
 

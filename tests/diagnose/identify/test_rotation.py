@@ -13,7 +13,6 @@ from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence
-from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import find_plainer_effect, is_physical
 from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
@@ -21,6 +20,7 @@ from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.settings import DEFAULTS
+from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.diagnose.task import Task, take_lines_at_rest
 from gyrostab.ingest.make_log import make_log
 from gyrostab.progress import no_stage

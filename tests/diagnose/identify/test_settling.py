@@ -11,7 +11,6 @@ from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify import selection as selecting
-from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identification import (
     Identification,
@@ -26,6 +25,7 @@ from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics import find_statistic
+from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.ingest.make_log import make_log
 
 MODEL = {"noise": {"N": 0.003, "K": 0.005}, "log": {"axes": ["x"]}}

@@ -7,12 +7,12 @@ import pytest
 from scipy.signal import lfilter
 
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
-from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identifiability import is_physical
 from gyrostab.diagnose.identify.steady import intermittent_nats
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.ingest.make_log import make_log
 from tests.support.candidates import find_components
 

@@ -8,11 +8,11 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify import surrogates
-from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.ingest.make_log import make_log
 from gyrostab.simulate import simulate
 from tests.support.candidates import find_components, select_candidate

@@ -9,7 +9,6 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.held_out import linear_model_factors
-from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.nuisance_alternatives import hat_functions, nuisance_alternatives
 from gyrostab.diagnose.predict.linear_model import (
     initial_state,
@@ -20,6 +19,7 @@ from gyrostab.diagnose.predict.linear_model import (
 from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics import STATISTICS
+from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.ingest.make_log import make_log
 from gyrostab.noise import sampled_psd
 from gyrostab.physics.registry import effects

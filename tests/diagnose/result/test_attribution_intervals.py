@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
+from gyrostab.diagnose.statistics.candidates import effect_candidates
 from tests.support.candidates import select_candidate
 from tests.support.named import COEFFICIENT, WORLD, record
 

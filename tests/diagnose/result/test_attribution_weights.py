@@ -9,7 +9,6 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
-from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.locate.mismatches import locate_mismatches
 from gyrostab.diagnose.locate.regions import merge_regions
@@ -20,6 +19,7 @@ from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.result.attribution import attribute_mismatches
 from gyrostab.diagnose.result.attribution_weights import needed_effects
 from gyrostab.diagnose.statistics import find_statistic
+from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.diagnose.statistics.sample_counts import find_anomalous_blocks
 from tests.support.candidates import make_identifications, select_candidate
 from tests.support.named import COEFFICIENT, nulls, record

@@ -12,10 +12,6 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
-from gyrostab.diagnose.identify.completeness import (
-    excess_low_frequency_noise,
-    variance_fluctuation,
-)
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
@@ -24,6 +20,10 @@ from gyrostab.diagnose.predict.candidates import CandidateEvidence
 from gyrostab.diagnose.predict.condition import refit_weights
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.statistics.left_structure import (
+    excess_low_frequency_noise,
+    variance_fluctuation,
+)
 from gyrostab.ingest.make_log import make_log
 from tests.support.named import nulls
 

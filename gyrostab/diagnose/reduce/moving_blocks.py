@@ -1,4 +1,4 @@
-"""Leave out the blocks in which an axis moves far beyond its noise without an effect to explain it.
+"""Find the blocks in which an axis moves far beyond its noise, and leave them out.
 
 What a moving axis measures stays in the record, because other axes may sense it through their
 misalignment.
@@ -6,17 +6,13 @@ misalignment.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.identify.identification import Identification, components_of
-from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.progress import Stage, no_stage
 
@@ -25,8 +21,8 @@ Array = NDArray[np.float64]
 #: normal law in standard deviations: 2 * 0.3186.
 CORE_SHARE, CORE_WIDTH_SIGMA = 0.25, 0.637
 MAD_TO_SIGMA = 1.4826  # median absolute deviation of a normal law
-#: Scatter of equal means, over the range of the samples, and scatter by errors of rounding alone. A
-#: few samples one quantization step away from all others are no motion.
+#: Scatter of equal means, over the range of the samples, and scatter by errors of rounding alone.
+#: The means do not move by a few samples that are one quantization step from all others.
 EQUAL_SCATTER, ROUNDING = 1e-3, 1e-9
 REST_ROUNDS = 3  # in which centre and scatter at rest are refined
 _KEPT_STATISTICS = ("mean", "power", "cross")
@@ -47,18 +43,16 @@ def moving_blocks(blocks: xr.Dataset, *, settings: Settings = DEFAULTS) -> NDArr
     >>> moving_blocks(reduce_log(make_log(rate, rate=100.0, unit="deg/h"), block="5s")).sum(axis=1)
     array([ 0, 24])
     """
-    span = _sample_range(blocks)
-    return np.stack(
-        [_moving_blocks_of_axis(mean, span, settings) for mean in blocks["mean"].values]
-    )
+    span = sample_range(blocks)
+    return np.stack([moving_blocks_of_axis(mean, span, settings) for mean in blocks["mean"].values])
 
 
-def _sample_range(blocks: xr.Dataset) -> float:
+def sample_range(blocks: xr.Dataset) -> float:
     """Return the distance of the largest sample of the record from the smallest."""
     return float(np.ptp(blocks["range_end"].values))
 
 
-def _moving_blocks_of_axis(mean: Array, span: float, settings: Settings) -> NDArray[np.bool_]:
+def moving_blocks_of_axis(mean: Array, span: float, settings: Settings) -> NDArray[np.bool_]:
     """Find the moving blocks of one axis of a record whose samples have the range `span`."""
     good = np.isfinite(mean)
     nothing = np.zeros(mean.size, np.bool_)
@@ -105,84 +99,6 @@ def _find_rest_level(mean: Array) -> tuple[float, float]:
     width = ordered[size - 1 :] - ordered[: mean.size - size + 1]
     first = int(width.argmin())
     return float(np.median(ordered[first : first + size])), float(width[first]) / CORE_WIDTH_SIGMA
-
-
-def unexplained_motion(
-    blocks: xr.Dataset, identified: Iterable[Identification], *, settings: Settings = DEFAULTS
-) -> NDArray[np.bool_]:
-    """Find the moving blocks of axes without an effect that explains the means.
-
-    An effect on the means must leave next to nothing of the motion. It is not enough that it adds
-    evidence: a step or a drifting channel also explains a part of an intermittent rotation. Two
-    levels have their course from the means themselves, hence no error of form: they must leave the
-    axis at rest.
-
-    Returns
-    -------
-    ndarray of bool, shape (axis, block)
-    """
-    components = components_of(identified)
-    explained_axes = {
-        axis
-        for component in components
-        if component.statistic.explains_motion
-        for axis in component.row
-    }
-    moving = moving_blocks(blocks, settings=settings)
-    span = _sample_range(blocks)
-    for row, axis in enumerate(map(str, blocks["axis"].values)):
-        axis_components = [
-            component
-            for component in components
-            if component.statistic.is_in_means and component.row == (axis,)
-        ]
-        columns = [
-            column
-            for component in axis_components
-            for column in mean_columns(component.variant, row)
-        ]
-        if axis in explained_axes or (
-            columns
-            and _is_explained(
-                axis_values(blocks, "mean", axis),
-                moving[row],
-                np.stack(columns, axis=1),
-                span,
-                settings,
-                has_form=not any(component.statistic.is_switching for component in axis_components),
-            )
-        ):
-            moving[row] = False
-    return moving
-
-
-def _is_explained(
-    mean: Array,
-    moving: NDArray[np.bool_],
-    columns: Array,
-    span: float,
-    settings: Settings,
-    *,
-    has_form: bool,
-) -> bool:
-    """Return whether these columns leave next to nothing of a motion.
-
-    Columns without a given form cannot have an error of form, and must leave the axis at rest.
-    """
-    good = np.isfinite(mean)
-    if not (good & moving).any():
-        return True
-    design = np.column_stack([np.ones(mean.size), np.nan_to_num(columns)])[good]
-    design /= np.maximum(np.abs(design).max(axis=0), 1e-300)
-    size, *_ = np.linalg.lstsq(design, mean[good], rcond=None)
-    residual = mean[good] - design @ size
-    if not has_form and _moving_blocks_of_axis(residual, span, settings).any():
-        return False
-    away = mean[good] - np.median(mean[good & ~moving])
-    is_moving = moving[good]
-    return float((residual[is_moving] ** 2).sum()) <= settings.spectrum_error_share * float(
-        (away[is_moving] ** 2).sum()
-    )
 
 
 def without_motion(

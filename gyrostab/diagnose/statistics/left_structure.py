@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.baseline.posterior import visible_coefficients
 from gyrostab.diagnose.evidence.held_out import noise_weight
 from gyrostab.diagnose.evidence.products import mean_products
-from gyrostab.diagnose.identify.identification import Identification, components_of
+from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import mean_mixture
@@ -22,15 +22,13 @@ Array = NDArray[np.float64]
 _NOISE_STEPS = (1.0, 3.0, 10.0, 30.0)
 
 
-def with_neighbouring_variants(
-    state: State, identified: Sequence[Identification], axis: str
-) -> State:
+def with_neighbouring_variants(state: State, components: Sequence[Component], axis: str) -> State:
     """Return the state with the neighbours of the fitted nuisance values in the model as well.
 
     A time constant lies between two points of its grid.
     """
     row = state.axes.index(axis)
-    for component in components_of(identified):
+    for component in components:
         if not (component.statistic.is_linear_in_means and component.row == (axis,)):
             continue
         family = [

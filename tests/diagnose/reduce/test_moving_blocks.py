@@ -10,9 +10,10 @@ import xarray as xr
 
 from gyrostab import diagnose
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
-from gyrostab.diagnose.identify.moving_axes import moving_blocks, unexplained_motion, without_motion
+from gyrostab.diagnose.estimate.unexplained_motion import unexplained_motion
 from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.diagnose.reduce.block_statistics import measured, reduce_log
+from gyrostab.diagnose.reduce.moving_blocks import moving_blocks, without_motion
 from gyrostab.diagnose.result.mismatch_tables import motion_mismatches
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.errors import SchemaError
