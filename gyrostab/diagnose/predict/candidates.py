@@ -116,3 +116,8 @@ class CandidateEvidence:
     best: tuple[Variant, ...]  # best variant of each row for the first record
     #: (record, row): index of the line for lines; otherwise empty.
     place: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 0), np.int64))
+
+
+def numbered_columns(count: int) -> tuple[str, ...]:
+    """Return column names for numbered columns."""
+    return tuple(str(number) for number in range(count))

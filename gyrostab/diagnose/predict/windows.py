@@ -20,6 +20,7 @@ from gyrostab.physics.registry import effects
 Array = NDArray[Any]
 #: Nuisance parameter that is a time.
 TIME_PARAMETER = "at"
+_SPLINE_KNOTS = 12  # of hat functions over the record; design choice
 FOLLOWING_AXES = ("misalignment",)  # effects that follow the means of other axes
 _MAX_DESIGN_DIFFERENCE = 1e-3  # of its size, up to which designs are equal; design choice
 
@@ -244,3 +245,16 @@ def max_correlation(surrogate: Variant, true: Variant, row: int) -> float:
     a, b = flat(surrogate.design), flat(true.design)
     size = np.sqrt((a**2).sum(axis=1) * (b**2).sum(axis=1))
     return float(np.max(np.abs((a * b).sum(axis=1)) / np.where(size > 0, size, 1.0)))
+
+
+def hat_functions(begin: Array, end: Array, knots: int = _SPLINE_KNOTS) -> Array:
+    """Return piecewise linear hat functions over the record, (knot, block).
+
+    Examples
+    --------
+    >>> hat_functions(np.arange(4.0), np.arange(1.0, 5.0), 2).sum(axis=0)
+    array([1., 1., 1., 1.])
+    """
+    middle = (begin + end) / 2.0
+    places = np.linspace(begin[0], end[-1], knots)
+    return np.stack([np.interp(middle, places, row) for row in np.eye(knots)])

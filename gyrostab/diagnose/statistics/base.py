@@ -161,6 +161,10 @@ class Statistic:
         """Return the candidates of an effect none of whose channels is in the record."""
         return []
 
+    def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
+        """Return generic changes of noise and bias that compete with effects in this statistic."""
+        return []
+
     # ---------------------------------------------------------------------- evidence
 
     def rows(self, candidate: Candidate, state: State) -> list[tuple[str, ...]]:

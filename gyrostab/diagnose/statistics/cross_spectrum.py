@@ -10,7 +10,13 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.held_out import LinearModel
-from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect, Variant
+from gyrostab.diagnose.predict.candidates import (
+    Candidate,
+    Component,
+    Prospect,
+    Variant,
+    numbered_columns,
+)
 from gyrostab.diagnose.predict.linear_model import (
     State,
     band_widths,
@@ -65,6 +71,12 @@ class CrossSpectrum(Statistic):
     is_pairwise = True
     has_course = True
     takes_noise = False  # only the effect itself gives the power of each axis
+
+    def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
+        """Return noise that two axes share, of any phase and spectrum."""
+        if "cross" not in blocks or not blocks.sizes["pair"]:
+            return []
+        return [Candidate("~cov", self, (), _covariance_variants(blocks.sizes["band"]))]
 
     def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         """Score the coherency of every pair of axes, in phase and in quadrature.
@@ -263,3 +275,20 @@ def draw_coherency(
         # Beta(1, n - 1)
         squared = np.where(freedom > 0.0, 1.0 - rng.random(size) ** (1.0 / freedom), 1.0)
     return np.asarray(np.sqrt(squared) * np.exp(2j * np.pi * rng.random(size)))
+
+
+def _covariance_variants(bands: int) -> tuple[Variant, ...]:
+    """Return covariances in each band, or in four groups of bands, with any phase."""
+    single_bands = [np.eye(bands)[number] for number in range(bands)]
+    groups = [
+        np.isin(np.arange(bands), group).astype(float)
+        for group in np.array_split(np.arange(bands), min(4, bands))
+    ]
+    variants = [_any_phase([band]) for band in single_bands]
+    return (*variants, _any_phase(groups))
+
+
+def _any_phase(rows: list[Array]) -> Variant:
+    """Return cross-densities of any phase in these bands."""
+    columns = np.array([factor * row for row in rows for factor in (1.0 + 0j, 1j)])
+    return Variant({}, numbered_columns(len(columns)), columns[:, None, None, :])

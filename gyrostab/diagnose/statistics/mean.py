@@ -18,13 +18,14 @@ from gyrostab.diagnose.predict.candidates import (
     Component,
     Prospect,
     Variant,
+    numbered_columns,
 )
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State, moves_within_blocks
 from gyrostab.diagnose.predict.search import Trial, collect_evidence
 from gyrostab.diagnose.predict.sizes import Mixture, mean_mixture
 from gyrostab.diagnose.predict.step_times import power_on_times
-from gyrostab.diagnose.predict.windows import TIME_PARAMETER
+from gyrostab.diagnose.predict.windows import TIME_PARAMETER, hat_functions
 from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.statistics.base import Region, Statistic, column_choices
 from gyrostab.diagnose.statistics.scores import (
@@ -104,6 +105,12 @@ class Mean(BlockMeanStatistic):
     is_linear_in_means = True
     has_course = True
     grows_in_time = False
+
+    def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
+        """Return a bias that wanders in any way."""
+        hats = hat_functions(blocks["begin"].values, blocks["end"].values)
+        wander = Variant({}, numbered_columns(len(hats)), hats[:, None, :])
+        return [Candidate("~bias(t)", self, (), (wander,))]
 
     def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
         """Score the mean of windows of four lengths against the rest of the record.

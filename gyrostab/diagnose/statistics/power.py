@@ -27,6 +27,7 @@ from gyrostab.diagnose.predict.linear_model import (
 )
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.statistics.base import Region, Statistic, column_choices
+from gyrostab.diagnose.statistics.free_powers import free_powers
 from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
@@ -88,6 +89,12 @@ class Power(Statistic):
     is_power = True
     has_course = True
     is_ratio = True
+
+    def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
+        """Return noise of any course, in an interval, and of any spectrum."""
+        return [
+            Candidate(name, self, (), variants) for name, variants in free_powers(blocks).items()
+        ]
 
     def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
         """Score the Allan variance in windows of three lengths and of the whole record.

@@ -73,6 +73,10 @@ class SampleCounts(Statistic):
     has_size = False
     takes_noise = False
 
+    def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
+        """Return a distribution with heavy tails."""
+        return [Candidate("~outliers", self, (), (Variant({}, ("kurtosis",), np.empty(0)),))]
+
     def null(self, draw: NullDraw) -> Mapping[str, NDArray[Any]]:
         """Draw outliers, repeats, extremes and zeros by chance."""
         return null_counts(draw.blocks, draw.sample_sd, draw.record_count, draw.rng)

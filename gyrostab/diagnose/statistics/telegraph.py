@@ -46,6 +46,10 @@ class Telegraph(BlockMeanStatistic):
     is_in_means = True
     is_switching = True
 
+    def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
+        """Return any course of levels, which the means determine."""
+        return [Candidate(_LEVELS, self, (), (Variant({}, ("0",), np.empty(0)),))]
+
     def design(self, case: Prospect) -> Iterator[Variant]:
         """Yield two levels; the means determine the course and its times."""
         if case.prediction.levels:

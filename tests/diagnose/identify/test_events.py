@@ -12,7 +12,6 @@ from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import is_physical
-from gyrostab.diagnose.identify.nuisance_alternatives import burst_intervals
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import Candidate, Component
@@ -21,6 +20,7 @@ from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.free_powers import burst_intervals
 from gyrostab.ingest.make_log import make_log
 from tests.support.candidates import find_components
 from tests.support.named import nulls

@@ -9,14 +9,14 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.held_out import linear_model_factors
-from gyrostab.diagnose.identify.nuisance_alternatives import hat_functions, nuisance_alternatives
+from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
 from gyrostab.diagnose.predict.linear_model import (
     initial_state,
     power_column,
     simulate_noise,
     spread_by_gaps,
 )
-from gyrostab.diagnose.predict.windows import make_windows
+from gyrostab.diagnose.predict.windows import hat_functions, make_windows
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics import STATISTICS
 from gyrostab.diagnose.statistics.candidates import effect_candidates
