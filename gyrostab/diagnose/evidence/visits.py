@@ -15,6 +15,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.evidence.mixture import products_mixture
 from gyrostab.diagnose.evidence.products import (
     Products,
     axis_noise,
@@ -124,14 +125,5 @@ def _log_evidence(
     width = chosen.size - base_count
     if width:
         part = marginalise(part, width, np.eye(width) / variance)
-    ridge = 1e-9 * (1.0 + np.trace(part.gram, axis1=1, axis2=2))[:, None, None] * np.eye(base_count)
-    gram = part.gram + ridge
-    mean = np.linalg.solve(gram, part.cross)[:, :, 0]
-    log = log_weight - 0.5 * (
-        part.square[:, 0]
-        - (mean * part.cross[:, :, 0]).sum(axis=1)
-        + part.log_determinant
-        + np.linalg.slogdet(gram)[1]
-    )
-    total = float(np.logaddexp.reduce(log))
-    return total, float(np.exp(log - total) @ mean[:, 0])
+    mixture = products_mixture(part, log_weight)
+    return mixture.evidence, float(mixture.weights() @ mixture.mean[:, 0])

@@ -26,38 +26,30 @@ _PPM = 1e6  # in one
 EQUIVALENTS = {"thermal_hysteresis": "temperature_bias"}
 
 
-def is_physical(
+def keep_physical(
     components: Sequence[Component], state: State, *, error: float = 0.0
-) -> list[Component]:
+) -> tuple[list[Component], tuple[str, float] | None]:
     """Return the components of an effect that no other form explains better, of possible sizes.
 
-    Without an effect on an axis, chance may fit an impossible size. `error` is what errors of the
-    form of all other effects may leave to this one [nats].
-    """
-    if _find_other_course(components, state, error):
-        return []
-    return [component for component in components if not _find_other_form(component, state)]
-
-
-def find_better_form(
-    components: Sequence[Component], state: State, *, error: float = 0.0
-) -> tuple[str, float] | None:
-    """Return the form that excludes an effect, and by how much it explains more [nats].
-
-    NaN for sizes that physics excludes; None where some component is left.
+    Without an effect on an axis, chance may fit an impossible size. If no component is left, the
+    second result is the form that excludes the effect, and by how much it explains more [nats], NaN
+    for sizes that physics excludes.
 
     Parameters
     ----------
     components : sequence of Component
         Components of the effect, the strongest first.
-    state, error : State, float
-        As for `is_physical`.
+    state : State
+        With all other effects in the model.
+    error : float
+        What errors of the form of all other effects may leave to this one [nats].
     """
     other_course = _find_other_course(components, state, error)
-    forms = (
-        [_find_other_form(component, state) for component in components] if not other_course else []
-    )
-    return other_course or (forms[0] if forms and all(forms) else None)
+    if other_course:
+        return [], other_course
+    forms = [_find_other_form(component, state) for component in components]
+    kept = [component for component, form in zip(components, forms, strict=True) if not form]
+    return kept, next(iter(forms), None) if not kept else None
 
 
 def _find_other_course(

@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.evidence.mixture import Mixture
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.sizes import Mixture, component_mixture, mean_mixture
+from gyrostab.diagnose.predict.sizes import component_mixture, mean_mixture
 from gyrostab.diagnose.predict.windows import TIME_PARAMETER
 from gyrostab.diagnose.reduce.schema import axis_values
 

@@ -7,7 +7,7 @@ from itertools import combinations_with_replacement
 
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.identifiability import is_physical
+from gyrostab.diagnose.identify.identifiability import keep_physical
 from gyrostab.diagnose.identify.identification import form_error, make_identification
 from gyrostab.diagnose.identify.jumps import is_step
 from gyrostab.diagnose.predict.candidates import Component
@@ -86,7 +86,7 @@ def _find_beside(
     components_beside = {}
     for key, effect_components in examination.find_components(sought, with_first).items():
         error = form_error(effect_components, chosen, settings=examination.settings)
-        physical = is_physical(effect_components, with_first, error=error)
+        physical, _ = keep_physical(effect_components, with_first, error=error)
         if sum_evidence(physical) > examination.threshold + error:
             components_beside[key] = physical
     return with_first, components_beside

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from gyrostab.diagnose.identify.components import axes_of, sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.identifiability import find_better_form
+from gyrostab.diagnose.identify.identifiability import keep_physical
 from gyrostab.diagnose.identify.identification import (
     Identification,
     Rejection,
@@ -95,7 +95,7 @@ def _find_veto(
             and effect in selection.candidates
         ):
             return NUISANCE_ALTERNATIVES[selection.generic], selection.evidence_nats
-    better_form = find_better_form(components, state, error=error)
+    _, better_form = keep_physical(components, state, error=error)
     if better_form:
         return better_form
     shifts = passes_time_shift_test(components, state, examination.folds)

@@ -16,7 +16,7 @@ from gyrostab.diagnose.identify.components import (
     sum_evidence,
 )
 from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.identifiability import is_physical
+from gyrostab.diagnose.identify.identifiability import keep_physical
 from gyrostab.diagnose.identify.identification import (
     Identification,
     Rejection,
@@ -201,7 +201,7 @@ def _select_next(
     }
     for key, effect_components in list(components.items()):
         if not key.startswith("~") and sum_evidence(effect_components) > required[key]:
-            components[key] = is_physical(
+            components[key], _ = keep_physical(
                 effect_components, state, error=required[key] - examination.threshold
             )
     passing = order_passing(components, required, state, examination)

@@ -18,7 +18,7 @@ from gyrostab.diagnose.identify.components import (
     sum_evidence,
 )
 from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.identifiability import is_physical
+from gyrostab.diagnose.identify.identifiability import keep_physical
 from gyrostab.diagnose.identify.identification import (
     Identification,
     Selection,
@@ -138,7 +138,7 @@ def _finish_identification(
         and other != key
         and not other.startswith("~")
         and sum_evidence(components) >= min_nats
-        and sum_evidence(is_physical(components, state)) >= min_nats
+        and sum_evidence(keep_physical(components, state)[0]) >= min_nats
     ]
     lines = {
         component.place

@@ -8,10 +8,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.evidence.mixture import Mixture
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.grid_refinement import Point, refine_grid
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.sizes import Mixture, component_mixture
+from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.settings import INTERVAL_TAILS
 from gyrostab.noise import NORMAL_95
 from gyrostab.physics.registry import effects

@@ -9,9 +9,10 @@ from itertools import groupby, pairwise
 
 import numpy as np
 
+from gyrostab.diagnose.evidence.mixture import Mixture
 from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.sizes import Mixture, component_mixture
+from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.predict.windows import rebuild_variant
 from gyrostab.errors import OptionError
 from gyrostab.physics.registry import effects

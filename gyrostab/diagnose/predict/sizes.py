@@ -3,73 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.held_out import Tier, mean_residual, noise_weight
+from gyrostab.diagnose.evidence.mixture import Mixture, products_mixture
 from gyrostab.diagnose.evidence.products import axis_noise, mean_products
 from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
 
 Array = NDArray[np.float64]
 _RIDGE = 1e-12  # of the trace of the Gram matrix, against singular columns
-
-
-@dataclass(frozen=True)
-class Mixture:
-    """A mixture of normal distributions of some sizes."""
-
-    log_weight: Array  # (point,): not normalised
-    mean: Array  # (point, size)
-    covariance: Array  # (point, size, size)
-
-    @property
-    def evidence(self) -> float:
-        """Log likelihood over all points, up to a constant."""
-        return float(np.logaddexp.reduce(self.log_weight))
-
-    def weights(self) -> Array:
-        """Return the probabilities of the points."""
-        return np.asarray(np.exp(self.log_weight - np.logaddexp.reduce(self.log_weight)))
-
-    def quantiles(self, tail: float) -> Array:
-        """Return the quantiles of each size at `tail` and ``1 - tail``, shape (2, size).
-
-        NaN for a size that is not determined.
-
-        Examples
-        --------
-        >>> mixture = Mixture(np.zeros(2), np.array([[10.0], [40.0]]), np.ones((2, 1, 1)))
-        >>> mixture.quantiles(0.025).round(1).tolist()
-        [[8.4], [41.6]]
-        """
-        from scipy.special import ndtr
-
-        weight = self.weights()[:, None]
-        sd = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
-        reach = 40.0 * sd.max(axis=0)
-        low, high = self.mean.min(axis=0) - reach, self.mean.max(axis=0) + reach
-        ends = []
-        for share in (tail, 1.0 - tail):
-            below, above = low.copy(), high.copy()
-            with np.errstate(invalid="ignore"):  # infinite errors
-                for _ in range(80):
-                    middle = 0.5 * (below + above)
-                    is_low = (weight * ndtr((middle - self.mean) / sd)).sum(axis=0) < share
-                    below, above = np.where(is_low, middle, below), np.where(is_low, above, middle)
-            ends.append(0.5 * (below + above))
-        return np.array(ends)
-
-    def moments(self) -> tuple[Array, Array]:
-        """Return mean and covariance of the mixture."""
-        weight = self.weights()
-        mean = weight @ self.mean
-        deviation = self.mean - mean
-        return mean, np.einsum("g,gij->ij", weight, self.covariance) + np.einsum(
-            "g,gi,gj->ij", weight, deviation, deviation
-        )
 
 
 def mean_mixture(
@@ -109,22 +55,13 @@ def mean_mixture(
         step=float(state.blocks.attrs["block_s"]),
         present=present,
     )
-    prior = noise_weight(baseline, axis, tier)
+    mixture = products_mixture(products, noise_weight(baseline, axis, tier), ridge=_RIDGE)
     own_count = len(columns)
-    gram = products.gram + _RIDGE * np.eye(stacked.shape[1]) * (
-        1.0 + np.trace(products.gram, axis1=1, axis2=2)[:, None, None]
-    )
-    covariance = np.linalg.inv(gram)
-    mean = np.einsum("gij,gj->gi", covariance, products.cross[:, :, 0])
-    fitted = (mean * products.cross[:, :, 0]).sum(axis=1)
-    log_weight = prior - 0.5 * (
-        products.square[:, 0] - fitted + products.log_determinant + np.linalg.slogdet(gram)[1]
-    )
     scale = size[:own_count]
     return Mixture(
-        log_weight,
-        mean[:, :own_count] / scale,
-        covariance[:, :own_count, :own_count] / np.outer(scale, scale),
+        mixture.log_weight,
+        mixture.mean[:, :own_count] / scale,
+        mixture.covariance[:, :own_count, :own_count] / np.outer(scale, scale),
     )
 
 

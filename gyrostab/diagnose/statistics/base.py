@@ -11,6 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.held_out import LinearModel, linear_model_factors
+from gyrostab.diagnose.evidence.mixture import Mixture
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.predict.average_sizes import average_sizes
 from gyrostab.diagnose.predict.candidates import (
@@ -22,7 +23,7 @@ from gyrostab.diagnose.predict.candidates import (
 )
 from gyrostab.diagnose.predict.linear_model import State, simulate_noise
 from gyrostab.diagnose.predict.search import Trial, collect_evidence
-from gyrostab.diagnose.predict.sizes import Mixture, linear_mixture
+from gyrostab.diagnose.predict.sizes import linear_mixture
 from gyrostab.diagnose.predict.windows import distinct_variants, weigh_by_time
 from gyrostab.diagnose.settings import Settings
 from gyrostab.physics.base import Effect

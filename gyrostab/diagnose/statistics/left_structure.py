@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.posterior import visible_coefficients
 from gyrostab.diagnose.evidence.held_out import noise_weight
+from gyrostab.diagnose.evidence.mixture import products_mixture
 from gyrostab.diagnose.evidence.products import mean_products
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import mean_columns
@@ -94,12 +95,7 @@ def variance_fluctuation(state: State, axis: str) -> float:
     limit = state.settings.max_level_sigma * np.sqrt(safe)
     values = np.clip(np.where(present, level, 0.0), -limit, limit)[:, None]
     products = mean_products(values, columns, variance=safe, step=step, K=K, B=B, present=present)
-    gram = products.gram + 1e-9 * np.eye(columns.shape[1]) * (
-        1.0 + np.trace(products.gram, axis1=1, axis2=2)[:, None, None]
-    )
-    size = np.linalg.solve(gram, products.cross)[..., 0]
-    square = products.square[:, 0] - (size * products.cross[..., 0]).sum(axis=1)
-    log = -0.5 * (square + products.log_determinant + np.linalg.slogdet(gram)[1])
+    log = products_mixture(products, np.zeros(K.size)).log_weight
     return float(np.logaddexp.reduce(log[1:]) - np.log(log.size - 1) - log[0])
 
 

@@ -11,6 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.held_out import mean_factors
+from gyrostab.diagnose.evidence.mixture import Mixture
 from gyrostab.diagnose.evidence.wandering import block_mean_variance, expected_processes
 from gyrostab.diagnose.predict.candidates import (
     Candidate,
@@ -23,7 +24,7 @@ from gyrostab.diagnose.predict.candidates import (
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State, moves_within_blocks
 from gyrostab.diagnose.predict.search import Trial, collect_evidence
-from gyrostab.diagnose.predict.sizes import Mixture, mean_mixture
+from gyrostab.diagnose.predict.sizes import mean_mixture
 from gyrostab.diagnose.predict.step_times import power_on_times
 from gyrostab.diagnose.predict.windows import TIME_PARAMETER, hat_functions
 from gyrostab.diagnose.settings import Settings

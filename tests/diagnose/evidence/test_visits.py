@@ -5,7 +5,7 @@ import pytest
 
 from gyrostab.diagnose.evidence.telegraph import telegraph_evidence
 from gyrostab.diagnose.evidence.visits import compare_visits, visit_columns
-from gyrostab.diagnose.identify.identifiability import find_better_form, is_physical
+from gyrostab.diagnose.identify.identifiability import keep_physical
 from tests.diagnose.evidence.test_telegraph import (
     BLOCKS,
     STEP,
@@ -81,9 +81,9 @@ def test_two_levels_are_named_only_if_the_bias_returns_to_them(
     course, share = bursts(heights)
     state = state_of(course + white(np.random.default_rng(3), 1)[0])
     shown = component(state, share)
-    assert bool(is_physical([shown], state)) is named
+    assert bool(keep_physical([shown], state)[0]) is named
     if not named:
-        assert find_better_form([shown], state)[0] == "levels that differ"
+        assert keep_physical([shown], state)[1][0] == "levels that differ"
 
 
 def test_equal_visits_on_several_axes_count_once() -> None:
@@ -93,7 +93,7 @@ def test_equal_visits_on_several_axes_count_once() -> None:
     state = state_of(0.18 * share + white(rng, 1)[0])
     shown = component(state, share)
     assert -3.0 < nats(state.blocks["mean"].values[0], share) < -1.0
-    assert not is_physical([shown] * 3, state)
+    assert not keep_physical([shown] * 3, state)[0]
 
 
 def test_the_course_of_a_telegraph_has_equal_visits() -> None:

@@ -10,17 +10,17 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks, fold_subsets
+from gyrostab.diagnose.evidence.mixture import Mixture
 from gyrostab.diagnose.evidence.sample_counts import expected_counts, sample_count_evidence
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence
 from gyrostab.diagnose.identify.forward_search import name_effects, tail_level
-from gyrostab.diagnose.identify.identifiability import _is_possible, is_physical
+from gyrostab.diagnose.identify.identifiability import _is_possible, keep_physical
 from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.predict import sizes
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.search import combine_rows
-from gyrostab.diagnose.predict.sizes import Mixture
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.statistics import find_statistic
@@ -90,7 +90,7 @@ def test_chance_on_another_axis_does_not_veto_an_effect(shaken, monkeypatch):
         "component_size",
         lambda component, state: (size_by_axis[component.row[0]], 0.01),
     )
-    assert is_physical([component, *elsewhere], state) == [component, elsewhere[1]]
+    assert keep_physical([component, *elsewhere], state)[0] == [component, elsewhere[1]]
 
 
 def test_sizes_outside_the_registry_are_rejected(shaken):
@@ -104,7 +104,7 @@ def test_sizes_outside_the_registry_are_rejected(shaken):
             state.blocks["axis"] == "y", 0.0
         )
         assert (
-            is_physical([component], replace(state, blocks=state.blocks.assign(mean=mean)))
+            keep_physical([component], replace(state, blocks=state.blocks.assign(mean=mean)))[0]
             == answer
         )
 

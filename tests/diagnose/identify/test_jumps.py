@@ -11,7 +11,7 @@ from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.identify.ambiguity import find_equivalent_effects
 from gyrostab.diagnose.identify.components import sum_evidence
-from gyrostab.diagnose.identify.identifiability import is_physical
+from gyrostab.diagnose.identify.identifiability import keep_physical
 from gyrostab.diagnose.identify.jumps import gradual_nats, is_free_jump, scatter_nats
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.linear_model import State, initial_state
@@ -53,7 +53,7 @@ def test_gradual_change_is_not_a_jump(way: float, size: float, jump: bool) -> No
     assert abs(float(components[0].variant.values["at"]) - MIDDLE) <= 30.0
     assert all(is_free_jump(component, state) for component in components)
     assert (gradual_nats(components, state) == 0.0) == jump
-    assert bool(is_physical(components, state)) == jump
+    assert bool(keep_physical(components, state)[0]) == jump
 
 
 def test_an_instant_that_axes_share_is_searched_once() -> None:

@@ -1,0 +1,87 @@
+"""Mixtures of normal distributions of sizes, over a grid of noise coefficients."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.evidence.products import Products
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """A mixture of normal distributions of some sizes."""
+
+    log_weight: Array  # (point,): not normalised
+    mean: Array  # (point, size)
+    covariance: Array  # (point, size, size)
+
+    @property
+    def evidence(self) -> float:
+        """Log likelihood over all points, up to a constant."""
+        return float(np.logaddexp.reduce(self.log_weight))
+
+    def weights(self) -> Array:
+        """Return the probabilities of the points."""
+        return np.asarray(np.exp(self.log_weight - np.logaddexp.reduce(self.log_weight)))
+
+    def quantiles(self, tail: float) -> Array:
+        """Return the quantiles of each size at `tail` and ``1 - tail``, shape (2, size).
+
+        NaN for a size that is not determined.
+
+        Examples
+        --------
+        >>> mixture = Mixture(np.zeros(2), np.array([[10.0], [40.0]]), np.ones((2, 1, 1)))
+        >>> mixture.quantiles(0.025).round(1).tolist()
+        [[8.4], [41.6]]
+        """
+        from scipy.special import ndtr
+
+        weight = self.weights()[:, None]
+        sd = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+        reach = 40.0 * sd.max(axis=0)
+        low, high = self.mean.min(axis=0) - reach, self.mean.max(axis=0) + reach
+        ends = []
+        for share in (tail, 1.0 - tail):
+            below, above = low.copy(), high.copy()
+            with np.errstate(invalid="ignore"):  # infinite errors
+                for _ in range(80):
+                    middle = 0.5 * (below + above)
+                    is_low = (weight * ndtr((middle - self.mean) / sd)).sum(axis=0) < share
+                    below, above = np.where(is_low, middle, below), np.where(is_low, above, middle)
+            ends.append(0.5 * (below + above))
+        return np.array(ends)
+
+    def moments(self) -> tuple[Array, Array]:
+        """Return mean and covariance of the mixture."""
+        weight = self.weights()
+        mean = weight @ self.mean
+        deviation = self.mean - mean
+        return mean, np.einsum("g,gij->ij", weight, self.covariance) + np.einsum(
+            "g,gi,gj->ij", weight, deviation, deviation
+        )
+
+
+def products_mixture(products: Products, log_weight: Array, *, ridge: float = 1e-9) -> Mixture:
+    """Return the sizes of free columns at each point of a grid, from the products of one record.
+
+    Parameters
+    ----------
+    log_weight : ndarray, shape (point,)
+        Prior of the grid, as logarithms.
+    ridge : float
+        Share of the trace of the Gram matrix on its diagonal, against singular columns.
+    """
+    cross = products.cross[:, :, 0]
+    trace = np.trace(products.gram, axis1=1, axis2=2)[:, None, None]
+    gram = products.gram + ridge * np.eye(cross.shape[1]) * (1.0 + trace)
+    covariance = np.linalg.inv(gram)
+    mean = np.einsum("gij,gj->gi", covariance, cross)
+    misfit = products.square[:, 0] - (mean * cross).sum(axis=1)
+    log = log_weight - 0.5 * (misfit + products.log_determinant + np.linalg.slogdet(gram)[1])
+    return Mixture(log, mean, covariance)
