@@ -12,8 +12,8 @@ import xarray as xr
 
 import gyrostab
 from gyrostab.diagnose.core import diagnose
-from gyrostab.diagnose.identify.forward_search import tail_probability
 from gyrostab.diagnose.inputs import parse_quiescent_span
+from gyrostab.diagnose.nulls.scores import fit_best_evidence
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.result.attribution import join_blocks
 from gyrostab.diagnose.result.content import check_diagnosis
@@ -335,10 +335,8 @@ def test_line_explains_only_its_own_frequency():
 
 
 def test_p_value_is_extrapolated_beyond_the_null_records():
-    best = np.sort(np.random.default_rng(1).exponential(size=400))
-    chances = [
-        tail_probability(best, evidence_nats) for evidence_nats in np.linspace(0.0, 20.0, 60)
-    ]
+    null = fit_best_evidence(np.random.default_rng(1).exponential(size=400))
+    chances = null.probability(np.linspace(0.0, 20.0, 60))
     assert np.all(np.diff(chances) <= 1e-12)
-    assert tail_probability(best, 7.0) == pytest.approx(np.exp(-7.0), rel=0.9)
-    assert tail_probability(best, 0.5) == pytest.approx(np.exp(-0.5), abs=0.06)
+    assert null.probability(7.0) == pytest.approx(np.exp(-7.0), rel=0.9)
+    assert null.probability(0.5) == pytest.approx(np.exp(-0.5), abs=0.06)

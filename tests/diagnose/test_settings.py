@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gyrostab.diagnose.identify.forward_search import tail_level
+from gyrostab.diagnose.nulls.scores import fit_best_evidence
 from gyrostab.diagnose.result.verdict import failed_checks
 from gyrostab.diagnose.settings import DEFAULTS, Settings, stored_settings
 
@@ -46,7 +46,7 @@ def test_a_setting_changes_the_decision() -> None:
     assert failed_checks(held)
     assert not failed_checks(held, settings=Settings(coverage_tolerance=0.03))
     best = np.sort(np.random.default_rng(1).exponential(size=400))
-    wide = tail_level(best, 0.2, settings=Settings(tail_share=0.1))
+    wide = fit_best_evidence(best, settings=Settings(tail_share=0.1)).level(0.2)
     assert wide == np.quantile(best, 0.8)  # no extrapolation within the sample
 
 

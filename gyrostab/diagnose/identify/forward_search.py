@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -17,6 +16,7 @@ from gyrostab.diagnose.identify.expected import identify_expected_effects
 from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
 from gyrostab.diagnose.identify.selection import select_effects
+from gyrostab.diagnose.nulls.scores import fit_best_evidence
 from gyrostab.diagnose.predict.candidates import Candidate
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.search import compute_evidence, evidence_by_effect
@@ -27,10 +27,6 @@ from gyrostab.physics.base import Effect
 from gyrostab.progress import Stage, no_stage
 
 Array = NDArray[np.float64]
-#: Floor of an extrapolated probability; decides nothing, because no level is that low.
-MIN_P_VALUE = 1e-12
-#: Keeps the tail from vanishing when null records score alike.
-MIN_TAIL_SCALE_NATS = 0.1
 
 
 def name_effects(
@@ -76,7 +72,7 @@ def name_effects(
             if has_coarse_grid(blocks).any()
             else "not identifiable: the quantization grid is that of angles, or too fine to show"
         )
-    threshold = tail_level(best, level, settings=settings)
+    threshold = fit_best_evidence(best, settings=settings).level(level)
     examination = identify_expected_effects(
         known, Examination(candidates, folds, count_evidence, threshold, start)
     )
@@ -133,39 +129,3 @@ def _score_null_records(
             np.max([linear_sums.get(key, zero) + count_sums.get(key, zero) for key in keys], axis=0)
         )
     return np.sort(np.concatenate(best)), count_evidence
-
-
-def tail_level(best: Array, level: float, *, settings: Settings = DEFAULTS) -> float:
-    """Return the value that the best evidence of a null record exceeds with probability `level`.
-
-    Beyond the upper quarter of the null records, an exponential tail extrapolates it.
-
-    Examples
-    --------
-    >>> sample = np.random.default_rng(1).exponential(size=100_000)
-    >>> abs(tail_level(sample, 0.001) - np.log(1000)) < 0.1
-    np.True_
-    """
-    share = settings.tail_share
-    if level >= share:
-        return float(np.quantile(best, 1.0 - level))
-    start, scale = _fit_tail(best, share)
-    return start + scale * math.log(share / level)
-
-
-def tail_probability(best: Array, nats: float, *, settings: Settings = DEFAULTS) -> float:
-    """Return the share of null records whose best evidence reaches `nats`.
-
-    It is the inverse of `tail_level`, and not less than `MIN_P_VALUE`.
-    """
-    start, scale = _fit_tail(best, settings.tail_share)
-    if nats <= start:
-        return float((best >= nats).mean())
-    return max(settings.tail_share * math.exp(-(nats - start) / scale), MIN_P_VALUE)
-
-
-def _fit_tail(best: Array, share: float) -> tuple[float, float]:
-    """Return start and scale of the exponential tail of the upper `share` of null records."""
-    start = float(np.quantile(best, 1.0 - share))
-    above = best[best > start]
-    return start, max(float(np.mean(above - start)) if above.size else 0.0, MIN_TAIL_SCALE_NATS)

@@ -17,7 +17,9 @@ _KEPT_BELOW_SIGMA = 1.4  # below the largest of independent cells, from which sc
 _POWERS_AT_ONCE = 1_000_000  # band powers of null records scored at once; limits memory
 _FIRST_RECORDS = 20  # null records for the first estimate of a standard deviation
 _MIN_TAIL_SCALE = 0.7  # of half a squared score; that of a single normal cell is 1
-_MIN_P_VALUE = 1e-9  # a tail from hundreds of records is unreliable beyond
+_MIN_EVIDENCE_SCALE = 0.1  # [nats]; keeps the tail from vanishing when null records score alike
+MIN_P_VALUE = 1e-12  # floor of an extrapolated probability; decides nothing: no level is that low
+_MIN_SCORE_P_VALUE = 1e-9  # a tail from hundreds of records is unreliable beyond
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,10 @@ class MaximumDistribution:
         return np.asarray(
             np.where(value > self.start, beyond, -np.log(np.clip(rank, self.share, 1.0)))
         )
+
+    def probability(self, value: Array | float) -> Array:
+        """Return the probability that a null record's largest is at least `value`."""
+        return np.asarray(np.clip(np.exp(-self.surprise(value)), MIN_P_VALUE, 1.0))
 
     def level(self, p: float) -> float:
         """Return the value that the largest of a null record reaches with probability `p`."""
@@ -69,7 +75,7 @@ class NullScores:
     def p_value(self, statistic: str, z: Array | float) -> Array:
         """Return the probability that a null record is as extreme in any statistic as `z` here."""
         surprise = self.statistics[statistic].tail.surprise(np.square(z) / 2.0)
-        return np.asarray(np.clip(np.exp(-self.family.surprise(surprise)), _MIN_P_VALUE, 1.0))
+        return np.maximum(self.family.probability(surprise), _MIN_SCORE_P_VALUE)
 
     def critical(self, statistic: str, level: float) -> float:
         """Return the standardised score of a statistic at which the p-value is `level`."""
@@ -99,9 +105,13 @@ def null_scores(
     for name, sums in gathered.items():
         mean, spread, z = sums.finish()
         half = z**2 / 2.0
-        statistics[name] = StatisticNull(mean, spread, _fit_maximum(half, settings.tail_share))
+        statistics[name] = StatisticNull(
+            mean, spread, _fit_maximum(half, settings.tail_share, _MIN_TAIL_SCALE)
+        )
         largest[name] = statistics[name].tail.surprise(half)
-    family = _fit_maximum(np.max(list(largest.values()), axis=0), settings.tail_share)
+    family = _fit_maximum(
+        np.max(list(largest.values()), axis=0), settings.tail_share, _MIN_TAIL_SCALE
+    )
     return NullScores(statistics, family, records)
 
 
@@ -111,14 +121,26 @@ def standardise(scores: xr.Dataset, null: StatisticNull) -> Array:
     return np.asarray(np.maximum(z, 0.0) if scores.attrs["one_sided"] else z)
 
 
-def _fit_maximum(largest: Array, tail_share: float) -> MaximumDistribution:
-    """Fit the distribution of the largest values."""
+def fit_best_evidence(best: Array, *, settings: Settings = DEFAULTS) -> MaximumDistribution:
+    """Fit the distribution of the best evidence of a null record [nats].
+
+    Examples
+    --------
+    >>> best = fit_best_evidence(np.random.default_rng(1).exponential(size=100_000))
+    >>> abs(best.level(0.001) - np.log(1000)) < 0.1, abs(best.probability(5.0) - 0.007) < 0.001
+    (np.True_, np.True_)
+    """
+    return _fit_maximum(best, settings.tail_share, _MIN_EVIDENCE_SCALE)
+
+
+def _fit_maximum(largest: Array, tail_share: float, min_scale: float) -> MaximumDistribution:
+    """Fit the distribution of the largest values, with a tail of at least this scale."""
     sample = np.sort(largest)
     start = float(np.quantile(sample, 1.0 - tail_share))
     above = sample[sample > start] - start
     share = max(above.size, 1) / (sample.size + 1.0)
     return MaximumDistribution(
-        sample, start, max(float(above.mean()) if above.size else 0.0, _MIN_TAIL_SCALE), share
+        sample, start, max(float(above.mean()) if above.size else 0.0, min_scale), share
     )
 
 

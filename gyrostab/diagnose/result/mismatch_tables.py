@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.identify.forward_search import MIN_P_VALUE, tail_probability
 from gyrostab.diagnose.identify.identification import Identification, Identifications, Unidentified
 from gyrostab.diagnose.identify.nuisance_alternatives import NUISANCE_ALTERNATIVES
+from gyrostab.diagnose.nulls.scores import MIN_P_VALUE, fit_best_evidence
 from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
 from gyrostab.diagnose.result.text import (
@@ -118,6 +118,7 @@ def identified_mismatches(
     out: list[dict[str, Any]] = []
     begin, end = blocks["begin"].values, blocks["end"].values
     settings = identifications.state.settings
+    null = fit_best_evidence(identifications.null_best, settings=settings)
     for identification in identifications.identified:
         if any(
             identification.effect in region["explained_by"]
@@ -128,9 +129,7 @@ def identified_mismatches(
         strongest = max(identification.components, key=lambda component: component.evidence_nats)
         view = strongest.statistic.view
         taus = strongest.statistic.averaging_times(strongest, blocks)
-        p_value = tail_probability(
-            identifications.null_best, identification.evidence_nats, settings=settings
-        )
+        p_value = float(null.probability(identification.evidence_nats))
         for span in join_blocks(
             active_blocks(identification, blocks, settings=settings), begin, end
         ):
@@ -163,6 +162,7 @@ def unidentified_mismatches(
     out: list[dict[str, Any]] = []
     rate, block = float(blocks.attrs["sampling_rate_hz"]), float(blocks.attrs["block_s"])
     longest = float(blocks["end"].values[-1]) / 2.0
+    null = fit_best_evidence(identifications.null_best, settings=identifications.state.settings)
     for unidentified in identifications.unknown:
         view = _NUISANCE_VIEWS.get(unidentified.generic, "davar")
         if any(
@@ -172,11 +172,7 @@ def unidentified_mismatches(
             for region in known
         ):
             continue
-        p_value = tail_probability(
-            identifications.null_best,
-            unidentified.evidence_nats,
-            settings=identifications.state.settings,
-        )
+        p_value = float(null.probability(unidentified.evidence_nats))
         nearest = unidentified.candidates
         verb = "comes" if len(nearest) == 1 else "come"
         explanation = (

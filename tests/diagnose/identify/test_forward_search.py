@@ -13,7 +13,7 @@ from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks, fold_subsets
 from gyrostab.diagnose.evidence.mixture import Mixture
 from gyrostab.diagnose.evidence.sample_counts import expected_counts, sample_count_evidence
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence
-from gyrostab.diagnose.identify.forward_search import name_effects, tail_level
+from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import _is_possible, keep_physical
 from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
@@ -221,12 +221,6 @@ def test_additional_axes_need_evidence():
     assert combine_rows(np.array([10.0, 1.0, -5.0])) == 10.0
     assert combine_rows(np.array([10.0, 10.0, 10.0])) == 27.0
     assert combine_rows(np.array([-2.0, -1.0])) == -1.0
-
-
-def test_tail_level_of_an_exponential_law():
-    sample = np.random.default_rng(2).exponential(size=50_000)
-    for level in (0.1, 0.01, 0.001):
-        assert tail_level(sample, level) == pytest.approx(-np.log(level), rel=0.05)
 
 
 def subsets(block_count: int) -> np.ndarray:
