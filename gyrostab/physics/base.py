@@ -25,6 +25,7 @@ __all__ = [
     "Array",
     "Chunk",
     "Effect",
+    "Likeness",
     "Parameter",
     "Prediction",
     "Setup",
@@ -35,6 +36,11 @@ __all__ = [
 ]
 
 Stage = Literal["motion", "noise", "rate", "sensor", "electronics", "sampling", "logger"]
+
+#: When another effect looks like an effect: "always"; "any spectrum", if their spectra may have any
+#: form; "limit", at the end of the range of a parameter, where the other is the plainer one;
+#: "single event", if it happens once; "size", if only the size of a step tells them apart.
+Likeness = Literal["always", "any spectrum", "limit", "single event", "size"]
 
 #: Stages of the signal path, in order.
 STAGES: tuple[Stage, ...] = (
@@ -179,6 +185,11 @@ class Effect:
     channels: ClassVar[Mapping[str, str]] = {}  # driver -> required unit (`gyrostab.units.INNER`)
     #: Parameters that disable the effect when all of them are zero.
     size_parameters: ClassVar[tuple[str, ...]] = ()
+    #: Other effects that a record may not tell from this one -> when; see `Likeness`.
+    likeness: ClassVar[Mapping[str, Likeness]] = {}
+    is_steady: ClassVar[bool] = False  # whether it acts all the time, with the same size
+    follows_axes: ClassVar[bool] = False  # whether it follows the rates of other axes
+    shapes_spectrum: ClassVar[bool] = False  # whether it changes the form of the spectrum
     terms: ClassVar[str] = "QNBK"  # symbols that an effect of the stage "noise" may change
 
     axes: tuple[str, ...] = ()  # axes of the log that it acts on; empty for all
@@ -221,6 +232,11 @@ class Effect:
             for item in fields(cls)
             if "parameter" in item.metadata
         )
+
+    @classmethod
+    def look_alikes(cls, when: Likeness) -> tuple[str, ...]:
+        """List the effects that look like this one in this way."""
+        return tuple(name for name, condition in cls.likeness.items() if condition == when)
 
     @classmethod
     def required(cls) -> tuple[str, ...]:

@@ -10,7 +10,16 @@ from typing import Any, ClassVar
 import numpy as np
 
 from gyrostab.errors import OptionError
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
+from gyrostab.physics.base import (
+    Array,
+    Chunk,
+    Effect,
+    Likeness,
+    Prediction,
+    Setup,
+    Windows,
+    parameter,
+)
 from gyrostab.physics.phase import lorentz_density, sine_means, steady_line
 from gyrostab.units import HOUR, INNER
 
@@ -178,6 +187,9 @@ class GaussMarkov(Effect):
     plain = "a slowly wandering bias (Gauss-Markov process)"
     next_measurement = "record at rest for at least ten times the correlation time of the bias"
     size_parameters = ("rms",)
+    likeness: ClassVar[Mapping[str, Likeness]] = {"telegraph": "always"}
+    is_steady = True
+    shapes_spectrum = True
 
     rms: tuple[float, ...] = parameter(
         "deg/h", "rms of the bias", typical=(0.05,), low=0.0, high=1e9, many=True

@@ -5,11 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
+from gyrostab.physics.base import (
+    Array,
+    Chunk,
+    Effect,
+    Likeness,
+    Prediction,
+    Setup,
+    Windows,
+    parameter,
+)
 from gyrostab.physics.phase import lorentz_density
 from gyrostab.units import HOUR
 
@@ -205,6 +214,9 @@ class Telegraph(Effect):
         "levels"
     )
     size_parameters = ("step",)
+    likeness: ClassVar[Mapping[str, Likeness]] = {"bias_jump": "single event"}
+    is_steady = True
+    shapes_spectrum = True
 
     step: tuple[float, ...] = parameter(
         "deg/h", "upper level over the lower", typical=(0.1,), low=-1e9, high=1e9, many=True
@@ -299,6 +311,7 @@ class FringeHop(Effect):
     next_measurement = "compare the size of the steps with the rate of one fringe of this coil"
     stage = "electronics"
     size_parameters = ("order",)
+    likeness: ClassVar[Mapping[str, Likeness]] = {"bias_jump": "size"}
 
     order: float = parameter(
         "1",

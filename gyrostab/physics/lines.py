@@ -9,7 +9,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
+from gyrostab.physics.base import (
+    Array,
+    Chunk,
+    Effect,
+    Likeness,
+    Prediction,
+    Setup,
+    Windows,
+    parameter,
+)
 from gyrostab.physics.phase import (
     TURN,
     comb_density,
@@ -56,6 +65,7 @@ class SpectralLine(Effect):
         "rate to see whether the line follows"
     )
     size_parameters = ("amplitude",)
+    likeness: ClassVar[Mapping[str, Likeness]] = {"real_motion": "always", "supply_bias": "always"}
 
     amplitude: tuple[float, ...] = parameter(
         "deg/h", "amplitude, sqrt(2) times the rms", typical=0.2, low=-1e6, high=1e6, many=True

@@ -50,6 +50,8 @@ class LoggerFilter(Effect):
     )
     stage = "sampling"
     size_parameters = ("cutoff", "length", "pick")
+    is_steady = True
+    shapes_spectrum = True
 
     cutoff: float = parameter(
         "Hz", "half power of the low-pass; 0 for none", default=0.0, typical=2.0, low=0.0, high=1e6
@@ -378,6 +380,7 @@ class HeldSamples(Effect):
     next_measurement = "log a counter with each sample"
     stage = "logger"
     size_parameters = ("per_hour",)
+    shapes_spectrum = True
 
     per_hour: float = parameter(
         "1/h", "losses, outside of a loss", typical=360.0, low=0.0, high=1e8

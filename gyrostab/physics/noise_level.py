@@ -16,7 +16,7 @@ import numpy as np
 
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import sampled_psd
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Windows, parameter
+from gyrostab.physics.base import Array, Chunk, Effect, Likeness, Prediction, Windows, parameter
 from gyrostab.units import HOUR, INNER
 
 #: Least N^2 of a polynomial law, as a share of its value at the reference (a tenth of N). Outside
@@ -269,6 +269,7 @@ class VibrationNoise(_FollowsVibration):
     )
     terms = "QN"
     size_parameters = ("white", "quantization")
+    likeness: ClassVar[Mapping[str, Likeness]] = {"aliased_vibration": "any spectrum"}
 
     white: float = parameter(
         "deg/sqrt(h)/g",

@@ -151,6 +151,7 @@ class Misalignment(Effect):
     plain = "rotation about another axis, coupled in by misalignment"
     next_measurement = "rotate about one axis at a time and read the others"
     size_parameters = ("x", "y", "z")
+    follows_axes = True
 
     x: float = _declare_angle("x")
     y: float = _declare_angle("y")

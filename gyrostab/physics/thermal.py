@@ -10,7 +10,7 @@ import numpy as np
 
 from gyrostab.errors import OptionError
 from gyrostab.noise import NORMAL_95
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Windows, parameter
+from gyrostab.physics.base import Array, Chunk, Effect, Likeness, Prediction, Windows, parameter
 from gyrostab.units import HOUR, INNER
 
 _MINUTE = 60.0
@@ -343,6 +343,7 @@ class ThermalHysteresis(Effect):
     )
     channels: ClassVar[Mapping[str, str]] = {"temperature": INNER["temperature"]}
     size_parameters = ("sensitivity",)
+    likeness: ClassVar[Mapping[str, Likeness]] = {"temperature_bias": "limit"}
 
     sensitivity: float = parameter(
         "deg/h/degC", "bias per degree in the dead band", typical=3e-4, low=-1e4, high=1e4

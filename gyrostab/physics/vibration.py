@@ -9,7 +9,16 @@ from typing import Any, ClassVar
 import numpy as np
 
 from gyrostab.errors import OptionError
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
+from gyrostab.physics.base import (
+    Array,
+    Chunk,
+    Effect,
+    Likeness,
+    Prediction,
+    Setup,
+    Windows,
+    parameter,
+)
 from gyrostab.units import INNER
 
 _MIN_EDGE_HZ = 0.01
@@ -188,6 +197,7 @@ class AliasedVibration(Effect):
     )
     channels: ClassVar[Mapping[str, str]] = {"vibration": INNER["acceleration"]}
     size_parameters = ("sensitivity",)
+    likeness: ClassVar[Mapping[str, Likeness]] = {"vibration_noise": "any spectrum"}
 
     sensitivity: tuple[float, ...] = parameter(
         "deg/h/g", "rms rate in the band per rms g", typical=3.7, low=-1e6, high=1e6, many=True

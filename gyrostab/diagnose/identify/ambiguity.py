@@ -12,25 +12,14 @@ from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.reduce.zero_bin import possibly_truncated_axes
-
-#: Effect -> effects that look the same in block statistics, whatever the excitation.
-OBSERVATIONALLY_EQUIVALENT: dict[str, tuple[str, ...]] = {
-    "gauss_markov": ("telegraph",),
-    "spectral_line": ("real_motion", "supply_bias"),
-}
-#: Effect -> effects that follow the same channel with another spectrum, which may be any that a
-#: mount, a filter or aliasing gives them.
-DIFFERENT_SPECTRUM: dict[str, tuple[str, ...]] = {
-    "aliased_vibration": ("vibration_noise",),
-    "vibration_noise": ("aliased_vibration",),
-}
+from gyrostab.physics.registry import effects
 
 
 def find_equivalent_effects(
     effect: str, components: Sequence[Component], state: State, *, lines: int = 0
 ) -> list[str]:
     """Return effects that the data cannot separate from this one; `lines` counts all lines."""
-    out = list(OBSERVATIONALLY_EQUIVALENT.get(effect, ()))
+    out = list(effects()[effect].look_alikes("always"))
     blocks = state.blocks
     if (
         effect == "spectral_line"
@@ -81,7 +70,8 @@ def find_spectral_alternatives(
     a mount has a hump like an aliased band. `state` has all other effects in the model.
     """
     powers = [component for component in components if component.statistic.is_power]
-    if effect not in DIFFERENT_SPECTRUM or not powers:
+    others = list(effects()[effect].look_alikes("any spectrum"))
+    if not others or not powers:
         return []
     own_nats = sum(component.evidence_nats for component in powers)
     free = 0.0
@@ -89,7 +79,7 @@ def find_spectral_alternatives(
         evidence = examination.compute_evidence([_any_spectrum(component, state)], state)[0]
         free += float(evidence.evidence_nats[0, evidence.rows.index(component.row)])
     allowed = state.settings.ambiguous_nats + state.settings.form_error_share * own_nats
-    return list(DIFFERENT_SPECTRUM[effect]) if free - own_nats > allowed else []
+    return others if free - own_nats > allowed else []
 
 
 def _any_spectrum(component: Component, state: State) -> Candidate:

@@ -17,7 +17,6 @@ from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.physics.base import Effect
 
 MAX_ROUNDS_PER_EFFECT = 6  # components of one kind that an effect may add, one in each round
-_SINGLE_EVENT = {"telegraph": "bias_jump"}  # a switch that does not return
 
 
 def identify_expected_effects(known: Sequence[Effect], examination: Examination) -> Examination:
@@ -58,9 +57,8 @@ def _are_anomalous_samples(components: Sequence[Component], needed: float) -> bo
 def _is_candidate_of(candidate: Candidate, effect: Effect) -> bool:
     """Return whether a candidate is this effect with its channels, or its single event."""
     named = {*filter(None, candidate.driver)}
-    return candidate.effect in (effect.name, _SINGLE_EVENT.get(effect.name)) and named <= {
-        *effect.channel_names().values()
-    }
+    names = (effect.name, *effect.look_alikes("single event"))
+    return candidate.effect in names and named <= {*effect.channel_names().values()}
 
 
 def _best_components(effect: Effect, examination: Examination, state: State) -> list[Component]:

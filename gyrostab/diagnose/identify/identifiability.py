@@ -21,9 +21,6 @@ from gyrostab.physics.registry import effects
 
 Array = NDArray[np.float64]
 _PPM = 1e6  # in one
-#: Effect -> effect that it becomes at the end of the range of a parameter: without a dead band,
-#: hysteresis is proportional to temperature.
-EQUIVALENTS = {"thermal_hysteresis": "temperature_bias"}
 
 
 def keep_physical(
@@ -48,8 +45,8 @@ def keep_physical(
     if other_course:
         return [], other_course
     forms = [_find_other_form(component, state) for component in components]
-    kept = [component for component, form in zip(components, forms, strict=True) if not form]
-    return kept, next(iter(forms), None) if not kept else None
+    remaining = [component for component, form in zip(components, forms, strict=True) if not form]
+    return remaining, next(iter(forms), None) if not remaining else None
 
 
 def _find_other_course(
@@ -79,7 +76,7 @@ def find_plainer_effect(components: Sequence[Component], state: State) -> str | 
         for component in components
     ):
         return "scale_factor"
-    return EQUIVALENTS.get(effect)
+    return next(iter(effects()[effect].look_alikes("limit")), None)
 
 
 def _is_rotation(component: Component) -> bool:
@@ -140,10 +137,7 @@ def _is_possible(component: Component, state: State) -> bool:
         and _rotation_share(component, state) > state.settings.max_misalignment_share
     ):
         return False
-    has_limit = np.isfinite(largest_size(effect, state.settings))
-    if (statistic.is_linear_in_means or has_limit) and not _is_in_range(component, state):
-        return False
-    if statistic.is_power and not _is_above_least(component, state):
+    if not _is_in_range(component, state):
         return False
     return not (
         component.variant.squared
@@ -153,38 +147,40 @@ def _is_possible(component: Component, state: State) -> bool:
 
 
 def _is_in_range(component: Component, state: State) -> bool:
-    """Return whether the sizes can lie in the ranges that the registry and the settings allow."""
+    """Return whether the sizes can lie in the ranges of the registry and the settings."""
     from gyrostab.diagnose.predict.sizes import component_mixture
 
-    effect, columns = component.candidate.effect, component.variant.columns
-    plausible = largest_size(effect, state.settings)
-    largest = {
-        item.name: min(max(abs(item.low), abs(item.high)), plausible)
-        for item in effects()[effect].parameters()
-    }
+    columns = component.variant.columns
+    low, high = (
+        np.array([_allowed_range(component, name, state) for name in columns]).reshape(-1, 2).T
+    )
+    if not (np.isfinite(low) | np.isfinite(high)).any():
+        return True
     sizes, covariance = component_mixture(component, state).moments()
-    smallest_sizes = np.abs(sizes) - state.settings.clear_sigma * np.sqrt(np.diagonal(covariance))
-    limits = [largest.get(name, np.inf) for name in columns]
-    # the parts of a complex size have the limit of its column
-    return bool((smallest_sizes <= np.repeat(limits, sizes.size // len(columns))).all())
+    error = state.settings.clear_sigma * np.sqrt(np.diagonal(covariance))
+    # the parts of a complex size have the range of its column
+    low, high = (np.repeat(ends, sizes.size // len(columns)) for ends in (low, high))
+    return bool(((sizes + error >= low) & (sizes - error <= high)).all())
 
 
-def _is_above_least(component: Component, state: State) -> bool:
-    """Return whether the size of a noise level can be above the least that the registry allows.
+def _allowed_range(component: Component, column: str, state: State) -> tuple[float, float]:
+    """Return the range of the size of a column.
 
-    Ageing, for example, does not improve a gyro.
+    A mean may have either sign. A single noise level may not be below the least: ageing, for
+    example, does not improve a gyro.
     """
-    from gyrostab.diagnose.predict.sizes import component_size
-
-    if component.variant.squared or len(component.variant.columns) != 1:
-        return True
-    lower_bound = {
-        item.name: item.low for item in effects()[component.candidate.effect].parameters()
-    }.get(component.variant.columns[0])
-    if lower_bound is None or not np.isfinite(lower_bound):
-        return True
-    size, error = component_size(component, state)
-    return size >= lower_bound - state.settings.clear_sigma * error
+    effect, statistic, variant = component.candidate.effect, component.statistic, component.variant
+    largest = largest_size(effect, state.settings)
+    parameters = {item.name: item for item in effects()[effect].parameters()}
+    if column not in parameters:
+        return -math.inf, math.inf
+    item = parameters[column]
+    if statistic.is_power:
+        has_least = not variant.squared and len(variant.columns) == 1
+        return item.low if has_least else -math.inf, math.inf
+    if statistic.is_linear_in_means:
+        largest = min(largest, max(abs(item.low), abs(item.high)))
+    return -largest, largest
 
 
 def _is_moving(axis: str, state: State) -> bool:

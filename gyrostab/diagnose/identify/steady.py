@@ -12,8 +12,7 @@ from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture, disagreement_nats
 from gyrostab.diagnose.reduce.accumulate import RECORD_PARTS
-
-_STEADY = ("gauss_markov", "telegraph", "logger_filter")
+from gyrostab.physics.registry import effects
 
 
 def intermittent_nats(component: Component, state: State) -> float:
@@ -28,7 +27,7 @@ def intermittent_nats(component: Component, state: State) -> float:
     state : State
         With all other effects in the model.
     """
-    if component.candidate.effect not in _STEADY or not component.statistic.is_power:
+    if not (component.statistic.is_power and effects()[component.candidate.effect].is_steady):
         return 0.0
     state = replace(state, weight=condition_on(state, [component]).weight)
     size, error = np.array(

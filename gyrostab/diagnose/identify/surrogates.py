@@ -12,7 +12,8 @@ import xarray as xr
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import compute_evidence
-from gyrostab.diagnose.predict.windows import FOLLOWING_AXES, make_surrogates, max_correlation
+from gyrostab.diagnose.predict.windows import make_surrogates, max_correlation
+from gyrostab.physics.registry import effects
 
 #: Number of time-shifted surrogates: two of them make the allowed share of 1 %.
 TIME_SHIFTS = 200
@@ -96,6 +97,7 @@ def _follows_channel(component: Component) -> bool:
     """Return whether a component follows a channel, or the means of other axes."""
     if not (component.statistic.is_linear_in_means or component.statistic.is_power):
         return False
+    follows_axes = effects()[component.candidate.effect].follows_axes
     return any(component.candidate.driver) or (
-        component.statistic.is_linear_in_means and component.candidate.effect in FOLLOWING_AXES
+        component.statistic.is_linear_in_means and follows_axes
     )

@@ -20,9 +20,8 @@ from gyrostab.diagnose.statistics.left_structure import (
     variance_fluctuation,
     with_neighbouring_variants,
 )
+from gyrostab.physics.registry import effects
 
-#: Effects that change the white variance of the means, which the calibration then misjudges.
-_SPECTRAL_SHAPES = ("logger_filter", "held_samples", "gauss_markov", "telegraph")
 #: Arbitrary courses of the bias.
 _DRIFTS = ("~bias(t)", "~levels")
 
@@ -74,8 +73,9 @@ def _withdraw_in_means(
         selection.generic in (*_DRIFTS, "~S(f)", "~cov") and axis in selection.axes
         for selection in unidentified
     )
+    # such an effect changes the white variance of the means, which the calibration then misjudges
     has_shape = any(
-        component.candidate.effect in _SPECTRAL_SHAPES and axis in component.row
+        effects()[component.candidate.effect].shapes_spectrum and axis in component.row
         for component in components_of(remaining)
     )
     if has_alternative or has_shape:

@@ -21,7 +21,6 @@ Array = NDArray[Any]
 #: Nuisance parameter that is a time.
 TIME_PARAMETER = "at"
 _SPLINE_KNOTS = 12  # of hat functions over the record; design choice
-FOLLOWING_AXES = ("misalignment",)  # effects that follow the means of other axes
 _MAX_DESIGN_DIFFERENCE = 1e-3  # of its size, up to which designs are equal; design choice
 
 
@@ -221,7 +220,7 @@ def make_surrogates(
             drivers={inner: fill_linearly(rotate(values)) for inner, values in channels.items()},
             fine={inner: rotate(values) for inner, values in windows.fine.items()},
         )
-        if candidate.effect not in FOLLOWING_AXES:
+        if not effects()[candidate.effect].follows_axes:
             return shifted
         rotated_means = (fill_linearly(rotate(mean)) for mean in means)
         return replace(shifted, own=dict(zip(windows.axes, rotated_means, strict=True)))

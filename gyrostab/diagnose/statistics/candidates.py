@@ -32,11 +32,6 @@ from gyrostab.physics.registry import effects
 from gyrostab.units import HOUR
 
 Array = NDArray[Any]
-#: Effect -> why it is not tried, because another has the same design.
-_SAME_DESIGN = {
-    "fringe_hop": "not identifiable: it has the form of a bias jump; compare the size of the jump "
-    "with the rate of one fringe"
-}
 
 
 def effect_candidates(
@@ -73,8 +68,9 @@ def effect_candidates(
     candidates: list[Candidate] = []
     reasons: dict[str, str] = {}
     for name, kind in effects().items():
-        if name in _SAME_DESIGN:
-            reasons[name] = _SAME_DESIGN[name]
+        if other := kind.look_alikes("size"):
+            form = effects()[other[0]].plain
+            reasons[name] = f"not identifiable: it has the form of {form}; {kind.next_measurement}"
             continue
         built: list[Candidate] = []
         reason = ""
