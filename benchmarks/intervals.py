@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
-from gyrostab.diagnose.identify.identification import Identification
+from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
@@ -42,7 +42,7 @@ def identify_effect(reduced, baseline, effect, statistic, column):
         if variant.columns == (column,) and variant.values.get("exponent", 1.0) == 1.0
     )
     components = (Component(candidate, variant, ("x",), 50.0),)
-    identification = Identification(effect, candidate.driver, ("x",), components, 50.0, 8.0)
+    identification = Selection(effect, candidate.driver, ("x",), components, 50.0, 8.0)
     return make_identifications([identification], initial_state(reduced, baseline), known, reasons)
 
 

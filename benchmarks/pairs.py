@@ -169,7 +169,7 @@ def count_draw(examinations: dict[str, tuple[Examination, dict[str, Any]]]) -> C
             f"{name}({','.join(finding.axes)}) {finding.evidence_nats:.0f}"
             for name, finding in (
                 *((identification.effect, identification) for identification in identified),
-                *((mismatch.generic, mismatch) for mismatch in unidentified),
+                *((mismatch.effect, mismatch) for mismatch in unidentified),
             )
         ]
         flag = "" if all(named) else "MISSED" if possible else "missed"

@@ -8,7 +8,7 @@ import numpy as np
 
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.components import group_components
-from gyrostab.diagnose.identify.identification import Identification, Identifications
+from gyrostab.diagnose.identify.identification import Identifications, Selection
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import compute_evidence
@@ -30,7 +30,7 @@ def find_components(candidates: Sequence[Candidate], state: State) -> dict[str, 
 
 
 def make_identifications(
-    identified: Iterable[Identification],
+    identified: Iterable[Selection],
     state: State | None = None,
     candidates: Iterable[Candidate] = (),
     reasons: Mapping[str, str] | None = None,

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.identify.identification import (
-    Identification,
     Identifications,
+    Selection,
     components_of,
     condition_on_selections,
     conditioned_states,
@@ -41,7 +41,7 @@ def predict_baseline(
     baseline: xr.Dataset,
     known: NDArray[np.bool_] | None = None,
     *,
-    left_out: Sequence[Identification] = (),
+    left_out: Sequence[Selection] = (),
 ) -> xr.Dataset:
     """Return the baseline with the identified effects in it, fitted to the blocks that may be used.
 
@@ -51,7 +51,7 @@ def predict_baseline(
         The effects, with those that were expected; their nuisance parameters are kept.
     known : ndarray of bool, shape (block,), optional
         Blocks that the sizes are fitted to; all by default.
-    left_out : sequence of Identification, optional
+    left_out : sequence of Selection, optional
         Effects that are fitted with the others and then taken out again. What a low-pass removed
         stays removed.
 
@@ -161,7 +161,7 @@ def expected_baseline(
 def without_expected(
     blocks: xr.Dataset,
     baseline: xr.Dataset,
-    expected: Sequence[Identification],
+    expected: Sequence[Selection],
     settings: Settings,
 ) -> xr.Dataset:
     """Drop the blocks in which expected effects leave anomalous samples or move the rate."""

@@ -9,8 +9,8 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.identify.identification import (
-    Identification,
     Identifications,
+    Selection,
 )
 from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
@@ -26,7 +26,7 @@ def settle_forms(identifications: Identifications, baseline: xr.Dataset) -> Iden
     form than the model has does not belong to that model.
     """
 
-    def settle(identification: Identification) -> Identification:
+    def settle(identification: Selection) -> Selection:
         state = identifications.state_without(identification, baseline)
         components = _share_choices(identification.components, state)
         return replace(

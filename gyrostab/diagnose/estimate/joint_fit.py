@@ -14,8 +14,8 @@ from scipy.special import ndtr, ndtri
 from gyrostab.diagnose.estimate.filter_sizes import fit_filter_sizes
 from gyrostab.diagnose.estimate.split_components import split_harmonics, split_steps
 from gyrostab.diagnose.identify.identification import (
-    Identification,
     Identifications,
+    Selection,
 )
 from gyrostab.diagnose.identify.jumps import is_step
 from gyrostab.diagnose.predict.candidates import Component
@@ -53,7 +53,7 @@ class Estimate:
 class Fitted:
     """An effect with its sizes, on one axis or on several together."""
 
-    identification: Identification
+    identification: Selection
     axes: tuple[str, ...]
     #: Keys are ``name``, or ``name.axis`` for a size of each of several axes.
     parameters: Mapping[str, Estimate]
@@ -102,7 +102,7 @@ def fit_expected(identifications: Identifications, baseline: xr.Dataset) -> list
 
 
 def _fit_identification(
-    identification: Identification, state: State, identifications: Identifications
+    identification: Selection, state: State, identifications: Identifications
 ) -> list[Fitted]:
     statistics = {component.statistic for component in identification.components}
     kind = effects()[identification.effect]
@@ -140,7 +140,7 @@ def _fit_identification(
     ]
 
 
-def _axes_shown(identification: Identification, components: Sequence[Component]) -> tuple[str, ...]:
+def _axes_shown(identification: Selection, components: Sequence[Component]) -> tuple[str, ...]:
     """Return the axes of the identification that the components are on."""
     return tuple(
         axis
@@ -150,7 +150,7 @@ def _axes_shown(identification: Identification, components: Sequence[Component])
 
 
 def _fit_components(
-    identification: Identification,
+    identification: Selection,
     axes: tuple[str, ...],
     components: list[Component],
     state: State,
@@ -267,7 +267,7 @@ def _store_value(values: dict[str, Any], name: str, value: Any, axes: tuple[str,
 
 
 def _model_settings(
-    identification: Identification, component: Component, state: State
+    identification: Selection, component: Component, state: State
 ) -> dict[str, Any]:
     """Return settings that the model needs in addition to the sizes."""
     if identification.effect == "rotation_line":

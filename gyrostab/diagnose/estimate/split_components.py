@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gyrostab.diagnose.identify.identification import Identification
+from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.identify.jumps import is_step
 from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.condition import condition_on_components
@@ -18,7 +18,7 @@ from gyrostab.diagnose.statistics.rotation_order import fit_amplitude, harmonic_
 MAX_BLOCKS_OF_STEP = 2  # by which the times of a step on two axes may differ; design choice
 
 
-def split_harmonics(identification: Identification, state: State) -> list[list[Component]]:
+def split_harmonics(identification: Selection, state: State) -> list[list[Component]]:
     """Split the components of several harmonics of the rotation, each with its amplitude and phase.
 
     Harmonics other than the strongest are dropped when their amplitude is within two standard

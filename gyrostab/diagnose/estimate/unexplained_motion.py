@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.identify.identification import Identification, components_of
+from gyrostab.diagnose.identify.identification import Selection, components_of
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.reduce.moving_blocks import (
     moving_blocks,
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 
 def unexplained_motion(
-    blocks: xr.Dataset, identified: Iterable[Identification], *, settings: Settings = DEFAULTS
+    blocks: xr.Dataset, identified: Iterable[Selection], *, settings: Settings = DEFAULTS
 ) -> NDArray[np.bool_]:
     """Find the moving blocks of axes without an effect that explains the means.
 

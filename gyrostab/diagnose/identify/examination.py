@@ -10,7 +10,6 @@ import xarray as xr
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.components import group_components
 from gyrostab.diagnose.identify.identification import (
-    Identification,
     Selection,
     condition_on_selections,
     form_error,
@@ -30,7 +29,7 @@ class Examination:
     count_evidence: CountEvidence
     threshold: float  # evidence [nats] that noise alone exceeds with the false-alarm probability
     start: State  # with the expected effects in the model
-    expected: tuple[Identification, ...] = ()  # effects that the simulation contains as well
+    expected: tuple[Selection, ...] = ()  # effects that the simulation contains as well
 
     @property
     def settings(self) -> Settings:

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.identification import Identification, make_identification
+from gyrostab.diagnose.identify.identification import Selection, make_selection
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
@@ -27,7 +27,7 @@ def identify_expected_effects(known: Sequence[Effect], examination: Examination)
     means too. An effect with several components of a kind, such as two jumps, is taken as long as
     it adds evidence. `known` are the effects of the model that its baseline leaves out.
     """
-    identified: list[Identification] = []
+    identified: list[Selection] = []
     state, remaining = examination.start, list(known)
     needed = examination.settings.component_nats
     rounds = MAX_ROUNDS_PER_EFFECT * len(remaining)
@@ -41,7 +41,7 @@ def identify_expected_effects(known: Sequence[Effect], examination: Examination)
         )
         if sum_evidence(components) <= needed:
             break
-        identified.append(make_identification(components, needed, order=state.axes))
+        identified.append(make_selection(components, needed, order=state.axes))
         state = condition_on(state, components)
         if _are_anomalous_samples(components, needed):  # their counts cannot be taken out
             remaining = [other for other in remaining if other is not effect]

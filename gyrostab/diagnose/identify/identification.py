@@ -23,35 +23,27 @@ _FILTER = "logger_filter"
 
 
 @dataclass(frozen=True)
-class Identification:
-    """An effect that was identified."""
+class Selection:
+    """What forward selection puts into the model: an effect, or a nuisance alternative."""
 
-    effect: str  # name in the registry
+    #: Name in the registry, or one of
+    #: `gyrostab.diagnose.identify.nuisance_alternatives.NUISANCE_ALTERNATIVES`.
+    effect: str
     driver: tuple[str, ...]  # channels of the log that it follows, in the order of the effect's
     axes: tuple[str, ...]
     components: tuple[Component, ...]  # statistics and rows in which it shows
     evidence_nats: float  # held-out log Bayes factor with all others in the model [nats]
     threshold: float  # evidence that it needed [nats]
-    alternatives: tuple[str, ...] = ()  # effects that these data do not separate from it
+    #: Effects that these data do not separate from it; for a nuisance alternative those that come
+    #: nearest, or whose channel is missing.
+    alternatives: tuple[str, ...] = ()
     #: Key of each candidate that could take its place -> evidence there [nats].
     instead: Mapping[str, float] = field(default_factory=dict)
 
-
-@dataclass(frozen=True)
-class Unidentified:
-    """A difference that no effect explains; fields without a comment as in `Identification`."""
-
-    generic: str  # one of `gyrostab.diagnose.identify.nuisance_alternatives.NUISANCE_ALTERNATIVES`
-    axes: tuple[str, ...]
-    evidence_nats: float
-    threshold: float
-    candidates: tuple[str, ...] = ()  # effects that come nearest, or whose channel is missing
-    components: tuple[Component, ...] = ()
-    instead: Mapping[str, float] = field(default_factory=dict)
-
-
-#: What forward selection puts into the model.
-Selection = Identification | Unidentified
+    @property
+    def is_named(self) -> bool:
+        """Whether it is an effect."""
+        return not self.effect.startswith("~")
 
 
 class Rejection(NamedTuple):
@@ -69,8 +61,8 @@ class Rejection(NamedTuple):
 class Identifications:
     """What the identification found."""
 
-    identified: tuple[Identification, ...]  # the strongest first
-    unknown: tuple[Unidentified, ...]
+    identified: tuple[Selection, ...]  # the strongest first
+    unknown: tuple[Selection, ...]
     #: Evidence that noise alone exceeds, in any effect or nuisance alternative, axis and point of
     #: the grid, with the false-alarm probability [nats].
     threshold: float
@@ -80,7 +72,7 @@ class Identifications:
     state: State  # with all of the above, and the expected effects, in the model
     count_evidence: CountEvidence = field(default_factory=lambda: CountEvidence({}))
     #: Effects that the simulation contains as well, with size and time from the recording.
-    expected: tuple[Identification, ...] = ()
+    expected: tuple[Selection, ...] = ()
     #: What beats each effect that was examined and not identified.
     rejected: tuple[Rejection, ...] = ()
 
@@ -95,7 +87,7 @@ class Identifications:
         """Return the state without any effect."""
         return initial_state(self.state.blocks, baseline, settings=self.state.settings)
 
-    def state_without(self, identification: Identification, baseline: xr.Dataset) -> State:
+    def state_without(self, identification: Selection, baseline: xr.Dataset) -> State:
         """Return the state with all selections but one in the model, weighted with all of them."""
         chosen: list[Selection] = [*self.expected, *self.identified, *self.unknown]
         return replace(
@@ -134,17 +126,13 @@ def conditioned_states(start: State, chosen: Sequence[Selection]) -> Iterator[St
         yield state
 
 
-def add_identification(chosen: Sequence[Selection], addition: Selection) -> list[Selection]:
+def add_selection(chosen: Sequence[Selection], addition: Selection) -> list[Selection]:
     """Return the list with another selection; one of the same effect and channel is merged with it.
 
     Lines of other frequencies are not merged.
     """
     for place, other in enumerate(chosen):
-        if (
-            isinstance(addition, Identification)
-            and isinstance(other, Identification)
-            and _is_same_effect(addition, other)
-        ):
+        if addition.is_named and _is_same_effect(addition, other):
             axes = tuple(sorted({*other.axes, *addition.axes}))
             alternatives = tuple(dict.fromkeys([*other.alternatives, *addition.alternatives]))
             merged = replace(
@@ -159,11 +147,11 @@ def add_identification(chosen: Sequence[Selection], addition: Selection) -> list
 
 
 def with_axes_of(
-    identification: Identification,
+    identification: Selection,
     components_by_key: Mapping[str, Sequence[Component]],
     *,
     settings: Settings = DEFAULTS,
-) -> Identification:
+) -> Selection:
     """Return an identification without the axes on which it adds no evidence.
 
     `components_by_key` has the components that were found with all others in the model.
@@ -188,7 +176,7 @@ def with_axes_of(
     )
 
 
-def _is_same_effect(first: Identification, other: Identification) -> bool:
+def _is_same_effect(first: Selection, other: Selection) -> bool:
     lines = {
         component.place
         for component in components_of((first, other))
@@ -197,16 +185,16 @@ def _is_same_effect(first: Identification, other: Identification) -> bool:
     return (first.effect, first.driver) == (other.effect, other.driver) and len(lines) < 2
 
 
-def make_identification(
+def make_selection(
     components: Sequence[Component],
     threshold: float,
     *,
     order: Sequence[str] = (),
     alternatives: Iterable[str] = (),
-) -> Identification:
-    """Make an identification of components that passed a threshold, with its axes in order."""
+) -> Selection:
+    """Make a selection of components that passed a threshold, with its axes in order."""
     first = components[0].candidate
-    return Identification(
+    return Selection(
         first.effect,
         first.driver,
         axes_of(components, order),
@@ -214,25 +202,6 @@ def make_identification(
         sum_evidence(components),
         threshold,
         tuple(dict.fromkeys(name for name in alternatives if name != first.effect)),
-    )
-
-
-def find_unidentified(
-    key: str,
-    components: Sequence[Component],
-    threshold: float,
-    nearest: Sequence[str],
-    *,
-    order: Sequence[str] = (),
-) -> Unidentified:
-    """Return what a nuisance alternative explains; `nearest` are the effects that come nearest."""
-    return Unidentified(
-        key,
-        axes_of(components, order),
-        sum_evidence(components),
-        threshold,
-        tuple(dict.fromkeys(nearest)),
-        tuple(components),
     )
 
 
@@ -266,7 +235,6 @@ def form_error(
             ]
             of_spectrum = (
                 component.statistic.is_power
-                and isinstance(selection, Identification)
                 and bool(selection.driver)
                 and any(
                     candidate.effect == _FILTER or candidate.driver == selection.driver

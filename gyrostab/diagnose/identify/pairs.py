@@ -8,7 +8,7 @@ from itertools import combinations_with_replacement
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifiability import keep_physical
-from gyrostab.diagnose.identify.identification import form_error, make_identification
+from gyrostab.diagnose.identify.identification import form_error, make_selection
 from gyrostab.diagnose.identify.jumps import is_step
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
@@ -80,7 +80,7 @@ def _find_beside(
     state: State,
 ) -> tuple[State, dict[str, list[Component]]]:
     """Return which of some effects pass with these components in the model."""
-    chosen = [make_identification(components, required)]
+    chosen = [make_selection(components, required)]
     with_first = condition_on(state, components)
     sought = [candidate for candidate in examination.candidates if candidate.key in keys]
     components_beside = {}

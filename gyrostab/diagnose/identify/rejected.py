@@ -10,10 +10,8 @@ from gyrostab.diagnose.identify.components import axes_of, sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifiability import keep_physical
 from gyrostab.diagnose.identify.identification import (
-    Identification,
     Rejection,
     Selection,
-    Unidentified,
     form_error,
 )
 from gyrostab.diagnose.identify.nuisance_alternatives import NUISANCE_ALTERNATIVES
@@ -27,8 +25,8 @@ _NOISE = "noise"
 
 def find_rejections(
     components: Mapping[str, Sequence[Component]],
-    identified: Sequence[Identification],
-    unidentified: Sequence[Unidentified],
+    identified: Sequence[Selection],
+    unidentified: Sequence[Selection],
     state: State,
     examination: Examination,
 ) -> list[Rejection]:
@@ -52,7 +50,7 @@ def find_rejections(
     ]
     selections = [*examination.expected, *chosen]
     threshold = examination.threshold
-    named = {selection.effect for selection in selections if isinstance(selection, Identification)}
+    named = {selection.effect for selection in selections if selection.is_named}
     out: dict[str, tuple[float, Rejection]] = {}
     for key, effect_components in components.items():
         effect = effect_components[0].candidate.effect
@@ -89,12 +87,8 @@ def _find_veto(
     """Return what beats an effect with enough evidence, and by how much."""
     effect = components[0].candidate.effect
     for selection in chosen:  # withdrawn: with the effect in the model, the noise still changes
-        if (
-            isinstance(selection, Unidentified)
-            and not selection.instead
-            and effect in selection.candidates
-        ):
-            return NUISANCE_ALTERNATIVES[selection.generic], selection.evidence_nats
+        if not selection.is_named and not selection.instead and effect in selection.alternatives:
+            return NUISANCE_ALTERNATIVES[selection.effect], selection.evidence_nats
     _, better_form = keep_physical(components, state, error=error)
     if better_form:
         return better_form
@@ -114,6 +108,6 @@ def _find_veto(
 
 
 def _name_of(selection: Selection) -> str:
-    if isinstance(selection, Identification):
+    if selection.is_named:
         return selection.effect
-    return NUISANCE_ALTERNATIVES[selection.generic]
+    return NUISANCE_ALTERNATIVES[selection.effect]

@@ -18,14 +18,11 @@ from gyrostab.diagnose.identify.components import (
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifiability import keep_physical
 from gyrostab.diagnose.identify.identification import (
-    Identification,
     Rejection,
     Selection,
-    Unidentified,
-    add_identification,
+    add_selection,
     components_of,
-    find_unidentified,
-    make_identification,
+    make_selection,
 )
 from gyrostab.diagnose.identify.naming_order import order_passing, order_rivals
 from gyrostab.diagnose.identify.pairs import find_pair
@@ -49,14 +46,14 @@ _ZERO_COUNTS = {"stuck", "filled"}
 
 def select_effects(
     examination: Examination,
-) -> tuple[list[Identification], list[Unidentified], list[Rejection], State]:
+) -> tuple[list[Selection], list[Selection], list[Rejection], State]:
     """Select effects until none passes, then test each again with the others.
 
     Returns
     -------
-    identified : list of Identification
+    identified : list of Selection
         The strongest first.
-    unidentified : list of Unidentified
+    unidentified : list of Selection
     rejected : list of Rejection
         What beats each of the other effects.
     state : State
@@ -65,7 +62,7 @@ def select_effects(
     selected, all_evidence = _select_all(examination)
     chosen = without_pulses(drop_explained_jumps(selected, examination), examination.settings)
     chosen, identified = settle_selections(examination, prune_selections(examination, chosen))
-    unidentified = [selection for selection in chosen if isinstance(selection, Unidentified)]
+    unidentified = [selection for selection in chosen if not selection.is_named]
     state = examination.state_with([*identified, *unidentified])
     remaining, withdrawn = withdraw_effects(examination, state, identified, unidentified)
     unidentified += withdrawn
@@ -110,7 +107,7 @@ def _select_all(examination: Examination) -> tuple[list[Selection], list[Candida
                 barred |= set() if lines_left > 0 else {PLAIN_LINE}
             else:
                 effects_left -= 1
-            chosen = add_identification(chosen, selection)
+            chosen = add_selection(chosen, selection)
             barred |= _explained_count_keys(examination, selection)
             state = condition_on(state, list(selection.components))
     return chosen, []
@@ -218,8 +215,7 @@ def _select_next(
         if failed:
             return [], failed
         return [
-            make_identification(effect_components, required[key])
-            for key, effect_components, _ in pair
+            make_selection(effect_components, required[key]) for key, effect_components, _ in pair
         ], set()
     rejected: set[str] = set()
     for key in rivals:
@@ -232,7 +228,7 @@ def _select_next(
                 and other not in rejected
                 and sum_evidence(components[other]) >= min_nats
             ]
-            identification = make_identification(components[key], required[key], alternatives=close)
+            identification = make_selection(components[key], required[key], alternatives=close)
             return [identification], rejected
         rejected.add(key)
     if rejected:
@@ -241,7 +237,7 @@ def _select_next(
     effects = [key for key in passing if not key.startswith("~")]
     nearest = [components[key][0].candidate.effect for key in effects[:3]]
     return [
-        find_unidentified(alternative, components[alternative], required[alternative], nearest)
+        make_selection(components[alternative], required[alternative], alternatives=nearest)
     ], set()
 
 

@@ -20,7 +20,6 @@ from gyrostab.diagnose.identify.components import (
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifiability import keep_physical
 from gyrostab.diagnose.identify.identification import (
-    Identification,
     Selection,
     components_of,
     with_axes_of,
@@ -45,7 +44,7 @@ def without_pulses(chosen: Sequence[Selection], settings: Settings) -> list[Sele
         lines.update(dict.fromkeys(component.row, weight))
     out: list[Selection] = []
     for selection in chosen:
-        if isinstance(selection, Identification) and selection.effect == "spikes":
+        if selection.effect == "spikes":
             remaining = tuple(
                 component
                 for component in selection.components
@@ -76,7 +75,7 @@ def prune_selections(examination: Examination, chosen: list[Selection]) -> list[
     """
     for selection in sorted(
         chosen,
-        key=lambda selection: (isinstance(selection, Identification), selection.evidence_nats),
+        key=lambda selection: (selection.is_named, selection.evidence_nats),
     ):
         if len(chosen) < 2:
             break
@@ -85,13 +84,13 @@ def prune_selections(examination: Examination, chosen: list[Selection]) -> list[
         )
         is_leading = (
             selection is chosen[0]
-            and isinstance(selection, Identification)
+            and selection.is_named
             and not selection.components[0].statistic.is_count
         )
         best = max(map(sum_evidence, components_by_key.values()), default=0.0)
         if not is_leading and best < examination.threshold:
             chosen = [other for other in chosen if other is not selection]
-        elif isinstance(selection, Identification):
+        elif selection.is_named:
             reduced = with_axes_of(selection, components_by_key, settings=examination.settings)
             chosen = [reduced if other is selection else other for other in chosen]
     return chosen
@@ -99,13 +98,13 @@ def prune_selections(examination: Examination, chosen: list[Selection]) -> list[
 
 def settle_selections(
     examination: Examination, chosen: list[Selection]
-) -> tuple[list[Selection], list[Identification]]:
+) -> tuple[list[Selection], list[Selection]]:
     """Finish the identifications, and drop the weakest until all reach their threshold."""
     while True:
         identified = {
             place: _finish_identification(examination, selection, chosen)
             for place, selection in enumerate(chosen)
-            if isinstance(selection, Identification)
+            if selection.is_named
         }
         margin = {}
         for place, identification in identified.items():
@@ -120,8 +119,8 @@ def settle_selections(
 
 
 def _finish_identification(
-    examination: Examination, identification: Identification, chosen: Sequence[Selection]
-) -> Identification:
+    examination: Examination, identification: Selection, chosen: Sequence[Selection]
+) -> Selection:
     """Return an identification with its evidence and its rivals, all others in the model."""
     state = examination.state_with(chosen, without=identification)
     key = identification.components[0].candidate.key

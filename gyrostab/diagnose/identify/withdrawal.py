@@ -8,11 +8,9 @@ from dataclasses import replace
 from gyrostab.diagnose.identify.components import split_layers, sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identification import (
-    Identification,
     Selection,
-    Unidentified,
     components_of,
-    find_unidentified,
+    make_selection,
 )
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.statistics.left_structure import (
@@ -29,9 +27,9 @@ _DRIFTS = ("~bias(t)", "~levels")
 def withdraw_effects(
     examination: Examination,
     state: State,
-    identified: list[Identification],
-    unidentified: Sequence[Unidentified],
-) -> tuple[list[Identification], list[Unidentified]]:
+    identified: list[Selection],
+    unidentified: Sequence[Selection],
+) -> tuple[list[Selection], list[Selection]]:
     """Withdraw effects that leave structure in time, in the means or in the powers.
 
     `state` has all selections in the model. The second result is what is unidentified instead.
@@ -62,15 +60,15 @@ def withdraw_effects(
 def _withdraw_in_means(
     examination: Examination,
     state: State,
-    remaining: list[Identification],
-    unidentified: Sequence[Unidentified],
+    remaining: list[Selection],
+    unidentified: Sequence[Selection],
     axis: str,
-) -> tuple[list[Identification], list[Unidentified]]:
+) -> tuple[list[Selection], list[Selection]]:
     """Withdraw effects on the means of an axis that leave more slow noise than calibrated."""
     remaining = _without_part_of_drift(remaining, unidentified, axis, examination.threshold)
     on_axis = _identified_on(remaining, axis, in_means=True)
     has_alternative = any(
-        selection.generic in (*_DRIFTS, "~S(f)", "~cov") and axis in selection.axes
+        selection.effect in (*_DRIFTS, "~S(f)", "~cov") and axis in selection.axes
         for selection in unidentified
     )
     # such an effect changes the white variance of the means, which the calibration then misjudges
@@ -90,15 +88,15 @@ def _withdraw_in_means(
     ):
         return remaining, []
     names = tuple(identification.effect for identification in weak)
-    unexplained = Unidentified("~red", (axis,), excess_nats, examination.threshold, names)
+    unexplained = Selection("~red", (), (axis,), (), excess_nats, examination.threshold, names)
     return [identification for identification in remaining if identification not in weak], [
         unexplained
     ]
 
 
 def _find_weak(
-    examination: Examination, identified: Sequence[Identification], excess_nats: float
-) -> tuple[list[Identification], float]:
+    examination: Examination, identified: Sequence[Selection], excess_nats: float
+) -> tuple[list[Selection], float]:
     """Return the effects that explain too little for what they leave [nats], and their sum."""
     settings = examination.settings
     strength = sum(identification.evidence_nats for identification in identified)
@@ -112,8 +110,8 @@ def _find_weak(
 
 
 def _find_fluctuation(
-    examination: Examination, state: State, axis: str, weak: Sequence[Identification]
-) -> list[Unidentified]:
+    examination: Examination, state: State, axis: str, weak: Sequence[Selection]
+) -> list[Selection]:
     """Return what a free noise level explains on an axis, instead of withdrawn effects."""
     free = [candidate for candidate in examination.candidates if candidate.effect == "~N(t)"]
     components_by_key = examination.find_components(free, state)
@@ -123,14 +121,14 @@ def _find_fluctuation(
         if component.row == (axis,) and component.evidence_nats > examination.threshold
     ]
     names = [identification.effect for identification in weak]
-    return (
-        [find_unidentified("~N(t)", components, examination.threshold, names)] if components else []
-    )
+    if not components:
+        return []
+    return [make_selection(components, examination.threshold, alternatives=names)]
 
 
 def _identified_on(
-    identified: Sequence[Identification], axis: str, *, in_means: bool
-) -> list[Identification]:
+    identified: Sequence[Selection], axis: str, *, in_means: bool
+) -> list[Selection]:
     """Return the identifications with a component in the means of an axis, or in its powers."""
     return [
         identification
@@ -144,17 +142,17 @@ def _identified_on(
 
 
 def _without_part_of_drift(
-    identified: Sequence[Identification],
-    unidentified: Sequence[Unidentified],
+    identified: Sequence[Selection],
+    unidentified: Sequence[Selection],
     axis: str,
     threshold: float,
-) -> list[Identification]:
+) -> list[Selection]:
     """Return effects without what an unidentified drift of an axis may be there.
 
     An effect without a channel that explains less there may be a piece of the drift. It stays on
     other axes where it reaches the threshold.
     """
-    drifts = [selection for selection in unidentified if selection.generic in _DRIFTS]
+    drifts = [selection for selection in unidentified if selection.effect in _DRIFTS]
     drift_nats = sum(_evidence_on(selection, axis) for selection in drifts)
     remaining = []
     for identification in identified:

@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion
-from gyrostab.diagnose.identify.identification import Identification
+from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.nulls.scores import NullScores
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import mean_columns
@@ -29,7 +29,7 @@ MAX_SPANS = 6  # more intervals than that are reported as the whole record
 
 
 def active_blocks(
-    identification: Identification, blocks: xr.Dataset, *, settings: Settings = DEFAULTS
+    identification: Selection, blocks: xr.Dataset, *, settings: Settings = DEFAULTS
 ) -> NDArray[np.bool_]:
     """Return the blocks in which an effect acts, from its designs and the rotation of the tool.
 
@@ -104,13 +104,13 @@ def join_blocks(
 
 def attribute_mismatches(
     located: xr.Dataset,
-    identified: Sequence[Identification],
+    identified: Sequence[Selection],
     blocks: xr.Dataset,
     after: xr.Dataset,
     null: NullScores,
     *,
     level: float,
-    without: Callable[[Sequence[Identification]], xr.Dataset] | None = None,
+    without: Callable[[Sequence[Selection]], xr.Dataset] | None = None,
     still: xr.Dataset | None = None,
     settings: Settings = DEFAULTS,
 ) -> list[list[str]]:
@@ -144,9 +144,7 @@ def attribute_mismatches(
         (): score_with(blocks, after, null, regions, identified)
     }
 
-    def score_without(
-        region: Mapping[str, Any], out: Sequence[Identification]
-    ) -> tuple[float, float]:
+    def score_without(region: Mapping[str, Any], out: Sequence[Selection]) -> tuple[float, float]:
         chosen = tuple(
             number
             for number, identification in enumerate(identified)
@@ -212,7 +210,7 @@ def attribute_mismatches(
 
 def drop_expected(
     located: xr.Dataset,
-    expected: Sequence[Identification],
+    expected: Sequence[Selection],
     blocks: xr.Dataset,
     before: xr.Dataset,
     null: NullScores,
@@ -274,7 +272,7 @@ def _is_caused_elsewhere(
 
 
 def _explained_spans(
-    identification: Identification, blocks: xr.Dataset, settings: Settings
+    identification: Selection, blocks: xr.Dataset, settings: Settings
 ) -> list[tuple[float, float]]:
     """Return the stretches whose mismatches an effect can explain.
 
@@ -306,7 +304,7 @@ def _is_within_blocks(region: Mapping[str, Any], blocks: xr.Dataset) -> bool:
 
 
 def _moving_spans(
-    identification: Identification, blocks: xr.Dataset, after: xr.Dataset, settings: Settings
+    identification: Selection, blocks: xr.Dataset, after: xr.Dataset, settings: Settings
 ) -> list[tuple[float, float]]:
     """Return the blocks [s] in which an effect moves the rate of an axis within the block."""
     axes = [str(axis) for axis in blocks["axis"].values]

@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.known_effects import remove_known_motion
-from gyrostab.diagnose.identify.identification import Identification, components_of
+from gyrostab.diagnose.identify.identification import Selection, components_of
 from gyrostab.diagnose.nulls.scores import NullScores, standardise
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import drop_changed_tails
@@ -28,7 +28,7 @@ def statistic_scores(
     after: xr.Dataset,
     null: NullScores,
     regions: Sequence[Region],
-    identified: Sequence[Identification],
+    identified: Sequence[Selection],
     *,
     still: xr.Dataset | None = None,
     settings: Settings = DEFAULTS,
@@ -64,7 +64,7 @@ def statistic_scores(
 
 
 def _with_shared_lines(
-    blocks: xr.Dataset, after: xr.Dataset, identified: Sequence[Identification]
+    blocks: xr.Dataset, after: xr.Dataset, identified: Sequence[Selection]
 ) -> xr.Dataset:
     """Return the baseline with the covariance of lines that axes have in common.
 
@@ -140,11 +140,11 @@ def score_left(
 
 def needed_effects(
     region: Region,
-    shown: Sequence[tuple[Identification, Sequence[Component]]],
-    left: Callable[[Sequence[Identification]], tuple[float, float]],
+    shown: Sequence[tuple[Selection, Sequence[Component]]],
+    left: Callable[[Sequence[Selection]], tuple[float, float]],
     *,
     settings: Settings = DEFAULTS,
-) -> list[Identification]:
+) -> list[Selection]:
     """Select the effects that are needed to explain a mismatch.
 
     An effect is needed when the mismatch returns without it. When several effects do the same,
@@ -158,7 +158,7 @@ def needed_effects(
     ----------
     region : mapping
         The mismatch, with the fields of `gyrostab.diagnose.locate.mismatches.FIELDS`.
-    shown : sequence of (Identification, sequence of Component)
+    shown : sequence of (Selection, sequence of Component)
         Effects that act there and together remove it, each with its components that can show in its
         statistic.
     left : callable

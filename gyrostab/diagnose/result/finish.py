@@ -22,8 +22,8 @@ from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_expected, fit_ident
 from gyrostab.diagnose.estimate.recalibrate import recalibrate, refer_to_kept_noise, with_noise
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
 from gyrostab.diagnose.identify.identification import (
-    Identification,
     Identifications,
+    Selection,
     components_of,
 )
 from gyrostab.diagnose.identify.jumps import is_step
@@ -273,9 +273,7 @@ def remove_phase_locked(
     return replace(identifications, identified=tuple(identified)), evidence_nats
 
 
-def _can_be_forecast(
-    identification: Identification, blocks: xr.Dataset, settings: Settings
-) -> bool:
+def _can_be_forecast(identification: Selection, blocks: xr.Dataset, settings: Settings) -> bool:
     """Return whether an effect that acts before a forecast begins can be forecast.
 
     The size of an event in the last part is unknown before, also where it is one of several jumps,
@@ -301,7 +299,7 @@ def _attributed_mismatches(
     mismatches = comparison.mismatches
     identified = fit.identifications.identified
 
-    def without(left_out: Sequence[Identification]) -> xr.Dataset:
+    def without(left_out: Sequence[Selection]) -> xr.Dataset:
         return predict_baseline(fit.identifications, fit.noise, left_out=left_out)
 
     lines = (

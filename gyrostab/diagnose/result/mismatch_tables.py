@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.identify.identification import Identification, Identifications, Unidentified
+from gyrostab.diagnose.identify.identification import Identifications, Selection
 from gyrostab.diagnose.identify.nuisance_alternatives import NUISANCE_ALTERNATIVES
 from gyrostab.diagnose.nulls.scores import MIN_P_VALUE, fit_best_evidence
 from gyrostab.diagnose.reduce.block_statistics import measured
@@ -164,7 +164,7 @@ def unidentified_mismatches(
     longest = float(blocks["end"].values[-1]) / 2.0
     null = fit_best_evidence(identifications.null_best, settings=identifications.state.settings)
     for unidentified in identifications.unknown:
-        view = _NUISANCE_VIEWS.get(unidentified.generic, "davar")
+        view = _NUISANCE_VIEWS.get(unidentified.effect, "davar")
         if any(
             region["view"] == view
             and set(region["axes"]) & set(unidentified.axes)
@@ -173,7 +173,7 @@ def unidentified_mismatches(
         ):
             continue
         p_value = float(null.probability(unidentified.evidence_nats))
-        nearest = unidentified.candidates
+        nearest = unidentified.alternatives
         verb = "comes" if len(nearest) == 1 else "come"
         explanation = (
             f"{join_words([plain_name(name) for name in nearest])} {verb} closest, but "
@@ -181,7 +181,7 @@ def unidentified_mismatches(
             if nearest
             else "no known effect explains it"
         )
-        description = NUISANCE_ALTERNATIVES.get(unidentified.generic, "something differs")
+        description = NUISANCE_ALTERNATIVES.get(unidentified.effect, "something differs")
         begin, end, when = _find_event(unidentified, blocks)
         text = (
             f"On {axes_text(unidentified.axes)} {description}{when}; {explanation} "
@@ -194,7 +194,7 @@ def unidentified_mismatches(
     return out
 
 
-def _find_event(unidentified: Unidentified, blocks: xr.Dataset) -> tuple[float, float, str]:
+def _find_event(unidentified: Selection, blocks: xr.Dataset) -> tuple[float, float, str]:
     """Return begin and end [s] of an unidentified event with their text, or the whole record."""
     record_s = float(blocks["end"].values[-1])
     spans = [
@@ -208,9 +208,7 @@ def _find_event(unidentified: Unidentified, blocks: xr.Dataset) -> tuple[float, 
     return begin, end, f", {span_text(begin, end, record_s)}"
 
 
-def motion_mismatches(
-    identified: Sequence[Identification], blocks: xr.Dataset
-) -> list[dict[str, Any]]:
+def motion_mismatches(identified: Sequence[Selection], blocks: xr.Dataset) -> list[dict[str, Any]]:
     """Return one mismatch for each axis with moving blocks that the comparison left out.
 
     It extends from the first of these blocks to the last.
@@ -237,7 +235,7 @@ def motion_mismatches(
     return out
 
 
-def _axes_following(axis: str, identified: Sequence[Identification]) -> list[str]:
+def _axes_following(axis: str, identified: Sequence[Selection]) -> list[str]:
     """Return the axes that sense the rate of `axis` through their misalignment."""
     components = [
         component

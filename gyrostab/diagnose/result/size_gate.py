@@ -7,13 +7,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from gyrostab.diagnose.estimate.joint_fit import Estimate, Fitted
-from gyrostab.diagnose.identify.components import sum_evidence
+from gyrostab.diagnose.identify.components import axes_of, sum_evidence
 from gyrostab.diagnose.identify.identification import (
-    Identification,
     Identifications,
     Rejection,
-    Unidentified,
-    find_unidentified,
+    Selection,
 )
 from gyrostab.physics.registry import effects
 
@@ -65,8 +63,8 @@ def keep_supported(
     Identifications
         `identifications` itself when every effect keeps all of its axes.
     """
-    identified: list[Identification] = []
-    unknown: list[Unidentified] = []
+    identified: list[Selection] = []
+    unknown: list[Selection] = []
     rejected: list[Rejection] = []
     changed = False
     for identification, numbers in zip(identifications.identified, fitted, strict=True):
@@ -102,14 +100,17 @@ def keep_supported(
             )
         if sum_evidence(lost) > identification.threshold:
             strongest = max(lost, key=lambda component: component.evidence_nats).statistic
-            unidentified = find_unidentified(
-                strongest.nuisance_alternative,
-                lost,
-                identification.threshold,
-                [identification.effect],
-                order=identification.axes,
+            unknown.append(
+                Selection(
+                    strongest.nuisance_alternative,
+                    (),
+                    axes_of(lost, identification.axes),
+                    lost,
+                    sum_evidence(lost),
+                    identification.threshold,
+                    (identification.effect,),
+                )
             )
-            unknown.append(unidentified)
         changed = True
     if not changed:
         return identifications

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gyrostab.diagnose.identify.identification import Identification
+from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
 
@@ -74,7 +74,7 @@ def doubtful_names(effects: Iterable[Mapping[str, Any]]) -> list[str]:
     )
 
 
-def name_probability(identification: Identification, *, settings: Settings = DEFAULTS) -> float:
+def name_probability(identification: Selection, *, settings: Settings = DEFAULTS) -> float:
     r"""Return the probability that the record contains this effect, and not an alternative.
 
     With the evidence :math:`E` of the effect [nats], and :math:`E_k` of its alternatives in its
@@ -84,7 +84,7 @@ def name_probability(identification: Identification, *, settings: Settings = DEF
 
     Examples
     --------
-    >>> alone = Identification("shupe", ("temperature",), ("x",), (), 20.0, 8.0)
+    >>> alone = Selection("shupe", ("temperature",), ("x",), (), 20.0, 8.0)
     >>> name_probability(alone) == DEFAULTS.set_probability
     True
     """
@@ -95,7 +95,7 @@ def name_probability(identification: Identification, *, settings: Settings = DEF
     return float(settings.set_probability * share)
 
 
-def _evidence_instead(identification: Identification, effect: str) -> float:
+def _evidence_instead(identification: Selection, effect: str) -> float:
     """Return the evidence of an alternative in the place of an effect [nats]."""
     nats_instead = [
         nats for key, nats in identification.instead.items() if key.partition("(")[0] == effect

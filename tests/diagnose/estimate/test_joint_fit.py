@@ -15,7 +15,7 @@ from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.estimate.forms import settle_forms
 from gyrostab.diagnose.estimate.joint_fit import _make_estimate, fit_identifications
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
-from gyrostab.diagnose.identify.identification import Identification, Identifications
+from gyrostab.diagnose.identify.identification import Identifications, Selection
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
@@ -50,7 +50,7 @@ def identify_by_hand(
     candidate = select_candidate(candidates, effect, statistic)
     variant = next(variant for variant in candidate.variants if variant.columns == columns)
     component = Component(candidate, variant, (axis,), 50.0)
-    identification = Identification(effect, candidate.driver, (axis,), (component,), 50.0, 8.0)
+    identification = Selection(effect, candidate.driver, (axis,), (component,), 50.0, 8.0)
     state = condition_on(initial_state(blocks, baseline), [component])
     return make_identifications([identification], state, candidates, reasons)
 
@@ -344,7 +344,7 @@ def test_axes_missing_in_the_strongest_statistic_get_sizes_from_the_next():
         Component(cross, cross.variants[0], ("x", "y"), 90.0),
         *(Component(power, power.variants[0], (axis,), 40.0) for axis in "yz"),
     ]
-    identification = Identification(
+    identification = Selection(
         effect["name"], power.driver, tuple(truth), tuple(components), 130.0, 8.0
     )
     state = condition_on(initial_state(blocks, baseline), components)

@@ -18,7 +18,7 @@ from gyrostab.diagnose.estimate.forms import settle_forms
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.estimate.recalibrate import recalibrate, with_noise
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
-from gyrostab.diagnose.identify.identification import Identification
+from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
@@ -63,7 +63,7 @@ def identify_by_hand(blocks, baseline, effect, statistic, columns, **values):
     )
     rows = [("x", "y")] if statistic == "cross_spectrum" else [("x",)]
     components = tuple(Component(candidate, variant, row, 500.0) for row in rows)
-    identification = Identification(effect, candidate.driver, rows[0], components, 500.0, 8.0)
+    identification = Selection(effect, candidate.driver, rows[0], components, 500.0, 8.0)
     state = condition_on(initial_state(blocks, baseline), list(components))
     return make_identifications([identification], state, known, reasons)
 
@@ -277,7 +277,7 @@ def test_phase_locked_power_is_counted_once():
         Component(statistics[statistic], variants[statistic], row, 500.0)
         for statistic, row in places
     )
-    identification = Identification(
+    identification = Selection(
         "aliased_vibration", statistics["power"].driver, ("x", "y"), components, 500.0, 8.0
     )
     state = condition_on(initial_state(blocks, baseline), list(components))

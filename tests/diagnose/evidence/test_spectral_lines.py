@@ -14,7 +14,7 @@ from gyrostab.diagnose.evidence.spectral_lines import line_evidence, line_skirt
 from gyrostab.diagnose.identify import selection
 from gyrostab.diagnose.identify.components import group_components, merge_lines
 from gyrostab.diagnose.identify.forward_search import name_effects
-from gyrostab.diagnose.identify.identification import Identification, add_identification, form_error
+from gyrostab.diagnose.identify.identification import Selection, add_selection, form_error
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.filter_response import undo_filter
@@ -96,14 +96,14 @@ def test_the_skirt_contains_only_its_line(wander: float) -> None:
 
 
 @pytest.fixture(scope="module")
-def lines() -> tuple[Identification, ...]:
+def lines() -> tuple[Selection, ...]:
     blocks = sines({0.7: 0.25, 2.03: 0.15, 4.06: 0.2}, size=12_000)
     baseline, records = nulls(blocks, 40)
     return name_effects(blocks, baseline, records).identified
 
 
 @pytest.mark.slow
-def test_each_line_is_a_separate_identification(lines: tuple[Identification, ...]) -> None:
+def test_each_line_is_a_separate_identification(lines: tuple[Selection, ...]) -> None:
     assert [identification.effect for identification in lines] == ["spectral_line"] * 3
     assert all(identification.axes == ("x",) for identification in lines)
     assert all(
@@ -191,8 +191,8 @@ def component(effect: str, statistic: str, evidence_nats: float, place: int = -1
     )
 
 
-def identification(component: Component) -> Identification:
-    return Identification(
+def identification(component: Component) -> Selection:
+    return Selection(
         component.candidate.effect, (), component.row, (component,), component.evidence_nats, 7.0
     )
 
@@ -216,20 +216,20 @@ def test_identifications_of_one_effect_merge_except_lines_of_other_frequencies()
     first = identification(component("spectral_line", "spectral_line", 50.0, 3))
     assert (
         len(
-            add_identification(
+            add_selection(
                 [first], identification(component("spectral_line", "spectral_line", 20.0, 9))
             )
         )
         == 2
     )
-    (merged,) = add_identification(
+    (merged,) = add_selection(
         [first],
         replace(identification(component("spectral_line", "spectral_line", 20.0, 3)), axes=("y",)),
     )
     assert (merged.axes, merged.evidence_nats) == (("x", "y"), 70.0)
     assert (
         len(
-            add_identification(
+            add_selection(
                 [identification(component("shupe", "mean", 9.0))],
                 identification(component("shupe", "mean", 8.0)),
             )

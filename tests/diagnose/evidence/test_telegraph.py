@@ -16,7 +16,7 @@ from gyrostab.diagnose.evidence.telegraph import (
 )
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import keep_physical
-from gyrostab.diagnose.identify.identification import Identification, Identifications
+from gyrostab.diagnose.identify.identification import Identifications, Selection
 from gyrostab.diagnose.identify.switching import drop_explained_jumps, put_followers_first
 from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component, Variant
 from gyrostab.diagnose.predict.condition import condition_on_components
@@ -302,7 +302,7 @@ def test_switches_are_not_also_jumps(
             )
         ]
 
-    def state_with(identifications: Sequence[Identification]) -> State:
+    def state_with(identifications: Sequence[Selection]) -> State:
         return condition_on_components(
             start,
             [
@@ -313,10 +313,10 @@ def test_switches_are_not_also_jumps(
         )
 
     jumps = [jump(place if place == REAL else int(moves[place]), 20.0) for place in places]
-    first = Identification("bias_jump", (), ("x",), tuple(jumps), 20.0 * len(jumps), 8.0)
+    first = Selection("bias_jump", (), ("x",), tuple(jumps), 20.0 * len(jumps), 8.0)
     (evidence,) = gains((), state_with([first]))
     evidence_nats = float(evidence.evidence_nats[0, 0])
-    hopping = Identification(
+    hopping = Selection(
         "telegraph",
         (),
         ("x",),

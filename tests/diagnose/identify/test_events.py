@@ -75,7 +75,7 @@ def test_temporary_noise_is_not_ageing(inside: slice) -> None:
     identifications = name_effects(blocks, *nulls(blocks, 40))
     assert not identifications.identified
     first = identifications.unknown[0]
-    assert first.generic == "~burst"
+    assert first.effect == "~burst"
     begin, end = (first.components[0].variant.values[name] / 20.0 for name in ("begin", "end"))
     assert abs(begin - range(BLOCKS)[inside][0]) <= 1
     assert abs(end - range(BLOCKS)[inside][-1] - 1) <= 1

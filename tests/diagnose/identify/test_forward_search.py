@@ -15,7 +15,7 @@ from gyrostab.diagnose.evidence.sample_counts import expected_counts, sample_cou
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import _is_possible, keep_physical
-from gyrostab.diagnose.identify.identification import Identification
+from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.predict import sizes
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
@@ -167,7 +167,7 @@ def test_effect_without_its_channel_is_not_identified():
     identifications = identify(VIBRATION, drop=("vibration",))
     assert not identifications.identified
     assert identifications.verdict == "unknown"
-    assert {unidentified.generic for unidentified in identifications.unknown} <= {
+    assert {unidentified.effect for unidentified in identifications.unknown} <= {
         "~N(t)",
         "~S(f)",
         "~burst",
@@ -210,7 +210,10 @@ def test_identified_effect_is_in_the_model_of_the_next(shaken):
 
 
 def test_identifications_are_frozen_data(shaken):
-    assert all(isinstance(identification, Identification) for identification in shaken.identified)
+    assert all(
+        isinstance(identification, Selection) and identification.is_named
+        for identification in shaken.identified
+    )
 
 
 # --------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.diagnose.identify.identification import Identification, Identifications
+from gyrostab.diagnose.identify.identification import Identifications, Selection
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import drop_changed_tails
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -128,7 +128,7 @@ def identifications(
         evidence_nats,
         place,
     )
-    identification = Identification(
+    identification = Selection(
         "shupe",
         ("temperature",),
         ("y",),

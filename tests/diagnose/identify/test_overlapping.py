@@ -8,7 +8,7 @@ import pytest
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.identify.components import evidence_of, split_layers
 from gyrostab.diagnose.identify.forward_search import name_effects
-from gyrostab.diagnose.identify.identification import Identification, with_axes_of
+from gyrostab.diagnose.identify.identification import Selection, with_axes_of
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -61,7 +61,7 @@ def test_evidence_is_kept_apart_by_reference_channel():
 
 def test_identification_keeps_axes_that_still_show_it():
     components = (component(9.0), component(8.0, row="y"))
-    identification = Identification("misalignment", (), ("x", "y"), components, 15.5, 8.0)
+    identification = Selection("misalignment", (), ("x", "y"), components, 15.5, 8.0)
     key = components[0].candidate.key
     assert with_axes_of(identification, {key: [component(9.0), component(1.0, row="y")]}).axes == (
         "x",

@@ -13,10 +13,7 @@ from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify import selection as selecting
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identification import (
-    Identification,
-    Unidentified,
-    find_unidentified,
-    make_identification,
+    make_selection,
 )
 from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
 from gyrostab.diagnose.identify.settling import prune_selections, settle_selections
@@ -76,10 +73,10 @@ def test_an_effect_stays_beside_an_unidentified_burst():
     channels = {"vibration": (np.repeat(vibration, 100), "g")}
     examination = _examine(values, 5.0, channels, ("vibration_noise", "~N(t)", "~burst"))
     chosen, _ = selecting._select_all(examination)
-    named = [selection for selection in chosen if isinstance(selection, Identification)]
-    others = [selection for selection in chosen if isinstance(selection, Unidentified)]
+    named = [selection for selection in chosen if selection.is_named]
+    others = [selection for selection in chosen if not selection.is_named]
     assert [selection.effect for selection in named] == ["vibration_noise"]
-    assert [selection.generic for selection in others] == ["~burst"]
+    assert [selection.effect for selection in others] == ["~burst"]
     state = examination.state_with([*named, *others])
     assert withdraw_effects(examination, state, named, others) == (named, [])
 
@@ -101,9 +98,9 @@ def _explain(effect, statistic, evidence):
     ],
 )
 def test_a_drift_takes_only_what_it_explains_on_its_axis(jump_nats, on_x, remaining_axes):
-    jump = make_identification(_explain("bias_jump", "mean", jump_nats), 8.0)
+    jump = make_selection(_explain("bias_jump", "mean", jump_nats), 8.0)
     parts = _explain("~bias(t)", "mean", {"x": on_x, "y": 201.0})
-    drift = find_unidentified("~bias(t)", parts, 8.0, [])
+    drift = make_selection(parts, 8.0)
     remaining = _without_part_of_drift([jump], [drift], "x", 8.0)
     assert [identification.axes for identification in remaining] == remaining_axes
     for identification in remaining:

@@ -8,7 +8,7 @@ import pytest
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.identify.components import sum_evidence
-from gyrostab.diagnose.identify.identification import Identification
+from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -55,7 +55,7 @@ def test_earth_rate_is_recovered(around):
     assert sum_evidence(components) > 1000.0
     state = condition_on(start, components)
     assert max(map(sum_evidence, find_components(orders, state).values())) < 5.0
-    identification = Identification(
+    identification = Selection(
         "earth_rate", components[0].candidate.driver, ("x", "y"), tuple(components), 500.0, 8.0
     )
     identifications = make_identifications([identification], state, known, reasons)
@@ -84,7 +84,7 @@ def test_angles_have_the_relative_error_of_the_size(latitude, most):
     start = initial_state(blocks, baseline)
     orders = [candidate for candidate in known if candidate.statistic.name == "rotation_order"]
     components = find_components(orders, start)["earth_rate(rotation_rate)"]
-    identification = Identification(
+    identification = Selection(
         "earth_rate", components[0].candidate.driver, ("x", "y"), tuple(components), 500.0, 8.0
     )
     identifications = make_identifications(
@@ -124,7 +124,7 @@ def test_all_harmonics_of_the_rotation_are_recovered():
     ]
     start = initial_state(blocks, baseline)
     components = find_components(orders, start)["rotation_line(rotation_rate)"]
-    identification = Identification(
+    identification = Selection(
         "rotation_line",
         components[0].candidate.driver,
         ("x", "y"),

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gyrostab.diagnose.identify.identification import Identification
+from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
 from gyrostab.diagnose.statistics.candidates import effect_candidates
@@ -29,7 +29,7 @@ def identification(blocks, effect, statistic):
     candidates, _ = effect_candidates(blocks, COEFFICIENT)
     candidate = select_candidate(candidates, effect, statistic)
     component = Component(candidate, candidate.variants[0], ("x",), 50.0, place=0)
-    return Identification(effect, candidate.driver, ("x",), (component,), 50.0, 8.0)
+    return Selection(effect, candidate.driver, ("x",), (component,), 50.0, 8.0)
 
 
 def test_rotation_line_acts_while_the_tool_rotates(turning):

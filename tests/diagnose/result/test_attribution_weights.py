@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
-from gyrostab.diagnose.identify.identification import Identification
+from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.locate.mismatches import locate_mismatches
 from gyrostab.diagnose.locate.regions import merge_regions
 from gyrostab.diagnose.nulls.scores import null_scores
@@ -38,7 +38,7 @@ def _make_identification(candidates, effect, statistic, column):
         for variant in candidate.variants
         if variant.columns == (column,) and variant.values.get("exponent", 1.0) == 1.0
     )
-    return Identification(
+    return Selection(
         effect, candidate.driver, ("x",), (Component(candidate, variant, ("x",), 50.0),), 50.0, 8.0
     )
 
@@ -141,7 +141,7 @@ def test_jump_explains_the_mean_on_either_side(shaken, step, attributed):
     candidates, reasons = effect_candidates(moved, COEFFICIENT)
     candidate = select_candidate(candidates, "bias_jump", "mean")
     variant = next(variant for variant in candidate.variants if variant.values["at"] == 1800.0)
-    identification = Identification(
+    identification = Selection(
         "bias_jump",
         candidate.driver,
         ("x",),
@@ -278,7 +278,7 @@ def test_line_on_two_axes_explains_their_covariance(shaken, axes, attributed):
     place = int(np.abs(shared["line_frequency"].values - 2.0).argmin())
     candidates, _ = effect_candidates(shared, COEFFICIENT)
     candidate = select_candidate(candidates, "spectral_line", "spectral_line")
-    identification = Identification(
+    identification = Selection(
         "spectral_line",
         (),
         tuple(axes),

@@ -10,7 +10,7 @@ import xarray as xr
 
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.identify.identification import (
-    Identification,
+    Selection,
 )
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.result.finish import remove_phase_locked
@@ -31,8 +31,8 @@ def component(statistic: str, evidence_nats: float) -> Component:
     )
 
 
-def identification(*components: Component) -> Identification:
-    return Identification(
+def identification(*components: Component) -> Selection:
+    return Selection(
         "rotation_line",
         (),
         ("x",),

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gyrostab.diagnose.identify.identification import Identification
+from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.result.verdict import name_probability
 from gyrostab.diagnose.settings import Settings
 
 SETTINGS = Settings(set_probability=0.9)
-ALONE = Identification("shupe", ("temperature",), ("x",), (), 20.0, 8.0)
+ALONE = Selection("shupe", ("temperature",), ("x",), (), 20.0, 8.0)
 
 
 def probability(*alternatives: str, **instead: float) -> float:

@@ -19,7 +19,7 @@ import gyrostab
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.joint_fit import Estimate, Fitted, fit_identifications
 from gyrostab.diagnose.estimate.upper_limits import mixture_limit
-from gyrostab.diagnose.identify.identification import Identification
+from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.result import finish as conclude
@@ -50,16 +50,16 @@ def estimate(value: float, error: float) -> Estimate:
     return Estimate(value, error, value - 1.96 * error, value + 1.96 * error, "deg/h")
 
 
-def make_identification(
+def make_selection(
     effect: str, axes: str, gains: tuple[float, ...] | None = None, *, statistic: str = "mean"
-) -> Identification:
+) -> Selection:
     candidate: Any = Candidate(effect, find_statistic(statistic), (), ())
     variant: Any = SimpleNamespace(values={}, columns=())
     components = tuple(
         Component(candidate, variant, (axis,), evidence_nats)
         for axis, evidence_nats in zip(axes, gains or (20.0,) * len(axes), strict=True)
     )
-    return Identification(effect, (), tuple(axes), components, 20.0 * len(axes), 8.0)
+    return Selection(effect, (), tuple(axes), components, 20.0 * len(axes), 8.0)
 
 
 @pytest.mark.parametrize(
@@ -78,12 +78,12 @@ def make_identification(
 def test_axis_is_supported_if_a_size_differs_from_zero(
     parameters: dict[str, Estimate], axes: tuple[str, ...]
 ):
-    identification = make_identification("temperature_bias", "xy")
+    identification = make_selection("temperature_bias", "xy")
     assert supported_axes(Fitted(identification, ("x", "y"), parameters, None)) == axes
 
 
 def test_line_of_zero_amplitude_is_not_an_effect():
-    identification = make_identification("spectral_line", "x", statistic="spectral_line")
+    identification = make_selection("spectral_line", "x", statistic="spectral_line")
     nothing = {
         "amplitude": Estimate(0.0, 0.0, 0.0, 0.0, "deg/h"),
         "frequency": Estimate(0.0, 0.1, 0.0, 0.2, "Hz"),
@@ -93,14 +93,14 @@ def test_line_of_zero_amplitude_is_not_an_effect():
     )
     assert not identifications.identified
     assert [
-        (unidentified.axes, unidentified.candidates) for unidentified in identifications.unknown
+        (unidentified.axes, unidentified.alternatives) for unidentified in identifications.unknown
     ] == [(("x",), ("spectral_line",))]
 
 
 def test_effect_keeps_axes_with_a_size():
     identification, other = (
-        make_identification("temperature_bias", "xy"),
-        make_identification("shupe", "z"),
+        make_selection("temperature_bias", "xy"),
+        make_selection("shupe", "z"),
     )
     numbers = [
         [
@@ -125,14 +125,14 @@ def test_effect_keeps_axes_with_a_size():
     assert supported.evidence_nats < identification.evidence_nats
     assert supported.instead == {"shupe": supported.evidence_nats - 2.0}  # on the same axes
     assert [
-        (unidentified.axes, unidentified.generic) for unidentified in identifications.unknown
+        (unidentified.axes, unidentified.effect) for unidentified in identifications.unknown
     ] == [(("y",), "~bias(t)")]
     assert keep_supported(before, [numbers[0][:1], numbers[1]]).identified[0].axes == ("x",)
     assert keep_supported(identifications, [numbers[0][:1], numbers[1]]) is identifications
 
 
 def test_unsupported_rest_below_the_threshold_is_dropped():
-    identification = make_identification("temperature_bias", "xy", (30.0, 3.0))
+    identification = make_selection("temperature_bias", "xy", (30.0, 3.0))
     numbers = [
         [
             Fitted(identification, (axis,), {"sensitivity": estimate(0.4, error)}, None)

@@ -158,5 +158,5 @@ def test_jump_and_ageing_are_withdrawn_in_a_stronger_drift():
     blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["y"]))
     identifications = name_effects(blocks, *nulls(blocks, 40))
     assert not identifications.identified
-    assert {unidentified.generic for unidentified in identifications.unknown} == {"~bias(t)"}
+    assert {unidentified.effect for unidentified in identifications.unknown} == {"~bias(t)"}
     assert {unidentified.axes for unidentified in identifications.unknown} == {("y",)}
