@@ -29,6 +29,19 @@ def find_components(candidates: Sequence[Candidate], state: State) -> dict[str, 
     return group_components(compute_evidence(candidates, blocks, state, fold_blocks(blocks)))
 
 
+def winning_forms(components: Sequence[Component], state: State, error: float = 0.0) -> set[str]:
+    """Return the names of other forms that explain clearly more than components of one statistic.
+
+    On all axes together, or on the axis of the first.
+    """
+    statistic = components[0].statistic
+    competitors = [
+        *statistic.competitors(components, state, error),
+        *statistic.axis_competitors(components[0], state),
+    ]
+    return {item.name for item in competitors if item.nats > item.needed}
+
+
 def make_identifications(
     identified: Iterable[Selection],
     state: State | None = None,

@@ -17,7 +17,6 @@ from gyrostab.diagnose.identify.identification import (
     Identifications,
     Selection,
 )
-from gyrostab.diagnose.identify.jumps import is_step
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.reduce.zero_bin import truncated_axes
@@ -251,7 +250,7 @@ def _estimate_sizes(
 ) -> tuple[Mapping[str, tuple[float, ...]], Mapping[str, float | str]]:
     """Return parameters with their errors from components in one statistic, and likely values."""
     # a step has its own grid of times, which ends where those of other steps begin
-    candidates = () if is_step(components[0]) else identifications.candidates
+    candidates = () if components[0].is_step else identifications.candidates
     fit = SizeFit(components, axes, state, candidates, identifications.count_evidence)
     return components[0].statistic.estimate(fit), fit.likeliest
 

@@ -8,11 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from gyrostab.diagnose.identify.identification import Selection
-from gyrostab.diagnose.identify.jumps import is_step
-from gyrostab.diagnose.predict.candidates import Component, Variant
+from gyrostab.diagnose.predict.candidates import TIME_PARAMETER, Component, Variant
 from gyrostab.diagnose.predict.condition import condition_on_components
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.windows import TIME_PARAMETER
 from gyrostab.diagnose.statistics.rotation_order import fit_amplitude, harmonic_sets
 
 MAX_BLOCKS_OF_STEP = 2  # by which the times of a step on two axes may differ; design choice
@@ -65,7 +63,7 @@ def split_steps(
     steps = [step for component in components for step in _single_steps(component)]
     groups = _group_steps(steps, state)
     if len(groups) < 2:
-        return [([*steps, *(part for part in components if not is_step(part))], state)]
+        return [([*steps, *(part for part in components if not part.is_step)], state)]
     out = []
     for group in groups:
         others = [step for other in groups if other is not group for step in other]
@@ -108,7 +106,7 @@ def _single_steps(component: Component) -> list[Component]:
     The times of steps at every restart are known.
     """
     variant = component.variant
-    if not is_step(component):
+    if not component.is_step:
         return []
     if len(variant.columns) == 1:
         return [component]

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.jumps import is_step
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture
@@ -37,7 +36,7 @@ def find_equivalent_effects(
     ):
         out.append("rate_quantization")  # truncation towards zero makes the zero bin twice as wide
     if effect == "bias_jump" and any(
-        is_step(component)
+        component.is_step
         and np.abs(component_mixture(component, state).moments()[0]).max()
         >= state.settings.min_fringe_step
         for component in components

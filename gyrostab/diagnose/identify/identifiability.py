@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.identify.jumps import event_nats, gradual_nats, scatter_nats
-from gyrostab.diagnose.identify.levels import further_level_nats, unequal_levels_nats
-from gyrostab.diagnose.identify.logger_filters import separate_axes_nats
-from gyrostab.diagnose.identify.steady import intermittent_nats
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.reduce.block_statistics import measured
+from gyrostab.diagnose.statistics.base import Competitor
 from gyrostab.diagnose.statistics.candidates import largest_size
 from gyrostab.physics.registry import effects
 
@@ -41,7 +38,15 @@ def keep_physical(
     error : float
         What errors of the form of all other effects may leave to this one [nats].
     """
-    other_course = _find_other_course(components, state, error)
+    by_statistic = {
+        statistic: [component for component in components if component.statistic is statistic]
+        for statistic in dict.fromkeys(component.statistic for component in components)
+    }
+    other_course = _find_winner(
+        competitor
+        for statistic, own in by_statistic.items()
+        for competitor in statistic.competitors(own, state, error)
+    )
     if other_course:
         return [], other_course
     forms = [_find_other_form(component, state) for component in components]
@@ -49,18 +54,16 @@ def keep_physical(
     return remaining, next(iter(forms), None) if not remaining else None
 
 
-def _find_other_course(
-    components: Sequence[Component], state: State, error: float
-) -> tuple[str, float] | None:
-    """Return another course on all axes that explains more, and by how much [nats]."""
-    forms: tuple[tuple[str, Callable[[], float]], ...] = (
-        ("a filter on each axis", lambda: separate_axes_nats(components, state)),
-        ("a gradual change", lambda: gradual_nats(components, state, error=error)),
-        ("an event that ends", lambda: event_nats(components, state)),
-        ("means that scatter for a while", lambda: scatter_nats(components, state)),
-        ("levels that differ", lambda: unequal_levels_nats(components, state, error=error)),
+def _find_winner(competitors: Iterable[Competitor]) -> tuple[str, float] | None:
+    """Return the first form that explains more than it needs, and by how much [nats]."""
+    return next(
+        (
+            (competitor.name, competitor.nats)
+            for competitor in competitors
+            if competitor.nats > competitor.needed
+        ),
+        None,
     )
-    return next(((name, nats) for name, find in forms if (nats := find())), None)
 
 
 def find_plainer_effect(components: Sequence[Component], state: State) -> str | None:
@@ -108,11 +111,7 @@ def _find_other_form(component: Component, state: State) -> tuple[str, float] | 
     """Return what excludes a component, and by how much it explains more [nats]."""
     if not _is_possible(component, state):
         return "an impossible size", math.nan
-    forms: tuple[tuple[str, Callable[[Component, State], float]], ...] = (
-        ("more than two levels", further_level_nats),
-        ("an effect in a part of the record", intermittent_nats),
-    )
-    return next(((name, nats) for name, find in forms if (nats := find(component, state))), None)
+    return _find_winner(component.statistic.axis_competitors(component, state))
 
 
 def _is_possible(component: Component, state: State) -> bool:

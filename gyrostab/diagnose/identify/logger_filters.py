@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,6 @@ from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.sizes import component_size, disagreement_nats
 
 Array = NDArray[np.float64]
 
@@ -55,23 +53,3 @@ def without_slopes(
         return [key for key in passing if key not in lines]
     stronger = passing[: passing.index(filters[0])]
     return [key for key in passing if key in real or (key in stronger and key not in lines)]
-
-
-def separate_axes_nats(components: Sequence[Component], state: State) -> float:
-    """Return by how much a filter for each axis explains more than one for all [nats].
-
-    Zero unless it does so clearly. All axes pass the same logger, which takes the same share of the
-    noise of each. The share of the strongest component is fitted on every axis, and once for all of
-    them.
-    """
-    shown = [component for component in components if component.is_filter]
-    if not shown:
-        return 0.0
-    first = max(shown, key=lambda component: component.evidence_nats)
-    share, error = np.array(
-        [component_size(replace(first, row=(axis,)), state) for axis in state.axes]
-    ).T
-    evidence = sum(max(component.evidence_nats, 0.0) for component in shown)
-    nats = disagreement_nats(share, error**-2.0)
-    allowed = state.settings.reject_nats + state.settings.spectrum_error_share * evidence
-    return nats if nats > allowed else 0.0

@@ -9,7 +9,6 @@ from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifiability import keep_physical
 from gyrostab.diagnose.identify.identification import form_error, make_selection
-from gyrostab.diagnose.identify.jumps import is_step
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
@@ -56,7 +55,7 @@ def find_pair(
         for pair in combinations_with_replacement(keys, 2)
         if pair in totals
         and pair[::-1] in totals
-        and (pair[0] != pair[1] or (is_course and is_step(components[pair[0]][0])))
+        and (pair[0] != pair[1] or (is_course and components[pair[0]][0].is_step))
     }
     best = max(pairs, key=lambda pair: pairs[pair], default=None)
     if best is None or pairs[best] <= sum_evidence(alternative):

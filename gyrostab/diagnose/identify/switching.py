@@ -18,10 +18,10 @@ from gyrostab.diagnose.identify.identification import (
     Selection,
     components_of,
 )
-from gyrostab.diagnose.identify.jumps import is_free_jump
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.statistics.jump_forms import is_free_jump
 
 
 def put_followers_first(

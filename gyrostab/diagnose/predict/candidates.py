@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from gyrostab.diagnose.statistics.base import Statistic
 
 Array = NDArray[Any]
+#: Nuisance parameter that is a time.
+TIME_PARAMETER = "at"
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,11 @@ class Component:
     def statistic(self) -> Statistic:
         """The statistic in which the effect shows."""
         return self.candidate.statistic
+
+    @property
+    def is_step(self) -> bool:
+        """Whether it is a step of the mean at a given time."""
+        return self.statistic.is_linear_in_means and TIME_PARAMETER in self.variant.values
 
     @property
     def is_filter(self) -> bool:

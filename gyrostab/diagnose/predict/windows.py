@@ -10,7 +10,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect, Variant
+from gyrostab.diagnose.predict.candidates import (
+    TIME_PARAMETER,
+    Candidate,
+    Component,
+    Prospect,
+    Variant,
+)
 from gyrostab.diagnose.predict.step_times import power_on_times
 from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.physics.base import Effect
@@ -18,8 +24,6 @@ from gyrostab.physics.prediction import Prediction, Windows
 from gyrostab.physics.registry import effects
 
 Array = NDArray[Any]
-#: Nuisance parameter that is a time.
-TIME_PARAMETER = "at"
 _SPLINE_KNOTS = 12  # of hat functions over the record; design choice
 _MAX_DESIGN_DIFFERENCE = 1e-3  # of its size, up to which designs are equal; design choice
 

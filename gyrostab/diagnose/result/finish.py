@@ -26,7 +26,6 @@ from gyrostab.diagnose.identify.identification import (
     Selection,
     components_of,
 )
-from gyrostab.diagnose.identify.jumps import is_step
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.channel_use import unused_channels
 from gyrostab.diagnose.result.attribution import active_blocks, attribute_mismatches
@@ -285,7 +284,7 @@ def _can_be_forecast(identification: Selection, blocks: xr.Dataset, settings: Se
     acts = active_blocks(identification, blocks, settings=settings)
     known = select_forecast_start(blocks)
     has_later_step = any(
-        is_step(component) and (np.ptp(component.variant.design[..., known], axis=-1) == 0.0).any()
+        component.is_step and (np.ptp(component.variant.design[..., known], axis=-1) == 0.0).any()
         for component in identification.components
     )
     return bool(acts[~known].any() and not has_later_step)

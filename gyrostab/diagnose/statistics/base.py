@@ -63,6 +63,14 @@ class SizeFit:
     likeliest: dict[str, float | str] = field(default_factory=dict)
 
 
+class Competitor(NamedTuple):
+    """Another form of an effect that competes with it."""
+
+    name: str  # in words, for what beats an effect
+    nats: float  # by how much it explains more [nats]
+    needed: float  # that it must exceed [nats]
+
+
 class Statistic:
     """One way to look at a recording, with all steps of the diagnosis in which it takes part.
 
@@ -198,6 +206,24 @@ class Statistic:
             factors.append(linear_model_factors(model, trial.folds)[:, 1:])
             spread = factors[-1].shape[1] // sum(len(candidate.variants) for candidate in group)
         return collect_evidence(group, rows, factors, spread)
+
+    def competitors(
+        self, components: Sequence[Component], state: State, error: float
+    ) -> Iterator[Competitor]:
+        """Yield other forms of an effect with these components in the statistic, on all axes.
+
+        Parameters
+        ----------
+        state : State
+            With all other effects in the model.
+        error : float
+            What errors of the form of these may leave [nats].
+        """
+        yield from ()
+
+    def axis_competitors(self, component: Component, state: State) -> Iterator[Competitor]:
+        """Yield other forms of a component on its axis alone."""
+        yield from ()
 
     # ---------------------------------------------------------------------- in the model
 

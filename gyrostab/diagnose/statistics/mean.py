@@ -14,6 +14,7 @@ from gyrostab.diagnose.evidence.held_out import mean_factors
 from gyrostab.diagnose.evidence.mixture import Mixture
 from gyrostab.diagnose.evidence.wandering import block_mean_variance, expected_processes
 from gyrostab.diagnose.predict.candidates import (
+    TIME_PARAMETER,
     Candidate,
     CandidateEvidence,
     Component,
@@ -26,9 +27,10 @@ from gyrostab.diagnose.predict.linear_model import State, moves_within_blocks
 from gyrostab.diagnose.predict.search import Trial, collect_evidence
 from gyrostab.diagnose.predict.sizes import mean_mixture
 from gyrostab.diagnose.predict.step_times import power_on_times
-from gyrostab.diagnose.predict.windows import TIME_PARAMETER, hat_functions
+from gyrostab.diagnose.predict.windows import hat_functions
 from gyrostab.diagnose.settings import Settings
-from gyrostab.diagnose.statistics.base import Region, Statistic, column_choices
+from gyrostab.diagnose.statistics.base import Competitor, Region, Statistic, column_choices
+from gyrostab.diagnose.statistics.jump_forms import jump_competitors
 from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
@@ -106,6 +108,12 @@ class Mean(BlockMeanStatistic):
     is_linear_in_means = True
     has_course = True
     grows_in_time = False
+
+    def competitors(
+        self, components: Sequence[Component], state: State, error: float
+    ) -> Iterator[Competitor]:
+        """Yield other courses than jumps."""
+        return jump_competitors(components, state, error)
 
     def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
         """Return a bias that wanders in any way."""

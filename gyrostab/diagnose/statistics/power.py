@@ -26,8 +26,9 @@ from gyrostab.diagnose.predict.linear_model import (
     unspread_share,
 )
 from gyrostab.diagnose.reduce.schema import axis_values
-from gyrostab.diagnose.statistics.base import Region, Statistic, column_choices
+from gyrostab.diagnose.statistics.base import Competitor, Region, Statistic, column_choices
 from gyrostab.diagnose.statistics.free_powers import free_powers
+from gyrostab.diagnose.statistics.power_forms import parts_of_record, separate_filters
 from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
@@ -89,6 +90,16 @@ class Power(Statistic):
     is_power = True
     has_course = True
     is_ratio = True
+
+    def competitors(
+        self, components: Sequence[Component], state: State, error: float
+    ) -> Iterator[Competitor]:
+        """Yield a filter for each axis."""
+        return separate_filters(components, state)
+
+    def axis_competitors(self, component: Component, state: State) -> Iterator[Competitor]:
+        """Yield other sizes in parts of the record."""
+        return parts_of_record(component, state)
 
     def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
         """Return noise of any course, in an interval, and of any spectrum."""

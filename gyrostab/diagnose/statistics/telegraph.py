@@ -11,7 +11,6 @@ import xarray as xr
 
 from gyrostab.diagnose.evidence.fast_switching import (
     SwitchingEvidence,
-    switching_evidence,
     switching_powers,
 )
 from gyrostab.diagnose.evidence.telegraph import (
@@ -27,12 +26,17 @@ from gyrostab.diagnose.predict.candidates import (
     Prospect,
     Variant,
 )
-from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State, power_column
 from gyrostab.diagnose.predict.search import Trial
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.reduce.schema import axis_values
-from gyrostab.diagnose.statistics.base import SizeFit, Sizes
+from gyrostab.diagnose.statistics.base import Competitor, SizeFit, Sizes
+from gyrostab.diagnose.statistics.fast_switching import (
+    add_fast_switching,
+    is_resolved,
+    search_sub_blocks,
+)
+from gyrostab.diagnose.statistics.level_forms import further_levels, level_competitors
 from gyrostab.diagnose.statistics.mean import BlockMeanStatistic, condition_means
 
 _LEVELS = "~levels"  # nuisance alternative: an arbitrary course
@@ -45,6 +49,16 @@ class Telegraph(BlockMeanStatistic):
     name = "telegraph"
     is_in_means = True
     is_switching = True
+
+    def competitors(
+        self, components: Sequence[Component], state: State, error: float
+    ) -> Iterator[Competitor]:
+        """Yield levels that differ."""
+        return level_competitors(components, state, error)
+
+    def axis_competitors(self, component: Component, state: State) -> Iterator[Competitor]:
+        """Yield more than two levels."""
+        return further_levels(component, state)
 
     def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
         """Return any course of levels, which the means determine."""
@@ -149,22 +163,14 @@ class Telegraph(BlockMeanStatistic):
         }
 
 
-def add_fast_switching(state: State, component: Component) -> State:
-    """Add the course of a bias that switches within blocks to the block and sub-block means."""
-    axis = component.row[0]
-    return state.with_columns("mean", axis, mean_columns(component.variant, 0)).with_columns(
-        "sub_block", axis, [component.variant.inside]
-    )
-
-
 def _search_fast_switching(
     data: xr.Dataset, state: State, axis: str, course: TelegraphCourses, evidence_nats: float
 ) -> tuple[SwitchingEvidence | None, bool]:
     """Find switching within blocks, if better than in block means; and whether it refutes it."""
-    switching, block = _search_sub_blocks(data, state, axis), float(state.blocks.attrs["block_s"])
+    switching, block = search_sub_blocks(data, state, axis), float(state.blocks.attrs["block_s"])
     if switching is None:
         return None, False
-    if not _is_resolved(switching, block):
+    if not is_resolved(switching, block):
         return None, switching.refuted and float(
             course.times[0].min()
         ) < state.settings.refuted_blocks
@@ -174,37 +180,6 @@ def _search_fast_switching(
     coarse = np.isfinite(evidence_nats) and error < state.settings.visible_sigma * deviation
     is_slow = switching.times.min() > state.settings.fast_blocks * block
     return (None if coarse and is_slow else switching), False
-
-
-def fast_switching_evidence(data: xr.Dataset, state: State, axis: str) -> SwitchingEvidence | None:
-    """Compute the evidence of a bias that switches within blocks; None if there is none."""
-    switching = _search_sub_blocks(data, state, axis)
-    return (
-        switching
-        if switching is not None and _is_resolved(switching, float(state.blocks.attrs["block_s"]))
-        else None
-    )
-
-
-def _is_resolved(switching: SwitchingEvidence, block: float) -> bool:
-    """Return whether sub-blocks resolve two levels; anything shorter is a spike."""
-    return (
-        bool(np.isfinite(switching.evidence_nats))
-        and float(switching.times.min()) >= block / switching.share.shape[1]
-    )
-
-
-def _search_sub_blocks(data: xr.Dataset, state: State, axis: str) -> SwitchingEvidence | None:
-    """Search sub-blocks; None if more is named in block means than is known in sub-blocks."""
-    if len(state.given.get(("sub_block", axis), [])) < len(state.given.get(("mean", axis), [])):
-        return None
-    return switching_evidence(
-        data,
-        state.baseline,
-        axis=axis,
-        given=state.given_to("sub_block", axis),
-        settings=state.settings,
-    )
 
 
 def _with_free_levels(evidence: CandidateEvidence, trial: Trial) -> CandidateEvidence:

@@ -1,7 +1,8 @@
-"""Check that effects without a driver are present all the time."""
+"""Other forms of effects on the powers, which compete with them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,25 +11,20 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.sizes import component_mixture, disagreement_nats
+from gyrostab.diagnose.predict.sizes import component_mixture, component_size, disagreement_nats
 from gyrostab.diagnose.reduce.accumulate import RECORD_PARTS
+from gyrostab.diagnose.statistics.base import Competitor
 from gyrostab.physics.registry import effects
 
 
-def intermittent_nats(component: Component, state: State) -> float:
-    """Return by how much other sizes in the eighths of a record explain more than one [nats].
+def parts_of_record(component: Component, state: State) -> Iterator[Competitor]:
+    """Yield other sizes in the eighths of a record of an effect that acts all the time.
 
-    Zero unless they do so clearly, and for effects that may be intermittent. Noise that is present
-    only while the tool rotates has a broad spectrum too, but is neither a filter nor a wandering
-    bias.
-
-    Parameters
-    ----------
-    state : State
-        With all other effects in the model.
+    Noise that is present only while the tool rotates has a broad spectrum too, but is neither a
+    filter nor a wandering bias.
     """
-    if not (component.statistic.is_power and effects()[component.candidate.effect].is_steady):
-        return 0.0
+    if not effects()[component.candidate.effect].is_steady:
+        return
     state = replace(state, weight=condition_on(state, [component]).weight)
     size, error = np.array(
         [
@@ -42,7 +38,7 @@ def intermittent_nats(component: Component, state: State) -> float:
     allowed = state.settings.disagreement_nats + state.settings.spectrum_error_share * max(
         component.evidence_nats, 0.0
     )
-    return nats if nats > allowed else 0.0
+    yield Competitor("an effect in a part of the record", nats, allowed)
 
 
 def _fit_part(component: Component, state: State, inside: NDArray[np.int64]) -> tuple[float, float]:
@@ -57,3 +53,22 @@ def _fit_part(component: Component, state: State, inside: NDArray[np.int64]) -> 
         component, replace(state, masked=state.masked | outside)
     ).moments()
     return float(mean[0]), float(np.sqrt(covariance[0, 0]))
+
+
+def separate_filters(components: Sequence[Component], state: State) -> Iterator[Competitor]:
+    """Yield a filter for each axis.
+
+    All axes pass the same logger, which takes the same share of the noise of each. The share of the
+    strongest component is fitted on every axis, and once for all of them.
+    """
+    shown = [component for component in components if component.is_filter]
+    if not shown:
+        return
+    first = max(shown, key=lambda component: component.evidence_nats)
+    share, error = np.array(
+        [component_size(replace(first, row=(axis,)), state) for axis in state.axes]
+    ).T
+    evidence = sum(max(component.evidence_nats, 0.0) for component in shown)
+    nats = disagreement_nats(share, error**-2.0)
+    allowed = state.settings.reject_nats + state.settings.spectrum_error_share * evidence
+    yield Competitor("a filter on each axis", nats, allowed)

@@ -1,8 +1,8 @@
-"""Check telegraph biases: whether the bias has more than two levels, or levels that differ."""
+"""Levels that differ, or are more than two, and compete with a bias of two levels."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,19 +12,29 @@ from gyrostab.diagnose.evidence.visits import compare_visits
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.reduce.schema import axis_values
-from gyrostab.diagnose.statistics.telegraph import add_fast_switching, fast_switching_evidence
+from gyrostab.diagnose.statistics.base import Competitor
+from gyrostab.diagnose.statistics.fast_switching import add_fast_switching, fast_switching_evidence
 
 Array = NDArray[np.float64]
 _JUMP_CHANGES = 2  # from block to block, in the column of a jump within a block
 
 
-def further_level_nats(component: Component, state: State) -> float:
-    """Return the evidence that the bias still switches with two levels in the model [nats].
+def level_competitors(
+    components: Sequence[Component], state: State, error: float
+) -> Iterator[Competitor]:
+    """Yield levels that differ at each visit.
 
-    Zero unless it is clear. The bias then has three levels or more.
+    They win unless two levels explain clearly more, with enough switches: the bias may follow
+    something that was not recorded. Axes of one course show the same visits: that these are equal
+    counts once.
     """
-    if not component.statistic.is_switching:
-        return 0.0
+    unequal = np.array([_unequal_nats(component, state) for component in components])
+    nats = float(unequal.min() + np.maximum(unequal, 0.0)[unequal > unequal.min()].sum())
+    yield Competitor("levels that differ", nats + error + state.settings.ambiguous_nats, 0.0)
+
+
+def further_levels(component: Component, state: State) -> Iterator[Competitor]:
+    """Yield a bias that still switches with two levels in the model, of three levels or more."""
     axis, settings = component.row[0], state.settings
     allowed = settings.ambiguous_nats + settings.form_error_share * component.evidence_nats
     if component.variant.inside.size:
@@ -32,29 +42,17 @@ def further_level_nats(component: Component, state: State) -> float:
             state.blocks, add_fast_switching(state, component), axis
         )
         nats = switching.evidence_nats if switching is not None else 0.0
-        return nats if nats > allowed else 0.0
-    given_columns = np.stack(
-        [*state.given.get(("mean", axis), []), component.variant.design[0, 0]], axis=-1
-    )
-    evidence_nats, _ = telegraph_evidence(
-        state.blocks, state.baseline, axis=axis, given=given_columns, settings=settings
-    )
-    return float(evidence_nats[0]) if evidence_nats[0] > allowed else 0.0
-
-
-def unequal_levels_nats(components: Sequence[Component], state: State, *, error: float) -> float:
-    """Return by how much levels that differ at each visit explain more than two levels [nats].
-
-    Zero if two levels explain clearly more, with enough switches. Otherwise the bias may follow
-    something that was not recorded. Axes of one course show the same visits: that these are equal
-    counts once.
-    """
-    levels = [component for component in components if component.statistic.is_switching]
-    if not levels:
-        return 0.0
-    unequal = np.array([_unequal_nats(component, state) for component in levels])
-    nats = float(unequal.min() + np.maximum(unequal, 0.0)[unequal > unequal.min()].sum())
-    return max(nats + error + state.settings.ambiguous_nats, 0.0)
+    else:
+        given_columns = [*state.given.get(("mean", axis), []), component.variant.design[0, 0]]
+        evidence_nats, _ = telegraph_evidence(
+            state.blocks,
+            state.baseline,
+            axis=axis,
+            given=np.stack(given_columns, axis=-1),
+            settings=settings,
+        )
+        nats = float(evidence_nats[0])
+    yield Competitor("more than two levels", nats, allowed)
 
 
 def _unequal_nats(component: Component, state: State) -> float:

@@ -1,0 +1,172 @@
+"""Jumps at free instants, and other courses of the means that compete with them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.predict.candidates import TIME_PARAMETER, Component, Variant
+from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.predict.sizes import component_mixture, mean_mixture
+from gyrostab.diagnose.reduce.schema import axis_values
+from gyrostab.diagnose.statistics.base import Competitor
+
+Array = NDArray[np.float64]
+_JUMP = "bias_jump"
+_TRANSITION_BLOCKS = (4, 8)  # lengths of the gradual changes that a jump is compared with
+EVENT_LENGTHS = 48  # that are tried, from two blocks up
+MIN_EVENT_LIMIT_BLOCKS = 8.0
+MIN_LEVEL_BLOCKS = 3  # before and after an event, that determine the level there
+_VARIANCE_FACTORS = (10.0, 100.0, 1e3, 1e4, 1e5)  # over the usual variance of the means
+
+
+def is_free_jump(component: Component, state: State) -> bool:
+    """Return whether a component is a jump at a free instant, not at a restart."""
+    if component.candidate.effect != _JUMP or not component.is_step:
+        return False
+    ends = state.blocks["restart_end"].values if "restart_end" in state.blocks else np.empty(0)
+    return not np.isclose(ends, float(component.variant.values[TIME_PARAMETER])).any()
+
+
+def jump_competitors(
+    components: Sequence[Component], state: State, error: float
+) -> Iterator[Competitor]:
+    """Yield other courses of the means than jumps, on all axes together.
+
+    A gradual change is a straight transition over four or eight blocks about the same instant.
+
+    An event that ends lasts for two blocks to a tenth of the record, before or after the instant.
+    It is two jumps if the level after it differs from that before.
+
+    Waves slower than a block make the means scatter, and any two such neighbours look like a jump.
+    Therefore jumps must keep their evidence when the white noise of the means may be larger for
+    some time about the instant, with and without the jumps.
+    """
+    jumps = [component for component in components if is_free_jump(component, state)]
+    if not jumps:
+        return
+    settings = state.settings
+    evidence = sum(max(component.evidence_nats, 0.0) for component in jumps)
+    allowed = settings.ambiguous_nats + settings.form_error_share * evidence
+    step = sum(component_mixture(jump, state).evidence for jump in jumps)
+    gradual = max(
+        _sum_evidence(jumps, state, transition) for transition in _transition_courses(state)
+    )
+    yield Competitor("a gradual change", gradual - step, error + allowed)
+    spans = _event_spans(jumps[0], state)
+    events = [_sum_evidence(jumps, state, partial(_event_course, state, span)) for span in spans]
+    if spans:
+        best = int(np.argmax(events))
+        nats, needed = events[best] - step, np.log(len(spans)) + allowed
+        if nats > needed and not any(_is_other_level(jump, state, spans[best]) for jump in jumps):
+            yield Competitor("an event that ends", nats, needed)
+    # the search of the instant counts once: on other axes it is the same
+    search = np.log(len(jumps[0].candidate.variants)) + (len(jumps) - 1) * np.log(2.0)
+    scatter = float(search - sum(_evidence_in_scatter(jump, state) for jump in jumps))
+    yield Competitor("means that scatter for a while", scatter, settings.ambiguous_nats)
+
+
+def _sum_evidence(
+    jumps: Sequence[Component], state: State, course: Callable[[Component], Array]
+) -> float:
+    """Return the log evidence of another course (block,) in place of jumps, of free size."""
+    return sum(
+        component_mixture(jump, state, _with_course(jump, course(jump))).evidence for jump in jumps
+    )
+
+
+def _with_course(jump: Component, *courses: Array) -> Variant:
+    """Return the variant of a jump with courses (block,) instead of the step."""
+    shape = jump.variant.design.shape
+    design = np.concatenate([np.broadcast_to(course, shape) for course in courses])
+    return replace(jump.variant, design=design)
+
+
+def _transition_courses(state: State) -> list[Callable[[Component], Array]]:
+    """Return the courses of gradual changes, for each length."""
+    block = float(state.blocks.attrs["block_s"])
+    middle = (np.arange(state.blocks.sizes["block"]) + 0.5) * block
+
+    def transition(length: int, jump: Component) -> Array:
+        after = middle - float(jump.variant.values[TIME_PARAMETER])
+        return np.clip(after / (length * block) + 0.5, 0.0, 1.0)
+
+    return [partial(transition, length) for length in _TRANSITION_BLOCKS]
+
+
+def _event_course(state: State, span: tuple[int, int], jump: Component) -> Array:
+    """Return the course of an event over these blocks."""
+    block = np.arange(state.blocks.sizes["block"])
+    return ((block >= span[0]) & (block < span[1])).astype(np.float64)
+
+
+def _evidence_in_scatter(component: Component, state: State) -> float:
+    """Return the log Bayes factor of a jump in means that may be noisy for a while [nats]."""
+    variances = _possible_variances(component, state)
+    jump = [component_mixture(component, state, variance=variance) for variance in variances]
+    none = [mean_mixture(state, component.row[0], [], variance=variance) for variance in variances]
+    with_jump, without = (
+        np.array([mixture.evidence for mixture in mixtures]) for mixtures in (jump, none)
+    )
+    likely = jump[int(with_jump.argmax())]
+    size, covariance = likely.moments()
+    wide = max(abs(float(size[0])), float(np.sqrt(covariance[0, 0]))) * float(
+        np.ptp(component.variant.design)
+    )
+    return float(np.logaddexp.reduce(with_jump) - np.logaddexp.reduce(without) - np.log(wide) - 0.5)
+
+
+def _possible_variances(component: Component, state: State) -> list[Array]:
+    """Return white variances of the means: the usual, and larger ones for a time near the jump."""
+    axis, block_count = component.row[0], state.blocks.sizes["block"]
+    block = np.arange(block_count)
+    at = round(
+        float(component.variant.values[TIME_PARAMETER]) / float(state.blocks.attrs["block_s"])
+    )
+    lengths = [2**power for power in range(1, max(block_count, 2).bit_length())]
+    spans = {
+        (max(at - blocks_before, 0), min(at + blocks_after, block_count))
+        for length in lengths
+        for blocks_before, blocks_after in ((length, length), (0, length), (length, 0))
+    }
+    usual = axis_values(state.baseline, "mean_variance", axis)
+    inside = [(block >= first) & (block < stop) for first, stop in sorted(spans)]
+    return [
+        usual,
+        *(
+            np.where(is_inside, factor * usual, usual)
+            for is_inside in inside
+            for factor in _VARIANCE_FACTORS
+        ),
+    ]
+
+
+def _event_spans(component: Component, state: State) -> list[tuple[int, int]]:
+    """Return the first and last edges of events that begin or end at a jump."""
+    block, block_count = float(state.blocks.attrs["block_s"]), state.blocks.sizes["block"]
+    at = round(float(component.variant.values[TIME_PARAMETER]) / block)
+    lengths = np.unique(
+        np.geomspace(
+            2.0,
+            max(state.settings.max_event_share * block_count, MIN_EVENT_LIMIT_BLOCKS),
+            EVENT_LENGTHS,
+        ).astype(int)
+    ).tolist()
+    spans = [span for length in lengths for span in ((at, at + length), (at - length, at))]
+    return [
+        (first, stop)
+        for first, stop in spans
+        if first >= MIN_LEVEL_BLOCKS and stop <= block_count - MIN_LEVEL_BLOCKS
+    ]
+
+
+def _is_other_level(jump: Component, state: State, span: tuple[int, int]) -> bool:
+    """Return whether the level after an event clearly differs from that before it."""
+    behind = (np.arange(state.blocks.sizes["block"]) >= span[1]).astype(np.float64)
+    with_level = _with_course(jump, _event_course(state, span, jump), behind)
+    size, covariance = component_mixture(jump, state, with_level).moments()
+    return bool(abs(size[-1]) > state.settings.clear_sigma * np.sqrt(covariance[-1, -1]))
