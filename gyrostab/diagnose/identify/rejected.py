@@ -8,7 +8,6 @@ from dataclasses import replace
 
 from gyrostab.diagnose.identify.components import axes_of, sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.identifiability import keep_physical
 from gyrostab.diagnose.identify.identification import (
     Rejection,
     Selection,
@@ -16,7 +15,6 @@ from gyrostab.diagnose.identify.identification import (
 )
 from gyrostab.diagnose.identify.nuisance_alternatives import NUISANCE_ALTERNATIVES
 from gyrostab.diagnose.identify.settling import evidence_instead
-from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State
 
@@ -27,6 +25,7 @@ def find_rejections(
     components: Mapping[str, Sequence[Component]],
     identified: Sequence[Selection],
     unidentified: Sequence[Selection],
+    beaten: Mapping[str, tuple[str, float]],
     state: State,
     examination: Examination,
 ) -> list[Rejection]:
@@ -35,8 +34,8 @@ def find_rejections(
     The noise beats an effect that lacks evidence both with all selections in the model and in
     place of any of them. A selection beats it if the effect has enough evidence in its place;
     among several, it is the one in whose place the evidence is largest. If the effect has enough
-    evidence although all selections are in the model, another form of it or a time-shifted channel
-    beats it. `components` of every candidate and `state` have all selections in the model.
+    evidence although all selections are in the model, what beat it in the selection does, by key in
+    `beaten`. `components` of every candidate and `state` have all selections in the model.
     """
     settled: list[Selection] = [*identified, *unidentified]
     chosen: list[Selection] = [
@@ -63,7 +62,11 @@ def find_rejections(
         )
         instead = winner.instead.get(key, -math.inf) if winner else -math.inf
         if added_nats > threshold + error:
-            name, nats = _find_veto(effect_components, chosen, state, examination, error)
+            name, nats = (
+                _find_withdrawn(effect, chosen)
+                or beaten.get(key)
+                or _find_strongest(effect_components, chosen)
+            )
         elif winner and instead > threshold:
             name, nats = _name_of(winner), winner.evidence_nats - instead
         else:
@@ -77,24 +80,22 @@ def find_rejections(
     return [rejection for _, rejection in out.values()]
 
 
-def _find_veto(
-    components: Sequence[Component],
-    chosen: Sequence[Selection],
-    state: State,
-    examination: Examination,
-    error: float,
+def _find_withdrawn(effect: str, chosen: Sequence[Selection]) -> tuple[str, float] | None:
+    """Return what is left of an effect that was withdrawn: with it, the noise still changes."""
+    return next(
+        (
+            (_name_of(selection), selection.evidence_nats)
+            for selection in chosen
+            if not selection.is_named and not selection.instead and effect in selection.alternatives
+        ),
+        None,
+    )
+
+
+def _find_strongest(
+    components: Sequence[Component], chosen: Sequence[Selection]
 ) -> tuple[str, float]:
-    """Return what beats an effect with enough evidence, and by how much."""
-    effect = components[0].candidate.effect
-    for selection in chosen:  # withdrawn: with the effect in the model, the noise still changes
-        if not selection.is_named and not selection.instead and effect in selection.alternatives:
-            return NUISANCE_ALTERNATIVES[selection.effect], selection.evidence_nats
-    _, better_form = keep_physical(components, state, error=error)
-    if better_form:
-        return better_form
-    shifts = passes_time_shift_test(components, state, examination.folds)
-    if not shifts.passed:
-        return "a time-shifted channel", shifts.nats
+    """Return the strongest selection in the statistics of an effect."""
     statistics = {component.statistic for component in components}
     rivals = [
         selection

@@ -31,7 +31,7 @@ from gyrostab.diagnose.identify.settling import prune_selections, settle_selecti
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.identify.switching import drop_explained_jumps
 from gyrostab.diagnose.identify.withdrawal import withdraw_effects
-from gyrostab.diagnose.predict.candidates import CandidateEvidence
+from gyrostab.diagnose.predict.candidates import CandidateEvidence, Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import reusable_evidence
@@ -59,7 +59,7 @@ def select_effects(
     state : State
         With all of these in the model.
     """
-    selected, all_evidence = _select_all(examination)
+    selected, all_evidence, beaten = _select_all(examination)
     chosen = without_pulses(drop_explained_jumps(selected, examination), examination.settings)
     chosen, identified = settle_selections(examination, prune_selections(examination, chosen))
     unidentified = [selection for selection in chosen if not selection.is_named]
@@ -72,14 +72,23 @@ def select_effects(
     is_unchanged = _variants_by_row(selected) == _variants_by_row([*remaining, *unidentified])
     all_evidence = score_candidates(examination, state, (), all_evidence if is_unchanged else ())
     components = merge_lines(group_components(all_evidence, settings=examination.settings))
-    rejected = find_rejections(components, remaining, unidentified, state, examination)
+    rejected = find_rejections(components, remaining, unidentified, beaten, state, examination)
     return remaining, unidentified, rejected, state
 
 
-def _select_all(examination: Examination) -> tuple[list[Selection], list[CandidateEvidence]]:
+def _select_all(
+    examination: Examination,
+) -> tuple[list[Selection], list[CandidateEvidence], dict[str, tuple[str, float]]]:
     """Select the best candidate, put it into the model, and repeat while one passes.
 
-    The second result is the evidence of the others, with all of these in the model.
+    Returns
+    -------
+    chosen : list of Selection
+    all_evidence : list of CandidateEvidence
+        Evidence of the others, with all of these in the model.
+    beaten : dict of str to (str, float)
+        Key of each candidate that passed the threshold and was not selected -> another form or a
+        time-shifted channel, and by how much it explained more [nats].
     """
     chosen: list[Selection] = []
     state = previous = examination.start
@@ -93,14 +102,16 @@ def _select_all(examination: Examination) -> tuple[list[Selection], list[Candida
     }
     effects_left, lines_left = MAX_EFFECTS, MAX_LINES
     all_evidence: list[CandidateEvidence] = []
+    beaten: dict[str, tuple[str, float]] = {}
     while effects_left > 0:
         known_evidence = reusable_evidence(all_evidence, previous, state)
         all_evidence, previous = score_candidates(examination, state, barred, known_evidence), state
-        selected = _select_next(examination, all_evidence, state, chosen)
+        selected = _select_next(examination, all_evidence, state, chosen, beaten)
         if selected is None:
-            return chosen, all_evidence
-        selections, rejected = selected
-        barred |= rejected
+            return chosen, all_evidence, beaten
+        selections, shifted = selected
+        beaten |= shifted
+        barred |= shifted.keys()
         for selection in selections:
             if are_lines(selection.components):
                 lines_left -= 1
@@ -110,7 +121,7 @@ def _select_all(examination: Examination) -> tuple[list[Selection], list[Candida
             chosen = add_selection(chosen, selection)
             barred |= _explained_count_keys(examination, selection)
             state = condition_on(state, list(selection.components))
-    return chosen, []
+    return chosen, [], beaten
 
 
 def _explained_count_keys(examination: Examination, selection: Selection) -> set[str]:
@@ -184,11 +195,13 @@ def _select_next(
     all_evidence: list[CandidateEvidence],
     state: State,
     chosen: Sequence[Selection],
-) -> tuple[list[Selection], set[str]] | None:
+    beaten: dict[str, tuple[str, float]],
+) -> tuple[list[Selection], dict[str, tuple[str, float]]] | None:
     """Select the next effect or pair of effects, or the nuisance alternative that explains more.
 
-    Returns the selections, none when only effects passed that fail the time-shift test, and the
-    keys that fail it; None instead of both when nothing passes.
+    Effects that another form beats are added to `beaten`. Returns the selections, none when only
+    effects passed that fail the time-shift test, and by how much a time-shifted channel explains
+    more than those that fail it; None instead of both when nothing passes.
     """
     settings = examination.settings
     components = merge_lines(group_components(all_evidence, settings=settings))
@@ -198,47 +211,58 @@ def _select_next(
     }
     for key, effect_components in list(components.items()):
         if not key.startswith("~") and sum_evidence(effect_components) > required[key]:
-            components[key], _ = keep_physical(
+            components[key], better_form = keep_physical(
                 effect_components, state, error=required[key] - examination.threshold
             )
+            if better_form:
+                beaten[key] = better_form
+            else:
+                beaten.pop(key, None)
     passing = order_passing(components, required, state, examination)
     if not passing:
         return None
     rivals = order_rivals(passing, components, state, examination)
     pair = [] if rivals else find_pair(examination, passing, components, required, state)
     if pair:
-        failed = {
-            key
+        shifted = {
+            key: beaten_by
             for key, effect_components, with_other in pair
-            if not passes_time_shift_test(effect_components, with_other, examination.folds).passed
+            if (beaten_by := _find_shifted(effect_components, with_other, examination))
         }
-        if failed:
-            return [], failed
+        if shifted:
+            return [], shifted
         return [
             make_selection(effect_components, required[key]) for key, effect_components, _ in pair
-        ], set()
-    rejected: set[str] = set()
+        ], {}
+    failed: dict[str, tuple[str, float]] = {}
     for key in rivals:
-        if passes_time_shift_test(components[key], state, examination.folds).passed:
-            min_nats = sum_evidence(components[key]) - settings.ambiguous_nats
-            close = [
-                components[other][0].candidate.effect
-                for other in rivals
-                if other != key
-                and other not in rejected
-                and sum_evidence(components[other]) >= min_nats
-            ]
-            identification = make_selection(components[key], required[key], alternatives=close)
-            return [identification], rejected
-        rejected.add(key)
-    if rejected:
-        return [], rejected
+        beaten_by = _find_shifted(components[key], state, examination)
+        if beaten_by:
+            failed[key] = beaten_by
+            continue
+        min_nats = sum_evidence(components[key]) - settings.ambiguous_nats
+        close = [
+            components[other][0].candidate.effect
+            for other in rivals
+            if other != key and other not in failed and sum_evidence(components[other]) >= min_nats
+        ]
+        return [make_selection(components[key], required[key], alternatives=close)], failed
+    if failed:
+        return [], failed
     alternative = passing[0]
     effects = [key for key in passing if not key.startswith("~")]
     nearest = [components[key][0].candidate.effect for key in effects[:3]]
     return [
         make_selection(components[alternative], required[alternative], alternatives=nearest)
-    ], set()
+    ], {}
+
+
+def _find_shifted(
+    components: Sequence[Component], state: State, examination: Examination
+) -> tuple[str, float] | None:
+    """Return the time-shifted channel that beats an effect, and by how much [nats]."""
+    shifts = passes_time_shift_test(components, state, examination.folds)
+    return None if shifts.passed else ("a time-shifted channel", shifts.nats)
 
 
 def _variants_by_row(chosen: Sequence[Selection]) -> set[tuple[str, tuple[str, ...], int]]:

@@ -57,7 +57,7 @@ def test_a_channel_that_two_others_make_superfluous_is_dropped():
         name: (30.0 + 5.0 * course, "degC") for name, course in zip(names, courses, strict=True)
     }
     examination = _examine(values, 1.0, channels, ("temperature_bias",))
-    chosen, _ = selecting._select_all(examination)
+    chosen, *_ = selecting._select_all(examination)
     assert chosen[0].driver == ("temperature",)
     _, settled = settle_selections(examination, prune_selections(examination, chosen))
     assert {identification.driver for identification in settled} == {(names[1],), (names[2],)}
@@ -72,7 +72,7 @@ def test_an_effect_stays_beside_an_unidentified_burst():
     values = 0.18 * np.sqrt(5.0 * np.repeat(level, 100)) * rng.standard_normal(BLOCKS * 100)
     channels = {"vibration": (np.repeat(vibration, 100), "g")}
     examination = _examine(values, 5.0, channels, ("vibration_noise", "~N(t)", "~burst"))
-    chosen, _ = selecting._select_all(examination)
+    chosen, *_ = selecting._select_all(examination)
     named = [selection for selection in chosen if selection.is_named]
     others = [selection for selection in chosen if not selection.is_named]
     assert [selection.effect for selection in named] == ["vibration_noise"]
@@ -115,11 +115,24 @@ def test_both_of_a_pair_are_selected_at_once():
     values += 0.3 * ((second >= 1000) & (second < 2200))
     examination = _examine(values, 1.0, {}, ("bias_jump", "~levels"))
     evidence = selecting.score_candidates(examination, examination.start, ())
-    selections, failed = selecting._select_next(examination, evidence, examination.start, [])
+    selections, failed = selecting._select_next(examination, evidence, examination.start, [], {})
     (first, other) = (selection.components for selection in selections)
     at = sorted(component.variant.values["at"] for component in (*first, *other))
     assert at == pytest.approx([1000.0, 2200.0], abs=20.0)
     assert not failed
+
+
+def test_the_form_that_beats_an_effect_is_recorded():
+    second = np.arange(BLOCKS * 20)
+    values = 0.18 * np.random.default_rng(2).standard_normal(second.size)
+    values += 2.0 * np.clip((second - 1700.0) / 160.0, 0.0, 1.0)
+    examination = _examine(values, 1.0, {}, ("bias_jump",))
+    evidence = selecting.score_candidates(examination, examination.start, ())
+    beaten = {}
+    assert selecting._select_next(examination, evidence, examination.start, [], beaten) is None
+    name, nats = beaten["bias_jump"]
+    assert name == "a gradual change"
+    assert nats > 3.0
 
 
 def test_rejected_channels_do_not_use_up_the_number_of_effects(monkeypatch):
@@ -127,7 +140,8 @@ def test_rejected_channels_do_not_use_up_the_number_of_effects(monkeypatch):
 
     def select_next(*_):
         number = next(rounds)
-        return ([], {f"channel {number}"}) if number < 2 * selecting.MAX_EFFECTS else None
+        failed = {f"channel {number}": ("a time-shifted channel", 1.0)}
+        return ([], failed) if number < 2 * selecting.MAX_EFFECTS else None
 
     monkeypatch.setattr(selecting, "_select_next", select_next)
     monkeypatch.setattr(selecting, "score_candidates", lambda *_: [])
