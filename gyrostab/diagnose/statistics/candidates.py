@@ -197,7 +197,7 @@ def _nuisance_grid(kind: type[Effect], windows: Windows) -> Iterator[dict[str, A
     """Yield values of the nuisance parameters and choices."""
     try:
         grid: dict[str, Sequence[Any]] = {
-            name: select_step_times(values, windows) if name == TIME_PARAMETER else values
+            name: select_step_times(values, windows) if name == TIME_PARAMETER else list(values)
             for name, values in kind.example().nuisance(windows).items()
         }
     except KeyError:
