@@ -35,12 +35,7 @@ from gyrostab.diagnose.result.attribution import drop_expected
 from gyrostab.diagnose.result.diagnosis import Diagnosis
 from gyrostab.diagnose.result.finish import finish_diagnosis
 from gyrostab.diagnose.settings import DEFAULTS, Settings
-from gyrostab.diagnose.task import (
-    Comparison,
-    Task,
-    lines_without_motion,
-    take_lines_at_rest,
-)
+from gyrostab.diagnose.task import Comparison, Task, lines_without_motion, take_lines_at_rest
 from gyrostab.errors import SchemaError
 from gyrostab.ingest.convert import as_log
 from gyrostab.progress import Stage, no_stage

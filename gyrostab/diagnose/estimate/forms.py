@@ -8,10 +8,7 @@ from dataclasses import replace
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.identify.identification import (
-    Identifications,
-    Selection,
-)
+from gyrostab.diagnose.identify.identification import Identifications, Selection
 from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture

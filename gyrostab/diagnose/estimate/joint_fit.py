@@ -13,10 +13,7 @@ from scipy.special import ndtr, ndtri
 
 from gyrostab.diagnose.estimate.filter_sizes import fit_filter_sizes
 from gyrostab.diagnose.estimate.split_components import split_harmonics, split_steps
-from gyrostab.diagnose.identify.identification import (
-    Identifications,
-    Selection,
-)
+from gyrostab.diagnose.identify.identification import Identifications, Selection
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.reduce.zero_bin import truncated_axes

@@ -9,11 +9,7 @@ import xarray as xr
 
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.components import group_components
-from gyrostab.diagnose.identify.identification import (
-    Selection,
-    condition_on_selections,
-    form_error,
-)
+from gyrostab.diagnose.identify.identification import Selection, condition_on_selections, form_error
 from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import compute_evidence

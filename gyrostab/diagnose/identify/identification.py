@@ -176,6 +176,26 @@ def with_axes_of(
     )
 
 
+def reduce_selection(
+    selection: Selection,
+    axes: Iterable[str],
+    components: Iterable[Component],
+    evidence_nats: float,
+) -> Selection:
+    """Return a selection with some of its axes and components.
+
+    Its alternatives are compared with it, and lose the same axes.
+    """
+    change_nats = evidence_nats - selection.evidence_nats
+    return replace(
+        selection,
+        axes=tuple(axes),
+        components=tuple(components),
+        evidence_nats=evidence_nats,
+        instead={key: nats + change_nats for key, nats in selection.instead.items()},
+    )
+
+
 def _is_same_effect(first: Selection, other: Selection) -> bool:
     lines = {
         component.place

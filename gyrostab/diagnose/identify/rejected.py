@@ -8,11 +8,7 @@ from dataclasses import replace
 
 from gyrostab.diagnose.identify.components import axes_of, sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.identification import (
-    Rejection,
-    Selection,
-    form_error,
-)
+from gyrostab.diagnose.identify.identification import Rejection, Selection, form_error
 from gyrostab.diagnose.identify.nuisance_alternatives import NUISANCE_ALTERNATIVES
 from gyrostab.diagnose.identify.settling import evidence_instead
 from gyrostab.diagnose.predict.candidates import Component

@@ -7,10 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
-from gyrostab.diagnose.identify.ambiguity import (
-    find_equivalent_effects,
-    find_spectral_alternatives,
-)
+from gyrostab.diagnose.identify.ambiguity import find_equivalent_effects, find_spectral_alternatives
 from gyrostab.diagnose.identify.components import (
     PLAIN_LINE,
     candidates_of,
@@ -19,11 +16,7 @@ from gyrostab.diagnose.identify.components import (
 )
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifiability import keep_physical
-from gyrostab.diagnose.identify.identification import (
-    Selection,
-    components_of,
-    with_axes_of,
-)
+from gyrostab.diagnose.identify.identification import Selection, components_of, with_axes_of
 from gyrostab.diagnose.identify.switching import renew_component
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on

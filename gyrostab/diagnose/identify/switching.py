@@ -14,10 +14,7 @@ import numpy as np
 from gyrostab.diagnose.evidence.telegraph import telegraph_evidence
 from gyrostab.diagnose.identify.components import axes_of, evidence_of
 from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.identification import (
-    Selection,
-    components_of,
-)
+from gyrostab.diagnose.identify.identification import Selection, components_of
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from gyrostab.diagnose.identify.components import split_layers, sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
@@ -11,6 +10,7 @@ from gyrostab.diagnose.identify.identification import (
     Selection,
     components_of,
     make_selection,
+    reduce_selection,
 )
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.statistics.left_structure import (
@@ -168,15 +168,8 @@ def _without_part_of_drift(
         ]
         evidence_nats = sum(max(sum_evidence(layer), 0.0) for layer in split_layers(elsewhere))
         if evidence_nats >= threshold:
-            axes = tuple(name for name in identification.axes if name != axis)
-            remaining.append(
-                replace(
-                    identification,
-                    components=tuple(elsewhere),
-                    axes=axes,
-                    evidence_nats=evidence_nats,
-                )
-            )
+            axes = [name for name in identification.axes if name != axis]
+            remaining.append(reduce_selection(identification, axes, elsewhere, evidence_nats))
     return remaining
 
 

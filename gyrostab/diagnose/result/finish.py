@@ -21,11 +21,7 @@ from gyrostab.diagnose.estimate.conditioned_baseline import (
 from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_expected, fit_identifications
 from gyrostab.diagnose.estimate.recalibrate import recalibrate, refer_to_kept_noise, with_noise
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
-from gyrostab.diagnose.identify.identification import (
-    Identifications,
-    Selection,
-    components_of,
-)
+from gyrostab.diagnose.identify.identification import Identifications, Selection, components_of
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.channel_use import unused_channels
 from gyrostab.diagnose.result.attribution import active_blocks, attribute_mismatches

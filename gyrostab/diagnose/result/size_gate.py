@@ -12,6 +12,7 @@ from gyrostab.diagnose.identify.identification import (
     Identifications,
     Rejection,
     Selection,
+    reduce_selection,
 )
 from gyrostab.physics.registry import effects
 
@@ -79,20 +80,9 @@ def keep_supported(
             component for component in identification.components if component not in supported
         )
         if sum_evidence(supported) > identification.threshold:
-            axes = tuple(axis for axis in identification.axes if axis in good)
+            axes = [axis for axis in identification.axes if axis in good]
             evidence_nats = min(identification.evidence_nats, sum_evidence(supported))
-            # its alternatives are compared with it, and lose the same axes
-            change_nats = evidence_nats - identification.evidence_nats
-            instead = {key: nats + change_nats for key, nats in identification.instead.items()}
-            identified.append(
-                replace(
-                    identification,
-                    components=supported,
-                    axes=axes,
-                    evidence_nats=evidence_nats,
-                    instead=instead,
-                )
-            )
+            identified.append(reduce_selection(identification, axes, supported, evidence_nats))
         else:
             lost = identification.components
             rejected.append(

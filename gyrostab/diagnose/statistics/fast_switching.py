@@ -5,13 +5,8 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.evidence.fast_switching import (
-    SwitchingEvidence,
-    switching_evidence,
-)
-from gyrostab.diagnose.predict.candidates import (
-    Component,
-)
+from gyrostab.diagnose.evidence.fast_switching import SwitchingEvidence, switching_evidence
+from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
 

@@ -9,10 +9,7 @@ from dataclasses import replace
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.evidence.fast_switching import (
-    SwitchingEvidence,
-    switching_powers,
-)
+from gyrostab.diagnose.evidence.fast_switching import SwitchingEvidence, switching_powers
 from gyrostab.diagnose.evidence.telegraph import (
     PARTS_PER_BLOCK,
     TelegraphCourses,

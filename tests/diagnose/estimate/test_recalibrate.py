@@ -8,11 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import (
-    assemble_baseline,
-    calibrate_axes,
-    calibrate_noise,
-)
+from gyrostab.diagnose.baseline.calibrate import assemble_baseline, calibrate_axes, calibrate_noise
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.estimate.forms import settle_forms
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications

@@ -10,10 +10,7 @@ from scipy.signal import lfilter
 
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
-from gyrostab.diagnose.evidence.telegraph import (
-    telegraph_courses,
-    telegraph_evidence,
-)
+from gyrostab.diagnose.evidence.telegraph import telegraph_courses, telegraph_evidence
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import keep_physical
 from gyrostab.diagnose.identify.identification import Identifications, Selection

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,9 +13,7 @@ from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify import selection as selecting
 from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.identification import (
-    make_selection,
-)
+from gyrostab.diagnose.identify.identification import make_selection
 from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
 from gyrostab.diagnose.identify.settling import prune_selections, settle_selections
 from gyrostab.diagnose.identify.withdrawal import _without_part_of_drift, withdraw_effects
@@ -99,12 +98,14 @@ def _explain(effect, statistic, evidence):
 )
 def test_a_drift_takes_only_what_it_explains_on_its_axis(jump_nats, on_x, remaining_axes):
     jump = make_selection(_explain("bias_jump", "mean", jump_nats), 8.0)
+    jump = replace(jump, instead={"warm_up": jump.evidence_nats - 5.0})
     parts = _explain("~bias(t)", "mean", {"x": on_x, "y": 201.0})
     drift = make_selection(parts, 8.0)
     remaining = _without_part_of_drift([jump], [drift], "x", 8.0)
     assert [identification.axes for identification in remaining] == remaining_axes
     for identification in remaining:
         assert identification.evidence_nats == sum(jump_nats[axis] for axis in identification.axes)
+        assert identification.instead == {"warm_up": identification.evidence_nats - 5.0}
         assert {component.row for component in identification.components} == {identification.axes}
 
 
