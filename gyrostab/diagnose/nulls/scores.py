@@ -75,7 +75,7 @@ class NullScores:
     def p_value(self, statistic: str, z: Array | float) -> Array:
         """Return the probability that a null record is as extreme in any statistic as `z` here."""
         surprise = self.statistics[statistic].tail.surprise(np.square(z) / 2.0)
-        return np.maximum(self.family.probability(surprise), _MIN_SCORE_P_VALUE)
+        return np.asarray(np.maximum(self.family.probability(surprise), _MIN_SCORE_P_VALUE))
 
     def critical(self, statistic: str, level: float) -> float:
         """Return the standardised score of a statistic at which the p-value is `level`."""

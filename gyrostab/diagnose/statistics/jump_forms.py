@@ -93,7 +93,7 @@ def _transition_courses(state: State) -> list[Callable[[Component], Array]]:
 
     def transition(length: int, jump: Component) -> Array:
         after = middle - float(jump.variant.values[TIME_PARAMETER])
-        return np.clip(after / (length * block) + 0.5, 0.0, 1.0)
+        return np.asarray(np.clip(after / (length * block) + 0.5, 0.0, 1.0))
 
     return [partial(transition, length) for length in _TRANSITION_BLOCKS]
 
