@@ -161,7 +161,7 @@ def _read_frame(
     kind: str | None = None,
 ) -> xr.Dataset:
     """Read a pandas table into a raw log, by the rules for files."""
-    from gyrostab.ingest.columns.headers import split_header
+    from gyrostab.ingest.columns.headers import FileColumn, split_header
     from gyrostab.ingest.columns.plan import plan_columns
     from gyrostab.ingest.columns.typed import read_columns
     from gyrostab.ingest.files import check_options
@@ -202,7 +202,8 @@ def _read_frame(
         return stamps[begin:end] if source == 0 else table.iloc[begin:end, source - 1].to_numpy()
 
     try:
-        plan = plan_columns(Path("DataFrame"), ["time", *headers], options, stamped=[0])
+        columns = [FileColumn("time", stamped=True), *(FileColumn(header) for header in headers)]
+        plan = plan_columns(Path("DataFrame"), columns, options)
         raw = read_columns(plan, options, len(table), fetch)
         check_options([raw])
     except MissingUnitError as error:

@@ -50,6 +50,18 @@ KNOWN_CHANNEL_PATTERN = re.compile(
 TEMPERATURE_PATTERN = re.compile(r"temp|(^|[^a-z])tmp")
 
 
+@dataclass(frozen=True)
+class FileColumn:
+    """A column as its format describes it."""
+
+    header: str  # as written, or "0", "1", ... in a file without a header
+    unit: str | None = None  # that the format stores outside the header
+    calendar: str | None = None  # the CF calendar of that unit
+    stamped: bool = False  # holds dates (text, datetime types)
+    date_order: str | None = YEAR_FIRST  # of these dates; None if they can be read in two ways
+    target: str | None = None  # by a code of the format, in the form of --map, which overrules it
+
+
 @dataclass
 class Header:
     """A column whose role is being determined."""
@@ -132,9 +144,9 @@ def _parse_or_none(parse: Callable[..., _T], *arguments: str) -> _T | None:
         return None
 
 
-def distinct_columns(headers: Sequence[str]) -> Iterator[Header]:
+def distinct_columns(columns: Sequence[FileColumn]) -> Iterator[Header]:
     """Yield the columns, each with a unique key: name, header or numbered name."""
-    split = [(header.strip(), *split_header(header)) for header in headers]
+    split = [(column.header.strip(), *split_header(column.header)) for column in columns]
     names = Counter(name.lower() for _, name, _ in split)
     header_counts = Counter(header.lower() for header, _, _ in split)
     used_names = header_counts.keys() | names.keys()
@@ -146,7 +158,18 @@ def distinct_columns(headers: Sequence[str]) -> Iterator[Header]:
             number = counts[key.lower()]
             key = key if number == 1 else free_name(f"{name}_", used_names, number)
             used_names.add(key.lower())
-        yield Header(source, header, name, unit, key=key)
+        column = columns[source]
+        yield Header(
+            source,
+            header,
+            name,
+            unit,
+            stored=column.unit,
+            calendar=column.calendar,
+            stamped=column.stamped,
+            date_order=column.date_order,
+            key=key,
+        )
 
 
 def free_name(stem: str, used_names: Collection[str], number: int = 2) -> str:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from gyrostab.errors import GyrostabError, OptionError
-from gyrostab.ingest.columns.headers import AXIS_PATTERN, split_header
+from gyrostab.ingest.columns.headers import AXIS_PATTERN, FileColumn, split_header
 from gyrostab.ingest.columns.plan_draft import (
     MAX_HEADERS,
     Column,
@@ -56,33 +56,17 @@ class Plan:
 
 def plan_columns(
     path: Path,
-    headers: Sequence[str],
+    columns: Sequence[FileColumn],
     options: ReadOptions,
     *,
-    units: Mapping[int, str] | None = None,
-    calendars: Mapping[int, str] | None = None,
-    stamped: Collection[int] = (),
-    orders: Mapping[int, str | None] | None = None,
     rising: Callable[[int], bool] | None = None,
     above: Sequence[str] = (),
     is_filled: Callable[[int], bool] | None = None,
-    coded: Mapping[int, str] | None = None,
 ) -> Plan:
     """Determine the role and unit of each column.
 
     Parameters
     ----------
-    headers : sequence of str
-        Header cells as written, or ``"0"``, ``"1"``, ... for a file without a header.
-    units : mapping of int to str, optional
-        Units that the format stores outside the header (NetCDF attributes).
-    calendars : mapping of int to str, optional
-        CF calendars of those units that name an epoch.
-    stamped : collection of int
-        Columns whose values are dates (text, datetime types).
-    orders : mapping of int to str or None, optional
-        Order of day, month and year in columns of text: one of `gyrostab.ingest.columns.dates`, or
-        None if they can be read in two ways; the year comes first in others.
     rising : callable, optional
         Returns whether the first values of a column rise; decides between several candidates for
         the time column.
@@ -90,34 +74,24 @@ def plan_columns(
         Lines above the header, which may identify the program that wrote the file.
     is_filled : callable, optional
         Returns whether any of the first cells of a column is filled.
-    coded : mapping of int to str, optional
-        Roles of columns by a code of the format, in the form of ``--map``, which overrules them.
 
     Returns
     -------
     Plan
         ``Plan.check()`` raises the first problem.
     """
-    check_columns(path, len(headers), options.limits)
+    check_columns(path, len(columns), options.limits)
+    headers = [column.header for column in columns]
     split = [(header, split_header(header)[0]) for header in headers]
     preset = PresetMatch("")
     if not any(AXIS_PATTERN.match(name.lower()) for _, name in split):  # named gyro_x ... already
         preset = find_preset(path, split, above=above, is_filled=is_filled)
     draft = PlanDraft(path, options, rising)
-    named = name_columns(
-        draft,
-        headers,
-        units or {},
-        calendars or {},
-        frozenset(stamped),
-        orders or {},
-        {**(coded or {}), **preset.columns},
-    )
-    named = resolve_duplicates(draft, named)
+    named = resolve_duplicates(draft, name_columns(draft, columns, preset.columns))
     time = find_time(draft, named)
     data_columns = [column for column in named if column is not time]
     gyro = [column for column in data_columns if AXIS_PATTERN.match(column.low)]
-    signal, kind = plan_gyro(draft, gyro, headers)
+    signal, kind = plan_gyro(draft, gyro, columns)
     plan_channels(draft, [column for column in data_columns if not AXIS_PATTERN.match(column.low)])
     rate = preset.rate if time is None and options.rate is None else None
     if preset.name:
@@ -137,17 +111,17 @@ def plan_columns(
             "there is no time column; give the sampling rate with --rate HZ (and --start), or "
             f"name the column: --map NAME=time. Columns: {list_some(headers, MAX_HEADERS)}",
         )
-    draft.add_notes(headers)
+    draft.add_notes(columns)
     unused = [f"--unit {key}" for key in options.unit if key not in draft.used_units]
     unmatched = [f"--map {key}" for key in options.map if key not in draft.used_map] + unused
     order = {"time": 0, "gyro": 1, "channel": 2}
-    columns = sorted(
+    planned = sorted(
         draft.columns,
         key=lambda column: (order[column.role], column.name if column.role == "gyro" else ""),
     )
     return Plan(
         path,
-        tuple(columns),
+        tuple(planned),
         tuple(draft.summaries),
         signal,
         kind,

@@ -24,6 +24,7 @@ from gyrostab.ingest.columns.headers import (
     KNOWN_CHANNEL_PATTERN,
     TEMPERATURE_PATTERN,
     TIME_PATTERN,
+    FileColumn,
     Header,
     channel_name,
     distinct_columns,
@@ -183,7 +184,7 @@ def _time_unit(draft: PlanDraft, column: Header) -> TimeUnit | None:
 
 
 def plan_gyro(
-    draft: PlanDraft, gyro: list[Header], headers: Sequence[str]
+    draft: PlanDraft, gyro: list[Header], columns: Sequence[FileColumn]
 ) -> tuple[str | None, str | None]:
     """Plan the gyro axes; return signal and kind (rates, increments or cumulative angles)."""
     if draft.options.channels_only:
@@ -193,7 +194,7 @@ def plan_gyro(
         return None, None
     if not gyro:
         if not draft.problems:
-            draft.refuse(FormatError, _describe_lack(draft.path, headers))
+            draft.refuse(FormatError, _describe_lack(draft.path, columns))
         return None, None
     quantities: dict[str, str] = {}
     for column in gyro:
@@ -402,10 +403,10 @@ def _plan_channel(
     draft.add_summary(column, stored, "channel", quantity or "other", text)
 
 
-def _describe_lack(path: Path, headers: Sequence[str]) -> str:
+def _describe_lack(path: Path, columns: Sequence[FileColumn]) -> str:
     """Say that no column is a gyro axis, and how to name the likely ones."""
-    columns = [column for column in distinct_columns(headers) if column.header]
-    free = [c for c in columns if not TIME_PATTERN.match(c.low) and quantity_of(c.low) is None]
+    headers = [column for column in distinct_columns(columns) if column.header]
+    free = [c for c in headers if not TIME_PATTERN.match(c.low) and quantity_of(c.low) is None]
     candidates = (c for pattern in GYRO_PATTERNS for c in free if pattern.search(c.name))
     likely = next(candidates, free[0] if free else None)
     low = likely.header.lower() if likely else ""
@@ -419,7 +420,7 @@ def _describe_lack(path: Path, headers: Sequence[str]) -> str:
         options = f" --kind {'rate' if INCREMENT_PATTERN.search(likely.name) else 'angle'}"
     return (
         "no gyro column (gyro_x, gyro_y, gyro_z or angle_x ...). Columns: "
-        f"{list_some([c.name for c in columns], 100)}. Say which they are, for instance: --map "
+        f"{list_some([c.name for c in headers], 100)}. Say which they are, for instance: --map "
         f'"{likely.key if likely else "NAME"}=gyro_x"{options}{scan_advice(path)}'
     )
 

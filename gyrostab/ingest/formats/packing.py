@@ -85,7 +85,7 @@ class Packing:
         """
         stored: np.dtype[Any] = np.dtype(dtype).newbyteorder("=")
         declared = {key: attributes[key] for key in _PACKING if key in attributes}
-        if stored.kind in "iu" and (text := _attribute_text(declared.get("_Unsigned"))):
+        if stored.kind in "iu" and (text := attribute_text(declared.get("_Unsigned"))):
             stored = np.dtype(f"{'u' if text.lower() == 'true' else 'i'}{stored.itemsize}")
         wraps = "_Unsigned" in declared
         numbers = {
@@ -147,25 +147,11 @@ class Packing:
         return np.logical_or.reduce(masks) if masks else None
 
 
-def _attribute_text(value: Any) -> str | None:
+def attribute_text(value: Any) -> str | None:
     """Return an attribute if it is text, otherwise None."""
     value = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
-    return (
-        value.decode(errors="replace")
-        if isinstance(value, bytes)
-        else value
-        if isinstance(value, str)
-        else None
-    )
-
-
-def text_attributes(attributes: Iterable[Mapping[str, Any]], name: str) -> dict[int, str]:
-    """Return the text attribute `name` of the variables that have it, by their position."""
-    return {
-        place: text
-        for place, attrs in enumerate(attributes)
-        if (text := _attribute_text(attrs.get(name)))
-    }
+    value = value.decode(errors="replace") if isinstance(value, bytes) else value
+    return value if isinstance(value, str) else None
 
 
 def _attribute_numbers(
@@ -348,7 +334,7 @@ def _decode_variable(
     if names_epoch(str(attrs.get("units", ""))):
         try:
             unit = parse_time_unit(
-                str(attrs.pop("units")), _attribute_text(attrs.pop("calendar", None))
+                str(attrs.pop("units")), attribute_text(attrs.pop("calendar", None))
             )
         except UnitError as error:
             raise UnitError(f"{where}: {error}") from error

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from gyrostab.ingest.columns.headers import FileColumn
 from gyrostab.ingest.columns.plan import Plan, plan_columns
 from gyrostab.ingest.columns.typed import float32_note, read_columns, summarise_columns
-from gyrostab.ingest.formats.packing import Decoder, fold_packing, text_attributes
+from gyrostab.ingest.formats.packing import Decoder, attribute_text, fold_packing
 from gyrostab.ingest.limits import check_stored
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.store.rows import EvenRows, LibraryRows, Rows
@@ -77,10 +78,17 @@ def plan_stored(
     FormatError
         When an attribute of a column that is read has no usable value.
     """
+    file_columns = [
+        FileColumn(
+            column.header,
+            attribute_text(column.attributes.get("units")) or None,
+            attribute_text(column.attributes.get("calendar")) or None,
+            target=(coded or {}).get(place),
+        )
+        for place, column in enumerate(columns)
+    ]
     attributes = [column.attributes for column in columns]
-    units, calendars = (text_attributes(attributes, name) for name in ("units", "calendar"))
-    headers = [column.header for column in columns]
-    plan = plan_columns(path, headers, options, units=units, calendars=calendars, coded=coded)
+    plan = plan_columns(path, file_columns, options)
     plan, decoders = fold_packing(plan, [column.dtype for column in columns], attributes)
     return StoredTable(columns, rows, plan, decoders, options, notes)
 

@@ -16,6 +16,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import FormatError, OptionError
+from gyrostab.ingest.columns.headers import FileColumn
 from gyrostab.ingest.columns.plan import Plan, plan_columns
 from gyrostab.ingest.columns.plan_draft import MAX_HEADERS, Column
 from gyrostab.ingest.columns.stamps import NAT, parse_time_unit
@@ -199,33 +200,31 @@ def _plan_tables(path: Path, tables: Sequence[Table], options: ReadOptions) -> _
     names = iter(_plain_names([c.name for table in tables for c in _with_stamps(table)]))
     filled: list[Table] = []
     first: list[int] = []
-    headers: list[str] = []
-    units: dict[int, str] = {}
-    targets: dict[int, str] = {}
+    columns: list[FileColumn] = []
     for table in tables:
-        columns = _with_stamps(table)
-        _, *column_names = islice(names, len(columns))
+        _, *column_names = islice(names, 1 + len(table.columns))
         if not table.rows or not column_names:
             continue
-        is_first_clock = table.stamps is not None and all(held.stamps is None for held in filled)
+        clock = table.stamps
+        is_first_clock = clock is not None and all(held.stamps is None for held in filled)
         filled.append(table)
-        first.append(len(headers))
-        for source, column in enumerate(columns, len(headers)):
-            if column.unit:
-                units[source] = column.unit
-            if column.target:
-                targets[source] = column.target
-        headers += ["time" if is_first_clock else "", *column_names]
+        first.append(len(columns))
+        columns.append(
+            FileColumn(
+                "time" if is_first_clock else "",
+                clock.unit if clock else None,
+                stamped=clock is not None and clock.unit is None,
+            )
+        )
+        columns += [
+            FileColumn(name, column.unit or None, target=column.target)
+            for name, column in zip(column_names, table.columns, strict=True)
+        ]
     if not filled:
         raise FormatError(
             f"{path.name}: it holds no values; copy it again, or check what the logger wrote"
         )
-    stamped = [
-        begin
-        for begin, table in zip(first, filled, strict=True)
-        if table.stamps is not None and table.stamps.unit is None
-    ]
-    plan = plan_columns(path, headers, options, units=units, stamped=stamped, coded=targets)
+    plan = plan_columns(path, columns, options)
     main_columns = plan.of("gyro") or plan.of("channel")
     holders = {
         max(place for place, begin in enumerate(first) if begin <= column.source)

@@ -29,6 +29,7 @@ from gyrostab.ingest.columns.dates import (
     holds_date,
     is_time_of_day,
 )
+from gyrostab.ingest.columns.headers import FileColumn
 from gyrostab.ingest.columns.plan import Plan, plan_columns
 from gyrostab.ingest.columns.plan_draft import Column
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
@@ -129,18 +130,17 @@ def _plan_file(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
             size *= 2
         layout = find_layout(path, head, complete=len(head) < size, limits=options.limits)
     rows = layout.full_samples
-    orders = {
-        column: find_order(row[column] for row in rows)
-        for column in range(layout.width)
-        if any(holds_date(row[column]) or is_time_of_day(row[column]) for row in rows)
-    }
+    columns = []
+    for place, header in enumerate(layout.headers):
+        cells = [row[place] for row in rows]
+        column = FileColumn(header, layout.units.get(place) or _duration_unit(cells))
+        if any(holds_date(cell) or is_time_of_day(cell) for cell in cells):
+            column = replace(column, stamped=True, date_order=find_order(cells))
+        columns.append(column)
     plan = plan_columns(
         path,
-        layout.headers,
+        columns,
         options,
-        units={**_duration_units(layout), **layout.units},
-        stamped=orders,
-        orders=orders,
         rising=partial(_is_rising, layout),
         above=layout.above,
         is_filled=lambda column: any(row[column].strip().lower() not in VOID_CELLS for row in rows),
@@ -148,15 +148,10 @@ def _plan_file(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
     return layout, plan
 
 
-def _duration_units(layout: Layout) -> dict[int, str]:
-    """Return the units of columns whose cells contain them, such as ``0.01 sec``."""
-    rows = layout.full_samples
-    return {
-        column: unit
-        for column, cell in enumerate(rows[0] if rows else ())
-        if (unit := unit_of_duration(cell))
-        and all(unit_of_duration(row[column]) == unit for row in rows)
-    }
+def _duration_unit(cells: Sequence[str]) -> str | None:
+    """Return the unit that all cells of a column contain, such as ``0.01 sec``."""
+    unit = unit_of_duration(cells[0]) if cells else None
+    return unit if unit and all(unit_of_duration(cell) == unit for cell in cells) else None
 
 
 def _is_rising(layout: Layout, column: int) -> bool:
