@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
@@ -29,11 +28,11 @@ from gyrostab.ingest.formats.tables import (
     NO_NAME,
     Table,
     TableColumn,
-    read_tables,
-    scan_tables,
+    TablesOfFile,
+    make_reader,
     sliced,
 )
-from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.ingest.options import ReadOptions
 from gyrostab.time.grid import check_span, grid_times
 
 SUFFIXES = (".bin", ".raw")
@@ -59,19 +58,8 @@ def list_layouts(paths: Iterable[Path]) -> list[Path]:
     return list(dict.fromkeys(filter(None, places)))
 
 
-def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Summarise fields, number of records, and first and last stamps; searches all messages."""
-    table, notes = _make_table(path, options, needs_rate=False)
-    return scan_tables(path, "binary", [table], options, notes)
-
-
-def read(path: Path, options: ReadOptions) -> xr.Dataset:
-    """Return the raw log of a binary file; see `gyrostab.ingest.read_log`."""
-    table, notes = _make_table(path, options, needs_rate=True)
-    return read_tables(path, [table], options, notes=notes)
-
-
-def _make_table(path: Path, options: ReadOptions, *, needs_rate: bool) -> tuple[Table, list[str]]:
+def _make_tables(path: Path, options: ReadOptions, *, needs_rate: bool) -> TablesOfFile:
+    """Return the table of all records; messages are searched in the whole file."""
     layout = find_layout(path)
     rows, extra_bytes = divmod(path.stat().st_size - layout.header, layout.size)
     starts = None
@@ -95,7 +83,14 @@ def _make_table(path: Path, options: ReadOptions, *, needs_rate: bool) -> tuple[
         notes.append(f"{where}{extra_bytes} bytes are not {expected}; is the layout right?")
     columns = [TableColumn((field.name,), partial(fetch, field)) for field in layout.fields]
     clock = None if stamps is None else TableColumn(NO_NAME, stamps, "ns")
-    return Table(rows, columns, clock), notes
+    return [Table(rows, columns, clock)], notes
+
+
+scan, read = make_reader(
+    "binary",
+    partial(_make_tables, needs_rate=True),
+    find_heads=partial(_make_tables, needs_rate=False),
+)
 
 
 def _count_time(

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.ingest.formats.recognise import begins_like
@@ -21,12 +21,12 @@ from gyrostab.ingest.formats.tables import (
     ReadSlice,
     Table,
     TableColumn,
+    TablesOfFile,
     library,
-    read_tables,
-    scan_tables,
+    make_reader,
     sliced,
 )
-from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.ingest.options import ReadOptions
 from gyrostab.time.grid import grid_times
 
 SUFFIXES = (".mseed", ".miniseed", ".msd", ".ms", ".mseed3")
@@ -52,21 +52,13 @@ def matches(path: Path) -> bool:
     return begins_like(path, _HEAD, *SUFFIXES)
 
 
-def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Summarise channels and the stamps of the record headers."""
-    return scan_tables(
-        path, "miniseed", _group_traces(_read_traces(path, unpack=False)), options, _cut_note(path)
-    )
+def _make_tables(path: Path, options: ReadOptions, *, unpack: bool) -> TablesOfFile:
+    return _group_traces(_read_traces(path, unpack=unpack)), _cut_note(path)
 
 
-def read(path: Path, options: ReadOptions) -> xr.Dataset:
-    """Return the raw log of a miniSEED file; see `gyrostab.ingest.read_log`."""
-    return read_tables(
-        path,
-        _group_traces(_read_traces(path, unpack=True)),
-        options,
-        notes=_cut_note(path),
-    )
+scan, read = make_reader(
+    "miniseed", partial(_make_tables, unpack=True), find_heads=partial(_make_tables, unpack=False)
+)
 
 
 def _cut_note(path: Path) -> list[str]:
@@ -80,17 +72,9 @@ def _cut_note(path: Path) -> list[str]:
         first = next(iter(pymseed.MS3Record.from_buffer(head)), None)
     except pymseed.MiniSEEDError:
         return []
-    cut_bytes = (
-        path.stat().st_size % first.reclen if first is not None and first.formatversion == 2 else 0
-    )
-    return (
-        [
-            f"cut off in its last record: {cut_bytes} bytes are left out, the complete records "
-            "are read"
-        ]
-        if cut_bytes
-        else []
-    )
+    if first is None or first.formatversion != 2 or not (cut := path.stat().st_size % first.reclen):
+        return []
+    return [f"cut off in its last record: {cut} bytes are left out, the complete records are read"]
 
 
 def _read_traces(path: Path, *, unpack: bool) -> list[_Trace]:

@@ -53,6 +53,7 @@ class Table:
 
 #: Tables of a file, and notes on it.
 TablesOfFile = tuple[Sequence[Table], Sequence[str]]
+FindTables = Callable[[Path, ReadOptions], TablesOfFile]
 
 
 class Messages:
@@ -282,13 +283,16 @@ def read_tables(
 
 
 def make_reader(
-    form: str, find_tables: Callable[[Path, ReadOptions], TablesOfFile]
+    form: str, find_tables: FindTables, find_heads: FindTables | None = None
 ) -> tuple[Callable[[Path, ReadOptions], FileSummary], Callable[[Path, ReadOptions], xr.Dataset]]:
-    """Make the functions `scan` and `read` of a format whose tables are read as a whole."""
+    """Make the functions `scan` and `read` of a format whose tables are read as a whole.
+
+    `find_heads` finds the tables for `scan` if that can leave out their values.
+    """
 
     def scan(path: Path, options: ReadOptions) -> FileSummary:
         """Summarise columns, rows, and first and last stamps."""
-        tables, notes = find_tables(path, options)
+        tables, notes = (find_heads or find_tables)(path, options)
         return scan_tables(path, form, tables, options, notes)
 
     def read(path: Path, options: ReadOptions) -> xr.Dataset:
