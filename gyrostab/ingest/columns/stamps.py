@@ -27,10 +27,6 @@ from gyrostab.time.stamps import to_nanoseconds
 #: The integer of ``NaT``.
 NAT = np.iinfo(np.int64).min
 _MAX_INT64 = 2**63 - 1
-#: Periods after which a clock of the time of day, and one of the GPS week, begin again [ns].
-CLOCK_PERIODS = (86400 * 10**9, 7 * 86400 * 10**9)
-#: Steps from which the typical one follows.
-_TYPICAL_STEPS = 4096
 #: Julian day number of 1970-01-01.
 _ORDINAL_1970 = 2440588
 
@@ -262,46 +258,3 @@ def cells_to_ns(
             if abs(nanoseconds) <= _MAX_INT64:
                 stamps[index] = nanoseconds
     return stamps
-
-
-def find_turn(step: int, typical: float) -> int:
-    """Return the period after which a clock began again at a step, if no row is lost there, or 0.
-
-    Parameters
-    ----------
-    step, typical : int, float
-        This step of the stamps, and a typical one [ns].
-
-    Examples
-    --------
-    >>> find_turn(-86_399_950_000_000, 5e7), find_turn(-86_000_000_000_000, 5e7)
-    (86400000000000, 0)
-    """
-    return next((turn for turn in CLOCK_PERIODS if 0 < step + turn <= 2 * typical < turn / 2), 0)
-
-
-def continue_clock(stamps: NDArray[np.int64]) -> tuple[NDArray[np.int64], list[int], float]:
-    """Continue readable stamps where a clock of the day or week begins again.
-
-    Returns
-    -------
-    stamps : ndarray of int64
-        The stamps; a copy if any changed.
-    turns : list of int
-        Periods that were added [ns].
-    typical : float
-        Typical step between different stamps [ns]; 0 if all are equal.
-    """
-    steps = np.diff(stamps)
-    rises = steps[:_TYPICAL_STEPS]
-    rises = rises[rises > 0]
-    typical = float(np.median(rises)) if rises.size else 0.0
-    turns: list[int] = []
-    if steps.size and steps.min() < -CLOCK_PERIODS[0] // 2:
-        for row in (np.flatnonzero(steps < -CLOCK_PERIODS[0] // 2) + 1).tolist():
-            turn = find_turn(int(steps[row - 1]), typical)
-            if turn and not (row < steps.size and steps[row] > turn // 2):  # not one wrong stamp
-                stamps = stamps if turns else stamps.copy()
-                stamps[row:] += turn
-                turns.append(turn)
-    return stamps, turns, typical
