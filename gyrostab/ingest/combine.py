@@ -67,14 +67,8 @@ def move_to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
 def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     """Concatenate raw logs along ``row`` in the order of their first stamps, without repeated rows.
 
-    Raises
-    ------
-    TimeError
-        When some files have stamps and others have none.
-    UnitError
-        When files hold different kinds of signal, or a channel changes its unit.
-    FormatError
-        When there is only one row.
+    `TimeError` when only some files have stamps; `UnitError` when they hold different kinds of
+    signal, or a channel changes its unit.
     """
     if len(parts) == 1:
         joined = parts[0]
@@ -286,13 +280,7 @@ def with_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:
 
 
 def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:
-    """Add the channels of other files, each on ``time_<channel>`` with its filled rows only.
-
-    Raises
-    ------
-    OptionError
-        When the log already contains a channel, or a file has no channel or no stamps.
-    """
+    """Add the channels of other files, each on ``time_<channel>`` with its filled rows only."""
     pieces: dict[str, list[tuple[NDArray[Any], NDArray[Any], str]]] = {}
     files: list[str] = []
     for source in sources:

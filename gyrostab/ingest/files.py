@@ -109,13 +109,7 @@ def _find_reader(path: Path) -> Reader:
 
 
 def expand(paths: str | Path | Iterable[str | Path]) -> list[Path]:
-    """Return the files that paths and patterns name, each once.
-
-    Raises
-    ------
-    FormatError
-        When a pattern matches no file.
-    """
+    """Return the files that paths and patterns name, each once."""
     files: dict[Path, None] = {}
     for item in [paths] if isinstance(paths, str | Path) else paths:
         text = str(item)

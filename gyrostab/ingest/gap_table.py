@@ -140,10 +140,7 @@ def name_lost(
 ) -> NDArray[np.int64]:
     """Change the cause of gaps that lost files leave to "unreadable".
 
-    Parameters
-    ----------
-    spans : iterable of pairs of int
-        First and last instant [ns since 1970] of each lost file.
+    `spans` are first and last instant of each lost file [ns since 1970].
     """
     table = table.copy()
     for span in spans:

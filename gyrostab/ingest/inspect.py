@@ -73,17 +73,9 @@ class FileInspection:
 
 
 def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileInspection:
-    r"""Inspect every column of a file, in any format that gyrostab reads.
+    r"""Inspect the first `MAX_COLUMNS` columns of a file, in any format that gyrostab reads.
 
-    Returns
-    -------
-    FileInspection
-        The first `MAX_COLUMNS` columns, with range, scatter and rate.
-
-    Raises
-    ------
-    FormatError
-        When the file cannot be read at all, or holds no numbers.
+    `FormatError` when the file cannot be read at all, or holds no numbers.
 
     Examples
     --------

@@ -54,11 +54,6 @@ STORED_SAMPLES_PER_BYTE = 1000
 def check_limits(given: Mapping[str, Any] | None) -> dict[str, float]:
     """Check the limits that a user set, and return them as numbers.
 
-    Raises
-    ------
-    OptionError
-        When a name is not that of a limit, or a value is not a number above 0.
-
     Examples
     --------
     >>> check_limits({"columns": "5e4"})

@@ -117,19 +117,10 @@ class ScanResult:
 def scan_and_inspect(
     paths: Sequence[str | Path] | str | Path, *, inspect: bool = True, **reading: Any
 ) -> ScanResult:
-    """Scan logs, and inspect the columns of those that need options.
+    """Scan logs as `scan` does, and `inspect` the columns of those that need options.
 
-    Parameters
-    ----------
-    paths, **reading
-        As for `scan`.
-    inspect : bool
-        Whether to inspect columns; of files with the same columns the first is inspected.
-
-    Returns
-    -------
-    ScanResult
-        Errors of unreadable files are collected, not raised.
+    Errors of unreadable files are collected, not raised. The first of files with the same columns
+    is inspected.
     """
     from gyrostab.ingest.columns.plan_roles import scan_advice
     from gyrostab.ingest.files import expand

@@ -72,10 +72,7 @@ def continue_block(
 def find_turn(step: int, typical: float) -> int:
     """Return the period after which a clock began again at a step, if no row is lost there, or 0.
 
-    Parameters
-    ----------
-    step, typical : int, float
-        This step of the stamps, and a typical one [ns].
+    `typical` is a typical step of the stamps [ns].
 
     Examples
     --------
@@ -88,14 +85,8 @@ def find_turn(step: int, typical: float) -> int:
 def _continue_clock(stamps: NDArray[np.int64]) -> tuple[NDArray[np.int64], list[int], float]:
     """Continue readable stamps where a clock of the day or week begins again.
 
-    Returns
-    -------
-    stamps : ndarray of int64
-        The stamps; a copy if any changed.
-    turns : list of int
-        Periods that were added [ns].
-    typical : float
-        Typical step between different stamps [ns]; 0 if all are equal.
+    Return the stamps (a copy if any changed), the periods that were added, and the typical step
+    between different stamps, 0 if all are equal [ns].
     """
     steps = np.diff(stamps)
     rises = steps[:_TYPICAL_STEPS]

@@ -65,20 +65,9 @@ def plan_columns(
 ) -> Plan:
     """Determine the role and unit of each column.
 
-    Parameters
-    ----------
-    rising : callable, optional
-        Returns whether the first values of a column rise; decides between several candidates for
-        the time column.
-    above : sequence of str
-        Lines above the header, which may identify the program that wrote the file.
-    is_filled : callable, optional
-        Returns whether any of the first cells of a column is filled.
-
-    Returns
-    -------
-    Plan
-        ``Plan.check()`` raises the first problem.
+    `rising` returns whether the first values of a column rise, which decides between candidates for
+    the time column; `above` are the lines above the header, which may identify the program that
+    wrote the file; `is_filled` returns whether any of the first cells of a column is filled.
     """
     check_columns(path, len(columns), options.limits)
     headers = [column.header for column in columns]

@@ -53,12 +53,8 @@ def find_preset(
 ) -> PresetMatch:
     """Find the preset that fits a file, with an empty name for the files of other programs.
 
-    Parameters
-    ----------
-    headers : sequence of (str, str)
-        Full header and name without unit of each column.
-    is_filled : callable, optional
-        Returns whether any of the first cells of a column is filled.
+    `headers` are full header and name without unit of each column; `is_filled` returns whether any
+    of the first cells of a column is filled.
     """
     places: dict[str, int] = {}
     for place, names in reversed(list(enumerate(headers))):

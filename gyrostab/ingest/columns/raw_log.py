@@ -90,15 +90,9 @@ class RawLogBuilder:
     ) -> ConvertedBlock:
         """Convert one block and pack its columns where possible; thread-safe.
 
-        Parameters
-        ----------
-        values : dict of int to ndarray
-            Column number -> values in the unit of the file, NaN where unreadable or empty. Changed
-            in place.
-        stamps : ndarray of int64 or None
-            Stamps [ns since 1970], `NAT` where unreadable; None without a time column.
-        words : int
-            Channel cells whose text is not a number (empty cells do not count).
+        `values` in the unit of the file by column number, NaN where unreadable or empty, are
+        changed in place; `stamps` [ns since 1970] are `NAT` where unreadable; `words` counts the
+        channel cells whose text is not a number (empty cells do not count).
         """
         size = (
             len(next(iter(values.values()))) if values else len(stamps) if stamps is not None else 0
@@ -201,13 +195,7 @@ class RawLogBuilder:
         return declare_counts(dtype, factors.pop()) if dtype else {}
 
     def finish(self, notes: Sequence[str] = ()) -> xr.Dataset:
-        """Return the raw log.
-
-        Raises
-        ------
-        FormatError
-            When there is no row, or more than half of them are unreadable.
-        """
+        """Return the raw log; `FormatError` if more than half of the rows are unreadable."""
         name, rows = self.plan.path.name, self.buffers.rows
         if rows == 0:
             raise FormatError(
@@ -310,12 +298,7 @@ def summary_of(
 ) -> FileSummary:
     """Summarise a file without reading all of its data.
 
-    Parameters
-    ----------
-    plan : Plan
-        Role and unit of each column, and the problems that prevent reading.
-    head, tail : sequence of int
-        Stamps at the two ends [ns since 1970], `NAT` where unreadable.
+    `head` and `tail` are stamps at the two ends [ns since 1970], `NAT` where unreadable.
     """
     first, last = (
         next((np.datetime64(int(stamp), "ns") for stamp in end if stamp != NAT), None)

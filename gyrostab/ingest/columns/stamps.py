@@ -83,18 +83,9 @@ def names_epoch(text: str) -> bool:
 def parse_time_unit(text: str, calendar: str | None = None) -> TimeUnit:
     """Parse a time unit, with an optional leading factor and an optional CF epoch.
 
-    Parameters
-    ----------
-    text : str
-        The unit; not case-sensitive, as in UDUNITS.
-    calendar : str, optional
-        The CF calendar of the epoch, `standard` when not given.
-
-    Raises
-    ------
-    UnitError
-        When the text is not a time unit, when its epoch is ambiguous or depends on the clock, or
-        when the calendar is not one of real dates.
+    It is not case-sensitive, as in UDUNITS. `calendar` is the CF calendar of the epoch. `UnitError`
+    when the text is not a time unit, when its epoch is ambiguous or depends on the clock, or when
+    the calendar is not one of real dates.
 
     Examples
     --------

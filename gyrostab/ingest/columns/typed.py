@@ -90,15 +90,8 @@ def read_columns(
 ) -> xr.Dataset:
     """Build the raw log of columns that can be fetched by ranges of rows.
 
-    Parameters
-    ----------
-    fetch : callable
-        Column number, first row, row after the last one -> values.
-    parallel : bool
-        Whether `fetch` is thread-safe.
-    stay : bool
-        Whether `fetch` is as fast as reading a temporary file, and can be called at any later time;
-        columns that exceed the memory limit then stay in the file.
+    `fetch` is thread-safe if `parallel`. With `stay` it is as fast as reading a temporary file, and
+    can be called at any later time; columns that exceed the memory limit then stay in the file.
     """
     builder = RawLogBuilder(plan.check(), options)
     stay = stay and 8 * rows * len(plan.columns) > builder.buffers.limit

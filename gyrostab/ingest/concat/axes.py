@@ -16,10 +16,7 @@ from gyrostab.store.lazy import select_part, stack_rows
 def group_axes(axes: Sequence[Sequence[str]]) -> list[list[int]]:
     """Group logs by their axes: logs of one group share axes, directly or through other logs.
 
-    Returns
-    -------
-    list of list of int
-        Positions of the logs of each group; the groups by their first axis.
+    Returns the positions of the logs of each group; the groups by their first axis.
 
     Examples
     --------
@@ -38,21 +35,8 @@ def group_axes(axes: Sequence[Sequence[str]]) -> list[list[int]]:
 def split_axes(raw: xr.Dataset) -> list[xr.Dataset]:
     """Split a raw log whose groups of axes have separate stamps into one raw log for each group.
 
-    Parameters
-    ----------
-    raw : xarray.Dataset
-        Raw log, in memory or lazy; its attribute ``axis_rows`` lists axes, first row and row after
-        the last of each group.
-
-    Returns
-    -------
-    list of xarray.Dataset
-        One raw log for each group; the log itself if it has no such attribute.
-
-    Raises
-    ------
-    SchemaError
-        When rows were selected from the log after it was read.
+    Its attribute ``axis_rows`` lists axes, first row and row after the last of each group.
+    `SchemaError` when rows were selected from the log after it was read.
     """
     groups = raw.attrs.get("axis_rows")
     if groups is None:

@@ -25,11 +25,8 @@ def concatenate_channels(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Concatenate the channels of logs that are placed on one grid.
 
-    Returns
-    -------
-    variables, coordinates : dict
-        Channels, NaN where a log lacks them, and the stamps ``time_<channel>`` of those with
-        separate stamps.
+    Returns variables, NaN where a log lacks them, and the coordinates ``time_<channel>`` of
+    channels with separate stamps.
     """
     variables: dict[str, Any] = {}
     coordinates: dict[str, Any] = {}

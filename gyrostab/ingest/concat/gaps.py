@@ -58,10 +58,7 @@ def _missing_in_both(held: Table, new: Table) -> Table:
 def merge_gaps(pieces: Sequence[PlacedLog]) -> Table:
     """Return the table of gaps of the concatenated log; a gap on some axes counts as a gap.
 
-    Returns
-    -------
-    ndarray of int64, shape (n, 5)
-        Columns of `gyrostab.ingest.gap_table.COLUMNS`, sorted by sample.
+    Its columns are those of `gyrostab.ingest.gap_table.COLUMNS`, sorted by sample.
     """
     groups = [
         [pieces[number] for number in group]

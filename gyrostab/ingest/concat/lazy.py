@@ -87,21 +87,10 @@ def place_on_grid(
 ) -> Any:
     """Place arrays on one grid, float64, NaN where no array has a sample.
 
-    Parameters
-    ----------
-    rows : sequence of sequence of PlacedArray
-        Arrays with samples of each row of the result. Where they overlap, the first value that is
-        not NaN counts.
-    flat : bool
-        Whether the result has one dimension only.
-    convert : callable, optional
-        Function that changes samples of a row in place.
-
-    Returns
-    -------
-    dask.array.Array, shape (len(rows), size) or (size,)
-        It has a source if all arrays can be read without dask; otherwise, its tasks depend on those
-        of the arrays.
+    `rows` lists the arrays of each row of the result; where they overlap, the first value that is
+    not NaN counts. A `flat` result has one dimension only; `convert` changes samples of a row in
+    place. The dask array has a source if all arrays can be read without dask; otherwise, its tasks
+    depend on those of the arrays.
     """
     source = GridSource(rows, (size,) if flat else (len(rows), size), convert)
     if all(map(can_read_directly, source.parts)):

@@ -150,21 +150,10 @@ def _match_logs(held: Source, new: Source, lag: int, cache: _Cache) -> _Match:
 
 
 def place_logs(sources: Sequence[Source], *, max_gap: float) -> tuple[list[PlacedLog], list[str]]:
-    """Place logs on the grid of the first.
+    """Place logs, in the order of their first stamps, on the grid of the first.
 
-    Parameters
-    ----------
-    sources : sequence of Source
-        Logs in the order of their first stamps.
-    max_gap : float
-        A longer pause is taken as a step of the clock [s].
-
-    Returns
-    -------
-    pieces : list of PlacedLog
-        The logs in the same order; the first sample of all is sample 0.
-    notes : list of str
-        Notes on logs between the samples of the grid, overlaps and steps of the clock.
+    A pause longer than `max_gap` [s] is taken as a step of the clock. The first sample of all is
+    sample 0. Also return notes on logs between the samples of the grid, overlaps and clock steps.
     """
     rate = sources[0].rate
     pieces: list[PlacedLog] = []

@@ -84,13 +84,7 @@ def find_layout_file(path: Path) -> Path | None:
 
 
 def find_layout(path: Path) -> Layout:
-    """Return the layout of a file: that of a layout file, or of a sensor whose messages it holds.
-
-    Raises
-    ------
-    OptionError
-        When there is no layout, or it is not usable.
-    """
+    """Return the layout of a layout file, or of the sensor whose messages a file holds."""
     place = find_layout_file(path)
     if place is None:
         return _find_known(path, layout_path(path).name)

@@ -104,10 +104,7 @@ class _Header:
 def read_classic_header(path: Path) -> dict[str, ClassicVariable] | None:
     """Read the locations of the variables of a classic NetCDF file; None for other formats.
 
-    Raises
-    ------
-    FormatError
-        When the header asks for more than the file holds.
+    `FormatError` when the header asks for more than the file holds.
     """
     size = path.stat().st_size
     for head_bytes in _HEAD_BYTES:

@@ -64,17 +64,7 @@ class Packing:
 
     @classmethod
     def from_attributes(cls, where: str, dtype: Any, attributes: Mapping[str, Any]) -> Packing:
-        """Parse the attributes of a variable.
-
-        Parameters
-        ----------
-        dtype : dtype
-            Type of the stored numbers, in any byte order.
-
-        Raises
-        ------
-        FormatError
-            When an attribute has no usable value.
+        """Parse the attributes of a variable that stores numbers of `dtype`, in any byte order.
 
         Examples
         --------
@@ -237,23 +227,9 @@ def fold_packing(
 ) -> tuple[Plan, dict[int, Decoder]]:
     """Fold the packing of variables into the factors of the plan, so that counts stay integers.
 
-    Parameters
-    ----------
-    dtypes, attributes : sequence of dtype, sequence of mapping
-        Type and attributes of each column's variable, by the column's source.
-
-    Returns
-    -------
-    plan : Plan
-        With factors, offsets and time units for the output of the decoders.
-    decoders : dict of int to callable
-        Source -> function from stored numbers to counts, or to values for a time variable whose
-        counts are not whole nanoseconds.
-
-    Raises
-    ------
-    FormatError
-        When an attribute of a column that is read has no usable value.
+    `dtypes` and `attributes` are those of the variable of each source. Also return, by source, the
+    functions from stored numbers to counts, or to values for a time variable whose counts are not
+    whole nanoseconds.
     """
     columns: list[Column] = []
     decoders: dict[int, Decoder] = {}
@@ -291,21 +267,8 @@ def _fold_time(unit: TimeUnit, packing: Packing) -> TimeUnit | None:
 def decode_variables(path: Path, stored: xr.Dataset) -> xr.Dataset:
     """Decode the variables of an undecoded dataset lazily, in the chunks of the file.
 
-    Parameters
-    ----------
-    path : Path
-        The file; it is named in errors of later reads.
-
-    Returns
-    -------
-    xarray.Dataset
-        Packed numbers as float64, NaN where missing or invalid; stamps as datetime64[ns]; the
-        packing of whole numbers is in the encoding.
-
-    Raises
-    ------
-    FormatError, UnitError
-        When an attribute has no usable value, or an epoch is ambiguous.
+    Packed numbers become float64, NaN where missing or invalid, and stamps datetime64[ns]; the
+    packing of whole numbers is in the encoding. Errors of later reads name `path`.
     """
     chunks: dict[Any, int] = {}
     for variable in stored.variables.values():

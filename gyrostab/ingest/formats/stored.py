@@ -71,13 +71,7 @@ def plan_stored(
     notes: Sequence[str] = (),
     coded: Mapping[int, str] | None = None,
 ) -> StoredTable:
-    """Determine roles and units of stored columns, with their packing folded into the factors.
-
-    Raises
-    ------
-    FormatError
-        When an attribute of a column that is read has no usable value.
-    """
+    """Determine roles and units of stored columns, with their packing folded into the factors."""
     file_columns = [
         FileColumn(
             column.header,

@@ -256,13 +256,7 @@ def read_tables(
     *,
     notes: Sequence[str] = (),
 ) -> xr.Dataset:
-    """Return the raw log of the tables with gyro axes; other channels keep separate stamps.
-
-    Raises
-    ------
-    FormatError
-        When the tables are empty.
-    """
+    """Return the raw log of the tables with gyro axes; other channels keep separate stamps."""
     planned = _plan_tables(path, tables, options)
     planned.plan.check()
     main: list[xr.Dataset] = []

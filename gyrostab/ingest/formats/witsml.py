@@ -39,13 +39,7 @@ def matches(path: Path) -> bool:
 
 
 def _read_logs(path: Path, options: ReadOptions) -> TablesOfFile:
-    """Return a table for each log with data and an index of dates and times.
-
-    Raises
-    ------
-    FormatError
-        When there is none.
-    """
+    """Return a table for each log with data and an index of dates and times."""
     tables: list[Table] = []
     for _, log in ElementTree.iterparse(path):
         if str(log.tag).rpartition("}")[2] == "log":

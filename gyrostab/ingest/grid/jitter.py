@@ -88,21 +88,9 @@ def fit_jitter(
 ) -> JitterModel | None:
     """Fit the sampling period that explains stretches of stamps best, with rare lost samples.
 
-    Parameters
-    ----------
-    parts : list of ndarray of int64
-        Stretches of stamps [ns], `NO_STAMP` where unreadable.
-    guesses : list of float
-        Periods to try in addition to those found in the stretches [ns].
-    observe : str
-        Rows to use; see `JitterModel`.
-    sure : float
-        Number of samples over which counting by the first estimate of the period is reliable.
-
-    Returns
-    -------
-    JitterModel or None
-        None if no period explains the stamps.
+    The stamps are `NO_STAMP` where unreadable. `guesses` are periods to try in addition to those
+    found in the stretches [ns]; `observe` names the rows to use (see `JitterModel`); `sure` is the
+    number of samples over which counting by the first estimate of the period is reliable.
     """
     observed = _observe_parts(parts, observe, guesses[0])
     lengths = (

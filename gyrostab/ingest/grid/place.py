@@ -141,25 +141,10 @@ def place_without_time(rows: int, start: int) -> Placement:
 def place_by_stamp(
     stamps: Stamps, rate: float, *, tolerance: float, max_gap: float, where: str
 ) -> Placement:
-    """Place rows by their stamps.
+    """Place rows by their stamps; the result does not depend on the size of their blocks.
 
-    Parameters
-    ----------
-    stamps : callable
-        Returns an iterator over blocks of (row numbers, stamps [ns]); the result does not depend
-        on the size of the blocks.
-    rate : float
-        Sampling rate [Hz].
-    tolerance : float
-        Largest distance of the smoothed stamps from the grid, beyond half a sample, before a sample
-        is skipped [samples].
-    max_gap : float
-        A longer step ahead is taken as a step of the clock [s].
-
-    Raises
-    ------
-    TimeError
-        When no stamp can be read.
+    `tolerance` is the largest distance of the smoothed stamps from the grid, beyond half a sample,
+    before a sample is skipped [samples]; a step ahead above `max_gap` [s] is a step of the clock.
     """
     nanoseconds, fraction = period_ns(rate)
     period = nanoseconds + fraction
@@ -283,10 +268,7 @@ def place_by_count(
 ) -> Placement:
     """Place rows by their count, for stamps that are times of arrival; a lasting delay is a loss.
 
-    Parameters
-    ----------
-    max_gap : float
-        A longer loss is taken as a step of the clock [s].
+    A loss longer than `max_gap` [s] is taken as a step of the clock.
     """
     nanoseconds, fraction = period_ns(rate)
     period = nanoseconds + fraction

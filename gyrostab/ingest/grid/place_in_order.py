@@ -167,12 +167,8 @@ def place_in_order(
 ) -> Placement:
     """Place rows in order, for stamps with jitter: see `gyrostab.ingest.grid.jitter`.
 
-    Parameters
-    ----------
-    stamps, rate, tolerance, max_gap, where
-        As for `place_by_stamp`.
-    by_row : bool
-        Whether rows that `stamps` leaves out occupy samples.
+    With `by_row`, rows that `stamps` leaves out occupy samples. Other options are those of
+    `place_by_stamp`.
     """
     ahead = int(min(_AHEAD_ROWS * np.ceil(jitter.group), _MAX_AHEAD_ROWS))
     size = int(min(TRACE_ROWS * np.ceil(jitter.group), _MAX_ROWS))

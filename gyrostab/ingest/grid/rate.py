@@ -81,17 +81,7 @@ def _round_rate(rate: float, error: float, samples: float, counted: bool) -> flo
 
 
 def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
-    """Find the sampling rate from the stamps.
-
-    Parameters
-    ----------
-    stamps : callable
-        Returns an iterator over blocks of (row numbers, stamps [ns]).
-
-    Raises
-    ------
-    TimeError
-        When all stamps are equal or unreadable, or time runs backwards.
+    """Find the sampling rate from the stamps; `TimeError` if they are all equal or run backwards.
 
     Examples
     --------

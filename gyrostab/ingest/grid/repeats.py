@@ -28,15 +28,7 @@ def find_repeats(raw: xr.Dataset, name: str, placement: Placement) -> NDArray[np
     Rows are equal if their stamps and values are. A clock that restarts may write the same stamps
     again, but with other values; values that never change are not taken as a repetition.
 
-    Parameters
-    ----------
-    placement : Placement
-        Rows on the grid, with the set-backs of the clock among the events.
-
-    Returns
-    -------
-    ndarray of int64, shape (n, 3)
-        First row of the repetition, first row of what it repeats, number of rows.
+    Returns (n, 3): first row of the repetition, first row of what it repeats, number of rows.
     """
     events = placement.events
     back = events[np.isin(events[:, 0], (STEP, RESTART)) & (events[:, 4] < events[:, 3])]

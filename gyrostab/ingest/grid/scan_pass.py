@@ -94,13 +94,7 @@ def _scan_blocks(
 
 
 def scan_rows(raw: xr.Dataset, name: str, *, block: int = BLOCK_ROWS) -> ScanPass:
-    """Scan every cell of a raw log once.
-
-    Raises
-    ------
-    FormatError
-        When no row holds a number.
-    """
+    """Scan every cell of a raw log once; `FormatError` when no row holds a number."""
     signal = raw[name].data
     n_axes, rows = signal.shape
     block -= block % 8

@@ -104,18 +104,10 @@ def split_line(line: str, separator: str) -> list[str]:
 def find_layout(
     path: Path, head: bytes, *, complete: bool, limits: Mapping[str, float] | None = None
 ) -> Layout:
-    """Find the layout of a text log in its first bytes.
+    """Find the layout of a text log in its first bytes, which may be the `complete` file.
 
-    Parameters
-    ----------
-    complete : bool
-        Whether `head` is the whole file.
-
-    Raises
-    ------
-    FormatError
-        When the file is empty, is not text, has no data rows, or has more columns than the limit
-        allows.
+    `FormatError` when the file is empty, is not text, has no data rows, or has more columns than
+    the limit allows.
     """
     lines, notes = _decode_lines(path, head, complete=complete)
     filled = (

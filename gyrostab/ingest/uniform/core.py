@@ -115,10 +115,7 @@ def grid_of(log: xr.Dataset, nominal: float | None = None) -> tuple[UniformGrid,
 def advise_dates(times: NDArray[Any], name: str) -> str:
     """Return the call that makes datetime64 of cftime dates or pandas periods, or "".
 
-    Parameters
-    ----------
-    name : str
-        Name of the Dataset or DataArray in the call.
+    `name` is that of the Dataset or DataArray in the call.
     """
     first = times.flat[0] if times.size else None
     if isinstance(first, pd.Period):
@@ -198,21 +195,11 @@ CHUNK_SAMPLES = 2**20
 
 
 def place_samples(log: xr.Dataset, runs: Runs, start: int, rate: float, size: int) -> xr.Dataset:
-    """Place the samples of a log on a grid, NaN where missing; lazy variables stay lazy.
+    """Place the variables along ``time`` of a log on a grid; lazy ones stay lazy.
 
-    Parameters
-    ----------
-    log : xarray.Dataset
-        Log whose variables along ``time`` are placed; others stay.
-    runs : ndarray of int64, shape (n, 3)
-        First sample of the grid, first sample of the log, length.
-    start, rate, size : int, float, int
-        First stamp [ns since 1970], sampling rate [Hz] and samples of the grid.
-
-    Returns
-    -------
-    xarray.Dataset
-        Log with a computed time axis. Variables without numbers are left out, with a note.
+    `runs` (n, 3) are first sample of the grid, first sample of the log, length; `start` and `rate`
+    those of the grid [ns since 1970, Hz]. Missing samples are NaN. Variables without numbers are
+    left out, with a note.
     """
     moved = {name: variable for name, variable in log.variables.items() if "time" in variable.dims}
     placed, left_out = {}, []
@@ -258,14 +245,8 @@ def has_gap_table(log: xr.Dataset) -> bool:
 def _change_rate(table: Table, log: xr.Dataset, old_rate: float, start: int, rate: float) -> Table:
     """Convert the table for a log of which every n-th sample was selected.
 
-    Parameters
-    ----------
-    table : ndarray of int64, shape (n, 5)
-        Table of `read_gaps`, on the grid of the selected samples.
-    log : xarray.Dataset
-        Log with the exact ends of the gaps.
-    old_rate : float
-        Sampling rate for which the table was made [Hz].
+    `table` is that of `read_gaps`, on the grid of the selected samples; `log` has the exact ends of
+    the gaps; the table was made for the sampling rate `old_rate` [Hz].
     """
     columns = read_gap_columns(log)
     assert columns is not None  # read_gaps has read them

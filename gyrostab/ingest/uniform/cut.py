@@ -40,11 +40,8 @@ Span = str | tuple[Any, Any]
 def parse_instant(value: Any, option: str, *, example: str = _EXAMPLE) -> int | float:
     """Parse an instant: a date [ns since 1970, int], or a duration after the start [s, float].
 
-    Parameters
-    ----------
-    value : str, timedelta, datetime or float
-        ISO 8601 text (UTC unless it says otherwise), a duration such as ``"10min"``, a number of
-        seconds after the start.
+    Dates are ISO 8601 text (UTC unless it says otherwise) or datetimes; durations are such as
+    ``"10min"`` or a number of seconds.
 
     Examples
     --------
