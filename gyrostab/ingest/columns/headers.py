@@ -181,12 +181,9 @@ def free_name(stem: str, used_names: Collection[str], number: int = 2) -> str:
 
 def quantity_of(low: str) -> str | None:
     """Return the quantity that a channel of this name measures, None if unknown."""
-    return (
-        QUANTITIES.get(low)
-        or QUANTITIES.get(low.split("_")[0])
-        or next(
-            (quantity for name, quantity in QUANTITIES.items() if low.startswith(name + "_")), None
-        )
+    return next(
+        (quantity for name, quantity in QUANTITIES.items() if f"{low}_".startswith(f"{name}_")),
+        None,
     )
 
 

@@ -16,7 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.ingest.concat.grid import LogSlice, PlacedLog, Source, read_log_slices, runs_of
-from gyrostab.ingest.gap_table import CLOCK_STEP, RESTART, describe_break, format_duration
+from gyrostab.ingest.gap_table import (
+    CLOCK_STEP,
+    RESTART,
+    describe_break,
+    format_duration,
+    is_restart,
+)
 from gyrostab.time.grid import grid_index, grid_times
 from gyrostab.time.stamps import format_stamp
 from gyrostab.wording import list_some
@@ -241,11 +247,7 @@ def _place_next(
 def _begins_again(pieces: list[PlacedLog], source: Source) -> bool:
     """Return whether a clock that was set back restarted, rather than being corrected."""
     latest = max(piece.source.end for piece in pieces if piece.clock == pieces[-1].clock)
-    elapsed = latest - pieces[-1].clock[0]
-    return (
-        source.start <= pieces[0].source.start + 0.1 * elapsed
-        or 2 * (latest - source.start) > elapsed
-    )
+    return is_restart(pieces[0].source.start, pieces[-1].clock[0], latest, source.start)
 
 
 def _grid_notes(pieces: Sequence[PlacedLog], rate: float) -> list[str]:

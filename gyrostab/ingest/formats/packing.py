@@ -168,18 +168,9 @@ def _representable_values(missing: Iterable[Any], stored: np.dtype[Any]) -> Iter
     """Yield the numbers that the type of a variable can hold, except NaN."""
     for value in missing:
         with np.errstate(all="ignore"):
-            number = stored.type(value) if stored.kind == "f" or _fits_type(value, stored) else None
-        if number is not None and number == number:
+            number = np.asarray(value).astype(stored)[()]
+        if number == number and (stored.kind == "f" or number.item() == value.item()):
             yield number
-
-
-def _fits_type(value: Any, stored: np.dtype[Any]) -> bool:
-    limits = np.iinfo(stored)
-    return (
-        bool(np.isfinite(value))
-        and float(value).is_integer()
-        and limits.min <= int(value) <= limits.max
-    )
 
 
 def _valid_range(

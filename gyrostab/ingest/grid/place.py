@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import TimeError
 from gyrostab.ingest.columns.stamps import read_stamps
-from gyrostab.ingest.gap_table import format_duration
+from gyrostab.ingest.gap_table import format_duration, is_restart
 from gyrostab.ingest.grid.rate import RateEstimate
 from gyrostab.ingest.grid.scan_pass import file_of
 from gyrostab.ingest.grid.starting_period import Stamps, readable_stamps, recut_blocks
@@ -283,23 +283,11 @@ def place_by_count(
         extra = int(np.rint(size))
         stamp_before = first + int((row - 1 + level) * period)
         if size < 0 or size > max_gap * rate:
-            back = -size
-            elapsed = row + level - begun
-            cause = (
-                RESTART
-                if size < 0 and (2 * back > elapsed or row + level + size < 0.1 * elapsed)
-                else STEP
-            )
-            events.append(
-                (
-                    cause,
-                    row + shifts[-1],
-                    row,
-                    stamp_before,
-                    stamp_before + int((size + 1) * period),
-                )
-            )
-            extra, begun = 1, row + level + size
+            before, after = row + level, row + level + size
+            cause = RESTART if size < 0 and is_restart(0.0, begun, before, after) else STEP
+            stamp = stamp_before + int((size + 1) * period)
+            events.append((cause, row + shifts[-1], row, stamp_before, stamp))
+            extra, begun = 1, after
         shifts.append(shifts[-1] + extra)
         cuts.append(row)
     runs = _counted_runs(stamps, np.array(cuts), np.array(shifts))

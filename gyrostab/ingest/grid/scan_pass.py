@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.pieces import InspectedRows
 from gyrostab.ingest.columns.stamps import read_stamps
-from gyrostab.ingest.uniform.core import merge_lines
+from gyrostab.ingest.uniform.core import merge_spans
 from gyrostab.schema import texts
 from gyrostab.store.lazy import find_source, read_slice
 from gyrostab.store.row_inspection import RowInspection, inspect_rows
@@ -51,12 +51,6 @@ class ScanPass:
         """Return which of the rows `begin` to `end` hold a sample."""
         bits = np.unpackbits(self.present[begin // 8 : -(-end // 8)])
         return bits[begin % 8 : begin % 8 + end - begin].astype(bool)
-
-
-def join_spans(parts: list[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Concatenate the spans of successive blocks of rows; spans that touch become one."""
-    spans = np.concatenate([*parts, np.empty((0, 2), dtype=np.int64)])
-    return np.stack(merge_lines(spans), axis=1)
 
 
 def _scan_block(
@@ -125,7 +119,7 @@ def scan_rows(raw: xr.Dataset, name: str, *, block: int = BLOCK_ROWS) -> ScanPas
     empty = [
         axis for axis, lowest, highest in zip(axes, low, high, strict=True) if lowest > highest
     ]
-    packed, spans = np.concatenate(bits), (join_spans(unreadable), join_spans(infinite))
+    packed, spans = np.concatenate(bits), (merge_spans(unreadable), merge_spans(infinite))
     return ScanPass(rows, packed, absent, *spans, still, empty, filled)
 
 

@@ -156,7 +156,8 @@ def find_layout(
             f"skipped {len(skipped)} line{'s' * (len(skipped) > 1)} above the header (from line "
             f"{skipped[0]})"
         )
-    comma = separator in COMMA_SEPARATORS and not _has_decimal_point(rows)
+    has_point = any("." in cell and is_number(cell) for row in rows for cell in row)
+    comma = separator in COMMA_SEPARATORS and not has_point
     notes += _describe_sources(headers, rows)
     top = tuple(lines[:above]) if header is not None else ()
     return Layout(
@@ -186,7 +187,7 @@ def _decode_lines(path: Path, head: bytes, *, complete: bool) -> tuple[list[str]
     try:
         text = b"\n".join(lines).decode("utf-8-sig").split("\n")
     except UnicodeDecodeError as error:
-        number = next(index for index, line in enumerate(lines) if not _is_utf8(line)) + 1
+        number = error.object.count(b"\n", 0, error.start) + 1
         notes.append(
             f"line {number} is not UTF-8 ({error.object[error.start : error.start + 1]!r}); the "
             "text was read as Latin-1"
@@ -269,14 +270,6 @@ def _join_headers(header: list[str], paired: int) -> list[str]:
     unit = " ".join(filter(None, units))
     joined = " ".join(names) + f" [{unit}]" * bool(unit)
     return [*header[:paired], joined, *header[paired + 2 :]]
-
-
-def _is_utf8(line: bytes) -> bool:
-    try:
-        line.decode("utf-8")
-    except UnicodeDecodeError:
-        return False
-    return True
 
 
 def _guess_separator(line: str) -> str:
@@ -371,7 +364,3 @@ def _commented_header(lines: list[str], first: int, separator: str, width: int) 
             return cells
         return None
     return None
-
-
-def _has_decimal_point(rows: list[tuple[str, ...]]) -> bool:
-    return any("." in cell and is_number(cell) for row in rows for cell in row)

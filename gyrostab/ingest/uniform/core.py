@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -286,25 +287,25 @@ def _add_holes(table: Table, runs: Table) -> Table:
     return sort_gaps(np.concatenate([table, holes]))
 
 
+def merge_spans(spans: Sequence[Table]) -> Table:
+    """Return the union of half-open spans (first, end), in order."""
+    return np.stack(merge_lines(np.concatenate([*spans, np.empty((0, 2), np.int64)])), axis=1)
+
+
 def merge_lines(table: Table) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return first samples and ends of the union of the lines of a table."""
     order = np.argsort(table[:, FIRST], kind="stable")
-    first, end = (
-        table[order, FIRST],
-        np.maximum.accumulate(table[order, END]) if len(table) else table[:, END],
-    )
-    new = np.concatenate([[True], first[1:] > end[:-1]]) if len(table) else np.zeros(0, np.bool_)
-    last = np.concatenate([new[1:], [True]]) if len(table) else new
-    return first[new], end[last]
+    first, end = table[order, FIRST], np.maximum.accumulate(table[order, END])
+    is_apart = first[1:] > end[:-1]
+    edge = np.ones(min(len(table), 1), dtype=bool)
+    return first[np.append(edge, is_apart)], end[np.append(is_apart, edge)]
 
 
 def add_spans(table: Table, spans: Table, cause: int) -> Table:
     """Add spans of samples (first, end) of one cause to a table."""
-    rows = [
-        np.array([[first, end, end - first, 0, cause]], dtype=np.int64)
-        for first, end in spans.tolist()
-    ]
-    return sort_gaps(np.concatenate([table, *rows]))
+    length = spans[:, 1] - spans[:, 0]
+    lines = np.column_stack([spans, length, np.zeros_like(length), np.full_like(length, cause)])
+    return sort_gaps(np.concatenate([table, lines]))
 
 
 def with_table(log: xr.Dataset, table: Table | None, start: int, rate: float) -> xr.Dataset:

@@ -17,7 +17,7 @@ from gyrostab.ingest.uniform.core import (
     add_spans,
     grid_of,
     has_gap_table,
-    merge_lines,
+    merge_spans,
     place_samples,
     with_table,
 )
@@ -120,7 +120,8 @@ def cut_log(
         raise OptionError(
             f"nothing is left between --from {time_from} and --to {time_to}; {clock.describe()}"
         )
-    excluded = _merge_spans([clock.span_of(span, low, high) for span in spans])
+    given = [clock.span_of(span, low, high) for span in spans]
+    excluded = merge_spans([np.array([span]) for span in given if span[1] > span[0]])
     runs = _kept_runs(low, high, excluded)
     if not len(runs):
         raise OptionError(f"--exclude leaves nothing of the log; {clock.describe()}")
@@ -228,12 +229,6 @@ class _Clock:
 def _format_stamp(stamp: np.datetime64) -> str:
     text = str(stamp)
     return text.rstrip("0").rstrip(".") if "." in text else text
-
-
-def _merge_spans(spans: Sequence[tuple[int, int]]) -> NDArray[np.int64]:
-    """Sort spans, merge those that touch, and drop empty ones."""
-    filled = np.array([span for span in spans if span[1] > span[0]], dtype=np.int64)
-    return np.stack(merge_lines(filled.reshape(-1, 2)), axis=1)
 
 
 def _kept_runs(low: int, high: int, excluded: NDArray[np.int64]) -> NDArray[np.int64]:
