@@ -164,8 +164,8 @@ def _read_frame(
     from gyrostab.ingest.columns.headers import FileColumn, split_header
     from gyrostab.ingest.columns.plan import plan_columns
     from gyrostab.ingest.columns.typed import read_columns
-    from gyrostab.ingest.files import check_options
     from gyrostab.ingest.options import ReadOptions
+    from gyrostab.ingest.reading import check_options
 
     table = (
         frame.to_frame("x" if frame.name is None else frame.name)
