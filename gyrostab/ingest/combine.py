@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError, OptionError, TimeError, UnitError
 from gyrostab.ingest.columns.pieces import (
     CHUNK_ROWS,
-    NaNPiece,
     PiecewiseColumn,
     Spool,
     as_lazy,
@@ -49,12 +48,8 @@ def move_to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
     """Return the raw log with its columns moved to a temporary file."""
 
     def moved(variable: xr.Variable) -> Any:
-        values = variable.values
-        return (
-            as_lazy(spool.store(values))
-            if values.ndim == 1
-            else stack_rows([as_lazy(spool.store(row)) for row in values])
-        )
+        rows = [as_lazy(spool.store(row)) for row in np.atleast_2d(variable.values)]
+        return stack_rows(rows) if variable.ndim == 2 else rows[0]
 
     for pieces in _columns_in_pieces(part):
         pieces.move_to(spool)
@@ -183,10 +178,7 @@ def _concatenate_parts(
         str(name) for part in parts for name in part.data_vars if name != signal
     ):
         units = _channel_units(parts, channel)
-        columns = [
-            part[channel].data if channel in part else np.full(size, np.nan)
-            for part, size in zip(parts, sizes, strict=True)
-        ]
+        columns = [part[channel].data if channel in part else _blank_column(part) for part in parts]
         packing = common_packing(part[channel].encoding for part in parts if channel in part)
         data[channel] = ("row", concatenate_columns(columns, CHUNK_ROWS), {"units": units}, packing)
         absent[f"channel {channel}"] = _files_without(
@@ -229,30 +221,23 @@ def _files_without(groups: list[list[xr.Dataset]], holders: set[int]) -> list[st
 
 def _stack_signal(parts: list[xr.Dataset], signal: str, axes: list[str]) -> Any:
     """Stack the signal of all parts, (axis, row); NaN where a part lacks an axis."""
-    if all(isinstance(part[signal].data, np.ndarray) for part in parts):
-        values = np.full((len(axes), sum(part.sizes["row"] for part in parts)), np.nan)
-        end = 0
+    rows = []
+    for axis in axes:
+        columns = []
         for part in parts:
-            end += part.sizes["row"]
-            for axis in map(str, part["axis"].values):
-                values[axes.index(axis), end - part.sizes["row"] : end] = (
-                    part[signal].sel(axis=axis).data
-                )
-        return values
-    return stack_rows(
-        [
-            concatenate_columns([_read_axis(part, signal, axis) for part in parts], CHUNK_ROWS)
-            for axis in axes
-        ]
-    )
+            names = _axis_names(part)
+            columns.append(
+                select_part(part[signal].data, names.index(axis))
+                if axis in names
+                else _blank_column(part)
+            )
+        rows.append(concatenate_columns(columns, CHUNK_ROWS))
+    return stack_rows(rows)
 
 
-def _read_axis(part: xr.Dataset, signal: str, axis: str) -> Any:
-    if axis in part["axis"].values:
-        return select_part(
-            part[signal].data, [str(name) for name in part["axis"].values].index(axis)
-        )
-    return as_lazy(PiecewiseColumn(np.float64, [NaNPiece(part.sizes["row"])]))
+def _blank_column(part: xr.Dataset) -> NDArray[np.float64]:
+    """Return a column of NaN that takes no memory."""
+    return np.broadcast_to(np.nan, (part.sizes["row"],))
 
 
 def _channel_units(parts: list[xr.Dataset], channel: str) -> str:

@@ -201,17 +201,6 @@ class FilePiece(Piece):
         out[:] = self.read(self.begin + first, self.begin + first + out.size).view(out.dtype)
 
 
-@dataclass(frozen=True)
-class NaNPiece(Piece):
-    """Rows without a value."""
-
-    rows: int
-
-    def read_into(self, first: int, out: NDArray[Any]) -> None:
-        """Fill `out` with NaN."""
-        out[:] = np.nan
-
-
 class PiecewiseColumn(RowSource):
     """A column in pieces, as a lazy source.
 

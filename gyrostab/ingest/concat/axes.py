@@ -54,8 +54,8 @@ def split_axes(raw: xr.Dataset) -> list[xr.Dataset]:
     )
     for number, (axes, first, end) in enumerate(groups):
         rows = [select_part(signal.data, places.index(axis), first, end) for axis in axes]
-        stacked = np.stack(rows) if isinstance(rows[0], np.ndarray) else stack_rows(rows)
-        data: dict[Any, Any] = {name: (("axis", "row"), stacked, signal.attrs, signal.encoding)}
+        stack = stack_rows(rows)
+        data: dict[Any, Any] = {name: (("axis", "row"), stack, signal.attrs, signal.encoding)}
         for key, variable in raw.data_vars.items():
             if key != name and (variable.dims == ("row",) or number == 0):
                 values = (
