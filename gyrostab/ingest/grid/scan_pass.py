@@ -127,21 +127,16 @@ def stamp_blocks(
     raw: xr.Dataset, scanned: ScanPass, *, block: int = BLOCK_ROWS, all_rows: bool = False
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """Yield row numbers and stamps [ns] (or `NO_STAMP`) of rows with a sample, in blocks."""
-    blocks = _read_stamp_blocks(raw, scanned, block, all_rows=all_rows)
-    return map_in_order(lambda item: item, blocks, workers=1)
 
-
-def _read_stamp_blocks(
-    raw: xr.Dataset, scanned: ScanPass, block: int, *, all_rows: bool
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    for begin in range(0, scanned.rows, block):
+    def read_block(begin: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         end = min(scanned.rows, begin + block)
         values = read_stamps(raw, begin, end)
         if not scanned.repeated and (all_rows or scanned.absent == 0):
-            yield np.arange(begin, end), values
-        else:
-            keep = scanned.mask(begin, end)
-            yield np.flatnonzero(keep) + begin, values[keep]
+            return np.arange(begin, end), values
+        keep = scanned.mask(begin, end)
+        return np.flatnonzero(keep) + begin, values[keep]
+
+    return map_in_order(read_block, range(0, scanned.rows, block), workers=1)
 
 
 def _source_names(raw: xr.Dataset) -> list[str]:
