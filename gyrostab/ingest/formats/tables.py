@@ -131,41 +131,38 @@ def _plain_names(names: Sequence[tuple[str, ...]]) -> list[str]:
 
 @dataclass(frozen=True)
 class _PlannedTables:
-    """Tables with one plan; source numbers run through all tables, stamps first."""
+    """Tables with one plan."""
 
     tables: list[Table]
-    first: list[int]
+    stored: list[TableColumn]  # those of all tables by source number, the stamps of each first
+    first: list[int]  # source number of the stamps of each table, and of the end of the last
     plan: Plan
     main: list[int]  # tables with gyro axes, each with separate stamps
 
-    def part(self, place: int) -> tuple[Plan, Any]:
-        """Return the plan of one table's columns, and the function that fetches them."""
-        begin, stored = self.first[place], _with_stamps(self.tables[place])
-        columns = [
-            column for column in self.plan.columns if begin <= column.source < begin + len(stored)
-        ]
-        if stored[0] is not _NO_STAMPS:
-            clocks = [self._clock_of(place, clock) for clock in self.plan.of("time")]
+    def plan_of(self, place: int) -> Plan:
+        """Return the plan of the columns of one table."""
+        begin, end = self.first[place : place + 2]
+        columns = [column for column in self.plan.columns if begin <= column.source < end]
+        if self.tables[place].stamps is not None:
+            clocks = [self._clock_of(begin, clock) for clock in self.plan.of("time")]
             columns = clocks + [c for c in columns if not (clocks and c.role == "time")]
+        return replace(self.plan, columns=tuple(columns))
 
-        def fetch(source: int, start: int, stop: int) -> Any:
-            return stored[source - begin].values(start, stop)
-
-        return replace(self.plan, columns=tuple(columns)), fetch
-
-    def _clock_of(self, place: int, planned: Column) -> Column:
+    def _clock_of(self, source: int, planned: Column) -> Column:
         """Return the stamps of a table, in the planned unit if both clocks are stored in one."""
-        holder = bisect_right(self.first, planned.source) - 1
-        stored = _with_stamps(self.tables[holder])[planned.source - self.first[holder]]
-        unit, time_unit = _with_stamps(self.tables[place])[0].unit, planned.time_unit
-        if unit != stored.unit:
+        unit, time_unit = self.stored[source].unit, planned.time_unit
+        if unit != self.stored[planned.source].unit:
             time_unit = parse_time_unit(unit) if unit else None
-        return replace(planned, source=self.first[place], time_unit=time_unit)
+        return replace(planned, source=source, time_unit=time_unit)
+
+    def fetch(self, source: int, start: int, stop: int) -> Any:
+        """Return the values of a column."""
+        return self.stored[source].values(start, stop)
 
 
 def _leave_out_unplaced(planned: _PlannedTables, options: ReadOptions) -> _PlannedTables:
     """Leave out, with notes, tables whose rows have no place on the time of the log."""
-    plans = [planned.part(place)[0] for place in range(len(planned.tables))]
+    plans = [planned.plan_of(place) for place in range(len(planned.tables))]
     is_dated = {
         place: options.epoch is not None
         or time.time_unit is None
@@ -193,46 +190,35 @@ def _leave_out_unplaced(planned: _PlannedTables, options: ReadOptions) -> _Plann
     return replace(planned, plan=plan, main=main)
 
 
-def _with_stamps(table: Table) -> list[TableColumn]:
-    return [table.stamps or _NO_STAMPS, *table.columns]
-
-
 def _plan_tables(path: Path, tables: Sequence[Table], options: ReadOptions) -> _PlannedTables:
-    names = iter(_plain_names([c.name for table in tables for c in _with_stamps(table)]))
+    columns = [c for table in tables for c in (table.stamps or _NO_STAMPS, *table.columns)]
+    named = iter(zip(_plain_names([column.name for column in columns]), columns, strict=True))
     filled: list[Table] = []
+    stored: list[TableColumn] = []
     first: list[int] = []
-    columns: list[FileColumn] = []
+    described: list[FileColumn] = []
     for table in tables:
-        _, *column_names = islice(names, 1 + len(table.columns))
-        if not table.rows or not column_names:
+        (_, clock), *others = islice(named, 1 + len(table.columns))
+        if not table.rows or not others:
             continue
-        clock = table.stamps
-        is_first_clock = clock is not None and all(held.stamps is None for held in filled)
+        is_timed = table.stamps is not None
+        is_first_clock = is_timed and all(held.stamps is None for held in filled)
         filled.append(table)
-        first.append(len(columns))
-        columns.append(
-            FileColumn(
-                "time" if is_first_clock else "",
-                clock.unit if clock else None,
-                stamped=clock is not None and clock.unit is None,
-            )
-        )
-        columns += [
-            FileColumn(name, column.unit or None, target=column.target)
-            for name, column in zip(column_names, table.columns, strict=True)
-        ]
+        first.append(len(stored))
+        stored += [clock, *(column for _, column in others)]
+        header, stamped = "time" if is_first_clock else "", is_timed and clock.unit is None
+        described.append(FileColumn(header, clock.unit or None, stamped=stamped))
+        described += [FileColumn(name, c.unit or None, target=c.target) for name, c in others]
     if not filled:
         raise FormatError(
             f"{path.name}: it holds no values; copy it again, or check what the logger wrote"
         )
-    plan = plan_columns(path, columns, options)
+    plan = plan_columns(path, described, options)
     main_columns = plan.of("gyro") or plan.of("channel")
-    holders = {
-        max(place for place, begin in enumerate(first) if begin <= column.source)
-        for column in main_columns
-    }
+    holders = {bisect_right(first, column.source) - 1 for column in main_columns}
     main = sorted(holders) if plan.of("gyro") else [min(holders, default=0)]
-    return _leave_out_unplaced(_PlannedTables(filled, first, plan, main), options)
+    planned = _PlannedTables(filled, stored, [*first, len(stored)], plan, main)
+    return _leave_out_unplaced(planned, options)
 
 
 def scan_tables(
@@ -241,8 +227,8 @@ def scan_tables(
     """Summarise tables, with the first and last stamps of the table with the gyro axes."""
     planned = _plan_tables(path, tables, options)
     main = planned.main[0]
-    plan, fetch = planned.part(main)
-    summary = summarise_columns(form, plan, options, planned.tables[main].rows, fetch, notes)
+    plan, rows = planned.plan_of(main), planned.tables[main].rows
+    summary = summarise_columns(form, plan, options, rows, planned.fetch, notes)
     axes, channels = (
         tuple(column.name for column in planned.plan.of(role)) for role in ("gyro", "channel")
     )
@@ -262,14 +248,14 @@ def read_tables(
     main: list[xr.Dataset] = []
     channel_logs: list[xr.Dataset] = []
     for place, table in enumerate(planned.tables):
-        plan, fetch = planned.part(place)
+        plan = planned.plan_of(place)
         if place in planned.main:
             if main:
                 plan, notes = replace(plan, notes=()), ()
-            main.append(read_columns(plan, options, table.rows, fetch, notes=notes))
+            main.append(read_columns(plan, options, table.rows, planned.fetch, notes=notes))
         elif plan.of("channel"):
             plan = replace(plan, signal=None, kind=None, notes=())
-            channel_logs.append(read_columns(plan, options, table.rows, fetch))
+            channel_logs.append(read_columns(plan, options, table.rows, planned.fetch))
     log = with_channels(concatenate(main) if len(main) > 1 else main[0], channel_logs)
     if "axis_rows" in log.attrs:
         return log
