@@ -254,6 +254,7 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
     from gyrostab.ingest.grid.regularise import regularise
     from gyrostab.ingest.uniform import cut_log
     from gyrostab.schema import log_channels, signal_name, texts
+    from gyrostab.store.row_inspection import find_spans
 
     max_gap = reading.get("max_gap", "10D")
     cut = {name: reading[name] for name in _CUTTING if name in reading}
@@ -286,7 +287,7 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
         "rows": int(raw.sizes["time" if regular else "row"]),
         "gaps": len(gap_table(log))
         if "gap_start" in log.variables
-        else _count_runs(signal.isnull().all("axis")),
+        else len(find_spans(signal.isnull().all("axis").values, 0)),
         "missing_share": 1.0 - count_present(signal.data) / signal.size,
         "odd": "; ".join(notes),
         "notes": tuple(notes),
@@ -323,8 +324,3 @@ def _measure_white_noise(log: xr.Dataset) -> dict[str, float]:
             factor *= 2
         noise[str(axis)] = math.sqrt(min(levels, default=math.nan))
     return noise
-
-
-def _count_runs(missing: xr.DataArray) -> int:
-    """Count the runs of missing samples, for a log without a table of gaps."""
-    return int((missing & ~missing.shift(time=1, fill_value=False)).sum())

@@ -196,16 +196,6 @@ def integers_to_ns(values: NDArray[np.int64], unit: TimeUnit, epoch: int) -> NDA
     return np.where(inside & (values >= low) & (values <= high), stamps, NAT)
 
 
-def _signed_counts(counts: NDArray[Any]) -> NDArray[np.int64]:
-    """Return whole numbers as int64; larger unsigned ones become its maximum."""
-    wide = (
-        np.minimum(counts, np.uint64(_MAX_INT64))
-        if counts.dtype.kind == "u" and counts.dtype.itemsize == 8
-        else counts
-    )
-    return wide.astype(np.int64)
-
-
 def floats_to_ns(
     values: NDArray[np.floating[Any]], unit: TimeUnit, epoch: int
 ) -> NDArray[np.int64]:
@@ -222,7 +212,9 @@ def numbers_to_ns(values: NDArray[Any], unit: TimeUnit, epoch: int) -> NDArray[n
     """Convert counts of `unit` since `epoch`, whole or not, to stamps."""
     if values.dtype.kind == "f":
         return floats_to_ns(values, unit, epoch)
-    return integers_to_ns(_signed_counts(values), unit, epoch)
+    if values.dtype.kind == "u":
+        values = np.minimum(values, np.uint64(_MAX_INT64))
+    return integers_to_ns(values.astype(np.int64), unit, epoch)
 
 
 def from_fortran(text: str) -> str:

@@ -8,7 +8,7 @@ is unknown, and one sample is taken as missing.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -173,7 +173,9 @@ def place_logs(sources: Sequence[Source], *, max_gap: float) -> tuple[list[Place
         if match is not None:
             overlaps.append(_overlap_note(piece, *match, rate))
         elif piece.cause >= 0:
-            breaks.append(_break_note(pieces, piece))
+            last = _last_stamp(pieces)
+            text = describe_break("", piece.cause, last, source.start, "samples")
+            breaks.append(f"{source.name}: {text}")
         pieces.append(piece)
     notes = [
         *_grid_notes(pieces, rate),
@@ -181,25 +183,21 @@ def place_logs(sources: Sequence[Source], *, max_gap: float) -> tuple[list[Place
         *_first_notes(overlaps, "overlaps"),
     ]
     lowest = min(piece.first for piece in pieces)
-    return [_shift_samples(piece, -lowest) for piece in pieces], notes
+    shifted = [
+        replace(
+            piece,
+            runs=piece.runs - np.array([lowest, 0, 0]),
+            clock=(piece.clock[0], piece.clock[1] - lowest),
+        )
+        for piece in pieces
+    ]
+    return shifted, notes
 
 
 def _first_notes(notes: Sequence[str], subject: str) -> list[str]:
     """Return the first of many notes of one kind, and how many more there are."""
     more = len(notes) - _MAX_NAMED
     return [*notes[:_MAX_NAMED], *([f"{more} more {subject}"] if more > 0 else [])]
-
-
-def _shift_samples(piece: PlacedLog, by: int) -> PlacedLog:
-    if not by:
-        return piece
-    return PlacedLog(
-        piece.source,
-        piece.runs + np.array([by, 0, 0]),
-        piece.off,
-        (piece.clock[0], piece.clock[1] + by),
-        piece.cause,
-    )
 
 
 def _place_next(
@@ -234,7 +232,9 @@ def _place_next(
         first - end > max_gap * rate,
     )
     if back or ahead:
-        cause = RESTART if back and _begins_again(pieces, source) else CLOCK_STEP
+        ends = clock[0], _last_stamp(pieces), source.start
+        is_new = back and is_restart(pieces[0].source.start, *ends)
+        cause = RESTART if is_new else CLOCK_STEP
         return PlacedLog(
             source, runs_of(end + 1, 0.0, source.size, ratio), 0.0, (source.start, end + 1), cause
         ), None
@@ -244,10 +244,9 @@ def _place_next(
     ) if first < end else None
 
 
-def _begins_again(pieces: list[PlacedLog], source: Source) -> bool:
-    """Return whether a clock that was set back restarted, rather than being corrected."""
-    latest = max(piece.source.end for piece in pieces if piece.clock == pieces[-1].clock)
-    return is_restart(pieces[0].source.start, pieces[-1].clock[0], latest, source.start)
+def _last_stamp(pieces: Sequence[PlacedLog]) -> int:
+    """Return the latest stamp of the clock of the last log [ns since 1970]."""
+    return max(piece.source.end for piece in pieces if piece.clock == pieces[-1].clock)
 
 
 def _grid_notes(pieces: Sequence[PlacedLog], rate: float) -> list[str]:
@@ -298,9 +297,3 @@ def _overlap_note(piece: PlacedLog, held: PlacedLog, match: _Match, rate: float)
         f"{name}: {extent} in {holder} too, and counted once{differ}; the samples of {holder} "
         "are kept where it has them"
     )
-
-
-def _break_note(pieces: Sequence[PlacedLog], piece: PlacedLog) -> str:
-    last_end = max(earlier.source.end for earlier in pieces if earlier.clock == pieces[-1].clock)
-    description = describe_break("", piece.cause, last_end, piece.source.start, "samples")
-    return f"{piece.source.name}: {description}"

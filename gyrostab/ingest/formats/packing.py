@@ -99,11 +99,6 @@ class Packing:
         return cls(stored, tuple(_representable_values(missing, stored)), low, high, scale, offset)
 
     @property
-    def is_identity(self) -> bool:
-        """Whether every stored number is a valid value without conversion."""
-        return self.is_plain and not self.missing and self.low == -np.inf and self.high == np.inf
-
-    @property
     def is_plain(self) -> bool:
         """Whether the stored numbers are the values."""
         return self.scale == 1.0 and self.offset == 0.0
@@ -294,7 +289,7 @@ def _decode_variable(
             raise UnitError(f"{where}: {error}") from error
         read = partial(_read_stamps, packing, unit)
         return Converted(source, read, "datetime64[ns]"), attrs, chunks
-    if packing.is_identity and packing.dtype == variable.dtype:
+    if packing == Packing(variable.dtype):  # every stored number is a value
         return source, attrs, variable.encoding
     encoding = dict(chunks)
     if packing.dtype.kind in "iu" and packing.scale != 1.0:

@@ -65,11 +65,6 @@ class JitterModel:
         """Code length of a stamp to the nanosecond, including the cost of its row [nats]."""
         return self.nats + float(np.log(max(self.sigma, MIN_SIGMA) * self.period))
 
-    @classmethod
-    def of_sharp(cls, period: float) -> JitterModel:
-        """Return the model of stamps that scatter by less than a tenth of a sample."""
-        return cls(period, MIN_SIGMA, "all", 1.0, 0.5)
-
 
 def observe_rows(stamps: Integers, observe: str, period: float) -> Integers:
     """Select the rows whose stamps are used; the last row of a block counts as end of its group."""

@@ -133,11 +133,6 @@ def append_runs(
         runs.append(table)
 
 
-def place_without_time(rows: int, start: int) -> Placement:
-    """Place rows without stamps: every row is the next sample."""
-    return make_placement(start, [np.array([[0, 0, rows]], dtype=np.int64)], [])
-
-
 def place_by_stamp(
     stamps: Stamps, rate: float, *, tolerance: float, max_gap: float, where: str
 ) -> Placement:

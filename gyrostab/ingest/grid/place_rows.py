@@ -12,13 +12,13 @@ import xarray as xr
 
 from gyrostab.errors import TimeError
 from gyrostab.ingest.columns.pieces import PiecewiseColumn
-from gyrostab.ingest.grid.jitter import JitterModel
+from gyrostab.ingest.grid.jitter import MIN_SIGMA, JitterModel
 from gyrostab.ingest.grid.notes import describe_rate
 from gyrostab.ingest.grid.place import (
     Placement,
+    make_placement,
     place_by_count,
     place_by_stamp,
-    place_without_time,
 )
 from gyrostab.ingest.grid.place_in_order import place_in_order
 from gyrostab.ingest.grid.rate import (
@@ -138,7 +138,8 @@ class RowPlacer:
             f"{self.where}: no time in the file and no --start: the log is said to start at "
             "1970-01-01T00:00:00"
         )
-        placement = place_without_time(self.scanned.rows, stamp_ns(text) if text else 0)
+        runs = [np.array([[0, 0, self.scanned.rows]], dtype=np.int64)]
+        placement = make_placement(stamp_ns(text) if text else 0, runs, [])
         return placement, self.declared, [] if text else [note]
 
     def _estimate_declared(
@@ -190,7 +191,7 @@ class RowPlacer:
         dropped = scanned.rows - scanned.absent - scanned.repeated - placement.placed
         if not scanned.repeated and (dropped >= _MIN_DROPPED_ROWS or placement.has_late_rows):
             # placing in order may recover them
-            along = place_along(jitter or JitterModel.of_sharp(1e9 / rate))
+            along = place_along(jitter or JitterModel(1e9 / rate, MIN_SIGMA, "all", 1.0, 0.5))
             if along.placed - placement.placed >= _LATE_SHARE * dropped:
                 placement = along
         return placement
