@@ -76,10 +76,8 @@ def find_time(draft: PlanDraft, named: list[Header]) -> Header | None:
             draft.notes.append(f"{header!r} is taken for the time column, as {reason}")
     if not time_columns:
         return None
-    time_columns.sort(key=lambda c: not draft.rising(c.source))
-    column = time_columns[0]
-    candidates = {id(c) for c in time_columns}
-    rivals = time_columns[1:] + [c for c in named if id(c) not in candidates and c.low == "time"]
+    column, *rivals = sorted(time_columns, key=lambda c: not draft.rising(c.source))
+    rivals += [c for c in named if c.low == "time" and c not in time_columns]
     if rivals:
         names = " and ".join(repr(c.header) for c in [column, *rivals][:3])
         draft.notes.append(
@@ -88,8 +86,7 @@ def find_time(draft: PlanDraft, named: list[Header]) -> Header | None:
         )
         for rival in rivals:
             draft.leave_out(rival)
-        dropped = {id(rival) for rival in rivals}
-        named[:] = [c for c in named if id(c) not in dropped]
+        named[:] = [c for c in named if c not in rivals]
     unit = None if column.stamped else _time_unit(draft, column)
     order = _date_order(draft, column) if column.stamped else YEAR_FIRST
     planned = column.source, column.header, "time", "time", "time", "ns"
