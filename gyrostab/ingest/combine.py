@@ -98,22 +98,18 @@ def _slow_channels(part: xr.Dataset) -> list[str]:
 
 def _group_by_axes(parts: list[xr.Dataset]) -> list[list[xr.Dataset]]:
     """Group files by their axes if the groups cover the same time; otherwise all form one group."""
-    groups = [
-        [parts[number] for number in group]
-        for group in group_axes([_axis_names(part) for part in parts])
-    ]
+    groups = group_axes(parts, map(_axis_names, parts))
     if len(groups) == 1 or not all(_axis_names(group[0]) for group in groups):
         return [list(parts)]
     if "time" not in parts[0].variables:
         return groups
-    spans = [[stamp_span(part) for part in group] for group in groups]
-    ends = sorted(
-        (min(first for first, _ in span), max(last for _, last in span)) for span in spans
-    )
-    in_time = [
-        later[0] > earlier[1] for earlier, later in pairwise(ends)
-    ]  # the later group begins after the earlier one has ended
-    return [list(parts)] if any(in_time) else groups
+    spans = []
+    for group in groups:
+        first, last = zip(*map(stamp_span, group), strict=True)
+        spans.append((min(first), max(last)))
+    # whether a group begins after another one has ended
+    is_later = any(later[0] > earlier[1] for earlier, later in pairwise(sorted(spans)))
+    return [list(parts)] if is_later else groups
 
 
 def _axis_names(part: xr.Dataset) -> list[str]:
@@ -125,10 +121,8 @@ def _in_order(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
     if not any(timed):
         return list(parts)
     if not all(timed):
-        with_time, without = (
-            next(p.attrs["source_files"][0] for p, t in zip(parts, timed, strict=True) if t is want)
-            for want in (True, False)
-        )
+        names = [part.attrs["source_files"][0] for part in parts]
+        with_time, without = names[timed.index(True)], names[timed.index(False)]
         raise TimeError(
             f"{with_time} has time stamps and {without} has none; read them one by one, or give "
             "the latter a time column"
@@ -140,13 +134,10 @@ def _common_signal(parts: Sequence[xr.Dataset]) -> str | None:
     first = parts[0]
     for part in parts[1:]:
         if part.attrs.get("kind") != first.attrs.get("kind"):
-            (a, b), (kind_a, kind_b) = zip(
-                *((p.attrs["source_files"][0], p.attrs.get("kind")) for p in (first, part)),
-                strict=True,
-            )
+            held, other = (f"of kind {log.attrs.get('kind')!r}" for log in (first, part))
+            names = [log.attrs["source_files"][0] for log in (first, part)]
             raise UnitError(
-                f"{a} holds a gyro signal of kind {kind_a!r}, {b} of kind {kind_b!r}; read them "
-                "one by one"
+                f"{names[0]} holds a gyro signal {held}, {names[1]} {other}; read them one by one"
             )
     return next((name for name in SIGNAL_UNITS if name in first.data_vars), None)
 

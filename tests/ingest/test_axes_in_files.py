@@ -174,8 +174,8 @@ def test_long_files_stay_on_disk_and_are_read_lazily(tmp_path, monkeypatch):
 
 
 def test_logs_are_grouped_by_the_axes_they_share():
-    assert group_axes([["x", "y"], ["y", "z"], ["z"]]) == [[0, 1, 2]]
-    assert group_axes([["z"], ["x"], ["y"], ["x"]]) == [[1, 3], [2], [0]]
+    assert group_axes(range(3), [["x", "y"], ["y", "z"], ["z"]]) == [[0, 1, 2]]
+    assert group_axes(range(4), [["z"], ["x"], ["y"], ["x"]]) == [[1, 3], [2], [0]]
 
 
 def write_miniseed(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -12,16 +12,18 @@ from gyrostab.errors import SchemaError
 from gyrostab.schema import signal_name, texts
 from gyrostab.store.lazy import select_part, stack_rows
 
+Log = TypeVar("Log")
 
-def group_axes(axes: Sequence[Sequence[str]]) -> list[list[int]]:
+
+def group_axes(logs: Sequence[Log], axes: Iterable[Sequence[str]]) -> list[list[Log]]:
     """Group logs by their axes: logs of one group share axes, directly or through other logs.
 
-    Returns the positions of the logs of each group; the groups by their first axis.
+    The groups are in the order of their first axes.
 
     Examples
     --------
-    >>> group_axes([["z"], ["x", "y"], ["z"], ["y"]])
-    [[1, 3], [0, 2]]
+    >>> group_axes("abcd", [["z"], ["x", "y"], ["z"], ["y"]])
+    [['b', 'd'], ['a', 'c']]
     """
     groups: list[tuple[set[str], list[int]]] = []
     for number, log_axes in enumerate(axes):
@@ -29,7 +31,8 @@ def group_axes(axes: Sequence[Sequence[str]]) -> list[list[int]]:
         groups = [group for group in groups if group not in sharing_groups]
         members = sorted([number, *(member for group in sharing_groups for member in group[1])])
         groups.append((set(log_axes).union(*(group[0] for group in sharing_groups)), members))
-    return [members for _, members in sorted(groups, key=lambda group: sorted(group[0]))]
+    ordered = sorted(groups, key=lambda group: sorted(group[0]))
+    return [[logs[number] for number in members] for _, members in ordered]
 
 
 def split_axes(raw: xr.Dataset) -> list[xr.Dataset]:

@@ -60,10 +60,7 @@ def merge_gaps(pieces: Sequence[PlacedLog]) -> Table:
 
     Its columns are those of `gyrostab.ingest.gap_table.COLUMNS`, sorted by sample.
     """
-    groups = [
-        [pieces[number] for number in group]
-        for group in group_axes([piece.source.axes for piece in pieces])
-    ]
+    groups = group_axes(pieces, [piece.source.axes for piece in pieces])
     spans = sorted(
         (min(piece.first for piece in group), max(piece.end for piece in group)) for group in groups
     )
