@@ -15,7 +15,8 @@ from gyrostab.ingest.columns.plan_draft import (
     name_columns,
     resolve_duplicates,
 )
-from gyrostab.ingest.columns.plan_roles import find_time, plan_channels, plan_gyro
+from gyrostab.ingest.columns.plan_roles import plan_channels, plan_gyro
+from gyrostab.ingest.columns.plan_time import find_time
 from gyrostab.ingest.columns.preset import PresetMatch, find_preset
 from gyrostab.ingest.limits import check_columns
 from gyrostab.ingest.options import ColumnSummary, ReadOptions
