@@ -24,14 +24,7 @@ from gyrostab.ingest.formats.layout import (
     layout_path,
 )
 from gyrostab.ingest.formats.messages import find_messages, unwrap_counter
-from gyrostab.ingest.formats.tables import (
-    NO_NAME,
-    Table,
-    TableColumn,
-    TablesOfFile,
-    make_reader,
-    sliced,
-)
+from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, make_reader
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.time.grid import check_span, grid_times
 
@@ -82,8 +75,7 @@ def _make_tables(path: Path, options: ReadOptions, *, needs_rate: bool) -> Table
         where = "" if layout.sync else "the last "
         notes.append(f"{where}{extra_bytes} bytes are not {expected}; is the layout right?")
     columns = [TableColumn((field.name,), partial(fetch, field)) for field in layout.fields]
-    clock = None if stamps is None else TableColumn(NO_NAME, stamps, "ns")
-    return [Table(rows, columns, clock)], notes
+    return [Table(rows, columns, stamps, "ns")], notes
 
 
 scan, read = make_reader(
@@ -121,7 +113,7 @@ def _count_time(
     notes = [f"by their counter, {lost} messages were lost"] if lost > 0 else []
     rate = float(options.rate)
     check_span(0, rate, int(numbers[-1]) + 1, path.name)
-    return sliced(grid_times(0, rate, numbers)), notes
+    return grid_times(0, rate, numbers), notes
 
 
 def _read_field(

@@ -19,15 +19,7 @@ from gyrostab.ingest.columns.headers import is_time_unit
 from gyrostab.ingest.columns.stamps import dates_to_ns, floats_to_ns, parse_time_unit
 from gyrostab.ingest.columns.typed import holds_dates
 from gyrostab.ingest.formats.recognise import read_head
-from gyrostab.ingest.formats.tables import (
-    NO_NAME,
-    Table,
-    TableColumn,
-    TablesOfFile,
-    library,
-    make_reader,
-    sliced,
-)
+from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, library, make_reader
 from gyrostab.ingest.options import ReadOptions
 
 # Date fields in units of curves -> codes of `datetime.strptime`.
@@ -49,14 +41,13 @@ def _read_curves(path: Path, options: ReadOptions) -> TablesOfFile:
     clocks, dates = _find_clock(path, curves, options) if rows else ([], None)
     columns = [
         TableColumn(
-            NO_NAME if any(curve is clock for clock in clocks) else (str(curve.mnemonic),),
-            sliced(np.asarray(curve.data)),
+            ("" if any(curve is clock for clock in clocks) else str(curve.mnemonic),),
+            np.asarray(curve.data),
             None if holds_dates(curve.data) else str(curve.unit or "").strip() or None,
         )
         for curve in curves
     ]
-    stamps = None if dates is None else TableColumn(NO_NAME, sliced(dates))
-    return [Table(rows, columns, stamps)], ()
+    return [Table(rows, columns, dates)], ()
 
 
 def _find_clock(

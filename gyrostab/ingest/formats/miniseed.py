@@ -7,6 +7,7 @@ axes, named by their orientation.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -16,16 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.ingest.formats.recognise import begins_like
-from gyrostab.ingest.formats.tables import (
-    NO_NAME,
-    ReadSlice,
-    Table,
-    TableColumn,
-    TablesOfFile,
-    library,
-    make_reader,
-    sliced,
-)
+from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, library, make_reader
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.time.grid import grid_times
 
@@ -112,12 +104,14 @@ def _group_traces(traces: list[_Trace]) -> list[Table]:
         columns = [
             TableColumn(
                 trace.name,
-                sliced(_join_values(trace.values, rows)),
-                target=_axis_of_code(trace.name[-1]),
+                _join_values(trace.values, rows),
+                target=f"gyro_{match[1].lower()}"
+                if (match := _ROTATION.fullmatch(trace.name[-1]))
+                else None,
             )
             for trace in group
         ]
-        tables.append(Table(rows, columns, TableColumn(NO_NAME, _trace_stamps(longest))))
+        tables.append(Table(rows, columns, _trace_stamps(longest)))
     return tables
 
 
@@ -133,12 +127,6 @@ def _in_step(first: _Trace, second: _Trace) -> bool:
     )
 
 
-def _axis_of_code(code: str) -> str | None:
-    """Return the gyro axis of a rotation sensor channel, None for other channels."""
-    match = _ROTATION.fullmatch(code)
-    return f"gyro_{match.group(1).lower()}" if match else None
-
-
 def _join_values(pieces: list[NDArray[Any]], rows: int) -> NDArray[Any]:
     """Join the segments of a trace, with NaN up to the number of rows; empty if not loaded."""
     missing = rows - sum(map(len, pieces)) if pieces else 0
@@ -146,7 +134,7 @@ def _join_values(pieces: list[NDArray[Any]], rows: int) -> NDArray[Any]:
     return np.concatenate([*pieces, *padding])
 
 
-def _trace_stamps(trace: _Trace) -> ReadSlice:
+def _trace_stamps(trace: _Trace) -> Callable[[int, int], Any]:
     ends = np.cumsum(trace.sizes)
 
     def part(start: int, stop: int) -> NDArray[np.datetime64]:

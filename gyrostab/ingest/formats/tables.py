@@ -25,18 +25,20 @@ from gyrostab.ingest.combine import concatenate, with_channels
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.wording import list_some
 
-#: First row, row after the last one -> values.
-ReadSlice = Callable[[int, int], Any]
-
 
 @dataclass(frozen=True)
 class TableColumn:
     """A column; its name is used alone, or after the names of its groups if several share it."""
 
     name: tuple[str, ...]
-    values: ReadSlice
+    values: Any  # what can be sliced, or a function of the first row and the row after the last
     unit: str | None = None
     target: str | None = None  # by a code of the format, in the form of ``--map``
+
+    def read(self, start: int, stop: int) -> Any:
+        """Return the values of rows."""
+        is_function = callable(self.values)
+        return self.values(start, stop) if is_function else np.asarray(self.values[start:stop])
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,8 @@ class Table:
 
     rows: int
     columns: Sequence[TableColumn]
-    stamps: TableColumn | None = None
+    stamps: Any = None  # as the values of a column
+    time_unit: str | None = None
 
 
 #: Tables of a file, and notes on it.
@@ -64,7 +67,7 @@ class Messages:
     >>> messages = Messages()
     >>> messages.add(0, {"x": 1.0})
     >>> messages.add(10, {"x": 2.0, "t": 20.5})
-    >>> [column.values(0, 2).tolist() for column in messages.make_table("imu").columns]
+    >>> [column.values.tolist() for column in messages.make_table("imu").columns]
     [[1.0, 2.0], [nan, 20.5]]
     """
 
@@ -91,27 +94,15 @@ class Messages:
             self._fill_column(column)
         stamps = np.frombuffer(self.stamps, dtype=np.int64)
         columns = [
-            TableColumn(
-                (*group, name), sliced(np.frombuffer(column)), target=(targets or {}).get(name)
-            )
+            TableColumn((*group, name), np.frombuffer(column), target=(targets or {}).get(name))
             for name, column in self.columns.items()
         ]
-        clock = sliced(stamps if time_unit else stamps.view("datetime64[ns]"))
-        return Table(len(stamps), columns, TableColumn(NO_NAME, clock, time_unit))
+        clock = stamps if time_unit else stamps.view("datetime64[ns]")
+        return Table(len(stamps), columns, clock, time_unit)
 
     def _fill_column(self, column: array[float]) -> None:
         if len(column) < len(self.stamps):
             column.extend([np.nan] * (len(self.stamps) - len(column)))
-
-
-def sliced(values: Any) -> ReadSlice:
-    """Return a function that slices an array, or what can be sliced like one."""
-    return lambda start, stop: np.asarray(values[start:stop])
-
-
-#: Name of a column without one.
-NO_NAME = ("",)
-_NO_STAMPS = TableColumn(NO_NAME, sliced(()))
 
 
 def _plain_names(names: Sequence[tuple[str, ...]]) -> list[str]:
@@ -157,7 +148,7 @@ class _PlannedTables:
 
     def fetch(self, source: int, start: int, stop: int) -> Any:
         """Return the values of a column."""
-        return self.stored[source].values(start, stop)
+        return self.stored[source].read(start, stop)
 
 
 def _leave_out_unplaced(planned: _PlannedTables, options: ReadOptions) -> _PlannedTables:
@@ -191,24 +182,26 @@ def _leave_out_unplaced(planned: _PlannedTables, options: ReadOptions) -> _Plann
 
 
 def _plan_tables(path: Path, tables: Sequence[Table], options: ReadOptions) -> _PlannedTables:
-    columns = [c for table in tables for c in (table.stamps or _NO_STAMPS, *table.columns)]
-    named = iter(zip(_plain_names([column.name for column in columns]), columns, strict=True))
+    names = iter(_plain_names([column.name for table in tables for column in table.columns]))
     filled: list[Table] = []
     stored: list[TableColumn] = []
     first: list[int] = []
     described: list[FileColumn] = []
     for table in tables:
-        (_, clock), *others = islice(named, 1 + len(table.columns))
-        if not table.rows or not others:
+        own_names = list(islice(names, len(table.columns)))
+        if not table.rows or not own_names:
             continue
         is_timed = table.stamps is not None
         is_first_clock = is_timed and all(held.stamps is None for held in filled)
         filled.append(table)
         first.append(len(stored))
-        stored += [clock, *(column for _, column in others)]
-        header, stamped = "time" if is_first_clock else "", is_timed and clock.unit is None
-        described.append(FileColumn(header, clock.unit or None, stamped=stamped))
-        described += [FileColumn(name, c.unit or None, target=c.target) for name, c in others]
+        stored += [TableColumn(("",), table.stamps, table.time_unit), *table.columns]
+        header, stamped = "time" if is_first_clock else "", is_timed and table.time_unit is None
+        described.append(FileColumn(header, table.time_unit, stamped=stamped))
+        described += [
+            FileColumn(name, column.unit or None, target=column.target)
+            for name, column in zip(own_names, table.columns, strict=True)
+        ]
     if not filled:
         raise FormatError(
             f"{path.name}: it holds no values; copy it again, or check what the logger wrote"

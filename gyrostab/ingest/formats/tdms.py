@@ -6,9 +6,8 @@ group.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +18,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.stamps import NAT, dates_to_ns
 from gyrostab.ingest.formats.recognise import begins_like
-from gyrostab.ingest.formats.tables import (
-    NO_NAME,
-    ReadSlice,
-    Table,
-    TableColumn,
-    library,
-    read_tables,
-    scan_tables,
-    sliced,
-)
+from gyrostab.ingest.formats.tables import Table, TableColumn, library, read_tables, scan_tables
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
 _FIRST_DATE = np.datetime64(
@@ -99,7 +89,7 @@ def _make_table(path: Path, channels: list[Any]) -> Table:
     columns = [
         TableColumn(
             (channel.group_name, channel.name),
-            sliced(channel),
+            channel,
             str(channel.properties.get("unit_string") or "").strip() or None,
         )
         for channel in channels
@@ -107,17 +97,15 @@ def _make_table(path: Path, channels: list[Any]) -> Table:
     clock = _waveform_clock(path, channels[0])
     if clock is not None:
         unit = None if isinstance(clock[1], np.datetime64) else "ns"
-        return Table(
-            len(channels[0]), columns, TableColumn(NO_NAME, _waveform_stamps(*clock), unit)
-        )
+        return Table(len(channels[0]), columns, _waveform_stamps(*clock), unit)
     kinds = [np.dtype(channel.dtype).kind for channel in channels]
     if "M" not in kinds:
         return Table(len(channels[0]), columns)
     dates = columns.pop(kinds.index("M"))
-    return Table(len(channels[0]), columns, replace(dates, unit=None))
+    return Table(len(channels[0]), columns, dates.values)
 
 
-def _waveform_stamps(step: float, start: Any) -> ReadSlice:
+def _waveform_stamps(step: float, start: Any) -> Callable[[int, int], Any]:
     def part(begin: int, stop: int) -> NDArray[Any]:
         since = np.rint(np.arange(begin, stop) * (step * 1e9)).astype(np.int64)
         stamps: NDArray[Any] = start + (

@@ -20,14 +20,7 @@ import pandas as pd
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.stamps import texts_to_ns
 from gyrostab.ingest.formats.recognise import begins_like
-from gyrostab.ingest.formats.tables import (
-    NO_NAME,
-    Table,
-    TableColumn,
-    TablesOfFile,
-    make_reader,
-    sliced,
-)
+from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, make_reader
 from gyrostab.ingest.options import ReadOptions
 
 _HEAD = re.compile(rb"(?is)^(?:\xef\xbb\xbf)?\s*<.*witsml")
@@ -80,12 +73,12 @@ def _make_table(log: Any) -> Table | None:
     stamps = texts_to_ns(cells[place].astype(str).tolist()).view("datetime64[ns]")
     columns = [
         TableColumn(
-            (name,), sliced(cells[number].to_numpy()), _child_text(curves.get(name), "unit") or None
+            (name,), cells[number].to_numpy(), _child_text(curves.get(name), "unit") or None
         )
         for number, name in enumerate(names)
         if number != place
     ]
-    return Table(len(cells), columns, TableColumn(NO_NAME, sliced(stamps)))
+    return Table(len(cells), columns, stamps)
 
 
 def _child_text(parent: Any, name: str) -> str:
