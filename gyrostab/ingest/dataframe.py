@@ -156,7 +156,7 @@ def _read_frame(
     try:
         columns = [FileColumn("time", stamped=True), *(FileColumn(header) for header in headers)]
         plan = plan_columns(Path("DataFrame"), columns, options)
-        raw = read_columns(plan, options, len(table), fetch)
+        raw = read_columns(plan, len(table), fetch)
         check_options([raw])
     except MissingUnitError as error:
         problem = str(error).split("; give")[0]

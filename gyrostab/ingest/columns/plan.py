@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gyrostab.errors import GyrostabError, OptionError
@@ -35,9 +35,7 @@ class Plan:
     notes: tuple[str, ...]
     problems: tuple[GyrostabError, ...]
     unmatched: tuple[str, ...]
-    rate: float | None = (
-        None  # [Hz], from the lines above the header of a file without a time column
-    )
+    options: ReadOptions  # with the sampling rate that the lines above the header name
 
     def check(self) -> Plan:
         """Raise the first problem, or return the plan."""
@@ -118,5 +116,5 @@ def plan_columns(
         tuple(draft.notes),
         tuple(draft.problems),
         tuple(unmatched),
-        rate,
+        options if rate is None else replace(options, rate=rate),
     )

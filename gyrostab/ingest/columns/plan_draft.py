@@ -46,6 +46,7 @@ class Column:
     offset: float = 0.0
     time_unit: TimeUnit | None = None
     date_order: str = YEAR_FIRST  # of stamps that are text
+    epoch: int = 0  # of numbers whose unit names none [ns since 1970]
 
 
 class PlanDraft:

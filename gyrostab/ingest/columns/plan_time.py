@@ -68,7 +68,9 @@ def find_time(draft: PlanDraft, named: list[Header]) -> Header | None:
     unit = None if column.stamped else _time_unit(draft, column)
     order = _date_order(draft, column) if column.stamped else YEAR_FIRST
     planned = column.source, column.header, "time", "time", "time", "ns"
-    draft.columns.append(Column(*planned, time_unit=unit, date_order=order))
+    draft.columns.append(
+        Column(*planned, time_unit=unit, date_order=order, epoch=draft.options.epoch_ns)
+    )
     written = unit.text if unit else None
     if column.stamped:
         written = "ISO 8601" if order == YEAR_FIRST else order

@@ -25,7 +25,7 @@ from gyrostab.ingest.columns.pieces import (
 from gyrostab.ingest.columns.plan import Plan
 from gyrostab.ingest.columns.plan_draft import Column
 from gyrostab.ingest.columns.stamps import NAT
-from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.ingest.options import FileSummary
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store.lazy import make_dask
 from gyrostab.store.row_inspection import RowInspection
@@ -62,8 +62,8 @@ class ConvertedBlock(NamedTuple):
 class RawLogBuilder:
     """Collect the blocks of one file and build its raw log."""
 
-    def __init__(self, plan: Plan, options: ReadOptions):
-        self.plan, self.options = plan, options
+    def __init__(self, plan: Plan):
+        self.plan, self.options = plan.check(), plan.options
         self.time = plan.time
         self.gyro, self.channels = plan.of("gyro"), plan.of("channel")
         dtypes: dict[int, Any] = {

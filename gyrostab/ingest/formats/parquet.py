@@ -62,7 +62,7 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
         values = _to_numpy(pa.chunked_array(columns))
         return values[: stop - start] if start == 0 else values[start - stop :]
 
-    return summarise_columns("parquet", plan, options, rows, fetch)
+    return summarise_columns("parquet", plan, rows, fetch)
 
 
 def read(path: Path, options: ReadOptions) -> xr.Dataset:
@@ -70,14 +70,13 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
     file, plan = _open_parquet(path, options)
     names = file.schema_arrow.names
     check_stored(path, file.metadata.num_rows, len(plan.columns), options.limits)
-    builder = RawLogBuilder(plan.check(), options)
+    builder = RawLogBuilder(plan)
     column_names = [names[column.source] for column in plan.columns]
 
     def convert(batch: Any) -> ConvertedBlock:
         arrays = {name: batch.column(place) for place, name in enumerate(batch.schema.names)}
         return convert_batch(
             builder,
-            options,
             {column.source: _to_numpy(arrays[names[column.source]]) for column in plan.columns},
         )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,24 +37,25 @@ class StoredTable:
     rows: int
     plan: Plan
     decoders: Mapping[int, Decoder]
-    options: ReadOptions
     notes: Sequence[str]
+
+    def fetch(self, source: int, start: int, stop: int) -> Any:
+        """Return the decoded values of a column."""
+        return self.decoders[source](self.columns[source].rows.read(start, stop))
 
     def scan(self, form: str) -> FileSummary:
         """Summarise columns, number of rows, and first and last stamps."""
-        fetch = partial(_fetch_rows, self.columns, self.decoders)
-        return summarise_columns(form, self.plan, self.options, self.rows, fetch, self.notes)
+        return summarise_columns(form, self.plan, self.rows, self.fetch, self.notes)
 
     def read(self) -> xr.Dataset:
         """Return the raw log."""
         plan, columns = self.plan, self.columns
-        check_stored(plan.path, self.rows, len(plan.columns), self.options.limits)
+        check_stored(plan.path, self.rows, len(plan.columns), plan.options.limits)
         sources = [columns[column.source].rows for column in plan.columns]
         return read_columns(
             plan,
-            self.options,
             self.rows,
-            partial(_fetch_rows, columns, self.decoders),
+            self.fetch,
             notes=[*self.notes, *float32_note(plan, [column.dtype for column in columns])],
             parallel=not any(isinstance(rows, LibraryRows) for rows in sources),
             stay=all(isinstance(rows, EvenRows) for rows in sources),
@@ -84,14 +84,4 @@ def plan_stored(
     attributes = [column.attributes for column in columns]
     plan = plan_columns(path, file_columns, options)
     plan, decoders = fold_packing(plan, [column.dtype for column in columns], attributes)
-    return StoredTable(columns, rows, plan, decoders, options, notes)
-
-
-def _fetch_rows(
-    columns: Sequence[StoredColumn],
-    decoders: Mapping[int, Decoder],
-    source: int,
-    start: int,
-    stop: int,
-) -> Any:
-    return decoders[source](columns[source].rows.read(start, stop))
+    return StoredTable(columns, rows, plan, decoders, notes)

@@ -151,11 +151,11 @@ class _PlannedTables:
         return self.stored[source].read(start, stop)
 
 
-def _leave_out_unplaced(planned: _PlannedTables, options: ReadOptions) -> _PlannedTables:
+def _leave_out_unplaced(planned: _PlannedTables) -> _PlannedTables:
     """Leave out, with notes, tables whose rows have no place on the time of the log."""
     plans = [planned.plan_of(place) for place in range(len(planned.tables))]
     is_dated = {
-        place: options.epoch is not None
+        place: planned.plan.options.epoch is not None
         or time.time_unit is None
         or time.time_unit.epoch is not None
         for place, time in enumerate(plan.time for plan in plans)
@@ -211,7 +211,7 @@ def _plan_tables(path: Path, tables: Sequence[Table], options: ReadOptions) -> _
     holders = {bisect_right(first, column.source) - 1 for column in main_columns}
     main = sorted(holders) if plan.of("gyro") else [min(holders, default=0)]
     planned = _PlannedTables(filled, stored, [*first, len(stored)], plan, main)
-    return _leave_out_unplaced(planned, options)
+    return _leave_out_unplaced(planned)
 
 
 def scan_tables(
@@ -221,7 +221,7 @@ def scan_tables(
     planned = _plan_tables(path, tables, options)
     main = planned.main[0]
     plan, rows = planned.plan_of(main), planned.tables[main].rows
-    summary = summarise_columns(form, plan, options, rows, planned.fetch, notes)
+    summary = summarise_columns(form, plan, rows, planned.fetch, notes)
     axes, channels = (
         tuple(column.name for column in planned.plan.of(role)) for role in ("gyro", "channel")
     )
@@ -245,10 +245,10 @@ def read_tables(
         if place in planned.main:
             if main:
                 plan, notes = replace(plan, notes=()), ()
-            main.append(read_columns(plan, options, table.rows, planned.fetch, notes=notes))
+            main.append(read_columns(plan, table.rows, planned.fetch, notes=notes))
         elif plan.of("channel"):
             plan = replace(plan, signal=None, kind=None, notes=())
-            channel_logs.append(read_columns(plan, options, table.rows, planned.fetch))
+            channel_logs.append(read_columns(plan, table.rows, planned.fetch))
     log = with_channels(concatenate(main) if len(main) > 1 else main[0], channel_logs)
     if "axis_rows" in log.attrs:
         return log

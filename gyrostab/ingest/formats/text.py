@@ -70,19 +70,15 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
     time, rows = plan.time, None
     head = tail = np.empty(0, np.int64)
     if time is not None:
-        head = _sample_stamps(layout, time, layout.samples, options)
+        head = _sample_stamps(layout, time, layout.samples)
     if not _is_gzipped(path):
         size = path.stat().st_size
         with path.open("rb") as file:
             file.seek(max(layout.offset, size - 2**14))
             ends = [layout.split_row(line) for line in file.read().decode("latin-1").splitlines()]
             if time is not None:
-                tail = _sample_stamps(
-                    layout,
-                    time,
-                    [row for row in ends if _is_solid(row, layout, time.source)],
-                    options,
-                )
+                solid = [row for row in ends if _is_solid(row, layout, time.source)]
+                tail = _sample_stamps(layout, time, solid)
             if size <= COUNTED_BYTES:
                 file.seek(layout.offset)
                 rows = sum(
@@ -101,9 +97,8 @@ def read(
 ) -> xr.Dataset:
     """Return the raw log of a text file; raise `CancelledError` once `stop` returns true."""
     layout, plan = _plan_file(path, options)
-    options = options if plan.rate is None else replace(options, rate=plan.rate)
-    builder = RawLogBuilder(plan.check(), options)
-    parse = partial(_parse_block, parser=BlockParser(layout, plan, options), builder=builder)
+    builder = RawLogBuilder(plan)
+    parse = partial(_parse_block, parser=BlockParser(layout, plan), builder=builder)
     line = layout.line
     for converted, block, starts, lines in map_in_order(
         parse, _read_blocks(path, layout.offset, growing=options.growing)
@@ -169,12 +164,12 @@ def _is_rising(layout: Layout, column: int) -> bool:
 
 
 def _sample_stamps(
-    layout: Layout, time: Column, rows: Sequence[Sequence[str]], options: ReadOptions
+    layout: Layout, time: Column, rows: Sequence[Sequence[str]]
 ) -> NDArray[np.int64]:
     cells = [row[time.source] for row in rows if len(row) == layout.width]
     if layout.decimal_comma and time.time_unit is not None:
         cells = [cell.replace(",", ".") for cell in cells]
-    return cells_to_ns(cells, time.time_unit, options.epoch_ns, time.date_order)
+    return cells_to_ns(cells, time.time_unit, time.epoch, time.date_order)
 
 
 def _is_solid(row: list[str], layout: Layout, time: int) -> bool:
