@@ -70,7 +70,10 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     else:
         split_parts = _in_order([group for part in parts for group in split_axes(part)])
         signal = _common_signal(split_parts)
-        slow_channels = [_slow_channels(part) for part in split_parts]
+        slow_channels = [
+            [str(name) for name, v in part.data_vars.items() if v.dims == (f"time_{name}",)]
+            for part in split_parts
+        ]  # those with a separate time coordinate
         ordered = [
             part.drop_vars([*names, *(f"time_{name}" for name in names)])
             for part, names in zip(split_parts, slow_channels, strict=True)
@@ -87,13 +90,6 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
         name = joined.attrs["source_files"][0]
         raise FormatError(f"{name}: there is only one row of data; a log needs at least two")
     return joined
-
-
-def _slow_channels(part: xr.Dataset) -> list[str]:
-    """Return the channels that have a separate time coordinate."""
-    return [
-        str(name) for name, variable in part.data_vars.items() if variable.dims == (f"time_{name}",)
-    ]
 
 
 def _group_by_axes(parts: list[xr.Dataset]) -> list[list[xr.Dataset]]:

@@ -72,8 +72,12 @@ def as_uniform(log: xr.Dataset) -> xr.Dataset:
     nominal = _declared_rate(log)
     grid, computed = grid_of(log, nominal)
     if not computed:
-        log = _onto_grid(log, grid)
-    if has_gap_table(log):
+        if len(grid.runs) > 1:
+            log = place_samples(log, grid.runs, grid.start, grid.rate, grid.size)
+        else:
+            time = time_coordinate(grid.start, grid.rate, grid.size)
+            log = log.drop_vars("time").assign_coords(time)
+    if "gap" in log.dims:
         log = _with_true_table(log, grid, nominal, computed=computed)
     true = {"sampling_rate_hz": grid.rate, "kind": signal_name(log)}
     if all(log.attrs.get(name) == value for name, value in true.items()):
@@ -158,14 +162,6 @@ def _declared_rate(log: xr.Dataset) -> float | None:
     return rate if np.isfinite(rate) and rate > 0 else None
 
 
-def _onto_grid(log: xr.Dataset, grid: UniformGrid) -> xr.Dataset:
-    if len(grid.runs) > 1:
-        return place_samples(log, grid.runs, grid.start, grid.rate, grid.size)
-    bare: xr.Dataset = log.drop_vars("time")
-    timed: xr.Dataset = bare.assign_coords(time_coordinate(grid.start, grid.rate, grid.size))
-    return timed
-
-
 def _with_true_table(
     log: xr.Dataset, grid: UniformGrid, declared: float | None, *, computed: bool
 ) -> xr.Dataset:
@@ -236,11 +232,6 @@ def _place_array(array: Any, runs: Runs, size: int) -> Any:
 
 
 Table = NDArray[np.int64]
-
-
-def has_gap_table(log: xr.Dataset) -> bool:
-    """Return whether a log has variables by gap."""
-    return "gap" in log.dims
 
 
 def _change_rate(table: Table, log: xr.Dataset, old_rate: float, start: int, rate: float) -> Table:

@@ -16,7 +16,6 @@ from gyrostab.ingest.gap_table import OUTSIDE_RANGE, clip_table, read_gaps
 from gyrostab.ingest.uniform.core import (
     add_spans,
     grid_of,
-    has_gap_table,
     merge_spans,
     place_samples,
     with_table,
@@ -128,7 +127,7 @@ def cut_log(
     start, size = int(grid_times(grid.start, grid.rate, low)), high - low
     part = _cut_samples(log, runs, start, grid, low, size)
     part = _cut_channels(part, grid, low, high, excluded)
-    if has_gap_table(log) or len(excluded):
+    if "gap" in log.dims or len(excluded):
         part = with_table(part, _cut_table(log, grid, low, high, excluded), start, grid.rate)
     options = [
         *([f"from {time_from}"] if time_from is not None else []),
@@ -259,7 +258,7 @@ def _cut_channels(
 def _cut_table(
     log: xr.Dataset, grid: UniformGrid, low: int, high: int, excluded: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    table = read_gaps(log, grid.start, grid.rate) if has_gap_table(log) else None
+    table = read_gaps(log, grid.start, grid.rate) if "gap" in log.dims else None
     pieces = [np.empty((0, 5), dtype=np.int64)]
     edges = [low, *excluded.ravel().tolist(), high]
     for first, end in zip(edges[::2], edges[1::2], strict=True):
