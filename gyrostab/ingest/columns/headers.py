@@ -70,13 +70,11 @@ class Header:
     header: str
     name: str
     unit: str | None
-    stored: str | None = None  # unit that the format stores outside the header; --unit overrules it
-    calendar: str | None = None  # the CF calendar of that unit
+    file: FileColumn  # as its format describes it
+    stored: str | None  # unit that the format stores outside the header; --unit overrules it
+    key: str  # unique name for --map
     mapped: bool = False  # named by --map
     preset: bool = False  # named by the preset of the program that wrote the file
-    stamped: bool = False  # holds dates
-    date_order: str | None = YEAR_FIRST  # of these dates; None if they can be read in two ways
-    key: str = ""  # unique name for --map
 
     @property
     def low(self) -> str:
@@ -159,17 +157,7 @@ def distinct_columns(columns: Sequence[FileColumn]) -> Iterator[Header]:
             key = key if number == 1 else free_name(f"{name}_", used_names, number)
             used_names.add(key.lower())
         column = columns[source]
-        yield Header(
-            source,
-            header,
-            name,
-            unit,
-            stored=column.unit,
-            calendar=column.calendar,
-            stamped=column.stamped,
-            date_order=column.date_order,
-            key=key,
-        )
+        yield Header(source, header, name, unit, column, column.unit, key)
 
 
 def free_name(stem: str, used_names: Collection[str], number: int = 2) -> str:

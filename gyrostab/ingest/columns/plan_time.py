@@ -33,16 +33,16 @@ def find_time(draft: PlanDraft, named: list[Header]) -> Header | None:
             for c in named
             if not (c.mapped or c.preset) and TIME_PATTERN.match(c.low) and _may_be_time(c)
         ]
-        sure = [c for c in time_columns if c.low != "t" or c.unit or c.stored or c.stamped]
+        sure = [c for c in time_columns if c.low != "t" or c.unit or c.stored or c.file.stamped]
         time_columns = sure or time_columns
     if not time_columns:
         time_columns = [
             c
             for c in named
-            if c.stamped
+            if c.file.stamped
             and draft.rising(c.source)
             and not (c.mapped or c.preset)
-            and not (c.date_order == NO_DATE and draft.options.rate is not None)
+            and not (c.file.date_order == NO_DATE and draft.options.rate is not None)
         ]
         reason = "it holds dates"
         if not time_columns:
@@ -65,14 +65,14 @@ def find_time(draft: PlanDraft, named: list[Header]) -> Header | None:
         for rival in rivals:
             draft.leave_out(rival)
         named[:] = [c for c in named if c not in rivals]
-    unit = None if column.stamped else _time_unit(draft, column)
-    order = _date_order(draft, column) if column.stamped else YEAR_FIRST
+    unit = None if column.file.stamped else _time_unit(draft, column)
+    order = _date_order(draft, column) if column.file.stamped else YEAR_FIRST
     planned = column.source, column.header, "time", "time", "time", "ns"
     draft.columns.append(
         Column(*planned, time_unit=unit, date_order=order, epoch=draft.options.epoch_ns)
     )
     written = unit.text if unit else None
-    if column.stamped:
+    if column.file.stamped:
         written = "ISO 8601" if order == YEAR_FIRST else order
     draft.add_summary(column, "time", "time", "time", written)
     if (
@@ -94,7 +94,7 @@ def find_time(draft: PlanDraft, named: list[Header]) -> Header | None:
 def _may_be_time(column: Header) -> bool:
     written = column.unit or column.stored
     # An epoch that cannot be read is reported, not ignored.
-    return written is None or column.stamped or names_epoch(written) or is_time_unit(written)
+    return written is None or column.file.stamped or names_epoch(written) or is_time_unit(written)
 
 
 def _is_clock(draft: PlanDraft, column: Header) -> bool:
@@ -118,7 +118,7 @@ def _date_order(draft: PlanDraft, column: Header) -> str:
         if order := parse_order(draft.options.unit[key]):
             draft.used_units.add(key)
             return order
-    order = parse_order(column.unit or column.stored or "") or column.date_order
+    order = parse_order(column.unit or column.stored or "") or column.file.date_order
     if order == NO_DATE:
         draft.refuse(
             UnitError,
@@ -151,7 +151,7 @@ def _time_unit(draft: PlanDraft, column: Header) -> TimeUnit | None:
         )
         return None
     try:
-        return parse_time_unit(text, column.calendar if text == column.stored else None)
+        return parse_time_unit(text, column.file.calendar if text == column.stored else None)
     except GyrostabError as error:
         advice = '"time=seconds since 2026-01-02T00:00:00"' if names_epoch(text) else "time=s"
         draft.refuse(

@@ -6,6 +6,7 @@ from array import array
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from importlib import import_module
 from itertools import islice
@@ -56,7 +57,7 @@ class Table:
 
 #: Tables of a file, and notes on it.
 TablesOfFile = tuple[Sequence[Table], Sequence[str]]
-FindTables = Callable[[Path, ReadOptions], TablesOfFile]
+FindTables = Callable[[Path, ReadOptions], TablesOfFile | AbstractContextManager[TablesOfFile]]
 
 
 class Messages:
@@ -260,20 +261,27 @@ def make_reader(
 ) -> tuple[Callable[[Path, ReadOptions], FileSummary], Callable[[Path, ReadOptions], xr.Dataset]]:
     """Make the functions `scan` and `read` of a format whose tables are read as a whole.
 
-    `find_heads` finds the tables for `scan` if that can leave out their values.
+    `find_heads` finds the tables for `scan` if that can leave out their values. Either may be a
+    context manager that keeps the file open.
     """
 
     def scan(path: Path, options: ReadOptions) -> FileSummary:
         """Summarise columns, rows, and first and last stamps."""
-        tables, notes = (find_heads or find_tables)(path, options)
-        return scan_tables(path, form, tables, options, notes)
+        with _opened((find_heads or find_tables)(path, options)) as (tables, notes):
+            return scan_tables(path, form, tables, options, notes)
 
     def read(path: Path, options: ReadOptions) -> xr.Dataset:
         """Return the raw log of a file; see `gyrostab.ingest.read_log`."""
-        tables, notes = find_tables(path, options)
-        return read_tables(path, tables, options, notes=notes)
+        with _opened(find_tables(path, options)) as (tables, notes):
+            return read_tables(path, tables, options, notes=notes)
 
     return scan, read
+
+
+def _opened(
+    found: TablesOfFile | AbstractContextManager[TablesOfFile],
+) -> AbstractContextManager[TablesOfFile]:
+    return found if isinstance(found, AbstractContextManager) else nullcontext(found)
 
 
 def library(name: str, path: Path, *, extra: str) -> Any:

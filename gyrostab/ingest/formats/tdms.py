@@ -12,14 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.stamps import NAT, dates_to_ns
 from gyrostab.ingest.formats.recognise import begins_like
-from gyrostab.ingest.formats.tables import Table, TableColumn, library, read_tables, scan_tables
-from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, library, make_reader
+from gyrostab.ingest.options import ReadOptions
 
 _FIRST_DATE = np.datetime64(
     "1950-01-01", "us"
@@ -31,20 +30,8 @@ def matches(path: Path) -> bool:
     return begins_like(path, b"TDSm", ".tdms")
 
 
-def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Summarise channels, lengths, and first and last stamps."""
-    with _open_tables(path) as tables:
-        return scan_tables(path, "tdms", tables, options)
-
-
-def read(path: Path, options: ReadOptions) -> xr.Dataset:
-    """Return the raw log of a TDMS file; see `gyrostab.ingest.read_log`."""
-    with _open_tables(path) as tables:
-        return read_tables(path, tables, options)
-
-
 @contextmanager
-def _open_tables(path: Path) -> Iterator[list[Table]]:
+def _open_tables(path: Path, options: ReadOptions) -> Iterator[TablesOfFile]:
     """Group channels of one length and clock into tables; without a clock, of one group."""
     nptdms = library("nptdms", path, extra="tdms")
     with nptdms.TdmsFile.open(str(path)) as file:
@@ -54,7 +41,10 @@ def _open_tables(path: Path) -> Iterator[list[Table]]:
                 if len(channel):
                     clock = _waveform_clock(path, channel) or channel.group_name
                     groups.setdefault((len(channel), clock), []).append(channel)
-        yield [_make_table(path, channels) for channels in groups.values()]
+        yield [_make_table(path, channels) for channels in groups.values()], ()
+
+
+scan, read = make_reader("tdms", _open_tables)
 
 
 def _waveform_clock(path: Path, channel: Any) -> tuple[float, Any] | None:
