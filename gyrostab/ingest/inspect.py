@@ -90,13 +90,10 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
     names = {f"column_{place}": column for place, column in enumerate(data_columns[:MAX_COLUMNS])}
     chosen = {column.key: f"{name} [1]" for name, column in names.items()}
     chosen.update({column.key: "-" for column in data_columns[MAX_COLUMNS:]})
-    unit: dict[str, str] = {}
-    if time is not None:
-        if time.unit is not None and time.unit != "ISO 8601":
-            unit["time"] = time.unit
-        chosen[time.key] = "time"
-        if time.key == "time" and "time" not in options.map:
-            del chosen[time.key]  # stamps of the format, not a named column
+    has_unit = time is not None and time.unit not in (None, "ISO 8601")
+    unit = {"time": str(time.unit)} if time is not None and has_unit else {}
+    if time is not None and (time.key != "time" or "time" in options.map):
+        chosen[time.key] = "time"  # else stamps of the format, not a named column
     reading = replace(
         options,
         map=chosen,

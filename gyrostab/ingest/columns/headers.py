@@ -182,13 +182,9 @@ def unit_quantity(quantity: str) -> str:
 
 def example_unit(quantity: str | None) -> str:
     """Return a unit to suggest in a message."""
-    return (
-        "1"
-        if quantity is None
-        else "deg/s"
-        if quantity == "rotation_rate"
-        else known_units(quantity).split(",")[0]
-    )
+    if quantity is None:
+        return "1"
+    return "deg/s" if quantity == "rotation_rate" else known_units(quantity).split(",")[0]
 
 
 def channel_name(column: Header) -> str:

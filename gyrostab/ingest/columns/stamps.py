@@ -43,12 +43,7 @@ _UNITS = {
 _NANOSECONDS = {spelling: ns for ns, spellings in _UNITS.items() for spelling in spellings}
 _SINCE = re.compile(r"\bsince\b", re.IGNORECASE)
 #: Calendars in which a date is an instant; the others are calendars of climate models.
-_CALENDARS = {
-    "standard": "standard",
-    "gregorian": "standard",
-    "proleptic_gregorian": "proleptic_gregorian",
-    "julian": "julian",
-}
+_CALENDARS = ("standard", "gregorian", "proleptic_gregorian", "julian")
 #: Longest cell that can be a stamp [characters]: a double written in full has at most 325 digits
 #: before and 1074 after the point.
 _MAX_DIGITS = 1400
@@ -121,8 +116,8 @@ def _epoch_ns(text: str, since: str, calendar: str | None) -> int:
     """Return the epoch of a unit [ns since 1970], which may exceed 64 bits."""
     import cftime
 
-    calendar_name = _CALENDARS.get((calendar or "standard").strip().lower())
-    if calendar_name is None:
+    calendar_name = (calendar or "standard").strip().lower()
+    if calendar_name not in _CALENDARS:
         raise UnitError(
             f"time unit {text!r}: dates of the calendar {calendar!r} are not instants of a "
             "recording; "

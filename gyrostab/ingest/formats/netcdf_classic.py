@@ -19,19 +19,8 @@ import numpy as np
 from gyrostab.errors import FormatError
 
 #: nc_type -> numpy type, big-endian.
-_TYPES = {
-    1: "i1",
-    2: "S1",
-    3: ">i2",
-    4: ">i4",
-    5: ">f4",
-    6: ">f8",
-    7: "u1",
-    8: ">u2",
-    9: ">u4",
-    10: ">i8",
-    11: ">u8",
-}
+_TYPE_CODES = ("i1", "S1", ">i2", ">i4", ">f4", ">f8", "u1", ">u2", ">u4", ">i8", ">u8")
+_TYPES = dict(enumerate(_TYPE_CODES, 1))
 _DIMENSION, _VARIABLE, _ATTRIBUTE = 10, 11, 12
 #: Bytes of the file that are read, tried in this order; the last has room for thousands of
 #: variables.
