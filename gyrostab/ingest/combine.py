@@ -19,6 +19,7 @@ from gyrostab.ingest.columns.pieces import (
     pieces_of,
 )
 from gyrostab.ingest.concat import absence_notes, group_axes, merge_notes, split_axes
+from gyrostab.ingest.concat.channels import check_units
 from gyrostab.ingest.overlap import drop_repeats, first_known_stamp, stamp_span
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store.lazy import concatenate_columns, select_part, stack_rows
@@ -164,7 +165,10 @@ def _concatenate_parts(
     for channel in dict.fromkeys(
         str(name) for part in parts for name in part.data_vars if name != signal
     ):
-        units = _channel_units(parts, channel)
+        holders = [(part.attrs["source_files"][0], part) for part in parts if channel in part]
+        advice = f"give one with --unit {channel}=UNIT or drop it with --map {channel}=-"
+        check_units(holders, channel, advice)
+        units = holders[0][1][channel].attrs["units"]
         columns = [part[channel].data if channel in part else _blank_column(part) for part in parts]
         packing = common_packing(part[channel].encoding for part in parts if channel in part)
         data[channel] = ("row", concatenate_columns(columns, CHUNK_ROWS), {"units": units}, packing)
@@ -225,21 +229,6 @@ def _stack_signal(parts: list[xr.Dataset], signal: str, axes: list[str]) -> Any:
 def _blank_column(part: xr.Dataset) -> NDArray[np.float64]:
     """Return a column of NaN that takes no memory."""
     return np.broadcast_to(np.nan, (part.sizes["row"],))
-
-
-def _channel_units(parts: list[xr.Dataset], channel: str) -> str:
-    holders = [part for part in parts if channel in part]
-    units = {
-        str(part[channel].attrs["units"]): part.attrs["source_files"][0]
-        for part in reversed(holders)
-    }
-    if len(units) > 1:
-        listed = ", ".join(f"{unit!r} in {name}" for unit, name in units.items())
-        raise UnitError(
-            f"channel {channel!r} has different units: {listed}; give one with --unit "
-            f"{channel}=UNIT or drop it with --map {channel}=-"
-        )
-    return next(iter(units))
 
 
 def with_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:

@@ -108,6 +108,12 @@ class PlanDraft:
         """Add the summary of a column that is left out."""
         self.add_summary(column, column.name, "left out", None, column.unit or column.stored)
 
+    def add_column(self, column: Header, text: str | None, planned: Column) -> None:
+        """Add a column to read, with the unit that the file or the user gives it."""
+        self.columns.append(planned)
+        name = column.low if planned.role == "gyro" else planned.name
+        self.add_summary(column, name, planned.role, planned.quantity, text)
+
     def add_summary(
         self, column: Header, name: str, role: str, quantity: str | None, unit: str | None
     ) -> None:

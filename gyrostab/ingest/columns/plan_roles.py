@@ -109,10 +109,8 @@ def _plan_axis(draft: PlanDraft, column: Header) -> str | None:
             unit.quantity,
         )
         return None
-    inner = INNER[unit.quantity]
-    planned = column.source, column.header, "gyro", axis, unit.quantity, inner
-    draft.columns.append(Column(*planned, unit.factor, unit.offset))
-    draft.add_summary(column, column.low, "gyro", unit.quantity, text)
+    planned = column.source, column.header, "gyro", axis, unit.quantity, INNER[unit.quantity]
+    draft.add_column(column, text, Column(*planned, unit.factor, unit.offset))
     return unit.quantity
 
 
@@ -249,8 +247,7 @@ def _plan_channel(
         )
     draft.kept_channels += 1
     planned = column.source, column.header, "channel", stored, quantity or "other", units
-    draft.columns.append(Column(*planned, factor, offset))
-    draft.add_summary(column, stored, "channel", quantity or "other", text)
+    draft.add_column(column, text, Column(*planned, factor, offset))
 
 
 def _describe_lack(path: Path, columns: Sequence[FileColumn]) -> str:
