@@ -183,30 +183,22 @@ def _try_guess(
     """Read a file by the guess, also with its mean rate if many samples seem to be missing."""
     from gyrostab.ingest.guess_unit import temperature_unit
 
-    options = {
-        **reading,
-        "map": dict(reading.get("map", {})),
-        "unit": dict(reading.get("unit", {})),
-    }
-    options["map"].update(
-        {column.key: f"gyro_{axis}" for axis, column in guess.axes.items() if column.role != "gyro"}
-    )
-    if guess.unit is not None:
-        angle = any(column.name.lower().startswith("angle_") for column in guess.axes.values())
-        options["unit"]["angle" if angle else "gyro"] = guess.unit
+    axes = guess.axes.items()
+    mapped = {column.key: f"gyro_{axis}" for axis, column in axes if column.role != "gyro"}
     if guess.time is not None and guess.time.role != "time":
-        options["map"][guess.time.key] = "time"
-    if guess.time_unit is not None:
-        options["unit"]["time"] = guess.time_unit
+        mapped[guess.time.key] = "time"
     if guess.temperature is not None:
-        options["map"][guess.temperature.key] = (
-            f"temperature [{temperature_unit(guess.temperature)}]"
-        )
-    if guess.rate is not None:
-        options["rate"] = guess.rate
-    if guess.kind is not None:
-        options["kind"] = guess.kind
-    options = {name: value for name, value in options.items() if value != {}}
+        mapped[guess.temperature.key] = f"temperature [{temperature_unit(guess.temperature)}]"
+    is_angle = any(column.name.lower().startswith("angle_") for _, column in axes)
+    units = {"angle" if is_angle else "gyro": guess.unit, "time": guess.time_unit}
+    guessed = {
+        "map": {**reading.get("map", {}), **mapped},
+        "unit": {**reading.get("unit", {}), **{key: unit for key, unit in units.items() if unit}},
+        "rate": guess.rate,
+        "kind": guess.kind,
+    }
+    chosen = {name: value for name, value in guessed.items() if value is not None}
+    options = {name: value for name, value in {**reading, **chosen}.items() if value != {}}
     tries = [options]
     if "rate" not in options and math.isfinite(inspection.rate_hz):
         tries.append({**options, "rate": float(f"{inspection.rate_hz:.6g}")})

@@ -267,21 +267,21 @@ def make_reader(
 
     def scan(path: Path, options: ReadOptions) -> FileSummary:
         """Summarise columns, rows, and first and last stamps."""
-        with _opened((find_heads or find_tables)(path, options)) as (tables, notes):
+        with _keep_open((find_heads or find_tables)(path, options)) as (tables, notes):
             return scan_tables(path, form, tables, options, notes)
 
     def read(path: Path, options: ReadOptions) -> xr.Dataset:
         """Return the raw log of a file; see `gyrostab.ingest.read_log`."""
-        with _opened(find_tables(path, options)) as (tables, notes):
+        with _keep_open(find_tables(path, options)) as (tables, notes):
             return read_tables(path, tables, options, notes=notes)
 
     return scan, read
 
 
-def _opened(
-    found: TablesOfFile | AbstractContextManager[TablesOfFile],
+def _keep_open(
+    tables: TablesOfFile | AbstractContextManager[TablesOfFile],
 ) -> AbstractContextManager[TablesOfFile]:
-    return found if isinstance(found, AbstractContextManager) else nullcontext(found)
+    return tables if isinstance(tables, AbstractContextManager) else nullcontext(tables)
 
 
 def library(name: str, path: Path, *, extra: str) -> Any:
