@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import xarray as xr
@@ -100,9 +101,4 @@ def with_repeats(placement: Placement, raw: xr.Dataset, repeats: NDArray[np.int6
         table = np.stack([np.full(length, DUPLICATE), sample, rows + row, stamps, stamps], axis=1)
         events.append(table[is_readable])
     table = np.concatenate(events)
-    return Placement(
-        placement.start,
-        placement.runs,
-        table[np.argsort(table[:, 1], kind="stable")],
-        placement.wander,
-    )
+    return replace(placement, events=table[np.argsort(table[:, 1], kind="stable")])

@@ -353,14 +353,8 @@ def _find_units(cells: Sequence[str], header: Sequence[str]) -> dict[int, str]:
 
 def _commented_header(lines: list[str], first: int, separator: str, width: int) -> list[str] | None:
     """Return a header after ``#`` (EuRoC, numpy.savetxt): the last comment, if its width fits."""
-    for line in reversed(lines[:first]):
-        if not line.strip():
-            continue
-        if not _COMMENT.match(line):
-            return None
-        bare = line.strip().lstrip("#%").strip()
-        cells = _header_cells(bare, separator)
-        if len(cells) == width and not _is_data(cells, comma=False):
-            return cells
+    last = next((line for line in reversed(lines[:first]) if line.strip()), "")
+    if not _COMMENT.match(last):
         return None
-    return None
+    cells = _header_cells(last.strip().lstrip("#%").strip(), separator)
+    return cells if len(cells) == width and not _is_data(cells, comma=False) else None
