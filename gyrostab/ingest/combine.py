@@ -187,15 +187,11 @@ def _concatenate_parts(
         unreadable_cells=sum(part.attrs["unreadable_cells"] for part in parts),
     )
     if len(groups) > 1:
-        ends = np.cumsum(
-            [0, *(sum(part.sizes["row"] for part in group) for group in groups)]
-        ).tolist()
-        axes_of = [
-            sorted({axis for part in group for axis in _axis_names(part)}) for group in groups
-        ]
-        joined.attrs["axis_rows"] = [
-            [axes, *rows] for axes, rows in zip(axes_of, pairwise(ends), strict=True)
-        ]
+        joined.attrs["axis_rows"], end = [], 0
+        for group in groups:
+            axes = sorted({axis for part in group for axis in _axis_names(part)})
+            begin, end = end, end + sum(part.sizes["row"] for part in group)
+            joined.attrs["axis_rows"].append([axes, begin, end])
     return joined
 
 
