@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from gyrostab.ingest import read_channel as read_channel
     from gyrostab.ingest import read_log as read_log
     from gyrostab.ingest.convert import from_dataarray as from_dataarray
-    from gyrostab.ingest.convert import from_dataframe as from_dataframe
+    from gyrostab.ingest.dataframe import from_dataframe as from_dataframe
     from gyrostab.ingest.grid.gaps import gap_table as gap_table
     from gyrostab.ingest.grid.regularise import regularise as regularise
     from gyrostab.ingest.make_log import make_log as make_log
@@ -64,7 +64,7 @@ _HOME = {
     "diagnose": "diagnose.core",
     "fit_noise": "allan.fit",
     "from_dataarray": "ingest.convert",
-    "from_dataframe": "ingest.convert",
+    "from_dataframe": "ingest.dataframe",
     "gap_table": "ingest.grid.gaps",
     "make_log": "ingest.make_log",
     "make_noise": "simulate",

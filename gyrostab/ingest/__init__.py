@@ -15,14 +15,14 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gyrostab.ingest.channel import read_channel as read_channel
-    from gyrostab.ingest.files import read_log as read_log
     from gyrostab.ingest.files import readers as readers
     from gyrostab.ingest.files import scan_file as scan_file
     from gyrostab.ingest.gap_table import gap_variables as gap_variables
     from gyrostab.ingest.options import ColumnSummary as ColumnSummary
     from gyrostab.ingest.options import FileSummary as FileSummary
     from gyrostab.ingest.options import ReadOptions as ReadOptions
+    from gyrostab.ingest.reading import read_channel as read_channel
+    from gyrostab.ingest.reading import read_log as read_log
 
 #: Public name -> module, imported on first use: the command line needs `limits` only.
 _MODULES = {
@@ -30,8 +30,8 @@ _MODULES = {
     "FileSummary": "options",
     "ReadOptions": "options",
     "gap_variables": "gap_table",
-    "read_channel": "channel",
-    "read_log": "files",
+    "read_channel": "reading",
+    "read_log": "reading",
     "readers": "files",
     "scan_file": "files",
 }

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError, OptionError, TimeError, UnitError
 from gyrostab.ingest.columns.pieces import (
     CHUNK_ROWS,
-    NaNPiece,
     PiecewiseColumn,
     Spool,
     as_lazy,
     pieces_of,
 )
 from gyrostab.ingest.concat import absence_notes, group_axes, merge_notes, split_axes
+from gyrostab.ingest.concat.channels import check_units
 from gyrostab.ingest.overlap import drop_repeats, first_known_stamp, stamp_span
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store.lazy import concatenate_columns, select_part, stack_rows
@@ -49,12 +49,8 @@ def move_to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
     """Return the raw log with its columns moved to a temporary file."""
 
     def moved(variable: xr.Variable) -> Any:
-        values = variable.values
-        return (
-            as_lazy(spool.store(values))
-            if values.ndim == 1
-            else stack_rows([as_lazy(spool.store(row)) for row in values])
-        )
+        rows = [as_lazy(spool.store(row)) for row in np.atleast_2d(variable.values)]
+        return stack_rows(rows) if variable.ndim == 2 else rows[0]
 
     for pieces in _columns_in_pieces(part):
         pieces.move_to(spool)
@@ -67,21 +63,18 @@ def move_to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
 def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     """Concatenate raw logs along ``row`` in the order of their first stamps, without repeated rows.
 
-    Raises
-    ------
-    TimeError
-        When some files have stamps and others have none.
-    UnitError
-        When files hold different kinds of signal, or a channel changes its unit.
-    FormatError
-        When there is only one row.
+    `TimeError` when only some files have stamps; `UnitError` when they hold different kinds of
+    signal, or a channel changes its unit.
     """
     if len(parts) == 1:
         joined = parts[0]
     else:
         split_parts = _in_order([group for part in parts for group in split_axes(part)])
         signal = _common_signal(split_parts)
-        slow_channels = [_slow_channels(part) for part in split_parts]
+        slow_channels = [
+            [str(name) for name, v in part.data_vars.items() if v.dims == (f"time_{name}",)]
+            for part in split_parts
+        ]  # those with a separate time coordinate
         ordered = [
             part.drop_vars([*names, *(f"time_{name}" for name in names)])
             for part, names in zip(split_parts, slow_channels, strict=True)
@@ -100,31 +93,20 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     return joined
 
 
-def _slow_channels(part: xr.Dataset) -> list[str]:
-    """Return the channels that have a separate time coordinate."""
-    return [
-        str(name) for name, variable in part.data_vars.items() if variable.dims == (f"time_{name}",)
-    ]
-
-
 def _group_by_axes(parts: list[xr.Dataset]) -> list[list[xr.Dataset]]:
     """Group files by their axes if the groups cover the same time; otherwise all form one group."""
-    groups = [
-        [parts[number] for number in group]
-        for group in group_axes([_axis_names(part) for part in parts])
-    ]
+    groups = group_axes(parts, map(_axis_names, parts))
     if len(groups) == 1 or not all(_axis_names(group[0]) for group in groups):
         return [list(parts)]
     if "time" not in parts[0].variables:
         return groups
-    spans = [[stamp_span(part) for part in group] for group in groups]
-    ends = sorted(
-        (min(first for first, _ in span), max(last for _, last in span)) for span in spans
-    )
-    in_time = [
-        later[0] > earlier[1] for earlier, later in pairwise(ends)
-    ]  # the later group begins after the earlier one has ended
-    return [list(parts)] if any(in_time) else groups
+    spans = []
+    for group in groups:
+        first, last = zip(*map(stamp_span, group), strict=True)
+        spans.append((min(first), max(last)))
+    # whether a group begins after another one has ended
+    is_later = any(later[0] > earlier[1] for earlier, later in pairwise(sorted(spans)))
+    return [list(parts)] if is_later else groups
 
 
 def _axis_names(part: xr.Dataset) -> list[str]:
@@ -136,10 +118,8 @@ def _in_order(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
     if not any(timed):
         return list(parts)
     if not all(timed):
-        with_time, without = (
-            next(p.attrs["source_files"][0] for p, t in zip(parts, timed, strict=True) if t is want)
-            for want in (True, False)
-        )
+        names = [part.attrs["source_files"][0] for part in parts]
+        with_time, without = names[timed.index(True)], names[timed.index(False)]
         raise TimeError(
             f"{with_time} has time stamps and {without} has none; read them one by one, or give "
             "the latter a time column"
@@ -151,13 +131,10 @@ def _common_signal(parts: Sequence[xr.Dataset]) -> str | None:
     first = parts[0]
     for part in parts[1:]:
         if part.attrs.get("kind") != first.attrs.get("kind"):
-            (a, b), (kind_a, kind_b) = zip(
-                *((p.attrs["source_files"][0], p.attrs.get("kind")) for p in (first, part)),
-                strict=True,
-            )
+            held, other = (f"of kind {log.attrs.get('kind')!r}" for log in (first, part))
+            names = [log.attrs["source_files"][0] for log in (first, part)]
             raise UnitError(
-                f"{a} holds a gyro signal of kind {kind_a!r}, {b} of kind {kind_b!r}; read them "
-                "one by one"
+                f"{names[0]} holds a gyro signal {held}, {names[1]} {other}; read them one by one"
             )
     return next((name for name in SIGNAL_UNITS if name in first.data_vars), None)
 
@@ -188,11 +165,11 @@ def _concatenate_parts(
     for channel in dict.fromkeys(
         str(name) for part in parts for name in part.data_vars if name != signal
     ):
-        units = _channel_units(parts, channel)
-        columns = [
-            part[channel].data if channel in part else np.full(size, np.nan)
-            for part, size in zip(parts, sizes, strict=True)
-        ]
+        holders = [(part.attrs["source_files"][0], part) for part in parts if channel in part]
+        advice = f"give one with --unit {channel}=UNIT or drop it with --map {channel}=-"
+        check_units(holders, channel, advice)
+        units = holders[0][1][channel].attrs["units"]
+        columns = [part[channel].data if channel in part else _blank_column(part) for part in parts]
         packing = common_packing(part[channel].encoding for part in parts if channel in part)
         data[channel] = ("row", concatenate_columns(columns, CHUNK_ROWS), {"units": units}, packing)
         absent[f"channel {channel}"] = _files_without(
@@ -210,15 +187,11 @@ def _concatenate_parts(
         unreadable_cells=sum(part.attrs["unreadable_cells"] for part in parts),
     )
     if len(groups) > 1:
-        ends = np.cumsum(
-            [0, *(sum(part.sizes["row"] for part in group) for group in groups)]
-        ).tolist()
-        axes_of = [
-            sorted({axis for part in group for axis in _axis_names(part)}) for group in groups
-        ]
-        joined.attrs["axis_rows"] = [
-            [axes, *rows] for axes, rows in zip(axes_of, pairwise(ends), strict=True)
-        ]
+        joined.attrs["axis_rows"], end = [], 0
+        for group in groups:
+            axes = sorted({axis for part in group for axis in _axis_names(part)})
+            begin, end = end, end + sum(part.sizes["row"] for part in group)
+            joined.attrs["axis_rows"].append([axes, begin, end])
     return joined
 
 
@@ -235,45 +208,23 @@ def _files_without(groups: list[list[xr.Dataset]], holders: set[int]) -> list[st
 
 def _stack_signal(parts: list[xr.Dataset], signal: str, axes: list[str]) -> Any:
     """Stack the signal of all parts, (axis, row); NaN where a part lacks an axis."""
-    if all(isinstance(part[signal].data, np.ndarray) for part in parts):
-        values = np.full((len(axes), sum(part.sizes["row"] for part in parts)), np.nan)
-        end = 0
+    rows = []
+    for axis in axes:
+        columns = []
         for part in parts:
-            end += part.sizes["row"]
-            for axis in map(str, part["axis"].values):
-                values[axes.index(axis), end - part.sizes["row"] : end] = (
-                    part[signal].sel(axis=axis).data
-                )
-        return values
-    return stack_rows(
-        [
-            concatenate_columns([_read_axis(part, signal, axis) for part in parts], CHUNK_ROWS)
-            for axis in axes
-        ]
-    )
+            names = _axis_names(part)
+            columns.append(
+                select_part(part[signal].data, names.index(axis))
+                if axis in names
+                else _blank_column(part)
+            )
+        rows.append(concatenate_columns(columns, CHUNK_ROWS))
+    return stack_rows(rows)
 
 
-def _read_axis(part: xr.Dataset, signal: str, axis: str) -> Any:
-    if axis in part["axis"].values:
-        return select_part(
-            part[signal].data, [str(name) for name in part["axis"].values].index(axis)
-        )
-    return as_lazy(PiecewiseColumn(np.float64, [NaNPiece(part.sizes["row"])]))
-
-
-def _channel_units(parts: list[xr.Dataset], channel: str) -> str:
-    holders = [part for part in parts if channel in part]
-    units = {
-        str(part[channel].attrs["units"]): part.attrs["source_files"][0]
-        for part in reversed(holders)
-    }
-    if len(units) > 1:
-        listed = ", ".join(f"{unit!r} in {name}" for unit, name in units.items())
-        raise UnitError(
-            f"channel {channel!r} has different units: {listed}; give one with --unit "
-            f"{channel}=UNIT or drop it with --map {channel}=-"
-        )
-    return next(iter(units))
+def _blank_column(part: xr.Dataset) -> NDArray[np.float64]:
+    """Return a column of NaN that takes no memory."""
+    return np.broadcast_to(np.nan, (part.sizes["row"],))
 
 
 def with_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:
@@ -286,13 +237,7 @@ def with_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:
 
 
 def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:
-    """Add the channels of other files, each on ``time_<channel>`` with its filled rows only.
-
-    Raises
-    ------
-    OptionError
-        When the log already contains a channel, or a file has no channel or no stamps.
-    """
+    """Add the channels of other files, each on ``time_<channel>`` with its filled rows only."""
     pieces: dict[str, list[tuple[NDArray[Any], NDArray[Any], str]]] = {}
     files: list[str] = []
     for source in sources:

@@ -67,22 +67,11 @@ def _name_key(path: Path) -> list[tuple[int, int, str]]:
 def find_lost_spans(
     lost: LostFiles, spans: Mapping[Path, Span], scan: Callable[[Path], FileSummary]
 ) -> dict[Path, Span]:
-    """Find the time spans of lost files, as far as they can be determined.
+    """Find the time spans [ns since 1970] of lost files, as far as they can be determined.
 
     A lost file fills the gap between the files whose names come before and after its name, if these
-    follow each other in time. Otherwise the stamps that are still readable are used.
-
-    Parameters
-    ----------
-    spans : mapping of Path to (int, int)
-        First and last stamp [ns since 1970] of the files that were read.
-    scan : callable
-        Path -> `FileSummary`; may fail.
-
-    Returns
-    -------
-    dict of Path to (int, int)
-        First and last instant [ns since 1970].
+    follow each other in time; `spans` are those of the files that were read. Otherwise the stamps
+    that are still readable are used; `scan` may fail.
     """
     names = sorted([*spans, *lost], key=_name_key)
     lost_spans: dict[Path, Span] = {}

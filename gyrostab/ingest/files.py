@@ -1,48 +1,23 @@
-"""Read paths into one raw log: find the reader, read, order the files, add channel files."""
+"""Find the readers of files, and read or scan single files."""
 
 from __future__ import annotations
 
 import glob
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
-from dataclasses import replace
-from functools import cache, partial
+from collections.abc import Iterable
+from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
-from threading import Event
 from typing import Any, Protocol, cast
 
 import xarray as xr
 
-from gyrostab.errors import FormatError, GyrostabError, OptionError, reading_of
-from gyrostab.ingest.columns.pieces import SPILL_BYTES, Spool
-from gyrostab.ingest.combine import attach_channels, concatenate, memory_bytes, move_to_disk
-from gyrostab.ingest.concat import concatenate_logs, log_span
-from gyrostab.ingest.damaged_files import (
-    add_lost_notes,
-    check_share,
-    find_lost_spans,
-    is_damage,
-    reason_of,
-)
+from gyrostab.errors import FormatError, OptionError, reading_of
 from gyrostab.ingest.formats.binary import has_layout
 from gyrostab.ingest.formats.recognise import refuse_unread
 from gyrostab.ingest.options import FileSummary, ReadOptions
-from gyrostab.ingest.overlap import stamp_span
-from gyrostab.ingest.uniform import check_same_rate
-from gyrostab.schema import texts
 from gyrostab.store.remote import fetch_file, find_store, find_url, list_urls
 
 GROUP = "gyrostab.readers"
-#: Text files that are read in parallel.
-_FILES_AHEAD = 2
-
-#: Called with the number of a file, the number of files and the path.
-OnFile = Callable[[int, int, Path], None]
-#: Reads one file in place of `read_file`.
-ReadFile = Callable[[Path, ReadOptions], xr.Dataset]
 
 
 class Reader(Protocol):
@@ -77,7 +52,7 @@ def readers() -> tuple[str, ...]:
     return tuple(_entry_points())
 
 
-def _find_reader(path: Path) -> Reader:
+def find_reader(path: Path) -> Reader:
     """Find the reader of a file; binary and text are tried last, as they match most files."""
     if find_url(path):
         return cast(Reader, _entry_points()["netcdf"].load())
@@ -109,13 +84,7 @@ def _find_reader(path: Path) -> Reader:
 
 
 def expand(paths: str | Path | Iterable[str | Path]) -> list[Path]:
-    """Return the files that paths and patterns name, each once.
-
-    Raises
-    ------
-    FormatError
-        When a pattern matches no file.
-    """
+    """Return the files that paths and patterns name, each once."""
     files: dict[Path, None] = {}
     for item in [paths] if isinstance(paths, str | Path) else paths:
         text = str(item)
@@ -162,7 +131,7 @@ def scan_file(path: str | Path, options: ReadOptions | None = None) -> FileSumma
     (('x',), 2, np.datetime64('1970-01-01T00:00:00.500000000'))
     """
     path = _fetch_remote(Path(path))
-    reader = _find_reader(path)
+    reader = find_reader(path)
     with reading_of(path):
         return reader.scan(path, options or ReadOptions())
 
@@ -176,241 +145,6 @@ def _fetch_remote(path: Path) -> Path:
 def read_file(path: Path, options: ReadOptions) -> xr.Dataset:
     """Read one file into a raw log, or open it as a regular log."""
     path = _fetch_remote(path)
-    reader = _find_reader(path)
+    reader = find_reader(path)
     with reading_of(path):
         return reader.read(path, options)
-
-
-def read_log(
-    paths: str | Path | Iterable[str | Path],
-    *,
-    rate: float | None = None,
-    start: str | None = None,
-    epoch: str | None = None,
-    map: Mapping[str, str] | None = None,
-    unit: Mapping[str, str] | None = None,
-    kind: str | None = None,
-    channel: str | Path | Sequence[str | Path] = (),
-    strict: bool = False,
-    max_gap: str | float = "10D",
-    limits: Mapping[str, float] | None = None,
-    on_file: OnFile | None = None,
-    read: ReadFile | None = None,
-) -> xr.Dataset:
-    r"""Read one or more logs as they were written.
-
-    Parameters
-    ----------
-    paths : path, pattern, or several of them
-        Files are concatenated in the order of their first stamps; an axis or channel that one of
-        them lacks is NaN there. Either raw logs, or regular logs that gyrostab wrote, which become
-        one regular log without being loaded.
-    rate : float, optional
-        Sampling rate [Hz] of files without a time column; otherwise the rate to check against.
-    start : str, optional
-        Stamp of the first row (ISO 8601, UTC) of files without a time column.
-    epoch : str, optional
-        Zero of a numeric time column (ISO 8601, UTC); 1970-01-01 when not given.
-    map : mapping of str to str, optional
-        Header name -> contract name, ``{"wx": "gyro_x [deg/s]"}``; ``"-"`` drops a column. Files
-        without a header row are mapped by column number from 0: ``{"1": "gyro_x"}``.
-    unit : mapping of str to str, optional
-        Name -> unit: ``{"gyro": "deg/s"}`` (all gyro axes), ``{"gyro_x": ...}``, ``{"time":
-        "us"}``; factors allowed (``"0.1 arcsec/s"``).
-    kind : {"rate", "angle"}, optional
-        How angle columns are meant: ``"angle"`` cumulative, ``"rate"`` increments.
-    channel : path or sequence of path, optional
-        Files with further channels; each keeps its stamps as ``time_<channel>``.
-    strict : bool
-        Raise an error for a damaged or missing file. Otherwise such a file among several is left
-        out with a note, and its time is a gap.
-    max_gap : str or float
-        Between regular logs, a longer step of time is taken as a step of the clock (raw logs: see
-        `gyrostab.regularise`); a number is in seconds.
-    limits : mapping of str to float, optional
-        Limits of `gyrostab.ingest.limits` with other values, ``{"columns": 50_000}``.
-    on_file : callable, optional
-        Called with the number of the file (from 1), the number of files and the path before each
-        file is read.
-    read : callable, optional
-        Function that reads one file, such as one that remembers files; by default each is read.
-
-    Returns
-    -------
-    xarray.Dataset
-        The raw log: ``rate(axis, row)`` [degree hour-1] or ``angle(axis, row)`` [degree],
-        ``time(row)`` where the file has stamps (NaT where unreadable), channels, and the attributes
-        ``kind``, ``source_files``, ``row_start``, ``notes``, ``unreadable_rows``,
-        ``unreadable_cells``. Regular logs that gyrostab wrote are returned as one such log, lazily.
-        ``unreadable_files`` lists the files that were left out.
-
-    Raises
-    ------
-    FormatError, UnitError, OptionError, TimeError
-        With file, position, what is wrong and what to do. `FormatError` also when more than half of
-        the files cannot be read.
-
-    Examples
-    --------
-    >>> from tempfile import mkdtemp
-    >>> path = Path(mkdtemp()) / "log.csv"
-    >>> header = "time [s],gyro_x [deg/s],temperature [degC]\n"
-    >>> _ = path.write_text(header + "0.0,0.5,21\n0.5,****,\n1.0,0.25,\n")
-    >>> raw = read_log(path)
-    >>> raw.rate.sel(axis="x").values
-    array([1800.,   nan,  900.])
-    >>> raw.attrs["notes"][-1]
-    'log.csv: 1 of 3 rows are unreadable: line 3'
-    """
-    options = ReadOptions(
-        rate=rate,
-        start=start,
-        epoch=epoch,
-        map=dict(map or {}),
-        unit=dict(unit or {}),
-        kind=kind,
-        channel=cast(Any, channel),
-        strict=strict,
-        limits=dict(limits or {}),
-    )
-    files = expand(paths)
-    extra = expand(options.channel) if options.channel else []
-    parts, lost = _read_all(files, options, on_file, read)
-    regular = [path for path, part in parts.items() if "sampling_rate_hz" in part.attrs]
-    if regular and len(regular) < len(parts):
-        raw = next(path for path in parts if path not in regular)
-        raise OptionError(
-            f"{regular[0].name} is a regular log already and {raw.name} is not; convert the raw "
-            "logs with gyrostab ingest, and then read all of them together"
-        )
-    channels = [read_file(path, replace(options, channels_only=True, start=None)) for path in extra]
-    spans = (
-        find_lost_spans(lost, _stamp_spans(parts), lambda path: scan_file(path, options))
-        if lost
-        else {}
-    )
-    if regular:
-        log = concatenate_logs(
-            [_check_regular(part, path.name, options) for path, part in parts.items()],
-            regular,
-            max_gap=max_gap,
-            lost=list(spans.values()),
-            limits=options.limits,
-        )
-    else:
-        check_options([*parts.values(), *channels])
-        log = concatenate(list(parts.values()))
-        if lost and "time" not in log.variables:
-            raise FormatError(
-                f"{next(iter(lost.values()))}; the files have no time stamps, so the time of "
-                "those that follow it is not known: repair it"
-            )
-        if spans:
-            # regularise marks the gaps there
-            log.attrs["unreadable_spans"] = [list(span) for span in spans.values()]
-    return attach_channels(add_lost_notes(log, lost, spans), channels)
-
-
-def _read_all(
-    paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None, read_one: ReadFile | None
-) -> tuple[dict[Path, xr.Dataset], dict[Path, str]]:
-    """Read the files one by one; move them to disk when they exceed the memory limit together."""
-    parts: dict[Path, xr.Dataset] = {}
-    lost: dict[Path, str] = {}
-    spool = Spool()
-    held = 0
-    with closing(_read_ahead(paths, options, on_file, read_one)) as reading:
-        for path, read in zip(paths, reading, strict=True):
-            try:
-                part = read()
-            except (GyrostabError, OSError) as error:
-                if options.strict or len(paths) == 1 or not is_damage(path, error):
-                    raise
-                lost[path] = reason_of(path, error)
-                continue
-            held += memory_bytes(part)
-            if held > SPILL_BYTES and len(paths) > 1:
-                held -= memory_bytes(part)
-                part = move_to_disk(part, spool)
-            parts[path] = part
-    check_share(lost, len(paths))
-    return parts, lost
-
-
-def _read_ahead(
-    paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None, read_one: ReadFile | None
-) -> Generator[Callable[[], xr.Dataset], None, None]:
-    """Yield a function that reads each file; text files are read ahead in threads by default."""
-    stop = Event()
-    with ThreadPoolExecutor(_FILES_AHEAD, thread_name_prefix="gyrostab-file") as pool:
-        waiting: deque[Callable[[], xr.Dataset]] = deque()
-        try:
-            for number, path in enumerate(paths, 1):
-                if on_file is not None:
-                    on_file(number, len(paths), path)
-                early = read_one is None and len(paths) > 1 and _is_text(path)
-                waiting.append(
-                    pool.submit(_read_text, path, options, stop).result
-                    if early
-                    else partial(read_one or read_file, path, options)
-                )
-                if len(waiting) == _FILES_AHEAD:
-                    yield waiting.popleft()
-            while waiting:
-                yield waiting.popleft()
-        finally:
-            stop.set()
-            pool.shutdown(wait=False, cancel_futures=True)
-
-
-def _read_text(path: Path, options: ReadOptions, stop: Event) -> xr.Dataset:
-    reader = _entry_points()["text"].load()
-    with reading_of(path):
-        return cast(xr.Dataset, reader.read(path, options, stop=stop.is_set))
-
-
-def _is_text(path: Path) -> bool:
-    try:
-        return bool(_find_reader(path) is _entry_points()["text"].load())
-    except (FormatError, OSError):
-        return False  # reading raises the error
-
-
-def _stamp_spans(parts: Mapping[Path, xr.Dataset]) -> dict[Path, tuple[int, int]]:
-    """Return the first and last stamp [ns since 1970] of the files with stamps."""
-    spans = {}
-    for path, part in parts.items():
-        if "sampling_rate_hz" in part.attrs:
-            spans[path] = log_span(part)
-        elif "time" in part.variables:
-            spans[path] = stamp_span(part)
-    return spans
-
-
-def _check_regular(log: xr.Dataset, name: str, options: ReadOptions) -> xr.Dataset:
-    """Refuse options that contradict a regular log, and note options that have no effect on it."""
-    if options.rate is not None:
-        check_same_rate(log, options.rate, name)
-    idle = [
-        f"--{option}"
-        for option in ("start", "epoch", "map", "unit", "kind")
-        if getattr(options, option)
-    ]
-    if not idle or options.channel:
-        return log
-    note = f"{name}: is a regular log already, so {', '.join(idle)} is not used"
-    return log.assign_attrs(notes=[*texts(log, "notes"), note])
-
-
-def check_options(parts: Sequence[xr.Dataset]) -> None:
-    """Refuse a ``--map`` or ``--unit`` that matches no file; it is probably mistyped."""
-    unmatched = set.intersection(*(set(part.attrs.pop("unmatched_options", ())) for part in parts))
-    headers = dict.fromkeys(name for part in parts for name in part.attrs.pop("headers", ()))
-    if unmatched:
-        files = ", ".join(
-            dict.fromkeys(name for part in parts for name in part.attrs["source_files"])
-        )
-        raise OptionError(
-            f"{' and '.join(sorted(unmatched))}: no such column in {files}; the columns are "
-            f"{', '.join(headers)}"
-        )

@@ -46,6 +46,15 @@ def format_duration(seconds: float) -> str:
     return f"{seconds:.1f} s" if abs(seconds) < 7200 else f"{seconds / HOUR:.1f} h"
 
 
+def is_restart(first: float, begin: float, before: float, after: float) -> bool:
+    """Return whether a clock that steps back restarts, rather than being corrected.
+
+    It began at `first`, and `begin` was its first stamp after the last step.
+    """
+    elapsed = before - begin
+    return after <= first + 0.1 * elapsed or 2 * (before - after) > elapsed
+
+
 def describe_break(place: str, cause: int, before: int, after: int, samples: str) -> str:
     """Describe a restart or step of the clock between two stamps [ns since 1970].
 
@@ -140,10 +149,7 @@ def name_lost(
 ) -> NDArray[np.int64]:
     """Change the cause of gaps that lost files leave to "unreadable".
 
-    Parameters
-    ----------
-    spans : iterable of pairs of int
-        First and last instant [ns since 1970] of each lost file.
+    `spans` are first and last instant of each lost file [ns since 1970].
     """
     table = table.copy()
     for span in spans:

@@ -106,14 +106,8 @@ def guess_columns(
 ) -> Guess:
     """Guess what the columns of a file are.
 
-    Parameters
-    ----------
-    rate : float, optional
-        Sampling rate given by the user [Hz].
-    rate_hint : float, optional
-        Sampling rate that a text in the file contains [Hz].
-    kind : {"rate", "angle"}, optional
-        Kind of angle columns given by the user.
+    `rate` [Hz] and `kind` are those that the user gives, `rate_hint` is the sampling rate that a
+    text in the file contains.
     """
     reasons: list[str] = []
     warnings: list[str] = []

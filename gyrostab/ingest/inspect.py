@@ -30,8 +30,8 @@ MEAN_STEP_BLOCKS = 64
 _MEDIAN_STEP = 0.6745 * math.sqrt(2.0)
 
 
-@dataclass(frozen=True)
-class ColumnInspection:
+@dataclass(frozen=True, kw_only=True)
+class ColumnInspection(ColumnSummary):
     """Statistics of one column, in the unit of the file; NaN if the column holds no numbers.
 
     `scatter` is the standard deviation of a sample about its neighbours, from the median of the
@@ -40,11 +40,6 @@ class ColumnInspection:
     the number of filled rows a second, NaN if the time is unknown.
     """
 
-    key: str
-    header: str
-    name: str
-    role: str
-    unit: str | None
     rows: int
     low: float
     high: float
@@ -73,17 +68,9 @@ class FileInspection:
 
 
 def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileInspection:
-    r"""Inspect every column of a file, in any format that gyrostab reads.
+    r"""Inspect the first `MAX_COLUMNS` columns of a file, in any format that gyrostab reads.
 
-    Returns
-    -------
-    FileInspection
-        The first `MAX_COLUMNS` columns, with range, scatter and rate.
-
-    Raises
-    ------
-    FormatError
-        When the file cannot be read at all, or holds no numbers.
+    `FormatError` when the file cannot be read at all, or holds no numbers.
 
     Examples
     --------
@@ -103,15 +90,10 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
     names = {f"column_{place}": column for place, column in enumerate(data_columns[:MAX_COLUMNS])}
     chosen = {column.key: f"{name} [1]" for name, column in names.items()}
     chosen.update({column.key: "-" for column in data_columns[MAX_COLUMNS:]})
-    unit: dict[str, str] = {}
-    if time is not None:
-        if time.unit is not None and time.unit != "ISO 8601":
-            unit["time"] = time.unit
-        chosen[time.key] = "time"
-        if (
-            time.key == "time" and "time" not in options.map
-        ):  # stamps of the format, not a named column
-            del chosen[time.key]
+    has_unit = time is not None and time.unit not in (None, "ISO 8601")
+    unit = {"time": str(time.unit)} if time is not None and has_unit else {}
+    if time is not None and (time.key != "time" or "time" in options.map):
+        chosen[time.key] = "time"  # else stamps of the format, not a named column
     reading = replace(
         options,
         map=chosen,
@@ -133,11 +115,8 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
     ]
     if not any(column.rows for column in columns):
         raise FormatError(f"{path.name}: there is no number in any of its columns; is it a log?")
-    notes = (
-        [f"{len(data_columns) - MAX_COLUMNS} further columns are not inspected"]
-        if len(data_columns) > MAX_COLUMNS
-        else []
-    )
+    further = len(data_columns) - MAX_COLUMNS
+    notes = [f"{further} further columns are not inspected"] if further > 0 else []
     rows = max((log.sizes[str(log[name].dims[0])] for name in names if name in log), default=0)
     return FileInspection(summary, tuple(columns), rows, time, rates["row"], tuple(notes))
 
@@ -200,11 +179,7 @@ def _inspect_column(
     variance = max(0.0, squares / rows - (total / rows) ** 2) if has_values else math.nan
     size = log[name].size if name in log.data_vars else log.sizes.get("row", 1)
     return ColumnInspection(
-        key=column.key or column.header,
-        header=column.header,
-        name=column.name,
-        role=column.role,
-        unit=column.unit,
+        **{**vars(column), "key": column.key or column.header},
         rows=int(rows),
         low=float(low),
         high=float(high),

@@ -9,7 +9,6 @@ limit.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -53,11 +52,6 @@ STORED_SAMPLES_PER_BYTE = 1000
 
 def check_limits(given: Mapping[str, Any] | None) -> dict[str, float]:
     """Check the limits that a user set, and return them as numbers.
-
-    Raises
-    ------
-    OptionError
-        When a name is not that of a limit, or a value is not a number above 0.
 
     Examples
     --------
@@ -128,21 +122,6 @@ def is_absurd_grid(samples: int, rows: int, given: Mapping[str, float] | None = 
     return samples > max(limit_value("grid_samples", given), GRID_SAMPLES_PER_ROW * rows)
 
 
-def _bytes_present(path: Path) -> int:
-    """Return the size of a file, or of all files in a directory."""
-    if not path.is_dir():
-        return path.stat().st_size
-    total, folders = 0, [os.fspath(path)]
-    while folders:
-        with os.scandir(folders.pop()) as entries:
-            for entry in entries:
-                if entry.is_dir():
-                    folders.append(entry.path)
-                else:
-                    total += entry.stat().st_size
-    return total
-
-
 def check_stored(
     path: Path, rows: int, columns: int, given: Mapping[str, float] | None = None
 ) -> None:
@@ -150,7 +129,8 @@ def check_stored(
     claimed = rows * columns
     if claimed <= limit_value("stored_samples", given):
         return
-    present = _bytes_present(path)
+    files = path.rglob("*") if path.is_dir() else [path]
+    present = sum(file.stat().st_size for file in files if file.is_file())
     if claimed > STORED_SAMPLES_PER_BYTE * present:
         raise FormatError(
             f"{path.name}: it declares {rows:.4g} samples in each of {columns} columns, but "

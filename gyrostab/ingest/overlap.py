@@ -17,22 +17,12 @@ _COMPARED_ROWS = 2**15  # at each end of an overlap
 
 
 def drop_repeats(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
-    """Drop the rows of each file that repeat rows of earlier files.
+    """Drop the rows of each file that repeat rows of earlier files, with notes.
 
     Two files overlap if rows of both have the same stamps and the same values. Files whose clocks
     merely cover the same hours, as after a restart of the clock, have other values and stay
-    unchanged.
-
-    Parameters
-    ----------
-    parts : sequence of xarray.Dataset
-        Raw logs with stamps, in the order of their first stamps.
-
-    Returns
-    -------
-    list of xarray.Dataset
-        The raw logs without repeated rows, with notes on dropped rows; a file without new rows is
-        dropped as a whole, with a note in the file that contains its rows.
+    unchanged. `parts` are in the order of their first stamps. A file without new rows is dropped as
+    a whole, with a note in the file that contains its rows.
     """
     unique_parts: list[xr.Dataset] = []
     ends: list[int] = []

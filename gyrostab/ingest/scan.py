@@ -118,19 +118,10 @@ class ScanResult:
 def scan_and_inspect(
     paths: Sequence[str | Path] | str | Path, *, inspect: bool = True, **reading: Any
 ) -> ScanResult:
-    """Scan logs, and inspect the columns of those that need options.
+    """Scan logs as `scan` does, and `inspect` the columns of those that need options.
 
-    Parameters
-    ----------
-    paths, **reading
-        As for `scan`.
-    inspect : bool
-        Whether to inspect columns; of files with the same columns the first is inspected.
-
-    Returns
-    -------
-    ScanResult
-        Errors of unreadable files are collected, not raised.
+    Errors of unreadable files are collected, not raised. The first of files with the same columns
+    is inspected.
     """
     from gyrostab.ingest.columns.plan_roles import scan_advice
     from gyrostab.ingest.files import expand
@@ -193,30 +184,22 @@ def _try_guess(
     """Read a file by the guess, also with its mean rate if many samples seem to be missing."""
     from gyrostab.ingest.guess_unit import temperature_unit
 
-    options = {
-        **reading,
-        "map": dict(reading.get("map", {})),
-        "unit": dict(reading.get("unit", {})),
-    }
-    options["map"].update(
-        {column.key: f"gyro_{axis}" for axis, column in guess.axes.items() if column.role != "gyro"}
-    )
-    if guess.unit is not None:
-        angle = any(column.name.lower().startswith("angle_") for column in guess.axes.values())
-        options["unit"]["angle" if angle else "gyro"] = guess.unit
+    axes = guess.axes.items()
+    mapped = {column.key: f"gyro_{axis}" for axis, column in axes if column.role != "gyro"}
     if guess.time is not None and guess.time.role != "time":
-        options["map"][guess.time.key] = "time"
-    if guess.time_unit is not None:
-        options["unit"]["time"] = guess.time_unit
+        mapped[guess.time.key] = "time"
     if guess.temperature is not None:
-        options["map"][guess.temperature.key] = (
-            f"temperature [{temperature_unit(guess.temperature)}]"
-        )
-    if guess.rate is not None:
-        options["rate"] = guess.rate
-    if guess.kind is not None:
-        options["kind"] = guess.kind
-    options = {name: value for name, value in options.items() if value != {}}
+        mapped[guess.temperature.key] = f"temperature [{temperature_unit(guess.temperature)}]"
+    is_angle = any(column.name.lower().startswith("angle_") for _, column in axes)
+    units = {"angle" if is_angle else "gyro": guess.unit, "time": guess.time_unit}
+    guessed = {
+        "map": {**reading.get("map", {}), **mapped},
+        "unit": {**reading.get("unit", {}), **{key: unit for key, unit in units.items() if unit}},
+        "rate": guess.rate,
+        "kind": guess.kind,
+    }
+    chosen = {name: value for name, value in guessed.items() if value is not None}
+    options = {name: value for name, value in {**reading, **chosen}.items() if value != {}}
     tries = [options]
     if "rate" not in options and math.isfinite(inspection.rate_hz):
         tries.append({**options, "rate": float(f"{inspection.rate_hz:.6g}")})
@@ -264,6 +247,7 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
     from gyrostab.ingest.grid.regularise import regularise
     from gyrostab.ingest.uniform import cut_log
     from gyrostab.schema import log_channels, signal_name, texts
+    from gyrostab.store.row_inspection import find_spans
 
     max_gap = reading.get("max_gap", "10D")
     cut = {name: reading[name] for name in _CUTTING if name in reading}
@@ -296,7 +280,7 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
         "rows": int(raw.sizes["time" if regular else "row"]),
         "gaps": len(gap_table(log))
         if "gap_start" in log.variables
-        else _count_runs(signal.isnull().all("axis")),
+        else len(find_spans(signal.isnull().all("axis").values, 0)),
         "missing_share": 1.0 - count_present(signal.data) / signal.size,
         "odd": "; ".join(notes),
         "notes": tuple(notes),
@@ -333,8 +317,3 @@ def _measure_white_noise(log: xr.Dataset) -> dict[str, float]:
             factor *= 2
         noise[str(axis)] = math.sqrt(min(levels, default=math.nan))
     return noise
-
-
-def _count_runs(missing: xr.DataArray) -> int:
-    """Count the runs of missing samples, for a log without a table of gaps."""
-    return int((missing & ~missing.shift(time=1, fill_value=False)).sum())

@@ -273,9 +273,12 @@ class Stacked(RowSource):
 
 
 def stack_rows(rows: Sequence[Any]) -> Any:
-    """Stack dask arrays of one dimension as the rows of one array."""
+    """Stack arrays of one dimension as the rows of one array; a dask array if one of them is."""
+    lazy_rows = [row for row in rows if not isinstance(row, np.ndarray)]
+    if not lazy_rows:
+        return np.stack(rows)
     if all(map(can_read_directly, rows)):
-        return make_dask(Stacked(rows), (1, rows[0].chunks[0]))
+        return make_dask(Stacked(rows), (1, lazy_rows[0].chunks[0]))
     import dask.array as da
 
     return da.stack(rows)

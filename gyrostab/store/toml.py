@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,16 @@ def read_toml_text(path: Path) -> str:
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError("it is not text in UTF-8; save it as UTF-8") from error
+
+
+def load_toml_folder(package: str, folder: str) -> dict[str, dict[str, Any]]:
+    """Load the TOML files in a folder of a package, by name and in order of their names."""
+    places = sorted(files(package).joinpath(folder).iterdir(), key=lambda place: place.name)
+    return {
+        place.name.removesuffix(".toml"): tomllib.loads(place.read_text(encoding="utf-8"))
+        for place in places
+        if place.name.endswith(".toml")
+    }
 
 
 def parse_toml(text: str) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from pyarrow import parquet
 
 import gyrostab
 from gyrostab.errors import SchemaError, TimeError
-from gyrostab.ingest import ReadOptions, files, read_log, scan_file
+from gyrostab.ingest import ReadOptions, read_log, reading, scan_file
 from gyrostab.ingest.columns import pieces
 from gyrostab.ingest.concat import group_axes
 from gyrostab.ingest.grid.gaps import gap_table
@@ -161,7 +161,7 @@ def test_axes_recorded_one_after_the_other_are_concatenated_in_time(tmp_path):
 
 def test_long_files_stay_on_disk_and_are_read_lazily(tmp_path, monkeypatch):
     monkeypatch.setattr(pieces, "_MAX_PLAIN_VALUES", 0)
-    monkeypatch.setattr(files, "SPILL_BYTES", 1000)
+    monkeypatch.setattr(reading, "SPILL_BYTES", 1000)
     paths = [write(tmp_path / f"{axis}.csv", axis) for axis in "xyz"]
     raw = read_log(paths)
     assert raw.rate.chunks is not None
@@ -174,8 +174,8 @@ def test_long_files_stay_on_disk_and_are_read_lazily(tmp_path, monkeypatch):
 
 
 def test_logs_are_grouped_by_the_axes_they_share():
-    assert group_axes([["x", "y"], ["y", "z"], ["z"]]) == [[0, 1, 2]]
-    assert group_axes([["z"], ["x"], ["y"], ["x"]]) == [[1, 3], [2], [0]]
+    assert group_axes(range(3), [["x", "y"], ["y", "z"], ["z"]]) == [[0, 1, 2]]
+    assert group_axes(range(4), [["z"], ["x"], ["y"], ["x"]]) == [[1, 3], [2], [0]]
 
 
 def write_miniseed(

@@ -28,7 +28,7 @@ from gyrostab.ingest.formats import matlab
 from gyrostab.ingest.formats import netcdf as netcdf_reader
 from gyrostab.ingest.limits import check_limits
 
-regularise_module = sys.modules["gyrostab.ingest.grid.regularise"]
+place_rows_module = sys.modules["gyrostab.ingest.grid.place_rows"]
 
 
 def write_stamped_netcdf(path: Path, rows: int) -> Path:
@@ -440,13 +440,13 @@ def test_log_of_values_in_a_file_equals_that_in_memory(
 def test_even_stamps_are_placed_from_the_beginning_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(regularise_module, "_EVEN_ROWS", 2**14)
+    monkeypatch.setattr(place_rows_module, "_EVEN_ROWS", 2**14)
     path = write_stamped_netcdf(tmp_path / "log.nc", 100_000)
     whole, lazy = (read_with(limit, path) for limit in (2**27, 1000))
     blocks_read = []
-    rate = regularise_module.estimate_rate
+    rate = place_rows_module.estimate_rate
     monkeypatch.setattr(
-        regularise_module,
+        place_rows_module,
         "estimate_rate",
         lambda stamps, **where: blocks_read.append(list(stamps())) or rate(stamps, **where),
     )

@@ -12,6 +12,7 @@ import pytest
 import xarray as xr
 
 import gyrostab.ingest.files as files
+import gyrostab.ingest.reading as reading
 from gyrostab.errors import FormatError, OptionError, SchemaError, TimeError, UnitError
 from gyrostab.ingest import FileSummary, ReadOptions, read_log, readers, scan_file
 from gyrostab.schema import check_log, check_raw
@@ -107,7 +108,7 @@ def test_packed_files_and_spreadsheets_are_refused_with_advice(
 
 def test_many_files_are_moved_to_disk(pair: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
     expected = read_log(pair)
-    monkeypatch.setattr(files, "SPILL_BYTES", 100)
+    monkeypatch.setattr(reading, "SPILL_BYTES", 100)
     raw = read_log(pair)
     assert raw.rate.chunks is not None
     xr.testing.assert_identical(raw.compute(), expected)
@@ -143,7 +144,7 @@ def test_rows_that_two_files_hold_count_once(
 ) -> None:
     whole = read_log(write(tmp_path / "whole.csv", HEADER + _rows(values, slice(None))))
     if spilled:
-        monkeypatch.setattr(files, "SPILL_BYTES", 100)
+        monkeypatch.setattr(reading, "SPILL_BYTES", 100)
     paths = [
         write(tmp_path / f"{place}.csv", HEADER + _rows(values, piece))
         for place, piece in enumerate(pieces)

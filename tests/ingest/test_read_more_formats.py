@@ -15,12 +15,10 @@ import xarray as xr
 from gyrostab.errors import FormatError, GyrostabError, OptionError
 from gyrostab.ingest import ReadOptions, read_log, scan_file
 from gyrostab.ingest.formats.tables import (
-    NO_NAME,
     Table,
     TableColumn,
     read_tables,
     scan_tables,
-    sliced,
 )
 from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.regularise import regularise
@@ -179,9 +177,8 @@ def make_tables(stamps: Sequence[tuple[Any, str | None] | None]) -> list[Table]:
     tables = []
     for number, clock in enumerate(stamps):
         name, unit = ("gyro_x", "deg/h") if number == 0 else (f"a{number}", "degC")
-        column = TableColumn((name,), sliced(np.arange(10.0)), unit)
-        times = None if clock is None else TableColumn(NO_NAME, sliced(clock[0]), clock[1])
-        tables.append(Table(10, [column], times))
+        column = TableColumn((name,), np.arange(10.0), unit)
+        tables.append(Table(10, [column], *(clock or ())))
     return tables
 
 

@@ -12,7 +12,7 @@ import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gyrostab.ingest import files, read_log
+from gyrostab.ingest import read_log, reading
 from gyrostab.ingest.columns import pieces
 from gyrostab.ingest.columns.pieces import (
     CountsPiece,
@@ -188,7 +188,7 @@ def test_packed_log_equals_the_plain_log(tmp_path, monkeypatch, limit, decimals)
     plain = read_log(paths)
     assert isinstance(plain.rate.data, np.ndarray)
     monkeypatch.setattr(pieces, "_MAX_PLAIN_VALUES", 0)
-    monkeypatch.setattr(files, "SPILL_BYTES", limit)
+    monkeypatch.setattr(reading, "SPILL_BYTES", limit)
     packed = read_log(paths)
     assert packed.rate.chunks is not None
     xr.testing.assert_identical(packed.compute(), plain)

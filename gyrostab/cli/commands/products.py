@@ -91,7 +91,7 @@ def correlate(
     """
     from gyrostab.correlate import correlate as compute
     from gyrostab.correlate import format_correlation, join
-    from gyrostab.ingest.channel import read_channel
+    from gyrostab.ingest.reading import read_channel
     from gyrostab.io.datasets import open_product, to_netcdf
     from gyrostab.plot.correlation import plot_correlation
     from gyrostab.plot.style import save_png

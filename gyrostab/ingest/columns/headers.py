@@ -50,6 +50,18 @@ KNOWN_CHANNEL_PATTERN = re.compile(
 TEMPERATURE_PATTERN = re.compile(r"temp|(^|[^a-z])tmp")
 
 
+@dataclass(frozen=True)
+class FileColumn:
+    """A column as its format describes it."""
+
+    header: str  # as written, or "0", "1", ... in a file without a header
+    unit: str | None = None  # that the format stores outside the header
+    calendar: str | None = None  # the CF calendar of that unit
+    stamped: bool = False  # holds dates (text, datetime types)
+    date_order: str | None = YEAR_FIRST  # of these dates; None if they can be read in two ways
+    target: str | None = None  # by a code of the format, in the form of --map, which overrules it
+
+
 @dataclass
 class Header:
     """A column whose role is being determined."""
@@ -58,13 +70,11 @@ class Header:
     header: str
     name: str
     unit: str | None
-    stored: str | None = None  # unit that the format stores outside the header; --unit overrules it
-    calendar: str | None = None  # the CF calendar of that unit
+    file: FileColumn  # as its format describes it
+    stored: str | None  # unit that the format stores outside the header; --unit overrules it
+    key: str  # unique name for --map
     mapped: bool = False  # named by --map
     preset: bool = False  # named by the preset of the program that wrote the file
-    stamped: bool = False  # holds dates
-    date_order: str | None = YEAR_FIRST  # of these dates; None if they can be read in two ways
-    key: str = ""  # unique name for --map
 
     @property
     def low(self) -> str:
@@ -132,9 +142,9 @@ def _parse_or_none(parse: Callable[..., _T], *arguments: str) -> _T | None:
         return None
 
 
-def distinct_columns(headers: Sequence[str]) -> Iterator[Header]:
+def distinct_columns(columns: Sequence[FileColumn]) -> Iterator[Header]:
     """Yield the columns, each with a unique key: name, header or numbered name."""
-    split = [(header.strip(), *split_header(header)) for header in headers]
+    split = [(column.header.strip(), *split_header(column.header)) for column in columns]
     names = Counter(name.lower() for _, name, _ in split)
     header_counts = Counter(header.lower() for header, _, _ in split)
     used_names = header_counts.keys() | names.keys()
@@ -146,7 +156,8 @@ def distinct_columns(headers: Sequence[str]) -> Iterator[Header]:
             number = counts[key.lower()]
             key = key if number == 1 else free_name(f"{name}_", used_names, number)
             used_names.add(key.lower())
-        yield Header(source, header, name, unit, key=key)
+        column = columns[source]
+        yield Header(source, header, name, unit, column, column.unit, key)
 
 
 def free_name(stem: str, used_names: Collection[str], number: int = 2) -> str:
@@ -158,12 +169,9 @@ def free_name(stem: str, used_names: Collection[str], number: int = 2) -> str:
 
 def quantity_of(low: str) -> str | None:
     """Return the quantity that a channel of this name measures, None if unknown."""
-    return (
-        QUANTITIES.get(low)
-        or QUANTITIES.get(low.split("_")[0])
-        or next(
-            (quantity for name, quantity in QUANTITIES.items() if low.startswith(name + "_")), None
-        )
+    return next(
+        (quantity for name, quantity in QUANTITIES.items() if f"{low}_".startswith(f"{name}_")),
+        None,
     )
 
 
@@ -174,13 +182,9 @@ def unit_quantity(quantity: str) -> str:
 
 def example_unit(quantity: str | None) -> str:
     """Return a unit to suggest in a message."""
-    return (
-        "1"
-        if quantity is None
-        else "deg/s"
-        if quantity == "rotation_rate"
-        else known_units(quantity).split(",")[0]
-    )
+    if quantity is None:
+        return "1"
+    return "deg/s" if quantity == "rotation_rate" else known_units(quantity).split(",")[0]
 
 
 def channel_name(column: Header) -> str:

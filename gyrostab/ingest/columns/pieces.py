@@ -201,17 +201,6 @@ class FilePiece(Piece):
         out[:] = self.read(self.begin + first, self.begin + first + out.size).view(out.dtype)
 
 
-@dataclass(frozen=True)
-class NaNPiece(Piece):
-    """Rows without a value."""
-
-    rows: int
-
-    def read_into(self, first: int, out: NDArray[Any]) -> None:
-        """Fill `out` with NaN."""
-        out[:] = np.nan
-
-
 class PiecewiseColumn(RowSource):
     """A column in pieces, as a lazy source.
 
@@ -286,11 +275,10 @@ class Buffers:
     """Columns of 8-byte numbers that grow block by block.
 
     Up to `SPILL_BYTES` they stay in memory; beyond it they are appended to a spool. Small columns
-    in memory are returned as arrays, and the columns `rows_of` as the rows of one matrix.
+    in memory are returned as arrays.
     """
 
-    def __init__(self, dtypes: Mapping[Any, Any], *, rows_of: Sequence[Any] = ()):
-        self.rows_of = rows_of
+    def __init__(self, dtypes: Mapping[Any, Any]):
         self.dtypes = {key: np.dtype(dtype) for key, dtype in dtypes.items()}
         self.limit = SPILL_BYTES
         self.rows = 0
@@ -330,17 +318,7 @@ class Buffers:
         self._pieces.clear()
         if stays or self._spool is not None or self.rows * len(columns) > _MAX_PLAIN_VALUES:
             return dict(columns)
-        matrix = np.empty((len(self.rows_of), self.rows))
-        arrays: dict[Any, NDArray[Any] | PiecewiseColumn] = {}
-        for key, column in columns.items():
-            plain = (
-                matrix[self.rows_of.index(key)]
-                if key in self.rows_of
-                else np.empty(self.rows, self.dtypes[key])
-            )
-            column.read_into(0, 0, plain)
-            arrays[key] = plain
-        return arrays
+        return {key: column[:] for key, column in columns.items()}
 
 
 class InspectedRows(Stacked):
@@ -349,17 +327,6 @@ class InspectedRows(Stacked):
     def __init__(self, rows: Sequence[Any], inspections: Sequence[RowInspection]):
         super().__init__(rows)
         self.inspections = tuple(inspections)
-
-
-def stack_as_rows(columns: Sequence[Any], inspections: Sequence[RowInspection] = ()) -> Any:
-    """Stack columns as the rows of one array, without a copy if they already share one matrix."""
-    if not isinstance(columns[0], np.ndarray):
-        return make_dask(InspectedRows(columns, inspections), (1, CHUNK_ROWS))
-    matrix = columns[0].base
-    same = matrix is not None and matrix.shape[:-1] == (len(columns),)
-    return (
-        matrix if same and all(column.base is matrix for column in columns) else np.stack(columns)
-    )
 
 
 def as_lazy(values: NDArray[Any] | PiecewiseColumn) -> Any:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gyrostab.errors import GyrostabError, OptionError
-from gyrostab.ingest.columns.headers import AXIS_PATTERN, split_header
+from gyrostab.ingest.columns.headers import AXIS_PATTERN, FileColumn, split_header
 from gyrostab.ingest.columns.plan_draft import (
     MAX_HEADERS,
     Column,
@@ -15,7 +15,8 @@ from gyrostab.ingest.columns.plan_draft import (
     name_columns,
     resolve_duplicates,
 )
-from gyrostab.ingest.columns.plan_roles import find_time, plan_channels, plan_gyro
+from gyrostab.ingest.columns.plan_roles import plan_channels, plan_gyro
+from gyrostab.ingest.columns.plan_time import find_time
 from gyrostab.ingest.columns.preset import PresetMatch, find_preset
 from gyrostab.ingest.limits import check_columns
 from gyrostab.ingest.options import ColumnSummary, ReadOptions
@@ -34,9 +35,7 @@ class Plan:
     notes: tuple[str, ...]
     problems: tuple[GyrostabError, ...]
     unmatched: tuple[str, ...]
-    rate: float | None = (
-        None  # [Hz], from the lines above the header of a file without a time column
-    )
+    options: ReadOptions  # with the sampling rate that the lines above the header name
 
     def check(self) -> Plan:
         """Raise the first problem, or return the plan."""
@@ -56,71 +55,33 @@ class Plan:
 
 def plan_columns(
     path: Path,
-    headers: Sequence[str],
+    columns: Sequence[FileColumn],
     options: ReadOptions,
     *,
-    units: Mapping[int, str] | None = None,
-    calendars: Mapping[int, str] | None = None,
-    stamped: Collection[int] = (),
-    orders: Mapping[int, str | None] | None = None,
     rising: Callable[[int], bool] | None = None,
     above: Sequence[str] = (),
     is_filled: Callable[[int], bool] | None = None,
     word_in: Callable[[int], str] | None = None,
-    coded: Mapping[int, str] | None = None,
 ) -> Plan:
     """Determine the role and unit of each column.
 
-    Parameters
-    ----------
-    headers : sequence of str
-        Header cells as written, or ``"0"``, ``"1"``, ... for a file without a header.
-    units : mapping of int to str, optional
-        Units that the format stores outside the header (NetCDF attributes).
-    calendars : mapping of int to str, optional
-        CF calendars of those units that name an epoch.
-    stamped : collection of int
-        Columns whose values are dates (text, datetime types).
-    orders : mapping of int to str or None, optional
-        Order of day, month and year in columns of text: one of `gyrostab.ingest.columns.dates`, or
-        None if they can be read in two ways; the year comes first in others.
-    rising : callable, optional
-        Returns whether the first values of a column rise; decides between several candidates for
-        the time column.
-    above : sequence of str
-        Lines above the header, which may identify the program that wrote the file.
-    is_filled : callable, optional
-        Returns whether any of the first cells of a column is filled.
-    word_in : callable, optional
-        Returns the first of the cells of a column that holds no number, or nothing.
-    coded : mapping of int to str, optional
-        Roles of columns by a code of the format, in the form of ``--map``, which overrules them.
-
-    Returns
-    -------
-    Plan
-        ``Plan.check()`` raises the first problem.
+    `rising` returns whether the first values of a column rise, which decides between candidates for
+    the time column; `above` are the lines above the header, which may identify the program that
+    wrote the file; `is_filled` returns whether any of the first cells of a column is filled, and
+    `word_in` the first of them that holds no number, or nothing.
     """
-    check_columns(path, len(headers), options.limits)
+    check_columns(path, len(columns), options.limits)
+    headers = [column.header for column in columns]
     split = [(header, split_header(header)[0]) for header in headers]
     preset = PresetMatch("")
     if not any(AXIS_PATTERN.match(name.lower()) for _, name in split):  # named gyro_x ... already
         preset = find_preset(path, split, above=above, is_filled=is_filled)
     draft = PlanDraft(path, options, rising, word_in)
-    named = name_columns(
-        draft,
-        headers,
-        units or {},
-        calendars or {},
-        frozenset(stamped),
-        orders or {},
-        {**(coded or {}), **preset.columns},
-    )
-    named = resolve_duplicates(draft, named)
+    named = resolve_duplicates(draft, name_columns(draft, columns, preset.columns))
     time = find_time(draft, named)
     data_columns = [column for column in named if column is not time]
     gyro = [column for column in data_columns if AXIS_PATTERN.match(column.low)]
-    signal, kind = plan_gyro(draft, gyro, headers)
+    signal, kind = plan_gyro(draft, gyro, columns)
     plan_channels(draft, [column for column in data_columns if not AXIS_PATTERN.match(column.low)])
     rate = preset.rate if time is None and options.rate is None else None
     if preset.name:
@@ -140,22 +101,22 @@ def plan_columns(
             "there is no time column; give the sampling rate with --rate HZ (and --start), or "
             f"name the column: --map NAME=time. Columns: {list_some(headers, MAX_HEADERS)}",
         )
-    draft.add_notes(headers)
+    draft.add_notes(columns)
     unused = [f"--unit {key}" for key in options.unit if key not in draft.used_units]
     unmatched = [f"--map {key}" for key in options.map if key not in draft.used_map] + unused
     order = {"time": 0, "gyro": 1, "channel": 2}
-    columns = sorted(
+    planned = sorted(
         draft.columns,
         key=lambda column: (order[column.role], column.name if column.role == "gyro" else ""),
     )
     return Plan(
         path,
-        tuple(columns),
+        tuple(planned),
         tuple(draft.summaries),
         signal,
         kind,
         tuple(draft.notes),
         tuple(draft.problems),
         tuple(unmatched),
-        rate,
+        options if rate is None else replace(options, rate=rate),
     )

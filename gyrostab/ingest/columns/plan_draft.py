@@ -11,6 +11,7 @@ from gyrostab.errors import FormatError, GyrostabError
 from gyrostab.ingest.columns.dates import YEAR_FIRST
 from gyrostab.ingest.columns.headers import (
     AXIS_PATTERN,
+    FileColumn,
     Header,
     channel_name,
     distinct_columns,
@@ -45,6 +46,7 @@ class Column:
     offset: float = 0.0
     time_unit: TimeUnit | None = None
     date_order: str = YEAR_FIRST  # of stamps that are text
+    epoch: int = 0  # of numbers whose unit names none [ns since 1970]
 
 
 class PlanDraft:
@@ -113,13 +115,19 @@ class PlanDraft:
         """Add the summary of a column that is left out."""
         self.add_summary(column, column.name, "left out", None, column.unit or column.stored)
 
+    def add_column(self, column: Header, text: str | None, planned: Column) -> None:
+        """Add a column to read, with the unit that the file or the user gives it."""
+        self.columns.append(planned)
+        name = column.low if planned.role == "gyro" else planned.name
+        self.add_summary(column, name, planned.role, planned.quantity, text)
+
     def add_summary(
         self, column: Header, name: str, role: str, quantity: str | None, unit: str | None
     ) -> None:
         """Add the summary of a column."""
         self.summaries.append(ColumnSummary(column.header, name, role, quantity, unit, column.key))
 
-    def add_notes(self, headers: Sequence[str]) -> None:
+    def add_notes(self, columns: Sequence[FileColumn]) -> None:
         """Add notes on columns that were left out, and sort the summaries as in the file."""
         if self.unitless:
             name, quantity, _ = min(
@@ -147,7 +155,7 @@ class PlanDraft:
                 "left out, as the file is read for its channels: "
                 f"{list_some(self.left_out, MAX_HEADERS)}"
             )
-        place = {header.strip(): index for index, header in enumerate(headers)}
+        place = {column.header.strip(): index for index, column in enumerate(columns)}
         self.summaries.sort(key=lambda summary: place.get(summary.header, -1))
 
 
@@ -158,22 +166,14 @@ def by_lower_name(names: Mapping[str, str]) -> dict[str, str]:
 
 def name_columns(
     draft: PlanDraft,
-    headers: Sequence[str],
-    units: Mapping[int, str],
-    calendars: Mapping[int, str],
-    stamped: frozenset[int],
-    orders: Mapping[int, str | None],
+    columns: Sequence[FileColumn],
     presets: Mapping[int, str],
 ) -> list[Header]:
     """Name the columns by ``--map``, then by the preset, and drop those that either drops."""
     keys_by_name = {key.strip().lower(): key for key in draft.options.map}
     targets = {split_header(target)[0].lower() for target in draft.options.map.values()}
     named: list[Header] = []
-    for column in distinct_columns(headers):
-        source = column.source
-        column.stored, column.calendar = units.get(source), calendars.get(source)
-        column.stamped = source in stamped
-        column.date_order = orders.get(source, YEAR_FIRST)
+    for column in distinct_columns(columns):
         texts = (column.key.lower(), column.header.lower(), column.low)
         key = next((keys_by_name[text] for text in texts if text in keys_by_name), None)
         if key is not None:
@@ -182,8 +182,8 @@ def name_columns(
             if target in ("", "-"):
                 continue
             column.name, column.unit, column.mapped = target, target_unit or column.unit, True
-        elif source in presets:
-            target, target_unit = split_header(presets[source])
+        elif preset := presets.get(column.source, columns[column.source].target):
+            target, target_unit = split_header(preset)
             if target == "-" or _is_taken(target.lower(), targets):
                 draft.leave_out(column)
                 continue

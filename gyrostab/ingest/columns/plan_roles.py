@@ -1,4 +1,4 @@
-"""Assign roles to the named columns of a file: time, gyro axes, channels."""
+"""Assign roles to the named columns of a file: gyro axes, channels."""
 
 from __future__ import annotations
 
@@ -8,15 +8,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from gyrostab.errors import FormatError, GyrostabError, MissingUnitError, OptionError, UnitError
-from gyrostab.ingest.columns.dates import (
-    DAY_FIRST,
-    EITHER_FIRST,
-    MONTH_FIRST,
-    NO_DATE,
-    YEAR_FIRST,
-    parse_order,
-)
+from gyrostab.errors import FormatError, MissingUnitError, OptionError, UnitError
 from gyrostab.ingest.columns.headers import (
     AXIS_PATTERN,
     GYRO_PATTERNS,
@@ -24,171 +16,25 @@ from gyrostab.ingest.columns.headers import (
     KNOWN_CHANNEL_PATTERN,
     TEMPERATURE_PATTERN,
     TIME_PATTERN,
+    FileColumn,
     Header,
     channel_name,
     distinct_columns,
     example_unit,
-    is_time_unit,
     is_unit,
     is_unit_of,
     quantity_of,
-    split_header,
     stored_name,
     unit_quantity,
 )
 from gyrostab.ingest.columns.plan_draft import MAX_HEADERS, Column, PlanDraft, by_lower_name
-from gyrostab.ingest.columns.stamps import TimeUnit, names_epoch, parse_time_unit
 from gyrostab.ingest.limits import limit_value
 from gyrostab.units import HOUR, INNER, known_units, parse_unit
 from gyrostab.wording import list_some
 
 
-def find_time(draft: PlanDraft, named: list[Header]) -> Header | None:
-    """Choose the time column and its unit; other candidates are left out with a note."""
-    time_columns = [c for c in named if c.low == "time" and c.mapped] or [
-        c for c in named if c.low == "time" and c.preset
-    ]
-    if not time_columns:
-        time_columns = [
-            c
-            for c in named
-            if not (c.mapped or c.preset) and TIME_PATTERN.match(c.low) and _may_be_time(c)
-        ]
-        sure = [c for c in time_columns if c.low != "t" or c.unit or c.stored or c.stamped]
-        time_columns = sure or time_columns
-    if not time_columns:
-        time_columns = [
-            c
-            for c in named
-            if c.stamped
-            and draft.rising(c.source)
-            and not (c.mapped or c.preset)
-            and not (c.date_order == NO_DATE and draft.options.rate is not None)
-        ]
-        reason = "it holds dates"
-        if not time_columns:
-            clocks = [c for c in named if _is_clock(draft, c)]
-            time_columns = clocks if len(clocks) == 1 else []
-            reason = "it is the only column that rises in a unit of time"
-        if time_columns:
-            header = time_columns[0].header
-            draft.notes.append(f"{header!r} is taken for the time column, as {reason}")
-    if not time_columns:
-        return None
-    time_columns.sort(key=lambda c: not draft.rising(c.source))
-    column = time_columns[0]
-    candidates = {id(c) for c in time_columns}
-    rivals = time_columns[1:] + [c for c in named if id(c) not in candidates and c.low == "time"]
-    if rivals:
-        names = " and ".join(repr(c.header) for c in [column, *rivals][:3])
-        draft.notes.append(
-            f"{names} look like the time; {column.header!r} is used (for another: --map "
-            f'"{rivals[0].key}=time")'
-        )
-        for rival in rivals:
-            draft.leave_out(rival)
-        dropped = {id(rival) for rival in rivals}
-        named[:] = [c for c in named if id(c) not in dropped]
-    unit = None if column.stamped else _time_unit(draft, column)
-    order = _date_order(draft, column) if column.stamped else YEAR_FIRST
-    planned = column.source, column.header, "time", "time", "time", "ns"
-    draft.columns.append(Column(*planned, time_unit=unit, date_order=order))
-    written = unit.text if unit else None
-    if column.stamped:
-        written = "ISO 8601" if order == YEAR_FIRST else order
-    draft.add_summary(column, "time", "time", "time", written)
-    if (
-        unit is not None
-        and unit.epoch is None
-        and draft.options.epoch is None
-        and not draft.options.channels_only
-    ):
-        draft.notes.append(
-            "numeric time is counted from 1970-01-01T00:00:00 UTC; give --epoch for another zero"
-        )
-    if unit is not None and unit.epoch is not None and draft.options.epoch is not None:
-        draft.notes.append(
-            f"--epoch is not used: the time column {column.header!r} is in {unit.text!r}"
-        )
-    return column
-
-
-def _may_be_time(column: Header) -> bool:
-    written = column.unit or column.stored
-    # An epoch that cannot be read is reported, not ignored.
-    return written is None or column.stamped or names_epoch(written) or is_time_unit(written)
-
-
-def _is_clock(draft: PlanDraft, column: Header) -> bool:
-    """Return whether a column of another name has a unit of time, and values known to rise."""
-    unit = column.unit or column.stored
-    return (
-        unit is not None
-        and (is_time_unit(unit) or names_epoch(unit))
-        and not (column.mapped or column.preset)
-        and not KNOWN_CHANNEL_PATTERN.match(column.low)
-        and draft.knows_rising
-        and draft.rising(column.source)
-    )
-
-
-def _date_order(draft: PlanDraft, column: Header) -> str:
-    """Return the order of day, month and year: from the user, the header, or the dates."""
-    keys_by_name = by_lower_name(draft.options.unit)
-    keys = [column.name, column.key, column.header, "time"]
-    for key in (keys_by_name[low] for low in map(str.lower, keys) if low in keys_by_name):
-        if order := parse_order(draft.options.unit[key]):
-            draft.used_units.add(key)
-            return order
-    order = parse_order(column.unit or column.stored or "") or column.date_order
-    if order == NO_DATE:
-        draft.refuse(
-            UnitError,
-            f"the time column {column.header!r} holds times of day without a date; write the date "
-            "before the time, in this column or in one to its left",
-        )
-    if order is None:
-        draft.refuse(
-            UnitError,
-            f"the dates in the time column {column.header!r} can be read in two ways; say which "
-            f"number is the day: --unit time={DAY_FIRST} or --unit time={MONTH_FIRST}",
-        )
-    return order or EITHER_FIRST
-
-
-def _time_unit(draft: PlanDraft, column: Header) -> TimeUnit | None:
-    suffix = TIME_PATTERN.match(split_header(column.header)[0].lower())
-    named = next((text for text in suffix.groups() if text), None) if suffix else None
-    written = column.unit or (
-        named if named not in ("utc", "iso") and column.stored is None else None
-    )
-    keys = [column.name, column.key, column.header, "time"]
-    text = draft.find_unit(column, keys, written, is_time_unit, prefer_given=column.unit is None)
-    if text is None:
-        word = draft.word_in(column.source)
-        draft.refuse(
-            MissingUnitError,
-            f"the time column {column.header!r} holds {word!r}, which is neither a number nor a "
-            "date in a form that is read; write the year with four digits and a zone as an offset, "
-            "for instance 2026-05-01T08:00:00-06:00, 01.05.2026 8:00:00, 01-May-2026 08:00:00 or "
-            "05/20/2026 8:00:00 AM"
-            if word
-            else f"the time column {column.header!r} carries no unit, and holds no dates; give the "
-            "unit of numbers with --unit time=s (or ms, us, ns)",
-        )
-        return None
-    try:
-        return parse_time_unit(text, column.calendar if text == column.stored else None)
-    except GyrostabError as error:
-        advice = '"time=seconds since 2026-01-02T00:00:00"' if names_epoch(text) else "time=s"
-        draft.refuse(
-            UnitError, f"column {column.header!r}: {error}; or give it with --unit {advice}"
-        )
-        return None
-
-
 def plan_gyro(
-    draft: PlanDraft, gyro: list[Header], headers: Sequence[str]
+    draft: PlanDraft, gyro: list[Header], columns: Sequence[FileColumn]
 ) -> tuple[str | None, str | None]:
     """Plan the gyro axes; return signal and kind (rates, increments or cumulative angles)."""
     if draft.options.channels_only:
@@ -198,7 +44,7 @@ def plan_gyro(
         return None, None
     if not gyro:
         if not draft.problems:
-            draft.refuse(FormatError, _describe_lack(draft.path, headers))
+            draft.refuse(FormatError, _describe_lack(draft.path, columns))
         return None, None
     quantities: dict[str, str] = {}
     for column in gyro:
@@ -263,10 +109,8 @@ def _plan_axis(draft: PlanDraft, column: Header) -> str | None:
             unit.quantity,
         )
         return None
-    inner = INNER[unit.quantity]
-    planned = column.source, column.header, "gyro", axis, unit.quantity, inner
-    draft.columns.append(Column(*planned, unit.factor, unit.offset))
-    draft.add_summary(column, column.low, "gyro", unit.quantity, text)
+    planned = column.source, column.header, "gyro", axis, unit.quantity, INNER[unit.quantity]
+    draft.add_column(column, text, Column(*planned, unit.factor, unit.offset))
     return unit.quantity
 
 
@@ -403,14 +247,13 @@ def _plan_channel(
         )
     draft.kept_channels += 1
     planned = column.source, column.header, "channel", stored, quantity or "other", units
-    draft.columns.append(Column(*planned, factor, offset))
-    draft.add_summary(column, stored, "channel", quantity or "other", text)
+    draft.add_column(column, text, Column(*planned, factor, offset))
 
 
-def _describe_lack(path: Path, headers: Sequence[str]) -> str:
+def _describe_lack(path: Path, columns: Sequence[FileColumn]) -> str:
     """Say that no column is a gyro axis, and how to name the likely ones."""
-    columns = [column for column in distinct_columns(headers) if column.header]
-    free = [c for c in columns if not TIME_PATTERN.match(c.low) and quantity_of(c.low) is None]
+    headers = [column for column in distinct_columns(columns) if column.header]
+    free = [c for c in headers if not TIME_PATTERN.match(c.low) and quantity_of(c.low) is None]
     candidates = (c for pattern in GYRO_PATTERNS for c in free if pattern.search(c.name))
     likely = next(candidates, free[0] if free else None)
     low = likely.header.lower() if likely else ""
@@ -424,7 +267,7 @@ def _describe_lack(path: Path, headers: Sequence[str]) -> str:
         options = f" --kind {'rate' if INCREMENT_PATTERN.search(likely.name) else 'angle'}"
     return (
         "no gyro column (gyro_x, gyro_y, gyro_z or angle_x ...). Columns: "
-        f"{list_some([c.name for c in columns], 100)}. Say which they are, for instance: --map "
+        f"{list_some([c.name for c in headers], 100)}. Say which they are, for instance: --map "
         f'"{likely.key if likely else "NAME"}=gyro_x"{options}{scan_advice(path)}'
     )
 

@@ -10,13 +10,13 @@ the sampling rate [Hz] above the header.
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
+
+from gyrostab.store.toml import load_toml_folder
 
 _KEYS = {"name", "above", "file", "needs", "times", "drops", "rate", "columns"}
 
@@ -33,14 +33,9 @@ class PresetMatch:
 @cache
 def _load_presets() -> dict[str, dict[str, Any]]:
     """Load the presets, by file name."""
-    presets = {}
-    for place in sorted(
-        files("gyrostab.ingest.columns").joinpath("presets").iterdir(), key=lambda place: place.name
-    ):
-        if place.name.endswith(".toml"):
-            preset = tomllib.loads(place.read_text(encoding="utf-8"))
-            assert set(preset) <= _KEYS, f"{place.name}: {set(preset) - _KEYS}"
-            presets[place.name.removesuffix(".toml")] = preset
+    presets = load_toml_folder("gyrostab.ingest.columns", "presets")
+    for name, preset in presets.items():
+        assert set(preset) <= _KEYS, f"{name}: {set(preset) - _KEYS}"
     return presets
 
 
@@ -53,12 +48,8 @@ def find_preset(
 ) -> PresetMatch:
     """Find the preset that fits a file, with an empty name for the files of other programs.
 
-    Parameters
-    ----------
-    headers : sequence of (str, str)
-        Full header and name without unit of each column.
-    is_filled : callable, optional
-        Returns whether any of the first cells of a column is filled.
+    `headers` are full header and name without unit of each column; `is_filled` returns whether any
+    of the first cells of a column is filled.
     """
     places: dict[str, int] = {}
     for place, names in reversed(list(enumerate(headers))):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,47 +10,28 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
+from gyrostab.ingest.columns.clock import ClockBlock, TurningClock, continue_block
+from gyrostab.ingest.columns.faults import Faults, Locate, Quote, describe_codes
 from gyrostab.ingest.columns.pieces import (
+    CHUNK_ROWS,
     Buffers,
     CountsPiece,
     EvenStampsPiece,
+    InspectedRows,
     Piece,
     PiecewiseColumn,
     as_lazy,
-    stack_as_rows,
 )
 from gyrostab.ingest.columns.plan import Plan
 from gyrostab.ingest.columns.plan_draft import Column
-from gyrostab.ingest.columns.stamps import CLOCK_PERIODS, NAT, continue_clock, find_turn
-from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.ingest.columns.stamps import NAT
+from gyrostab.ingest.options import FileSummary
 from gyrostab.schema import SIGNAL_UNITS
-from gyrostab.store.lazy import read_slice
+from gyrostab.store.lazy import make_dask
 from gyrostab.store.row_inspection import RowInspection
 from gyrostab.store.write import declare_counts
 
-#: Largest number of bad places that a note lists.
-MAX_NAMED_PLACES = 10
-#: Largest share of unreadable rows; a file with more is refused.
-MAX_UNREADABLE_SHARE = 0.5
-
-#: Rows at the beginning in which a code for missing values is searched.
-_CODE_ROWS = 2**18
-#: A code repeats, is farther from the other values than their range times this number, and the
-#: latter have at least so many different values, unlike the states of a switch.
-_MIN_CODE_REPEATS, _MIN_CODE_DISTANCE, _MIN_READINGS = 3, 3.0, 16
-
 Values = dict[int, NDArray[np.float64]]
-Locate = Callable[[Sequence[int]], list[str]]
-
-
-class ClockBlock(NamedTuple):
-    """Stamps of a block whose clock may begin again after a day or a week [ns]."""
-
-    first: int
-    last: int  # continued within the block
-    typical: float  # step
-    turns: list[int]  # periods that were added within the block
-
 
 _NO_ROWS = np.empty(0, np.int64)
 
@@ -78,31 +59,11 @@ class ConvertedBlock(NamedTuple):
     clock: ClockBlock | None = None
 
 
-class _Places:
-    """Number of bad places, and the names of the first ones."""
-
-    def __init__(self) -> None:
-        self.total, self.names = 0, list[str]()
-
-    def add(self, rows: NDArray[np.int64], locate: Locate) -> None:
-        self.total += len(rows)
-        if room := MAX_NAMED_PLACES - len(self.names):
-            self.names += locate(rows[:room].tolist())
-
-    def describe(self) -> str:
-        """Join the names: ``lines 7, 8, 9 and others``."""
-        kind, names = self.names[0].split(" ")[0], self.names
-        numbers = ", ".join(name.removeprefix(f"{kind} ") for name in names)
-        return (
-            f"{kind}{'s' * (len(names) > 1)} {numbers}{' and others' * (self.total > len(names))}"
-        )
-
-
 class RawLogBuilder:
     """Collect the blocks of one file and build its raw log."""
 
-    def __init__(self, plan: Plan, options: ReadOptions):
-        self.plan, self.options = plan, options
+    def __init__(self, plan: Plan):
+        self.plan, self.options = plan.check(), plan.options
         self.time = plan.time
         self.gyro, self.channels = plan.of("gyro"), plan.of("channel")
         dtypes: dict[int, Any] = {
@@ -110,20 +71,15 @@ class RawLogBuilder:
         }
         if self.time is not None:
             dtypes[self.time.source] = np.int64
-        self.buffers = Buffers(dtypes, rows_of=[column.source for column in self.gyro])
+        self.buffers = Buffers(dtypes)
         self.grids: dict[int, tuple[float, float] | None] = {
             column.source: (1.0, 1.0) for column in [*self.gyro, *self.channels]
         }  # step and divisor to try when packing; None: not packed
-        self.bad_cells = self.cells = 0
-        self.bad_rows, self.cell_rows = _Places(), _Places()
-        self.missing = dict[int, int]()  # missing values by column number
-        self.first_bad_row = ""
-        self.bad_index: list[NDArray[np.int64]] = []
+        self.faults = Faults()
         self.low, self.high = np.iinfo(np.int64).max, NAT
         unit = None if self.time is None else self.time.time_unit
         self.continues_clock = unit is not None and unit.epoch is None
-        self.last_stamp: int | None = None
-        self.turns: list[int] = []
+        self.clock = TurningClock()
         self.inspections: list[RowInspection] = []
         self.whole: dict[int, tuple[float, float] | None] = {
             column.source: (0.0, 0.0) for column in [*self.gyro, *self.channels]
@@ -134,15 +90,9 @@ class RawLogBuilder:
     ) -> ConvertedBlock:
         """Convert one block and pack its columns where possible; thread-safe.
 
-        Parameters
-        ----------
-        values : dict of int to ndarray
-            Column number -> values in the unit of the file, NaN where unreadable or empty. Changed
-            in place.
-        stamps : ndarray of int64 or None
-            Stamps [ns since 1970], `NAT` where unreadable; None without a time column.
-        words : int
-            Channel cells whose text is not a number (empty cells do not count).
+        `values` in the unit of the file by column number, NaN where unreadable or empty, are
+        changed in place; `stamps` [ns since 1970] are `NAT` where unreadable; `words` counts the
+        channel cells whose text is not a number (empty cells do not count).
         """
         size = (
             len(next(iter(values.values()))) if values else len(stamps) if stamps is not None else 0
@@ -168,7 +118,7 @@ class RawLogBuilder:
         low, high, clock = np.iinfo(np.int64).max, NAT, None
         if stamps is not None and self.time is not None:
             if self.continues_clock:
-                stamps, clock = _continue_block(stamps)
+                stamps, clock = continue_block(stamps)
             block[self.time.source] = _pack_stamps(stamps)
             good = stamps[~bad] if bad_rows.size else stamps
             if len(good):
@@ -181,48 +131,23 @@ class RawLogBuilder:
         self,
         converted: ConvertedBlock,
         locate: Locate | None = None,
-        quote: Callable[[int], str] | None = None,
+        quote: Quote | None = None,
     ) -> None:
-        """Add one block.
-
-        Parameters
-        ----------
-        locate : callable, optional
-            Row numbers within the block -> names of the rows for messages.
-        quote : callable, optional
-            Row number within the block -> the row as it is written, for messages.
-        """
+        """Add one block; messages name its rows by `locate` and `quote`."""
         if converted.rows == 0:
             return
         if converted.clock is not None:
-            converted = self._continue_clock(converted, converted.clock)
-        first = self.buffers.rows
-        locate = locate or (lambda rows: [f"row {first + row}" for row in rows])
-        self.bad_cells += converted.bad_cells
+            converted = self._shift_stamps(converted, self.clock.continue_from(converted.clock))
         for source, (missing, low, high, is_whole) in converted.ranges.items():
-            self.missing[source] = self.missing.get(source, 0) + missing
             span = self.whole[source]
             if span is not None and missing < converted.rows:
                 self.whole[source] = (min(span[0], low), max(span[1], high)) if is_whole else None
-        if converted.bad_rows.size:
-            if quote is not None and not self.bad_rows.total:
-                self.first_bad_row = f": {quote(int(converted.bad_rows[0])):.100}"
-            self.bad_rows.add(converted.bad_rows, locate)
-            self.bad_index.append(converted.bad_rows + first)
-        if converted.cell_rows.size:
-            self.cell_rows.add(converted.cell_rows, locate)
-            self.cells += converted.cells
+        self.faults.add(converted, self.buffers.rows, locate, quote)
         self.low, self.high = min(self.low, converted.low), max(self.high, converted.high)
         self.inspections += [converted.inspection] if converted.inspection is not None else []
         self.buffers.add(converted.block)
 
-    def _continue_clock(self, converted: ConvertedBlock, clock: ClockBlock) -> ConvertedBlock:
-        """Continue the stamps of a block where those of the blocks before it end."""
-        shift, last = sum(self.turns), self.last_stamp
-        turn = 0 if last is None else find_turn(clock.first + shift - last, clock.typical)
-        shift += turn
-        self.turns += [*([turn] if turn else []), *clock.turns]
-        self.last_stamp = clock.last + shift
+    def _shift_stamps(self, converted: ConvertedBlock, shift: int) -> ConvertedBlock:
         if shift == 0 or self.time is None:
             return converted
         piece = converted.block[self.time.source]
@@ -270,31 +195,24 @@ class RawLogBuilder:
         return declare_counts(dtype, factors.pop()) if dtype else {}
 
     def finish(self, notes: Sequence[str] = ()) -> xr.Dataset:
-        """Return the raw log.
-
-        Raises
-        ------
-        FormatError
-            When there is no row, or more than half of them are unreadable.
-        """
+        """Return the raw log; `FormatError` if more than half of the rows are unreadable."""
         name, rows = self.plan.path.name, self.buffers.rows
         if rows == 0:
             raise FormatError(
                 f"{name}: there is a header but no data row below it; copy it again, or check "
                 "what the logger wrote"
             )
-        if self.bad_rows.total > MAX_UNREADABLE_SHARE * rows:
-            share, first = self.bad_rows.total / rows, self.bad_rows.names[0]
-            suspects = (
-                "the separator, the columns that --map names and the unit of time (stamps lie "
-                "in the years 1678 to 2262)"
-            )
-            raise FormatError(
-                f"{name}: {100 * share:.0f} % of {rows} rows are unreadable, the first is {first}"
-                f"{self.first_bad_row}; look at it, and check {suspects}"
-            )
+        self.faults.check(name, rows)
         columns = self.buffers.finish()
-        notes = [*notes, *self._describe_codes(columns)]
+        notes = [
+            *self.plan.notes,
+            *notes,
+            *describe_codes([*self.gyro, *self.channels], columns),
+            *self.faults.describe(rows, self.gyro),
+            *self.clock.describe(),
+        ]
+        if self.options.start is not None and self.time is not None:
+            notes.append("--start is not used: the file has its own time column")
         stamps = self._finish_stamps(columns)
         dataset = self._make_dataset(
             {key: as_lazy(column) for key, column in columns.items()}, stamps
@@ -302,12 +220,9 @@ class RawLogBuilder:
         dataset.attrs.update(
             source_files=[name],
             row_start=[0],
-            notes=[
-                f"{name}: {note}"
-                for note in [*self.plan.notes, *notes, *self._describe_faults(rows)]
-            ],
-            unreadable_rows=self.bad_rows.total,
-            unreadable_cells=self.bad_cells,
+            notes=[f"{name}: {note}" for note in notes],
+            unreadable_rows=self.faults.rows.total,
+            unreadable_cells=self.faults.cells,
             unmatched_options=list(self.plan.unmatched),
             headers=[summary.header for summary in self.plan.summaries],
         )
@@ -317,8 +232,8 @@ class RawLogBuilder:
         if self.time is None:
             return None
         stamps = columns.pop(self.time.source)
-        if self.bad_index and self.low <= self.high:
-            rows = np.concatenate(self.bad_index)
+        if self.faults.index and self.low <= self.high:
+            rows = np.concatenate(self.faults.index)
             written = stamps[rows] if isinstance(stamps, np.ndarray) else stamps.take_rows(rows)
             outside = (written < self.low) | (written > self.high)
             rows = rows[outside & (written != NAT)]  # a number in a bad row is not a stamp
@@ -333,8 +248,11 @@ class RawLogBuilder:
         coords: dict[str, Any] = {}
         if self.gyro and self.plan.signal is not None:
             axes = [column.name for column in self.gyro]
-            stack = stack_as_rows(
-                [columns[column.source] for column in self.gyro], self.inspections
+            rows = [columns[column.source] for column in self.gyro]
+            stack = (
+                np.stack(rows)
+                if isinstance(rows[0], np.ndarray)
+                else make_dask(InspectedRows(rows, self.inspections), (1, CHUNK_ROWS))
             )
             data[self.plan.signal] = (
                 ("axis", "row"),
@@ -361,82 +279,6 @@ class RawLogBuilder:
             dataset.attrs["start"] = self.options.start
         return dataset
 
-    def _describe_codes(self, columns: dict[int, Any]) -> list[str]:
-        """Return notes on values that repeat far outside all others, as codes for missing do."""
-        notes = []
-        for column in [*self.gyro, *self.channels]:
-            head = np.asarray(read_slice(columns[column.source], 0, _CODE_ROWS), dtype=np.float64)
-            code = _find_code(head[np.isfinite(head)])
-            if code is not None:
-                number, written = int((head == code).sum()), (code - column.offset) / column.factor
-                notes.append(
-                    f"{column.header!r} is {written:.10g} in {number} of the first {len(head)} "
-                    "rows, far outside all other values; if that is a code for a missing value, "
-                    "replace it by nan before the log is read"
-                )
-        return notes
-
-    def _describe_faults(self, rows: int) -> list[str]:
-        notes = []
-        if self.bad_rows.total:
-            notes.append(
-                f"{self.bad_rows.total} of {rows} rows are unreadable: {self.bad_rows.describe()}"
-            )
-        empty = sum(self.missing.get(column.source, 0) == rows for column in self.gyro)
-        cells = self.cells - empty * (rows - self.bad_rows.total)  # empty axes have a note later
-        if cells:
-            places = "" if empty else f": {self.cell_rows.describe()}"
-            notes.append(
-                f"{cells} gyro cells hold no number in rows that are readable otherwise{places}"
-            )
-        if self.turns:
-            period = "a day" if max(self.turns) == CLOCK_PERIODS[0] else "a week"
-            times = f"{len(self.turns)} time{'s' * (len(self.turns) > 1)}"
-            notes.append(
-                f"the clock begins again after {period} ({times}) "
-                "without a pause; the stamps are continued"
-            )
-        if self.options.start is not None and self.time is not None:
-            notes.append("--start is not used: the file has its own time column")
-        return notes
-
-
-def _find_code(values: NDArray[np.float64]) -> float | None:
-    """Return the lowest or highest value if it repeats far outside all others; zero is a reading.
-
-    Examples
-    --------
-    >>> _find_code(np.r_[np.arange(100.0), [-999.25] * 3]), _find_code(np.arange(100.0))
-    (-999.25, None)
-    """
-    for code in (values.min(initial=np.inf), values.max(initial=-np.inf)):
-        others = values[values != code]
-        if code == 0 or not _MIN_CODE_REPEATS <= len(values) - len(others) < len(others):
-            continue
-        low, high = others.min(), others.max()
-        if max(low - code, code - high) > _MIN_CODE_DISTANCE * (high - low) and (
-            len(np.unique(others)) >= _MIN_READINGS
-        ):
-            return float(code)
-    return None
-
-
-def _continue_block(
-    stamps: NDArray[np.int64],
-) -> tuple[NDArray[np.int64], ClockBlock | None]:
-    """Continue the readable stamps of a block; the block is None without any."""
-    is_good = stamps != NAT
-    good = stamps if is_good.all() else stamps[is_good]
-    if not good.size:
-        return stamps, None
-    continued, turns, typical = continue_clock(good)
-    clock = ClockBlock(int(good[0]), int(continued[-1]), typical, turns)
-    if turns and good is not stamps:
-        stamps = stamps.copy()
-        stamps[is_good] = continued
-        return stamps, clock
-    return continued if turns else stamps, clock
-
 
 def _pack_stamps(stamps: NDArray[np.int64]) -> NDArray[np.int64] | EvenStampsPiece:
     from gyrostab.kernels.encoding.compact import even_steps
@@ -456,12 +298,7 @@ def summary_of(
 ) -> FileSummary:
     """Summarise a file without reading all of its data.
 
-    Parameters
-    ----------
-    plan : Plan
-        Role and unit of each column, and the problems that prevent reading.
-    head, tail : sequence of int
-        Stamps at the two ends [ns since 1970], `NAT` where unreadable.
+    `head` and `tail` are stamps at the two ends [ns since 1970], `NAT` where unreadable.
     """
     first, last = (
         next((np.datetime64(int(stamp), "ns") for stamp in end if stamp != NAT), None)

@@ -27,10 +27,6 @@ from gyrostab.time.stamps import to_nanoseconds
 #: The integer of ``NaT``.
 NAT = np.iinfo(np.int64).min
 _MAX_INT64 = 2**63 - 1
-#: Periods after which a clock of the time of day, and one of the GPS week, begin again [ns].
-CLOCK_PERIODS = (86400 * 10**9, 7 * 86400 * 10**9)
-#: Steps from which the typical one follows.
-_TYPICAL_STEPS = 4096
 #: Julian day number of 1970-01-01.
 _ORDINAL_1970 = 2440588
 
@@ -47,12 +43,7 @@ _UNITS = {
 _NANOSECONDS = {spelling: ns for ns, spellings in _UNITS.items() for spelling in spellings}
 _SINCE = re.compile(r"\bsince\b", re.IGNORECASE)
 #: Calendars in which a date is an instant; the others are calendars of climate models.
-_CALENDARS = {
-    "standard": "standard",
-    "gregorian": "standard",
-    "proleptic_gregorian": "proleptic_gregorian",
-    "julian": "julian",
-}
+_CALENDARS = ("standard", "gregorian", "proleptic_gregorian", "julian")
 #: Longest cell that can be a stamp [characters]: a double written in full has at most 325 digits
 #: before and 1074 after the point.
 _MAX_DIGITS = 1400
@@ -87,18 +78,9 @@ def names_epoch(text: str) -> bool:
 def parse_time_unit(text: str, calendar: str | None = None) -> TimeUnit:
     """Parse a time unit, with an optional leading factor and an optional CF epoch.
 
-    Parameters
-    ----------
-    text : str
-        The unit; not case-sensitive, as in UDUNITS.
-    calendar : str, optional
-        The CF calendar of the epoch, `standard` when not given.
-
-    Raises
-    ------
-    UnitError
-        When the text is not a time unit, when its epoch is ambiguous or depends on the clock, or
-        when the calendar is not one of real dates.
+    It is not case-sensitive, as in UDUNITS. `calendar` is the CF calendar of the epoch. `UnitError`
+    when the text is not a time unit, when its epoch is ambiguous or depends on the clock, or when
+    the calendar is not one of real dates.
 
     Examples
     --------
@@ -134,8 +116,8 @@ def _epoch_ns(text: str, since: str, calendar: str | None) -> int:
     """Return the epoch of a unit [ns since 1970], which may exceed 64 bits."""
     import cftime
 
-    calendar_name = _CALENDARS.get((calendar or "standard").strip().lower())
-    if calendar_name is None:
+    calendar_name = (calendar or "standard").strip().lower()
+    if calendar_name not in _CALENDARS:
         raise UnitError(
             f"time unit {text!r}: dates of the calendar {calendar!r} are not instants of a "
             "recording; "
@@ -188,16 +170,6 @@ def integers_to_ns(values: NDArray[np.int64], unit: TimeUnit, epoch: int) -> NDA
     return np.where(inside & (values >= low) & (values <= high), stamps, NAT)
 
 
-def _signed_counts(counts: NDArray[Any]) -> NDArray[np.int64]:
-    """Return whole numbers as int64; larger unsigned ones become its maximum."""
-    wide = (
-        np.minimum(counts, np.uint64(_MAX_INT64))
-        if counts.dtype.kind == "u" and counts.dtype.itemsize == 8
-        else counts
-    )
-    return wide.astype(np.int64)
-
-
 def floats_to_ns(
     values: NDArray[np.floating[Any]], unit: TimeUnit, epoch: int
 ) -> NDArray[np.int64]:
@@ -214,7 +186,9 @@ def numbers_to_ns(values: NDArray[Any], unit: TimeUnit, epoch: int) -> NDArray[n
     """Convert counts of `unit` since `epoch`, whole or not, to stamps."""
     if values.dtype.kind == "f":
         return floats_to_ns(values, unit, epoch)
-    return integers_to_ns(_signed_counts(values), unit, epoch)
+    if values.dtype.kind == "u":
+        values = np.minimum(values, np.uint64(_MAX_INT64))
+    return integers_to_ns(values.astype(np.int64), unit, epoch)
 
 
 def from_fortran(text: str) -> str:
@@ -241,46 +215,3 @@ def cells_to_ns(
             if abs(nanoseconds) <= _MAX_INT64:
                 stamps[index] = nanoseconds
     return stamps
-
-
-def find_turn(step: int, typical: float) -> int:
-    """Return the period after which a clock began again at a step, if no row is lost there, or 0.
-
-    Parameters
-    ----------
-    step, typical : int, float
-        This step of the stamps, and a typical one [ns].
-
-    Examples
-    --------
-    >>> find_turn(-86_399_950_000_000, 5e7), find_turn(-86_000_000_000_000, 5e7)
-    (86400000000000, 0)
-    """
-    return next((turn for turn in CLOCK_PERIODS if 0 < step + turn <= 2 * typical < turn / 2), 0)
-
-
-def continue_clock(stamps: NDArray[np.int64]) -> tuple[NDArray[np.int64], list[int], float]:
-    """Continue readable stamps where a clock of the day or week begins again.
-
-    Returns
-    -------
-    stamps : ndarray of int64
-        The stamps; a copy if any changed.
-    turns : list of int
-        Periods that were added [ns].
-    typical : float
-        Typical step between different stamps [ns]; 0 if all are equal.
-    """
-    steps = np.diff(stamps)
-    rises = steps[:_TYPICAL_STEPS]
-    rises = rises[rises > 0]
-    typical = float(np.median(rises)) if rises.size else 0.0
-    turns: list[int] = []
-    if steps.size and steps.min() < -CLOCK_PERIODS[0] // 2:
-        for row in (np.flatnonzero(steps < -CLOCK_PERIODS[0] // 2) + 1).tolist():
-            turn = find_turn(int(steps[row - 1]), typical)
-            if turn and not (row < steps.size and steps[row] > turn // 2):  # not one wrong stamp
-                stamps = stamps if turns else stamps.copy()
-                stamps[row:] += turn
-                turns.append(turn)
-    return stamps, turns, typical

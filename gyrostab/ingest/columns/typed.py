@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -16,7 +16,7 @@ from gyrostab.ingest.columns.plan import Plan
 from gyrostab.ingest.columns.plan_draft import Column
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
 from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, numbers_to_ns
-from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.ingest.options import FileSummary
 from gyrostab.store.row_inspection import inspect_rows
 from gyrostab.store.threads import map_in_order
 from gyrostab.time.stamps import to_nanoseconds
@@ -52,7 +52,7 @@ def _to_floats(values: Any) -> tuple[NDArray[np.float64], int]:
     return out, words
 
 
-def to_stamps(values: Any, column: Column, options: ReadOptions) -> NDArray[np.int64]:
+def to_stamps(values: Any, column: Column) -> NDArray[np.int64]:
     """Convert a column of dates, numbers or text to stamps [ns since 1970]."""
     mask = np.ma.getmaskarray(values) if np.ma.isMaskedArray(values) else None
     array = np.ma.getdata(values) if mask is not None else np.asarray(values)
@@ -63,11 +63,11 @@ def to_stamps(values: Any, column: Column, options: ReadOptions) -> NDArray[np.i
         stamps = cells_to_ns(
             ["" if value is None else str(value) for value in array],
             unit,
-            options.epoch_ns,
+            column.epoch,
             column.date_order,
         )
     else:
-        stamps = numbers_to_ns(array, unit, options.epoch_ns)
+        stamps = numbers_to_ns(array, unit, column.epoch)
     return stamps if mask is None else np.where(mask, NAT, stamps)
 
 
@@ -81,7 +81,6 @@ def holds_dates(values: Any) -> bool:
 
 def read_columns(
     plan: Plan,
-    options: ReadOptions,
     rows: int,
     fetch: Fetch,
     *,
@@ -91,23 +90,16 @@ def read_columns(
 ) -> xr.Dataset:
     """Build the raw log of columns that can be fetched by ranges of rows.
 
-    Parameters
-    ----------
-    fetch : callable
-        Column number, first row, row after the last one -> values.
-    parallel : bool
-        Whether `fetch` is thread-safe.
-    stay : bool
-        Whether `fetch` is as fast as reading a temporary file, and can be called at any later time;
-        columns that exceed the memory limit then stay in the file.
+    `fetch` is thread-safe if `parallel`. With `stay` it is as fast as reading a temporary file, and
+    can be called at any later time; columns that exceed the memory limit then stay in the file.
     """
-    builder = RawLogBuilder(plan.check(), options)
+    builder = RawLogBuilder(plan)
     stay = stay and 8 * rows * len(plan.columns) > builder.buffers.limit
     if stay:
         builder.grids = dict.fromkeys(builder.grids)  # nothing is packed
     step = batch_rows(len(plan.columns))
     spans = ((start, min(start + step, rows)) for start in range(0, rows, step))
-    take = partial(_convert_span, builder, plan, options, fetch, stay)
+    take = partial(_convert_span, builder, fetch, stay)
     for converted in map_in_order(take, spans) if parallel else map(take, spans):
         builder.add(converted)
     return builder.finish(notes)
@@ -125,70 +117,49 @@ def batch_rows(columns: int) -> int:
 
 
 def _convert_span(
-    builder: RawLogBuilder,
-    plan: Plan,
-    options: ReadOptions,
-    fetch: Fetch,
-    stay: bool,
-    span: tuple[int, int],
+    builder: RawLogBuilder, fetch: Fetch, stay: bool, span: tuple[int, int]
 ) -> ConvertedBlock:
     """Convert one batch; keep only its findings if the values stay in the file."""
-    converted = convert_batch(
-        builder, options, {column.source: fetch(column.source, *span) for column in plan.columns}
-    )
+    columns = builder.plan.columns
+    batch = {column.source: fetch(column.source, *span) for column in columns}
+    converted = convert_batch(builder, batch)
     if not stay:
         return converted
     begin, rows = span[0], converted.rows
+    block: dict[int, Any] = dict(converted.block)
     inspection = None
     if builder.gyro:
-        cells = np.stack(
-            [cast(NDArray[np.float64], converted.block[column.source]) for column in builder.gyro]
-        )
-        inspection = inspect_rows(
-            cells,
-            {
-                column.name: cast(NDArray[Any], converted.block[column.source])
-                for column in builder.channels
-            },
-            begin,
-        )
-    block: dict[int, Any] = {}
-    for column in plan.columns:
-        piece = converted.block[column.source]
+        cells = np.stack([block[column.source] for column in builder.gyro])
+        channels = {column.name: block[column.source] for column in builder.channels}
+        inspection = inspect_rows(cells, channels, begin)
+    for column in columns:
         is_continued = column.role == "time" and converted.clock and converted.clock.turns
-        if not (is_continued or isinstance(piece, EvenStampsPiece)):
-            piece = FilePiece(partial(_read_column, column, options, fetch), begin, rows)
-        block[column.source] = piece
+        if not (is_continued or isinstance(block[column.source], EvenStampsPiece)):
+            read = partial(_read_column, column, fetch)
+            block[column.source] = FilePiece(read, begin, rows)
     return converted._replace(block=block, inspection=inspection)
 
 
-def _read_column(
-    column: Column, options: ReadOptions, fetch: Fetch, start: int, stop: int
-) -> NDArray[Any]:
+def _read_column(column: Column, fetch: Fetch, start: int, stop: int) -> NDArray[Any]:
     """Read a range of a column as stamps, or as values in the inner unit."""
     from gyrostab.kernels.encoding.rows import clean_column
 
     stored = fetch(column.source, start, stop)
     if column.role == "time":
-        return to_stamps(stored, column, options)
+        return to_stamps(stored, column)
     values, _ = _to_floats(stored)
     clean_column(values, column.factor, column.offset)
     return values
 
 
-def convert_batch(
-    builder: RawLogBuilder, options: ReadOptions, batch: dict[int, Any]
-) -> ConvertedBlock:
+def convert_batch(builder: RawLogBuilder, batch: dict[int, Any]) -> ConvertedBlock:
     """Convert one batch of columns for the builder."""
     values, words = {}, 0
     for column in [*builder.gyro, *builder.channels]:
         values[column.source], not_numbers = _to_floats(batch[column.source])
         words += not_numbers if column.role == "channel" else 0
-    stamps = (
-        None
-        if builder.time is None
-        else to_stamps(batch[builder.time.source], builder.time, options)
-    )
+    time = builder.time
+    stamps = None if time is None else to_stamps(batch[time.source], time)
     return builder.prepare(values, stamps, words=words)
 
 
@@ -204,14 +175,14 @@ def float32_note(plan: Plan, dtypes: Sequence[Any]) -> list[str]:
 
 
 def summarise_columns(
-    form: str, plan: Plan, options: ReadOptions, rows: int, fetch: Fetch, notes: Sequence[str] = ()
+    form: str, plan: Plan, rows: int, fetch: Fetch, notes: Sequence[str] = ()
 ) -> FileSummary:
     """Summarise a file, with the first and last stamps fetched from the two ends."""
     time = plan.time
     if time is None or not rows:
         return summary_of(plan, form, rows, notes=notes)
     head, tail = (
-        to_stamps(fetch(time.source, *span), time, options)
+        to_stamps(fetch(time.source, *span), time)
         for span in ((0, min(END_ROWS, rows)), (max(0, rows - END_ROWS), rows))
     )
     return summary_of(plan, form, rows, head=head, tail=tail, notes=notes)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -12,19 +12,18 @@ from gyrostab.errors import SchemaError
 from gyrostab.schema import signal_name, texts
 from gyrostab.store.lazy import select_part, stack_rows
 
+Log = TypeVar("Log")
 
-def group_axes(axes: Sequence[Sequence[str]]) -> list[list[int]]:
+
+def group_axes(logs: Sequence[Log], axes: Iterable[Sequence[str]]) -> list[list[Log]]:
     """Group logs by their axes: logs of one group share axes, directly or through other logs.
 
-    Returns
-    -------
-    list of list of int
-        Positions of the logs of each group; the groups by their first axis.
+    The groups are in the order of their first axes.
 
     Examples
     --------
-    >>> group_axes([["z"], ["x", "y"], ["z"], ["y"]])
-    [[1, 3], [0, 2]]
+    >>> group_axes("abcd", [["z"], ["x", "y"], ["z"], ["y"]])
+    [['b', 'd'], ['a', 'c']]
     """
     groups: list[tuple[set[str], list[int]]] = []
     for number, log_axes in enumerate(axes):
@@ -32,27 +31,15 @@ def group_axes(axes: Sequence[Sequence[str]]) -> list[list[int]]:
         groups = [group for group in groups if group not in sharing_groups]
         members = sorted([number, *(member for group in sharing_groups for member in group[1])])
         groups.append((set(log_axes).union(*(group[0] for group in sharing_groups)), members))
-    return [members for _, members in sorted(groups, key=lambda group: sorted(group[0]))]
+    ordered = sorted(groups, key=lambda group: sorted(group[0]))
+    return [[logs[number] for number in members] for _, members in ordered]
 
 
 def split_axes(raw: xr.Dataset) -> list[xr.Dataset]:
     """Split a raw log whose groups of axes have separate stamps into one raw log for each group.
 
-    Parameters
-    ----------
-    raw : xarray.Dataset
-        Raw log, in memory or lazy; its attribute ``axis_rows`` lists axes, first row and row after
-        the last of each group.
-
-    Returns
-    -------
-    list of xarray.Dataset
-        One raw log for each group; the log itself if it has no such attribute.
-
-    Raises
-    ------
-    SchemaError
-        When rows were selected from the log after it was read.
+    Its attribute ``axis_rows`` lists axes, first row and row after the last of each group.
+    `SchemaError` when rows were selected from the log after it was read.
     """
     groups = raw.attrs.get("axis_rows")
     if groups is None:
@@ -70,8 +57,8 @@ def split_axes(raw: xr.Dataset) -> list[xr.Dataset]:
     )
     for number, (axes, first, end) in enumerate(groups):
         rows = [select_part(signal.data, places.index(axis), first, end) for axis in axes]
-        stacked = np.stack(rows) if isinstance(rows[0], np.ndarray) else stack_rows(rows)
-        data: dict[Any, Any] = {name: (("axis", "row"), stacked, signal.attrs, signal.encoding)}
+        stack = stack_rows(rows)
+        data: dict[Any, Any] = {name: (("axis", "row"), stack, signal.attrs, signal.encoding)}
         for key, variable in raw.data_vars.items():
             if key != name and (variable.dims == ("row",) or number == 0):
                 values = (

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import UnitError
@@ -25,47 +26,32 @@ def concatenate_channels(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Concatenate the channels of logs that are placed on one grid.
 
-    Returns
-    -------
-    variables, coordinates : dict
-        Channels, NaN where a log lacks them, and the stamps ``time_<channel>`` of those with
-        separate stamps.
+    Returns variables, NaN where a log lacks them, and the coordinates ``time_<channel>`` of
+    channels with separate stamps.
     """
     variables: dict[str, Any] = {}
     coordinates: dict[str, Any] = {}
     for name in dict.fromkeys(name for piece in pieces for name in log_channels(piece.source.log)):
         holders = [piece for piece in pieces if name in piece.source.log]
-        attributes = _channel_attributes(holders, name)
+        advice = f"ingest one of them again with --unit {name}=UNIT or --map {name}=-"
+        check_units([(piece.source.name, piece.source.log) for piece in holders], name, advice)
+        attributes = dict(holders[0].source.log[name].attrs)
         if all(piece.source.log.variables[name].dims != ("time",) for piece in holders):
             stamps, values = _own_time(holders, name, start, rate)
             variables[name] = (f"time_{name}", values, attributes)
             coordinates[f"time_{name}"] = stamps.view("datetime64[ns]")
         else:
-            variables[name] = (
-                "time",
-                place_on_grid(
-                    [[_on_time(piece, name, start, rate) for piece in holders]],
-                    size,
-                    chunk,
-                    flat=True,
-                ),
-                attributes,
-            )
+            arrays = [_on_time(piece, name, start, rate) for piece in holders]
+            variables[name] = ("time", place_on_grid([arrays], size, chunk, flat=True), attributes)
     return variables, coordinates
 
 
-def _channel_attributes(holders: Sequence[PlacedLog], name: str) -> dict[str, Any]:
-    units = {
-        str(piece.source.log.variables[name].attrs.get("units", "1")): piece.source.name
-        for piece in reversed(holders)
-    }
+def check_units(logs: Sequence[tuple[str, xr.Dataset]], name: str, advice: str) -> None:
+    """Refuse logs, with their file names, in which a channel has different units."""
+    units = {str(log.variables[name].attrs.get("units", "1")): file for file, log in reversed(logs)}
     if len(units) > 1:
         listed = ", ".join(f"{unit!r} in {file}" for unit, file in units.items())
-        raise UnitError(
-            f"channel {name!r} has different units: {listed}; ingest one of them again with "
-            f"--unit {name}=UNIT or --map {name}=-"
-        )
-    return dict(holders[0].source.log[name].attrs)
+        raise UnitError(f"channel {name!r} has different units: {listed}; {advice}")
 
 
 def _on_time(piece: PlacedLog, name: str, start: int, rate: float) -> PlacedArray:

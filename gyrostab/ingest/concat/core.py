@@ -189,10 +189,7 @@ def _placed_arrays(pieces: Sequence[PlacedLog], name: str, axis: str) -> list[An
 
 def _describe_absent(sources: Sequence[Source], axes: Sequence[str]) -> list[str]:
     """Return notes on axes and channels that some logs lack, unless those hold other axes."""
-    groups = [
-        [sources[number] for number in group]
-        for group in group_axes([source.axes for source in sources])
-    ]
+    groups = group_axes(sources, [source.axes for source in sources])
     names = {
         f"axis {axis}": _logs_without(groups, [s for s in sources if axis in s.axes])
         for axis in axes

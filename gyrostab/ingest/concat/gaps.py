@@ -58,15 +58,9 @@ def _missing_in_both(held: Table, new: Table) -> Table:
 def merge_gaps(pieces: Sequence[PlacedLog]) -> Table:
     """Return the table of gaps of the concatenated log; a gap on some axes counts as a gap.
 
-    Returns
-    -------
-    ndarray of int64, shape (n, 5)
-        Columns of `gyrostab.ingest.gap_table.COLUMNS`, sorted by sample.
+    Its columns are those of `gyrostab.ingest.gap_table.COLUMNS`, sorted by sample.
     """
-    groups = [
-        [pieces[number] for number in group]
-        for group in group_axes([piece.source.axes for piece in pieces])
-    ]
+    groups = group_axes(pieces, [piece.source.axes for piece in pieces])
     spans = sorted(
         (min(piece.first for piece in group), max(piece.end for piece in group)) for group in groups
     )

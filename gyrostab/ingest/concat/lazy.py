@@ -87,21 +87,10 @@ def place_on_grid(
 ) -> Any:
     """Place arrays on one grid, float64, NaN where no array has a sample.
 
-    Parameters
-    ----------
-    rows : sequence of sequence of PlacedArray
-        Arrays with samples of each row of the result. Where they overlap, the first value that is
-        not NaN counts.
-    flat : bool
-        Whether the result has one dimension only.
-    convert : callable, optional
-        Function that changes samples of a row in place.
-
-    Returns
-    -------
-    dask.array.Array, shape (len(rows), size) or (size,)
-        It has a source if all arrays can be read without dask; otherwise, its tasks depend on those
-        of the arrays.
+    `rows` lists the arrays of each row of the result; where they overlap, the first value that is
+    not NaN counts. A `flat` result has one dimension only; `convert` changes samples of a row in
+    place. The dask array has a source if all arrays can be read without dask; otherwise, its tasks
+    depend on those of the arrays.
     """
     source = GridSource(rows, (size,) if flat else (len(rows), size), convert)
     if all(map(can_read_directly, source.parts)):
@@ -129,28 +118,19 @@ def _chunk_of_dask(
     """Make one chunk of one row from dask arrays, with the public operations of dask."""
     import dask.array as da
 
-    runs = [
-        (which, *entry)
-        for which, part in enumerate(parts)
-        for entry in _overlapping_runs(part, begin, end)
-    ]
-    if not runs:
-        return _make_blank_chunk(end - begin)
-    # Neighbouring runs share a slice, because each slice of a dask array takes time.
-    slices: list[tuple[int, int, int]] = []  # number of the part, first sample and end
-    plan, offset = [], 0
-    for which, _, _, at_source, at, length in runs:
-        low, high = slices[-1][1:] if slices and slices[-1][0] == which else (0, -1)
-        if high < 0 or at_source < high or at_source + length - low > 2 * (end - begin):
-            offset += slices[-1][2] - slices[-1][1] if slices else 0
-            low = at_source
-            slices.append((which, at_source, at_source))
-        slices[-1] = (which, low, at_source + length)
-        plan.append((which, None, 0, offset + at_source - low, at, length))
-    pieces = []
-    for which, low, high in slices:
-        array, row, _ = parts[which]
+    pieces, plan, offset = [], [], 0
+    for which, part in enumerate(parts):
+        runs = _overlapping_runs(part, begin, end)
+        if not runs:
+            continue
+        array, row, _ = part
+        # one slice for all runs, because each slice of a dask array takes time
+        low, high = min(run[2] for run in runs), max(run[2] + run[4] for run in runs)
         pieces.append(da.asarray(array if array.ndim == 1 else array[row or 0])[low:high])
+        plan += [(which, offset + first - low, at, length) for _, _, first, at, length in runs]
+        offset += high - low
+    if not pieces:
+        return _make_blank_chunk(end - begin)
     return (
         da.concatenate(pieces)
         .rechunk(-1)
@@ -180,7 +160,7 @@ def _place_pieces(
     convert: Callable[[NDArray[np.float64]], None] | None,
 ) -> NDArray[np.float64]:
     out = np.empty(size)
-    _fill(out, [(which, values, *rest) for which, _, *rest in plan])
+    _fill(out, [(which, values, 0, *run) for which, *run in plan])
     if convert is not None:
         convert(out)
     return out

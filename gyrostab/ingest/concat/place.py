@@ -8,7 +8,7 @@ is unknown, and one sample is taken as missing.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -16,7 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.ingest.concat.grid import LogSlice, PlacedLog, Source, read_log_slices, runs_of
-from gyrostab.ingest.gap_table import CLOCK_STEP, RESTART, describe_break, format_duration
+from gyrostab.ingest.gap_table import (
+    CLOCK_STEP,
+    RESTART,
+    describe_break,
+    format_duration,
+    is_restart,
+)
 from gyrostab.time.grid import grid_index, grid_times
 from gyrostab.time.stamps import format_stamp
 from gyrostab.wording import list_some
@@ -150,21 +156,10 @@ def _match_logs(held: Source, new: Source, lag: int, cache: _Cache) -> _Match:
 
 
 def place_logs(sources: Sequence[Source], *, max_gap: float) -> tuple[list[PlacedLog], list[str]]:
-    """Place logs on the grid of the first.
+    """Place logs, in the order of their first stamps, on the grid of the first.
 
-    Parameters
-    ----------
-    sources : sequence of Source
-        Logs in the order of their first stamps.
-    max_gap : float
-        A longer pause is taken as a step of the clock [s].
-
-    Returns
-    -------
-    pieces : list of PlacedLog
-        The logs in the same order; the first sample of all is sample 0.
-    notes : list of str
-        Notes on logs between the samples of the grid, overlaps and steps of the clock.
+    A pause longer than `max_gap` [s] is taken as a step of the clock. The first sample of all is
+    sample 0. Also return notes on logs between the samples of the grid, overlaps and clock steps.
     """
     rate = sources[0].rate
     pieces: list[PlacedLog] = []
@@ -178,7 +173,9 @@ def place_logs(sources: Sequence[Source], *, max_gap: float) -> tuple[list[Place
         if match is not None:
             overlaps.append(_overlap_note(piece, *match, rate))
         elif piece.cause >= 0:
-            breaks.append(_break_note(pieces, piece))
+            last = _last_stamp(pieces)
+            text = describe_break("", piece.cause, last, source.start, "samples")
+            breaks.append(f"{source.name}: {text}")
         pieces.append(piece)
     notes = [
         *_grid_notes(pieces, rate),
@@ -186,25 +183,21 @@ def place_logs(sources: Sequence[Source], *, max_gap: float) -> tuple[list[Place
         *_first_notes(overlaps, "overlaps"),
     ]
     lowest = min(piece.first for piece in pieces)
-    return [_shift_samples(piece, -lowest) for piece in pieces], notes
+    shifted = [
+        replace(
+            piece,
+            runs=piece.runs - np.array([lowest, 0, 0]),
+            clock=(piece.clock[0], piece.clock[1] - lowest),
+        )
+        for piece in pieces
+    ]
+    return shifted, notes
 
 
 def _first_notes(notes: Sequence[str], subject: str) -> list[str]:
     """Return the first of many notes of one kind, and how many more there are."""
     more = len(notes) - _MAX_NAMED
     return [*notes[:_MAX_NAMED], *([f"{more} more {subject}"] if more > 0 else [])]
-
-
-def _shift_samples(piece: PlacedLog, by: int) -> PlacedLog:
-    if not by:
-        return piece
-    return PlacedLog(
-        piece.source,
-        piece.runs + np.array([by, 0, 0]),
-        piece.off,
-        (piece.clock[0], piece.clock[1] + by),
-        piece.cause,
-    )
 
 
 def _place_next(
@@ -239,7 +232,9 @@ def _place_next(
         first - end > max_gap * rate,
     )
     if back or ahead:
-        cause = RESTART if back and _begins_again(pieces, source) else CLOCK_STEP
+        ends = clock[0], _last_stamp(pieces), source.start
+        is_new = back and is_restart(pieces[0].source.start, *ends)
+        cause = RESTART if is_new else CLOCK_STEP
         return PlacedLog(
             source, runs_of(end + 1, 0.0, source.size, ratio), 0.0, (source.start, end + 1), cause
         ), None
@@ -249,14 +244,9 @@ def _place_next(
     ) if first < end else None
 
 
-def _begins_again(pieces: list[PlacedLog], source: Source) -> bool:
-    """Return whether a clock that was set back restarted, rather than being corrected."""
-    latest = max(piece.source.end for piece in pieces if piece.clock == pieces[-1].clock)
-    elapsed = latest - pieces[-1].clock[0]
-    return (
-        source.start <= pieces[0].source.start + 0.1 * elapsed
-        or 2 * (latest - source.start) > elapsed
-    )
+def _last_stamp(pieces: Sequence[PlacedLog]) -> int:
+    """Return the latest stamp of the clock of the last log [ns since 1970]."""
+    return max(piece.source.end for piece in pieces if piece.clock == pieces[-1].clock)
 
 
 def _grid_notes(pieces: Sequence[PlacedLog], rate: float) -> list[str]:
@@ -307,9 +297,3 @@ def _overlap_note(piece: PlacedLog, held: PlacedLog, match: _Match, rate: float)
         f"{name}: {extent} in {holder} too, and counted once{differ}; the samples of {holder} "
         "are kept where it has them"
     )
-
-
-def _break_note(pieces: Sequence[PlacedLog], piece: PlacedLog) -> str:
-    last_end = max(earlier.source.end for earlier in pieces if earlier.clock == pieces[-1].clock)
-    description = describe_break("", piece.cause, last_end, piece.source.start, "samples")
-    return f"{piece.source.name}: {description}"

@@ -26,14 +26,7 @@ from gyrostab.ingest.formats.layout import (
     layout_path,
 )
 from gyrostab.ingest.formats.messages import find_messages, unwrap_counter
-from gyrostab.ingest.formats.tables import (
-    NO_NAME,
-    Table,
-    TableColumn,
-    read_tables,
-    scan_tables,
-    sliced,
-)
+from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, make_reader
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.time.grid import check_span, grid_times
 
@@ -60,32 +53,9 @@ def list_layouts(paths: Iterable[Path]) -> list[Path]:
     return list(dict.fromkeys(filter(None, places)))
 
 
-def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Summarise fields, number of records, and first and last stamps; searches all messages."""
+def _make_tables(path: Path, options: ReadOptions, *, needs_rate: bool) -> TablesOfFile:
+    """Return the table of all records; messages are searched in the whole file."""
     layout = find_layout(path)
-    options = _date_first_message(layout, options)
-    table, notes = _make_table(path, layout, options, needs_rate=False)
-    return scan_tables(path, "binary", [table], options, notes)
-
-
-def read(path: Path, options: ReadOptions) -> xr.Dataset:
-    """Return the raw log of a binary file; see `gyrostab.ingest.read_log`."""
-    layout = find_layout(path)
-    options = _date_first_message(layout, options)
-    table, notes = _make_table(path, layout, options, needs_rate=True)
-    return read_tables(path, [table], options, notes=notes)
-
-
-def _date_first_message(layout: Layout, options: ReadOptions) -> ReadOptions:
-    """Count numbered messages from ``--start``, as their first one is at zero."""
-    if options.epoch is not None or layout.counter is None:
-        return options
-    return replace(options, start=None, epoch=options.start)
-
-
-def _make_table(
-    path: Path, layout: Layout, options: ReadOptions, *, needs_rate: bool
-) -> tuple[Table, list[str]]:
     rows, extra_bytes = divmod(path.stat().st_size - layout.header, layout.size)
     starts = None
     if layout.sync and rows > 0:
@@ -107,8 +77,31 @@ def _make_table(
         where = "" if layout.sync else "the last "
         notes.append(f"{where}{extra_bytes} bytes are not {expected}; is the layout right?")
     columns = [TableColumn((field.name,), partial(fetch, field)) for field in layout.fields]
-    clock = None if stamps is None else TableColumn(NO_NAME, stamps, "ns")
-    return Table(rows, columns, clock), notes
+    return [Table(rows, columns, stamps, "ns")], notes
+
+
+_scan_tables, _read_tables = make_reader(
+    "binary",
+    partial(_make_tables, needs_rate=True),
+    find_heads=partial(_make_tables, needs_rate=False),
+)
+
+
+def scan(path: Path, options: ReadOptions) -> FileSummary:
+    """Summarise fields, number of records, and first and last stamps; searches all messages."""
+    return _scan_tables(path, _date_first_message(path, options))
+
+
+def read(path: Path, options: ReadOptions) -> xr.Dataset:
+    """Return the raw log of a binary file; see `gyrostab.ingest.read_log`."""
+    return _read_tables(path, _date_first_message(path, options))
+
+
+def _date_first_message(path: Path, options: ReadOptions) -> ReadOptions:
+    """Count numbered messages from ``--start``, as their first one is at zero."""
+    if options.epoch is not None or find_layout(path).counter is None:
+        return options
+    return replace(options, start=None, epoch=options.start)
 
 
 def _count_time(
@@ -139,7 +132,7 @@ def _count_time(
     notes = [f"by their counter, {lost} messages were lost"] if lost > 0 else []
     rate = float(options.rate)
     check_span(0, rate, int(numbers[-1]) + 1, path.name)
-    return sliced(grid_times(0, rate, numbers)), notes
+    return grid_times(0, rate, numbers), notes
 
 
 def _read_field(

@@ -19,14 +19,7 @@ from typing import Any
 
 from gyrostab.ingest.columns.headers import is_time_unit
 from gyrostab.ingest.formats.recognise import begins_like
-from gyrostab.ingest.formats.tables import (
-    Table,
-    TableColumn,
-    TablesOfFile,
-    library,
-    make_reader,
-    sliced,
-)
+from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, library, make_reader
 from gyrostab.ingest.options import ReadOptions
 
 #: Held while the settings of the process are changed.
@@ -72,7 +65,7 @@ def _make_table(frame: Any) -> Table | None:
     columns = [
         TableColumn(
             (frame.name, channel.name),
-            sliced(values[channel.name]),
+            values[channel.name],
             str(channel.units or "").strip() or None,
         )
         for channel in channels
@@ -82,7 +75,7 @@ def _make_table(frame: Any) -> Table | None:
         "TIME" in kind and channels[0].name == frame.index and is_time_unit(columns[0].unit or "")
     )
     if is_timed:
-        return Table(len(values), columns[1:], columns[0])
+        return Table(len(values), columns[1:], columns[0].values, columns[0].unit)
     return Table(len(values), columns)
 
 

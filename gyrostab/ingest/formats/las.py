@@ -19,20 +19,21 @@ from gyrostab.ingest.columns.headers import is_time_unit
 from gyrostab.ingest.columns.stamps import floats_to_ns, parse_time_unit
 from gyrostab.ingest.columns.typed import holds_dates
 from gyrostab.ingest.formats.recognise import read_head
-from gyrostab.ingest.formats.tables import (
-    NO_NAME,
-    Table,
-    TableColumn,
-    TablesOfFile,
-    library,
-    make_reader,
-    sliced,
-)
+from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, library, make_reader
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.time.stamps import to_nanoseconds
 
 # Date fields in units of curves -> codes of `datetime.strptime`.
 _DATE_CODES = {"yyyy": "%Y", "yy": "%y", "mmm": "%b", "mm": "%m", "dd": "%d"}
+_CLEAR_FORMATS = (
+    *("%Y-%m-%d", "%Y%m%d", "%Y/%m/%d"),
+    *("%d-%b-%y", "%d-%b-%Y", "%d/%b/%y", "%d/%b/%Y", "%d %b %Y"),
+)
+#: Several of these may fit a date.
+_UNCLEAR_FORMATS = (
+    *("%d/%m/%Y", "%m/%d/%Y", "%d-%m-%Y", "%m-%d-%Y"),
+    *("%d/%m/%y", "%m/%d/%y", "%y/%m/%d"),
+)
 #: A cell with a date and a time of day, such as ``14-Mar-26/08:00:00.5``.
 _DATE_AND_TIME = re.compile(r"^(\S+?)[T_/:;-](\d{1,2}:\d\d:\d\d(?:\.\d+)?)Z?$")
 
@@ -50,14 +51,13 @@ def _read_curves(path: Path, options: ReadOptions) -> TablesOfFile:
     clocks, dates = _find_clock(path, curves, options) if rows else ([], None)
     columns = [
         TableColumn(
-            NO_NAME if any(curve is clock for clock in clocks) else (str(curve.mnemonic),),
-            sliced(np.asarray(curve.data)),
+            ("" if any(curve is clock for clock in clocks) else str(curve.mnemonic),),
+            np.asarray(curve.data),
             None if holds_dates(curve.data) else str(curve.unit or "").strip() or None,
         )
         for curve in curves
     ]
-    stamps = None if dates is None else TableColumn(NO_NAME, sliced(dates))
-    return [Table(rows, columns, stamps)], ()
+    return [Table(rows, columns, dates)], ()
 
 
 def _find_clock(
@@ -128,28 +128,11 @@ def _date_order(unit: str, days: list[str]) -> str | None:
         if re.search(r"(?i)yy", unit)
         else ""
     )
-    known_formats = (
-        "%Y-%m-%d",
-        "%Y%m%d",
-        "%Y/%m/%d",
-        "%d-%b-%y",
-        "%d-%b-%Y",
-        "%d/%b/%y",
-        "%d/%b/%Y",
-        "%d %b %Y",
-    )
-    for order in (unit_format, *known_formats):
+    for order in (unit_format, *_CLEAR_FORMATS):
         if order and _has_date_format(order, days):
             return order
-    unclear = [
-        order
-        for order in (
-            *("%d/%m/%Y", "%m/%d/%Y", "%d-%m-%Y", "%m-%d-%Y"),
-            *("%d/%m/%y", "%m/%d/%y", "%y/%m/%d"),
-        )
-        if _has_date_format(order, days)
-    ]
-    return unclear[0] if len(unclear) == 1 else None
+    fitting = [order for order in _UNCLEAR_FORMATS if _has_date_format(order, days)]
+    return fitting[0] if len(fitting) == 1 else None
 
 
 def _has_date_format(order: str, days: list[str]) -> bool:

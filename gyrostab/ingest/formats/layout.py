@@ -18,11 +18,9 @@ shown with every file of the layout.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +28,7 @@ import numpy as np
 
 from gyrostab.errors import OptionError
 from gyrostab.ingest.formats.messages import CRC_BYTES, find_messages
-from gyrostab.store.toml import parse_toml, read_toml_text
+from gyrostab.store.toml import load_toml_folder, parse_toml, read_toml_text
 
 #: Name of a type -> code of numpy; 24 bits are read as three bytes.
 TYPES = {
@@ -84,13 +82,7 @@ def find_layout_file(path: Path) -> Path | None:
 
 
 def find_layout(path: Path) -> Layout:
-    """Return the layout of a file: that of a layout file, or of a sensor whose messages it holds.
-
-    Raises
-    ------
-    OptionError
-        When there is no layout, or it is not usable.
-    """
+    """Return the layout of a layout file, or of the sensor whose messages a file holds."""
     place = find_layout_file(path)
     if place is None:
         return _find_known(path, layout_path(path).name)
@@ -118,11 +110,8 @@ def _find_known(path: Path, name: str) -> Layout:
 
 @cache
 def _known_layouts() -> list[Layout]:
-    places = files("gyrostab.ingest.formats").joinpath("layouts").iterdir()
-    return [
-        _parse_layout(place.name.removesuffix(".toml"), tomllib.loads(place.read_text("utf-8")))
-        for place in sorted(places, key=lambda place: place.name)
-    ]
+    layouts = load_toml_folder("gyrostab.ingest.formats", "layouts")
+    return [_parse_layout(name, content) for name, content in layouts.items()]
 
 
 def _parse_layout(place: str, content: Mapping[str, Any]) -> Layout:

@@ -35,10 +35,7 @@ class _Damage(Exception):
 def check_structure(path: Path) -> None:
     """Check that every data element fits into its parent, and that array sizes are consistent.
 
-    Parameters
-    ----------
-    path : Path
-        The file. Files that are not of level 5 pass.
+    Files that are not of level 5 pass.
     """
     with path.open("rb") as file:
         head = file.read(_HEADER_BYTES)

@@ -50,14 +50,8 @@ def crc32_mpeg2(rows: NDArray[np.uint8]) -> NDArray[np.uint32]:
 def find_messages(raw: NDArray[np.uint8], sync: bytes, size: int) -> NDArray[np.int64]:
     """Return the first byte of each message that is complete and whose checksum is right.
 
-    Parameters
-    ----------
-    raw : ndarray of uint8, shape (bytes,)
-        The stream, such as a memory map of a file.
-    sync : bytes
-        First bytes of a message.
-    size : int
-        Bytes of a message with sync bytes and checksum.
+    `raw` is the stream, such as a memory map of a file; a message begins with `sync` and has `size`
+    bytes with sync bytes and checksum.
     """
     message_starts = [np.empty(0, dtype=np.int64)]
     for begin in range(0, max(len(raw) - size + 1, 0), _BLOCK):

@@ -7,26 +7,18 @@ axes, named by their orientation.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.ingest.formats.recognise import begins_like
-from gyrostab.ingest.formats.tables import (
-    NO_NAME,
-    ReadSlice,
-    Table,
-    TableColumn,
-    library,
-    read_tables,
-    scan_tables,
-    sliced,
-)
-from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, library, make_reader
+from gyrostab.ingest.options import ReadOptions
 from gyrostab.time.grid import grid_times
 
 SUFFIXES = (".mseed", ".miniseed", ".msd", ".ms", ".mseed3")
@@ -52,21 +44,13 @@ def matches(path: Path) -> bool:
     return begins_like(path, _HEAD, *SUFFIXES)
 
 
-def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Summarise channels and the stamps of the record headers."""
-    return scan_tables(
-        path, "miniseed", _group_traces(_read_traces(path, unpack=False)), options, _cut_note(path)
-    )
+def _make_tables(path: Path, options: ReadOptions, *, unpack: bool) -> TablesOfFile:
+    return _group_traces(_read_traces(path, unpack=unpack)), _cut_note(path)
 
 
-def read(path: Path, options: ReadOptions) -> xr.Dataset:
-    """Return the raw log of a miniSEED file; see `gyrostab.ingest.read_log`."""
-    return read_tables(
-        path,
-        _group_traces(_read_traces(path, unpack=True)),
-        options,
-        notes=_cut_note(path),
-    )
+scan, read = make_reader(
+    "miniseed", partial(_make_tables, unpack=True), find_heads=partial(_make_tables, unpack=False)
+)
 
 
 def _cut_note(path: Path) -> list[str]:
@@ -80,17 +64,9 @@ def _cut_note(path: Path) -> list[str]:
         first = next(iter(pymseed.MS3Record.from_buffer(head)), None)
     except pymseed.MiniSEEDError:
         return []
-    cut_bytes = (
-        path.stat().st_size % first.reclen if first is not None and first.formatversion == 2 else 0
-    )
-    return (
-        [
-            f"cut off in its last record: {cut_bytes} bytes are left out, the complete records "
-            "are read"
-        ]
-        if cut_bytes
-        else []
-    )
+    if first is None or first.formatversion != 2 or not (cut := path.stat().st_size % first.reclen):
+        return []
+    return [f"cut off in its last record: {cut} bytes are left out, the complete records are read"]
 
 
 def _read_traces(path: Path, *, unpack: bool) -> list[_Trace]:
@@ -128,12 +104,14 @@ def _group_traces(traces: list[_Trace]) -> list[Table]:
         columns = [
             TableColumn(
                 trace.name,
-                sliced(_join_values(trace.values, rows)),
-                target=_axis_of_code(trace.name[-1]),
+                _join_values(trace.values, rows),
+                target=f"gyro_{match[1].lower()}"
+                if (match := _ROTATION.fullmatch(trace.name[-1]))
+                else None,
             )
             for trace in group
         ]
-        tables.append(Table(rows, columns, TableColumn(NO_NAME, _trace_stamps(longest))))
+        tables.append(Table(rows, columns, _trace_stamps(longest)))
     return tables
 
 
@@ -149,12 +127,6 @@ def _in_step(first: _Trace, second: _Trace) -> bool:
     )
 
 
-def _axis_of_code(code: str) -> str | None:
-    """Return the gyro axis of a rotation sensor channel, None for other channels."""
-    match = _ROTATION.fullmatch(code)
-    return f"gyro_{match.group(1).lower()}" if match else None
-
-
 def _join_values(pieces: list[NDArray[Any]], rows: int) -> NDArray[Any]:
     """Join the segments of a trace, with NaN up to the number of rows; empty if not loaded."""
     missing = rows - sum(map(len, pieces)) if pieces else 0
@@ -162,7 +134,7 @@ def _join_values(pieces: list[NDArray[Any]], rows: int) -> NDArray[Any]:
     return np.concatenate([*pieces, *padding])
 
 
-def _trace_stamps(trace: _Trace) -> ReadSlice:
+def _trace_stamps(trace: _Trace) -> Callable[[int, int], Any]:
     ends = np.cumsum(trace.sizes)
 
     def part(start: int, stop: int) -> NDArray[np.datetime64]:

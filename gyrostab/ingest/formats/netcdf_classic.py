@@ -11,7 +11,7 @@ NetCDF classic format specification, Unidata (appendix B of the NetCDF users gui
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,19 +19,8 @@ import numpy as np
 from gyrostab.errors import FormatError
 
 #: nc_type -> numpy type, big-endian.
-_TYPES = {
-    1: "i1",
-    2: "S1",
-    3: ">i2",
-    4: ">i4",
-    5: ">f4",
-    6: ">f8",
-    7: "u1",
-    8: ">u2",
-    9: ">u4",
-    10: ">i8",
-    11: ">u8",
-}
+_TYPE_CODES = ("i1", "S1", ">i2", ">i4", ">f4", ">f8", "u1", ">u2", ">u4", ">i8", ">u8")
+_TYPES = dict(enumerate(_TYPE_CODES, 1))
 _DIMENSION, _VARIABLE, _ATTRIBUTE = 10, 11, 12
 #: Bytes of the file that are read, tried in this order; the last has room for thousands of
 #: variables.
@@ -104,10 +93,7 @@ class _Header:
 def read_classic_header(path: Path) -> dict[str, ClassicVariable] | None:
     """Read the locations of the variables of a classic NetCDF file; None for other formats.
 
-    Raises
-    ------
-    FormatError
-        When the header asks for more than the file holds.
+    `FormatError` when the header asks for more than the file holds.
     """
     size = path.stat().st_size
     for head_bytes in _HEAD_BYTES:
@@ -130,58 +116,49 @@ def _read_header(header: _Header, size: int) -> dict[str, ClassicVariable]:
         header.name()
         lengths.append(header.count())
     header.skip_attributes()
-    entries: list[tuple[str, np.dtype[np.generic], list[int], int]] = []
+    stored = []
     for _ in header.items(_VARIABLE):
         name = header.name()
-        places = _take_dimensions(header, len(lengths))
+        shape = _take_shape(header, lengths)
         header.skip_attributes()
         dtype = header.dtype(header.number())
         header.count()  # vsize, which is wrong above 4 GiB
-        entries.append((name, dtype, places, header.number(header.begin_bytes)))
-    return _lay_out(header, size, records, lengths, entries)
+        stride = dtype.itemsize * math.prod(shape[1:])
+        begin = header.number(header.begin_bytes)
+        stored.append(ClassicVariable(name, dtype, shape, begin, stride))
+    return _place_records(header, size, records, stored)
 
 
-def _take_dimensions(header: _Header, n_dimensions: int) -> list[int]:
+def _take_shape(header: _Header, lengths: list[int]) -> tuple[int, ...]:
+    """Take the dimensions of a variable; 0 is that of the records."""
     count = header.count()
     if count > 1024:
         raise header.fail(f"it asks for a variable of {count:,} dimensions")
     places = [header.count() for _ in range(count)]
-    if any(place >= n_dimensions for place in places):
+    if any(place >= len(lengths) for place in places):
         raise header.fail("a variable has a dimension that is not there")
-    return places
+    return tuple(lengths[place] for place in places)
 
 
-def _lay_out(
-    header: _Header,
-    size: int,
-    records: int,
-    lengths: list[int],
-    entries: list[tuple[str, np.dtype[np.generic], list[int], int]],
+def _place_records(
+    header: _Header, size: int, records: int, stored: list[ClassicVariable]
 ) -> dict[str, ClassicVariable]:
-    """Find shapes and strides, and check the last byte of each variable against the file size."""
-    spans = {}
-    for name, dtype, places, _ in entries:
-        shape = [lengths[place] for place in places]
-        is_record = bool(shape) and shape[0] == 0
-        spans[name] = (is_record, dtype.itemsize * math.prod(shape[1:] if is_record else shape))
-    rows = [span for is_record, span in spans.values() if is_record]
-    stride = rows[0] if len(rows) == 1 else sum(-(-span // 4) * 4 for span in rows)
+    """Find number and stride of records, and check the last byte of each variable."""
+    in_records = [variable for variable in stored if variable.shape[:1] == (0,)]
+    spans = [variable.stride for variable in in_records]
+    stride = spans[0] if len(spans) == 1 else sum(-(-span // 4) * 4 for span in spans)
+    if spans and records in (2**32 - 1, 2**64 - 1):
+        # written as a stream: the file size gives the number
+        first = min(variable.begin for variable in in_records)
+        records = max(size - first, 0) // max(stride, 1)
     variables = {}
-    begins = [begin for name, _, _, begin in entries if spans[name][0]]
-    if rows and records in (
-        2**32 - 1,
-        2**64 - 1,
-    ):  # written as a stream: the file size gives the number
-        records = max(size - min(begins), 0) // max(stride, 1)
-    for name, dtype, places, begin in entries:
-        is_record, span = spans[name]
-        shape = [lengths[place] for place in places]
-        end = begin + (
-            stride * (records - 1) + span if is_record and records else 0 if is_record else span
-        )
+    for variable in stored:
+        end = variable.begin + variable.stride * math.prod(variable.shape[:1])
+        if variable.shape[:1] == (0,):
+            end += stride * (records - 1) + variable.stride if records else 0
+            shape = (records, *variable.shape[1:])
+            variable = replace(variable, shape=shape, stride=stride)
         if end > size:
-            raise header.fail(f"{name!r} would end at byte {end:,} of {size:,}")
-        shape = [records, *shape[1:]] if is_record else shape
-        step = stride if is_record else dtype.itemsize * math.prod(shape[1:])
-        variables[name] = ClassicVariable(name, dtype, tuple(shape), begin, step)
+            raise header.fail(f"{variable.name!r} would end at byte {end:,} of {size:,}")
+        variables[variable.name] = variable
     return variables

@@ -42,13 +42,7 @@ class StoredVariable:
 
 @contextmanager
 def open_variables(path: Path, limits: Mapping[str, float]) -> Iterator[dict[str, StoredVariable]]:
-    """Open a file or store, and describe its variables.
-
-    Raises
-    ------
-    FormatError
-        When the file is damaged, or a chunk is too large.
-    """
+    """Open a file or store, and describe its variables; `FormatError` if a chunk is too large."""
     if path.is_dir():
         yield {variable.name: variable for variable in _zarr_variables(path, limits)}
         return

@@ -64,17 +64,7 @@ class Packing:
 
     @classmethod
     def from_attributes(cls, where: str, dtype: Any, attributes: Mapping[str, Any]) -> Packing:
-        """Parse the attributes of a variable.
-
-        Parameters
-        ----------
-        dtype : dtype
-            Type of the stored numbers, in any byte order.
-
-        Raises
-        ------
-        FormatError
-            When an attribute has no usable value.
+        """Parse the attributes of a variable that stores numbers of `dtype`, in any byte order.
 
         Examples
         --------
@@ -85,7 +75,7 @@ class Packing:
         """
         stored: np.dtype[Any] = np.dtype(dtype).newbyteorder("=")
         declared = {key: attributes[key] for key in _PACKING if key in attributes}
-        if stored.kind in "iu" and (text := _attribute_text(declared.get("_Unsigned"))):
+        if stored.kind in "iu" and (text := attribute_text(declared.get("_Unsigned"))):
             stored = np.dtype(f"{'u' if text.lower() == 'true' else 'i'}{stored.itemsize}")
         wraps = "_Unsigned" in declared
         numbers = {
@@ -107,11 +97,6 @@ class Packing:
         ]
         low, high = _valid_range(where, numbers, stored, scale, offset)
         return cls(stored, tuple(_representable_values(missing, stored)), low, high, scale, offset)
-
-    @property
-    def is_identity(self) -> bool:
-        """Whether every stored number is a valid value without conversion."""
-        return self.is_plain and not self.missing and self.low == -np.inf and self.high == np.inf
 
     @property
     def is_plain(self) -> bool:
@@ -147,25 +132,11 @@ class Packing:
         return np.logical_or.reduce(masks) if masks else None
 
 
-def _attribute_text(value: Any) -> str | None:
+def attribute_text(value: Any) -> str | None:
     """Return an attribute if it is text, otherwise None."""
     value = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
-    return (
-        value.decode(errors="replace")
-        if isinstance(value, bytes)
-        else value
-        if isinstance(value, str)
-        else None
-    )
-
-
-def text_attributes(attributes: Iterable[Mapping[str, Any]], name: str) -> dict[int, str]:
-    """Return the text attribute `name` of the variables that have it, by their position."""
-    return {
-        place: text
-        for place, attrs in enumerate(attributes)
-        if (text := _attribute_text(attrs.get(name)))
-    }
+    value = value.decode(errors="replace") if isinstance(value, bytes) else value
+    return value if isinstance(value, str) else None
 
 
 def _attribute_numbers(
@@ -192,18 +163,9 @@ def _representable_values(missing: Iterable[Any], stored: np.dtype[Any]) -> Iter
     """Yield the numbers that the type of a variable can hold, except NaN."""
     for value in missing:
         with np.errstate(all="ignore"):
-            number = stored.type(value) if stored.kind == "f" or _fits_type(value, stored) else None
-        if number is not None and number == number:
+            number = np.asarray(value).astype(stored)[()]
+        if number == number and (stored.kind == "f" or number.item() == value.item()):
             yield number
-
-
-def _fits_type(value: Any, stored: np.dtype[Any]) -> bool:
-    limits = np.iinfo(stored)
-    return (
-        bool(np.isfinite(value))
-        and float(value).is_integer()
-        and limits.min <= int(value) <= limits.max
-    )
 
 
 def _valid_range(
@@ -251,23 +213,9 @@ def fold_packing(
 ) -> tuple[Plan, dict[int, Decoder]]:
     """Fold the packing of variables into the factors of the plan, so that counts stay integers.
 
-    Parameters
-    ----------
-    dtypes, attributes : sequence of dtype, sequence of mapping
-        Type and attributes of each column's variable, by the column's source.
-
-    Returns
-    -------
-    plan : Plan
-        With factors, offsets and time units for the output of the decoders.
-    decoders : dict of int to callable
-        Source -> function from stored numbers to counts, or to values for a time variable whose
-        counts are not whole nanoseconds.
-
-    Raises
-    ------
-    FormatError
-        When an attribute of a column that is read has no usable value.
+    `dtypes` and `attributes` are those of the variable of each source. Also return, by source, the
+    functions from stored numbers to counts, or to values for a time variable whose counts are not
+    whole nanoseconds.
     """
     columns: list[Column] = []
     decoders: dict[int, Decoder] = {}
@@ -305,21 +253,8 @@ def _fold_time(unit: TimeUnit, packing: Packing) -> TimeUnit | None:
 def decode_variables(path: Path, stored: xr.Dataset) -> xr.Dataset:
     """Decode the variables of an undecoded dataset lazily, in the chunks of the file.
 
-    Parameters
-    ----------
-    path : Path
-        The file; it is named in errors of later reads.
-
-    Returns
-    -------
-    xarray.Dataset
-        Packed numbers as float64, NaN where missing or invalid; stamps as datetime64[ns]; the
-        packing of whole numbers is in the encoding.
-
-    Raises
-    ------
-    FormatError, UnitError
-        When an attribute has no usable value, or an epoch is ambiguous.
+    Packed numbers become float64, NaN where missing or invalid, and stamps datetime64[ns]; the
+    packing of whole numbers is in the encoding. Errors of later reads name `path`.
     """
     chunks: dict[Any, int] = {}
     for variable in stored.variables.values():
@@ -348,13 +283,13 @@ def _decode_variable(
     if names_epoch(str(attrs.get("units", ""))):
         try:
             unit = parse_time_unit(
-                str(attrs.pop("units")), _attribute_text(attrs.pop("calendar", None))
+                str(attrs.pop("units")), attribute_text(attrs.pop("calendar", None))
             )
         except UnitError as error:
             raise UnitError(f"{where}: {error}") from error
         read = partial(_read_stamps, packing, unit)
         return Converted(source, read, "datetime64[ns]"), attrs, chunks
-    if packing.is_identity and packing.dtype == variable.dtype:
+    if packing == Packing(variable.dtype):  # every stored number is a value
         return source, attrs, variable.encoding
     encoding = dict(chunks)
     if packing.dtype.kind in "iu" and packing.scale != 1.0:

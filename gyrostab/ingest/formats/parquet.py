@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import xarray as xr
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.dates import find_order, holds_date
-from gyrostab.ingest.columns.headers import split_header
+from gyrostab.ingest.columns.headers import FileColumn, split_header
 from gyrostab.ingest.columns.plan import Plan, plan_columns
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder
 from gyrostab.ingest.columns.typed import (
@@ -61,7 +62,7 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
         values = _to_numpy(pa.chunked_array(columns))
         return values[: stop - start] if start == 0 else values[start - stop :]
 
-    return summarise_columns("parquet", plan, options, rows, fetch)
+    return summarise_columns("parquet", plan, rows, fetch)
 
 
 def read(path: Path, options: ReadOptions) -> xr.Dataset:
@@ -69,14 +70,13 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
     file, plan = _open_parquet(path, options)
     names = file.schema_arrow.names
     check_stored(path, file.metadata.num_rows, len(plan.columns), options.limits)
-    builder = RawLogBuilder(plan.check(), options)
+    builder = RawLogBuilder(plan)
     column_names = [names[column.source] for column in plan.columns]
 
     def convert(batch: Any) -> ConvertedBlock:
         arrays = {name: batch.column(place) for place, name in enumerate(batch.schema.names)}
         return convert_batch(
             builder,
-            options,
             {column.source: _to_numpy(arrays[names[column.source]]) for column in plan.columns},
         )
 
@@ -94,30 +94,18 @@ def _open_parquet(path: Path, options: ReadOptions) -> tuple[Any, Plan]:
     file = parquet.ParquetFile(path, buffer_size=_BUFFER_BYTES, pre_buffer=False)
     schema = file.schema_arrow
     head = next(file.iter_batches(batch_size=50), None)
-    units = {
-        index: text.decode(errors="replace")
-        for index, entry in enumerate(schema)
-        if (text := (entry.metadata or {}).get(b"units")) is not None
-    }
-    durations = {i: kind.unit for i, kind in enumerate(schema.types) if pa.types.is_duration(kind)}
-    headers = [
-        split_header(name)[0] if index in durations else name
-        for index, name in enumerate(schema.names)
-    ]
-    samples = [] if head is None else [_to_numpy(column) for column in head.columns]
-    texts = [[value for value in values if isinstance(value, str)] for values in samples]
-    orders = {
-        index: find_order(text) for index, text in enumerate(texts) if any(map(holds_date, text))
-    }
-    dates = [index for index, values in enumerate(samples) if holds_dates(values)]
-    return file, plan_columns(
-        path,
-        headers,
-        options,
-        units=units | durations,
-        stamped={*dates, *orders},
-        orders=orders,
-    )
+    columns = []
+    for index, entry in enumerate(schema):
+        unit = (entry.metadata or {}).get(b"units")
+        column = FileColumn(entry.name, None if unit is None else unit.decode(errors="replace"))
+        if pa.types.is_duration(entry.type):
+            column = FileColumn(split_header(entry.name)[0], entry.type.unit)
+        sample = () if head is None else _to_numpy(head.column(index))
+        texts = [value for value in sample if isinstance(value, str)]
+        if any(map(holds_date, texts)):
+            column = replace(column, stamped=True, date_order=find_order(texts))
+        columns.append(replace(column, stamped=column.stamped or holds_dates(sample)))
+    return file, plan_columns(path, columns, options)
 
 
 def _to_numpy(column: Any) -> Any:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from gyrostab.ingest.columns.headers import FileColumn
 from gyrostab.ingest.columns.plan import Plan, plan_columns
 from gyrostab.ingest.columns.typed import float32_note, read_columns, summarise_columns
-from gyrostab.ingest.formats.packing import Decoder, fold_packing, text_attributes
+from gyrostab.ingest.formats.packing import Decoder, attribute_text, fold_packing
 from gyrostab.ingest.limits import check_stored
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.store.rows import EvenRows, LibraryRows, Rows
@@ -37,24 +37,25 @@ class StoredTable:
     rows: int
     plan: Plan
     decoders: Mapping[int, Decoder]
-    options: ReadOptions
     notes: Sequence[str]
+
+    def fetch(self, source: int, start: int, stop: int) -> Any:
+        """Return the decoded values of a column."""
+        return self.decoders[source](self.columns[source].rows.read(start, stop))
 
     def scan(self, form: str) -> FileSummary:
         """Summarise columns, number of rows, and first and last stamps."""
-        fetch = partial(_fetch_rows, self.columns, self.decoders)
-        return summarise_columns(form, self.plan, self.options, self.rows, fetch, self.notes)
+        return summarise_columns(form, self.plan, self.rows, self.fetch, self.notes)
 
     def read(self) -> xr.Dataset:
         """Return the raw log."""
         plan, columns = self.plan, self.columns
-        check_stored(plan.path, self.rows, len(plan.columns), self.options.limits)
+        check_stored(plan.path, self.rows, len(plan.columns), plan.options.limits)
         sources = [columns[column.source].rows for column in plan.columns]
         return read_columns(
             plan,
-            self.options,
             self.rows,
-            partial(_fetch_rows, columns, self.decoders),
+            self.fetch,
             notes=[*self.notes, *float32_note(plan, [column.dtype for column in columns])],
             parallel=not any(isinstance(rows, LibraryRows) for rows in sources),
             stay=all(isinstance(rows, EvenRows) for rows in sources),
@@ -70,26 +71,17 @@ def plan_stored(
     notes: Sequence[str] = (),
     coded: Mapping[int, str] | None = None,
 ) -> StoredTable:
-    """Determine roles and units of stored columns, with their packing folded into the factors.
-
-    Raises
-    ------
-    FormatError
-        When an attribute of a column that is read has no usable value.
-    """
+    """Determine roles and units of stored columns, with their packing folded into the factors."""
+    file_columns = [
+        FileColumn(
+            column.header,
+            attribute_text(column.attributes.get("units")) or None,
+            attribute_text(column.attributes.get("calendar")) or None,
+            target=(coded or {}).get(place),
+        )
+        for place, column in enumerate(columns)
+    ]
     attributes = [column.attributes for column in columns]
-    units, calendars = (text_attributes(attributes, name) for name in ("units", "calendar"))
-    headers = [column.header for column in columns]
-    plan = plan_columns(path, headers, options, units=units, calendars=calendars, coded=coded)
+    plan = plan_columns(path, file_columns, options)
     plan, decoders = fold_packing(plan, [column.dtype for column in columns], attributes)
-    return StoredTable(columns, rows, plan, decoders, options, notes)
-
-
-def _fetch_rows(
-    columns: Sequence[StoredColumn],
-    decoders: Mapping[int, Decoder],
-    source: int,
-    start: int,
-    stop: int,
-) -> Any:
-    return decoders[source](columns[source].rows.read(start, stop))
+    return StoredTable(columns, rows, plan, decoders, notes)

@@ -6,6 +6,7 @@ from array import array
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from importlib import import_module
 from itertools import islice
@@ -16,6 +17,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import FormatError, OptionError
+from gyrostab.ingest.columns.headers import FileColumn
 from gyrostab.ingest.columns.plan import Plan, plan_columns
 from gyrostab.ingest.columns.plan_draft import MAX_HEADERS, Column
 from gyrostab.ingest.columns.stamps import NAT, parse_time_unit
@@ -24,18 +26,20 @@ from gyrostab.ingest.combine import concatenate, with_channels
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.wording import list_some
 
-#: First row, row after the last one -> values.
-ReadSlice = Callable[[int, int], Any]
-
 
 @dataclass(frozen=True)
 class TableColumn:
     """A column; its name is used alone, or after the names of its groups if several share it."""
 
     name: tuple[str, ...]
-    values: ReadSlice
+    values: Any  # what can be sliced, or a function of the first row and the row after the last
     unit: str | None = None
     target: str | None = None  # by a code of the format, in the form of ``--map``
+
+    def read(self, start: int, stop: int) -> Any:
+        """Return the values of rows."""
+        is_function = callable(self.values)
+        return self.values(start, stop) if is_function else np.asarray(self.values[start:stop])
 
 
 @dataclass(frozen=True)
@@ -47,11 +51,13 @@ class Table:
 
     rows: int
     columns: Sequence[TableColumn]
-    stamps: TableColumn | None = None
+    stamps: Any = None  # as the values of a column
+    time_unit: str | None = None
 
 
 #: Tables of a file, and notes on it.
 TablesOfFile = tuple[Sequence[Table], Sequence[str]]
+FindTables = Callable[[Path, ReadOptions], TablesOfFile | AbstractContextManager[TablesOfFile]]
 
 
 class Messages:
@@ -62,7 +68,7 @@ class Messages:
     >>> messages = Messages()
     >>> messages.add(0, {"x": 1.0})
     >>> messages.add(10, {"x": 2.0, "t": 20.5})
-    >>> [column.values(0, 2).tolist() for column in messages.make_table("imu").columns]
+    >>> [column.values.tolist() for column in messages.make_table("imu").columns]
     [[1.0, 2.0], [nan, 20.5]]
     """
 
@@ -89,27 +95,15 @@ class Messages:
             self._fill_column(column)
         stamps = np.frombuffer(self.stamps, dtype=np.int64)
         columns = [
-            TableColumn(
-                (*group, name), sliced(np.frombuffer(column)), target=(targets or {}).get(name)
-            )
+            TableColumn((*group, name), np.frombuffer(column), target=(targets or {}).get(name))
             for name, column in self.columns.items()
         ]
-        clock = sliced(stamps if time_unit else stamps.view("datetime64[ns]"))
-        return Table(len(stamps), columns, TableColumn(NO_NAME, clock, time_unit))
+        clock = stamps if time_unit else stamps.view("datetime64[ns]")
+        return Table(len(stamps), columns, clock, time_unit)
 
     def _fill_column(self, column: array[float]) -> None:
         if len(column) < len(self.stamps):
             column.extend([np.nan] * (len(self.stamps) - len(column)))
-
-
-def sliced(values: Any) -> ReadSlice:
-    """Return a function that slices an array, or what can be sliced like one."""
-    return lambda start, stop: np.asarray(values[start:stop])
-
-
-#: Name of a column without one.
-NO_NAME = ("",)
-_NO_STAMPS = TableColumn(NO_NAME, sliced(()))
 
 
 def _plain_names(names: Sequence[tuple[str, ...]]) -> list[str]:
@@ -129,43 +123,40 @@ def _plain_names(names: Sequence[tuple[str, ...]]) -> list[str]:
 
 @dataclass(frozen=True)
 class _PlannedTables:
-    """Tables with one plan; source numbers run through all tables, stamps first."""
+    """Tables with one plan."""
 
     tables: list[Table]
-    first: list[int]
+    stored: list[TableColumn]  # those of all tables by source number, the stamps of each first
+    first: list[int]  # source number of the stamps of each table, and of the end of the last
     plan: Plan
     main: list[int]  # tables with gyro axes, each with separate stamps
 
-    def part(self, place: int) -> tuple[Plan, Any]:
-        """Return the plan of one table's columns, and the function that fetches them."""
-        begin, stored = self.first[place], _with_stamps(self.tables[place])
-        columns = [
-            column for column in self.plan.columns if begin <= column.source < begin + len(stored)
-        ]
-        if stored[0] is not _NO_STAMPS:
-            clocks = [self._clock_of(place, clock) for clock in self.plan.of("time")]
+    def plan_of(self, place: int) -> Plan:
+        """Return the plan of the columns of one table."""
+        begin, end = self.first[place : place + 2]
+        columns = [column for column in self.plan.columns if begin <= column.source < end]
+        if self.tables[place].stamps is not None:
+            clocks = [self._clock_of(begin, clock) for clock in self.plan.of("time")]
             columns = clocks + [c for c in columns if not (clocks and c.role == "time")]
+        return replace(self.plan, columns=tuple(columns))
 
-        def fetch(source: int, start: int, stop: int) -> Any:
-            return stored[source - begin].values(start, stop)
-
-        return replace(self.plan, columns=tuple(columns)), fetch
-
-    def _clock_of(self, place: int, planned: Column) -> Column:
+    def _clock_of(self, source: int, planned: Column) -> Column:
         """Return the stamps of a table, in the planned unit if both clocks are stored in one."""
-        holder = bisect_right(self.first, planned.source) - 1
-        stored = _with_stamps(self.tables[holder])[planned.source - self.first[holder]]
-        unit, time_unit = _with_stamps(self.tables[place])[0].unit, planned.time_unit
-        if unit != stored.unit:
+        unit, time_unit = self.stored[source].unit, planned.time_unit
+        if unit != self.stored[planned.source].unit:
             time_unit = parse_time_unit(unit) if unit else None
-        return replace(planned, source=self.first[place], time_unit=time_unit)
+        return replace(planned, source=source, time_unit=time_unit)
+
+    def fetch(self, source: int, start: int, stop: int) -> Any:
+        """Return the values of a column."""
+        return self.stored[source].read(start, stop)
 
 
-def _leave_out_unplaced(planned: _PlannedTables, options: ReadOptions) -> _PlannedTables:
+def _leave_out_unplaced(planned: _PlannedTables) -> _PlannedTables:
     """Leave out, with notes, tables whose rows have no place on the time of the log."""
-    plans = [planned.part(place)[0] for place in range(len(planned.tables))]
+    plans = [planned.plan_of(place) for place in range(len(planned.tables))]
     is_dated = {
-        place: options.epoch is not None
+        place: planned.plan.options.epoch is not None
         or time.time_unit is None
         or time.time_unit.epoch is not None
         for place, time in enumerate(plan.time for plan in plans)
@@ -191,48 +182,37 @@ def _leave_out_unplaced(planned: _PlannedTables, options: ReadOptions) -> _Plann
     return replace(planned, plan=plan, main=main)
 
 
-def _with_stamps(table: Table) -> list[TableColumn]:
-    return [table.stamps or _NO_STAMPS, *table.columns]
-
-
 def _plan_tables(path: Path, tables: Sequence[Table], options: ReadOptions) -> _PlannedTables:
-    names = iter(_plain_names([c.name for table in tables for c in _with_stamps(table)]))
+    names = iter(_plain_names([column.name for table in tables for column in table.columns]))
     filled: list[Table] = []
+    stored: list[TableColumn] = []
     first: list[int] = []
-    headers: list[str] = []
-    units: dict[int, str] = {}
-    targets: dict[int, str] = {}
+    described: list[FileColumn] = []
     for table in tables:
-        columns = _with_stamps(table)
-        _, *column_names = islice(names, len(columns))
-        if not table.rows or not column_names:
+        own_names = list(islice(names, len(table.columns)))
+        if not table.rows or not own_names:
             continue
-        is_first_clock = table.stamps is not None and all(held.stamps is None for held in filled)
+        is_timed = table.stamps is not None
+        is_first_clock = is_timed and all(held.stamps is None for held in filled)
         filled.append(table)
-        first.append(len(headers))
-        for source, column in enumerate(columns, len(headers)):
-            if column.unit:
-                units[source] = column.unit
-            if column.target:
-                targets[source] = column.target
-        headers += ["time" if is_first_clock else "", *column_names]
+        first.append(len(stored))
+        stored += [TableColumn(("",), table.stamps, table.time_unit), *table.columns]
+        header, stamped = "time" if is_first_clock else "", is_timed and table.time_unit is None
+        described.append(FileColumn(header, table.time_unit, stamped=stamped))
+        described += [
+            FileColumn(name, column.unit or None, target=column.target)
+            for name, column in zip(own_names, table.columns, strict=True)
+        ]
     if not filled:
         raise FormatError(
             f"{path.name}: it holds no values; copy it again, or check what the logger wrote"
         )
-    stamped = [
-        begin
-        for begin, table in zip(first, filled, strict=True)
-        if table.stamps is not None and table.stamps.unit is None
-    ]
-    plan = plan_columns(path, headers, options, units=units, stamped=stamped, coded=targets)
+    plan = plan_columns(path, described, options)
     main_columns = plan.of("gyro") or plan.of("channel")
-    holders = {
-        max(place for place, begin in enumerate(first) if begin <= column.source)
-        for column in main_columns
-    }
+    holders = {bisect_right(first, column.source) - 1 for column in main_columns}
     main = sorted(holders) if plan.of("gyro") else [min(holders, default=0)]
-    return _leave_out_unplaced(_PlannedTables(filled, first, plan, main), options)
+    planned = _PlannedTables(filled, stored, [*first, len(stored)], plan, main)
+    return _leave_out_unplaced(planned)
 
 
 def scan_tables(
@@ -241,8 +221,8 @@ def scan_tables(
     """Summarise tables, with the first and last stamps of the table with the gyro axes."""
     planned = _plan_tables(path, tables, options)
     main = planned.main[0]
-    plan, fetch = planned.part(main)
-    summary = summarise_columns(form, plan, options, planned.tables[main].rows, fetch, notes)
+    plan, rows = planned.plan_of(main), planned.tables[main].rows
+    summary = summarise_columns(form, plan, rows, planned.fetch, notes)
     axes, channels = (
         tuple(column.name for column in planned.plan.of(role)) for role in ("gyro", "channel")
     )
@@ -256,26 +236,20 @@ def read_tables(
     *,
     notes: Sequence[str] = (),
 ) -> xr.Dataset:
-    """Return the raw log of the tables with gyro axes; other channels keep separate stamps.
-
-    Raises
-    ------
-    FormatError
-        When the tables are empty.
-    """
+    """Return the raw log of the tables with gyro axes; other channels keep separate stamps."""
     planned = _plan_tables(path, tables, options)
     planned.plan.check()
     main: list[xr.Dataset] = []
     channel_logs: list[xr.Dataset] = []
     for place, table in enumerate(planned.tables):
-        plan, fetch = planned.part(place)
+        plan = planned.plan_of(place)
         if place in planned.main:
             if main:
                 plan, notes = replace(plan, notes=()), ()
-            main.append(read_columns(plan, options, table.rows, fetch, notes=notes))
+            main.append(read_columns(plan, table.rows, planned.fetch, notes=notes))
         elif plan.of("channel"):
             plan = replace(plan, signal=None, kind=None, notes=())
-            channel_logs.append(read_columns(plan, options, table.rows, fetch))
+            channel_logs.append(read_columns(plan, table.rows, planned.fetch))
     log = with_channels(concatenate(main) if len(main) > 1 else main[0], channel_logs)
     if "axis_rows" in log.attrs:
         return log
@@ -283,21 +257,31 @@ def read_tables(
 
 
 def make_reader(
-    form: str, find_tables: Callable[[Path, ReadOptions], TablesOfFile]
+    form: str, find_tables: FindTables, find_heads: FindTables | None = None
 ) -> tuple[Callable[[Path, ReadOptions], FileSummary], Callable[[Path, ReadOptions], xr.Dataset]]:
-    """Make the functions `scan` and `read` of a format whose tables are read as a whole."""
+    """Make the functions `scan` and `read` of a format whose tables are read as a whole.
+
+    `find_heads` finds the tables for `scan` if that can leave out their values. Either may be a
+    context manager that keeps the file open.
+    """
 
     def scan(path: Path, options: ReadOptions) -> FileSummary:
         """Summarise columns, rows, and first and last stamps."""
-        tables, notes = find_tables(path, options)
-        return scan_tables(path, form, tables, options, notes)
+        with _keep_open((find_heads or find_tables)(path, options)) as (tables, notes):
+            return scan_tables(path, form, tables, options, notes)
 
     def read(path: Path, options: ReadOptions) -> xr.Dataset:
         """Return the raw log of a file; see `gyrostab.ingest.read_log`."""
-        tables, notes = find_tables(path, options)
-        return read_tables(path, tables, options, notes=notes)
+        with _keep_open(find_tables(path, options)) as (tables, notes):
+            return read_tables(path, tables, options, notes=notes)
 
     return scan, read
+
+
+def _keep_open(
+    tables: TablesOfFile | AbstractContextManager[TablesOfFile],
+) -> AbstractContextManager[TablesOfFile]:
+    return tables if isinstance(tables, AbstractContextManager) else nullcontext(tables)
 
 
 def library(name: str, path: Path, *, extra: str) -> Any:

@@ -6,30 +6,19 @@ group.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.stamps import NAT
 from gyrostab.ingest.formats.recognise import begins_like
-from gyrostab.ingest.formats.tables import (
-    NO_NAME,
-    ReadSlice,
-    Table,
-    TableColumn,
-    library,
-    read_tables,
-    scan_tables,
-    sliced,
-)
-from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, library, make_reader
+from gyrostab.ingest.options import ReadOptions
 from gyrostab.time.stamps import to_nanoseconds
 
 _FIRST_DATE = np.datetime64(
@@ -42,20 +31,8 @@ def matches(path: Path) -> bool:
     return begins_like(path, b"TDSm", ".tdms")
 
 
-def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Summarise channels, lengths, and first and last stamps."""
-    with _open_tables(path) as tables:
-        return scan_tables(path, "tdms", tables, options)
-
-
-def read(path: Path, options: ReadOptions) -> xr.Dataset:
-    """Return the raw log of a TDMS file; see `gyrostab.ingest.read_log`."""
-    with _open_tables(path) as tables:
-        return read_tables(path, tables, options)
-
-
 @contextmanager
-def _open_tables(path: Path) -> Iterator[list[Table]]:
+def _open_tables(path: Path, options: ReadOptions) -> Iterator[TablesOfFile]:
     """Group channels of one length and clock into tables; without a clock, of one group."""
     nptdms = library("nptdms", path, extra="tdms")
     with nptdms.TdmsFile.open(str(path)) as file:
@@ -65,7 +42,10 @@ def _open_tables(path: Path) -> Iterator[list[Table]]:
                 if len(channel):
                     clock = _waveform_clock(path, channel) or channel.group_name
                     groups.setdefault((len(channel), clock), []).append(channel)
-        yield [_make_table(path, channels) for channels in groups.values()]
+        yield [_make_table(path, channels) for channels in groups.values()], ()
+
+
+scan, read = make_reader("tdms", _open_tables)
 
 
 def _waveform_clock(path: Path, channel: Any) -> tuple[float, Any] | None:
@@ -100,7 +80,7 @@ def _make_table(path: Path, channels: list[Any]) -> Table:
     columns = [
         TableColumn(
             (channel.group_name, channel.name),
-            sliced(channel),
+            channel,
             str(channel.properties.get("unit_string") or "").strip() or None,
         )
         for channel in channels
@@ -108,17 +88,15 @@ def _make_table(path: Path, channels: list[Any]) -> Table:
     clock = _waveform_clock(path, channels[0])
     if clock is not None:
         unit = None if isinstance(clock[1], np.datetime64) else "ns"
-        return Table(
-            len(channels[0]), columns, TableColumn(NO_NAME, _waveform_stamps(*clock), unit)
-        )
+        return Table(len(channels[0]), columns, _waveform_stamps(*clock), unit)
     kinds = [np.dtype(channel.dtype).kind for channel in channels]
     if "M" not in kinds:
         return Table(len(channels[0]), columns)
     dates = columns.pop(kinds.index("M"))
-    return Table(len(channels[0]), columns, replace(dates, unit=None))
+    return Table(len(channels[0]), columns, dates.values)
 
 
-def _waveform_stamps(step: float, start: Any) -> ReadSlice:
+def _waveform_stamps(step: float, start: Any) -> Callable[[int, int], Any]:
     def part(begin: int, stop: int) -> NDArray[Any]:
         since = np.rint(np.arange(begin, stop) * (step * 1e9)).astype(np.int64)
         stamps: NDArray[Any] = start + (

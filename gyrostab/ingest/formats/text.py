@@ -29,6 +29,7 @@ from gyrostab.ingest.columns.dates import (
     holds_date,
     is_time_of_day,
 )
+from gyrostab.ingest.columns.headers import FileColumn
 from gyrostab.ingest.columns.plan import Plan, plan_columns
 from gyrostab.ingest.columns.plan_draft import Column
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
@@ -69,19 +70,15 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
     time, rows = plan.time, None
     head = tail = np.empty(0, np.int64)
     if time is not None:
-        head = _sample_stamps(layout, time, layout.samples, options)
+        head = _sample_stamps(layout, time, layout.samples)
     if not _is_gzipped(path):
         size = path.stat().st_size
         with path.open("rb") as file:
             file.seek(max(layout.offset, size - 2**14))
             ends = [layout.split_row(line) for line in file.read().decode("latin-1").splitlines()]
             if time is not None:
-                tail = _sample_stamps(
-                    layout,
-                    time,
-                    [row for row in ends if _is_solid(row, layout, time.source)],
-                    options,
-                )
+                solid = [row for row in ends if _is_solid(row, layout, time.source)]
+                tail = _sample_stamps(layout, time, solid)
             if size <= COUNTED_BYTES:
                 file.seek(layout.offset)
                 rows = sum(
@@ -100,9 +97,8 @@ def read(
 ) -> xr.Dataset:
     """Return the raw log of a text file; raise `CancelledError` once `stop` returns true."""
     layout, plan = _plan_file(path, options)
-    options = options if plan.rate is None else replace(options, rate=plan.rate)
-    builder = RawLogBuilder(plan.check(), options)
-    parse = partial(_parse_block, parser=BlockParser(layout, plan, options), builder=builder)
+    builder = RawLogBuilder(plan)
+    parse = partial(_parse_block, parser=BlockParser(layout, plan), builder=builder)
     line = layout.line
     for converted, block, starts, lines in map_in_order(
         parse, _read_blocks(path, layout.offset, growing=options.growing)
@@ -129,18 +125,17 @@ def _plan_file(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
             size *= 2
         layout = find_layout(path, head, complete=len(head) < size, limits=options.limits)
     rows = layout.full_samples
-    orders = {
-        column: find_order(row[column] for row in rows)
-        for column in range(layout.width)
-        if any(holds_date(row[column]) or is_time_of_day(row[column]) for row in rows)
-    }
+    columns = []
+    for place, header in enumerate(layout.headers):
+        cells = [row[place] for row in rows]
+        column = FileColumn(header, layout.units.get(place) or _duration_unit(cells))
+        if any(holds_date(cell) or is_time_of_day(cell) for cell in cells):
+            column = replace(column, stamped=True, date_order=find_order(cells))
+        columns.append(column)
     plan = plan_columns(
         path,
-        layout.headers,
+        columns,
         options,
-        units={**_duration_units(layout), **layout.units},
-        stamped=orders,
-        orders=orders,
         rising=partial(_is_rising, layout),
         above=layout.above,
         is_filled=lambda column: any(row[column].strip().lower() not in VOID_CELLS for row in rows),
@@ -162,15 +157,10 @@ def _find_word(layout: Layout, column: int) -> str:
     )
 
 
-def _duration_units(layout: Layout) -> dict[int, str]:
-    """Return the units of columns whose cells contain them, such as ``0.01 sec``."""
-    rows = layout.full_samples
-    return {
-        column: unit
-        for column, cell in enumerate(rows[0] if rows else ())
-        if (unit := unit_of_duration(cell))
-        and all(unit_of_duration(row[column]) == unit for row in rows)
-    }
+def _duration_unit(cells: Sequence[str]) -> str | None:
+    """Return the unit that all cells of a column contain, such as ``0.01 sec``."""
+    unit = unit_of_duration(cells[0]) if cells else None
+    return unit if unit and all(unit_of_duration(cell) == unit for cell in cells) else None
 
 
 def _is_rising(layout: Layout, column: int) -> bool:
@@ -188,12 +178,12 @@ def _is_rising(layout: Layout, column: int) -> bool:
 
 
 def _sample_stamps(
-    layout: Layout, time: Column, rows: Sequence[Sequence[str]], options: ReadOptions
+    layout: Layout, time: Column, rows: Sequence[Sequence[str]]
 ) -> NDArray[np.int64]:
     cells = [row[time.source] for row in rows if len(row) == layout.width]
     if layout.decimal_comma and time.time_unit is not None:
         cells = [cell.replace(",", ".") for cell in cells]
-    return cells_to_ns(cells, time.time_unit, options.epoch_ns, time.date_order)
+    return cells_to_ns(cells, time.time_unit, time.epoch, time.date_order)
 
 
 def _is_solid(row: list[str], layout: Layout, time: int) -> bool:

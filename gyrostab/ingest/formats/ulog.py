@@ -9,15 +9,7 @@ import io
 from pathlib import Path
 
 from gyrostab.ingest.formats.recognise import begins_like
-from gyrostab.ingest.formats.tables import (
-    NO_NAME,
-    Table,
-    TableColumn,
-    TablesOfFile,
-    library,
-    make_reader,
-    sliced,
-)
+from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, library, make_reader
 from gyrostab.ingest.options import ReadOptions
 
 MAGIC = b"ULog\x01\x12\x35"
@@ -50,10 +42,9 @@ def _make_tables(path: Path, options: ReadOptions) -> TablesOfFile:
     for message in log.data_list:
         name = message.name + (f"_{message.multi_id}" if message.multi_id else "")
         fields = {field: values for field, values in message.data.items() if field != "timestamp"}
-        columns = [TableColumn((name, field), sliced(values)) for field, values in fields.items()]
-        stamps = message.data.get("timestamp")
-        clock = None if stamps is None else TableColumn(NO_NAME, sliced(stamps), "us")
-        tables.append(Table(len(next(iter(fields.values()), ())), columns, clock))
+        columns = [TableColumn((name, field), values) for field, values in fields.items()]
+        rows = len(next(iter(fields.values()), ()))
+        tables.append(Table(rows, columns, message.data.get("timestamp"), "us"))
     notes = []
     if lost := [dropout.duration for dropout in log.dropouts]:
         notes.append(

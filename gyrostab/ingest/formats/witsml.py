@@ -20,14 +20,7 @@ import pandas as pd
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.stamps import texts_to_ns
 from gyrostab.ingest.formats.recognise import begins_like
-from gyrostab.ingest.formats.tables import (
-    NO_NAME,
-    Table,
-    TableColumn,
-    TablesOfFile,
-    make_reader,
-    sliced,
-)
+from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, make_reader
 from gyrostab.ingest.options import ReadOptions
 
 _HEAD = re.compile(rb"(?is)^(?:\xef\xbb\xbf)?\s*<.*witsml")
@@ -39,16 +32,10 @@ def matches(path: Path) -> bool:
 
 
 def _read_logs(path: Path, options: ReadOptions) -> TablesOfFile:
-    """Return a table for each log with data and an index of dates and times.
-
-    Raises
-    ------
-    FormatError
-        When there is none.
-    """
+    """Return a table for each log with data and an index of dates and times."""
     tables: list[Table] = []
     for _, log in ElementTree.iterparse(path):
-        if _local_name(log) == "log":
+        if str(log.tag).rpartition("}")[2] == "log":
             table = _make_table(log)
             log.clear()
             if table is not None:
@@ -64,17 +51,10 @@ def _read_logs(path: Path, options: ReadOptions) -> TablesOfFile:
 def _make_table(log: Any) -> Table | None:
     if "date" not in _child_text(log, "indexType").lower():
         return None
-    names, units, nulls, lines = [], {}, {}, []
-    for element in log.iter():
-        if _local_name(element) == "logCurveInfo":
-            name = _child_text(element, "mnemonic")
-            units[name] = _child_text(element, "unit")
-            nulls[name] = _child_text(element, "nullValue")
-        elif _local_name(element) == "mnemonicList":
-            names = [name.strip() for name in (element.text or "").split(",")]
-        elif _local_name(element) == "data" and element.text:
-            lines.append(element.text.strip())
-    names = names or list(units)
+    curves = {_child_text(curve, "mnemonic"): curve for curve in log.iterfind(".//{*}logCurveInfo")}
+    lists = [names.text for names in log.iterfind(".//{*}mnemonicList") if names.text]
+    names = [name.strip() for name in lists[-1].split(",")] if lists else list(curves)
+    lines = [data.text.strip() for data in log.iterfind(".//{*}data") if data.text]
     if not lines or not names:
         return None
     cells = pd.read_csv(  # type: ignore[call-overload]
@@ -83,7 +63,7 @@ def _make_table(log: Any) -> Table | None:
         names=range(len(names)),
         index_col=False,
         na_values={
-            number: [nulls.get(name) or _child_text(log, "nullValue")]
+            number: [_child_text(curves.get(name), "nullValue") or _child_text(log, "nullValue")]
             for number, name in enumerate(names)
         },
         on_bad_lines="skip",
@@ -92,21 +72,18 @@ def _make_table(log: Any) -> Table | None:
     place = names.index(index) if index in names else 0
     stamps = texts_to_ns(cells[place].astype(str).tolist()).view("datetime64[ns]")
     columns = [
-        TableColumn((name,), sliced(cells[number].to_numpy()), units.get(name) or None)
+        TableColumn(
+            (name,), cells[number].to_numpy(), _child_text(curves.get(name), "unit") or None
+        )
         for number, name in enumerate(names)
         if number != place
     ]
-    return Table(len(cells), columns, TableColumn(NO_NAME, sliced(stamps)))
-
-
-def _local_name(element: Any) -> str:
-    """Return the name of an element without its namespace."""
-    return str(element.tag).rpartition("}")[2]
+    return Table(len(cells), columns, stamps)
 
 
 def _child_text(parent: Any, name: str) -> str:
-    """Return the text of a child, empty if there is none."""
-    return next(((child.text or "").strip() for child in parent if _local_name(child) == name), "")
+    """Return the text of a child, in any namespace; empty if there is none."""
+    return (parent.findtext(f"{{*}}{name}") or "").strip() if parent is not None else ""
 
 
 scan, read = make_reader("witsml", _read_logs)

@@ -34,19 +34,9 @@ def rows_on_grid(
 ) -> Any:
     """Convert an array by row to an array by sample, float64, NaN where missing or infinite.
 
-    Parameters
-    ----------
-    rows : array, shape (..., n_rows)
-        numpy, memmap or dask.
-    unit : float, optional
-        Unit of which the values are whole multiples; the result has exact whole multiples of
-        ``unit * scale``.
-
-    Returns
-    -------
-    ndarray or dask.array.Array, shape (..., n_samples)
-        A numpy array if the result is small; chunks without any sample take no memory until they
-        are computed.
+    If the values are whole multiples of `unit`, the result has exact whole multiples of ``unit *
+    scale``. A small result is a numpy array; chunks of others without any sample take no memory
+    until they are computed.
     """
     size, lead, runs = placement.size, rows.shape[:-1], placement.runs
     convert = partial(_scale_samples, scale=scale, unit=unit)

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from gyrostab.errors import SchemaError
 from gyrostab.ingest.gap_table import MISSING, OUTSIDE_RANGE, UNREADABLE, sort_lines
 from gyrostab.ingest.grid.place import Placement
-from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, join_spans
+from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass
+from gyrostab.ingest.uniform.core import merge_spans
 from gyrostab.kernels.grid.stamps import DUPLICATE, OUT_OF_ORDER, RESTART, STEP
 from gyrostab.schema import GAP_CAUSES
 from gyrostab.store.row_inspection import find_spans
@@ -69,7 +70,7 @@ def _absent_rows(placement: Placement, scanned: ScanPass) -> NDArray[np.int64]:
         find_spans(~scanned.mask(begin, min(begin + BLOCK_ROWS, scanned.rows)), begin)
         for begin in range(0, scanned.rows, BLOCK_ROWS)
     ]
-    return join_spans(spans)
+    return merge_spans(spans)
 
 
 def _dropped_rows(events: NDArray[np.int64]) -> NDArray[np.int64]:

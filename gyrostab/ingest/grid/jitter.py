@@ -65,11 +65,6 @@ class JitterModel:
         """Code length of a stamp to the nanosecond, including the cost of its row [nats]."""
         return self.nats + float(np.log(max(self.sigma, MIN_SIGMA) * self.period))
 
-    @classmethod
-    def of_sharp(cls, period: float) -> JitterModel:
-        """Return the model of stamps that scatter by less than a tenth of a sample."""
-        return cls(period, MIN_SIGMA, "all", 1.0, 0.5)
-
 
 def observe_rows(stamps: Integers, observe: str, period: float) -> Integers:
     """Select the rows whose stamps are used; the last row of a block counts as end of its group."""
@@ -88,21 +83,9 @@ def fit_jitter(
 ) -> JitterModel | None:
     """Fit the sampling period that explains stretches of stamps best, with rare lost samples.
 
-    Parameters
-    ----------
-    parts : list of ndarray of int64
-        Stretches of stamps [ns], `NO_STAMP` where unreadable.
-    guesses : list of float
-        Periods to try in addition to those found in the stretches [ns].
-    observe : str
-        Rows to use; see `JitterModel`.
-    sure : float
-        Number of samples over which counting by the first estimate of the period is reliable.
-
-    Returns
-    -------
-    JitterModel or None
-        None if no period explains the stamps.
+    The stamps are `NO_STAMP` where unreadable. `guesses` are periods to try in addition to those
+    found in the stretches [ns]; `observe` names the rows to use (see `JitterModel`); `sure` is the
+    number of samples over which counting by the first estimate of the period is reliable.
     """
     observed = _observe_parts(parts, observe, guesses[0])
     lengths = (

@@ -218,20 +218,15 @@ def describe_placement(
             f"{_count_of(len(twice), 'row')}, first {_name_row(raw, int(twice[:, 2].min()))}"
         )
     late = events[events[:, 0] == OUT_OF_ORDER]
+    n_placed = int((samples_of(placement, late[:, 2]) >= 0).sum())
     if len(late):
-        n_placed = int((samples_of(placement, late[:, 2]) >= 0).sum())
         notes.append(
             f"{where}: out of order: {_count_of(len(late), 'row')}, first "
             f"{_name_row(raw, int(late[:, 2].min()))}; "
             f"{n_placed} were put in their place, {len(late) - n_placed} dropped"
         )
-    lost = (
-        scanned.rows
-        - scanned.absent
-        - placement.placed
-        - len(twice)
-        - (len(late) - n_placed if len(late) else 0)
-    )
+    dropped = len(twice) + len(late) - n_placed
+    lost = scanned.rows - scanned.absent - placement.placed - dropped
     if lost > 0:
         notes.append(
             f"{where}: dropped without a readable time stamp: {_count_of(lost, 'row')} whose "

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,12 +28,33 @@ def fit_pieces(
     jitter: JitterModel | None = None,
 ) -> NDArray[np.float64]:
     """Sum each unbroken piece: n, mean count, mean stamp [ns], cc, ct, squared residuals."""
+
+    def sum_block(
+        block: tuple[NDArray[np.int64], NDArray[np.int64]],
+    ) -> tuple[tuple[int, int] | None, NDArray[np.float64]]:
+        """Return first stamp, reference stamp and sums of the pieces of a block."""
+        values = block[1]
+        readable = readable_stamps(values)
+        if len(readable) == 0:
+            return None, np.empty((0, 6))
+        first = int(readable[0])
+        if jitter is not None:
+            readable, count, piece = count_samples(np.arange(len(values)), values, jitter, longest)
+        elif counted:
+            piece = np.concatenate([[0], np.cumsum(np.abs(np.diff(readable)) > longest)])
+            count = np.flatnonzero(values != NO_STAMP)  # rows without a readable stamp count too
+        else:
+            count, piece = track(readable, period, GAIN, longest)
+        tick = np.flatnonzero(np.diff(readable)) + 1
+        if coarse and jitter is None and tick.size > 1:
+            # the time is exact only where the stamp changes
+            readable, count, piece = readable[tick], count[tick], piece[tick]
+        sums = piece_sums(readable, count, piece, period)
+        return (first, int(readable[0])) if len(readable) else None, sums
+
     table = np.empty((0, 6))
     zero: int | None = None
-    work = partial(
-        _piece_sums, period=period, counted=counted, coarse=coarse, longest=longest, jitter=jitter
-    )
-    for first, sums in map_in_order(work, stamps()):
+    for first, sums in map_in_order(sum_block, stamps()):
         if first is None:
             continue
         zero = first[0] if zero is None else zero
@@ -45,38 +64,6 @@ def fit_pieces(
             table = table[np.argsort(-table[:, 3], kind="stable")[: _MAX_PIECES // 2]]
             table = table[np.argsort(table[:, 2], kind="stable")]
     return table
-
-
-def _piece_sums(
-    rows_and_stamps: tuple[NDArray[np.int64], NDArray[np.int64]],
-    *,
-    period: float,
-    counted: bool,
-    coarse: bool,
-    longest: float,
-    jitter: JitterModel | None,
-) -> tuple[tuple[int, int] | None, NDArray[np.float64]]:
-    """Return first stamp, reference stamp and sums of the pieces of a block."""
-    _, stamps = rows_and_stamps
-    block = readable_stamps(stamps)
-    if len(block) == 0:
-        return None, np.empty((0, 6))
-    first = int(block[0])
-    if jitter is not None:
-        block, count, piece = count_samples(np.arange(len(stamps)), stamps, jitter, longest)
-        return (first, int(block[0])) if len(block) else None, piece_sums(
-            block, count, piece, period
-        )
-    if counted:
-        piece = np.concatenate([[0], np.cumsum(np.abs(np.diff(block)) > longest)])
-        count = np.flatnonzero(stamps != NO_STAMP)  # rows without a readable stamp count too
-    else:
-        count, piece = track(block, period, GAIN, longest)
-    if (
-        coarse and (tick := np.flatnonzero(np.diff(block)) + 1).size > 1
-    ):  # the time is exact only where the stamp changes
-        block, count, piece = block[tick], count[tick], piece[tick]
-    return (first, int(block[0])), piece_sums(block, count, piece, period)
 
 
 def pool_pieces(

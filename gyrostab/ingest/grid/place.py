@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import TimeError
 from gyrostab.ingest.columns.stamps import read_stamps
-from gyrostab.ingest.gap_table import format_duration
+from gyrostab.ingest.gap_table import format_duration, is_restart
 from gyrostab.ingest.grid.rate import RateEstimate
 from gyrostab.ingest.grid.scan_pass import file_of
 from gyrostab.ingest.grid.starting_period import Stamps, readable_stamps, recut_blocks
@@ -133,36 +134,15 @@ def append_runs(
         runs.append(table)
 
 
-def place_without_time(rows: int, start: int) -> Placement:
-    """Place rows without stamps: every row is the next sample."""
-    return make_placement(start, [np.array([[0, 0, rows]], dtype=np.int64)], [])
-
-
 def place_by_stamp(
     stamps: Stamps, rate: float, *, tolerance: float, max_gap: float, where: str
 ) -> Placement:
-    """Place rows by their stamps.
+    """Place rows by their stamps; the result does not depend on the size of their blocks.
 
-    Parameters
-    ----------
-    stamps : callable
-        Returns an iterator over blocks of (row numbers, stamps [ns]); the result does not depend
-        on the size of the blocks.
-    rate : float
-        Sampling rate [Hz].
-    tolerance : float
-        Largest distance of the smoothed stamps from the grid, beyond half a sample, before a sample
-        is skipped [samples].
-    max_gap : float
-        A longer step ahead is taken as a step of the clock [s].
-
-    Raises
-    ------
-    TimeError
-        When no stamp can be read.
+    `tolerance` is the largest distance of the smoothed stamps from the grid, beyond half a sample,
+    before a sample is skipped [samples]; a step ahead above `max_gap` [s] is a step of the clock.
     """
-    nanoseconds, fraction = period_ns(rate)
-    period = nanoseconds + fraction
+    period = sum(period_ns(rate))
     state, ring = kernel.new_state()
     runs: list[NDArray[np.int64]] = []
     events: list[NDArray[np.int64]] = []
@@ -193,8 +173,7 @@ def _find_start(stamps: NDArray[np.int64], period: float) -> int:
     return int(stamps[0]) + (int(np.rint(delay * period)) if is_certain else 0)
 
 
-@dataclass
-class _Windows:
+class _Windows(NamedTuple):
     """Lead of the stamps over the row count in windows of equal length [samples]."""
 
     low: NDArray[np.float64]
@@ -206,7 +185,7 @@ class _Windows:
 
 def _make_windows(stamps: Stamps, period: float, width: int) -> tuple[_Windows, int]:
     """Make windows of `width` rows; also return the first stamp [ns]."""
-    parts: list[tuple[NDArray[np.float64], ...]] = []
+    parts: list[tuple[NDArray[Any], ...]] = []
     pending = np.empty(0, dtype=np.int64)
     first: int | None = None
     last: list[float] = []  # lead at the end of the previous window
@@ -223,15 +202,8 @@ def _make_windows(stamps: Stamps, period: float, width: int) -> tuple[_Windows, 
         last[:] = [filled[-1, -1]]
         at = np.arange(len(table)) * width + first_row
         low, high = filled.min(axis=1), filled.max(axis=1)
-        parts.append(
-            (
-                low,
-                high,
-                np.quantile(filled, 0.9, axis=1) - low,
-                at + step.argmax(axis=1),
-                at + step.argmin(axis=1),
-            )
-        )
+        reach = np.quantile(filled, 0.9, axis=1) - low
+        parts.append((low, high, reach, at + step.argmax(axis=1), at + step.argmin(axis=1)))
 
     for _, values in stamps():
         pending = np.concatenate([pending, values])
@@ -243,21 +215,21 @@ def _make_windows(stamps: Stamps, period: float, width: int) -> tuple[_Windows, 
             pending, done = pending[n:], done + n
     if first is not None and (len(pending) >= width // 2 or not parts) and len(pending):
         summarise(pending, done, first)
-    low, high, reach, up, down = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return _Windows(low, high, reach, up.astype(np.int64), down.astype(np.int64)), int(first or 0)
+    return _Windows(*map(np.concatenate, zip(*parts, strict=True))), int(first or 0)
 
 
-def _find_jumps(windows: _Windows) -> tuple[list[tuple[int, float, int, float]], float]:
-    """Find lasting shifts of the lower envelope (row count, size, window, level) and the wander."""
+def _find_jumps(windows: _Windows) -> tuple[list[tuple[int, float, float]], float]:
+    """Find lasting shifts of the lower envelope (row count, size, level) and the wander."""
     low = windows.low
     change = np.abs(np.diff(low))
     noise = 1.4826 * float(np.median(change)) if len(change) else 0.0
     min_size = max(6 * noise, float(np.median(windows.reach)), 3.0)
-    jumps: list[tuple[int, float, int, float]] = []
-    level, placed, wander, b = float(low[0]), float(low[0]), 0.0, 1
-    while b < len(low):
+    jumps: list[tuple[int, float, float]] = []
+    level, placed, wander = float(low[0]), float(low[0]), 0.0
+    for b in range(1, len(low)):
         next_lows = low[b : b + 3]
-        size = float(np.median(next_lows)) - level
+        usual = float(np.median(next_lows))
+        size = usual - level
         if (
             abs(size) > min_size
             and abs(low[b] - level) > min_size
@@ -267,14 +239,11 @@ def _find_jumps(windows: _Windows) -> tuple[list[tuple[int, float, int, float]],
             rows = (windows.up if size > 0 else windows.down)[b - 1 : b + 1]
             tops = windows.high[b - 1] - level if size > 0 else level - low[b - 1]
             row = int(rows[0]) if size > 0 and tops > 0.7 * size else int(rows[-1])
-            jumps.append((row, size, b, level))
-            level = float(np.median(next_lows))
-            placed += level - jumps[-1][3]
-            b += 1
-            continue
-        level += 0.2 * (float(low[b]) - level)
-        wander = max(wander, abs(level - placed))
-        b += 1
+            jumps.append((row, size, level))
+            level, placed = usual, placed + size
+        else:
+            level += 0.2 * (float(low[b]) - level)
+            wander = max(wander, abs(level - placed))
     return jumps, wander
 
 
@@ -283,13 +252,9 @@ def place_by_count(
 ) -> Placement:
     """Place rows by their count, for stamps that are times of arrival; a lasting delay is a loss.
 
-    Parameters
-    ----------
-    max_gap : float
-        A longer loss is taken as a step of the clock [s].
+    A loss longer than `max_gap` [s] is taken as a step of the clock.
     """
-    nanoseconds, fraction = period_ns(rate)
-    period = nanoseconds + fraction
+    period = sum(period_ns(rate))
     width = max(64, int(4 * rate))
     windows, first = _make_windows(stamps, period, width)
     jumps, wander = _find_jumps(windows)
@@ -297,57 +262,37 @@ def place_by_count(
     start = first + int(np.rint(edge * period)) if abs(edge) < 2 * width else first
     shifts, cuts, events = [0], [0], []
     begun = 0.0
-    for row, size, _window, level in jumps:
+    for row, size, level in jumps:
         extra = int(np.rint(size))
         stamp_before = first + int((row - 1 + level) * period)
         if size < 0 or size > max_gap * rate:
-            back = -size
-            elapsed = row + level - begun
-            cause = (
-                RESTART
-                if size < 0 and (2 * back > elapsed or row + level + size < 0.1 * elapsed)
-                else STEP
-            )
-            events.append(
-                (
-                    cause,
-                    row + shifts[-1],
-                    row,
-                    stamp_before,
-                    stamp_before + int((size + 1) * period),
-                )
-            )
-            extra, begun = 1, row + level + size
+            before, after = row + level, row + level + size
+            cause = RESTART if size < 0 and is_restart(0.0, begun, before, after) else STEP
+            stamp = stamp_before + int((size + 1) * period)
+            events.append((cause, row + shifts[-1], len(cuts), stamp_before, stamp))
+            extra, begun = 1, after
         shifts.append(shifts[-1] + extra)
         cuts.append(row)
-    runs = _counted_runs(stamps, np.array(cuts), np.array(shifts))
+    runs, cut_rows = _counted_runs(stamps, np.array(cuts), np.array(shifts))
     numbers = np.array(events, dtype=np.int64).reshape(-1, 5)
-    if len(numbers):
-        numbers[:, 2] = _rows_at(stamps, numbers[:, 2])
+    numbers[:, 2] = cut_rows[numbers[:, 2]]
     return make_placement(start, runs, [numbers], wander)
-
-
-def _rows_at(stamps: Stamps, counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the row numbers of the rows with the given counts."""
-    row_numbers, done = counts.copy(), 0
-    for rows, _ in stamps():
-        is_inside = (counts >= done) & (counts < done + len(rows))
-        row_numbers[is_inside] = rows[counts[is_inside] - done]
-        done += len(rows)
-    return row_numbers
 
 
 def _counted_runs(
     stamps: Stamps, cuts: NDArray[np.int64], shifts: NDArray[np.int64]
-) -> list[NDArray[np.int64]]:
-    """Make runs of rows by count; from count ``cuts[i]`` on, sample = count + ``shifts[i]``."""
+) -> tuple[list[NDArray[np.int64]], NDArray[np.int64]]:
+    """Make runs of rows by count; from count ``cuts[i]`` on, sample = count + ``shifts[i]``.
+
+    Also return the row number of each cut.
+    """
     runs: list[NDArray[np.int64]] = []
-    done = 0
+    cut_rows, done = cuts.copy(), 0
     for rows, _ in stamps():
-        if len(rows) == 0:
-            continue
-        count = np.arange(done, done + len(rows))
-        grid = count + shifts[np.searchsorted(cuts, count, side="right") - 1]
-        append_runs(runs, grid, rows)
-        done += len(rows)
-    return runs
+        if len(rows):
+            count = np.arange(done, done + len(rows))
+            append_runs(runs, count + shifts[np.searchsorted(cuts, count, side="right") - 1], rows)
+            is_inside = (cuts >= done) & (cuts < done + len(rows))
+            cut_rows[is_inside] = rows[cuts[is_inside] - done]
+            done += len(rows)
+    return runs, cut_rows

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from gyrostab.errors import TimeError
+from gyrostab.ingest.gap_table import is_restart
 from gyrostab.ingest.grid.jitter import (
     GAIN,
     MIN_SIGMA,
@@ -67,16 +68,10 @@ class _Placer:
                 )
 
     def _add_break(self, row: int, previous_stamp: int, stamp: int) -> None:
-        elapsed = previous_stamp - self.origin
-        is_restart = stamp < previous_stamp and (
-            stamp <= self.origin + 0.1 * elapsed or 2 * (previous_stamp - stamp) > elapsed
-        )
-        self.events.append(
-            np.array(
-                [[RESTART if is_restart else STEP, self.last + 1, row, previous_stamp, stamp]],
-                dtype=np.int64,
-            )
-        )
+        back = stamp < previous_stamp
+        is_new = back and is_restart(self.origin, self.origin, previous_stamp, stamp)
+        event = [RESTART if is_new else STEP, self.last + 1, row, previous_stamp, stamp]
+        self.events.append(np.array([event], dtype=np.int64))
 
     def _begin_piece(self, count: Integers, stamps: Integers, at: Integers) -> None:
         """Begin a piece; its first row is the next sample but one, or the first of the log."""
@@ -167,12 +162,8 @@ def place_in_order(
 ) -> Placement:
     """Place rows in order, for stamps with jitter: see `gyrostab.ingest.grid.jitter`.
 
-    Parameters
-    ----------
-    stamps, rate, tolerance, max_gap, where
-        As for `place_by_stamp`.
-    by_row : bool
-        Whether rows that `stamps` leaves out occupy samples.
+    With `by_row`, rows that `stamps` leaves out occupy samples. Other options are those of
+    `place_by_stamp`.
     """
     ahead = int(min(_AHEAD_ROWS * np.ceil(jitter.group), _MAX_AHEAD_ROWS))
     size = int(min(TRACE_ROWS * np.ceil(jitter.group), _MAX_ROWS))

@@ -81,17 +81,7 @@ def _round_rate(rate: float, error: float, samples: float, counted: bool) -> flo
 
 
 def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
-    """Find the sampling rate from the stamps.
-
-    Parameters
-    ----------
-    stamps : callable
-        Returns an iterator over blocks of (row numbers, stamps [ns]).
-
-    Raises
-    ------
-    TimeError
-        When all stamps are equal or unreadable, or time runs backwards.
+    """Find the sampling rate from the stamps; `TimeError` if they are all equal or run backwards.
 
     Examples
     --------
@@ -99,9 +89,7 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
     >>> estimate_rate(lambda: iter([(np.arange(1000), stamps)]), where="tool.csv").rate
     300.0
     """
-    stamps = partial(recut_blocks, stamps, _BLOCK)
-    stretches = sample_stretches(stamps)
-    parts = [readable_stamps(stretch) for stretch in stretches]
+    stamps, stretches, parts, sure = _sample_stamps(stamps)
     if not parts:
         raise TimeError(
             f"{where}: there is only one sample with a readable stamp, so no sampling rate can "
@@ -122,7 +110,6 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
             "(--map) and give --rate HZ"
         )
     period, counted, coarse = starting_period(stretches)
-    sure = _trusted_samples(parts)
     finer = None if counted else finer_period(parts, period)
     lost = None if finer is None else _estimate_sharp(stamps, parts, SECOND / finer)
     if lost is not None:
@@ -178,6 +165,16 @@ def _mean_rate(parts: list[NDArray[np.int64]]) -> float:
     return float(f"{np.median(rates):.4g}")
 
 
+def _sample_stamps(
+    stamps: Stamps,
+) -> tuple[Stamps, list[NDArray[np.int64]], list[NDArray[np.int64]], float]:
+    """Return stamps in even blocks, stretches, their readable stamps, and `_trusted_samples`."""
+    stamps = partial(recut_blocks, stamps, _BLOCK)
+    stretches = sample_stretches(stamps)
+    parts = [readable_stamps(stretch) for stretch in stretches]
+    return stamps, stretches, parts, _trusted_samples(parts)
+
+
 def _trusted_samples(parts: list[NDArray[np.int64]]) -> float:
     """Return the samples over which counting by a period from these stretches is reliable."""
     return min(_MAX_TRUSTED_SAMPLES, max(5.0, sum(len(part) - 1 for part in parts) / 20))
@@ -219,15 +216,12 @@ def estimate_near(stamps: Stamps, rate: float) -> RateEstimate | None:
     >>> estimate_rate(stamps, where="tool.csv").rate, estimate_near(stamps, 60.0).rate
     (100.0, 60.0)
     """
-    stamps = partial(recut_blocks, stamps, _BLOCK)
-    stretches = sample_stretches(stamps)
-    parts = [readable_stamps(stretch) for stretch in stretches]
+    stamps, stretches, parts, sure = _sample_stamps(stamps)
     if not parts:
         return None
     sharp = _estimate_sharp(stamps, parts, rate)
     if sharp is not None:
         return sharp
-    sure = _trusted_samples(parts)
     for observe in ("all", "last"):
         jitter = fit_jitter_near(stretches, SECOND / rate, observe, sure=sure)
         if jitter is not None:
@@ -249,8 +243,7 @@ def is_far_worse(stamps: Stamps, given: RateEstimate, estimated: RateEstimate) -
     """
     jitter = estimated.jitter
     if jitter is None and not estimated.counted:
-        stretches = sample_stretches(partial(recut_blocks, stamps, _BLOCK))
-        sure = _trusted_samples(stretches)
+        _, stretches, _, sure = _sample_stamps(stamps)
         jitter = fit_jitter_near(stretches, SECOND / estimated.raw, "all", sure=sure)
     return (
         given.jitter is not None

@@ -6,66 +6,33 @@ file, bit for bit, or NaN.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
-from functools import partial
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import xarray as xr
 
-from gyrostab.errors import OptionError, TimeError
-from gyrostab.ingest.columns.pieces import PiecewiseColumn
+from gyrostab.errors import OptionError
+from gyrostab.ingest.concat import concatenate_logs, split_axes
 from gyrostab.ingest.gap_table import gap_variables, name_lost, sort_gaps
-from gyrostab.ingest.grid.axes import regularise_axes
 from gyrostab.ingest.grid.fill import count_placed, gather_channel, rows_on_grid
 from gyrostab.ingest.grid.gaps import find_gaps
-from gyrostab.ingest.grid.jitter import JitterModel
-from gyrostab.ingest.grid.notes import (
-    describe_angles,
-    describe_channels,
-    describe_placement,
-    describe_rate,
-)
-from gyrostab.ingest.grid.place import (
-    Placement,
-    check_grid,
-    place_by_count,
-    place_by_stamp,
-    place_without_time,
-)
-from gyrostab.ingest.grid.place_in_order import place_in_order
-from gyrostab.ingest.grid.rate import (
-    RateEstimate,
-    deviating_stretches,
-    estimate_near,
-    estimate_rate,
-    is_far_worse,
-)
-from gyrostab.ingest.grid.repeats import find_repeats, with_repeats
-from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, file_of, scan_rows, stamp_blocks
-from gyrostab.ingest.grid.starting_period import Stamps
+from gyrostab.ingest.grid.notes import describe_angles, describe_channels, describe_placement
+from gyrostab.ingest.grid.place import Placement, check_grid
+from gyrostab.ingest.grid.place_rows import RowPlacer
+from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, file_of, scan_rows
 from gyrostab.ingest.limits import check_limits
 from gyrostab.ingest.uniform import as_uniform, check_same_rate
 from gyrostab.schema import SIGNAL_UNITS, check_raw, signal_name, texts
-from gyrostab.store.lazy import find_source, read_slice
 from gyrostab.store.write import chunk_samples
 from gyrostab.time.clock import extend_history
 from gyrostab.time.durations import duration_seconds
-from gyrostab.time.grid import check_rate, check_span, period_ns, stamp_ns, time_coordinate
+from gyrostab.time.grid import check_rate, check_span, first_stamp, time_coordinate
 from gyrostab.time.stamps import format_stamp
 from gyrostab.units import HOUR
+from gyrostab.wording import list_some
 
-_MAX_RATE_DIFFERENCE = 0.02  # relative, between declared and estimated rate
-_EVEN_ROWS = 2**18  # rows at the beginning that give the rate of a log with even stamps
-# Largest jitter at which stamps give the samples of 99 % of the rows; placing by stamp is then
-# tried first [samples].
-_SHARP_SIGMA = 0.2
-_MIN_DROPPED_ROWS = 10  # rows without a sample for which placing in order is tried
-_LATE_SHARE = 0.9  # share of the dropped rows that placing in order must recover
 # Share of the values of a channel that may be lost with rows that have no sample.
 _MAX_UNPLACED_SHARE = 0.1
-_MAX_ROUNDS = 4  # a repetition within another is found after the latter is removed
 _OWN_ATTRIBUTES = (
     "declared_rate_hz",
     "start",
@@ -87,179 +54,6 @@ def _check_options(*, rate: float | None, tolerance: float, chunk: int | None, b
         raise OptionError(
             f"chunk={chunk!r} and block={block!r} count samples and rows; give at least 1 and 64"
         )
-
-
-def _declared_rate(raw: xr.Dataset, rate: float | None) -> float | None:
-    value = rate if rate is not None else raw.attrs.get("declared_rate_hz")
-    return None if value is None else float(value)
-
-
-def _start_stamp(raw: xr.Dataset, notes: list[str]) -> int:
-    text = raw.attrs.get("start")
-    if not text:
-        notes.append(
-            f"{file_of(raw)[0]}: no time in the file and no --start: the log is said to start at "
-            "1970-01-01T00:00:00"
-        )
-        return 0
-    return stamp_ns(text)
-
-
-def _place_rows(
-    raw: xr.Dataset,
-    scanned: ScanPass,
-    declared: float | None,
-    *,
-    tolerance: float,
-    max_gap: float,
-    block: int,
-    notes: list[str],
-) -> tuple[Placement, float]:
-    where = file_of(raw)[0]
-    if "time" not in raw.variables:
-        if declared is None:
-            raise TimeError(
-                f"{where}: the file has no time column; give the sampling rate with --rate HZ"
-            )
-        return place_without_time(scanned.rows, _start_stamp(raw, notes)), declared
-    count_all_rows = (
-        scanned.absent <= 0.01 * scanned.rows
-    )  # single unreadable rows still occupy samples
-    stamps: Stamps = partial(stamp_blocks, raw, scanned, block=block)
-    counted: Stamps = partial(stamp_blocks, raw, scanned, block=block, all_rows=count_all_rows)
-    try:
-        estimate = estimate_rate(stamps, where=where)
-    except TimeError:
-        if declared is None or scanned.rows - scanned.absent > 1:
-            raise
-        estimate = RateEstimate(declared, 0.0, counted=False, coarse=False, raw=declared)
-    if declared is not None and abs(declared / estimate.raw - 1) > _MAX_RATE_DIFFERENCE:
-        near_estimate = estimate_near(stamps, declared)
-        named = (
-            estimate.even is not None and abs(declared / estimate.even - 1) <= _MAX_RATE_DIFFERENCE
-        )  # without the recurring losses
-        if (
-            near_estimate is None
-            or abs(declared / near_estimate.raw - 1) > _MAX_RATE_DIFFERENCE
-            or (not named and is_far_worse(stamps, near_estimate, estimate))
-        ):
-            raise TimeError(
-                f"{where}: the sampling rate given is {declared:.10g} Hz, but the time stamps "
-                f"say {estimate.raw:.6g} Hz, and neither "
-                "lost samples nor jitter explain the difference; "
-                "leave out --rate to use the stamps, or correct --rate, --epoch or the unit of "
-                "the time column"
-            )
-        notes.append(
-            f"{where}: the stamps alone say {estimate.raw:.6g} Hz; they fit the rate given, "
-            f"{declared:.10g} Hz, which is used"
-        )
-        estimate = near_estimate
-    rate = estimate.rate
-    if declared is not None:
-        rate, estimate = (
-            declared,
-            replace(estimate, finer=None, even=None),
-        )  # a given rate settles the question
-    if estimate.counted:
-        placement = place_by_count(counted, estimate, rate, max_gap=max_gap)
-        deviating: list[tuple[int, int, float]] = []
-    else:
-        placement, deviating = _place_stamped(
-            raw,
-            scanned,
-            stamps,
-            estimate,
-            rate,
-            count_all_rows=count_all_rows,
-            tolerance=tolerance,
-            max_gap=max_gap,
-            where=where,
-        )
-    notes += describe_rate(raw, estimate, rate, deviating, placement)
-    return replace(placement, rate_changes=tuple(stamp for _, stamp, _ in deviating)), rate
-
-
-def _place_even(
-    raw: xr.Dataset, scanned: ScanPass, place: Callable[..., tuple[Placement, float]]
-) -> tuple[Placement, float] | None:
-    """Place the rows of a long log with evenly spaced stamps, from its beginning alone.
-
-    Returns None if the stamps are not even, a row has no sample, or the beginning has notes.
-    """
-    clock = find_source(raw["time"].data) if "time" in raw.variables else None
-    line = clock.find_line() if isinstance(clock, PiecewiseColumn) else None
-    if line is None or scanned.absent or scanned.repeated or scanned.rows <= _EVEN_ROWS:
-        return None
-    start, step = line
-    stamps = (start + step * np.arange(_EVEN_ROWS)).view("datetime64[ns]")
-    signal = signal_name(raw)
-    values = read_slice(raw[signal].data, 0, _EVEN_ROWS)
-    head = xr.Dataset(
-        {signal: (("axis", "row"), values)},
-        {"time": ("row", stamps), "axis": raw["axis"].values},
-        raw.attrs,
-    )
-    present = replace(scanned, rows=_EVEN_ROWS, present=scanned.present[: _EVEN_ROWS // 8].copy())
-    notes: list[str] = []
-    placement, rate = place(head, present, notes=notes)
-    nanoseconds, fraction = period_ns(rate)
-    if (
-        notes
-        or fraction
-        or nanoseconds != step
-        or placement.runs.tolist() != [[0, 0, _EVEN_ROWS]]
-        or len(placement.events)
-    ):
-        return None
-    return replace(placement, runs=np.array([[0, 0, scanned.rows]], dtype=np.int64)), rate
-
-
-def _place_stamped(
-    raw: xr.Dataset,
-    scanned: ScanPass,
-    stamps: Stamps,
-    estimate: RateEstimate,
-    rate: float,
-    *,
-    count_all_rows: bool,
-    **options: Any,
-) -> tuple[Placement, list[tuple[int, int, float]]]:
-    """Place rows by their stamps, or in order if stamps have jitter; return deviating stretches."""
-    jitter = estimate.jitter
-
-    def place_along(jitter: JitterModel) -> Placement:
-        def place() -> Placement:  # repetitions occupy no samples
-            by_row = count_all_rows and not scanned.repeated
-            return place_in_order(stamps, jitter, rate, by_row=by_row, **options)
-
-        return _place_once(raw, scanned, place)
-
-    if jitter is not None and jitter.sigma > _SHARP_SIGMA:
-        return place_along(jitter), []
-    placement = _place_once(raw, scanned, partial(place_by_stamp, stamps, rate, **options))
-    dropped = scanned.rows - scanned.absent - scanned.repeated - placement.placed
-    if not scanned.repeated and (
-        dropped >= _MIN_DROPPED_ROWS or placement.has_late_rows
-    ):  # placing in order may recover them
-        along = place_along(jitter or JitterModel.of_sharp(1e9 / rate))
-        if along.placed - placement.placed >= _LATE_SHARE * dropped:
-            placement = along
-    return placement, deviating_stretches(stamps, 1e9 / rate)
-
-
-def _place_once(raw: xr.Dataset, scanned: ScanPass, place: Callable[[], Placement]) -> Placement:
-    """Place each sample once; repeated stretches of rows are duplicates, not clock restarts."""
-    placement, all_repeats = place(), np.empty((0, 3), dtype=np.int64)
-    for _ in range(_MAX_ROUNDS):
-        repeats = find_repeats(raw, signal_name(raw), placement)
-        if not len(repeats):
-            break
-        for row, _source, length in repeats.tolist():
-            scanned.leave_out(row, row + length)
-        all_repeats = np.concatenate([all_repeats, repeats])
-        placement = place()
-    return with_repeats(placement, raw, all_repeats) if len(all_repeats) else placement
 
 
 def _is_on_grid(channel: Any, n_filled: int, scanned: ScanPass, placement: Placement) -> bool:
@@ -312,6 +106,27 @@ def _log_attributes(
         "history": extend_history(raw, f"gyrostab.regularise: {done}"),
         "notes": [*texts(raw, "notes"), *notes],
     }
+
+
+def _describe_axes(
+    axis_rows: Sequence[Any], parts: Sequence[xr.Dataset], logs: Sequence[xr.Dataset]
+) -> tuple[list[str], str]:
+    """Return labels of logs of groups of axes with separate stamps, and a note on these."""
+    labels = [list_some(texts(part, "source_files")) for part in parts]
+    names = [", ".join(axes) for axes, _, _ in axis_rows]
+    if len(set(labels)) < len(labels):
+        labels = [f"{label} ({axes})" for label, axes in zip(labels, names, strict=True)]
+    starts = [first_stamp(log) for log in logs]
+    rate = logs[starts.index(min(starts))].attrs["sampling_rate_hz"]
+    members = [
+        f"{axes} in {label}"
+        + f" (begins {(start - min(starts)) / 1e9 * rate:.3g} samples later)"
+        * (start > min(starts))
+        for axes, label, start in zip(names, labels, starts, strict=True)
+    ]
+    return labels, (
+        f"the axes have separate stamps over the same time and form one log: {'; '.join(members)}"
+    )
 
 
 def regularise(
@@ -390,29 +205,23 @@ def regularise(
         return log
     check_raw(raw)
     if "axis_rows" in raw.attrs:
-        regularise_group = partial(
-            regularise,
-            rate=rate,
-            tolerance=tolerance,
-            max_gap=max_gap,
-            chunk=chunk,
-            block=block,
-            limits=limits,
-        )
-        return regularise_axes(raw, regularise_group, max_gap=max_gap, limits=limits)
+        options: dict[str, Any] = {"max_gap": max_gap, "limits": limits}
+        parts = [part.assign_attrs(notes=[]) for part in split_axes(raw)]
+        logs = [
+            regularise(part, rate=rate, tolerance=tolerance, chunk=chunk, block=block, **options)
+            for part in parts
+        ]
+        labels, note = _describe_axes(raw.attrs["axis_rows"], parts, logs)
+        log = concatenate_logs(logs, labels, **options)
+        return log.assign_attrs(notes=[*texts(raw, "notes"), *texts(log, "notes"), note])
     gap_limit = duration_seconds(max_gap, "max_gap")
     name = signal_name(raw)
     allowed = check_limits(limits)
     scanned = scan_rows(raw, name, block=block)
-    notes: list[str] = []
-    place = partial(
-        _place_rows,
-        declared=_declared_rate(raw, rate),
-        tolerance=tolerance,
-        max_gap=gap_limit,
-        block=block,
-    )
-    placement, hertz = _place_even(raw, scanned, place) or place(raw, scanned, notes=notes)
+    given = rate if rate is not None else raw.attrs.get("declared_rate_hz")
+    declared = None if given is None else float(given)
+    placer = RowPlacer(raw, scanned, declared, tolerance, gap_limit, block)
+    placement, hertz, notes = placer.place()
     check_grid(raw, placement, hertz, gap_limit, allowed)
     check_span(placement.start, hertz, placement.size, file_of(raw)[0])
     chunk = chunk or chunk_samples(hertz)

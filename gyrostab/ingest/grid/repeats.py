@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import xarray as xr
@@ -28,15 +29,7 @@ def find_repeats(raw: xr.Dataset, name: str, placement: Placement) -> NDArray[np
     Rows are equal if their stamps and values are. A clock that restarts may write the same stamps
     again, but with other values; values that never change are not taken as a repetition.
 
-    Parameters
-    ----------
-    placement : Placement
-        Rows on the grid, with the set-backs of the clock among the events.
-
-    Returns
-    -------
-    ndarray of int64, shape (n, 3)
-        First row of the repetition, first row of what it repeats, number of rows.
+    Returns (n, 3): first row of the repetition, first row of what it repeats, number of rows.
     """
     events = placement.events
     back = events[np.isin(events[:, 0], (STEP, RESTART)) & (events[:, 4] < events[:, 3])]
@@ -108,9 +101,4 @@ def with_repeats(placement: Placement, raw: xr.Dataset, repeats: NDArray[np.int6
         table = np.stack([np.full(length, DUPLICATE), sample, rows + row, stamps, stamps], axis=1)
         events.append(table[is_readable])
     table = np.concatenate(events)
-    return Placement(
-        placement.start,
-        placement.runs,
-        table[np.argsort(table[:, 1], kind="stable")],
-        placement.wander,
-    )
+    return replace(placement, events=table[np.argsort(table[:, 1], kind="stable")])

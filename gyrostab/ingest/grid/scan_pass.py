@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.pieces import InspectedRows
 from gyrostab.ingest.columns.stamps import read_stamps
-from gyrostab.ingest.uniform.core import merge_lines
+from gyrostab.ingest.uniform.core import merge_spans
 from gyrostab.schema import texts
 from gyrostab.store.lazy import find_source, read_slice
 from gyrostab.store.row_inspection import RowInspection, inspect_rows
@@ -53,12 +53,6 @@ class ScanPass:
         return bits[begin % 8 : begin % 8 + end - begin].astype(bool)
 
 
-def join_spans(parts: list[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Concatenate the spans of successive blocks of rows; spans that touch become one."""
-    spans = np.concatenate([*parts, np.empty((0, 2), dtype=np.int64)])
-    return np.stack(merge_lines(spans), axis=1)
-
-
 def _scan_block(
     raw: xr.Dataset, name: str, channels: Sequence[str], ends: tuple[int, int]
 ) -> RowInspection:
@@ -94,13 +88,7 @@ def _scan_blocks(
 
 
 def scan_rows(raw: xr.Dataset, name: str, *, block: int = BLOCK_ROWS) -> ScanPass:
-    """Scan every cell of a raw log once.
-
-    Raises
-    ------
-    FormatError
-        When no row holds a number.
-    """
+    """Scan every cell of a raw log once; `FormatError` when no row holds a number."""
     signal = raw[name].data
     n_axes, rows = signal.shape
     block -= block % 8
@@ -131,7 +119,7 @@ def scan_rows(raw: xr.Dataset, name: str, *, block: int = BLOCK_ROWS) -> ScanPas
     empty = [
         axis for axis, lowest, highest in zip(axes, low, high, strict=True) if lowest > highest
     ]
-    packed, spans = np.concatenate(bits), (join_spans(unreadable), join_spans(infinite))
+    packed, spans = np.concatenate(bits), (merge_spans(unreadable), merge_spans(infinite))
     return ScanPass(rows, packed, absent, *spans, still, empty, filled)
 
 
@@ -139,21 +127,16 @@ def stamp_blocks(
     raw: xr.Dataset, scanned: ScanPass, *, block: int = BLOCK_ROWS, all_rows: bool = False
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """Yield row numbers and stamps [ns] (or `NO_STAMP`) of rows with a sample, in blocks."""
-    blocks = _read_stamp_blocks(raw, scanned, block, all_rows=all_rows)
-    return map_in_order(lambda item: item, blocks, workers=1)
 
-
-def _read_stamp_blocks(
-    raw: xr.Dataset, scanned: ScanPass, block: int, *, all_rows: bool
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    for begin in range(0, scanned.rows, block):
+    def read_block(begin: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         end = min(scanned.rows, begin + block)
         values = read_stamps(raw, begin, end)
         if not scanned.repeated and (all_rows or scanned.absent == 0):
-            yield np.arange(begin, end), values
-        else:
-            keep = scanned.mask(begin, end)
-            yield np.flatnonzero(keep) + begin, values[keep]
+            return np.arange(begin, end), values
+        keep = scanned.mask(begin, end)
+        return np.flatnonzero(keep) + begin, values[keep]
+
+    return map_in_order(read_block, range(0, scanned.rows, block), workers=1)
 
 
 def _source_names(raw: xr.Dataset) -> list[str]:

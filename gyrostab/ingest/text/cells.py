@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from gyrostab.ingest.columns.dates import DAY_FIRST, YEAR_FIRST
 from gyrostab.ingest.columns.plan import Plan
 from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, from_fortran, integers_to_ns
-from gyrostab.ingest.options import ReadOptions
 from gyrostab.ingest.text.layout import BLANK, VOID_CELLS, Layout
 
 
@@ -28,10 +27,10 @@ class ParsedBlock(NamedTuple):
 class BlockParser:
     """Parse the rows of one file."""
 
-    def __init__(self, layout: Layout, plan: Plan, options: ReadOptions):
+    def __init__(self, layout: Layout, plan: Plan):
         from gyrostab.kernels.encoding import rows
 
-        self.layout, self.epoch = layout, options.epoch_ns
+        self.layout, self.epoch = layout, plan.time.epoch if plan.time else 0
         self.sources = sorted(column.source for column in plan.columns if column.role != "time")
         self.channels = {column.source for column in plan.of("channel")}
         self.time = plan.time.source if plan.time else None

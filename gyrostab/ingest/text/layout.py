@@ -104,18 +104,10 @@ def split_line(line: str, separator: str) -> list[str]:
 def find_layout(
     path: Path, head: bytes, *, complete: bool, limits: Mapping[str, float] | None = None
 ) -> Layout:
-    """Find the layout of a text log in its first bytes.
+    """Find the layout of a text log in its first bytes, which may be the `complete` file.
 
-    Parameters
-    ----------
-    complete : bool
-        Whether `head` is the whole file.
-
-    Raises
-    ------
-    FormatError
-        When the file is empty, is not text, has no data rows, or has more columns than the limit
-        allows.
+    `FormatError` when the file is empty, is not text, has no data rows, or has more columns than
+    the limit allows.
     """
     lines, notes = _decode_lines(path, head, complete=complete)
     filled = (
@@ -164,7 +156,8 @@ def find_layout(
             f"skipped {len(skipped)} line{'s' * (len(skipped) > 1)} above the header (from line "
             f"{skipped[0]})"
         )
-    comma = separator in COMMA_SEPARATORS and not _has_decimal_point(rows)
+    has_point = any("." in cell and is_number(cell) for row in rows for cell in row)
+    comma = separator in COMMA_SEPARATORS and not has_point
     notes += _describe_sources(headers, rows)
     top = tuple(lines[:above]) if header is not None else ()
     return Layout(
@@ -194,7 +187,7 @@ def _decode_lines(path: Path, head: bytes, *, complete: bool) -> tuple[list[str]
     try:
         text = b"\n".join(lines).decode("utf-8-sig").split("\n")
     except UnicodeDecodeError as error:
-        number = next(index for index, line in enumerate(lines) if not _is_utf8(line)) + 1
+        number = error.object.count(b"\n", 0, error.start) + 1
         notes.append(
             f"line {number} is not UTF-8 ({error.object[error.start : error.start + 1]!r}); the "
             "text was read as Latin-1"
@@ -279,14 +272,6 @@ def _join_headers(header: list[str], paired: int) -> list[str]:
     return [*header[:paired], joined, *header[paired + 2 :]]
 
 
-def _is_utf8(line: bytes) -> bool:
-    try:
-        line.decode("utf-8")
-    except UnicodeDecodeError:
-        return False
-    return True
-
-
 def _guess_separator(line: str) -> str:
     bare = _WITHIN_CELL.sub("", line)
     return next((mark for mark in ("\t", ";", ",") if mark in bare), BLANK)
@@ -368,18 +353,8 @@ def _find_units(cells: Sequence[str], header: Sequence[str]) -> dict[int, str]:
 
 def _commented_header(lines: list[str], first: int, separator: str, width: int) -> list[str] | None:
     """Return a header after ``#`` (EuRoC, numpy.savetxt): the last comment, if its width fits."""
-    for line in reversed(lines[:first]):
-        if not line.strip():
-            continue
-        if not _COMMENT.match(line):
-            return None
-        bare = line.strip().lstrip("#%").strip()
-        cells = _header_cells(bare, separator)
-        if len(cells) == width and not _is_data(cells, comma=False):
-            return cells
+    last = next((line for line in reversed(lines[:first]) if line.strip()), "")
+    if not _COMMENT.match(last):
         return None
-    return None
-
-
-def _has_decimal_point(rows: list[tuple[str, ...]]) -> bool:
-    return any("." in cell and is_number(cell) for row in rows for cell in row)
+    cells = _header_cells(last.strip().lstrip("#%").strip(), separator)
+    return cells if len(cells) == width and not _is_data(cells, comma=False) else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -71,8 +72,12 @@ def as_uniform(log: xr.Dataset) -> xr.Dataset:
     nominal = _declared_rate(log)
     grid, computed = grid_of(log, nominal)
     if not computed:
-        log = _onto_grid(log, grid)
-    if has_gap_table(log):
+        if len(grid.runs) > 1:
+            log = place_samples(log, grid.runs, grid.start, grid.rate, grid.size)
+        else:
+            time = time_coordinate(grid.start, grid.rate, grid.size)
+            log = log.drop_vars("time").assign_coords(time)
+    if "gap" in log.dims:
         log = _with_true_table(log, grid, nominal, computed=computed)
     true = {"sampling_rate_hz": grid.rate, "kind": signal_name(log)}
     if all(log.attrs.get(name) == value for name, value in true.items()):
@@ -113,10 +118,7 @@ def grid_of(log: xr.Dataset, nominal: float | None = None) -> tuple[UniformGrid,
 def advise_dates(times: NDArray[Any], name: str) -> str:
     """Return the call that makes datetime64 of cftime dates or pandas periods, or "".
 
-    Parameters
-    ----------
-    name : str
-        Name of the Dataset or DataArray in the call.
+    `name` is that of the Dataset or DataArray in the call.
     """
     first = times.flat[0] if times.size else None
     if isinstance(first, pd.Period):
@@ -158,14 +160,6 @@ def _declared_rate(log: xr.Dataset) -> float | None:
     return rate if np.isfinite(rate) and rate > 0 else None
 
 
-def _onto_grid(log: xr.Dataset, grid: UniformGrid) -> xr.Dataset:
-    if len(grid.runs) > 1:
-        return place_samples(log, grid.runs, grid.start, grid.rate, grid.size)
-    bare: xr.Dataset = log.drop_vars("time")
-    timed: xr.Dataset = bare.assign_coords(time_coordinate(grid.start, grid.rate, grid.size))
-    return timed
-
-
 def _with_true_table(
     log: xr.Dataset, grid: UniformGrid, declared: float | None, *, computed: bool
 ) -> xr.Dataset:
@@ -196,21 +190,11 @@ CHUNK_SAMPLES = 2**20
 
 
 def place_samples(log: xr.Dataset, runs: Runs, start: int, rate: float, size: int) -> xr.Dataset:
-    """Place the samples of a log on a grid, NaN where missing; lazy variables stay lazy.
+    """Place the variables along ``time`` of a log on a grid; lazy ones stay lazy.
 
-    Parameters
-    ----------
-    log : xarray.Dataset
-        Log whose variables along ``time`` are placed; others stay.
-    runs : ndarray of int64, shape (n, 3)
-        First sample of the grid, first sample of the log, length.
-    start, rate, size : int, float, int
-        First stamp [ns since 1970], sampling rate [Hz] and samples of the grid.
-
-    Returns
-    -------
-    xarray.Dataset
-        Log with a computed time axis. Variables without numbers are left out, with a note.
+    `runs` (n, 3) are first sample of the grid, first sample of the log, length; `start` and `rate`
+    those of the grid [ns since 1970, Hz]. Missing samples are NaN. Variables without numbers are
+    left out, with a note.
     """
     moved = {name: variable for name, variable in log.variables.items() if "time" in variable.dims}
     placed, left_out = {}, []
@@ -248,22 +232,11 @@ def _place_array(array: Any, runs: Runs, size: int) -> Any:
 Table = NDArray[np.int64]
 
 
-def has_gap_table(log: xr.Dataset) -> bool:
-    """Return whether a log has variables by gap."""
-    return "gap" in log.dims
-
-
 def _change_rate(table: Table, log: xr.Dataset, old_rate: float, start: int, rate: float) -> Table:
     """Convert the table for a log of which every n-th sample was selected.
 
-    Parameters
-    ----------
-    table : ndarray of int64, shape (n, 5)
-        Table of `read_gaps`, on the grid of the selected samples.
-    log : xarray.Dataset
-        Log with the exact ends of the gaps.
-    old_rate : float
-        Sampling rate for which the table was made [Hz].
+    `table` is that of `read_gaps`, on the grid of the selected samples; `log` has the exact ends of
+    the gaps; the table was made for the sampling rate `old_rate` [Hz].
     """
     columns = read_gap_columns(log)
     assert columns is not None  # read_gaps has read them
@@ -303,25 +276,25 @@ def _add_holes(table: Table, runs: Table) -> Table:
     return sort_gaps(np.concatenate([table, holes]))
 
 
+def merge_spans(spans: Sequence[Table]) -> Table:
+    """Return the union of half-open spans (first, end), in order."""
+    return np.stack(merge_lines(np.concatenate([*spans, np.empty((0, 2), np.int64)])), axis=1)
+
+
 def merge_lines(table: Table) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return first samples and ends of the union of the lines of a table."""
     order = np.argsort(table[:, FIRST], kind="stable")
-    first, end = (
-        table[order, FIRST],
-        np.maximum.accumulate(table[order, END]) if len(table) else table[:, END],
-    )
-    new = np.concatenate([[True], first[1:] > end[:-1]]) if len(table) else np.zeros(0, np.bool_)
-    last = np.concatenate([new[1:], [True]]) if len(table) else new
-    return first[new], end[last]
+    first, end = table[order, FIRST], np.maximum.accumulate(table[order, END])
+    is_apart = first[1:] > end[:-1]
+    edge = np.ones(min(len(table), 1), dtype=bool)
+    return first[np.append(edge, is_apart)], end[np.append(is_apart, edge)]
 
 
 def add_spans(table: Table, spans: Table, cause: int) -> Table:
     """Add spans of samples (first, end) of one cause to a table."""
-    rows = [
-        np.array([[first, end, end - first, 0, cause]], dtype=np.int64)
-        for first, end in spans.tolist()
-    ]
-    return sort_gaps(np.concatenate([table, *rows]))
+    length = spans[:, 1] - spans[:, 0]
+    lines = np.column_stack([spans, length, np.zeros_like(length), np.full_like(length, cause)])
+    return sort_gaps(np.concatenate([table, lines]))
 
 
 def with_table(log: xr.Dataset, table: Table | None, start: int, rate: float) -> xr.Dataset:

@@ -16,8 +16,7 @@ from gyrostab.ingest.gap_table import OUTSIDE_RANGE, clip_table, read_gaps
 from gyrostab.ingest.uniform.core import (
     add_spans,
     grid_of,
-    has_gap_table,
-    merge_lines,
+    merge_spans,
     place_samples,
     with_table,
 )
@@ -40,11 +39,8 @@ Span = str | tuple[Any, Any]
 def parse_instant(value: Any, option: str, *, example: str = _EXAMPLE) -> int | float:
     """Parse an instant: a date [ns since 1970, int], or a duration after the start [s, float].
 
-    Parameters
-    ----------
-    value : str, timedelta, datetime or float
-        ISO 8601 text (UTC unless it says otherwise), a duration such as ``"10min"``, a number of
-        seconds after the start.
+    Dates are ISO 8601 text (UTC unless it says otherwise) or datetimes; durations are such as
+    ``"10min"`` or a number of seconds.
 
     Examples
     --------
@@ -106,7 +102,7 @@ def cut_log(
     >>> cut_log(log, time_from="2s", time_to="8s", exclude="3s/5s").rate.values
     array([[ 2., nan, nan,  5.,  6.,  7.]])
     """
-    spans = _list_spans(exclude)
+    spans = _parse_spans(exclude)
     if time_from is None and time_to is None and not spans:
         return log
     check_log(log)
@@ -121,18 +117,25 @@ def cut_log(
     high = grid.size if time_to is None else clock.sample_of(time_to, "--to", last=grid.size)
     if low >= high:
         ends = (("--from", time_from), ("--to", time_to))
-        given = " and ".join(f"{option} {end}" for option, end in ends if end is not None)
-        raise OptionError(f"nothing is left with {given}; {clock.describe()}")
-    excluded = _merge_spans([clock.span_of(span, low, high) for span in spans])
+        named = " and ".join(f"{option} {end}" for option, end in ends if end is not None)
+        raise OptionError(f"nothing is left with {named}; {clock.describe()}")
+    given = [clock.span_of(span, low, high) for span in spans]
+    excluded = merge_spans([np.array([span]) for span in given if span[1] > span[0]])
     runs = _kept_runs(low, high, excluded)
     if not len(runs):
         raise OptionError(f"--exclude leaves nothing of the log; {clock.describe()}")
     start, size = int(grid_times(grid.start, grid.rate, low)), high - low
     part = _cut_samples(log, runs, start, grid, low, size)
     part = _cut_channels(part, grid, low, high, excluded)
-    if has_gap_table(log) or len(excluded):
+    if "gap" in log.dims or len(excluded):
         part = with_table(part, _cut_table(log, grid, low, high, excluded), start, grid.rate)
-    return part.assign_attrs(history=_describe_cut(log, time_from, time_to, spans, size))
+    options = [
+        *([f"from {time_from}"] if time_from is not None else []),
+        *([f"to {time_to}"] if time_to is not None else []),
+        *(f"without {first}/{end}" for first, end in spans),
+    ]
+    done = f"gyrostab.cut_log: {', '.join(options)}: {size} samples"
+    return part.assign_attrs(history=extend_history(log, done))
 
 
 def check_cut(
@@ -149,32 +152,23 @@ def check_cut(
     for option, value in (("--from", time_from), ("--to", time_to)):
         if value is not None:
             parse_instant(value, option)
-    for span in _list_spans(exclude):
-        for value in _split_span(span):
+    for ends in _parse_spans(exclude):
+        for value in ends:
             parse_instant(value, "--exclude", example=_SPAN_EXAMPLE)
 
 
-def _list_spans(exclude: Span | Sequence[Span]) -> list[Span]:
-    return [exclude] if isinstance(exclude, str) or _is_pair(exclude) else list(exclude)  # type: ignore[list-item]
-
-
-def _split_span(span: Span) -> list[Any]:
-    """Return the two ends of an excluded span."""
-    ends = [part.strip() for part in span.split("/")] if isinstance(span, str) else list(span)
-    if len(ends) != 2 or not all(str(end) for end in ends):
-        text = _format_span(span)
-        raise OptionError(f"--exclude {text!r}: write START/END, for instance {_SPAN_EXAMPLE}")
-    return ends
-
-
-def _format_span(span: Span) -> str:
-    return span if isinstance(span, str) else "/".join(map(str, span))
-
-
-def _is_pair(value: Any) -> bool:
-    return (
-        isinstance(value, tuple) and len(value) == 2 and not any("/" in str(end) for end in value)
-    )
+def _parse_spans(exclude: Any) -> list[tuple[Any, Any]]:
+    """Return the two ends of each excluded span; `exclude` is one or several."""
+    is_pair = isinstance(exclude, tuple) and len(exclude) == 2
+    is_single = isinstance(exclude, str) or (is_pair and not any("/" in str(e) for e in exclude))
+    spans = []
+    for span in [exclude] if is_single else exclude:
+        ends = [end.strip() for end in span.split("/")] if isinstance(span, str) else list(span)
+        if len(ends) != 2 or not all(str(end) for end in ends):
+            text = "/".join(map(str, ends))
+            raise OptionError(f"--exclude {text!r}: write START/END, for instance {_SPAN_EXAMPLE}")
+        spans.append((ends[0], ends[1]))
+    return spans
 
 
 class _Clock:
@@ -185,14 +179,10 @@ class _Clock:
 
     def describe(self) -> str:
         """Describe the time range of the record."""
-        first, end = (
-            np.datetime64(int(grid_times(self.grid.start, self.grid.rate, n)), "ns")
-            for n in (0, self.grid.size)
-        )
-        return (
-            f"the record goes from {_format_stamp(first)} to {_format_stamp(end)} "
-            f"({self.grid.size / self.grid.rate:.6g} s)"
-        )
+        start, rate, size, _ = self.grid
+        first, end = (str(np.datetime64(int(grid_times(start, rate, n)), "ns")) for n in (0, size))
+        first, end = (text.rstrip("0").rstrip(".") for text in (first, end))
+        return f"the record goes from {first} to {end} ({size / rate:.6g} s)"
 
     def sample_of(self, value: Any, option: str, *, last: int) -> int:
         """Return the first sample at or after an instant, which must lie in the record."""
@@ -214,9 +204,9 @@ class _Clock:
             sample += 1
         return sample
 
-    def span_of(self, span: Span, low: int, high: int) -> tuple[int, int]:
+    def span_of(self, ends: tuple[Any, Any], low: int, high: int) -> tuple[int, int]:
         """Return the samples of an excluded span within the kept part."""
-        ends, text = _split_span(span), _format_span(span)
+        text = f"{ends[0]}/{ends[1]}"
         first, end = (self.first_at(value, "--exclude", example=_SPAN_EXAMPLE) for value in ends)
         if end < first:
             raise OptionError(
@@ -226,17 +216,6 @@ class _Clock:
         if first >= self.grid.size or end <= 0:
             raise OptionError(f"--exclude {text} lies outside the record; {self.describe()}")
         return max(first, low), min(end, high)
-
-
-def _format_stamp(stamp: np.datetime64) -> str:
-    text = str(stamp)
-    return text.rstrip("0").rstrip(".") if "." in text else text
-
-
-def _merge_spans(spans: Sequence[tuple[int, int]]) -> NDArray[np.int64]:
-    """Sort spans, merge those that touch, and drop empty ones."""
-    filled = np.array([span for span in spans if span[1] > span[0]], dtype=np.int64)
-    return np.stack(merge_lines(filled.reshape(-1, 2)), axis=1)
 
 
 def _kept_runs(low: int, high: int, excluded: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -279,7 +258,7 @@ def _cut_channels(
 def _cut_table(
     log: xr.Dataset, grid: UniformGrid, low: int, high: int, excluded: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    table = read_gaps(log, grid.start, grid.rate) if has_gap_table(log) else None
+    table = read_gaps(log, grid.start, grid.rate) if "gap" in log.dims else None
     pieces = [np.empty((0, 5), dtype=np.int64)]
     edges = [low, *excluded.ravel().tolist(), high]
     for first, end in zip(edges[::2], edges[1::2], strict=True):
@@ -288,15 +267,3 @@ def _cut_table(
     cut = add_spans(np.concatenate(pieces), excluded, OUTSIDE_RANGE)
     cut[:, :2] -= low
     return cut
-
-
-def _describe_cut(
-    log: xr.Dataset, time_from: Any, time_to: Any, spans: Sequence[Span], size: int
-) -> str:
-    options = [
-        f"{name} {value}"
-        for name, value in (("from", time_from), ("to", time_to))
-        if value is not None
-    ]
-    options += [f"without {_format_span(span)}" for span in spans]
-    return extend_history(log, f"gyrostab.cut_log: {', '.join(options)}: {size} samples")

@@ -48,24 +48,10 @@ class _Steps(NamedTuple):
 
 
 def find_grid(read: ReadStamps, count: int, *, nominal: float | None = None) -> UniformGrid:
-    """Find the uniform grid of stamps, reading them in blocks.
+    """Find the slowest uniform grid that contains every stamp, reading them in blocks.
 
-    Parameters
-    ----------
-    read : callable
-        First stamp, stamp after the last one -> stamps [ns since 1970].
-    nominal : float, optional
-        Sampling rate that the log declares [Hz]; only a candidate, the stamps decide.
-
-    Returns
-    -------
-    UniformGrid
-        The slowest grid that contains every stamp.
-
-    Raises
-    ------
-    TimeError
-        When stamps are missing, repeated, out of order or not uniform.
+    `nominal` is the sampling rate that the log declares [Hz]; it is only a candidate, the stamps
+    decide. `TimeError` when stamps are missing, repeated, out of order or not uniform.
 
     Examples
     --------

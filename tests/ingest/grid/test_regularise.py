@@ -14,11 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.errors import FormatError, OptionError, TimeError
-from gyrostab.ingest.files import read_log
 from gyrostab.ingest.grid.fill import rows_on_grid
 from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.place import place_by_stamp
 from gyrostab.ingest.grid.regularise import regularise
+from gyrostab.ingest.reading import read_log
 from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import check_log
 from tests.support.raw_rows import START, expected, raw_log, stamps_of

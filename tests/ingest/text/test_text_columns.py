@@ -11,7 +11,7 @@ import pytest
 
 from gyrostab.errors import FormatError, GyrostabError, MissingUnitError, OptionError, UnitError
 from gyrostab.ingest import read_log
-from gyrostab.ingest.columns.headers import distinct_columns
+from gyrostab.ingest.columns.headers import FileColumn, distinct_columns
 from gyrostab.units import INNER
 from tests.support.text_logs import PLAIN, ns, write
 
@@ -214,7 +214,8 @@ def test_only_the_ramp_has_any_scale(tmp_path: Path) -> None:
 
 
 def test_keys_of_columns_are_unique() -> None:
-    keys = [column.key for column in distinct_columns(["wx", "wx", "wx", "wx_2", "wx"])]
+    columns = [FileColumn(name) for name in ("wx", "wx", "wx", "wx_2", "wx")]
+    keys = [column.key for column in distinct_columns(columns)]
     assert keys == ["wx", "wx_3", "wx_4", "wx_2", "wx_5"]
 
 

@@ -1,0 +1,165 @@
+"""Choose the time column of a file, its unit, and the order of day and month in its dates."""
+
+from __future__ import annotations
+
+from gyrostab.errors import GyrostabError, MissingUnitError, UnitError
+from gyrostab.ingest.columns.dates import (
+    DAY_FIRST,
+    EITHER_FIRST,
+    MONTH_FIRST,
+    NO_DATE,
+    YEAR_FIRST,
+    parse_order,
+)
+from gyrostab.ingest.columns.headers import (
+    KNOWN_CHANNEL_PATTERN,
+    TIME_PATTERN,
+    Header,
+    is_time_unit,
+    split_header,
+)
+from gyrostab.ingest.columns.plan_draft import Column, PlanDraft, by_lower_name
+from gyrostab.ingest.columns.stamps import TimeUnit, names_epoch, parse_time_unit
+
+
+def find_time(draft: PlanDraft, named: list[Header]) -> Header | None:
+    """Choose the time column and its unit; other candidates are left out with a note."""
+    time_columns = [c for c in named if c.low == "time" and c.mapped] or [
+        c for c in named if c.low == "time" and c.preset
+    ]
+    if not time_columns:
+        time_columns = [
+            c
+            for c in named
+            if not (c.mapped or c.preset) and TIME_PATTERN.match(c.low) and _may_be_time(c)
+        ]
+        sure = [c for c in time_columns if c.low != "t" or c.unit or c.stored or c.file.stamped]
+        time_columns = sure or time_columns
+    if not time_columns:
+        time_columns = [
+            c
+            for c in named
+            if c.file.stamped
+            and draft.rising(c.source)
+            and not (c.mapped or c.preset)
+            and not (c.file.date_order == NO_DATE and draft.options.rate is not None)
+        ]
+        reason = "it holds dates"
+        if not time_columns:
+            clocks = [c for c in named if _is_clock(draft, c)]
+            time_columns = clocks if len(clocks) == 1 else []
+            reason = "it is the only column that rises in a unit of time"
+        if time_columns:
+            header = time_columns[0].header
+            draft.notes.append(f"{header!r} is taken for the time column, as {reason}")
+    if not time_columns:
+        return None
+    column, *rivals = sorted(time_columns, key=lambda c: not draft.rising(c.source))
+    rivals += [c for c in named if c.low == "time" and c not in time_columns]
+    if rivals:
+        names = " and ".join(repr(c.header) for c in [column, *rivals][:3])
+        draft.notes.append(
+            f"{names} look like the time; {column.header!r} is used (for another: --map "
+            f'"{rivals[0].key}=time")'
+        )
+        for rival in rivals:
+            draft.leave_out(rival)
+        named[:] = [c for c in named if c not in rivals]
+    unit = None if column.file.stamped else _time_unit(draft, column)
+    order = _date_order(draft, column) if column.file.stamped else YEAR_FIRST
+    planned = column.source, column.header, "time", "time", "time", "ns"
+    draft.columns.append(
+        Column(*planned, time_unit=unit, date_order=order, epoch=draft.options.epoch_ns)
+    )
+    written = unit.text if unit else None
+    if column.file.stamped:
+        written = "ISO 8601" if order == YEAR_FIRST else order
+    draft.add_summary(column, "time", "time", "time", written)
+    if (
+        unit is not None
+        and unit.epoch is None
+        and draft.options.epoch is None
+        and not draft.options.channels_only
+    ):
+        draft.notes.append(
+            "numeric time is counted from 1970-01-01T00:00:00 UTC; give --epoch for another zero"
+        )
+    if unit is not None and unit.epoch is not None and draft.options.epoch is not None:
+        draft.notes.append(
+            f"--epoch is not used: the time column {column.header!r} is in {unit.text!r}"
+        )
+    return column
+
+
+def _may_be_time(column: Header) -> bool:
+    written = column.unit or column.stored
+    # An epoch that cannot be read is reported, not ignored.
+    return written is None or column.file.stamped or names_epoch(written) or is_time_unit(written)
+
+
+def _is_clock(draft: PlanDraft, column: Header) -> bool:
+    """Return whether a column of another name has a unit of time, and values known to rise."""
+    unit = column.unit or column.stored
+    return (
+        unit is not None
+        and (is_time_unit(unit) or names_epoch(unit))
+        and not (column.mapped or column.preset)
+        and not KNOWN_CHANNEL_PATTERN.match(column.low)
+        and draft.knows_rising
+        and draft.rising(column.source)
+    )
+
+
+def _date_order(draft: PlanDraft, column: Header) -> str:
+    """Return the order of day, month and year: from the user, the header, or the dates."""
+    keys_by_name = by_lower_name(draft.options.unit)
+    keys = [column.name, column.key, column.header, "time"]
+    for key in (keys_by_name[low] for low in map(str.lower, keys) if low in keys_by_name):
+        if order := parse_order(draft.options.unit[key]):
+            draft.used_units.add(key)
+            return order
+    order = parse_order(column.unit or column.stored or "") or column.file.date_order
+    if order == NO_DATE:
+        draft.refuse(
+            UnitError,
+            f"the time column {column.header!r} holds times of day without a date; write the date "
+            "before the time, in this column or in one to its left",
+        )
+    if order is None:
+        draft.refuse(
+            UnitError,
+            f"the dates in the time column {column.header!r} can be read in two ways; say which "
+            f"number is the day: --unit time={DAY_FIRST} or --unit time={MONTH_FIRST}",
+        )
+    return order or EITHER_FIRST
+
+
+def _time_unit(draft: PlanDraft, column: Header) -> TimeUnit | None:
+    suffix = TIME_PATTERN.match(split_header(column.header)[0].lower())
+    named = next((text for text in suffix.groups() if text), None) if suffix else None
+    written = column.unit or (
+        named if named not in ("utc", "iso") and column.stored is None else None
+    )
+    keys = [column.name, column.key, column.header, "time"]
+    text = draft.find_unit(column, keys, written, is_time_unit, prefer_given=column.unit is None)
+    if text is None:
+        word = draft.word_in(column.source)
+        draft.refuse(
+            MissingUnitError,
+            f"the time column {column.header!r} holds {word!r}, which is neither a number nor a "
+            "date in a form that is read; write the year with four digits and a zone as an offset, "
+            "for instance 2026-05-01T08:00:00-06:00, 01.05.2026 8:00:00, 01-May-2026 08:00:00 or "
+            "05/20/2026 8:00:00 AM"
+            if word
+            else f"the time column {column.header!r} carries no unit, and holds no dates; give the "
+            "unit of numbers with --unit time=s (or ms, us, ns)",
+        )
+        return None
+    try:
+        return parse_time_unit(text, column.file.calendar if text == column.stored else None)
+    except GyrostabError as error:
+        advice = '"time=seconds since 2026-01-02T00:00:00"' if names_epoch(text) else "time=s"
+        draft.refuse(
+            UnitError, f"column {column.header!r}: {error}; or give it with --unit {advice}"
+        )
+        return None

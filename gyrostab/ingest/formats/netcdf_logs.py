@@ -1,0 +1,289 @@
+"""Regular logs in NetCDF files and Zarr stores, of gyrostab and of other programs."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import FormatError, SchemaError, TimeError
+from gyrostab.ingest.columns.stamps import names_epoch
+from gyrostab.ingest.concat.grid import log_span
+from gyrostab.ingest.formats.netcdf_classic import read_classic_header
+from gyrostab.ingest.formats.netcdf_variables import with_default_fill
+from gyrostab.ingest.formats.packing import decode_variables
+from gyrostab.ingest.limits import check_declared, check_stored
+from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
+from gyrostab.ingest.uniform import as_uniform
+from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name
+from gyrostab.store.attributes import decode_attributes, decode_json
+from gyrostab.store.blosc_chunks import check_blosc_chunks
+from gyrostab.store.cf import from_disk
+from gyrostab.store.hdf5_heaps import check_global_heaps
+from gyrostab.store.netcdf_log import StoredLog, read_attribute
+from gyrostab.store.read import open_stored
+from gyrostab.store.remote import find_url
+from gyrostab.store.safe_names import ORIGINAL_NAME
+from gyrostab.store.times import index_dim, parse_time_grids
+from gyrostab.time.grid import grid_times, time_coordinate
+from gyrostab.time.stamps import to_nanoseconds
+from gyrostab.units import ON_DISK
+
+CHECKED_BLOCKS = 33
+#: Options to open a file with xarray; numbers and stamps are decoded when they are read.
+_UNDECODED: dict[str, Any] = {
+    "chunks": None,
+    "mask_and_scale": False,
+    "decode_times": False,
+    "create_default_indexes": False,
+}
+_OTHER_CONTENT = {"surface": "a dynamic Allan variance", "product": "a product"}
+
+
+def open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
+    """Open a regular log, of gyrostab or with a stamp for each sample; None for other files."""
+    if url := find_url(path):
+        return _open_remote(path, url)
+    if path.is_file():
+        read_classic_header(path)  # before the library allocates what a damaged header asks for
+    content = read_attribute(path, "gyrostab_content")
+    if content == "log":
+        check = partial(check_declared, given=options.limits)
+        return _open_own(path, open_stored(path, strict=options.strict, check=check))
+    if path.is_file():
+        check_global_heaps(path)
+    if content in _OTHER_CONTENT and not options.channels_only:
+        raise FormatError(
+            f"{path.name}: is {_OTHER_CONTENT[content]} that gyrostab wrote, not a log; give the "
+            "log that it was made from"
+        )
+    if path.is_dir():
+        check_blosc_chunks(path)
+    regular = _open_regular(path)
+    if regular is None:
+        return None
+    log = _as_in_memory(path, decode_variables(path, regular))  # an index would load every stamp
+    log.set_close(regular.close)
+    check_stored(path, log.sizes.get("time", 0), log.sizes.get("axis", 1), options.limits)
+    try:
+        return _with_uniform_time(log)
+    except SchemaError as error:
+        raise SchemaError(f"{path.name}: {error}") from error
+    except TimeError:
+        log.close()
+        return None  # its rows are placed by their stamps, like those of other files
+
+
+def _open_remote(path: Path, url: str) -> xr.Dataset:
+    """Open a Zarr log of gyrostab at an address."""
+    stored = open_stored(path)
+    content = str(stored.attrs.get("gyrostab_content", ""))
+    if content != "log":
+        raise FormatError(
+            f"{url}: is {_OTHER_CONTENT.get(content, 'a Zarr store of another program')}"
+            ", not a log of gyrostab; open it with xarray and give it to gyrostab.davar, or copy "
+            "it here and use gyrostab ingest"
+        )
+    return _open_own(path, stored)
+
+
+def _as_in_memory(path: Path, log: xr.Dataset) -> xr.Dataset:
+    """Convert units, names of axes and attributes to their form in memory."""
+    if path.is_dir():
+        log = log[sorted(log.variables, key=str)]  # the order within a directory is arbitrary
+    for name in log.variables:
+        units = log[name].attrs.get("units")
+        if units in ON_DISK.values():
+            log[name].attrs["units"] = next(
+                inner for inner, disk in ON_DISK.items() if disk == units
+            )
+    log = log.assign_coords(
+        axis=_read_labels(path, log["axis"]) if log["axis"].ndim else str(log["axis"].values)
+    )
+    decode_json(log.attrs)
+    log.attrs = {
+        name: value.item() if isinstance(value, np.generic) else value
+        for name, value in log.attrs.items()
+    }
+    log.attrs.setdefault("source_files", [path.name])
+    return log
+
+
+def _open_regular(path: Path) -> xr.Dataset | None:
+    """Open a regular log of another program undecoded, with its default fill values."""
+    zarr_format, attributes = (
+        _read_group(path) if path.is_dir() else (0, {"sampling_rate_hz": None})
+    )
+    if "sampling_rate_hz" not in attributes:
+        return None
+    engine: Any = "zarr" if path.is_dir() else "netcdf4"
+    extra: Any = {"consolidated": False} if path.is_dir() else {}
+    stored = xr.open_dataset(path, engine=engine, **_UNDECODED, **extra)
+    if not _is_regular(stored):
+        stored.close()
+        return None
+    for variable in stored.variables.values():
+        if engine == "netcdf4":
+            variable.attrs = with_default_fill(variable.attrs, variable.dtype)
+        elif zarr_format == 2 and not variable.attrs.get("_FillValue", 1):
+            del variable.attrs["_FillValue"]  # 0 is the default of Zarr
+    return stored
+
+
+def _is_regular(stored: xr.Dataset) -> bool:
+    """Return whether a dataset has signal, axes, stamps and sampling rate, as a regular log has."""
+    has_signal = any(name in stored.variables for name in SIGNAL_UNITS)
+    has_stamps = "time" in stored.variables and names_epoch(
+        str(stored.variables["time"].attrs.get("units", ""))
+    )
+    return (
+        has_signal
+        and has_stamps
+        and "sampling_rate_hz" in stored.attrs
+        and "axis" in stored.variables
+    )
+
+
+def _read_group(path: Path) -> tuple[int, dict[str, Any]]:
+    """Return format and attributes of a Zarr group, also of one that xarray cannot open."""
+    import zarr
+
+    group = zarr.open_group(path, mode="r")
+    return group.metadata.zarr_format, dict(group.attrs)
+
+
+def _read_labels(path: Path, labels: xr.DataArray) -> NDArray[np.str_]:
+    """Return the names of the axes as text; damaged names may hold invalid code points."""
+    values = np.atleast_1d(labels.values)
+    if values.dtype.kind == "U" and values.size:
+        codes = np.ascontiguousarray(values).view(
+            np.dtype(np.uint32).newbyteorder(values.dtype.byteorder)
+        )
+        if codes.size and codes.max() > sys.maxunicode:
+            raise FormatError(f"{path.name}: the names of its axes are damaged; copy it again")
+    return np.array([str(label) for label in values], dtype=str)
+
+
+def _open_own(path: Path, stored: xr.Dataset | StoredLog) -> xr.Dataset:
+    """Open a log that gyrostab wrote."""
+    log = from_disk(stored, path.name)
+    try:
+        log = as_uniform(log)
+    except SchemaError as error:
+        log.close()
+        raise SchemaError(f"{path.name}: {error}") from error
+    log.attrs.setdefault("source_files", [path.name])
+    return log
+
+
+def _with_uniform_time(log: xr.Dataset) -> xr.Dataset:
+    """Return the log on a computed time axis; raise `TimeError` if its stamps are not uniform.
+
+    Stamps that agree with the declared rate in `CHECKED_BLOCKS` blocks are not read in full,
+    because a lost or doubled sample shifts every stamp after it.
+    """
+    rate, size = float(log.attrs["sampling_rate_hz"]), log.sizes["time"]
+    stored = log["time"].variable
+
+    def stamps(start: int, stop: int) -> Any:
+        return to_nanoseconds(stored[start:stop].values)
+
+    if size > CHECKED_BLOCKS * 1024 and np.isfinite(rate) and rate > 0:
+        begin = int(stamps(0, 1)[0])
+        for first in np.unique(np.linspace(0, size - 1024, CHECKED_BLOCKS).astype(int)):
+            block = stamps(int(first), int(first) + 1024)
+            if np.any(
+                np.abs(block - grid_times(begin, rate, np.arange(first, first + len(block)))) > 1000
+            ):
+                break
+        else:
+            log = log.drop_vars("time").assign_coords(time_coordinate(begin, rate, size))
+    return as_uniform(log)
+
+
+def summarise_stored(path: Path, stored: StoredLog, options: ReadOptions) -> FileSummary | None:
+    """Summarise a log as it is on disk; None where decoding finds more, or what is wrong."""
+    check_declared(path, stored.variables, given=options.limits)
+    rules = {rule["dim"]: rule for rule in parse_time_grids(stored.variables, path.name).values()}
+    signals = [name for name in SIGNAL_UNITS if name in stored.data_vars]
+    variables, labels = stored.variables, stored.variables.get("axis")
+    if "time" not in rules or len(signals) != 1 or labels is None or labels.ndim != 1:
+        return None
+    rule, (signal,) = rules["time"], signals
+    time = next((dim for dim in ("time", index_dim("time")) if dim in stored.sizes), "")
+    is_plain = (
+        variables[signal].dims == ("axis", time)
+        and stored.sizes[time] == rule["size"] > 0
+        and variables[signal].attrs.get("units") == ON_DISK.get(*2 * (SIGNAL_UNITS[signal],))
+        and len(set(labels.values.tolist())) == labels.size > 0
+        and not any(ORIGINAL_NAME in item.attrs for item in variables.values())
+    )
+    if not is_plain:
+        return None
+    ends = rule["first"] + rule["stride"] * np.array([0, rule["size"] - 1])
+    time_dims = {
+        dim: {time} | {f"time_{dim}", index_dim(f"time_{dim}")} for dim in stored.data_vars
+    }
+    channels = {
+        name: str(decode_attributes(dict(variables[name].attrs)).get("units", ""))
+        for name in stored.data_vars
+        if variables[name].ndim == 1 and variables[name].dims[0] in time_dims[name]
+    }
+    return _make_summary(
+        path,
+        signal,
+        labels.values.tolist(),
+        channels,
+        grid_times(rule["start_ns"], rule["rate_hz"], ends),
+        rule["size"],
+        decode_attributes(dict(stored.attrs)).get("notes", ()),
+    )
+
+
+def summarise_log(path: Path, log: xr.Dataset) -> FileSummary:
+    """Summarise a regular log."""
+    return _make_summary(
+        path,
+        signal_name(log),
+        log["axis"].values.tolist(),
+        {name: str(log[name].attrs.get("units", "")) for name in log_channels(log)},
+        log_span(log),
+        log.sizes["time"],
+        log.attrs.get("notes", ()),
+    )
+
+
+def _make_summary(
+    path: Path,
+    signal: str,
+    labels: Sequence[Any],
+    channels: Mapping[str, str],
+    span: Iterable[int],
+    size: int,
+    notes: Iterable[str],
+) -> FileSummary:
+    axes = [
+        ColumnSummary(str(axis), f"gyro_{axis}", "gyro", signal, SIGNAL_UNITS[signal])
+        for axis in labels
+    ]
+    channel_columns = [
+        ColumnSummary(name, name, "channel", None, units) for name, units in channels.items()
+    ]
+    first, last = (np.datetime64(int(stamp), "ns") for stamp in span)
+    return FileSummary(
+        path=path,
+        format="gyrostab log",
+        columns=(*axes, *channel_columns),
+        axes=tuple(map(str, labels)),
+        channels=tuple(channels),
+        first=first,
+        last=last,
+        n_rows=size,
+        notes=tuple(notes),
+    )

@@ -1,0 +1,214 @@
+"""Place the rows of a raw log: by their stamps, in order, or by their count."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.errors import TimeError
+from gyrostab.ingest.columns.pieces import PiecewiseColumn
+from gyrostab.ingest.grid.jitter import MIN_SIGMA, JitterModel
+from gyrostab.ingest.grid.notes import describe_rate
+from gyrostab.ingest.grid.place import (
+    Placement,
+    make_placement,
+    place_by_count,
+    place_by_stamp,
+)
+from gyrostab.ingest.grid.place_in_order import place_in_order
+from gyrostab.ingest.grid.rate import (
+    RateEstimate,
+    deviating_stretches,
+    estimate_near,
+    estimate_rate,
+    is_far_worse,
+)
+from gyrostab.ingest.grid.repeats import find_repeats, with_repeats
+from gyrostab.ingest.grid.scan_pass import ScanPass, file_of, stamp_blocks
+from gyrostab.ingest.grid.starting_period import Stamps
+from gyrostab.schema import signal_name
+from gyrostab.store.lazy import find_source, read_slice
+from gyrostab.time.grid import period_ns, stamp_ns
+
+_MAX_RATE_DIFFERENCE = 0.02  # relative, between declared and estimated rate
+_EVEN_ROWS = 2**18  # rows at the beginning that give the rate of a log with even stamps
+# Largest jitter at which stamps give the samples of 99 % of the rows; placing by stamp is then
+# tried first [samples].
+_SHARP_SIGMA = 0.2
+_MIN_DROPPED_ROWS = 10  # rows without a sample for which placing in order is tried
+_LATE_SHARE = 0.9  # share of the dropped rows that placing in order must recover
+_MAX_ROUNDS = 4  # a repetition within another is found after the latter is removed
+
+
+@dataclass(frozen=True)
+class RowPlacer:
+    """The rows of a raw log, and how to place them."""
+
+    raw: xr.Dataset
+    scanned: ScanPass
+    declared: float | None  # sampling rate [Hz]; found from the stamps if None
+    tolerance: float  # as for `place_by_stamp`
+    max_gap: float  # a longer step ahead is a step of the clock [s]
+    block: int  # rows in memory at one time
+
+    def place(self) -> tuple[Placement, float, list[str]]:
+        """Return the placement, the sampling rate [Hz] and notes."""
+        return self._place_even() or self._place_all()
+
+    @property
+    def where(self) -> str:
+        """File of the first row, for messages."""
+        return file_of(self.raw)[0]
+
+    def _place_even(self) -> tuple[Placement, float, list[str]] | None:
+        """Place the rows of a long log with evenly spaced stamps, from its beginning alone.
+
+        Returns None if the stamps are not even, a row has no sample, or the beginning has notes.
+        """
+        raw, scanned = self.raw, self.scanned
+        clock = find_source(raw["time"].data) if "time" in raw.variables else None
+        line = clock.find_line() if isinstance(clock, PiecewiseColumn) else None
+        if line is None or scanned.absent or scanned.repeated or scanned.rows <= _EVEN_ROWS:
+            return None
+        start, step = line
+        stamps = (start + step * np.arange(_EVEN_ROWS)).view("datetime64[ns]")
+        signal = signal_name(raw)
+        head = xr.Dataset(
+            {signal: (("axis", "row"), read_slice(raw[signal].data, 0, _EVEN_ROWS))},
+            {"time": ("row", stamps), "axis": raw["axis"].values},
+            raw.attrs,
+        )
+        bits = scanned.present[: _EVEN_ROWS // 8].copy()
+        placer = replace(self, raw=head, scanned=replace(scanned, rows=_EVEN_ROWS, present=bits))
+        placement, rate, notes = placer._place_all()
+        is_even = (
+            period_ns(rate) == (step, 0.0)
+            and placement.runs.tolist() == [[0, 0, _EVEN_ROWS]]
+            and not len(placement.events)
+        )
+        if notes or not is_even:
+            return None
+        return replace(placement, runs=np.array([[0, 0, scanned.rows]], dtype=np.int64)), rate, []
+
+    def _place_all(self) -> tuple[Placement, float, list[str]]:
+        raw, scanned, declared = self.raw, self.scanned, self.declared
+        if "time" not in raw.variables:
+            return self._place_without_time()
+        # single unreadable rows still occupy samples
+        count_all_rows = scanned.absent <= 0.01 * scanned.rows
+        stamps: Stamps = partial(stamp_blocks, raw, scanned, block=self.block)
+        try:
+            estimate = estimate_rate(stamps, where=self.where)
+        except TimeError:
+            if declared is None or scanned.rows - scanned.absent > 1:
+                raise
+            estimate = RateEstimate(declared, 0.0, counted=False, coarse=False, raw=declared)
+        rate, notes = estimate.rate, list[str]()
+        if declared is not None:
+            if abs(declared / estimate.raw - 1) > _MAX_RATE_DIFFERENCE:
+                estimate, note = self._estimate_declared(stamps, estimate, declared)
+                notes.append(note)
+            # a given rate settles the question
+            rate, estimate = declared, replace(estimate, finer=None, even=None)
+        deviating: list[tuple[int, int, float]] = []
+        if estimate.counted:
+            counted = partial(stamps, all_rows=count_all_rows)
+            placement = place_by_count(counted, estimate, rate, max_gap=self.max_gap)
+        else:
+            placement = self._place_stamped(stamps, estimate.jitter, rate, count_all_rows)
+            if _is_sharp(estimate.jitter):
+                deviating = deviating_stretches(stamps, 1e9 / rate)
+        notes += describe_rate(raw, estimate, rate, deviating, placement)
+        changes = tuple(stamp for _, stamp, _ in deviating)
+        return replace(placement, rate_changes=changes), rate, notes
+
+    def _place_without_time(self) -> tuple[Placement, float, list[str]]:
+        """Place rows without stamps from the given start."""
+        if self.declared is None:
+            raise TimeError(
+                f"{self.where}: the file has no time column; give the sampling rate with --rate HZ"
+            )
+        text = self.raw.attrs.get("start")
+        note = (
+            f"{self.where}: no time in the file and no --start: the log is said to start at "
+            "1970-01-01T00:00:00"
+        )
+        runs = [np.array([[0, 0, self.scanned.rows]], dtype=np.int64)]
+        placement = make_placement(stamp_ns(text) if text else 0, runs, [])
+        return placement, self.declared, [] if text else [note]
+
+    def _estimate_declared(
+        self, stamps: Stamps, estimate: RateEstimate, declared: float
+    ) -> tuple[RateEstimate, str]:
+        """Estimate the rate near a declared one that the stamps alone do not say, with a note."""
+        near_estimate = estimate_near(stamps, declared)
+        named = (
+            estimate.even is not None and abs(declared / estimate.even - 1) <= _MAX_RATE_DIFFERENCE
+        )  # without the recurring losses
+        if (
+            near_estimate is None
+            or abs(declared / near_estimate.raw - 1) > _MAX_RATE_DIFFERENCE
+            or (not named and is_far_worse(stamps, near_estimate, estimate))
+        ):
+            raise TimeError(
+                f"{self.where}: the sampling rate given is {declared:.10g} Hz, but the time stamps "
+                f"say {estimate.raw:.6g} Hz, and neither "
+                "lost samples nor jitter explain the difference; "
+                "leave out --rate to use the stamps, or correct --rate, --epoch or the unit of "
+                "the time column"
+            )
+        return near_estimate, (
+            f"{self.where}: the stamps alone say {estimate.raw:.6g} Hz; they fit the rate given, "
+            f"{declared:.10g} Hz, which is used"
+        )
+
+    def _place_stamped(
+        self, stamps: Stamps, jitter: JitterModel | None, rate: float, count_all_rows: bool
+    ) -> Placement:
+        """Place rows by their stamps, or in order if stamps have jitter."""
+        scanned = self.scanned
+        options: dict[str, Any] = {
+            "tolerance": self.tolerance,
+            "max_gap": self.max_gap,
+            "where": self.where,
+        }
+
+        def place_along(jitter: JitterModel) -> Placement:
+            def place() -> Placement:  # repetitions occupy no samples
+                by_row = count_all_rows and not scanned.repeated
+                return place_in_order(stamps, jitter, rate, by_row=by_row, **options)
+
+            return self._place_once(place)
+
+        if jitter is not None and not _is_sharp(jitter):
+            return place_along(jitter)
+        placement = self._place_once(partial(place_by_stamp, stamps, rate, **options))
+        dropped = scanned.rows - scanned.absent - scanned.repeated - placement.placed
+        if not scanned.repeated and (dropped >= _MIN_DROPPED_ROWS or placement.has_late_rows):
+            # placing in order may recover them
+            along = place_along(jitter or JitterModel(1e9 / rate, MIN_SIGMA, "all", 1.0, 0.5))
+            if along.placed - placement.placed >= _LATE_SHARE * dropped:
+                placement = along
+        return placement
+
+    def _place_once(self, place: Callable[[], Placement]) -> Placement:
+        """Place each sample once; repeated stretches of rows are duplicates, not clock restarts."""
+        placement, all_repeats = place(), np.empty((0, 3), dtype=np.int64)
+        for _ in range(_MAX_ROUNDS):
+            repeats = find_repeats(self.raw, signal_name(self.raw), placement)
+            if not len(repeats):
+                break
+            for row, _source, length in repeats.tolist():
+                self.scanned.leave_out(row, row + length)
+            all_repeats = np.concatenate([all_repeats, repeats])
+            placement = place()
+        return with_repeats(placement, self.raw, all_repeats) if len(all_repeats) else placement
+
+
+def _is_sharp(jitter: JitterModel | None) -> bool:
+    return jitter is None or jitter.sigma <= _SHARP_SIGMA
