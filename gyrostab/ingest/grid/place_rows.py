@@ -117,7 +117,7 @@ class RowPlacer:
             rate, estimate = declared, replace(estimate, finer=None, even=None)
         deviating: list[tuple[int, int, float]] = []
         if estimate.counted:
-            counted = partial(stamps, all_rows=count_all_rows)
+            counted = partial(stamp_blocks, raw, scanned, block=self.block, all_rows=count_all_rows)
             placement = place_by_count(counted, estimate, rate, max_gap=self.max_gap)
         else:
             placement = self._place_stamped(stamps, estimate.jitter, rate, count_all_rows)

@@ -313,7 +313,7 @@ def test_keys_of_columns_are_unique() -> None:
             OptionError,
             r"--unit gryo: no such column",
         ),
-        ("time [s],gyro_x [deg/h]\n0,1\n1,2\n", {"rate": -1.0}, OptionError, r"above 0"),
+        ("time [s],gyro_x [deg/h]\n0,1\n1,2\n", {"rate": -1.0}, OptionError, r"from 1e-09"),
         ("time [s],gyro_x [deg/h]\n0,1\n1,2\n", {"kind": "speed"}, OptionError, r"'rate'.*'angle'"),
         (
             "time [s],gyro_x [deg/h]\n0,1\n1,2\n",
