@@ -47,6 +47,7 @@ def duration_seconds(
             if _JOINED.search(value):
                 raise ValueError("numbers without a unit between them")
             text = re.sub(r"(?<=[\d ])m$", "min", value.strip().replace("μ", "µ"))
+            text = re.sub(r"(?<=[\d ])d(?![a-z])", "D", text)  # as pandas names a day
             seconds = pd.Timedelta(text).value / 1e9
         elif _is_bare_number(value):
             seconds = float(value)

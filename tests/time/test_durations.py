@@ -67,7 +67,13 @@ def test_numbers_without_a_unit_between_them_are_refused(text):
 
 @pytest.mark.parametrize(
     ("text", "seconds"),
-    [("1 day, 2:00:00", 93600.0), ("2h,30min", 9000.0), ("1.5h 2.5min", 5550.0), ("10μs", 1e-5)],
+    [
+        ("1 day, 2:00:00", 93600.0),
+        ("2h,30min", 9000.0),
+        ("1.5h 2.5min", 5550.0),
+        ("10μs", 1e-5),
+        ("1.5d2h", 136800.0),
+    ],
 )
 def test_durations_of_several_units_are_read(text, seconds):
     assert duration_seconds(text, "window") == seconds
