@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.ingest.columns.stamps import NAT
+from gyrostab.units import DAY
 
 #: Periods after which a clock of the time of day, and one of the GPS week, begin again [ns].
-CLOCK_PERIODS = (86400 * 10**9, 7 * 86400 * 10**9)
+CLOCK_PERIODS = (int(DAY) * 10**9, 7 * int(DAY) * 10**9)
 #: Steps from which the typical one follows.
 _TYPICAL_STEPS = 4096
 
