@@ -25,6 +25,7 @@ FILES = (
     "davar_3d.png",
     "coefficients.png",
 )
+_DPI = 200
 
 
 def sample_log(name: str = "mwd_sample.csv.gz") -> Path:
@@ -102,6 +103,8 @@ def run_demo(
     from gyrostab.allan.davar import davar
     from gyrostab.allan.fit import fit_noise
     from gyrostab.io.datasets import to_netcdf
+    from gyrostab.plot import plot_coefficients, plot_davar, plot_davar_3d, plot_signal
+    from gyrostab.plot.style import save_png
     from gyrostab.report import write_report
     from gyrostab.store.output import check_folder, new_folder, protect_inputs
 
@@ -112,27 +115,20 @@ def run_demo(
             stage("reading")
             log = load_log([path])
             to_netcdf(log, temporary / "log.nc")
+            stage("drawing the log")  # while another process compiles the fit, on the first run
+            save_png(plot_signal(log), temporary / "signal.png", dpi=_DPI)
             stage("computing", count_samples(log))
             surface = davar(log, window=WINDOW, step=STEP).compute()
             stage("fitting")
             product = fit_noise(surface).compute()
             to_netcdf(product, temporary / "product.nc")
             stage("drawing")
-            _draw_figures(log, product, temporary)
+            axis = str(product["axis"].values[0])
+            for name, figure in (
+                ("davar.png", plot_davar(product)),
+                ("davar_3d.png", plot_davar_3d(product, axis=axis)),
+                ("coefficients.png", plot_coefficients(product)),
+            ):
+                save_png(figure, temporary / name, dpi=_DPI)
             write_report(product, temporary / "report.html", log=log)
     return product, [folder / name for name in FILES]
-
-
-def _draw_figures(log: xr.Dataset, product: xr.Dataset, folder: Path) -> None:
-    from gyrostab.plot import plot_coefficients, plot_davar, plot_davar_3d, plot_signal
-    from gyrostab.plot.style import save_png
-
-    axis = str(product["axis"].values[0])
-    figures = {
-        "signal.png": plot_signal(log),
-        "davar.png": plot_davar(product),
-        "davar_3d.png": plot_davar_3d(product, axis=axis),
-        "coefficients.png": plot_coefficients(product),
-    }
-    for name, figure in figures.items():
-        save_png(figure, folder / name, dpi=200)
