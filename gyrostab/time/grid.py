@@ -360,7 +360,7 @@ class TimeGridIndex(CoordinateTransformIndex):
         return xr.indexes.PandasIndex(joined, own.dims[0])
 
     def reindex_like(self, other: Any, method: Any = None, tolerance: Any = None) -> dict[Any, Any]:
-        """Find the positions of the stamps of another index, -1 where there is none."""
+        """Find the positions of the stamps of another index, -1 for those without a position."""
         positions, is_found = self._find_stamps(other.to_pandas_index().values, method, tolerance)
         return {self.transform.dims[0]: np.where(is_found, positions, -1)}
 

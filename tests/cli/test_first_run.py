@@ -88,3 +88,30 @@ assert not clean_column.stats.cache_path
 
 def test_kernels_work_where_nothing_can_be_cached() -> None:
     subprocess.run([sys.executable, "-c", NO_FOLDER + CLEAN], check=True)
+
+
+@pytest.mark.parametrize("command", [["demo"], ["run", "log.csv", "-o", "product.nc"]])
+def test_the_fit_is_compiled_from_before_the_libraries_are_imported(command, tmp_path):
+    code = f"""
+import os, sys
+from gyrostab.kernels import compile_ahead
+
+def start(module, kernel):
+    print(module, kernel.__name__, {{"xarray", "dask"}} & set(sys.modules), flush=True)
+    os._exit(0)
+
+compile_ahead.start_compilation = start
+sys.argv = ["gyrostab", *{command!r}]
+from gyrostab.cli import main
+main()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=tmp_path
+    )
+    assert done.stdout == "gyrostab.allan.compile_fit fit_windows set()\n"
+
+
+def test_the_second_process_imports_neither_xarray_nor_dask():
+    code = "import sys, gyrostab.allan.compile_fit; print({'xarray', 'dask'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout == "set()\n"

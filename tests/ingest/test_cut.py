@@ -169,7 +169,7 @@ def test_lazy_log_stays_lazy():
         ({"time_to": "2027-02-01T00:00"}, "--to 2027-02-01T00:00 lies outside the record"),
         (
             {"time_from": "3min", "time_to": "2min"},
-            "nothing is left with --from 3min and --to 2min",
+            "--from 3min and --to 2min leaves no sample of the log",
         ),
         ({"time_from": "10:05:00"}, "neither a time nor a duration; write 2026-11-20T14:00"),
         ({"time_from": "60"}, "neither a time nor a duration"),

@@ -204,7 +204,9 @@ class TestAccelerometers:
         terms = convert_terms(fit_accelerometers(log, product), ACCELEROMETER_KEYS)
         assert terms["y"]["accelerometer_random_walk"].value == pytest.approx(walk, rel=0.05)
 
-    @pytest.mark.parametrize("cut", [{"time_from": "200s"}, {"exclude": "0s/190s"}])
+    @pytest.mark.parametrize(
+        "cut", [{"time_from": "200s"}, {"time_from": "200.37s"}, {"exclude": "0s/190s"}]
+    )
     def test_only_windows_of_the_product_count(self, tmp_path, cut):
         """The tool is shaken for 190 s, which the product leaves out."""
         log = make_accelerometers(samples=30_000)

@@ -25,9 +25,9 @@ def demo(*, output: Output = Path("gyrostab-demo"), common: Common = Common()) -
     output
         Folder to write to.
     """
+    _compile_fit_ahead()
     with show_stages(common) as stage:
         stage("loading the libraries")
-        _compile_fit_ahead()
         from gyrostab.jobs.demo import format_summary, run_demo
 
         product, files = run_demo(output, overwrite=common.overwrite, stage=stage)

@@ -20,7 +20,7 @@ def add_fast_switching(state: State, component: Component) -> State:
 
 
 def fast_switching_evidence(data: xr.Dataset, state: State, axis: str) -> SwitchingEvidence | None:
-    """Compute the evidence of a bias that switches within blocks; None if there is none."""
+    """Compute the evidence of a bias that switches within blocks, None without one."""
     switching = search_sub_blocks(data, state, axis)
     return (
         switching

@@ -82,7 +82,7 @@ def _make_table(log: Any) -> Table | None:
 
 
 def _child_text(parent: Any, name: str) -> str:
-    """Return the text of a child, in any namespace; empty if there is none."""
+    """Return the text of a child, in any namespace; empty without it."""
     return (parent.findtext(f"{{*}}{name}") or "").strip() if parent is not None else ""
 
 

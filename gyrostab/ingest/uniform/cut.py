@@ -118,7 +118,7 @@ def cut_log(
     if low >= high:
         ends = (("--from", time_from), ("--to", time_to))
         named = " and ".join(f"{option} {end}" for option, end in ends if end is not None)
-        raise OptionError(f"nothing is left with {named}; {clock.describe()}")
+        raise OptionError(f"{named} leaves no sample of the log; {clock.describe()}")
     given = [clock.span_of(span, low, high) for span in spans]
     excluded = merge_spans([np.array([span]) for span in given if span[1] > span[0]])
     runs = _kept_runs(low, high, excluded)
