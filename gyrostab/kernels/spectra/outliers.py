@@ -44,25 +44,6 @@ def histogram_edge(number: Any) -> Array:
 
 
 @njit(**INNER)
-def _sorted_four(a, b, c, d):  # type: ignore[no-untyped-def]
-    a, b = min(a, b), max(a, b)
-    c, d = min(c, d), max(c, d)
-    a, c = min(a, c), max(a, c)
-    b, d = min(b, d), max(b, d)
-    return a, min(b, c), max(b, c), d
-
-
-@njit(**INNER)
-def _median_eight(row, i):  # type: ignore[no-untyped-def]
-    """Median of the four samples on either side, none of them missing."""
-    a, b, c, d = _sorted_four(row[i - 1], row[i - 2], row[i - 3], row[i - 4])
-    e, f, g, h = _sorted_four(row[i + 1], row[i + 2], row[i + 3], row[i + 4])
-    fourth = min(min(d, h), min(max(c, e), min(max(b, f), max(a, g))))
-    fifth = max(max(a, e), max(min(b, h), max(min(c, g), min(d, f))))
-    return 0.5 * (fourth + fifth)
-
-
-@njit(**INNER)
 def _insert_sorted(values, count, value):  # type: ignore[no-untyped-def]
     """Put a value among the first `count`, which are sorted."""
     at = count
@@ -91,17 +72,20 @@ def _median_pairs(row, i, neighbours):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _one_sided(row, i):  # type: ignore[no-untyped-def]
+def _one_sided(row, i, neighbours):  # type: ignore[no-untyped-def]
     """Compute the departure at an edge from the level or slope of four samples on one side."""
     for side in (1, -1):
         if 0 <= i + _PAIRS * side < row.size:
-            first, second = row[i + side], row[i + 2 * side]
-            _, low, high, _ = _sorted_four(first, second, row[i + 3 * side], row[i + 4 * side])
-            level = (row[i] - 0.5 * (low + high)) * math.sqrt(
+            total = 0.0
+            for apart in range(1, _PAIRS + 1):
+                _insert_sorted(neighbours, apart - 1, row[i + apart * side])
+                total += row[i + apart * side]
+            level = (row[i] - 0.5 * (neighbours[1] + neighbours[2])) * math.sqrt(
                 (1.0 + _MEDIANS[4]) / (1.0 + _MEDIANS[2])
             )
-            slope = (row[i] - 2.0 * first + second) * math.sqrt((1.0 + _MEDIANS[4]) / 6.0)
-            total = first + second + row[i + 3 * side] + row[i + 4 * side]
+            slope = (row[i] - 2.0 * row[i + side] + row[i + 2 * side]) * math.sqrt(
+                (1.0 + _MEDIANS[4]) / 6.0
+            )
             if total == total:
                 if level * slope <= 0.0:
                     return 0.0
@@ -131,23 +115,8 @@ def departures(x, out, histogram):  # type: ignore[no-untyped-def]
     for b in range(x.shape[0]):
         row = x[b]
         for i in range(size):
-            middle, pairs = np.nan, _PAIRS
-            if _PAIRS <= i < size - _PAIRS:
-                total = (
-                    row[i - 4]
-                    + row[i - 3]
-                    + row[i - 2]
-                    + row[i - 1]
-                    + row[i + 1]
-                    + row[i + 2]
-                    + row[i + 3]
-                    + row[i + 4]
-                )
-                if total == total:
-                    middle = _median_eight(row, i)
-            if middle != middle:
-                middle, pairs = _median_pairs(row, i, neighbours)
-            away = _one_sided(row, i) if pairs < 2 else np.nan
+            middle, pairs = _median_pairs(row, i, neighbours)
+            away = _one_sided(row, i, neighbours) if pairs < 2 else np.nan
             if away != away:
                 away = (row[i] - middle) * share[pairs]
             out[b, i] = away
