@@ -97,7 +97,10 @@ def switching_evidence(
     n = present.size
     flat = np.where(present, values.ravel(), 0.0)[:, None]
     variance = np.where(present, variance.ravel(), 1.0)
-    effect_columns = scale_columns(None if given is None else _merge_columns(given, merged), n)
+    if given is not None:
+        parts = np.nan_to_num(given).reshape(shape[0], -1, merged, given.shape[2])
+        given = parts.mean(axis=2).reshape(-1, given.shape[2])
+    effect_columns = scale_columns(given, n)
     best: SwitchingEvidence | None = None
     for count in (0, 8):
         columns_given = np.concatenate([drift_waves(n, count), effect_columns], axis=1)
@@ -198,12 +201,6 @@ def _sub_block_means(data: xr.Dataset, baseline: xr.Dataset, axis: str) -> tuple
     return values, np.where(enough, variance, np.nan), merged
 
 
-def _merge_columns(given: Array, merged: int) -> Array:
-    """Average columns (block, sub-block, column) over merged sub-blocks, as (mean, column)."""
-    parts = np.nan_to_num(given).reshape(given.shape[0], -1, merged, given.shape[2])
-    return np.asarray(parts.mean(axis=2).reshape(-1, given.shape[2]))
-
-
 def _course_gains(
     courses: TelegraphCourses,
     values: Array,
@@ -218,7 +215,7 @@ def _course_gains(
     base = {"step": step, "K": K, "B": B, "present": present}
     columns = np.concatenate([courses.share.T, given], axis=1)
     columns_given = given.shape[1]
-    logs: dict[str, list[float]] = {"none": [], "two": []}
+    logs = []
     scales = _white_levels(courses, values[:, 0], variance, present)
     for scale in scales:
         white = {**base, "variance": variance * scale}
@@ -227,14 +224,9 @@ def _course_gains(
         scatter = float(courses.spread[0] @ np.where(present, 1.0 / white["variance"], 0.0))
         usual = courses.share[0][present]
         unit = float(((usual - usual.mean()) ** 2 / white["variance"][present]).sum())
-        none, two = course_evidence(
-            marginalise(plain, columns_given, wide), 0, scatter, prior, unit=unit
-        )
-        logs["none"].append(none)
-        logs["two"].append(two)
-    none, two = (
-        float(np.logaddexp.reduce(logs[name])) - np.log(scales.size) for name in ("none", "two")
-    )
+        marginal = marginalise(plain, columns_given, wide)
+        logs.append(course_evidence(marginal, 0, scatter, prior, unit=unit))
+    none, two = (np.logaddexp.reduce(logs, axis=0) - np.log(scales.size)).tolist()
     two -= float(courses.cost[0])
     return two - none, two - _normal_log_likelihood(values[:, 0], variance, present, given)
 

@@ -81,6 +81,14 @@ class BlockMeanStatistic(Statistic):
     error_shows_in = ("mean",)
     is_in_baseline = True
 
+    def condition(self, state: State, component: Component) -> State:
+        """Put columns into the means, and mask blocks in which the effect moves much."""
+        axis = component.row[0]
+        row = state.axes.index(axis)
+        columns = mean_columns(component.variant, row)
+        state = state.with_columns("mean", axis, columns)
+        return replace(state, masked=state.masked | _moving_blocks(state, row, columns))
+
     def mixture(
         self, component: Component, state: State, variant: Variant, *, variance: Array | None = None
     ) -> Mixture:
@@ -188,10 +196,6 @@ class Mean(BlockMeanStatistic):
                 )[:, 1:]
             )
         return collect_evidence(group, [(axis,) for axis in trial.state.axes], factors)
-
-    def condition(self, state: State, component: Component) -> State:
-        """Put columns into the means, and mask blocks in which the effect moves much."""
-        return condition_means(state, component)
 
     def describe(self, region: Region, when: str) -> str:
         """Describe another mean, or one that wanders."""
@@ -326,15 +330,6 @@ def region_mean(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, inside: Arr
     rows = apply_precision(columns, noise)
     solved = np.linalg.lstsq(rows @ columns.T, rows @ np.nan_to_num(residual), rcond=None)[0]
     return float(solved[1])
-
-
-def condition_means(state: State, component: Component) -> State:
-    """Condition on a component in the means."""
-    axis = component.row[0]
-    row = state.axes.index(axis)
-    columns = mean_columns(component.variant, row)
-    state = state.with_columns("mean", axis, columns)
-    return replace(state, masked=state.masked | _moving_blocks(state, row, columns))
 
 
 def _moving_blocks(state: State, row: int, columns: list[Array]) -> NDArray[np.bool_]:

@@ -9,13 +9,17 @@ from dataclasses import replace
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.evidence.fast_switching import SwitchingEvidence, switching_powers
+from gyrostab.diagnose.evidence.fast_switching import (
+    SwitchingEvidence,
+    switching_evidence,
+    switching_powers,
+)
 from gyrostab.diagnose.evidence.telegraph import (
     PARTS_PER_BLOCK,
     TelegraphCourses,
     telegraph_evidence,
 )
-from gyrostab.diagnose.evidence.visits import compare_visits
+from gyrostab.diagnose.evidence.visits import Visits, compare_visits
 from gyrostab.diagnose.predict.candidates import (
     Candidate,
     CandidateEvidence,
@@ -23,21 +27,18 @@ from gyrostab.diagnose.predict.candidates import (
     Prospect,
     Variant,
 )
+from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State, power_column
 from gyrostab.diagnose.predict.search import Trial
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.statistics.base import Competitor, SizeFit, Sizes
-from gyrostab.diagnose.statistics.fast_switching import (
-    add_fast_switching,
-    is_resolved,
-    search_sub_blocks,
-)
-from gyrostab.diagnose.statistics.level_forms import further_levels, level_competitors
-from gyrostab.diagnose.statistics.mean import BlockMeanStatistic, condition_means
+from gyrostab.diagnose.statistics.mean import BlockMeanStatistic
+from gyrostab.diagnose.statistics.scores import Array
 
 _LEVELS = "~levels"  # nuisance alternative: an arbitrary course
 _MAX_NULL_BLOCKS = 20_000  # of null records that are searched for two levels; limits time
+_JUMP_CHANGES = 2  # from block to block, in the column of a jump within a block
 
 
 class Telegraph(BlockMeanStatistic):
@@ -51,11 +52,11 @@ class Telegraph(BlockMeanStatistic):
         self, components: Sequence[Component], state: State, error: float
     ) -> Iterator[Competitor]:
         """Yield levels that differ."""
-        return level_competitors(components, state, error)
+        return _level_competitors(components, state, error)
 
     def axis_competitors(self, component: Component, state: State) -> Iterator[Competitor]:
         """Yield more than two levels."""
-        return further_levels(component, state)
+        return _further_levels(component, state)
 
     def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
         """Return any course of levels, which the means determine."""
@@ -114,7 +115,7 @@ class Telegraph(BlockMeanStatistic):
         """
         inside = component.variant.inside
         if not inside.size:
-            return condition_means(state, component)
+            return super().condition(state, component)
         axis = component.row[0]
         row = state.axes.index(axis)
         attrs = state.blocks.attrs
@@ -122,7 +123,7 @@ class Telegraph(BlockMeanStatistic):
         power = switching_powers(
             inside, low, high, int(attrs["block_samples"]), float(attrs["sampling_rate_hz"])
         )
-        state = add_fast_switching(state, component)
+        state = _add_fast_switching(state, component)
         state = state.with_columns("power", axis, [power_column(power[None], row, state)])
         moves = xr.DataArray(np.ptp(inside, axis=1) > state.settings.rest_share, dims="block") & (
             state.blocks["axis"] == axis
@@ -164,10 +165,10 @@ def _search_fast_switching(
     data: xr.Dataset, state: State, axis: str, course: TelegraphCourses, evidence_nats: float
 ) -> tuple[SwitchingEvidence | None, bool]:
     """Find switching within blocks, if better than in block means; and whether it refutes it."""
-    switching, block = search_sub_blocks(data, state, axis), float(state.blocks.attrs["block_s"])
+    switching, block = _search_sub_blocks(data, state, axis), float(state.blocks.attrs["block_s"])
     if switching is None:
         return None, False
-    if not is_resolved(switching, block):
+    if not _is_resolved(switching, state):
         return None, switching.refuted and float(
             course.times[0].min()
         ) < state.settings.refuted_blocks
@@ -190,15 +191,8 @@ def _with_free_levels(evidence: CandidateEvidence, trial: Trial) -> CandidateEvi
     for row, (axis,) in enumerate(evidence.rows):
         if not np.isfinite(evidence_nats[0, row]):
             continue
-        inside = best[row].inside
-        visits = compare_visits(
-            axis_values(trial.data, "mean", axis),
-            trial.state.baseline,
-            inside if inside.size else best[row].design[0, 0],
-            axis=axis,
-            block_s=float(trial.state.blocks.attrs["block_s"]),
-            given=trial.state.given_to("mean", axis),
-        )
+        given = trial.state.given_to("mean", axis)
+        visits = _compare_visits(_course_of(best[row]), axis, trial.data, trial.state, given)
         evidence_nats[0, row] += visits.unequal_nats
         best[row] = replace(
             best[row],
@@ -221,3 +215,111 @@ def _variant_with_course(
         count, share = float(course.switch_count[0]), course.share[0]
     values = {"low": float(low), "high": float(high), "switches": count}
     return replace(variant, values=values, design=share[None, None])
+
+
+def _level_competitors(
+    components: Sequence[Component], state: State, error: float
+) -> Iterator[Competitor]:
+    """Yield levels that differ at each visit.
+
+    They win unless two levels explain clearly more, with enough switches: the bias may follow
+    something that was not recorded. Axes of one course show the same visits: that these are equal
+    counts once.
+    """
+    unequal = np.array([_unequal_nats(component, state) for component in components])
+    nats = float(unequal.min() + np.maximum(unequal, 0.0)[unequal > unequal.min()].sum())
+    yield Competitor("levels that differ", nats + error + state.settings.ambiguous_nats, 0.0)
+
+
+def _further_levels(component: Component, state: State) -> Iterator[Competitor]:
+    """Yield a bias that still switches with two levels in the model, of three levels or more."""
+    axis, settings = component.row[0], state.settings
+    allowed = settings.ambiguous_nats + settings.form_error_share * component.evidence_nats
+    if component.variant.inside.size:
+        within = _search_sub_blocks(state.blocks, _add_fast_switching(state, component), axis)
+        nats = within.evidence_nats if within is not None and _is_resolved(within, state) else 0.0
+    else:
+        given = state.with_columns("mean", axis, [component.variant.design[0, 0]])
+        evidence_nats, _ = telegraph_evidence(
+            state.blocks,
+            state.baseline,
+            axis=axis,
+            given=given.given_to("mean", axis),
+            settings=settings,
+        )
+        nats = float(evidence_nats[0])
+    yield Competitor("more than two levels", nats, allowed)
+
+
+def _unequal_nats(component: Component, state: State) -> float:
+    """Return the evidence of an axis for levels that differ [nats], 0 or more with few switches.
+
+    Jumps that were named first may be switches. The switches are therefore also found without them.
+    """
+    variant, axis = component.variant, component.row[0]
+    given_columns = state.given.get(("mean", axis), [])
+    courses = [(_course_of(variant), given_columns)]
+    without_jumps = [
+        column for column in given_columns if np.count_nonzero(np.diff(column)) > _JUMP_CHANGES
+    ]
+    if len(without_jumps) < len(given_columns) and not variant.inside.size:
+        _, telegraph = telegraph_evidence(
+            state.blocks,
+            state.baseline,
+            axis=axis,
+            given=np.stack(without_jumps, axis=-1) if without_jumps else None,
+            settings=state.settings,
+        )
+        courses.append((telegraph.share[0], without_jumps))
+    nats = []
+    for share, columns in courses:
+        given = np.stack(columns, axis=-1) if columns else None
+        visits = _compare_visits(share, axis, state.blocks, state, given)
+        is_known = visits.switch_count >= state.settings.min_switches
+        nats.append(visits.unequal_nats if is_known else max(visits.unequal_nats, 0.0))
+    return min(nats)
+
+
+def _course_of(variant: Variant) -> Array:
+    """Return the share on the upper level of each block, or of its sub-blocks if it is known."""
+    return variant.inside if variant.inside.size else np.asarray(variant.design[0, 0])
+
+
+def _compare_visits(
+    share: Array, axis: str, data: xr.Dataset, state: State, given: Array | None
+) -> Visits:
+    return compare_visits(
+        axis_values(data, "mean", axis),
+        state.baseline,
+        share,
+        axis=axis,
+        block_s=float(state.blocks.attrs["block_s"]),
+        given=given,
+    )
+
+
+def _add_fast_switching(state: State, component: Component) -> State:
+    """Add the course of a bias that switches within blocks to the block and sub-block means."""
+    axis = component.row[0]
+    return state.with_columns("mean", axis, mean_columns(component.variant, 0)).with_columns(
+        "sub_block", axis, [component.variant.inside]
+    )
+
+
+def _is_resolved(switching: SwitchingEvidence, state: State) -> bool:
+    """Return whether sub-blocks resolve two levels; anything shorter is a spike."""
+    sub_block = float(state.blocks.attrs["block_s"]) / switching.share.shape[1]
+    return bool(np.isfinite(switching.evidence_nats)) and float(switching.times.min()) >= sub_block
+
+
+def _search_sub_blocks(data: xr.Dataset, state: State, axis: str) -> SwitchingEvidence | None:
+    """Search sub-blocks; None if more is named in block means than is known in sub-blocks."""
+    if len(state.given.get(("sub_block", axis), [])) < len(state.given.get(("mean", axis), [])):
+        return None
+    return switching_evidence(
+        data,
+        state.baseline,
+        axis=axis,
+        given=state.given_to("sub_block", axis),
+        settings=state.settings,
+    )
