@@ -27,8 +27,7 @@ from gyrostab.diagnose.predict.linear_model import (
 )
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.statistics.base import Competitor, Region, Statistic, column_choices
-from gyrostab.diagnose.statistics.free_powers import free_powers
-from gyrostab.diagnose.statistics.power_forms import parts_of_record, separate_filters
+from gyrostab.diagnose.statistics.power_forms import free_powers, parts_of_record, separate_filters
 from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
