@@ -38,6 +38,7 @@ from gyrostab.kernels.spectra.periodogram import band_covariance, taper
 from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 #: Null records up to this size stay in memory; larger ones are drawn again on each pass.
 MAX_KEPT_NULL_BYTES = 3e8
 #: Band powers of the null records that are drawn and scored together; bounds the memory.
@@ -216,10 +217,10 @@ def _draw_records(setup: _NullSetup, count: int, rng: np.random.Generator) -> xr
     if "form_shape" in baseline:  # the form of the spectrum was measured on a simulated log
         form = baseline["form_shape"].values
         expected *= _draw_gamma(form, np.ones((count, *form.shape)), rng)[:, :, None]
+    between: Complex | None = None
     if setup.shared is None:
         shape_alone = baseline["shape_alone"].values
         power = _draw_correlated_gamma(shape_alone, setup.ties, expected, rng)
-        between = np.empty(0, np.complex128)
     else:
         power, between = draw_shared_spectra(setup.shared, count, rng)
         power *= expected
@@ -241,9 +242,7 @@ def _draw_records(setup: _NullSetup, count: int, rng: np.random.Generator) -> xr
         "kurtosis": (("axis", "block"), _draw_kurtosis(setup, count, rng)),
         "cross": (
             ("pair", "block", "band"),
-            _draw_independent_cross(setup, power, rng)
-            if setup.shared is None
-            else _scale_shared_cross(setup, expected * swell, between),
+            _draw_cross(setup, power if between is None else expected * swell, between, rng),
         ),
     }
     draw = NullDraw(blocks, baseline, count, rng, expected, power, setup.sd)
@@ -372,23 +371,18 @@ def _correlate_lines(drawn: Array, size: int) -> Array:
     return np.asarray(np.maximum(leaked, drawn.min(axis=-1, keepdims=True)))
 
 
-def _draw_independent_cross(
-    setup: _NullSetup, power: Array, rng: np.random.Generator
+def _draw_cross(
+    setup: _NullSetup,
+    level: Array,
+    between: Complex | None,
+    rng: np.random.Generator,
 ) -> NDArray[np.complex128]:
-    """Draw cross-spectra of axes without anything in common."""
+    """Return cross-spectra from those over the levels of both axes; independent ones if None."""
     first, second = pair_indices(setup.blocks)
-    size = np.sqrt(power[:, first] * power[:, second])
-    cross = size * draw_coherency(setup.blocks["cross_shape"].values, size.shape, rng)
-    cross[..., np.isnan(setup.blocks["cross"].values)] = np.nan
-    return np.asarray(cross)
-
-
-def _scale_shared_cross(
-    setup: _NullSetup, level: Array, between: NDArray[np.complex128]
-) -> NDArray[np.complex128]:
-    """Return cross-spectra of axes with common noise, from those over the levels of both."""
-    first, second = pair_indices(setup.blocks)
-    cross = between * np.sqrt(level[:, first] * level[:, second])
+    size = np.sqrt(level[:, first] * level[:, second])
+    if between is None:
+        between = draw_coherency(setup.blocks["cross_shape"].values, size.shape, rng)
+    cross = size * between
     cross[..., np.isnan(setup.blocks["cross"].values)] = np.nan
     return np.asarray(cross)
 
