@@ -47,7 +47,18 @@ class RampPhase(Statistic):
 
     def null(self, draw: NullDraw) -> Mapping[str, Array]:
         """Draw ramp profiles."""
-        return {"profile": _draw_profiles(draw)} if "profile" in draw.blocks else {}
+        if "profile" not in draw.blocks:
+            return {}
+        recorded = draw.blocks["profile"].values
+        samples = draw.blocks["profile_samples"].values.astype(np.float64)
+        safe = np.maximum(samples, 1.0)
+        noise = draw.rng.standard_normal((draw.record_count, *recorded.shape))
+        noise = noise * draw.sample_sd[:, :1, None] / np.sqrt(safe)
+        noise -= (noise * samples).sum(axis=-1, keepdims=True) / np.maximum(
+            samples.sum(axis=-1), 1.0
+        )[..., None]
+        noise[..., np.isnan(recorded)] = np.nan
+        return {"profile": noise}
 
     def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         """Score the harmonics that are phase-locked to the rotation, and the mean by ramp phase.
@@ -137,7 +148,20 @@ class RampPhase(Statistic):
         self, component: Component, axis: str, state: State, weight: Array
     ) -> tuple[Array | float, list[Array], list[Array]]:
         """Return the power of the aliased lines of the profile."""
-        return _profile_power(component, replace(state, weight=weight)), [], []
+        blocks = state.blocks
+        mean, _ = component_mixture(component, replace(state, weight=weight)).moments()
+        profile = np.tensordot(mean, component.variant.design, axes=1)
+        square = np.abs(np.fft.rfft(profile)[1:] / profile.size) ** 2
+        turns, rate = np.abs(blocks["ramp_turns"].values), float(blocks.attrs["sampling_rate_hz"])
+        turns = np.where(np.isfinite(turns), turns, 0.0)
+        low, high = blocks["band_low"].values, blocks["band_high"].values
+        out = np.zeros((turns.size, low.size))
+        for number, size in enumerate(square, start=1):
+            place = fold(number * turns, rate)[:, None]
+            out += np.where(
+                (place >= low) & (place < high) & (turns > 0.0)[:, None], size / (high - low), 0.0
+            )
+        return out, [], []
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
         """Describe what is locked to the rotation or to the ramp."""
@@ -186,35 +210,3 @@ def _ramp_lines(state: State) -> NDArray[np.bool_]:
         lines[:, None] <= np.maximum(low, high) + reach
     )
     return np.asarray(near_ramp.any(axis=1))
-
-
-def _profile_power(component: Component, state: State) -> Array:
-    """Return the power locked to the ramp, (block, band): the aliased lines of its profile."""
-    blocks = state.blocks
-    mean, _ = component_mixture(component, state).moments()
-    profile = np.tensordot(mean, component.variant.design, axes=1)
-    square = np.abs(np.fft.rfft(profile)[1:] / profile.size) ** 2
-    turns, rate = np.abs(blocks["ramp_turns"].values), float(blocks.attrs["sampling_rate_hz"])
-    turns = np.where(np.isfinite(turns), turns, 0.0)
-    low, high = blocks["band_low"].values, blocks["band_high"].values
-    out = np.zeros((turns.size, low.size))
-    for number, size in enumerate(square, start=1):
-        place = fold(number * turns, rate)[:, None]
-        out += np.where(
-            (place >= low) & (place < high) & (turns > 0.0)[:, None], size / (high - low), 0.0
-        )
-    return out
-
-
-def _draw_profiles(draw: NullDraw) -> Array:
-    """Draw ramp profiles."""
-    recorded = draw.blocks["profile"].values
-    samples = draw.blocks["profile_samples"].values.astype(np.float64)
-    safe = np.maximum(samples, 1.0)
-    noise = draw.rng.standard_normal((draw.record_count, *recorded.shape))
-    noise = noise * draw.sample_sd[:, :1, None] / np.sqrt(safe)
-    noise -= (noise * samples).sum(axis=-1, keepdims=True) / np.maximum(samples.sum(axis=-1), 1.0)[
-        ..., None
-    ]
-    noise[..., np.isnan(recorded)] = np.nan
-    return np.asarray(noise)

@@ -16,7 +16,6 @@ from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect,
 from gyrostab.diagnose.predict.condition import bands_at, free_covariance
 from gyrostab.diagnose.predict.linear_model import (
     State,
-    given_columns,
     real_and_imaginary,
     records_last,
     stack_columns,
@@ -51,8 +50,30 @@ class RotationOrder(Statistic):
     explains_motion = True
 
     def null(self, draw: NullDraw) -> Mapping[str, Array]:
-        """Draw Gaussian amplitudes at the rotation orders."""
-        return {"order": _draw_orders(draw)} if "order" in draw.blocks else {}
+        """Draw Gaussian amplitudes at the rotation orders, with the density near that frequency."""
+        if "order" not in draw.blocks:
+            return {}
+        blocks, expected = draw.blocks, draw.expected
+        recorded = blocks["order"].values
+        rate = float(blocks.attrs["sampling_rate_hz"])
+        samples = np.maximum(blocks["samples"].values, 1)
+        turning = np.abs(np.nan_to_num(blocks["channel_rotation_rate"].values)) / 360.0
+        bands = np.log(blocks["frequency"].values)
+        density = np.empty((len(expected), *recorded.shape))
+        for place, harmonic in enumerate(blocks["harmonic"].values):
+            folded = np.abs((turning * harmonic + rate / 2.0) % rate - rate / 2.0)
+            at = np.interp(np.log(np.maximum(folded, 1e-9)), bands, np.arange(bands.size))
+            low = np.minimum(at.astype(int), bands.size - 2)
+            block = np.arange(turning.size)
+            density[..., place] = expected[:, :, block, low] * (1.0 - (at - low)) + expected[
+                :, :, block, low + 1
+            ] * (at - low)
+        noise = draw.rng.standard_normal((*density.shape, 2)) @ np.array([1.0, 1j])
+        out = np.asarray(
+            np.sqrt(2.0 * noise_at_orders(blocks, density) * rate / samples[..., None]) * noise
+        )
+        out[..., np.isnan(recorded)] = np.nan
+        return {"order": out}
 
     def design(self, case: Prospect) -> Iterator[Variant]:
         """Yield patterns of the harmonics over the axes."""
@@ -80,51 +101,41 @@ class RotationOrder(Statistic):
         self, candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
     ) -> LinearModel:
         """Build the model of the rotation orders of an axis, or of all axes together."""
-        values = records_last(data["order"].values, 3)
-        weight = order_weight(state)
+        order, weight = records_last(data["order"].values, 3), order_weight(state)
         count = weight.shape[-1]
-        if candidates[0].is_per_axis:
-            cell_weight = np.concatenate([weight[row], weight[row]], axis=1)
+        is_per_axis = candidates[0].is_per_axis
+        # The cells of all axes side by side.
+        axes: Sequence[int] = [row] if is_per_axis else range(len(state.axes))
+        values = np.concatenate([real_and_imaginary(order[axis], axis=1) for axis in axes], axis=1)
+        cell_weight = np.concatenate([weight[axis] for axis in axes for _ in range(2)], axis=1)
+        if is_per_axis:
             designs = [
                 stack_columns(order_columns(np.ones(count, complex), chosen), cell_weight.shape)
                 for chosen in harmonic_sets(count)
-            ]
-            given, precision = given_columns(state, "order", (state.axes[row],), cell_weight.shape)
-            return LinearModel(
-                real_and_imaginary(values[row], axis=1),
-                cell_weight,
-                designs * len(candidates),
-                given,
-                precision,
-            )
-        # The cells of all axes side by side.
-        cell_weight = np.concatenate(
-            [np.concatenate([axis_weight, axis_weight], axis=1) for axis_weight in weight], axis=1
-        )
-        stacked = np.concatenate(
-            [real_and_imaginary(axis_values, axis=1) for axis_values in values], axis=1
-        )
-        designs = []
-        for candidate in candidates:
-            for variant in candidate.variants:
-                for pattern in (variant.design[0], np.conj(variant.design[0])):
-                    by_axis = [order_columns(factor, (0,)) for factor in pattern]
-                    designs.append(
-                        stack_columns(
-                            [np.concatenate(columns) for columns in zip(*by_axis, strict=True)],
-                            cell_weight.shape,
+            ] * len(candidates)
+        else:
+            designs = [
+                stack_columns(
+                    [
+                        np.concatenate(columns)
+                        for columns in zip(
+                            *(order_columns(factor, (0,)) for factor in pattern), strict=True
                         )
-                    )
-        named_columns = [state.given.get(("order", axis), []) for axis in state.axes]
-        given, precision = np.empty((*cell_weight.shape, 0)), np.empty((0, 0))
-        for number, columns in enumerate(named_columns):
-            for column in columns:
-                wide = np.zeros((*cell_weight.shape, 1))
-                wide[:, number * 2 * count : (number + 1) * 2 * count, 0] = column
-                given = np.concatenate([given, wide], axis=2)
-        if given.shape[2]:
-            precision = -np.eye(given.shape[2])
-        return LinearModel(stacked, cell_weight, designs, given, precision)
+                    ],
+                    cell_weight.shape,
+                )
+                for candidate in candidates
+                for variant in candidate.variants
+                for pattern in (variant.design[0], np.conj(variant.design[0]))
+            ]
+        given = []
+        for place, axis in enumerate(axes):
+            for column in state.given.get(("order", state.axes[axis]), []):
+                wide = np.zeros(cell_weight.shape)
+                wide[:, place * 2 * count : (place + 1) * 2 * count] = column
+                given.append(wide)
+        columns = np.stack(given, axis=-1) if given else np.empty((*cell_weight.shape, 0))
+        return LinearModel(values, cell_weight, designs, columns, -np.eye(len(given)))
 
     def condition(self, state: State, component: Component) -> State:
         """Condition on a component in the rotation orders."""
@@ -220,31 +231,6 @@ def order_columns(pattern: Array, chosen: tuple[int, ...]) -> list[Array]:
         harmonic[..., k] = pattern[..., k]
         columns += [real_and_imaginary(harmonic), real_and_imaginary(1j * harmonic)]
     return columns
-
-
-def _draw_orders(draw: NullDraw) -> NDArray[np.complex128]:
-    """Draw Gaussian amplitudes at the rotation orders, with the density near that frequency."""
-    blocks, expected = draw.blocks, draw.expected
-    recorded = blocks["order"].values
-    rate = float(blocks.attrs["sampling_rate_hz"])
-    samples = np.maximum(blocks["samples"].values, 1)
-    turning = np.abs(np.nan_to_num(blocks["channel_rotation_rate"].values)) / 360.0
-    bands = np.log(blocks["frequency"].values)
-    density = np.empty((len(expected), *recorded.shape))
-    for place, harmonic in enumerate(blocks["harmonic"].values):
-        folded = np.abs((turning * harmonic + rate / 2.0) % rate - rate / 2.0)
-        at = np.interp(np.log(np.maximum(folded, 1e-9)), bands, np.arange(bands.size))
-        low = np.minimum(at.astype(int), bands.size - 2)
-        block = np.arange(turning.size)
-        density[..., place] = expected[:, :, block, low] * (1.0 - (at - low)) + expected[
-            :, :, block, low + 1
-        ] * (at - low)
-    noise = draw.rng.standard_normal((*density.shape, 2)) @ np.array([1.0, 1j])
-    out = np.asarray(
-        np.sqrt(2.0 * noise_at_orders(blocks, density) * rate / samples[..., None]) * noise
-    )
-    out[..., np.isnan(recorded)] = np.nan
-    return out
 
 
 def _latitude_from_rate(across: float, error: float) -> tuple[float, float, float, float]:

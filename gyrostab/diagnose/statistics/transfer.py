@@ -52,7 +52,13 @@ class Transfer(Statistic):
         """Draw cross-spectra of axes with reference channels."""
         if "reference_cross" not in draw.blocks:
             return {}
-        return {"reference_cross": _draw_channel_cross(draw)}
+        recorded = draw.blocks["reference_cross"].values
+        shape = draw.blocks["shape"].values
+        channel_power = draw.blocks["reference_power"].values
+        size = np.sqrt(draw.power[:, :, None] * channel_power)
+        cross = size * draw_coherency(shape[:, None], size.shape, draw.rng)
+        cross[..., np.isnan(recorded)] = np.nan
+        return {"reference_cross": cross}
 
     def candidates(
         self,
@@ -135,7 +141,10 @@ class Transfer(Statistic):
         self, component: Component, axis: str, state: State, weight: Array
     ) -> tuple[Array | float, list[Array], list[Array]]:
         """Return the power that follows the channel or the other axis."""
-        return _transferred_power(component, replace(state, weight=weight)), [], []
+        mean, _ = component_mixture(component, replace(state, weight=weight)).moments()
+        transfer = np.tensordot(mean, component.variant.design, axes=1)
+        power = reference_channel_power(component.candidate.reference[0], state.blocks)
+        return np.abs(transfer) ** 2 * np.nan_to_num(power), [], []
 
 
 def reference_channel_of(
@@ -188,19 +197,13 @@ def _reference_channels(blocks: xr.Dataset) -> list[str]:
 
 def _unknown_channels(blocks: xr.Dataset) -> list[str]:
     """Return the channels on the log's time that may show motion, but drive no known effect."""
-    return [name for name in sorted(_reference_channels(blocks)) if not _is_known_channel(name)]
-
-
-def _is_known_channel(channel: str) -> bool:
-    """Return whether a channel drives a registered effect, or cannot show motion."""
     bases = {name for kind in effects().values() for name in kind.channels}
-    return (
-        any(
-            channel == name or channel.startswith(name.rstrip("0123456789").rstrip("_") + "_")
-            for name in bases
-        )
-        or channel == "pressure"
-    )
+    known = (*(base.rstrip("0123456789").rstrip("_") + "_" for base in bases),)
+    return [
+        name
+        for name in sorted(_reference_channels(blocks))
+        if not (name in bases or name == "pressure" or name.startswith(known))
+    ]
 
 
 def _any_transfer(bands: int) -> list[Variant]:
@@ -211,24 +214,3 @@ def _any_transfer(bands: int) -> list[Variant]:
         *variants,
         Variant({}, ("any",) * (2 * bands), np.concatenate([single_bands, 1j * single_bands])),
     ]
-
-
-def _transferred_power(component: Component, state: State) -> Array:
-    """Return the power that follows a channel or another axis, (block, band)."""
-    mean, _ = component_mixture(component, state).moments()
-    transfer = np.tensordot(mean, component.variant.design, axes=1)
-    return np.asarray(
-        np.abs(transfer) ** 2
-        * np.nan_to_num(reference_channel_power(component.candidate.reference[0], state.blocks))
-    )
-
-
-def _draw_channel_cross(draw: NullDraw) -> NDArray[np.complex128]:
-    """Draw cross-spectra of axes with reference channels."""
-    recorded = draw.blocks["reference_cross"].values
-    shape = draw.blocks["shape"].values
-    channel_power = draw.blocks["reference_power"].values
-    size = np.sqrt(draw.power[:, :, None] * channel_power)
-    cross = size * draw_coherency(shape[:, None], size.shape, draw.rng)
-    cross[..., np.isnan(recorded)] = np.nan
-    return np.asarray(cross)
