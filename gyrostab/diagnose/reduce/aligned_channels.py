@@ -42,8 +42,8 @@ ROTATION_WAVE_PREFIXES = ("rotation_rate", "toolface", "accel", "mag_")
 _MAX_STAMPS_INSPECTED = 2**20  # limits memory
 _CHUNK_SAMPLES = 2**20  # samples converted at once; limits memory
 
-#: Instants, stamps and their values, reach and period of the gyro [ns] -> value at each instant.
-_Choose = Callable[[Stamps, Stamps, Array, float, float], Array]
+#: Instants, stamps and their values, and reach [ns] -> value at each instant.
+_Choose = Callable[[Stamps, Stamps, Array, float], Array]
 
 
 class Aligned(NamedTuple):
@@ -172,7 +172,7 @@ def _place_channel(log: xr.Dataset, name: str) -> _Placed | str | None:
     hold_previous = log[name].attrs.get("interpolation") == "previous"
     choose: _Choose
     if ratio > MAX_SAME_PERIODS:
-        choose = partial(_interpolate_linearly, hold_previous=hold_previous)
+        choose = partial(interpolate_linearly, hold_previous=hold_previous)
         reach = MAX_BRIDGED_PERIODS
         method = f"it is interpolated from {1e9 / period:.4g} Hz"
     elif is_ramp or ratio * MAX_SAME_PERIODS >= 1.0:
@@ -180,7 +180,7 @@ def _place_channel(log: xr.Dataset, name: str) -> _Placed | str | None:
         reach = MAX_NEAREST_PERIODS
         method = "each sample has the nearest value"
     else:
-        choose = _average_around
+        choose = partial(_average_around, period=1e9 / rate)
         reach = 1.0
         method = f"each sample has the mean of its values at {1e9 / period:.4g} Hz"
     grid = _Grid(clock, start, rate, max(reach * period, 0.5e9 / rate), choose)
@@ -252,7 +252,7 @@ class _Grid:
         if not numbers.size:
             return np.full(high - low, np.nan)
         instants = grid_times(self.start, self.rate, np.arange(low, high))
-        return np.asarray(self.choose(instants, stamps, numbers, self.reach, 1e9 / self.rate))
+        return np.asarray(self.choose(instants, stamps, numbers, self.reach))
 
 
 def _place_on_grid(log: xr.Dataset, name: str, grid: _Grid, size: int) -> Any:
@@ -277,9 +277,7 @@ def _place_on_grid(log: xr.Dataset, name: str, grid: _Grid, size: int) -> Any:
     return da.concatenate(chunks)
 
 
-def _take_nearest(
-    instants: Stamps, stamps: Stamps, values: Array, reach: float, period: float
-) -> Array:
+def _take_nearest(instants: Stamps, stamps: Stamps, values: Array, reach: float) -> Array:
     """Return the nearest value of each instant, NaN beyond reach."""
     following = (
         np.clip(np.searchsorted(stamps, instants), 1, stamps.size - 1)
@@ -293,14 +291,8 @@ def _take_nearest(
     return np.where(np.abs(instants - stamps[place]) <= reach, values[place], np.nan)
 
 
-def _interpolate_linearly(
-    instants: Stamps,
-    stamps: Stamps,
-    values: Array,
-    reach: float,
-    period: float,
-    *,
-    hold_previous: bool,
+def interpolate_linearly(
+    instants: Stamps, stamps: Stamps, values: Array, reach: float, *, hold_previous: bool
 ) -> Array:
     """Interpolate linearly, or hold the previous value; NaN across gaps longer than reach."""
     following = np.searchsorted(stamps, instants, side="left")
@@ -316,7 +308,7 @@ def _interpolate_linearly(
 
 
 def _average_around(
-    instants: Stamps, stamps: Stamps, values: Array, reach: float, period: float
+    instants: Stamps, stamps: Stamps, values: Array, reach: float, *, period: float
 ) -> Array:
     """Return the mean of the values within half a period of the gyro of each instant."""
     edges = np.append(instants, instants[-1] + round(period)) - round(period / 2.0)

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.reduce.aligned_channels import interpolate_linearly
 from gyrostab.schema import log_channels, signal_name
 from gyrostab.simulate.drivers import Source, make_source
 from gyrostab.store import lazy
@@ -150,31 +151,18 @@ def channel_means(log: xr.Dataset, name: str, edges: NDArray[np.int64], *, rms: 
     with np.errstate(invalid="ignore", divide="ignore"):
         means = sums / counts
     means = np.sqrt(means) if rms else means
-    if 1 < stamps.size <= _CHANNEL_VALUES_PER_READ and counts.any():
-        longest = 3 * float(np.median(np.diff(stamps)))
-        return _interpolate_empty(means, make_source(log, name), edges, longest)
-    return means
-
-
-def _interpolate_empty(
-    means: Array, source: Source, edges: NDArray[np.int64], longest: float
-) -> Array:
-    """Interpolate empty intervals between values at most `longest` [ns] apart."""
-    middle = edges[:-1] + np.diff(edges) // 2
-    stamps = source.stamps
-    assert stamps is not None
-    following = np.searchsorted(stamps, middle)
-    inside = (following > 0) & (following < stamps.size)
-    within_reach = inside & (
-        stamps[np.clip(following, 1, stamps.size - 1)]
-        - stamps[np.clip(following - 1, 0, stamps.size - 2)]
-        <= longest
+    if not (1 < stamps.size <= _CHANNEL_VALUES_PER_READ and counts.any()):
+        return means
+    source = make_source(log, name)
+    assert source.stamps is not None
+    line = interpolate_linearly(
+        edges[:-1] + np.diff(edges) // 2,
+        source.stamps,
+        source.values,
+        3 * float(np.median(np.diff(stamps))),
+        hold_previous=source.held,
     )
-    fill = np.isnan(means) & within_reach
-    if fill.any():
-        means = means.copy()
-        means[fill] = source.at(middle[fill], None, None)[0]
-    return means
+    return np.where(np.isnan(means), line, means)
 
 
 def finite_range(data: Any) -> tuple[float, float]:
