@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
 
 from gyrostab.kernels.spectra.outliers import HISTOGRAM, departures, histogram_edge, peaks
 
@@ -62,8 +64,6 @@ def outlier_limit(samples: float) -> float:
     >>> round(outlier_limit(18_000), 2), round(outlier_limit(8_640_000), 2)
     (4.87, 5.97)
     """
-    from scipy.special import ndtri
-
     return float(
         max(-ndtri(EXPECTED_FALSE_OUTLIERS / (2.0 * max(samples, 1.0))), _MIN_OUTLIER_SIGMA)
     )
@@ -123,8 +123,6 @@ def count_outliers(
 
 def _fluctuating_level_limit(histogram: NDArray[np.uint32], scale: Array) -> float:
     """Return the limit in deviations of an axis whose noise level may fluctuate within blocks."""
-    from scipy.special import ndtr
-
     total = float(histogram.sum())
     limit = outlier_limit(total)
     low, high = _TAIL_RANGE_SIGMA
@@ -142,8 +140,6 @@ def _fluctuating_level_limit(histogram: NDArray[np.uint32], scale: Array) -> flo
 
 def _count_between(histogram: NDArray[np.uint32], scale: Array, low: float, high: float) -> float:
     """Count departures from `low` to `high` deviations; a split bin is shared as if normal."""
-    from scipy.special import ndtr
-
     edges = (
         np.concatenate([[0.0], histogram_edge(np.arange(1, HISTOGRAM + 1))])
         / np.where(scale > 0.0, scale, np.inf)[:, None]
@@ -217,22 +213,12 @@ def simultaneous_samples(present: NDArray[np.bool_]) -> dict[tuple[bool, ...], N
     (True, True, False) [1]
     (True, True, True) [1]
     """
-    axes, block_count = present.shape[:2]
-    if axes < 2:
-        return {}
-    if (present == present[:1]).all():
-        return {(True,) * axes: np.asarray(np.count_nonzero(present[0], axis=-1), np.int64)}
-    code = (present * (1 << np.arange(axes, dtype=np.int64))[:, None, None]).sum(axis=0)
-    kinds, place = np.unique(code, return_inverse=True)
-    cell = np.arange(block_count)[:, None] * kinds.size + place.reshape(code.shape)
-    number = np.bincount(cell.ravel(), minlength=block_count * kinds.size).reshape(
-        block_count, kinds.size
-    )
     number_by_kind = {
-        tuple(bool(kind >> axis & 1) for axis in range(axes)): number[:, k]
-        for k, kind in enumerate(kinds.tolist())
+        kind: np.count_nonzero((present == np.reshape(kind, (-1, 1, 1))).all(axis=0), axis=-1)
+        for kind in product((False, True), repeat=len(present))
+        if sum(kind) > 1
     }
-    return {kind: number_by_kind[kind] for kind in sorted(number_by_kind) if sum(kind) > 1}
+    return {kind: number for kind, number in number_by_kind.items() if number.any()}
 
 
 def zeros_beyond_chance(
