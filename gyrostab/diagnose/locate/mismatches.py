@@ -107,18 +107,17 @@ def _locate_regions(
     settings: Settings,
 ) -> list[dict[str, Any]]:
     """Locate the regions of one statistic, row by row."""
-    scores, name = statistic.score(blocks, baseline), statistic.name
+    scores = statistic.score(blocks, baseline)
     if scores is None:
         return []
-    z, critical = standardise(scores, null.statistics[name]), null.critical(name, level)
+    z = standardise(scores, null.statistics[statistic.name])
     regions = []
     for row in range(z.shape[0]):
         remaining = z[row].copy()
         for _ in range(MAX_PER_ROW):
-            region = _take_region(statistic, scores, row, remaining, z[row], critical, settings)
+            region = _take_region(statistic, scores, row, remaining, z[row], null, level, settings)
             if region is None:
                 break
-            region["p_value"] = float(null.p_value(name, region.pop("cell_z")))
             regions.append(region)
     return regions
 
@@ -135,8 +134,7 @@ def _locate_mean_regions(
 
     A step at one place shifts the mean of the whole record.
     """
-    name = statistic.name
-    critical, regions = null.critical(name, level), []
+    regions = []
     known_mean = baseline["known_mean"].copy(deep=True)
     open_rows = set(range(blocks.sizes["axis"]))
     for _ in range(MAX_PER_ROW):
@@ -144,13 +142,14 @@ def _locate_mean_regions(
         scores = statistic.score(blocks, now)
         if scores is None:
             break
-        z = standardise(scores, null.statistics[name])
+        z = standardise(scores, null.statistics[statistic.name])
         for row in sorted(open_rows):
-            region = _take_region(statistic, scores, row, z[row].copy(), z[row], critical, settings)
+            region = _take_region(
+                statistic, scores, row, z[row].copy(), z[row], null, level, settings
+            )
             if region is None:
                 open_rows.discard(row)
                 continue
-            region["p_value"] = float(null.p_value(name, region.pop("cell_z")))
             inside = (blocks["begin"].values >= region["begin"] - 1e-9) & (
                 blocks["end"].values <= region["end"] + 1e-9
             )
@@ -171,10 +170,12 @@ def _take_region(
     row: int,
     remaining: Array,
     z: Array,
-    critical: float,
+    null: NullScores,
+    level: float,
     settings: Settings,
 ) -> dict[str, Any] | None:
     """Return the region around the largest score left, or None; remove it from `remaining`."""
+    critical = null.critical(statistic.name, level)
     if not np.isfinite(remaining).any() or np.nanmax(np.abs(remaining)) < critical:
         return None
     window, column = np.unravel_index(np.nanargmax(np.abs(remaining)), remaining.shape)
@@ -199,7 +200,8 @@ def _take_region(
         "frequency": float(scores["frequency"].values[column]),
         "sign": int(sign),
         "z": float(sign * largest),
-        "cell_z": float(remaining[window, column]),  # null records have the largest of cells
+        # null records have the largest of cells
+        "p_value": float(null.p_value(statistic.name, remaining[window, column])),
         "ratio": float(ratio[column]),
         "estimate": float(ratio[column]),
     }
