@@ -15,7 +15,8 @@ its factor when the fold is held out.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from functools import reduce
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -134,12 +135,26 @@ def mean_factors(
     limits = factor_errors(raw_square[:design_width], np.diagonal(without_given.gram[0]))
     log_weight = noise_weight(baseline, axis, tier)
     subsets = fold_subsets(fold_blocks(data) if folds is None else folds)
-    out = np.empty((len(subsets), 1 + len(designs), values.shape[1]))
-    for number, subset in enumerate(subsets):
-        products = mean_products(values, columns, **setup, present=present & subset)
-        out[number] = log_evidence(
-            marginalise(products, columns_given.shape[1], precision), numbers, limits, log_weight
-        )
+    by_subset = (
+        mean_products(values, columns, **setup, present=present & subset) for subset in subsets
+    )
+    return _factors_by_subset(by_subset, precision, numbers, limits, log_weight)
+
+
+def _factors_by_subset(
+    by_subset: Iterable[Products],
+    precision: Array,
+    designs: Sequence[NDArray[np.int64]],
+    limits: Array,
+    log_weight: Array,
+) -> Array:
+    """Return the factors of designs from products, whose last columns have this prior precision."""
+    out = np.stack(
+        [
+            log_evidence(marginalise(part, len(precision), precision), designs, limits, log_weight)
+            for part in by_subset
+        ]
+    )
     out[:, 1:] -= out[:, :1]
     return out
 
@@ -233,33 +248,14 @@ def linear_model_factors(model: LinearModel, folds: xr.DataArray) -> Array:
     for length in range(classes.shape[1]):
         for number in range(FOLDS):
             of_fold = zip(products, classes[:, length] == number, strict=True)
-            held = _sum_products([part for part, is_held in of_fold if is_held], total)
-            subset_products.append(Products(*(a - b for a, b in zip(total, held, strict=True))))
-    out = np.stack(
-        [
-            log_evidence(marginalise(part, count, precision), numbers, limits, np.zeros(1))
-            for part in subset_products
-        ]
-    )
-    out[:, 1:] -= out[:, :1]
-    return out
+            held = [part for part, is_held in of_fold if is_held]
+            left = zip(total, _sum_products(held), strict=True) if held else ()
+            subset_products.append(Products(*(a - b for a, b in left)) if held else total)
+    return _factors_by_subset(subset_products, precision, numbers, limits, np.zeros(1))
 
 
-def _sum_products(products: Sequence[Products], like: Products | None = None) -> Products:
-    """Add products; zeros like `like` if there are none."""
-    if not products and like is not None:
-        return Products(*map(np.zeros_like, like))
-    return Products(*map(_add_arrays, zip(*products, strict=True)))
-
-
-def _add_arrays(arrays: Sequence[Array]) -> Array:
-    """Add arrays in order, but single numbers pairwise, as `numpy.sum` does on a copy of all."""
-    if arrays[0].size == 1:
-        return np.asarray(np.sum(arrays, axis=0))
-    total = arrays[0].copy()
-    for array in arrays[1:]:
-        total += array
-    return total
+def _sum_products(products: Sequence[Products]) -> Products:
+    return Products(*(reduce(np.add, arrays) for arrays in zip(*products, strict=True)))
 
 
 def _fill_free_precision(precision: Array, square: Array) -> Array:
