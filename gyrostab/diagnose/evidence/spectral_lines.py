@@ -69,6 +69,14 @@ def line_evidence(power: Array, weight: Array, expected: Array | None = None) ->
     return np.asarray(evidence_nats - np.log(power.shape[3]))
 
 
+def mean_line_power(blocks: xr.Dataset, axis: str) -> tuple[Array, float]:
+    """Return the mean periodogram (line,) of the record on an axis, and how many it has."""
+    weight, power = (axis_values(blocks, name, axis) for name in ("line_weight", "line_power"))
+    good = (weight > 0) & np.isfinite(power).all(axis=1)
+    count = float(weight[good].sum())
+    return (power[good] * weight[good, None]).sum(axis=0) / max(count, 1e-300), count
+
+
 def line_skirt(
     blocks: xr.Dataset, axis: str, place: int, settings: Settings = DEFAULTS
 ) -> NDArray[np.bool_]:
@@ -77,12 +85,8 @@ def line_skirt(
     The skirt extends on both sides until the power falls to the level. A line with a wandering
     phase is wider than the leakage; its slopes are not further lines.
     """
-    weight = axis_values(blocks, "line_weight", axis)
-    power = axis_values(blocks, "line_power", axis)
-    good = (weight > 0) & np.isfinite(power).all(axis=1)
-    count = float(weight[good].sum())
-    total = (power[good] * weight[good, None]).sum(axis=0) / max(count, 1e-300)
-    limit = local_level(total[None])[0] * (1.0 + settings.clear_sigma / np.sqrt(max(count, 1.0)))
+    total, count = mean_line_power(blocks, axis)
+    limit = local_level(total) * (1.0 + settings.clear_sigma / np.sqrt(max(count, 1.0)))
     in_skirt = np.abs(np.arange(total.size) - place) <= LEAK_LINES
     for step in (-1, 1):
         line = place + step

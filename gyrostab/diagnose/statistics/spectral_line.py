@@ -12,6 +12,7 @@ from gyrostab.diagnose.evidence.spectral_lines import (
     expected_lines,
     line_evidence,
     line_skirt,
+    mean_line_power,
 )
 from gyrostab.diagnose.predict.candidates import (
     Candidate,
@@ -280,24 +281,21 @@ def estimate_line(
     record if a sine of constant phase has more evidence than a line, and else in blocks.
     """
     axis_blocks = blocks.sel(axis=axis)
-    lines, power, weight = (
-        axis_blocks[name].values for name in ("line_frequency", "line_power", "line_weight")
-    )
     if _has_constant_phase(axis_blocks, place):
         sine = axis_blocks.isel(line=place)
         return _root_of_square(float(sine["sine_square"]), float(sine["sine_square_stderr"])), (
             float(sine["sine_frequency"]),
             0.5 * float(sine["sine_resolution"]),
         )
-    good = (weight > 0) & np.isfinite(power).all(axis=1)
-    total = (power[good] * weight[good, None]).sum(axis=0) / weight[good].sum()
-    level = local_level(total[None, None])[0, 0]
+    lines = blocks["line_frequency"].values
+    total, count = mean_line_power(blocks, axis)
+    level = local_level(total)
     skirt = line_skirt(blocks, axis, place, settings)
     step = float(np.diff(lines[:2])[0])
     above = total[skirt] - level[skirt]
     # Power N and a line S have the variance N^2 + 2 N S.
     variance = level[skirt] * np.maximum(2.0 * total[skirt] - level[skirt], level[skirt])
-    noise = 4.0 * step * float(np.sqrt(variance.sum() / weight[good].sum()))
+    noise = 4.0 * step * float(np.sqrt(variance.sum() / count))
     positive = np.maximum(above, 0.0)
     frequency = float((positive * lines[skirt]).sum() / max(positive.sum(), 1e-300))
     return _root_of_square(4.0 * float(above.sum()) * step, noise), (frequency, 0.5 * step)
