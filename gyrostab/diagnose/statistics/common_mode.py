@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -27,6 +26,8 @@ from gyrostab.diagnose.statistics.wording import subject, taus_text
 from gyrostab.kernels.regression.state_space import flicker_states, whiten
 from gyrostab.units import HOUR
 
+#: Indices of the first and of the second axis of each pair.
+Pairs = tuple[NDArray[np.int64], NDArray[np.int64]]
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (60,)
 #: Blocks over which the increments are averaged.
@@ -68,7 +69,7 @@ class CommonMode(Statistic):
         residual = blocks["mean"].values - baseline["known_mean"].values
         present = np.isfinite(residual).reshape(-1, *residual.shape[-2:]).all(axis=0)
         increments = _whiten_means(residual, present, blocks, baseline)
-        pairs = list(combinations(range(len(axes)), 2))
+        pairs = np.triu_indices(len(axes), 1)
         shared = (
             _shared_increments(present, pairs, blocks, baseline) if "cross" in baseline else None
         )
@@ -78,7 +79,7 @@ class CommonMode(Statistic):
         r = np.stack([first for first, _ in correlations], axis=-1)
         count = np.stack([first for _, first in correlations], axis=-1)
         z = correlation_score(r, np.broadcast_to(count, r.shape))
-        rows = [f"{axes[a]} {axes[b]}" for a, b in pairs]
+        rows = [f"{axes[a]} {axes[b]}" for a, b in zip(*pairs, strict=True)]
         if len(rows) > 1:
             z = np.concatenate(
                 [z, _score_all_axes(r, count, pairs, len(axes))[..., None, :, :]], axis=-3
@@ -136,7 +137,7 @@ def _whiten_means(
 
 def _shared_increments(
     present: NDArray[np.bool_],
-    pairs: list[tuple[int, int]],
+    pairs: Pairs,
     blocks: xr.Dataset,
     baseline: xr.Dataset,
 ) -> tuple[Array, Array]:
@@ -145,7 +146,7 @@ def _shared_increments(
     series = series * np.sqrt(np.nan_to_num(baseline["mean_variance"].values))
     spectrum = baseline["spectrum"].values[..., 0]
     cross = baseline["cross"].values[..., 0].real
-    first, second = ([pair[side] for pair in pairs] for side in (0, 1))
+    first, second = pairs
     with np.errstate(divide="ignore", invalid="ignore"):
         share = cross / np.sqrt(spectrum[first] * spectrum[second])
     return _whiten_means(series, present, blocks, baseline), np.nan_to_num(
@@ -156,13 +157,13 @@ def _shared_increments(
 def _correlate_pairs(
     increments: Array,
     present: NDArray[np.bool_],
-    pairs: list[tuple[int, int]],
+    pairs: Pairs,
     windows: Windows,
     span: int,
     shared: tuple[Array, Array] | None,
 ) -> tuple[Array, Array]:
     """Correlate pairs by (record), pair, window, averaged over `span` blocks; count averages."""
-    first, second = ([pair[side] for pair in pairs] for side in (0, 1))
+    first, second = pairs
 
     def products(values: Array) -> Array:
         product = values[..., first, :] * values[..., second, :]
@@ -177,11 +178,11 @@ def _correlate_pairs(
     share = _OVERLAP_FACTOR / span if span > 1 else 1.0  # of an average that is independent
     joint = (present[first] & present[second]).astype(float)
     count = sum_over_windows(joint, windows, axis=-1) * share
-    memory = _blocks_per_value(averages, first, second)[..., None] * share
+    memory = _blocks_per_value(averages, pairs)[..., None] * share
     return np.where(count >= _MIN_AVERAGES, r, np.nan), count / np.maximum(memory, 1.0)
 
 
-def _blocks_per_value(averages: Array, first: list[int], second: list[int]) -> Array:
+def _blocks_per_value(averages: Array, pairs: Pairs) -> Array:
     """Return the blocks per independent value of each pair (Bartlett 1935).
 
     It is the sum of the products of their autocorrelations.
@@ -191,23 +192,21 @@ def _blocks_per_value(averages: Array, first: list[int], second: list[int]) -> A
     autocorrelation = np.fft.irfft(power, 2 * n, axis=-1)[..., : n // 4]
     with np.errstate(divide="ignore", invalid="ignore"):
         autocorrelation = np.nan_to_num(autocorrelation / autocorrelation[..., :1])
-    return np.asarray(
-        2.0 * (autocorrelation[..., first, :] * autocorrelation[..., second, :]).sum(axis=-1) - 1.0
-    )
+    first, second = (autocorrelation[..., side, :] for side in pairs)
+    return np.asarray(2.0 * (first * second).sum(axis=-1) - 1.0)
 
 
-def _score_all_axes(r: Array, count: Array, pairs: list[tuple[int, int]], axes: int) -> Array:
+def _score_all_axes(r: Array, count: Array, pairs: Pairs, axes: int) -> Array:
     """Score all correlations by (record), window, span, jointly (Bartlett 1954)."""
     matrix = np.broadcast_to(np.eye(axes), (*r.shape[:-3], *r.shape[-2:], axes, axes)).copy()
-    for place, (a, b) in enumerate(pairs):
-        matrix[..., a, b] = matrix[..., b, a] = r[..., place, :, :]
+    matrix[(..., *pairs)] = matrix[(..., *pairs[::-1])] = np.moveaxis(r, -3, -1)
     is_complete = np.asarray(np.isfinite(matrix).all(axis=(-2, -1)))
     sign, logarithm = np.linalg.slogdet(
         np.where(is_complete[..., None, None], matrix, np.eye(axes))
     )
     logarithm = np.maximum(np.where(sign > 0, logarithm, -np.inf), _MIN_LOG_DETERMINANT)
     samples = np.maximum(count.min(axis=-3) - (2.0 * axes + 5.0) / 6.0, 1.0)
-    freedom = len(pairs)
+    freedom = r.shape[-3]
     value = -samples * logarithm / freedom
     z = cube_root_score(value, np.full(value.shape, freedom / 2.0))
     return np.where(is_complete, z, np.nan)
