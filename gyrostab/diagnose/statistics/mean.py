@@ -257,11 +257,9 @@ def window_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> 
     amount = np.full((*residual.shape[:-1], windows.first.size), np.nan)
     information = np.full((residual.shape[-2], windows.first.size), np.nan)
     for axis in range(residual.shape[-2]):
-        present = np.isfinite(residual[..., axis, :]).reshape(-1, residual.shape[-1]).any(axis=0)
-        noise = mean_noise(blocks, baseline, axis, present)
-        amount[..., axis, :], information[axis] = _matched_filter(
-            residual[..., axis, :], noise, windows
-        )
+        series = residual[..., axis, :]
+        noise = mean_noise(blocks, baseline, axis, series)
+        amount[..., axis, :], information[axis] = _matched_filter(series, noise, windows)
     return amount, information
 
 
@@ -288,8 +286,8 @@ def slow_coefficients(baseline: xr.Dataset, axis: int) -> tuple[float, float]:
     return float(np.nan_to_num(B)), float(np.nan_to_num(K))
 
 
-def mean_noise(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, present: Array) -> MeanNoise:
-    """Return the covariance of the block means of an axis, with all known random processes."""
+def mean_noise(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, series: Array) -> MeanNoise:
+    """Return the covariance of the means (..., block) of an axis, with all known processes."""
     b, k = slow_coefficients(baseline, axis)
     begin, end = blocks["begin"].values, blocks["end"].values
     step = np.diff((begin + end) / 2.0, append=end[-1])
@@ -300,8 +298,9 @@ def mean_noise(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, present: Arr
     times = np.append(times, processes.time)
     decay = np.exp(-step[:, None] / times)
     variance = baseline["mean_variance"].values[axis] + b**2 * white
-    present = present & np.isfinite(variance) & (variance > 0)
     n = variance.size
+    present = np.isfinite(series).reshape(-1, n).any(axis=0)
+    present = present & np.isfinite(variance) & (variance > 0)
     innovation, gain = np.empty(n), np.empty((n, times.size + 1))
     remaining = np.empty((n + 1, times.size + 1, times.size + 1))
     filter_gains(
@@ -325,7 +324,7 @@ def region_mean(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, inside: Arr
     By generalised least squares with a constant of the record.
     """
     residual = blocks["mean"].values[axis] - baseline["known_mean"].values[axis]
-    noise = mean_noise(blocks, baseline, axis, np.isfinite(residual))
+    noise = mean_noise(blocks, baseline, axis, residual)
     columns = np.stack([np.ones(residual.size), inside.astype(float)])
     rows = apply_precision(columns, noise)
     solved = np.linalg.lstsq(rows @ columns.T, rows @ np.nan_to_num(residual), rcond=None)[0]

@@ -38,9 +38,9 @@ class Restart(Statistic):
         residual = blocks["mean"].values - baseline["known_mean"].values
         z, estimate = (np.full((*residual.shape[:-1], len(designs)), np.nan) for _ in range(2))
         for axis in range(blocks.sizes["axis"]):
-            present = np.isfinite(residual[..., axis, :]).reshape(-1, block_count).any(axis=0)
-            noise = mean_noise(blocks, baseline, axis, present)
-            amount, information = _matched_filter(residual[..., axis, :], designs, noise)
+            series = residual[..., axis, :]
+            noise = mean_noise(blocks, baseline, axis, series)
+            amount, information = _matched_filter(series, designs, noise)
             with np.errstate(divide="ignore", invalid="ignore"):
                 z[..., axis, :] = amount / np.sqrt(information)
                 estimate[..., axis, :] = amount / information
