@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from gyrostab.diagnose.evidence.products import Products
 
@@ -40,8 +41,6 @@ class Mixture:
         >>> mixture.quantiles(0.025).round(1).tolist()
         [[8.4], [41.6]]
         """
-        from scipy.special import ndtr
-
         weight = self.weights()[:, None]
         sd = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
         reach = 40.0 * sd.max(axis=0)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.special import gammaln
 
 from gyrostab.diagnose.evidence.folds import FOLDS
 
@@ -167,8 +168,6 @@ class CountEvidence:
 
 def _log_ratio(count: Array, mean: Array) -> Array:
     """Return the log Bayes factor of a count raised by an unknown factor."""
-    from scipy.special import gammaln
-
     a, b = _PRIOR_SHAPE, _PRIOR_RATE
     raised = (
         gammaln(count + a)
@@ -183,9 +182,10 @@ def _log_ratio(count: Array, mean: Array) -> Array:
     )
 
 
-def _best_held_out(evidence: Array, lengths: int) -> Array:
-    """Return the largest over the lengths of the sum over folds, from (subset, ...)."""
-    without_fold = evidence[1:].reshape(lengths, FOLDS, *evidence.shape[1:])
+def _best_held_out(by_subset: list[Array]) -> Array:
+    """Return the largest over the lengths of the sum over folds."""
+    evidence = np.stack(by_subset)
+    without_fold = evidence[1:].reshape(-1, FOLDS, *evidence.shape[1:])
     return np.asarray((evidence[0] - without_fold).sum(axis=1).max(axis=0))
 
 
@@ -200,7 +200,7 @@ def sample_count_evidence(
     for subset in subsets:
         count = values[:, :, subset].sum(axis=2) / spread
         log_ratios.append(_log_ratio(count, mean[:, subset].sum(axis=1) / spread))
-    return _best_held_out(np.stack(log_ratios), (len(subsets) - 1) // FOLDS)
+    return _best_held_out(log_ratios)
 
 
 def kurtosis_evidence(
@@ -221,4 +221,4 @@ def kurtosis_evidence(
         log_ratios.append(
             0.5 * total**2 * prior / (1.0 + prior) * (total > 0) - 0.5 * np.log1p(prior)
         )
-    return _best_held_out(np.stack(log_ratios), (len(subsets) - 1) // FOLDS)
+    return _best_held_out(log_ratios)

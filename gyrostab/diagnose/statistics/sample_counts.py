@@ -228,10 +228,11 @@ def _count_evidence(
     """Return the evidence of a raised count, (record, axis)."""
     records = data.sizes.get("record", 1)
     if name == "lattice":
-        return np.broadcast_to(
-            _grid_evidence(state, count_evidence) if "record" not in data.dims else 0.0,
-            (records, len(state.axes)),
-        )
+        # one nat for each sample of a rounded rate: unrounded noise is never on the grid
+        is_rounded = count_evidence.rounded.size > 0 and "record" not in data.dims
+        samples = state.blocks["samples"].values.sum(axis=1).astype(np.float64)
+        nats = np.where(count_evidence.rounded, samples, 0.0) if is_rounded else 0.0
+        return np.broadcast_to(nats, (records, len(state.axes)))
     if name not in data or name not in count_evidence.of:
         return np.zeros((records, len(state.axes)))
     values = data[name].values.astype(np.float64)
@@ -241,13 +242,6 @@ def _count_evidence(
         values = np.where(state.masked, np.nan, values)
     compute = kurtosis_evidence if name == "kurtosis" else sample_count_evidence
     return compute(values, *count_evidence.of[name], subsets)
-
-
-def _grid_evidence(state: State, count_evidence: CountEvidence) -> Array:
-    """Count samples of a rounded rate, one nat each: unrounded noise is never on the grid."""
-    samples = state.blocks["samples"].values.sum(axis=1)
-    rounded = count_evidence.rounded if count_evidence.rounded.size else False
-    return np.where(rounded, samples, 0.0).astype(np.float64)
 
 
 def _is_everywhere(component: Component) -> bool:
