@@ -91,7 +91,6 @@ def _are_adjacent(region: Region, other: Region, settings: Settings) -> bool:
 
 
 def _extend_region(region: Region, other: Region, settings: Settings) -> None:
-    """Extend a region to another one."""
     if _common_share(region, other) <= settings.majority_share:
         region["begin"], region["end"] = (
             min(region["begin"], other["begin"]),

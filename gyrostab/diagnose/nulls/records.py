@@ -127,7 +127,6 @@ def repeatable_null_records(
 def _prepare_nulls(
     blocks: xr.Dataset, baseline: xr.Dataset, rng: np.random.Generator
 ) -> _NullSetup:
-    """Compute the quantities common to all null records."""
     columns = baseline["columns"].values
     noise = np.einsum("abfn,an->abf", columns, baseline["square"].values)
     effects = baseline["spectrum"].values / noise
@@ -206,7 +205,6 @@ def _kurtosis_excess(
 
 
 def _draw_records(setup: _NullSetup, count: int, rng: np.random.Generator) -> xr.Dataset:
-    """Draw some null records."""
     blocks, baseline = setup.blocks, setup.baseline
     axes, draws = blocks.sizes["axis"], baseline.sizes["draw"]
     chosen = rng.integers(0, draws, (count, axes))

@@ -196,7 +196,6 @@ def _is_wave_of_rotation(log: xr.Dataset, name: str) -> bool:
 
 
 def _clock_of(log: xr.Dataset, name: str) -> _Clock:
-    """Return the time stamps of a channel."""
     index = log.xindexes.get(f"time_{name}")
     if isinstance(index, TimeGridIndex):
         return _Clock(log.sizes[f"time_{name}"], index.start, index.rate)

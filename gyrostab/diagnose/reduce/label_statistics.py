@@ -281,12 +281,10 @@ def _gap_table(work: Accumulator, log: xr.Dataset, restart: float) -> dict[str, 
 
 
 def _line_frequencies(work: Accumulator) -> Array:
-    """Return the frequencies of the lines of a block [Hz]."""
     return np.asarray(np.arange(1, work.line_sum.shape[-1] + 1) * (work.rate / work.length))
 
 
 def _make_coordinates(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
-    """Return the coordinates of the block statistics."""
     ends = np.arange(work.block_count + 1) * work.length
     stamps = grid_times(work.start, work.rate, ends)
     step = work.rate / work.length

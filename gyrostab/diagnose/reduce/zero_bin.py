@@ -112,7 +112,6 @@ def empty_zone(values: Array) -> tuple[float, float]:
 
 
 def _parabola_columns(at: Array, reach: float) -> Array:
-    """Return the columns of a parabola."""
     return np.stack([np.ones(at.size), at / reach, np.square(at / reach)], axis=1)
 
 
@@ -176,7 +175,6 @@ def _read_widths(blocks: xr.Dataset) -> tuple[Array, Array, NDArray[np.bool_]]:
 
 
 def _is_like_truncation(width: Array, error: Array) -> NDArray[np.bool_]:
-    """Return which axes have the bin widths of truncation."""
     misfit = np.abs(width - _TRUNCATED_WIDTHS_STEPS)
     return np.asarray((misfit <= _allowed_misfit(error)).all(axis=1))
 

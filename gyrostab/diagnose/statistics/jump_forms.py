@@ -99,7 +99,6 @@ def _transition_courses(state: State) -> list[Callable[[Component], Array]]:
 
 
 def _event_course(state: State, span: tuple[int, int], jump: Component) -> Array:
-    """Return the course of an event over these blocks."""
     block = np.arange(state.blocks.sizes["block"])
     return ((block >= span[0]) & (block < span[1])).astype(np.float64)
 

@@ -398,7 +398,6 @@ def with_axis(density: Array) -> Array:
 
 
 def _changes_over_time(density: Array) -> bool:
-    """Return whether a density changes over time."""
     rows = with_axis(density)
     return bool(np.abs(rows - rows[:, :1]).max(initial=0.0) > 1e-6 * np.abs(rows).max(initial=0.0))
 

@@ -151,7 +151,6 @@ def _size_spikes(
 
 
 def _normal_density(x: Any) -> Any:
-    """Return the density of the standard normal law."""
     return np.exp(-(x**2) / 2.0) / math.sqrt(2.0 * math.pi)
 
 

@@ -191,7 +191,6 @@ def _moving_share(name: str, power: Array, state: State) -> Array:
 
 
 def _reference_channels(blocks: xr.Dataset) -> list[str]:
-    """Return the channels on the log's time."""
     return list(map(str, blocks["reference"].values)) if "reference" in blocks.dims else []
 
 
