@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -213,12 +212,13 @@ def simultaneous_samples(present: NDArray[np.bool_]) -> dict[tuple[bool, ...], N
     (True, True, False) [1]
     (True, True, True) [1]
     """
+    axes = len(present)
+    code = (present * (1 << np.arange(axes, dtype=np.int64))[:, None, None]).sum(axis=0)
     number_by_kind = {
-        kind: np.count_nonzero((present == np.reshape(kind, (-1, 1, 1))).all(axis=0), axis=-1)
-        for kind in product((False, True), repeat=len(present))
-        if sum(kind) > 1
+        tuple(bool(kind >> axis & 1) for axis in range(axes)): np.count_nonzero(code == kind, -1)
+        for kind in np.unique(code).tolist()
     }
-    return {kind: number for kind, number in number_by_kind.items() if number.any()}
+    return {kind: number_by_kind[kind] for kind in sorted(number_by_kind) if sum(kind) > 1}
 
 
 def zeros_beyond_chance(
