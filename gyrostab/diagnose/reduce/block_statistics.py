@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.fft import prev_fast_len
 
 from gyrostab.diagnose.reduce.accumulate import Accumulator
 from gyrostab.diagnose.reduce.label_statistics import label_statistics
@@ -45,7 +46,7 @@ def block_samples(size: int, rate: float, block: Any = None) -> int:
         default_length = max(
             min(_BLOCK_S * rate, size / _MIN_DEFAULT_BLOCKS), size / _MAX_BLOCKS, _MIN_BLOCK_SAMPLES
         )
-        length = _round_to_small_primes(int(default_length))
+        length = 2 * prev_fast_len(int(default_length) // 2, real=True)  # of 2, 3 and 5
     else:
         length = samples(block, rate, "block")
         if length < 16:
@@ -61,18 +62,6 @@ def block_samples(size: int, rate: float, block: Any = None) -> int:
             + ("; give a shorter block" if block is not None else "")
         )
     return length
-
-
-def _round_to_small_primes(length: int) -> int:
-    """Return the largest even product of 2, 3 and 5 up to `length`."""
-    while True:
-        cofactor = length
-        for prime in (2, 3, 5):
-            while cofactor % prime == 0:
-                cofactor //= prime
-        if cofactor == 1 and length % 2 == 0:
-            return length
-        length -= 1
 
 
 def reduce_log(
