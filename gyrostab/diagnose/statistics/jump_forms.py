@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,12 +52,20 @@ def jump_competitors(
     evidence = sum(max(component.evidence_nats, 0.0) for component in jumps)
     allowed = settings.ambiguous_nats + settings.form_error_share * evidence
     step = sum(component_mixture(jump, state).evidence for jump in jumps)
+    block = float(state.blocks.attrs["block_s"])
+    middle = (np.arange(state.blocks.sizes["block"]) + 0.5) * block
+    after = [middle - float(jump.variant.values[TIME_PARAMETER]) for jump in jumps]
     gradual = max(
-        _sum_evidence(jumps, state, transition) for transition in _transition_courses(state)
+        _sum_evidence(
+            jumps, state, [np.clip(time / (length * block) + 0.5, 0.0, 1.0) for time in after]
+        )
+        for length in _TRANSITION_BLOCKS
     )
     yield Competitor("a gradual change", gradual - step, error + allowed)
     spans = _event_spans(jumps[0], state)
-    events = [_sum_evidence(jumps, state, partial(_event_course, state, span)) for span in spans]
+    events = [
+        _sum_evidence(jumps, state, [_event_course(state, span)] * len(jumps)) for span in spans
+    ]
     if spans:
         best = int(np.argmax(events))
         nats, needed = events[best] - step, np.log(len(spans)) + allowed
@@ -70,12 +77,11 @@ def jump_competitors(
     yield Competitor("means that scatter for a while", scatter, settings.ambiguous_nats)
 
 
-def _sum_evidence(
-    jumps: Sequence[Component], state: State, course: Callable[[Component], Array]
-) -> float:
-    """Return the log evidence of another course (block,) in place of jumps, of free size."""
+def _sum_evidence(jumps: Sequence[Component], state: State, courses: Sequence[Array]) -> float:
+    """Return the log evidence of other courses (block,), one for each jump, of free size."""
     return sum(
-        component_mixture(jump, state, _with_course(jump, course(jump))).evidence for jump in jumps
+        component_mixture(jump, state, _with_course(jump, course)).evidence
+        for jump, course in zip(jumps, courses, strict=True)
     )
 
 
@@ -86,19 +92,7 @@ def _with_course(jump: Component, *courses: Array) -> Variant:
     return replace(jump.variant, design=design)
 
 
-def _transition_courses(state: State) -> list[Callable[[Component], Array]]:
-    """Return the courses of gradual changes, for each length."""
-    block = float(state.blocks.attrs["block_s"])
-    middle = (np.arange(state.blocks.sizes["block"]) + 0.5) * block
-
-    def transition(length: int, jump: Component) -> Array:
-        after = middle - float(jump.variant.values[TIME_PARAMETER])
-        return np.asarray(np.clip(after / (length * block) + 0.5, 0.0, 1.0))
-
-    return [partial(transition, length) for length in _TRANSITION_BLOCKS]
-
-
-def _event_course(state: State, span: tuple[int, int], jump: Component) -> Array:
+def _event_course(state: State, span: tuple[int, int]) -> Array:
     block = np.arange(state.blocks.sizes["block"])
     return ((block >= span[0]) & (block < span[1])).astype(np.float64)
 
@@ -166,6 +160,6 @@ def _event_spans(component: Component, state: State) -> list[tuple[int, int]]:
 def _is_other_level(jump: Component, state: State, span: tuple[int, int]) -> bool:
     """Return whether the level after an event clearly differs from that before it."""
     behind = (np.arange(state.blocks.sizes["block"]) >= span[1]).astype(np.float64)
-    with_level = _with_course(jump, _event_course(state, span, jump), behind)
+    with_level = _with_course(jump, _event_course(state, span), behind)
     size, covariance = component_mixture(jump, state, with_level).moments()
     return bool(abs(size[-1]) > state.settings.clear_sigma * np.sqrt(covariance[-1, -1]))
