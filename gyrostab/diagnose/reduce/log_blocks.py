@@ -1,4 +1,4 @@
-"""Reading of a log, once and in order of time, as batches of blocks; and channels at any time."""
+"""Reading of a log, once and in order of time, as batches of blocks; and means of channels."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.reduce.aligned_channels import interpolate_linearly
 from gyrostab.schema import log_channels, signal_name
-from gyrostab.simulate.drivers import Source, make_source
+from gyrostab.simulate.drivers import make_source
 from gyrostab.store import lazy
 from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import HOUR
@@ -111,19 +111,6 @@ def _load_rows(signal: Any, channels: Sequence[Any], low: int, high: int) -> Arr
     for row, channel_values in enumerate(loaded[1:], start=signal.shape[0]):
         out[row] = channel_values
     return out
-
-
-def channel_at(
-    source: Source, instants: NDArray[np.int64], carry: float | None
-) -> tuple[Array, float | None]:
-    """Return a channel at rising `instants` [ns since 1970], and `carry` for the next call."""
-    stretch = source.stretch(int(instants[0]) - 1, int(instants[-1]))
-    values = (
-        None
-        if stretch is None
-        else (stretch, lazy.read_slice(source.values, stretch.start, stretch.stop))
-    )
-    return source.at(instants, values, carry)
 
 
 def channel_means(log: xr.Dataset, name: str, edges: NDArray[np.int64], *, rms: bool) -> Array:

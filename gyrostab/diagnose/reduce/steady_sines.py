@@ -7,7 +7,7 @@ each of 200 blocks would gain 60 nats in one periodogram of them all, and gains 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,40 +32,44 @@ _MIN_SHARE = 0.25  # of a transformed length that must be present; design choice
 _STRENGTHS = 3.0 * 3.0 ** np.arange(12)
 
 
-class _Spectrum(NamedTuple):
+class _Spectrum:
     """Sum of periodograms of one length."""
 
-    size: int  # samples of each
-    taper: Array
-    total: Array  # (axis, frequency) [degree2 hour-2 Hz-1]
-    used: NDArray[np.int64]  # (axis,), their number
-    band_total: Array  # (axis, band), sum of their levels
-    band_largest: Array  # (axis, band), level of the noisiest one
+    def __init__(self, axes: int, size: int) -> None:
+        lines, self.size, self.taper = ordinates(_FINER * size), size, taper(size)
+        self.total = np.zeros((axes, lines))  # [degree2 hour-2 Hz-1]
+        self.used = np.zeros(axes, np.int64)  # their number
+        # bands of noise: first line, and number of lines
+        self.edges = np.linspace(0, lines, min(_NOISE_BANDS, lines), endpoint=False).astype(int)
+        self.widths = np.diff(self.edges, append=lines)
+        # (axis, band): sum of the levels, and that of the noisiest periodogram
+        self.band_total, self.band_largest = np.zeros((2, axes, self.edges.size))
+
+    def add(self, axis: int, values: Array, rate: float) -> None:
+        """Add the periodogram of some samples of an axis, if enough are present."""
+        present = np.isfinite(values)
+        if np.count_nonzero(present) < _MIN_SHARE * self.size:
+            return
+        centred = np.where(present, values - values[present].mean(), 0.0) * self.taper
+        lines = self.total.shape[1]
+        power = np.abs(np.fft.rfft(centred, _FINER * self.size)[1 : lines + 1]) ** 2
+        power /= (self.taper**2 * present).sum() * rate
+        self.total[axis] += power
+        self.used[axis] += 1
+        level = np.add.reduceat(power, self.edges) / self.widths
+        self.band_total[axis] += level
+        self.band_largest[axis] = np.maximum(self.band_largest[axis], level)
 
     def equal_count(self) -> Array:
         """Return (axis, frequency) how many equal periodograms have a sum with this upper tail.
 
         A noisier stretch leaves fewer: with a single one, the sum is an exponential variable.
         """
-        lines = self.total.shape[1]
-        widths = np.diff(_band_edges(lines), append=lines)
         used = np.maximum(self.used, 1)[:, None]
         mean = np.where(self.band_total > 0.0, self.band_total / used, 1.0)
         excess = self.band_largest / mean
-        is_equal = excess < 1.0 + _EQUAL_SIGMA * np.sqrt(_FINER / widths)
-        return np.repeat(used / np.where(is_equal, 1.0, excess), widths, axis=1)
-
-
-def _band_edges(lines: int) -> NDArray[np.int64]:
-    """Return the first line of each noise band."""
-    return np.linspace(0, lines, min(_NOISE_BANDS, lines), endpoint=False).astype(np.int64)
-
-
-def _make_spectrum(axes: int, size: int) -> _Spectrum:
-    lines = ordinates(_FINER * size)
-    bands = np.zeros((axes, _band_edges(lines).size))
-    total, used = np.zeros((axes, lines)), np.zeros(axes, np.int64)
-    return _Spectrum(size, taper(size), total, used, bands, bands.copy())
+        is_equal = excess < 1.0 + _EQUAL_SIGMA * np.sqrt(_FINER / self.widths)
+        return np.repeat(used / np.where(is_equal, 1.0, excess), self.widths, axis=1)
 
 
 class SineSearch:
@@ -79,7 +83,7 @@ class SineSearch:
         # none in blocks so long that hardly one fits a segment
         self.segment = np.full((axes, blocks * length if sizes else 0), np.nan)
         self.filled = 0
-        self.spectra = [_make_spectrum(axes, size) for size in sizes]
+        self.spectra = [_Spectrum(axes, size) for size in sizes]
 
     def add(self, values: Array) -> None:
         """Add the samples (axis, sample) that follow; NaN where missing."""
@@ -88,26 +92,12 @@ class SineSearch:
             self.segment[:, self.filled : self.filled + count] = values[:, :count]
             self.filled, values = self.filled + count, values[:, count:]
             if self.filled == self.segment.shape[1]:
-                self._add_periodograms()
                 self.filled = 0
-
-    def _add_periodograms(self) -> None:
-        for size, weights, total, used, band_total, band_largest in self.spectra:
-            edges = _band_edges(total.shape[1])
-            widths = np.diff(edges, append=total.shape[1])
-            for begin in range(0, self.segment.shape[1] - size + 1, size):
-                for axis, values in enumerate(self.segment[:, begin : begin + size]):
-                    present = np.isfinite(values)
-                    if np.count_nonzero(present) < _MIN_SHARE * size:
-                        continue
-                    centred = np.where(present, values - values[present].mean(), 0.0) * weights
-                    power = np.abs(np.fft.rfft(centred, _FINER * size)[1 : total.shape[1] + 1]) ** 2
-                    power /= (weights**2 * present).sum() * self.rate
-                    total[axis] += power
-                    used[axis] += 1
-                    level = np.add.reduceat(power, edges) / widths
-                    band_total[axis] += level
-                    band_largest[axis] = np.maximum(band_largest[axis], level)
+                for spectrum in self.spectra:
+                    size = spectrum.size
+                    for begin in range(0, self.segment.shape[1] - size + 1, size):
+                        for axis, part in enumerate(self.segment[:, begin : begin + size]):
+                            spectrum.add(axis, part, self.rate)
 
     def strongest(self, lines: Array) -> dict[str, Any]:
         """Return the strongest sine nearest to each line (frequencies [Hz], evenly spaced).
