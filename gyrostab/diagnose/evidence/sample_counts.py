@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,6 +16,8 @@ from gyrostab.diagnose.evidence.folds import FOLDS
 Array = NDArray[Any]
 #: Counts that effects raise.
 COUNTS = ("outliers", "repeats", "extremes", "stuck", "filled")
+#: What null records have by chance.
+EXPECTED = (*COUNTS, "kurtosis")
 #: Statistics of the distribution that a coarse quantization grid changes.
 GRID_COUNTS = ("repeats", "extremes", "zeros", "stuck", "filled", "kurtosis")
 #: Counts of `GRID_COUNTS` whose number by chance follows from the scatter of normal noise.
@@ -110,20 +113,6 @@ def kurtosis_moments(n: Array) -> tuple[Array, Array, Array]:
     return mean, variance, 6.0 + 8.0 / skew * (2.0 / skew + np.sqrt(1.0 + 4.0 / skew**2))
 
 
-class ExpectedCounts:
-    """Mean and overdispersion of the counts of null records, by axis, added batch by batch."""
-
-    def __init__(self) -> None:
-        self.sums: dict[str, list[Array]] = {name: [] for name in (*COUNTS, "kurtosis")}
-
-    def add(self, nulls: xr.Dataset) -> None:
-        """Add some null records."""
-        for name in self.sums:
-            if name in nulls:
-                values = nulls[name].values.astype(np.float64)
-                self.sums[name].append(excess_extremes(values) if name == "extremes" else values)
-
-
 def expected_counts(values: Array) -> tuple[Array, Array]:
     """Return the mean count (axis, block) and the overdispersion (axis,) of null records.
 
@@ -150,10 +139,11 @@ class CountEvidence:
     rounded: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
 
     @classmethod
-    def gathered(cls, expected: ExpectedCounts, rounded: NDArray[np.bool_]) -> CountEvidence:
+    def gathered(cls, nulls: Sequence[xr.Dataset], rounded: NDArray[np.bool_]) -> CountEvidence:
         """Compute the expected counts from all null records."""
         moments = {}
-        for name, counts in expected.sums.items():
+        for name in EXPECTED:
+            counts = [chunk[name].values.astype(np.float64) for chunk in nulls if name in chunk]
             if not counts:
                 continue
             values = np.concatenate(counts)  # (record, axis, block)
@@ -162,7 +152,9 @@ class CountEvidence:
                 clean = np.where(good, values, np.nan)
                 moments[name] = (np.nanmean(clean, axis=(0, 2)), np.nanstd(clean, axis=(0, 2)))
             else:
-                moments[name] = expected_counts(values)
+                moments[name] = expected_counts(
+                    excess_extremes(values) if name == "extremes" else values
+                )
         return cls(moments, rounded)
 
 

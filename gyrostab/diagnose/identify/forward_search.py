@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.quantization_grid import rounded_rates
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.evidence.sample_counts import CountEvidence, ExpectedCounts, has_coarse_grid
+from gyrostab.diagnose.evidence.sample_counts import EXPECTED, CountEvidence, has_coarse_grid
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.expected import identify_expected_effects
 from gyrostab.diagnose.identify.identification import Identifications
@@ -104,20 +104,18 @@ def _score_null_records(
     The evidence of counts needs the counts of all null records. It is added in a second pass, for
     which the counts are kept.
     """
-    expected = ExpectedCounts()
     linear = [candidate for candidate in candidates if not candidate.statistic.is_count]
     counts = [candidate for candidate in candidates if candidate.statistic.is_count]
     sums: list[dict[str, Array]] = []
     count_chunks: list[xr.Dataset] = []
     records = 0
     for chunk in nulls:
-        expected.add(chunk)
         sums.append(evidence_by_effect(compute_evidence(linear, chunk, state, folds, rng=rng)))
-        count_chunks.append(chunk[[name for name in expected.sums if name in chunk]])
+        count_chunks.append(chunk[[name for name in EXPECTED if name in chunk]])
         records += chunk.sizes["record"]
         progress("naming", 0, records)
     rounded = rounded_rates(state.blocks, state.baseline, settings=state.settings)
-    count_evidence = CountEvidence.gathered(expected, rounded)
+    count_evidence = CountEvidence.gathered(count_chunks, rounded)
     best = []
     for linear_sums, chunk in zip(sums, count_chunks, strict=True):
         count_sums = evidence_by_effect(
