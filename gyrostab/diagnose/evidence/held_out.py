@@ -88,7 +88,6 @@ def mean_factors(
     tier: Tier = "free",
     given: Array | None = None,
     folds: xr.DataArray | None = None,
-    walk: Array | None = None,
 ) -> Array:
     """Compute factors of designs in the block means of an axis, one record or many of equal gaps.
 
@@ -98,8 +97,6 @@ def mean_factors(
         Columns in any unit.
     given : ndarray, shape (block, column), optional
         Columns in the model with and without the design (effects already named).
-    walk : ndarray, shape (block,), optional
-        Growth of the variance of a random walk in addition to the baseline [degree2 hour-2 s-1].
 
     Returns
     -------
@@ -120,8 +117,6 @@ def mean_factors(
         "step": float(data["end"][0] - data["begin"][0]),
         "pairs": column_pairs(columns.shape[1], numbers, columns_given.shape[1]),
     }
-    if walk is not None:
-        setup["wander"] = setup["wander"].with_walk(walk)
     white = mean_products(
         values[:, :0],
         columns,

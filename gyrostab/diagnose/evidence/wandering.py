@@ -20,10 +20,6 @@ class RandomProcesses(NamedTuple):
     time: Array  # (process,): their correlation times [s]
     walk: Array  # (block,): growth of the variance of random walks [degree2 hour-2 s-1]
 
-    def with_walk(self, walk: Array) -> RandomProcesses:
-        """Return the processes with another random walk."""
-        return self._replace(walk=self.walk + walk)
-
 
 def expected_processes(baseline: xr.Dataset, axis: str | int) -> RandomProcesses:
     """Return the random processes expected in the mean of an axis, by name or index."""

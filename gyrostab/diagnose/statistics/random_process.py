@@ -152,13 +152,12 @@ def _walk_factors(
     def log_evidence(walk: Array) -> Array:
         factors = mean_factors(
             data,
-            baseline,
+            with_walk(baseline, axis, walk),
             [],
             axis=axis,
             tier=tier,
             given=state.given_to("mean", axis),
             folds=folds,
-            walk=walk,
         )
         return np.asarray(factors[0, 0])
 
