@@ -99,20 +99,17 @@ def telegraph_courses(
     plain = np.linalg.lstsq(
         columns_given * np.sqrt(weight)[:, None], (y * np.sqrt(weight)).T, rcond=None
     )[0].T
-    level = np.quantile((y - plain @ columns_given.T)[:, present], np.unique(starts), axis=1)
+    residual = (y - plain @ columns_given.T)[:, present]
     attempts = []
     for start in starts:
-        first, last = (
-            level[int(np.searchsorted(np.unique(starts), quantile))] for quantile in start
-        )
+        first, last = np.quantile(residual, start, axis=1)
         size = np.concatenate([plain, (last - first)[:, None]], axis=1)
         size[:, 0] += first
         fit = _Fit(size, np.full((len(y), 2), _START_TIME_BLOCKS), np.ones(len(y)))
         attempts.append(_maximise(fit, y, weight, columns_given, _TRIAL_ROUNDS, min_scatter))
     chosen = np.argmax([log for _, log in attempts], axis=0)
     by_attempt = zip(*((fit.size, fit.times, fit.scale) for fit, _ in attempts), strict=True)
-    size, times, scale = (_select_by_record(arrays, chosen) for arrays in by_attempt)
-    best = _Fit(size, times, scale)
+    best = _Fit(*(_select_by_record(arrays, chosen) for arrays in by_attempt))
     best, _ = _maximise(best, y, weight, columns_given, _ROUNDS, min_scatter)
     if parts > PARTS_PER_BLOCK:
         finer = best._replace(scale=np.ones(len(y)), parts=parts)
