@@ -76,8 +76,7 @@ class CommonMode(Statistic):
         correlations = [
             _correlate_pairs(increments, present, pairs, windows, span, shared) for span in spans
         ]
-        r = np.stack([first for first, _ in correlations], axis=-1)
-        count = np.stack([first for _, first in correlations], axis=-1)
+        r, count = (np.stack(part, axis=-1) for part in zip(*correlations, strict=True))
         z = correlation_score(r, np.broadcast_to(count, r.shape))
         rows = [f"{axes[a]} {axes[b]}" for a, b in zip(*pairs, strict=True)]
         if len(rows) > 1:

@@ -355,8 +355,8 @@ def _walk_variance(walk: Array, k: int) -> Array:
 
 def _pad_end(values: Array, size: int) -> Array:
     """Append NaN up to the size of the record."""
-    padding = np.full((*values.shape[:-1], size - values.shape[-1]), np.nan)
-    return np.concatenate([values, padding], axis=-1)
+    sides = [*[(0, 0)] * (values.ndim - 1), (0, size - values.shape[-1])]
+    return np.pad(values, sides, constant_values=np.nan)
 
 
 def _slow_allan_variance(blocks: xr.Dataset, baseline: xr.Dataset, tau: float) -> Array:

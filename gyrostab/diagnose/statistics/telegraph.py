@@ -51,12 +51,36 @@ class Telegraph(BlockMeanStatistic):
     def competitors(
         self, components: Sequence[Component], state: State, error: float
     ) -> Iterator[Competitor]:
-        """Yield levels that differ."""
-        return _level_competitors(components, state, error)
+        """Yield levels that differ at each visit.
+
+        They win unless two levels explain clearly more, with enough switches: the bias may follow
+        something that was not recorded. Axes of one course show the same visits: that these are
+        equal counts once.
+        """
+        unequal = np.array([_unequal_nats(component, state) for component in components])
+        nats = float(unequal.min() + np.maximum(unequal, 0.0)[unequal > unequal.min()].sum())
+        yield Competitor("levels that differ", nats + error + state.settings.ambiguous_nats, 0.0)
 
     def axis_competitors(self, component: Component, state: State) -> Iterator[Competitor]:
-        """Yield more than two levels."""
-        return _further_levels(component, state)
+        """Yield three levels or more: a bias that still switches with two in the model."""
+        axis, settings = component.row[0], state.settings
+        allowed = settings.ambiguous_nats + settings.form_error_share * component.evidence_nats
+        if component.variant.inside.size:
+            within = _search_sub_blocks(state.blocks, _add_fast_switching(state, component), axis)
+            nats = (
+                within.evidence_nats if within is not None and _is_resolved(within, state) else 0.0
+            )
+        else:
+            given = state.with_columns("mean", axis, [component.variant.design[0, 0]])
+            evidence_nats, _ = telegraph_evidence(
+                state.blocks,
+                state.baseline,
+                axis=axis,
+                given=given.given_to("mean", axis),
+                settings=settings,
+            )
+            nats = float(evidence_nats[0])
+        yield Competitor("more than two levels", nats, allowed)
 
     def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
         """Return any course of levels, which the means determine."""
@@ -215,40 +239,6 @@ def _variant_with_course(
         count, share = float(course.switch_count[0]), course.share[0]
     values = {"low": float(low), "high": float(high), "switches": count}
     return replace(variant, values=values, design=share[None, None])
-
-
-def _level_competitors(
-    components: Sequence[Component], state: State, error: float
-) -> Iterator[Competitor]:
-    """Yield levels that differ at each visit.
-
-    They win unless two levels explain clearly more, with enough switches: the bias may follow
-    something that was not recorded. Axes of one course show the same visits: that these are equal
-    counts once.
-    """
-    unequal = np.array([_unequal_nats(component, state) for component in components])
-    nats = float(unequal.min() + np.maximum(unequal, 0.0)[unequal > unequal.min()].sum())
-    yield Competitor("levels that differ", nats + error + state.settings.ambiguous_nats, 0.0)
-
-
-def _further_levels(component: Component, state: State) -> Iterator[Competitor]:
-    """Yield a bias that still switches with two levels in the model, of three levels or more."""
-    axis, settings = component.row[0], state.settings
-    allowed = settings.ambiguous_nats + settings.form_error_share * component.evidence_nats
-    if component.variant.inside.size:
-        within = _search_sub_blocks(state.blocks, _add_fast_switching(state, component), axis)
-        nats = within.evidence_nats if within is not None and _is_resolved(within, state) else 0.0
-    else:
-        given = state.with_columns("mean", axis, [component.variant.design[0, 0]])
-        evidence_nats, _ = telegraph_evidence(
-            state.blocks,
-            state.baseline,
-            axis=axis,
-            given=given.given_to("mean", axis),
-            settings=settings,
-        )
-        nats = float(evidence_nats[0])
-    yield Competitor("more than two levels", nats, allowed)
 
 
 def _unequal_nats(component: Component, state: State) -> float:
