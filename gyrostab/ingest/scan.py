@@ -245,9 +245,9 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
     from gyrostab.ingest.grid.fill import count_present
     from gyrostab.ingest.grid.gaps import gap_table
     from gyrostab.ingest.grid.regularise import regularise
+    from gyrostab.ingest.grid.scan_pass import find_spans
     from gyrostab.ingest.uniform import cut_log
     from gyrostab.schema import log_channels, signal_name, texts
-    from gyrostab.store.row_inspection import find_spans
 
     max_gap = reading.get("max_gap", "10D")
     cut = {name: reading[name] for name in _CUTTING if name in reading}

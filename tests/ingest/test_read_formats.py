@@ -427,25 +427,7 @@ def test_buffers_spill_to_disk_and_read_back(monkeypatch: pytest.MonkeyPatch) ->
             np.testing.assert_array_equal(np.asarray(as_lazy(columns[key])), expected[key])
             for part in (slice(3, 38), slice(6, 6), slice(1, 40, 7), slice(-9, None)):
                 np.testing.assert_array_equal(columns[key][part], expected[key][part])
-        rows = np.array([4, 5, 6, 42])
-        column = columns["b"]
-        if not isinstance(column, PiecewiseColumn):
-            continue
-        np.testing.assert_array_equal(column.take_rows(rows), expected["b"][rows])
-        column.changed, column.value = rows, -1
-        np.testing.assert_array_equal(
-            column[:], np.where(np.isin(np.arange(43), rows), -1, expected["b"])
-        )
-        np.testing.assert_array_equal(column[5:7], [-1, -1])
-    reads: list[int] = []
-    read_into = PiecewiseColumn.read_into
-    monkeypatch.setattr(
-        PiecewiseColumn, "read_into", lambda *args: (reads.append(1), read_into(*args))[1]
-    )
-    spool, values, rows = Spool(), rng.normal(size=10_000), np.arange(5, 9995, 7)
-    monkeypatch.setattr(pieces, "CHUNK_ROWS", 4096)
-    np.testing.assert_array_equal(spool.store(values).take_rows(rows), values[rows])
-    assert len(reads) == 3
+    spool = Spool()
     first, second = (
         spool.store(np.arange(5.0)),
         spool.store(np.array(["2026-01-01", "NaT"], dtype="datetime64[ns]")),

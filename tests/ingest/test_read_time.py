@@ -304,7 +304,7 @@ def test_clock_that_begins_again_at_midnight_is_continued(
 
 @pytest.mark.parametrize("name", ["log.h5", "log.nc"])
 @pytest.mark.parametrize("batch", [128, 2**20])
-def test_clock_is_continued_where_values_stay_in_the_file(tmp_path, monkeypatch, name, batch):
+def test_clock_is_continued_over_batches_and_on_disk(tmp_path, monkeypatch, name, batch):
     monkeypatch.setattr("gyrostab.ingest.columns.pieces.SPILL_BYTES", 1000)
     monkeypatch.setattr("gyrostab.ingest.columns.typed.BATCH_ROWS", batch)
     clock = 86400.0 - 100.0 + np.arange(10_000) / 20

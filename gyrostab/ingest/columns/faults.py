@@ -59,7 +59,6 @@ class Faults:
     def __init__(self) -> None:
         self.cells = self.gyro_cells = 0  # the latter in rows that are readable otherwise
         self.rows, self.cell_rows = _Places(), _Places()
-        self.index: list[NDArray[np.int64]] = []  # numbers of the unreadable rows
         self.missing: Counter[int] = Counter()  # missing values by column number
         self.first_row = ""
 
@@ -74,7 +73,6 @@ class Faults:
             if quote is not None and not self.rows.total:
                 self.first_row = f": {quote(int(block.bad_rows[0])):.100}"
             self.rows.add(block.bad_rows, locate)
-            self.index.append(block.bad_rows + first)
         if block.cell_rows.size:
             self.cell_rows.add(block.cell_rows, locate)
             self.gyro_cells += block.cells

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,13 +10,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.ingest.columns.dates import is_iso
-from gyrostab.ingest.columns.pieces import EvenStampsPiece, FilePiece
 from gyrostab.ingest.columns.plan import Plan
 from gyrostab.ingest.columns.plan_draft import Column
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
 from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, numbers_to_ns
 from gyrostab.ingest.options import FileSummary
-from gyrostab.store.row_inspection import inspect_rows
 from gyrostab.store.threads import map_in_order
 from gyrostab.time.stamps import to_nanoseconds
 
@@ -80,27 +77,21 @@ def holds_dates(values: Any) -> bool:
 
 
 def read_columns(
-    plan: Plan,
-    rows: int,
-    fetch: Fetch,
-    *,
-    notes: Sequence[str] = (),
-    parallel: bool = False,
-    stay: bool = False,
+    plan: Plan, rows: int, fetch: Fetch, *, notes: Sequence[str] = (), parallel: bool = False
 ) -> xr.Dataset:
     """Build the raw log of columns that can be fetched by ranges of rows.
 
-    `fetch` is thread-safe if `parallel`. With `stay` it is as fast as reading a temporary file, and
-    can be called at any later time; columns that exceed the memory limit then stay in the file.
+    `fetch` is thread-safe if `parallel`.
     """
     builder = RawLogBuilder(plan)
-    stay = stay and 8 * rows * len(plan.columns) > builder.buffers.limit
-    if stay:
-        builder.grids = dict.fromkeys(builder.grids)  # nothing is packed
     step = batch_rows(len(plan.columns))
     spans = ((start, min(start + step, rows)) for start in range(0, rows, step))
-    take = partial(_convert_span, builder, fetch, stay)
-    for converted in map_in_order(take, spans) if parallel else map(take, spans):
+
+    def convert(span: tuple[int, int]) -> ConvertedBlock:
+        batch = {column.source: fetch(column.source, *span) for column in plan.columns}
+        return convert_batch(builder, batch)
+
+    for converted in map_in_order(convert, spans) if parallel else map(convert, spans):
         builder.add(converted)
     return builder.finish(notes)
 
@@ -114,42 +105,6 @@ def batch_rows(columns: int) -> int:
     (1048576, 8384)
     """
     return min(max(BATCH_BYTES // (8 * max(columns, 1)), 2**10), BATCH_ROWS) // 8 * 8
-
-
-def _convert_span(
-    builder: RawLogBuilder, fetch: Fetch, stay: bool, span: tuple[int, int]
-) -> ConvertedBlock:
-    """Convert one batch; keep only its findings if the values stay in the file."""
-    columns = builder.plan.columns
-    batch = {column.source: fetch(column.source, *span) for column in columns}
-    converted = convert_batch(builder, batch)
-    if not stay:
-        return converted
-    begin, rows = span[0], converted.rows
-    block: dict[int, Any] = dict(converted.block)
-    inspection = None
-    if builder.gyro:
-        cells = np.stack([block[column.source] for column in builder.gyro])
-        channels = {column.name: block[column.source] for column in builder.channels}
-        inspection = inspect_rows(cells, channels, begin)
-    for column in columns:
-        is_continued = column.role == "time" and converted.clock and converted.clock.turns
-        if not (is_continued or isinstance(block[column.source], EvenStampsPiece)):
-            read = partial(_read_column, column, fetch)
-            block[column.source] = FilePiece(read, begin, rows)
-    return converted._replace(block=block, inspection=inspection)
-
-
-def _read_column(column: Column, fetch: Fetch, start: int, stop: int) -> NDArray[Any]:
-    """Read a range of a column as stamps, or as values in the inner unit."""
-    from gyrostab.kernels.encoding.rows import clean_column
-
-    stored = fetch(column.source, start, stop)
-    if column.role == "time":
-        return to_stamps(stored, column)
-    values, _ = _to_floats(stored)
-    clean_column(values, column.factor, column.offset)
-    return values
 
 
 def convert_batch(builder: RawLogBuilder, batch: dict[int, Any]) -> ConvertedBlock:

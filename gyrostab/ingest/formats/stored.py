@@ -16,7 +16,7 @@ from gyrostab.ingest.columns.typed import float32_note, read_columns, summarise_
 from gyrostab.ingest.formats.packing import Decoder, attribute_text, fold_packing
 from gyrostab.ingest.limits import check_stored
 from gyrostab.ingest.options import FileSummary, ReadOptions
-from gyrostab.store.rows import EvenRows, LibraryRows, Rows
+from gyrostab.store.rows import LibraryRows, Rows
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,6 @@ class StoredTable:
             self.fetch,
             notes=[*self.notes, *float32_note(plan, [column.dtype for column in columns])],
             parallel=not any(isinstance(rows, LibraryRows) for rows in sources),
-            stay=all(isinstance(rows, EvenRows) for rows in sources),
         )
 
 

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from gyrostab.errors import SchemaError
 from gyrostab.ingest.gap_table import MISSING, OUTSIDE_RANGE, UNREADABLE, sort_lines
 from gyrostab.ingest.grid.place import Placement
-from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass
+from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, find_spans
 from gyrostab.ingest.uniform.core import merge_spans
 from gyrostab.kernels.grid.stamps import DUPLICATE, OUT_OF_ORDER, RESTART, STEP
 from gyrostab.schema import GAP_CAUSES
-from gyrostab.store.row_inspection import find_spans
 
 
 def _missing_samples(placement: Placement, scanned: ScanPass) -> NDArray[np.int64]:

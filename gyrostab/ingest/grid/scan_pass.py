@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.pieces import InspectedRows
 from gyrostab.ingest.columns.stamps import read_stamps
 from gyrostab.ingest.uniform.core import merge_spans
+from gyrostab.kernels.grid.stamps import scan_cells
 from gyrostab.schema import texts
-from gyrostab.store.lazy import find_source, read_slice
-from gyrostab.store.row_inspection import RowInspection, inspect_rows
+from gyrostab.store.lazy import read_slice
 from gyrostab.store.threads import map_in_order
 
 #: Rows in memory at one time.
@@ -53,58 +53,47 @@ class ScanPass:
         return bits[begin % 8 : begin % 8 + end - begin].astype(bool)
 
 
+class _Block(NamedTuple):
+    """Findings in a block of rows."""
+
+    bits: NDArray[np.uint8]
+    absent: int
+    unreadable: NDArray[np.int64]
+    infinite: NDArray[np.int64]
+    low: NDArray[np.float64]  # (n_axes,): range of the finite values
+    high: NDArray[np.float64]
+    filled: list[int]
+
+
 def _scan_block(
     raw: xr.Dataset, name: str, channels: Sequence[str], ends: tuple[int, int]
-) -> RowInspection:
-    return inspect_rows(
-        read_slice(raw[name].data, *ends),
-        {key: read_slice(raw[key].data, *ends) for key in channels},
-        ends[0],
-    )
+) -> _Block:
+    cells = np.ascontiguousarray(read_slice(raw[name].data, *ends), dtype=np.float64)
+    present = np.empty(cells.shape[1], dtype=bool)
+    absent, holes, infinities, low, high = scan_cells(cells, present)
+    unreadable = np.isnan(cells).any(axis=0) & present if holes else ()
+    infinite = np.isinf(cells).any(axis=0) if infinities else ()
+    filled = [int(np.isfinite(read_slice(raw[key].data, *ends)).sum()) for key in channels]
+    spans = (find_spans(bad, ends[0]) for bad in (unreadable, infinite))
+    return _Block(np.packbits(present), absent, *spans, low, high, filled)
 
 
-def _scan_blocks(
-    raw: xr.Dataset, name: str, channels: Sequence[str], block: int
-) -> Iterable[RowInspection]:
-    """Yield the findings of each block, from the reader if it has scanned it."""
-    rows = raw.sizes["row"]
-    source = find_source(raw[name].data)
-    inspections: Sequence[RowInspection] = ()
-    if isinstance(source, InspectedRows):
-        inspections = source.inspections
-    is_complete = sum(inspection.rows for inspection in inspections) == rows and all(
-        inspection.rows % 8 == 0 for inspection in inspections[:-1]
-    )
-    if (
-        inspections
-        and is_complete
-        and all(inspection.filled.keys() == set(channels) for inspection in inspections)
-    ):
-        return inspections
-    return map_in_order(
-        partial(_scan_block, raw, name, channels),
-        ((at, min(rows, at + block)) for at in range(0, rows, block)),
-    )
+def find_spans(bad: Any, offset: int) -> NDArray[np.int64]:
+    """Return the half-open spans in which `bad` is true, as rows from `offset` on."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]])))
+    return np.asarray(edges.reshape(-1, 2) + offset, dtype=np.int64)
 
 
 def scan_rows(raw: xr.Dataset, name: str, *, block: int = BLOCK_ROWS) -> ScanPass:
     """Scan every cell of a raw log once; `FormatError` when no row holds a number."""
-    signal = raw[name].data
-    n_axes, rows = signal.shape
+    rows = raw.sizes["row"]
     block -= block % 8
-    bits, unreadable, infinite = [], [], []
-    absent = 0
-    low, high = np.full(n_axes, np.inf), np.full(n_axes, -np.inf)
     channels = [str(key) for key, variable in raw.data_vars.items() if variable.dims == ("row",)]
-    filled = dict.fromkeys(channels, 0)
-    for inspection in _scan_blocks(raw, name, channels, block):
-        absent += inspection.absent
-        bits.append(inspection.bits)
-        unreadable.append(inspection.unreadable)
-        infinite.append(inspection.infinite)
-        low, high = np.minimum(low, inspection.low), np.maximum(high, inspection.high)
-        for key, count in inspection.filled.items():
-            filled[key] += count
+    spans = ((begin, min(rows, begin + block)) for begin in range(0, rows, block))
+    blocks = list(map_in_order(partial(_scan_block, raw, name, channels), spans))
+    absent = sum(part.absent for part in blocks)
+    low = np.min([part.low for part in blocks], axis=0, initial=np.inf)
+    high = np.max([part.high for part in blocks], axis=0, initial=-np.inf)
     if rows == 0 or absent == rows or not np.any(low <= high):
         raise FormatError(
             f"{', '.join(_source_names(raw))}: none of the {rows} rows holds a number for any "
@@ -119,8 +108,17 @@ def scan_rows(raw: xr.Dataset, name: str, *, block: int = BLOCK_ROWS) -> ScanPas
     empty = [
         axis for axis, lowest, highest in zip(axes, low, high, strict=True) if lowest > highest
     ]
-    packed, spans = np.concatenate(bits), (merge_spans(unreadable), merge_spans(infinite))
-    return ScanPass(rows, packed, absent, *spans, still, empty, filled)
+    counts = np.sum([part.filled for part in blocks], axis=0, dtype=int).tolist()
+    return ScanPass(
+        rows,
+        np.concatenate([part.bits for part in blocks]),
+        absent,
+        merge_spans([part.unreadable for part in blocks]),
+        merge_spans([part.infinite for part in blocks]),
+        still,
+        empty,
+        dict(zip(channels, counts, strict=True)),
+    )
 
 
 def stamp_blocks(

@@ -1,0 +1,160 @@
+"""Columns in pieces, in memory and on disk, and files that are read ahead."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.ingest import read_log, reading
+from gyrostab.ingest.columns import pieces
+from gyrostab.ingest.columns.pieces import (
+    EvenPiece,
+    PiecewiseColumn,
+    Spool,
+    find_even,
+)
+from gyrostab.ingest.formats import text
+from gyrostab.kernels.grid.stamps import NO_STAMP, new_state, place
+from gyrostab.store.threads import map_in_order
+
+
+def bits(values: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(values).view(np.int64)
+
+
+@pytest.mark.parametrize("where", ["memory", "disk", "both"])
+def test_pieces_of_every_kind_in_memory_and_on_disk(where):
+    spool = Spool()
+    values = np.array([1.5, np.nan, 1 / 3, 0.25])
+    pieces = PiecewiseColumn(np.float64, [bits(values[:3]), bits(values[3:])])
+    stamps = np.array([5, 10, 15, 20, 100, 200])
+    times = PiecewiseColumn("datetime64[ns]", [EvenPiece(5, 5, 4), stamps[4:].copy()])
+    if where == "both":
+        first = PiecewiseColumn(np.float64, pieces._pieces[:1])
+        first.move_to(spool)
+        pieces = PiecewiseColumn(np.float64, [*first._pieces, bits(values[3:])])
+    if where == "disk":
+        held = pieces.memory_bytes
+        pieces.move_to(spool)
+        times.move_to(spool)
+        assert held == 8 * 4
+        assert pieces.memory_bytes == times.memory_bytes == 0
+    for begin, end in [(0, 4), (2, 4), (3, 4), (2, 2)]:
+        np.testing.assert_array_equal(bits(pieces[begin:end]), bits(values[begin:end]))
+    for begin, end in [(0, 6), (2, 4), (3, 6), (5, 5)]:
+        np.testing.assert_array_equal(times[begin:end].view(np.int64), stamps[begin:end])
+    apart = np.empty((6, 2), "datetime64[ns]")
+    times.read_into(0, 0, apart[:, 1])
+    np.testing.assert_array_equal(apart[:, 1].view(np.int64), stamps)
+
+
+def test_stamps_at_even_steps_are_one_piece():
+    stamps = np.arange(7, 5000, 5).view("datetime64[ns]")
+    assert find_even(stamps) == EvenPiece(7, 5, 999)
+    assert find_even(stamps[:1]) == EvenPiece(7, 0, 1)
+    uneven = np.delete(stamps, 3)
+    assert find_even(uneven) is uneven
+    uneven = np.where(np.arange(999) == 3, np.datetime64("NaT"), stamps)
+    assert find_even(uneven) is uneven
+
+
+def text_log(path: Path, first: int, rows: int, *, decimals: int) -> Path:
+    rng = np.random.default_rng(first)
+    lines = ["time [ms],gyro_x [deg/h],gyro_y [0.02 deg/h],temperature [degC]"]
+    for n in range(rows):
+        x, y = rng.normal(scale=30), rng.integers(-500, 500)
+        temperature = f"{20 + n / 1000:.2f}" if n % 10 == 0 else ""
+        lines.append(
+            f"{(first + n + 40 * (n > 700)) * 10},{x:.{decimals}f},"
+            f"{'****' if n == 333 else y},{temperature}"
+        )
+    lines[500] = "@@@@,,,"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("limit", [100, 10**9])
+@pytest.mark.parametrize("decimals", [3, 12])
+def test_log_in_pieces_equals_the_plain_log(tmp_path, monkeypatch, limit, decimals):
+    paths = [
+        text_log(tmp_path / f"{number}.csv", 1100 * number, 1000, decimals=decimals)
+        for number in range(3)
+    ]
+    plain = read_log(paths)
+    assert isinstance(plain.rate.data, np.ndarray)
+    monkeypatch.setattr(pieces, "_MAX_PLAIN_VALUES", 0)
+    monkeypatch.setattr(reading, "SPILL_BYTES", limit)
+    piecewise = read_log(paths)
+    assert piecewise.rate.chunks is not None
+    xr.testing.assert_identical(piecewise.compute(), plain)
+    np.testing.assert_array_equal(bits(piecewise.rate.compute().values), bits(plain.rate.values))
+
+
+def test_reading_ahead_stops_with_an_error(tmp_path, monkeypatch):
+    paths = [
+        text_log(tmp_path / f"{number}.csv", 2000 * number, 2000, decimals=3) for number in range(3)
+    ]
+    sizes: list[int] = []
+    take = text._parse_block
+
+    def slowly(block, **options):
+        time.sleep(0.005)
+        sizes.append(len(block))
+        return take(block, **options)
+
+    def refuse(number, count, path):
+        if number == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(text, "_parse_block", slowly)
+    monkeypatch.setattr(text, "BLOCK_BYTES", 256)
+    with pytest.raises(KeyboardInterrupt):
+        read_log(paths, on_file=refuse)
+    assert sum(sizes) < paths[0].stat().st_size / 3
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("gyrostab-")]
+
+
+def test_even_stamps_are_placed_like_nearly_even_ones():
+    """With a nanosecond of jitter the kernel takes another path; the log exceeds its memory."""
+    rng = np.random.default_rng(5)
+    samples = np.sort(rng.choice(50_000, 49_900, replace=False))
+    rows = np.concatenate(
+        [samples[:30_000], samples[30_001:30_006], samples[30_000:30_001], samples[30_006:]]
+    )  # one row comes late
+    stamps = 7_000_000_000 + rows * 2_500_000
+    stamps[123] = NO_STAMP
+    placements = []
+    for jitter in (0, 1):
+        state, ring = new_state()
+        shaken = np.where(
+            stamps == NO_STAMP, stamps, stamps + jitter * (np.arange(stamps.size) % 3)
+        )
+        runs, events = place(
+            np.arange(stamps.size), shaken, stamps.size, 2_500_000.0, 0.75, 1e9, state, ring
+        )
+        placements.append((runs, events[:, :3], state[:3], np.array(ring)))
+    for first, second in zip(*placements, strict=True):
+        np.testing.assert_array_equal(first, second)
+    assert len(placements[0][1]) == 1  # the late row
+    assert len(placements[0][0]) > 90  # the gaps
+
+
+def test_results_come_in_the_order_of_the_items_and_few_are_fetched_ahead():
+    fetched: list[int] = []
+
+    def items():
+        for n in range(50):
+            fetched.append(n)
+            yield n
+
+    results = map_in_order(lambda n: n * n, items(), workers=2)
+    assert next(results) == 0
+    assert len(fetched) <= 5
+    assert list(results) == [n * n for n in range(1, 50)]
+    with pytest.raises(ZeroDivisionError):
+        list(map_in_order(lambda n: 1 / n, [2, 1, 0, 3]))
