@@ -35,11 +35,6 @@ _WHOLE_TENS = np.array([10**n for n in range(20)], dtype=np.uint64)
 _LEAST, _MOST = -60, 40
 _HALF = np.uint64(2**32 - 1)
 _FULL = np.uint64(2**64 - 1)
-_ONES, _PAIR_ONES = np.uint64(0x0101010101010101), np.uint64(0x5555555555555555)
-_LOW_PAIRS, _LOW_HALVES = np.uint64(0x3333333333333333), np.uint64(0x0F0F0F0F0F0F0F0F)
-_ZEROS, _TO_TEN = np.uint64(0x3030303030303030), np.uint64(0x7676767676767676)
-_TOPS, _FIRST_PAIRS = np.uint64(0x8080808080808080), np.uint64(0xFF000000FF)
-_FIRST_SCALE, _SECOND_SCALE = np.uint64(0xF424000000064), np.uint64(0x271000000001)
 _LONGEST_NS = np.uint64(2**63 - 1)
 
 
@@ -65,34 +60,6 @@ _FIVES = _powers_of_five()
 def _as_pointer(text):  # type: ignore[no-untyped-def]
     """Convert ``array.ctypes`` to a pointer; passing arrays would cost more than the reading."""
     return text
-
-
-@njit(**INNER)
-def _load_eight(text, at):  # type: ignore[no-untyped-def]
-    """Load eight bytes, little-endian; the compiler makes one instruction of it."""
-    low = (
-        np.uint64(text[at])
-        | np.uint64(text[at + 1]) << np.uint64(8)
-        | np.uint64(text[at + 2]) << np.uint64(16)
-        | np.uint64(text[at + 3]) << np.uint64(24)
-    )
-    return (
-        low
-        | np.uint64(text[at + 4]) << np.uint64(32)
-        | np.uint64(text[at + 5]) << np.uint64(40)
-        | np.uint64(text[at + 6]) << np.uint64(48)
-        | np.uint64(text[at + 7]) << np.uint64(56)
-    )
-
-
-@njit(**INNER)
-def _zeros_behind(word):  # type: ignore[no-untyped-def]
-    """Count the trailing zero bits of a word (64 for zero); the compiler knows this form."""
-    bits = ~word & (word - np.uint64(1))
-    bits = bits - ((bits >> np.uint64(1)) & _PAIR_ONES)
-    bits = (bits & _LOW_PAIRS) + ((bits >> np.uint64(2)) & _LOW_PAIRS)
-    bits = (bits + (bits >> np.uint64(4))) & _LOW_HALVES
-    return (bits * _ONES) >> np.uint64(56)
 
 
 @njit(**INNER)
@@ -148,25 +115,8 @@ def _nearest_double(mantissa, power):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _read_digits(text, at, size, mantissa):  # type: ignore[no-untyped-def]
-    """Continue reading a whole number: value and end.
-
-    Reads eight bytes at a time, because the processor cannot predict the end of a loop over digits.
-    """
-    while at + 8 <= size:
-        bare = _load_eight(text, at) ^ _ZEROS
-        non_digits = ((bare + _TO_TEN) | bare) & _TOPS
-        count = _zeros_behind(non_digits) >> np.uint64(3)
-        if count == np.uint64(0):
-            return mantissa, at
-        bare <<= (np.uint64(8) - count) << np.uint64(3)
-        pairs = bare * np.uint64(10) + (bare >> np.uint64(8))
-        high = (pairs & _FIRST_PAIRS) * _FIRST_SCALE
-        value = (high + ((pairs >> np.uint64(16)) & _FIRST_PAIRS) * _SECOND_SCALE) >> np.uint64(32)
-        mantissa = mantissa * _WHOLE_TENS[count] + value
-        at += np.int64(count)
-        if count < np.uint64(8):
-            return mantissa, at
+def _read_digits(text, at, mantissa):  # type: ignore[no-untyped-def]
+    """Continue reading a whole number: value and end."""
     while True:
         digit = np.uint8(text[at] - np.uint8(_ZERO))
         if digit > 9:
@@ -176,16 +126,16 @@ def _read_digits(text, at, size, mantissa):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _read_decimal(text, at, size, point):  # type: ignore[no-untyped-def]
+def _read_decimal(text, at, point):  # type: ignore[no-untyped-def]
     """Read sign, digits, decimals and end; the end is negative without one, or if long."""
     negative = text[at] == _MINUS
     at += np.int64(negative) | np.int64(text[at] == _PLUS)
     first = at
-    mantissa, at = _read_digits(text, at, size, np.uint64(0))
+    mantissa, at = _read_digits(text, at, np.uint64(0))
     count, decimals = at - first, np.int64(0)
     if text[at] == point:
         first_decimal = at + 1
-        mantissa, at = _read_digits(text, first_decimal, size, mantissa)
+        mantissa, at = _read_digits(text, first_decimal, mantissa)
         decimals = at - first_decimal
         count += decimals
     if count > _DIGITS:
@@ -201,16 +151,16 @@ def _read_decimal(text, at, size, point):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _read_number(text, at, size, point):  # type: ignore[no-untyped-def]
+def _read_number(text, at, point):  # type: ignore[no-untyped-def]
     """Read a number: value and end; the end is negative without a number."""
-    negative, mantissa, decimals, end = _read_decimal(text, at, size, point)
+    negative, mantissa, decimals, end = _read_decimal(text, at, point)
     if end < 0:
         return 0.0, end
     power = -decimals
     if text[end] | 32 == _SMALL_E:
         down = text[end + 1] == _MINUS
         first = end + 1 + (down or text[end + 1] == _PLUS)
-        exponent, end = _read_digits(text, first, size, np.uint64(0))
+        exponent, end = _read_digits(text, first, np.uint64(0))
         if not 0 < end - first < 4:
             return 0.0, np.int64(-1)
         power += -np.int64(exponent) if down else np.int64(exponent)
@@ -219,9 +169,9 @@ def _read_number(text, at, size, point):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _count_of_time(text, at, size, point, digits):  # type: ignore[no-untyped-def]
+def _count_of_time(text, at, point, digits):  # type: ignore[no-untyped-def]
     """Read a numeric time as a multiple of ``10**-digits``, rounded half to even, and its end."""
-    negative, mantissa, decimals, end = _read_decimal(text, at, size, point)
+    negative, mantissa, decimals, end = _read_decimal(text, at, point)
     if end < 0 or (digits == 0 and decimals > 0) or decimals - digits > 18:
         return np.int64(0), np.int64(-1)
     if decimals <= digits:
@@ -310,7 +260,7 @@ def _read_date_stamp(text, at, size, order, mark_of_part, between):  # type: ign
         return none
     end, part = at + (19 if has_seconds else 16), np.uint64(0)
     if has_seconds and (text[end] == _POINT or text[end] == mark_of_part):
-        part, stop = _read_digits(text, end + 1, size, np.uint64(0))
+        part, stop = _read_digits(text, end + 1, np.uint64(0))
         length = stop - end - 1
         if not 0 < length <= 9:
             return none
@@ -400,9 +350,9 @@ def _read_cell(text, at, size, role, separator, point, digits, between, may_quot
         end = _past_void(text, at, separator)
     if end < 0:
         if role == NUMBER:
-            value, end = _read_number(text, at, size, point)
+            value, end = _read_number(text, at, point)
         elif role == NUMERIC_TIME:
-            stamp, end = _count_of_time(text, at, size, point, digits)
+            stamp, end = _count_of_time(text, at, point, digits)
         else:
             mark = _COMMA if quoted or separator != _COMMA else _POINT
             stamp, end = _read_date_stamp(text, at, size, role, mark, between)
