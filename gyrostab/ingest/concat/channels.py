@@ -59,25 +59,11 @@ def _on_time(piece: PlacedLog, name: str, start: int, rate: float) -> PlacedArra
     channel = piece.source.log[name]
     if channel.dims == ("time",):
         return channel.data, None, piece.runs
-    import dask
-    import dask.array as da
-
     stamps = _channel_stamps(piece, name, start, rate)
-    sample = np.rint(grid_index(start, rate, stamps)).astype(np.int64)
-    inside = (sample >= piece.first) & (sample < piece.end)
-    spread = dask.delayed(_scatter_values, pure=False)(
-        channel.data, sample - piece.first, inside, piece.end - piece.first
-    )
-    values = da.from_delayed(spread, (piece.end - piece.first,), dtype=np.float64)
-    return values, None, np.array([[piece.first, 0, piece.end - piece.first]], dtype=np.int64)
-
-
-def _scatter_values(
-    values: NDArray[Any], at: NDArray[np.int64], inside: NDArray[np.bool_], size: int
-) -> NDArray[np.float64]:
-    out = np.full(size, np.nan)
-    out[at[inside]] = np.asarray(values)[inside]
-    return out
+    samples = np.rint(grid_index(start, rate, stamps)).astype(np.int64)
+    inside = np.flatnonzero((samples >= piece.first) & (samples < piece.end))[::-1]
+    samples, places = np.unique(samples[inside], return_index=True)  # the last value of a sample
+    return channel.data, None, np.stack([samples, inside[places], np.ones_like(places)], axis=1)
 
 
 def _channel_stamps(piece: PlacedLog, name: str, start: int, rate: float) -> NDArray[np.int64]:
@@ -92,40 +78,20 @@ def _own_time(
 ) -> tuple[NDArray[np.int64], Any]:
     """Return stamps and values in order of time; duplicates are taken from the earlier log."""
     tolerance = int(_SAME_STAMP_PERIODS * 1e9 / rate)
-    done: list[
-        tuple[NDArray[np.int64], NDArray[np.int64]]
-    ] = []  # stamps and positions among all values, in order of time
-    arrays, offset = [], 0
-    for piece in holders:
-        values = piece.source.log.variables[name].data
-        stamps, places = _channel_stamps(piece, name, start, rate), np.arange(len(values)) + offset
-        arrays.append(values)
-        offset += len(values)
-        touched: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
-        while len(stamps) and done and done[-1][0][-1] >= stamps[0] - tolerance:
-            touched.insert(0, done.pop())
-        if touched:
-            held, held_places = (np.concatenate(column) for column in zip(*touched, strict=True))
-            cut = np.searchsorted(held, stamps[0] - tolerance)
-            positions = np.searchsorted(held, stamps)
-            following, previous = (
-                held[np.minimum(positions, len(held) - 1)],
-                held[np.maximum(positions - 1, 0)],
-            )
-            new = np.minimum(np.abs(following - stamps), np.abs(stamps - previous)) > tolerance
-            if cut:
-                done.append((held[:cut], held_places[:cut]))
-            stamps, places = (
-                np.concatenate([held[cut:], stamps[new]]),
-                np.concatenate([held_places[cut:], places[new]]),
-            )
-            order = np.argsort(stamps, kind="stable")
-            stamps, places = stamps[order], places[order]
-        if len(stamps):
-            done.append((stamps, places))
-    if not done:
-        return np.empty(0, dtype=np.int64), np.empty(0)
-    stamps, places = (np.concatenate(column) for column in zip(*done, strict=True))
-    done.clear()  # saves one copy of a long channel
+    arrays = [piece.source.log.variables[name].data for piece in holders]
+    by_log = [_channel_stamps(piece, name, start, rate) for piece in holders]
+    number = np.repeat(np.arange(len(holders)), list(map(len, by_log)))
+    stamps = np.concatenate(by_log)
+    places = np.argsort(stamps, kind="stable")
+    stamps, number = stamps[places], number[places]
+    is_copy = np.zeros(len(stamps), dtype=bool)
+    for apart in range(1, len(holders)):
+        earlier, later = number[:-apart], number[apart:]
+        is_close = (stamps[apart:] - stamps[:-apart] <= tolerance) & (earlier != later)
+        if not is_close.any():
+            break
+        is_copy[apart:] |= is_close & (later > earlier)
+        is_copy[:-apart] |= is_close & (earlier > later)
     chunk = chunk_of(arrays)
-    return stamps, take_samples(concatenate_columns(arrays, chunk), places, chunk)
+    values = take_samples(concatenate_columns(arrays, chunk), places[~is_copy], chunk)
+    return stamps[~is_copy], values

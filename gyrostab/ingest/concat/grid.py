@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -13,7 +12,6 @@ from numpy.typing import NDArray
 
 from gyrostab.schema import signal_name
 from gyrostab.store.lazy import read_slice
-from gyrostab.store.threads import map_in_order
 from gyrostab.time.grid import TimeGridIndex, first_stamp, grid_times
 
 
@@ -36,10 +34,6 @@ class Source:
     def axes(self) -> list[str]:
         """Names of the axes in the order of the rows; cached, as the look-up in xarray is slow."""
         return [str(axis) for axis in self.log["axis"].values]
-
-
-#: A log, and the samples at which a slice of it begins and ends.
-LogSlice = tuple[Source, int, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,14 +69,8 @@ class PlacedLog:
         return np.asarray(self.runs[which, 0] + samples - self.runs[which, 1])
 
 
-def read_log_slices(slices: Iterable[LogSlice]) -> dict[LogSlice, NDArray[np.float64]]:
-    """Read the signals of slices (axis, sample) in parallel; NaN beyond the ends of a log."""
-    places = list(dict.fromkeys(slices))
-    return dict(zip(places, map_in_order(_read_log_slice, places), strict=True))
-
-
-def _read_log_slice(place: LogSlice) -> NDArray[np.float64]:
-    source, begin, end = place
+def read_log_slice(source: Source, begin: int, end: int) -> NDArray[np.float64]:
+    """Read the signal of some samples (axis, sample); NaN beyond the ends of a log."""
     data = source.log.variables[signal_name(source.log)].data
     values = np.full((data.shape[0], end - begin), np.nan)
     low, high = min(max(begin, 0), source.size), max(min(end, source.size), 0)

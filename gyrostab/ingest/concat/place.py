@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.ingest.concat.grid import LogSlice, PlacedLog, Source, read_log_slices, runs_of
+from gyrostab.ingest.concat.grid import PlacedLog, Source, read_log_slice, runs_of
 from gyrostab.ingest.gap_table import (
     CLOCK_STEP,
     RESTART,
@@ -42,9 +41,7 @@ MAX_SHIFT_SAMPLES = 64
 _COMPARED_SAMPLES = 2**13  # samples at each end of an overlap whose values are compared
 _PROBED_SAMPLES = 64  # compared samples that are tried at every displacement
 _MIN_COMMON_SAMPLES = 32  # common samples needed to find a displacement
-_BATCH_LOGS = 50  # logs whose overlaps are read at once
 _MAX_NAMED = 5  # events of one kind that are listed one by one
-_Cache = dict[LogSlice, NDArray[np.float64]]
 
 
 def count_alike(held: NDArray[np.float64], new: NDArray[np.float64]) -> tuple[Any, Any]:
@@ -98,58 +95,24 @@ def _find_shift(held: NDArray[np.float64], new: NDArray[np.float64]) -> _Match:
     return unshifted
 
 
-def _lag_samples(held: Source, new: Source) -> int:
-    """Return the sample of `held` at which `new` begins according to the clock."""
-    return int(np.rint(grid_index(held.start, held.rate, new.start)))
-
-
-def _overlap_ends(held: Source, new: Source, lag: int) -> list[tuple[LogSlice, LogSlice]]:
-    """Return slices at both ends of the overlap, with a margin in the earlier log."""
-    low, high = max(lag, 0), min(lag + new.size, held.size)
-    if high <= low:
-        return []
-    ends = dict.fromkeys(
-        [(low, min(high, low + _COMPARED_SAMPLES)), (max(low, high - _COMPARED_SAMPLES), high)]
-    )
-    return [
-        ((held, begin - MAX_SHIFT_SAMPLES, end + MAX_SHIFT_SAMPLES), (new, begin - lag, end - lag))
-        for begin, end in ends
-    ]
-
-
-def _read_overlaps(sources: Sequence[Source]) -> _Cache:
-    """Read the slices needed to compare each log with the next, in parallel."""
-    pairs = [
-        pair
-        for held, new in pairwise(sources)
-        if held.end >= new.start
-        for pair in _overlap_ends(held, new, _lag_samples(held, new))
-    ]
-    return read_log_slices(log_slice for pair in pairs for log_slice in pair)
-
-
-def _match_logs(held: Source, new: Source, lag: int, cache: _Cache) -> _Match:
-    """Compare two logs where they overlap by the clock: `new` begins at sample `lag` of `held`."""
+def _match_logs(held: Source, new: Source, lag: int) -> _Match:
+    """Compare both ends of the overlap by the clock: `new` begins at sample `lag` of `held`."""
     axes = [axis for axis in held.axes if axis in new.axes]
-    pairs = _overlap_ends(held, new, lag)
-    if not axes or not pairs:
-        return _Match(0, 0, 0)
+    low, high = max(lag, 0), min(lag + new.size, held.size)
+    ends = [(low, min(high, low + _COMPARED_SAMPLES)), (max(low, high - _COMPARED_SAMPLES), high)]
     rows_held, rows_new = ([source.axes.index(axis) for axis in axes] for source in (held, new))
     matches: list[_Match] = []
-    for held_slice, new_slice in pairs:
+    for begin, end in dict.fromkeys(ends) if axes and high > low else ():
         if (
             matches
             and matches[0].common >= _COMPARED_SAMPLES // 2
             and matches[0].same < 0.5 * matches[0].common
         ):
             break  # not a copy, whatever its end
-        cache.update(
-            read_log_slices(
-                log_slice for log_slice in (held_slice, new_slice) if log_slice not in cache
-            )
-        )
-        matches.append(_find_shift(cache[held_slice][rows_held], cache[new_slice][rows_new]))
-    surest = max(matches, key=lambda match: (match.alike, match.same))
+        ours = read_log_slice(held, begin - MAX_SHIFT_SAMPLES, end + MAX_SHIFT_SAMPLES)
+        theirs = read_log_slice(new, begin - lag, end - lag)
+        matches.append(_find_shift(ours[rows_held], theirs[rows_new]))
+    surest = max(matches, key=lambda match: (match.alike, match.same), default=_Match(0, 0, 0))
     return _Match(
         sum(match.common for match in matches), sum(match.same for match in matches), surest.shift
     )
@@ -165,11 +128,8 @@ def place_logs(sources: Sequence[Source], *, max_gap: float) -> tuple[list[Place
     pieces: list[PlacedLog] = []
     overlaps: list[str] = []
     breaks: list[str] = []
-    cache: _Cache = {}
-    for number, source in enumerate(sources):
-        if number % _BATCH_LOGS == 0:
-            cache = _read_overlaps(sources[max(number - 1, 0) : number + _BATCH_LOGS])
-        piece, match = _place_next(pieces, source, rate, max_gap, cache)
+    for source in sources:
+        piece, match = _place_next(pieces, source, rate, max_gap)
         if match is not None:
             overlaps.append(_overlap_note(piece, *match, rate))
         elif piece.cause >= 0:
@@ -201,7 +161,7 @@ def _first_notes(notes: Sequence[str], subject: str) -> list[str]:
 
 
 def _place_next(
-    pieces: list[PlacedLog], source: Source, rate: float, max_gap: float, cache: _Cache
+    pieces: list[PlacedLog], source: Source, rate: float, max_gap: float
 ) -> tuple[PlacedLog, tuple[PlacedLog, _Match] | None]:
     """Place the next log on the grid; also return the log that it overlaps, if any."""
     ratio = rate / source.rate
@@ -212,8 +172,8 @@ def _place_next(
     for held in reversed(pieces):
         if held.source.end < source.start or not set(held.source.axes) & set(source.axes):
             continue  # other axes over the same time do not overlap
-        lag = _lag_samples(held.source, source)
-        match = _match_logs(held.source, source, lag, cache)
+        lag = int(np.rint(grid_index(held.source.start, held.source.rate, source.start)))
+        match = _match_logs(held.source, source, lag)
         if match.alike:
             first = int(held.on_grid(lag + match.shift))
             return PlacedLog(source, runs_of(first, 0.0, source.size, ratio), 0.0, held.clock), (
