@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, OptionError
@@ -28,8 +28,7 @@ from gyrostab.ingest.columns.headers import (
 )
 from gyrostab.ingest.formats.matlab5 import check_structure
 from gyrostab.ingest.formats.packing import ATTRIBUTES
-from gyrostab.ingest.formats.stored import StoredColumn, StoredTable, plan_stored
-from gyrostab.ingest.formats.tables import library
+from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, library, make_reader
 from gyrostab.ingest.limits import check_chunk
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.store.hdf5_heaps import check_global_heaps
@@ -50,20 +49,24 @@ def matches(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() in (".mat", *HDF_SUFFIXES)
 
 
+@contextmanager
+def _open_table(path: Path, options: ReadOptions) -> Iterator[TablesOfFile]:
+    """Return the table of the longest variables."""
+    with ExitStack() as stack:
+        yield _make_table(path, options, stack)
+
+
+_scan_matlab, read = make_reader("matlab", _open_table)
+_scan_hdf5, _ = make_reader("hdf5", _open_table)
+
+
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Summarise variables, shapes, and first and last stamps."""
-    with ExitStack() as stack:
-        name = "hdf5" if path.suffix.lower() in HDF_SUFFIXES else "matlab"
-        return _plan_file(path, options, stack).scan(name)
+    is_hdf5 = path.suffix.lower() in HDF_SUFFIXES
+    return (_scan_hdf5 if is_hdf5 else _scan_matlab)(path, options)
 
 
-def read(path: Path, options: ReadOptions) -> xr.Dataset:
-    """Return the raw log of a MATLAB file; see `gyrostab.ingest.read_log`."""
-    with ExitStack() as stack:
-        return _plan_file(path, options, stack).read()
-
-
-def _plan_file(path: Path, options: ReadOptions, stack: ExitStack) -> StoredTable:
+def _make_table(path: Path, options: ReadOptions, stack: ExitStack) -> TablesOfFile:
     objects: list[str] = []
     sized_columns = [
         (max(array.shape), column)
@@ -84,7 +87,7 @@ def _plan_file(path: Path, options: ReadOptions, stack: ExitStack) -> StoredTabl
         )
     rows = int(max(size for size, _ in sized_columns))
     columns = [column for size, column in sized_columns if size == rows]
-    shorter = [column.header for size, column in sized_columns if size != rows]
+    shorter = [column.name[0] for size, column in sized_columns if size != rows]
     notes = (
         [
             f"left out, as they are shorter than the {rows} rows of the longest: "
@@ -98,8 +101,9 @@ def _plan_file(path: Path, options: ReadOptions, stack: ExitStack) -> StoredTabl
             f"left out, as MATLAB alone can read it: {', '.join(dict.fromkeys(objects))}; to "
             f"keep it, {_PLAIN_ARRAYS}"
         )
-    coded = _known_fields([column.header for column in columns])
-    return plan_stored(path, columns, rows, options, notes=notes, coded=coded)
+    fields = _known_fields([column.name[0] for column in columns])
+    columns = [replace(c, target=fields.get(place)) for place, c in enumerate(columns)]
+    return [Table(rows, columns)], notes
 
 
 def _known_fields(headers: Sequence[str]) -> dict[int, str]:
@@ -123,7 +127,7 @@ def _known_fields(headers: Sequence[str]) -> dict[int, str]:
     return {place: name for place, name in field_names.items() if "." in headers[place]}
 
 
-def _columns_of(path: Path, name: str, array: Any, options: ReadOptions) -> Iterator[StoredColumn]:
+def _columns_of(path: Path, name: str, array: Any, options: ReadOptions) -> Iterator[TableColumn]:
     shape = array.shape
     if len(shape) not in (1, 2) or max(shape, default=0) <= 1:
         return
@@ -137,7 +141,7 @@ def _columns_of(path: Path, name: str, array: Any, options: ReadOptions) -> Iter
     attributes = {key: stored[key] for key in ATTRIBUTES if key in stored}
     for place in range(size) if size <= MAX_COLUMNS else ():
         header = name if size == 1 else f"{name}/{place}"
-        yield StoredColumn(header, array.dtype, attributes, locate(along, place))
+        yield TableColumn.of_rows(header, locate(along, place), array.dtype, attributes)
 
 
 def _find_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[tuple[str, Any]]:
@@ -220,7 +224,7 @@ def _find_hdf_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterat
     yield from arrays
 
 
-def _read_tables(path: Path, objects: list[str]) -> Iterator[tuple[int, StoredColumn]]:
+def _read_tables(path: Path, objects: list[str]) -> Iterator[tuple[int, TableColumn]]:
     """Yield length and column for all tables and timetables; row times are columns too.
 
     `objects` describes what the file holds, such as "a table 'log'"; tables are removed from it.
@@ -247,7 +251,7 @@ def _read_tables(path: Path, objects: list[str]) -> Iterator[tuple[int, StoredCo
 
 def _make_column(
     header: str, values: NDArray[Any], unit: str = ""
-) -> Iterator[tuple[int, StoredColumn]]:
+) -> Iterator[tuple[int, TableColumn]]:
     """Yield length and column of numbers; dates and durations become nanoseconds."""
     if values.dtype.kind == "M":
         values, unit = to_nanoseconds(values, far_as_nat=True), "nanoseconds since 1970-01-01"
@@ -255,4 +259,5 @@ def _make_column(
         values, unit = values.astype("timedelta64[ns]").view(np.int64), "ns"
     if values.dtype.kind in "biuf":
         attributes = {"units": unit} if unit else {}
-        yield len(values), StoredColumn(header, values.dtype, attributes, LibraryRows(values))
+        column = TableColumn.of_rows(header, LibraryRows(values), values.dtype, attributes)
+        yield len(values), column

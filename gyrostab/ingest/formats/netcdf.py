@@ -8,9 +8,8 @@ from the coordinate of the short dimension, or ``name/0`` without such a coordin
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +26,7 @@ from gyrostab.ingest.formats.netcdf_variables import (
     open_variables,
 )
 from gyrostab.ingest.formats.recognise import begins_like
-from gyrostab.ingest.formats.stored import StoredColumn, StoredTable, plan_stored
+from gyrostab.ingest.formats.tables import Table, TableColumn, read_tables, scan_tables
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.schema import texts
 from gyrostab.store.netcdf_log import open_netcdf_log
@@ -57,9 +56,11 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
         with log:
             return summarise_log(path, log)
     with open_variables(path, options.limits) as variables:
-        table, slower = _plan_file(path, variables, options)
-        summary = table.scan("zarr" if path.is_dir() else "netcdf")
-        names = [column.name for part in slower for column in part.plan.of("channel")]
+        form = "zarr" if path.is_dir() else "netcdf"
+        main, slower, notes = _find_tables(path, variables, options)
+        summary = scan_tables(path, form, [main], options, notes)
+        others = (scan_tables(path, form, [table], _for_channels(options)) for table in slower)
+        names = [name for other in others for name in other.channels]
         return replace(summary, channels=tuple(dict.fromkeys([*summary.channels, *names])))
 
 
@@ -69,14 +70,21 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
     if log is not None:
         return log
     with open_variables(path, options.limits) as variables:
-        table, slower = _plan_file(path, variables, options)
-        return _add_slower_channels(table.read(), slower)
+        main, slower, notes = _find_tables(path, variables, options)
+        log = read_tables(path, [main], options, notes=notes)
+        for table in slower:
+            log = _add_channels(log, read_tables(path, [table], _for_channels(options)))
+        return log
 
 
-def _plan_file(
+def _for_channels(options: ReadOptions) -> ReadOptions:
+    return replace(options, channels_only=True, start=None)
+
+
+def _find_tables(
     path: Path, variables: Mapping[str, StoredVariable], options: ReadOptions
-) -> tuple[StoredTable, list[StoredTable]]:
-    """Plan the variables on the main dimension, and channels on others that have stamps.
+) -> tuple[Table, list[Table], list[str]]:
+    """Return a table of the main dimension, those of others that have stamps, and notes.
 
     The main dimension is the longest of those with gyro axes, otherwise the longest.
     """
@@ -97,13 +105,13 @@ def _plan_file(
         for v in numeric
         if len(v.shape) == 1 and names_epoch(str(v.attributes.get("units", "")))
     }
-    columns: dict[str, list[StoredColumn]] = {dim: [] for dim in (main_dim, *stamped)}
+    columns: dict[str, list[TableColumn]] = {dim: [] for dim in (main_dim, *stamped)}
     left_out: list[str] = []
     for variable in numeric:
         dim = next((dim for dim in columns if dim in variable.dimensions), main_dim)
         variable_columns = _columns_of(variables, variable, dim)
         if dim != main_dim and variable is stamped[dim]:
-            variable_columns = [replace(variable_columns[0], header="time")]
+            variable_columns = [replace(variable_columns[0], name=("time",))]
         columns[dim] += variable_columns
         left_out += [] if variable_columns else [variable.name]
     notes = (
@@ -111,29 +119,21 @@ def _plan_file(
         if left_out
         else []
     )
-    table = plan_stored(path, columns.pop(main_dim), sizes[main_dim], options, notes=notes)
-    channel_options = replace(options, channels_only=True, start=None)
-    slower = [
-        plan_stored(path, part, sizes[dim], channel_options)
-        for dim, part in columns.items()
-        if len(part) > 1
-    ]
-    return table, slower
+    main = Table(sizes[main_dim], columns.pop(main_dim))
+    slower = [Table(sizes[dim], part) for dim, part in columns.items() if len(part) > 1]
+    return main, slower, notes
 
 
-def _add_slower_channels(log: xr.Dataset, tables: Sequence[StoredTable]) -> xr.Dataset:
-    """Add the channels of other dimensions, each on ``time_<channel>``."""
-    for table in tables:
-        part = table.read()
-        part = part.drop_vars([name for name in part.data_vars if name in log.variables])
-        lists = {
-            name: list(dict.fromkeys([*texts(log, name), *texts(part, name)]))
-            for name in ("notes", "headers")
-        }
-        unmatched = set(texts(log, "unmatched_options")) & set(texts(part, "unmatched_options"))
-        log = log.assign_attrs(lists, unmatched_options=sorted(unmatched))
-        log = with_channels(log, [part]) if part.data_vars else log
-    return log
+def _add_channels(log: xr.Dataset, part: xr.Dataset) -> xr.Dataset:
+    """Add the channels of another dimension, each on ``time_<channel>``."""
+    part = part.drop_vars([name for name in part.data_vars if name in log.variables])
+    lists = {
+        name: list(dict.fromkeys([*texts(log, name), *texts(part, name)]))
+        for name in ("notes", "headers")
+    }
+    unmatched = set(texts(log, "unmatched_options")) & set(texts(part, "unmatched_options"))
+    log = log.assign_attrs(lists, unmatched_options=sorted(unmatched))
+    return with_channels(log, [part]) if part.data_vars else log
 
 
 def _holds_axes(variable: StoredVariable, options: ReadOptions) -> bool:
@@ -148,10 +148,10 @@ def _holds_axes(variable: StoredVariable, options: ReadOptions) -> bool:
 
 def _columns_of(
     variables: Mapping[str, StoredVariable], variable: StoredVariable, dim: str
-) -> list[StoredColumn]:
-    make = partial(StoredColumn, dtype=variable.dtype, attributes=variable.attributes)
+) -> list[TableColumn]:
+    stored = variable.dtype, variable.attributes
     if variable.dimensions == (dim,):
-        return [make(variable.name, rows=variable.locate(0, 0))]
+        return [TableColumn.of_rows(variable.name, variable.locate(0, 0), *stored)]
     if dim not in variable.dimensions or len(variable.shape) != 2:
         return []
     along = variable.dimensions.index(dim)
@@ -166,6 +166,6 @@ def _columns_of(
         ]
     stem = "gyro_" if variable.name.lower() in _SIGNALS else f"{variable.name}/"
     return [
-        make(f"{stem}{label}", rows=variable.locate(along, place))
+        TableColumn.of_rows(f"{stem}{label}", variable.locate(along, place), *stored)
         for place, label in enumerate(labels)
     ]

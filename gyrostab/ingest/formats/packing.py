@@ -208,32 +208,36 @@ def _valid_range(
     return low - 0.5, high + 0.5
 
 
-def fold_packing(
-    plan: Plan, dtypes: Sequence[Any], attributes: Sequence[Mapping[str, Any]]
-) -> tuple[Plan, dict[int, Decoder]]:
+def fold_packing(plan: Plan, stored: Sequence[Any]) -> tuple[Plan, dict[int, Decoder]]:
     """Fold the packing of variables into the factors of the plan, so that counts stay integers.
 
-    `dtypes` and `attributes` are those of the variable of each source. Also return, by source, the
-    functions from stored numbers to counts, or to values for a time variable whose counts are not
-    whole nanoseconds.
+    `stored` has, by source, the type and the attributes of each variable; those without attributes
+    are not packed. Also return, by source, the functions from stored numbers to counts, or to
+    values for a time variable whose counts are not whole nanoseconds.
     """
     columns: list[Column] = []
     decoders: dict[int, Decoder] = {}
     for column in plan.columns:
-        where = f"{plan.path.name}: variable {column.header!r}"
-        packing = Packing.from_attributes(where, dtypes[column.source], attributes[column.source])
-        decoders[column.source] = packing.read_counts
-        if column.role != "time":
-            offset = column.factor * packing.offset + column.offset
-            column = replace(column, factor=column.factor * packing.scale, offset=offset)
-        elif not packing.is_plain and column.time_unit is not None:
-            unit = _fold_time(column.time_unit, packing)
-            if unit is None:
-                decoders[column.source] = packing.read_values
-            else:
-                column = replace(column, time_unit=unit)
+        variable = stored[column.source]
+        if variable.attributes is not None:
+            where = f"{plan.path.name}: variable {column.header!r}"
+            packing = Packing.from_attributes(where, variable.dtype, variable.attributes)
+            column, decoders[column.source] = _fold_column(column, packing)
         columns.append(column)
     return replace(plan, columns=tuple(columns)), decoders
+
+
+def _fold_column(column: Column, packing: Packing) -> tuple[Column, Decoder]:
+    if column.role != "time":
+        offset = column.factor * packing.offset + column.offset
+        factor = column.factor * packing.scale
+        return replace(column, factor=factor, offset=offset), packing.read_counts
+    if packing.is_plain or column.time_unit is None:
+        return column, packing.read_counts
+    unit = _fold_time(column.time_unit, packing)
+    if unit is None:
+        return column, packing.read_values
+    return replace(column, time_unit=unit), packing.read_counts
 
 
 def _fold_time(unit: TimeUnit, packing: Packing) -> TimeUnit | None:

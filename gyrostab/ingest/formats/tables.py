@@ -1,4 +1,7 @@
-"""Files of several tables with separate stamps: gyro tables become the log, others its channels."""
+"""Files of tables with separate stamps: gyro tables become the log, others its channels.
+
+Numbers that NetCDF, Zarr and HDF5 (MATLAB 7.3) files store with CF attributes are decoded here.
+"""
 
 from __future__ import annotations
 
@@ -21,9 +24,12 @@ from gyrostab.ingest.columns.headers import FileColumn
 from gyrostab.ingest.columns.plan import Plan, plan_columns
 from gyrostab.ingest.columns.plan_draft import MAX_HEADERS, Column
 from gyrostab.ingest.columns.stamps import NAT, parse_time_unit
-from gyrostab.ingest.columns.typed import read_columns, summarise_columns
+from gyrostab.ingest.columns.typed import float32_note, read_columns, summarise_columns
 from gyrostab.ingest.combine import concatenate, with_channels
+from gyrostab.ingest.formats.packing import Decoder, attribute_text, fold_packing
+from gyrostab.ingest.limits import check_stored
 from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.store.rows import LibraryRows, Rows
 from gyrostab.wording import list_some
 
 
@@ -35,6 +41,19 @@ class TableColumn:
     values: Any  # what can be sliced, or a function of the first row and the row after the last
     unit: str | None = None
     target: str | None = None  # by a code of the format, in the form of ``--map``
+    #: Type and CF attributes of stored numbers, which are packed.
+    dtype: Any = None
+    attributes: Mapping[str, Any] | None = None
+    parallel: bool = False  # whether several threads can read it
+
+    @classmethod
+    def of_rows(
+        cls, name: str, rows: Rows, dtype: Any, attributes: Mapping[str, Any]
+    ) -> TableColumn:
+        """Make a column of stored numbers; the file must be open for rows of a library."""
+        unit = attribute_text(attributes.get("units")) or None
+        parallel = not isinstance(rows, LibraryRows)
+        return cls((name,), rows.read, unit, None, dtype, attributes, parallel)
 
     def read(self, start: int, stop: int) -> Any:
         """Return the values of rows."""
@@ -127,8 +146,9 @@ class _PlannedTables:
 
     tables: list[Table]
     stored: list[TableColumn]  # those of all tables by source number, the stamps of each first
-    first: list[int]  # source number of the stamps of each table, and of the end of the last
+    first: list[int]  # first source number of each table, and that of the end of the last
     plan: Plan
+    decoders: dict[int, Decoder]
     main: list[int]  # tables with gyro axes, each with separate stamps
 
     def plan_of(self, place: int) -> Plan:
@@ -148,8 +168,16 @@ class _PlannedTables:
         return replace(planned, source=source, time_unit=time_unit)
 
     def fetch(self, source: int, start: int, stop: int) -> Any:
-        """Return the values of a column."""
-        return self.stored[source].read(start, stop)
+        """Return the values of a column, decoded."""
+        values = self.stored[source].read(start, stop)
+        return self.decoders[source](values) if source in self.decoders else values
+
+    def read(self, place: int, plan: Plan, notes: Sequence[str] = ()) -> xr.Dataset:
+        """Read the columns of one table into a raw log."""
+        rows, columns = self.tables[place].rows, [self.stored[c.source] for c in plan.columns]
+        check_stored(plan.path, rows, len(columns), plan.options.limits)
+        parallel = all(column.parallel for column in columns)
+        return read_columns(plan, rows, self.fetch, notes=notes, parallel=parallel)
 
 
 def _leave_out_unplaced(planned: _PlannedTables) -> _PlannedTables:
@@ -190,28 +218,29 @@ def _plan_tables(path: Path, tables: Sequence[Table], options: ReadOptions) -> _
     described: list[FileColumn] = []
     for table in tables:
         own_names = list(islice(names, len(table.columns)))
-        if not table.rows or not own_names:
+        if not own_names or not (table.rows or table.columns[0].attributes is not None):
             continue
         is_timed = table.stamps is not None
         is_first_clock = is_timed and all(held.stamps is None for held in filled)
         filled.append(table)
         first.append(len(stored))
-        stored += [TableColumn(("",), table.stamps, table.time_unit), *table.columns]
-        header, stamped = "time" if is_first_clock else "", is_timed and table.time_unit is None
-        described.append(FileColumn(header, table.time_unit, stamped=stamped))
-        described += [
-            FileColumn(name, column.unit or None, target=column.target)
-            for name, column in zip(own_names, table.columns, strict=True)
-        ]
+        if is_timed:
+            stored.append(TableColumn(("",), table.stamps, table.time_unit))
+            header, stamped = "time" if is_first_clock else "", table.time_unit is None
+            described.append(FileColumn(header, table.time_unit, stamped=stamped))
+        for name, column in zip(own_names, table.columns, strict=True):
+            calendar = attribute_text((column.attributes or {}).get("calendar")) or None
+            stored.append(column)
+            described.append(FileColumn(name, column.unit or None, calendar, target=column.target))
     if not filled:
         raise FormatError(
             f"{path.name}: it holds no values; copy it again, or check what the logger wrote"
         )
-    plan = plan_columns(path, described, options)
+    plan, decoders = fold_packing(plan_columns(path, described, options), stored)
     main_columns = plan.of("gyro") or plan.of("channel")
     holders = {bisect_right(first, column.source) - 1 for column in main_columns}
     main = sorted(holders) if plan.of("gyro") else [min(holders, default=0)]
-    planned = _PlannedTables(filled, stored, [*first, len(stored)], plan, main)
+    planned = _PlannedTables(filled, stored, [*first, len(stored)], plan, decoders, main)
     return _leave_out_unplaced(planned)
 
 
@@ -239,17 +268,18 @@ def read_tables(
     """Return the raw log of the tables with gyro axes; other channels keep separate stamps."""
     planned = _plan_tables(path, tables, options)
     planned.plan.check()
+    notes = [*notes, *float32_note(planned.plan, [column.dtype for column in planned.stored])]
     main: list[xr.Dataset] = []
     channel_logs: list[xr.Dataset] = []
-    for place, table in enumerate(planned.tables):
+    for place in range(len(planned.tables)):
         plan = planned.plan_of(place)
         if place in planned.main:
             if main:
-                plan, notes = replace(plan, notes=()), ()
-            main.append(read_columns(plan, table.rows, planned.fetch, notes=notes))
+                plan, notes = replace(plan, notes=()), []
+            main.append(planned.read(place, plan, notes))
         elif plan.of("channel"):
             plan = replace(plan, signal=None, kind=None, notes=())
-            channel_logs.append(read_columns(plan, table.rows, planned.fetch))
+            channel_logs.append(planned.read(place, plan))
     log = with_channels(concatenate(main) if len(main) > 1 else main[0], channel_logs)
     if "axis_rows" in log.attrs:
         return log
