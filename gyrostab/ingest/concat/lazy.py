@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
@@ -115,55 +114,31 @@ def _chunk_of_dask(
     end: int,
     convert: Callable[[NDArray[np.float64]], None] | None,
 ) -> Any:
-    """Make one chunk of one row from dask arrays, with the public operations of dask."""
+    """Make one chunk of one row from dask arrays, by a task that depends on theirs."""
+    import dask
     import dask.array as da
 
-    pieces, plan, offset = [], [], 0
-    for which, part in enumerate(parts):
-        runs = _overlapping_runs(part, begin, end)
-        if not runs:
-            continue
-        array, row, _ = part
-        # one slice for all runs, because each slice of a dask array takes time
-        low, high = min(run[2] for run in runs), max(run[2] + run[4] for run in runs)
-        pieces.append(da.asarray(array if array.ndim == 1 else array[row or 0])[low:high])
-        plan += [(which, offset + first - low, at, length) for _, _, first, at, length in runs]
-        offset += high - low
-    if not pieces:
-        return _make_blank_chunk(end - begin)
-    return (
-        da.concatenate(pieces)
-        .rechunk(-1)
-        .map_blocks(
-            _place_pieces,
-            plan=plan,
-            size=end - begin,
-            convert=convert,
-            dtype=np.float64,
-            chunks=((end - begin,),),
-        )
-    )
-
-
-@lru_cache(maxsize=16)
-def _make_blank_chunk(size: int) -> Any:
-    import dask.array as da
-
-    return da.full(size, np.nan, chunks=size)
+    pieces = []
+    for part in parts:
+        runs = [
+            (at, first, length) for *_, first, at, length in _overlapping_runs(part, begin, end)
+        ]
+        if runs:
+            # one slice for all runs, because each slice of a dask array takes time
+            low, high = min(run[1] for run in runs), max(run[1] + run[2] for run in runs)
+            line = da.asarray(part[0] if part[0].ndim == 1 else part[0][part[1] or 0])
+            pieces.append((line[low:high], np.array(runs) - [0, low, 0]))
+    placed = dask.delayed(_place_pieces, pure=False)(pieces, end - begin, convert)
+    return da.from_delayed(placed, (end - begin,), np.float64)
 
 
 def _place_pieces(
-    values: NDArray[Any],
-    *,
-    plan: list[Any],
+    pieces: Sequence[tuple[NDArray[Any], NDArray[np.int64]]],
     size: int,
     convert: Callable[[NDArray[np.float64]], None] | None,
 ) -> NDArray[np.float64]:
-    out = np.empty(size)
-    _fill(out, [(which, values, 0, *run) for which, *run in plan])
-    if convert is not None:
-        convert(out)
-    return out
+    parts: list[PlacedArray] = [(values, None, runs) for values, runs in pieces]
+    return GridSource([parts], (size,), convert)[:]
 
 
 def _fill(
@@ -172,23 +147,20 @@ def _fill(
 ) -> None:
     """Read runs (number of the part, array, row, first, place in `out`, length) into `out`."""
     ends = sorted((at, at + length) for *_, at, length in runs)
-    if any(stop > start for (_, stop), (start, _) in pairwise(ends)):
-        out[:] = np.nan  # overlaps are filled where NaN
+    overlap = any(stop > start for (_, stop), (start, _) in pairwise(ends))
+    if overlap:
+        out[:] = np.nan
     else:
         for (_, stop), (start, _) in pairwise([(0, 0), *ends, (out.size, 0)]):
             out[stop:start] = np.nan
-    # by part: the runs of one part do not overlap
-    filled_spans: dict[int, list[tuple[int, int]]] = {}
-    for number, array, row, at_source, at, length in _read_ahead(runs):
+    for _, array, row, at_source, at, length in _read_ahead(runs):
         place = out[at : at + length]
-        earlier = (span for part, spans in filled_spans.items() if part != number for span in spans)
-        if any(at < stop and start < at + length for start, stop in earlier):
+        if overlap:  # the first value that is not NaN counts
             values = np.empty(length)
             read_into(array, row, at_source, values)
             np.copyto(place, values, where=np.isnan(place))
         else:
             read_into(array, row, at_source, place)
-        filled_spans.setdefault(number, []).append((at, at + length))
 
 
 def _read_ahead(
