@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -23,6 +23,7 @@ BATCH_ROWS = 2**20
 BATCH_BYTES = 2**26
 END_ROWS = 64
 
+Batch = TypeVar("Batch")
 #: Column number, first row, row after the last one -> values.
 Fetch = Callable[[int, int, int], Any]
 
@@ -83,15 +84,39 @@ def read_columns(
 
     `fetch` is thread-safe if `parallel`.
     """
-    builder = RawLogBuilder(plan)
     step = batch_rows(len(plan.columns))
     spans = ((start, min(start + step, rows)) for start in range(0, rows, step))
 
-    def convert(span: tuple[int, int]) -> ConvertedBlock:
-        batch = {column.source: fetch(column.source, *span) for column in plan.columns}
-        return convert_batch(builder, batch)
+    def take(span: tuple[int, int]) -> dict[int, Any]:
+        return {column.source: fetch(column.source, *span) for column in plan.columns}
 
-    for converted in map_in_order(convert, spans) if parallel else map(convert, spans):
+    return read_batches(plan, spans, take, notes=notes, parallel=parallel)
+
+
+def read_batches(
+    plan: Plan,
+    batches: Iterable[Batch],
+    take: Callable[[Batch], dict[int, Any]],
+    *,
+    notes: Sequence[str] = (),
+    parallel: bool = False,
+) -> xr.Dataset:
+    """Build the raw log of batches of rows; `take` returns the columns of one by their numbers.
+
+    `take` is thread-safe if `parallel`.
+    """
+    builder = RawLogBuilder(plan)
+
+    def convert(batch: Batch) -> ConvertedBlock:
+        columns, values, words = take(batch), {}, 0
+        for column in [*builder.gyro, *builder.channels]:
+            values[column.source], not_numbers = _to_floats(columns[column.source])
+            words += not_numbers if column.role == "channel" else 0
+        time = builder.time
+        stamps = None if time is None else to_stamps(columns[time.source], time)
+        return builder.prepare(values, stamps, words=words)
+
+    for converted in map_in_order(convert, batches) if parallel else map(convert, batches):
         builder.add(converted)
     return builder.finish(notes)
 
@@ -105,17 +130,6 @@ def batch_rows(columns: int) -> int:
     (1048576, 8384)
     """
     return min(max(BATCH_BYTES // (8 * max(columns, 1)), 2**10), BATCH_ROWS) // 8 * 8
-
-
-def convert_batch(builder: RawLogBuilder, batch: dict[int, Any]) -> ConvertedBlock:
-    """Convert one batch of columns for the builder."""
-    values, words = {}, 0
-    for column in [*builder.gyro, *builder.channels]:
-        values[column.source], not_numbers = _to_floats(batch[column.source])
-        words += not_numbers if column.role == "channel" else 0
-    time = builder.time
-    stamps = None if time is None else to_stamps(batch[time.source], time)
-    return builder.prepare(values, stamps, words=words)
 
 
 def float32_note(plan: Plan, dtypes: Sequence[Any]) -> list[str]:

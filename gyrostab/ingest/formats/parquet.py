@@ -15,18 +15,16 @@ from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.dates import find_order, holds_date
 from gyrostab.ingest.columns.headers import FileColumn, split_header
 from gyrostab.ingest.columns.plan import Plan, plan_columns
-from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder
 from gyrostab.ingest.columns.typed import (
     batch_rows,
-    convert_batch,
     float32_note,
     holds_dates,
+    read_batches,
     summarise_columns,
 )
 from gyrostab.ingest.formats.recognise import begins_like
 from gyrostab.ingest.limits import check_stored
 from gyrostab.ingest.options import FileSummary, ReadOptions
-from gyrostab.store.threads import map_in_order
 
 #: Bytes of a column that are read at one time; without a buffer a whole row group is read, which
 #: may be the whole log.
@@ -70,21 +68,19 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
     file, plan = _open_parquet(path, options)
     names = file.schema_arrow.names
     check_stored(path, file.metadata.num_rows, len(plan.columns), options.limits)
-    builder = RawLogBuilder(plan)
-    column_names = [names[column.source] for column in plan.columns]
+    columns = [names[column.source] for column in plan.columns]
 
-    def convert(batch: Any) -> ConvertedBlock:
-        arrays = {name: batch.column(place) for place, name in enumerate(batch.schema.names)}
-        return convert_batch(
-            builder,
-            {column.source: _to_numpy(arrays[names[column.source]]) for column in plan.columns},
-        )
+    def take(batch: Any) -> dict[int, Any]:
+        arrays = dict(zip(batch.schema.names, batch.columns, strict=True))
+        return {c.source: _to_numpy(arrays[names[c.source]]) for c in plan.columns}
 
-    for converted in map_in_order(
-        convert, file.iter_batches(batch_size=batch_rows(len(column_names)), columns=column_names)
-    ):
-        builder.add(converted)
-    return builder.finish(float32_note(plan, file.schema_arrow.types))
+    return read_batches(
+        plan,
+        file.iter_batches(batch_size=batch_rows(len(columns)), columns=columns),
+        take,
+        notes=float32_note(plan, file.schema_arrow.types),
+        parallel=True,
+    )
 
 
 def _open_parquet(path: Path, options: ReadOptions) -> tuple[Any, Plan]:
