@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, reading_of
-from gyrostab.kernels.encoding.checksum import fletcher32
 from gyrostab.store.blosc_chunks import is_blosc_cut
 from gyrostab.store.private import library_lock
 
@@ -260,22 +259,22 @@ class _Shuffle:
 
 
 class _Fletcher32:
-    """The checksum at the end of a chunk; numcodecs takes five times as long and holds the GIL."""
+    """The checksum at the end of a chunk."""
 
     def encode(self, data: NDArray[Any]) -> NDArray[np.uint8]:
         """Add the checksum to the bytes of an array."""
-        stored = data.reshape(-1).view(np.uint8)
-        checksum = fletcher32(stored).to_bytes(4, "little")
-        return np.concatenate([stored, np.frombuffer(checksum, np.uint8)])
+        from numcodecs import Fletcher32
+
+        return np.frombuffer(Fletcher32().encode(data), np.uint8)
 
     def decode(self, data: Any) -> NDArray[np.uint8]:
         """Verify the checksum and return the bytes before it."""
-        stored = np.frombuffer(data, np.uint8)
-        if stored.size < 4 or fletcher32(stored[:-4]) != int.from_bytes(
-            stored[-4:].tobytes(), "little"
-        ):
-            raise RuntimeError("its checksum is wrong")
-        return stored[:-4]
+        from numcodecs import Fletcher32
+
+        try:
+            return np.frombuffer(Fletcher32().decode(data), np.uint8)
+        except (RuntimeError, ValueError, IndexError) as error:
+            raise RuntimeError("its checksum is wrong") from error
 
 
 class _Blosc:
