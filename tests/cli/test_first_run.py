@@ -74,20 +74,20 @@ getattr(caching, name)._locator_classes = []
 """
 
 
-#: A kernel of a single loop.
-CLEAN = """
+#: A kernel without others.
+SCAN = """
 import numpy as np
-from gyrostab.kernels.encoding.rows import clean_column
+from gyrostab.kernels.grid.stamps import scan_cells
 
-values = np.array([1.0, 2.0])
-clean_column(values, 10.0, 1.0)
-assert values.tolist() == [11.0, 21.0]
-assert not clean_column.stats.cache_path
+present = np.empty(2, bool)
+assert scan_cells(np.array([[1.0, np.nan]]), present)[0] == 1
+assert present.tolist() == [True, False]
+assert not scan_cells.stats.cache_path
 """
 
 
 def test_kernels_work_where_nothing_can_be_cached() -> None:
-    subprocess.run([sys.executable, "-c", NO_FOLDER + CLEAN], check=True)
+    subprocess.run([sys.executable, "-c", NO_FOLDER + SCAN], check=True)
 
 
 @pytest.mark.parametrize("command", [["demo"], ["run", "log.csv", "-o", "product.nc"]])

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gyrostab.ingest import read_log, reading
 from gyrostab.ingest.columns import pieces
@@ -18,6 +20,7 @@ from gyrostab.ingest.columns.pieces import (
     Spool,
     find_even,
 )
+from gyrostab.ingest.columns.raw_log import clean_column
 from gyrostab.ingest.formats import text
 from gyrostab.kernels.grid.stamps import NO_STAMP, new_state, place
 from gyrostab.store.threads import map_in_order
@@ -158,3 +161,22 @@ def test_results_come_in_the_order_of_the_items_and_few_are_fetched_ahead():
     assert list(results) == [n * n for n in range(1, 50)]
     with pytest.raises(ZeroDivisionError):
         list(map_in_order(lambda n: 1 / n, [2, 1, 0, 3]))
+
+
+@given(
+    st.lists(
+        st.floats(-1e6, 1e6)
+        | st.sampled_from([np.nan, np.inf, -np.inf])
+        | st.integers(-100, 100).map(float)
+    )
+)
+def test_column_is_converted_and_its_range_found(values):
+    column = np.array(values, dtype=np.float64)
+    missing, low, high, whole = clean_column(held := column.copy(), 3.7, 0.1)
+    finite = column[np.isfinite(column)]
+    assert missing == len(column) - len(finite)
+    assert np.array_equal(
+        held, np.where(np.isfinite(column), column * 3.7 + 0.1, np.nan), equal_nan=True
+    )
+    assert (low, high) == (finite.min(initial=np.inf), finite.max(initial=-np.inf))
+    assert whole == (finite == np.rint(finite)).all()

@@ -82,8 +82,6 @@ class RawLogBuilder:
         `stamps` [ns since 1970] are `NAT` where unreadable; `words` counts the channel cells whose
         text is not a number (empty cells do not count).
         """
-        from gyrostab.kernels.encoding.rows import clean_column
-
         size = (
             len(next(iter(values.values()))) if values else len(stamps) if stamps is not None else 0
         )
@@ -218,6 +216,27 @@ class RawLogBuilder:
         if self.options.start is not None and stamps is None:
             dataset.attrs["start"] = self.options.start
         return dataset
+
+
+def clean_column(
+    values: NDArray[np.float64], factor: float, offset: float
+) -> tuple[int, float, float, bool]:
+    """Convert in place, ``values * factor + offset``, and set infinite values to NaN.
+
+    Return the number of values that are not finite, the range of the others before conversion, and
+    whether these are whole numbers.
+    """
+    is_known = np.isfinite(values)
+    missing = values.size - int(np.count_nonzero(is_known))
+    known = values[is_known] if missing else values
+    low, high = float(known.min(initial=np.inf)), float(known.max(initial=-np.inf))
+    is_whole = all((part == np.rint(part)).all() for part in (known[:64], known))
+    values[~is_known] = np.nan
+    if factor != 1.0 or offset != 0.0:
+        with np.errstate(over="ignore"):
+            values *= factor
+            values += offset
+    return missing, low, high, is_whole
 
 
 def _hide_others(stamps: NDArray[np.datetime64], low: int, high: int) -> NDArray[np.datetime64]:

@@ -5,10 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
-
-from gyrostab.kernels.compiled import KERNEL
 
 
 def to_counts(
@@ -63,14 +60,6 @@ def from_counts(
     array([0.1, nan, 0.3])
     """
     values = np.empty(counts.shape) if out is None else out
-    _from_counts(
-        np.ascontiguousarray(counts).reshape(-1), float(scale), int(fill), values.reshape(-1)
-    )
+    np.multiply(counts, np.float64(scale), out=values)
+    np.copyto(values, np.nan, where=counts == fill)
     return values
-
-
-@njit(**KERNEL)
-def _from_counts(counts, scale, fill, values):  # type: ignore[no-untyped-def]
-    """Run `from_counts` in one pass instead of three."""
-    for i in range(counts.size):
-        values[i] = np.nan if counts[i] == fill else counts[i] * scale

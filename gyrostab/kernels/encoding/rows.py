@@ -437,32 +437,3 @@ def read_rows(lines, at, row, roles, separator, point, digits, between, values, 
         starts[row] = begin
         row, begin = row + 1, _next_row(text, at, size)
     return row, begin
-
-
-@njit(**KERNEL)
-def clean_column(values, factor, offset):  # type: ignore[no-untyped-def]
-    """Convert in place, ``values * factor + offset``, and set infinite values to NaN.
-
-    Returns
-    -------
-    missing : int
-        Values that are not finite.
-    low, high : float
-        Range of the others, before conversion; infinite without any.
-    is_whole : bool
-        Whether they are whole numbers.
-    """
-    missing, low, high, is_whole = np.int64(0), np.inf, -np.inf, True
-    same = factor == 1.0 and offset == 0.0
-    for i in range(len(values)):
-        value = values[i]
-        if not math.isfinite(value):
-            missing += 1
-            values[i] = np.nan
-            continue
-        low, high = min(low, value), max(high, value)
-        if is_whole:
-            is_whole = value == np.rint(value)
-        if not same:
-            values[i] = value * factor + offset
-    return missing, low, high, is_whole

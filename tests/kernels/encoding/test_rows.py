@@ -17,7 +17,6 @@ from gyrostab.kernels.encoding.rows import (
     NUMERIC_TIME,
     SKIPPED,
     YEAR_FIRST,
-    clean_column,
     read_rows,
 )
 
@@ -255,25 +254,6 @@ def test_dates_that_do_not_exist_are_not_read(text):
     assert rows_of(f"{text}\n", [YEAR_FIRST])[2] == 0
     assert rows_of("\n", [YEAR_FIRST])[1].tolist() == []
     assert rows_of(",1\n", [YEAR_FIRST, NUMBER])[1].tolist() == [NAT]
-
-
-@given(
-    st.lists(
-        st.floats(-1e6, 1e6)
-        | st.sampled_from([np.nan, np.inf, -np.inf])
-        | st.integers(-100, 100).map(float)
-    )
-)
-def test_column_is_cleaned_as_with_numpy(values):
-    column = np.array(values, dtype=np.float64)
-    missing, low, high, whole = clean_column(held := column.copy(), 3.7, 0.1)
-    finite = column[np.isfinite(column)]
-    assert missing == len(column) - len(finite)
-    assert np.array_equal(
-        held, np.where(np.isfinite(column), column * 3.7 + 0.1, np.nan), equal_nan=True
-    )
-    assert (low, high) == (finite.min(initial=np.inf), finite.max(initial=-np.inf))
-    assert whole == (finite == np.rint(finite)).all()
 
 
 def test_dates_to_the_minute():
