@@ -1,8 +1,8 @@
 """Growing columns of 8-byte values in pieces, in memory or on disk.
 
-Files are read back with `gyrostab.store.system.read_at`, not mapped: the pages of a mapped file
-count as memory of this process, and their number grows as a long log is read. Each map also holds a
-file handle, so hundreds of files would need thousands of handles.
+Files are read back, not mapped: the pages of a mapped file count as memory of this process, and
+their number grows as a long log is read. Each map also holds a file handle, so hundreds of files
+would need thousands of handles.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OutputError
 from gyrostab.store.lazy import RowSource, find_source, make_dask
-from gyrostab.store.system import read_at, write_at
 
 #: Largest total size of the columns of one file that is held in memory [bytes].
 SPILL_BYTES = 128 * 2**20
@@ -46,8 +45,9 @@ class Spool:
                 if self.file is None:
                     self.file = tempfile.TemporaryFile(prefix="gyrostab-", buffering=0)  # noqa: SIM115
                 begin, view = self.end, values.data.cast("B")
+                self.file.seek(begin)
                 while view.nbytes:
-                    count = write_at(self.handle, view, self.end)
+                    count = self.file.write(view)
                     view, self.end = view[count:], self.end + count
                 return begin
         except OSError as error:
@@ -58,16 +58,22 @@ class Spool:
                 "make room, or name a larger place in the environment variable TMPDIR"
             ) from error
 
+    def read_into(self, begin: int, out: NDArray[Any]) -> None:
+        """Read the bytes of a contiguous array from an offset on; threads take turns."""
+        assert self.file is not None
+        view = out.data.cast("B")
+        with self._lock:
+            self.file.seek(begin)
+            while view.nbytes:
+                got: int = self.file.readinto(view)  # type: ignore[attr-defined]
+                if not got:
+                    raise OSError("the temporary file of a long log is shorter than it was")
+                view = view[got:]
+
     def store(self, values: NDArray[Any]) -> PiecewiseColumn:
         """Write a column to the file and return it as a piecewise column."""
         bits = np.ascontiguousarray(values).view(np.int64)
         return PiecewiseColumn(values.dtype, [_spooled(bits, self)])
-
-    @property
-    def handle(self) -> int:
-        """File descriptor."""
-        assert self.file is not None
-        return self.file.fileno()
 
 
 @dataclass(frozen=True)
@@ -80,17 +86,10 @@ class SpooledPiece:
 
     def read_into(self, first: int, out: NDArray[np.int64]) -> None:
         """Read the values from row `first` on into `out`."""
-        if not out.flags.c_contiguous:
-            line = np.empty(out.size, np.int64)
-            self.read_into(first, line)
+        line = out if out.flags.c_contiguous else np.empty(out.size, np.int64)
+        self.spool.read_into(self.begin + 8 * first, line)
+        if line is not out:
             out[:] = line
-            return
-        begin, view, done = self.begin + 8 * first, out.data.cast("B"), 0
-        while done < view.nbytes:
-            got = read_at(self.spool.handle, view[done:], begin + done)
-            if got < 1:
-                raise OSError("the temporary file of a long log is shorter than it was")
-            done += got
 
 
 @dataclass(frozen=True)
