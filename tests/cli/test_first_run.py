@@ -74,20 +74,19 @@ getattr(caching, name)._locator_classes = []
 """
 
 
-#: A kernel without others.
-SCAN = """
+#: A kernel of a single loop.
+TRACK = """
 import numpy as np
-from gyrostab.kernels.grid.stamps import scan_cells
+from gyrostab.kernels.grid.stamps import track
 
-present = np.empty(2, bool)
-assert scan_cells(np.array([[1.0, np.nan]]), present)[0] == 1
-assert present.tolist() == [True, False]
-assert not scan_cells.stats.cache_path
+count, piece = track(np.array([0, 10, 30]), 10.0, 0.1, 100.0)
+assert count.tolist() == [0, 1, 3]
+assert not track.stats.cache_path
 """
 
 
 def test_kernels_work_where_nothing_can_be_cached() -> None:
-    subprocess.run([sys.executable, "-c", NO_FOLDER + SCAN], check=True)
+    subprocess.run([sys.executable, "-c", NO_FOLDER + TRACK], check=True)
 
 
 @pytest.mark.parametrize("command", [["demo"], ["run", "log.csv", "-o", "product.nc"]])

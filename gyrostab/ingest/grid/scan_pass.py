@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.stamps import read_stamps
 from gyrostab.ingest.uniform.core import merge_spans
-from gyrostab.kernels.grid.stamps import scan_cells
 from gyrostab.schema import texts
 from gyrostab.store.lazy import read_slice
 from gyrostab.store.threads import map_in_order
@@ -68,14 +67,19 @@ class _Block(NamedTuple):
 def _scan_block(
     raw: xr.Dataset, name: str, channels: Sequence[str], ends: tuple[int, int]
 ) -> _Block:
-    cells = np.ascontiguousarray(read_slice(raw[name].data, *ends), dtype=np.float64)
-    present = np.empty(cells.shape[1], dtype=bool)
-    absent, holes, infinities, low, high = scan_cells(cells, present)
-    unreadable = np.isnan(cells).any(axis=0) & present if holes else ()
-    infinite = np.isinf(cells).any(axis=0) if infinities else ()
-    filled = [int(np.isfinite(read_slice(raw[key].data, *ends)).sum()) for key in channels]
-    spans = (find_spans(bad, ends[0]) for bad in (unreadable, infinite))
-    return _Block(np.packbits(present), absent, *spans, low, high, filled)
+    cells = np.asarray(read_slice(raw[name].data, *ends), dtype=np.float64)
+    is_nan, is_infinite = np.isnan(cells), np.isinf(cells)
+    present, infinite = ~is_nan.all(axis=0), is_infinite.any(axis=0)
+    finite = np.where(is_infinite, np.nan, cells) if infinite.any() else cells
+    return _Block(
+        np.packbits(present),
+        present.size - int(np.count_nonzero(present)),
+        find_spans(is_nan.any(axis=0) & present, ends[0]),
+        find_spans(infinite, ends[0]),
+        np.fmin.reduce(finite, axis=1, initial=np.inf),
+        np.fmax.reduce(finite, axis=1, initial=-np.inf),
+        [int(np.isfinite(read_slice(raw[key].data, *ends)).sum()) for key in channels],
+    )
 
 
 def find_spans(bad: Any, offset: int) -> NDArray[np.int64]:

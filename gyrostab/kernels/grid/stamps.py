@@ -154,49 +154,6 @@ def piece_sums(stamps, count, piece, period):  # type: ignore[no-untyped-def]
     return table
 
 
-@njit(**KERNEL)
-def scan_cells(cells, present):  # type: ignore[no-untyped-def]
-    """Count missing cells and find the range of values, in one pass.
-
-    Parameters
-    ----------
-    cells : ndarray, shape (n_axes, n)
-        Values by axis and row.
-    present : ndarray of bool, shape (n,)
-        Set where any axis has a number (or infinity).
-
-    Returns
-    -------
-    absent : int
-        Rows without any number.
-    holes, infinite : int
-        Cells without a number in other rows, and infinite cells.
-    low, high : ndarray, shape (n_axes,)
-        Range of the finite values; infinite without any.
-    """
-    axes, n = cells.shape
-    low, high = np.full(axes, np.inf), np.full(axes, -np.inf)
-    present[:] = False
-    nans = infinite = np.int64(0)
-    for axis in range(axes):
-        smallest, largest = np.inf, -np.inf
-        for row in range(n):
-            value = cells[axis, row]
-            if np.isfinite(value):
-                smallest, largest = min(smallest, value), max(largest, value)
-                present[row] = True
-            elif np.isnan(value):
-                nans += 1
-            else:
-                infinite += 1
-                present[row] = True
-        low[axis], high[axis] = smallest, largest
-    absent = np.int64(0)
-    for row in range(n):
-        absent += not present[row]
-    return absent, nans - axes * absent, infinite, low, high
-
-
 @njit(**INNER)
 def _fits_counting(stamps, j, expected, period, state):  # type: ignore[no-untyped-def]
     """Check whether the next readable stamps after row j agree with unbroken counting."""
