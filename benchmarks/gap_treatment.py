@@ -24,6 +24,7 @@ from page import renew
 import gyrostab
 from gyrostab.noise import NORMAL_95
 from tests.support.noise_records import flicker, lose, random_walk, white
+from tests.support.published import published_davar
 
 SAMPLES, RATE, MEAN = 6000, 100.0, 10.0
 TRUTH = {"N": 0.01, "B": 1.5, "K": 150.0}
@@ -72,11 +73,11 @@ def hold(row: np.ndarray) -> np.ndarray:
     return np.nan_to_num(row[last], nan=MEAN)
 
 
-def make_surface(row: np.ndarray, gaps: str = "bridge") -> xr.Dataset:
+def make_surface(row: np.ndarray, run: Callable[..., xr.Dataset] = gyrostab.davar) -> xr.Dataset:
     """Compute the Allan variance of one record."""
     log = gyrostab.make_log(row, rate=RATE, unit="deg/h")
     size = f"{row.size}samples"
-    return gyrostab.davar(log, window=size, step=size, taus=24, gaps=gaps)
+    return run(log, window=size, step=size, taus=24)
 
 
 def weigh_means(row: np.ndarray) -> xr.Dataset:
@@ -101,7 +102,9 @@ def weigh_means(row: np.ndarray) -> xr.Dataset:
 Treatment = Callable[[np.ndarray], xr.Dataset]
 TREATMENTS: dict[str, Treatment] = {
     "gyrostab: counted": make_surface,
-    "differences at gaps set to zero (P16)": partial(make_surface, gaps="zero"),
+    "differences at gaps set to zero (P16)": partial(
+        make_surface, run=partial(published_davar, method="direct", zero_fill=True)
+    ),
     "weighted means of what is present (FAVAR)": weigh_means,
     "interpolated": lambda row: make_surface(interpolate(row)),
     "last value held": lambda row: make_surface(hold(row)),

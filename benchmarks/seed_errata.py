@@ -54,14 +54,15 @@ def _averages(rate: Array, k: int) -> Array:
     return np.convolve(rate, np.full(k, 1.0 / k), mode="valid")
 
 
-def _avar(values: Array, k: int, *, kind: str = "rate", gaps: str = "bridge") -> float:
-    """Allan variance of samples at 100 Hz over all of the record, as one window."""
+def _avar(values: Array, k: int, *, kind: str = "rate", zero_fill: bool = False) -> float:
+    """Allan variance of samples at 100 Hz over all of the record, as one window.
+
+    With `zero_fill`, the sum is divided by the number of terms without gaps.
+    """
     log = make_log(values, rate=100.0, unit="deg/h" if kind == "rate" else "deg", kind=kind)
-    return float(
-        davar(log, window=f"{values.size - (kind == 'angle')}samples", taus=[k / 100.0], gaps=gaps)[
-            "avar"
-        ].values.item()
-    )
+    size = values.size - (kind == "angle")
+    surface = davar(log, window=f"{size}samples", taus=[k / 100.0])
+    return float((surface["avar"] * (surface["coverage"] if zero_fill else 1.0)).values.item())
 
 
 def _filtered(density: Callable[[Array], Array], tau: float) -> float:
@@ -198,7 +199,7 @@ def _canyon() -> Erratum:
         "lost differences are zero, the divisor stays N_w − 2k",
         "divide by the number of differences that are there",
         "Allan variance of x1 at 0.1 s, half of it lost [deg²/h²]; 0.1",
-        _avar(rate, 10, gaps="zero"),
+        _avar(rate, 10, zero_fill=True),
         _avar(rate, 10),
     )
 

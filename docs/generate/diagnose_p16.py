@@ -5,16 +5,19 @@ import sys
 import tomllib
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
 import numpy as np
 
 import gyrostab
 from gyrostab.plot.diagnosis import plot_change
 from gyrostab.plot.style import save_png
+from tests.support.published import fit_deviations
 
 
 def published(log, plan):
     """Fit the five terms as the paper does; return their medians over still and shaken windows."""
-    product = gyrostab.fit_noise(gyrostab.davar(log, **plan["davar"]), method="adev")
+    product = fit_deviations(gyrostab.davar(log, **plan["davar"]))
     seconds = (product["time"] - log["time"][0]) / np.timedelta64(1, "s")
     parts = {
         name: product.isel(time=((seconds > low) & (seconds < high)).values)

@@ -6,10 +6,13 @@ import time
 import tomllib
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
 import numpy as np
 
 import gyrostab
 from gyrostab.plot.style import save_png
+from tests.support.published import fit_deviations, published_davar
 
 ROOT = Path(__file__).resolve().parents[2]
 PLAN = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
@@ -32,11 +35,12 @@ def simulate(name, run):
 def analyse(log, run):
     """Go from the log to noise coefficients, and note the processor time of the surface."""
     log, began = log.compute(), time.process_time()
-    surface = gyrostab.davar(log, **run["davar"]).assign(windows=lambda made: made.sizes["time"])
-    return gyrostab.fit_noise(
-        surface.assign(seconds=time.process_time() - began),
-        **{"observed_only": False, **run.get("fit", {})},
-    )
+    davar = published_davar if "method" in run["davar"] else gyrostab.davar
+    surface = davar(log, **run["davar"]).assign(windows=lambda made: made.sizes["time"])
+    surface = surface.assign(seconds=time.process_time() - began)
+    if run.get("fit") == "deviations":
+        return fit_deviations(surface)
+    return gyrostab.fit_noise(surface, **{"observed_only": False, **run.get("fit", {})})
 
 
 def number(entry, products):

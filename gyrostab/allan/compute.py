@@ -1,4 +1,4 @@
-"""Computation of a surface: units of work, with all dask calls, and the published methods."""
+"""Computation of a surface: units of work, with all dask calls."""
 
 from __future__ import annotations
 
@@ -13,18 +13,9 @@ from numpy.typing import NDArray
 
 from gyrostab.allan.freedoms import NoiseTables, estimate_freedoms, make_noise_tables
 from gyrostab.allan.plan import Plan, last_sample, units_of_work
-from gyrostab.errors import OptionError
 from gyrostab.kernels.allan.gap_edges import gap_edge_ratio
 from gyrostab.kernels.allan.outlier_count import count_outliers
-from gyrostab.kernels.allan.reference import direct_sums, recursive_sums, reference_theta
-from gyrostab.kernels.allan.surface import (
-    STRICT,
-    Cells,
-    Unit,
-    convert_to_native,
-    surface_unit,
-    window_means,
-)
+from gyrostab.kernels.allan.surface import Cells, Unit, convert_to_native, surface_unit
 from gyrostab.kernels.allan.trend import window_trends
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.store.lazy import find_source, keep_sources, read_into, read_slice
@@ -131,12 +122,10 @@ def _join_field(parts: list[Floats], sizes: list[int], n_axes: int, kind: Any) -
     return parts[0].reshape(shape)
 
 
-def _describe_windows(
-    x: NDArray[np.generic], unit: Unit, windows: int | None = None
-) -> NDArray[np.float64]:
+def _describe_windows(x: NDArray[np.generic], unit: Unit) -> NDArray[np.float64]:
     """Compute the plane fields from the trend on, (7, n_windows)."""
     x = convert_to_native(x)
-    count = (x.size - unit.window - unit.angle) // unit.step + 1 if windows is None else windows
+    count = (x.size - unit.window - unit.angle) // unit.step + 1
     first = np.arange(count) * unit.step
     trends = window_trends(x, angle=unit.angle, window=unit.window, step=unit.step, n_windows=count)
     trends[0] *= _trend_scale(unit)
@@ -184,49 +173,3 @@ def run_units(data: Any, plan: Plan) -> tuple[Any, Any]:
     cells_array, means_array = (keep_sources(data, part) for part in stacked)
     kinds = [FIELD_TYPES.get(name, np.float64) for name in CELL_FIELDS]
     return [cells_array[i].astype(kind) for i, kind in enumerate(kinds)], means_array
-
-
-def run_published_method(
-    plan: Plan, method: str, *, paper: bool
-) -> tuple[list[NDArray[Any]], Floats]:
-    """Run a published algorithm in memory: fields (axis, time, tau), plane (9, axis, time)."""
-    signal, unit = plan.signal, plan.unit
-    points = unit.window + (0 if paper and not unit.angle else 1)
-    all_points = signal.sizes["time"] + (0 if unit.angle or paper else 1)
-    n_windows = (all_points - points) // unit.step + (0 if paper else 1)
-    if n_windows < 1:
-        raise OptionError(
-            "convention='paper' leaves no window, because it omits the last one; give a longer "
-            "record"
-        )
-    run = direct_sums if method == "direct" else recursive_sums
-    tables = make_noise_tables(plan)
-    full = (points - 2 * unit.ks).astype(np.float64)
-    results = []
-    for row in range(signal.sizes["axis"]):
-        x = np.asarray(signal.isel(axis=row).data)
-        theta, present, missing = reference_theta(x, angle=unit.angle, paper=paper)
-        sums, counts = run(theta, present, missing, points, unit.step, n_windows, unit.ks)
-        interval = unit.interval / HOUR if unit.angle else 1.0
-        with np.errstate(invalid="ignore", divide="ignore"):
-            avar = sums / (2.0 * (unit.ks * interval) ** 2 * (full if unit.zero_fill else counts))
-        coverage = counts / full
-        if not unit.zero_fill:
-            avar[coverage < unit.min_coverage] = np.nan
-        ones = np.ones_like(avar)
-        cells = Cells(
-            avar,
-            counts.astype(np.float64),
-            coverage,
-            coverage,
-            STRICT * ones,
-            ones,
-            ones,
-            ones,
-            np.nan * ones,
-        )
-        means = window_means(x, unit)[:, :n_windows]
-        means[0] *= HOUR if unit.angle else 1.0
-        plane = np.concatenate([means, _describe_windows(x, unit, n_windows)])
-        results.append(([*cells, estimate_freedoms(cells, tables)], plane))
-    return join_units(results, len(results))

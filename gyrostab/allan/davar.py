@@ -18,7 +18,6 @@ from gyrostab.allan.compute import (
     compute_unit,
     join_units,
     read_spans,
-    run_published_method,
     run_units,
 )
 from gyrostab.allan.freedoms import make_noise_tables
@@ -52,11 +51,8 @@ def davar(
     tau_max: Any = None,
     axis: str | Sequence[str] | None = None,
     overlap: str = "full",
-    gaps: str = "bridge",
     min_strict: float = 0.3,
     min_coverage: float = 0.1,
-    method: str = "blocks",
-    convention: str = "all",
     variance: str = "avar",
 ) -> xr.Dataset:
     """Compute the dynamic overlapping Allan variance of a gyro log (improved fast DAVAR).
@@ -92,21 +88,11 @@ def davar(
         Use every second difference, or for ``k >= 16`` one in k/16 to k/8 of them, with k rounded
         to a multiple of a power of two: less work on long windows (1.7 times faster as measured by
         ``make bench``), with 1 % more scatter.
-    gaps : {"bridge", "zero"}
-        ``"bridge"`` uses only samples that are present. In a rate log these are the terms inside
-        unbroken runs or, if fewer than `min_strict` of them are left, weighted cluster means (see
-        ``estimator``). In an angle log they are the terms of which all three angles are present.
-        ``"zero"`` divides by the number of terms without gaps instead, which lowers the surface at
-        every gap (the gap bias of P16).
     min_strict, min_coverage : float
-        Share of terms in unbroken runs below which cluster means are used; coverage below which a
-        cell is NaN.
-    method : {"blocks", "direct", "recursive"}
-        Block sums (default); the classical DAVAR (P16 Eq. 16); the published recursion (P16 Eq.
-        19-22). The last two load the log into memory and are provided for comparison.
-    convention : {"all", "paper"}
-        With ``"paper"`` the reference methods count ``window - 2k`` terms and omit the last window,
-        as P16 does.
+        In a rate log with gaps, the terms inside unbroken runs are used or, where fewer than
+        `min_strict` of them are left, weighted cluster means (see ``estimator``); in an angle log,
+        the terms of which all three angles are present. A cell whose coverage is below
+        `min_coverage` is NaN.
     variance : {"avar", "hadamard", "modified"}
         The overlapping Allan variance; the overlapping Hadamard variance, which a constant drift
         of the rate does not change; or the modified Allan variance, in which quantization noise
@@ -136,7 +122,7 @@ def davar(
 
     References
     ----------
-    P16: Wang et al., Sensors 16 (2016), Eq. 16-22. L13: Li et al., Chin. J. Lasers 40 (2013)
+    P16: Wang et al., Sensors 16 (2016), Eq. 16. L13: Li et al., Chin. J. Lasers 40 (2013)
     0908004. Degrees of freedom: Greenhall and Riley, PTTI 2003.
 
     Examples
@@ -153,13 +139,9 @@ def davar(
     log = as_log(log)
     plan = make_plan(
         log, window=window, step=step, taus=taus, tau_max=tau_max, axis=axis, overlap=overlap,
-        gaps=gaps, min_strict=min_strict, min_coverage=min_coverage, method=method,
-        convention=convention, variance=variance,
+        min_strict=min_strict, min_coverage=min_coverage, variance=variance,
     )  # fmt: skip
-    if method == "blocks":
-        cells, means = run_units(plan.signal.data, plan)
-    else:
-        cells, means = run_published_method(plan, method, paper=convention == "paper")
+    cells, means = run_units(plan.signal.data, plan)
     return _attach_labels(cells, means, log, plan)
 
 
@@ -226,13 +208,12 @@ def davar_part(
     space : gyrostab.kernels.workspace.Workspace, optional
         Working memory, reused by parts that one thread computes one after the other.
     **options
-        Options of `davar`, with ``method="blocks"``.
+        Options of `davar`.
 
     Raises
     ------
     OptionError
-        If the options do not fit, the part has no window, or the method is not that of the block
-        sums.
+        If the options do not fit, or the part has no window.
 
     Examples
     --------
@@ -243,7 +224,7 @@ def davar_part(
     True
     """
     log = as_log(log)
-    plan = _plan_blocks(log, options)
+    plan = make_plan(log, **options)
     data, unit = plan.signal.data, plan.unit
     tables = make_noise_tables(plan)
     units = units_of_work(data.shape[1], unit)
@@ -270,7 +251,7 @@ def davar_sample(log: xr.Dataset, *, numbers: Sequence[int], **options: Any) -> 
     """
     log = as_log(log)
     log = log.drop_vars(log_channels(log))
-    plan, space = _plan_blocks(log, options), Workspace()
+    plan, space = make_plan(log, **options), Workspace()
     data, unit = plan.signal.data, plan.unit
     tables = make_noise_tables(plan)
     results = []
@@ -281,17 +262,6 @@ def davar_sample(log: xr.Dataset, *, numbers: Sequence[int], **options: Any) -> 
         )
     cells, means = join_units(list(chain.from_iterable(zip(*results, strict=True))), data.shape[0])
     return _attach_labels(cells, means, log, plan, numbers=numbers)
-
-
-def _plan_blocks(log: xr.Dataset, options: dict[str, Any]) -> Plan:
-    """Plan windows of the block sums, which alone can be computed in parts."""
-    plan = make_plan(log, **options)
-    if plan.attrs["method"] != "blocks":
-        raise OptionError(
-            f"method={plan.attrs['method']!r} is for whole logs; parts are computed with "
-            "method='blocks'"
-        )
-    return plan
 
 
 def _attach_labels(
@@ -328,12 +298,6 @@ def _attach_labels(
         variables[name] = (plane, values.astype(kind), attributes(name))
     variables["gap_factor"] = gap_factor
     groups = units_of_work(signal.sizes["time"], unit)
-    if part is None:  # convention "paper" omits the last window
-        groups = [
-            slice(group.start, min(group.stop, first.size))
-            for group in groups
-            if group.start < first.size
-        ]
     return xr.Dataset(
         {**variables, **window_channels(log, unit.window, unit.step, groups, part=part)},
         coords={

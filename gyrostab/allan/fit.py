@@ -22,7 +22,7 @@ from gyrostab.allan.window_fit import FitTables, fit_block, fit_tables, run_kern
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.fit.covariance import STOCHASTIC
 from gyrostab.kernels.fit.submodels import FIT_FIELDS
-from gyrostab.noise import LAWS, TERMS, avar_columns
+from gyrostab.noise import TERMS
 from gyrostab.schema import attributes, check_surface
 from gyrostab.time.durations import duration_seconds, thin
 from gyrostab.units import HOUR
@@ -35,7 +35,6 @@ def fit_noise(
     surface: xr.Dataset,
     *,
     terms: str | Iterable[str] = "QNBKR",
-    method: str = "gls",
     tau_min: Any = None,
     tau_max: Any = None,
     observed_only: bool = True,
@@ -58,10 +57,6 @@ def fit_noise(
         Surface of `gyrostab.davar`.
     terms : str or iterable of str
         Terms to fit, a selection of Q, N, B, K, R; the others are taken as zero.
-    method : {"gls", "adev"}
-        Generalised least squares (default), or the unweighted fit of deviations of P15 (Eq. 3),
-        ``sigma = sum C_n tau^(n/2)``. The latter adds deviations although variances add, gives no
-        errors, and is provided for comparison.
     tau_min, tau_max : float or str, optional
         Averaging times to fit [s]. By default all, but of a sensor with a filter those that are
         longer than the memory of the filter, whose effect on white noise is taken into account; up
@@ -91,13 +86,13 @@ def fit_noise(
     Raises
     ------
     OptionError
-        If a term or the method is unknown.
+        If a term is unknown.
     SchemaError
         If `surface` is not a surface.
 
     References
     ----------
-    IEEE Std 952-1997, annex C. P15: Wang et al., Measurement 75 (2015) 263, Eq. 3.
+    IEEE Std 952-1997, annex C.
 
     Examples
     --------
@@ -109,14 +104,8 @@ def fit_noise(
     >>> round(float(product.N.mean()), 3)
     0.01
     """
-    return _fit_checked(
-        surface,
-        terms=terms,
-        method=method,
-        tau_min=tau_min,
-        tau_max=tau_max,
-        observed_only=observed_only,
-    )
+    options = {"terms": terms, "tau_min": tau_min, "tau_max": tau_max}
+    return _fit_checked(surface, **options, observed_only=observed_only)
 
 
 def refit(product: xr.Dataset, **options: Any) -> xr.Dataset:
@@ -146,7 +135,6 @@ def refit(product: xr.Dataset, **options: Any) -> xr.Dataset:
     """
     option_attributes = {
         "terms": "fit_terms",
-        "method": "fit_method",
         "tau_min": "fit_tau_min_s",
         "tau_max": "fit_tau_max_s",
     }
@@ -202,36 +190,29 @@ def _fit_checked(
     surface: xr.Dataset,
     *,
     terms: str | Iterable[str] = "QNBKR",
-    method: str = "gls",
     tau_min: Any = None,
     tau_max: Any = None,
     observed_only: bool = True,
     immediate: bool = False,
     bands: Bands | None = None,
 ) -> xr.Dataset:
-    fitted_terms, chosen = _check_options(surface, terms, method, tau_min, tau_max)
+    fitted_terms, chosen = _check_options(surface, terms, tau_min, tau_max)
     if bands is None:
-        bands = find_bands(
-            surface, terms=fitted_terms, method=method, tau_min=tau_min, tau_max=tau_max
-        )
+        bands = find_bands(surface, terms=fitted_terms, tau_min=tau_min, tau_max=tau_max)
     limits = [BandLimit(*bands[str(axis)]) for axis in surface["axis"].values]
-    if method == "gls":
-        product = _fit_gls(
-            surface,
-            _bits(fitted_terms),
-            chosen,
-            limits,
-            immediate=immediate,
-            observed_only=observed_only,
-        )
-    else:
-        product = _fit_adev(surface, fitted_terms, chosen)
+    product = _fit_windows(
+        surface,
+        _bits(fitted_terms),
+        chosen,
+        limits,
+        immediate=immediate,
+        observed_only=observed_only,
+    )
     band_variables = {
         name: ("axis", np.array(values), attributes(name))
         for name, values in zip(_BAND_VARIABLES, zip(*limits, strict=True), strict=True)
     }
     return product.assign(band_variables).assign_attrs(
-        fit_method=method,
         fit_terms="".join(fitted_terms),
         fit_tau_min_s=min(limit.tau_min for limit in limits),
         fit_tau_max_s=surface["tau"].values[chosen[-1]],
@@ -246,7 +227,6 @@ def find_bands(
     surface: xr.Dataset,
     *,
     terms: str | Iterable[str] = "QNBKR",
-    method: str = "gls",
     tau_min: Any = None,
     tau_max: Any = None,
 ) -> Bands:
@@ -256,7 +236,7 @@ def find_bands(
     ----------
     surface : xarray.Dataset
         Surface of `gyrostab.davar`, or windows of it that are spread over the record.
-    terms, method, tau_min, tau_max
+    terms, tau_min, tau_max
         Options of `fit_noise`. With `tau_min`, that is the shortest averaging time, without a
         filter, which is also not sought in Hadamard and modified Allan variances.
 
@@ -275,10 +255,10 @@ def find_bands(
     >>> find_bands(davar(make_log(smooth, rate=100.0, unit="deg/h"), window="1min"))
     {'x': BandLimit(tau_min=0.13, time_constant=0.0292, white_error=0.0122)}
     """
-    fitted_terms, chosen = _check_options(surface, terms, method, tau_min, tau_max)
+    fitted_terms, chosen = _check_options(surface, terms, tau_min, tau_max)
     tau, axes = surface["tau"].values, list(map(str, surface["axis"].values))
     allan = surface.attrs.get("variance", "avar") == "avar"
-    if tau_min is not None or method != "gls" or not allan:
+    if tau_min is not None or not allan:
         return {axis: BandLimit(float(tau[chosen[0]]), 0.0) for axis in axes}
     window = int(surface.attrs.get("window_samples", 1))
     step = int(surface.attrs.get("step_samples", window))
@@ -315,7 +295,6 @@ def _bits(terms: Iterable[str]) -> int:
 
 def check_fit_options(
     terms: str | Iterable[str] = "QNBKR",
-    method: str = "gls",
     tau_min: Any = None,
     tau_max: Any = None,
     **other: Any,
@@ -338,25 +317,18 @@ def check_fit_options(
     unknown = [term for term in fitted_terms if term not in TERMS]
     if unknown or not fitted_terms:
         raise OptionError(f"terms {unknown or fitted_terms}: choose among {', '.join(TERMS)}")
-    if method not in ("gls", "adev"):
-        raise OptionError(f"method={method!r}: give 'gls' or 'adev'")
     low = 0.0 if tau_min in (None, "all") else duration_seconds(tau_min, "tau_min (--fit-from)")
     high = np.inf if tau_max is None else duration_seconds(tau_max, "tau_max (--fit-to)")
     return fitted_terms, low, high
 
 
 def _check_options(
-    surface: xr.Dataset, terms: str | Iterable[str], method: str, tau_min: Any, tau_max: Any
+    surface: xr.Dataset, terms: str | Iterable[str], tau_min: Any, tau_max: Any
 ) -> tuple[list[str], NDArray[np.int64]]:
     """Check the options of a fit; return the terms, and the positions of the averaging times."""
     check_surface(surface)
-    fitted_terms, low, high = check_fit_options(terms, method, tau_min, tau_max)
-    variance = surface.attrs.get("variance", "avar")
-    if method == "adev" and variance != "avar":
-        raise OptionError(
-            f"method='adev' is for Allan variances; the surface has variance={variance!r}"
-        )
-    if variance == "hadamard" and fitted_terms == ["R"]:
+    fitted_terms, low, high = check_fit_options(terms, tau_min, tau_max)
+    if surface.attrs.get("variance") == "hadamard" and fitted_terms == ["R"]:
         raise OptionError("terms 'R': the Hadamard variance does not see a ramp")
     return fitted_terms, _select_taus(surface["tau"].values, low, high)
 
@@ -443,7 +415,7 @@ def _prepare_fit(
     return cells, tables, chosen
 
 
-def _fit_gls(
+def _fit_windows(
     surface: xr.Dataset,
     allowed: int,
     within: NDArray[np.int64],
@@ -506,67 +478,19 @@ def _fit_gls(
         if not lazy:
             fitted = fitted.compute()
     n = len(TERMS)
-    parts = [fitted[..., i] for i in range(4 * n + 2)]
-    extra: dict[str, Any] = {
-        "fit_chi2": (("axis", "time"), parts[4 * n], attributes("fit_chi2")),
-        "fit_dof": (("axis", "time"), parts[4 * n + 1], attributes("fit_dof")),
-    }
+    plane = ("axis", "time")
+    out: dict[str, Any] = {}
+    for i, symbol in enumerate(TERMS):
+        for part, end in enumerate(("", "_stderr", "_upper")):
+            out[f"{symbol}{end}"] = (plane, fitted[..., part * n + i])
+        if symbol in "NK":
+            out[f"{symbol}_squared"] = (plane, fitted[..., i] ** 2)
+    out["observable"] = ((*plane, "term"), fitted[..., 3 * n : 4 * n].astype(np.int8))
+    out |= {"fit_chi2": (plane, fitted[..., 4 * n]), "fit_dof": (plane, fitted[..., 4 * n + 1])}
+    out["term"] = ("term", list(TERMS))
+    out = {name: (*variable, attributes(name)) for name, variable in out.items()}
     # otherwise that of davar is kept, for every averaging time and from more of them
     if surface.sizes["tau"] == chosen.size > allowed.bit_count():
         edf = np.where(below, surface["edf"].data, fitted[..., 4 * n + 2 :])
-        extra["edf"] = (("axis", "time", "tau"), edf, surface["edf"].attrs)
-    return _assemble_product(surface, *(parts[i * n : (i + 1) * n] for i in range(4)), extra=extra)
-
-
-def _assemble_product(
-    surface: xr.Dataset,
-    values: list[Any],
-    errors: list[Any],
-    limits: list[Any],
-    observable: list[Any],
-    *,
-    extra: dict[str, Any],
-) -> xr.Dataset:
-    plane = ("axis", "time")
-    out: dict[str, Any] = {}
-    for symbol, value, error, limit in zip(TERMS, values, errors, limits, strict=True):
-        out[symbol] = (plane, value, attributes(symbol))
-        out[f"{symbol}_stderr"] = (plane, error, attributes(f"{symbol}_stderr"))
-        out[f"{symbol}_upper"] = (plane, limit, attributes(f"{symbol}_upper"))
-        if f"{symbol}_squared" in _SQUARED_NAMES:
-            out[f"{symbol}_squared"] = (plane, value**2, attributes(f"{symbol}_squared"))
-    stack = da.stack if isinstance(observable[0], da.Array) else np.stack
-    out["observable"] = (
-        (*plane, "term"),
-        stack(observable, axis=-1).astype(np.int8),
-        attributes("observable"),
-    )
-    return surface.assign({**out, **extra, "term": ("term", list(TERMS), attributes("term"))})
-
-
-_SQUARED_NAMES = ("N_squared", "K_squared")
-
-
-def _fit_adev(
-    surface: xr.Dataset, fitted_terms: list[str], chosen: NDArray[np.int64]
-) -> xr.Dataset:
-    """Fit the Allan deviation of each window in half-integer powers of tau (P15 Eq. 3-4)."""
-    deviation = np.sqrt(np.asarray(surface["avar"].data[..., chosen], dtype=np.float64))
-    members = [TERMS.index(term) for term in fitted_terms]
-    columns = np.sqrt(avar_columns(surface["tau"].values[chosen]))[:, members]
-    scale = np.linalg.norm(columns, axis=0)
-    values = np.full((*deviation.shape[:2], len(TERMS)), np.nan)
-    for where in np.ndindex(deviation.shape[:2]):
-        valid = np.isfinite(deviation[where])
-        if np.count_nonzero(valid) >= len(members):
-            solution = np.linalg.lstsq(columns[valid] / scale, deviation[where][valid], rcond=None)[
-                0
-            ]
-            values[where][members] = np.abs(solution / scale)
-    nothing = [np.full(deviation.shape[:2], np.nan) for _ in LAWS]
-    flags = [np.where(np.isfinite(values[..., i]), 2, 0) for i in range(len(TERMS))]
-    extra = {
-        name: (("axis", "time"), nothing[0], attributes(name)) for name in ("fit_chi2", "fit_dof")
-    }
-    coefficients = [values[..., i] for i in range(len(TERMS))]
-    return _assemble_product(surface, coefficients, nothing, nothing, flags, extra=extra)
+        out["edf"] = (("axis", "time", "tau"), edf, surface["edf"].attrs)
+    return surface.assign(out)

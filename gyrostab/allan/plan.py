@@ -23,10 +23,7 @@ MOST_CELLS = 2**20
 WINDOWS_S = (600, 300, 120, 60, 30, 20, 10, 5, 2, 1)
 #: Shortest window [samples].
 MIN_WINDOW_SAMPLES = 4
-_METHODS = ("blocks", "direct", "recursive")
-_GAPS = ("bridge", "zero")
 _OVERLAPS = ("full", "octave")
-_CONVENTIONS = ("all", "paper")
 
 
 class Plan(NamedTuple):
@@ -47,14 +44,16 @@ class Plan(NamedTuple):
 
 def make_plan(
     log: xr.Dataset, *, window: Any = None, step: Any = None, taus: Any = 40, tau_max: Any = None,
-    axis: str | Sequence[str] | None = None, overlap: str = "full", gaps: str = "bridge",
-    min_strict: float = 0.3, min_coverage: float = 0.1, method: str = "blocks",
-    convention: str = "all", variance: str = "avar",
+    axis: str | Sequence[str] | None = None, overlap: str = "full", min_strict: float = 0.3,
+    min_coverage: float = 0.1, variance: str = "avar",
 ) -> Plan:  # fmt: skip
     """Check the options of `davar` against a log of `gyrostab.ingest.convert.as_log`."""
-    _check_choices(
-        method=method, gaps=gaps, overlap=overlap, convention=convention, variance=variance
-    )
+    for option, value, choices in (
+        ("overlap", overlap, _OVERLAPS),
+        ("variance", variance, tuple(VARIANCES)),
+    ):
+        if value not in choices:
+            raise OptionError(f"{option}={value!r}: give one of {', '.join(choices)}")
     # with min_strict above 1, all cells are of cluster means
     for option, share, most in (
         ("min_strict", min_strict, np.inf),
@@ -80,7 +79,6 @@ def make_plan(
         shifts,
         name == "angle",
         1.0 / rate,
-        gaps == "zero",
         min_strict,
         min_coverage,
         variance,
@@ -88,8 +86,8 @@ def make_plan(
     attrs = {
         "window_s": length / rate, "step_s": hop / rate,
         "window_samples": length, "step_samples": hop,
-        "method": method, "overlap": overlap, "gaps": gaps, "convention": convention,
-        "min_strict": min_strict, "min_coverage": min_coverage, "variance": variance,
+        "overlap": overlap, "min_strict": min_strict, "min_coverage": min_coverage,
+        "variance": variance,
     }  # fmt: skip
     return Plan(signal, unit, rate, attrs, np.searchsorted(ks, asked))
 
@@ -142,32 +140,6 @@ def choose_window(log: xr.Dataset) -> str:
     if seconds is None:
         return f"{max(MIN_WINDOW_SAMPLES, size // 4)}samples"
     return f"{seconds}s" if seconds < 60 else f"{seconds // 60}min"
-
-
-def _check_choices(*, method: str, gaps: str, overlap: str, convention: str, variance: str) -> None:
-    for option, value, choices in (
-        ("method", method, _METHODS),
-        ("gaps", gaps, _GAPS),
-        ("overlap", overlap, _OVERLAPS),
-        ("convention", convention, _CONVENTIONS),
-        ("variance", variance, tuple(VARIANCES)),
-    ):
-        if value not in choices:
-            raise OptionError(f"{option}={value!r}: give one of {', '.join(choices)}")
-    if convention == "paper" and method == "blocks":
-        raise OptionError(
-            "convention='paper' is for method='direct' and method='recursive'; the block sums use "
-            "all terms"
-        )
-    if variance != "avar" and method != "blocks":
-        raise OptionError(
-            f"variance={variance!r} is for method='blocks'; method={method!r} is that of the "
-            "published Allan variance"
-        )
-    if overlap == "octave" and method != "blocks":
-        raise OptionError(
-            f"overlap='octave' is for method='blocks'; method={method!r} uses every term"
-        )
 
 
 def _select_axes(signal: xr.DataArray, axis: str | Sequence[str]) -> xr.DataArray:

@@ -176,9 +176,6 @@ class Windows:
     overlap
         full uses all second differences. octave uses fewer of them at long averaging times: faster
         on long windows, 1 % more scatter.
-    gaps
-        bridge divides by the number of second differences present. zero divides by the gap-free
-        number, as some papers do, which biases the variance low at every gap.
     axis
         Analyse this gyro axis only: x. Repeat for more.
     variance
@@ -191,7 +188,6 @@ class Windows:
     taus: Annotated[str, Parameter(metavar="LIST")] = "40"
     tau_max: Annotated[str | None, Parameter(metavar="DURATION")] = None
     overlap: Literal["full", "octave"] = "full"
-    gaps: Literal["bridge", "zero"] = "bridge"
     axis: Annotated[list[str] | None, Parameter(metavar="NAME", negative=())] = None
     variance: Literal["avar", "hadamard", "modified"] = "avar"
 
@@ -209,9 +205,6 @@ class Fitting:
     ----------
     terms
         Noise terms to fit; NBK, for instance, leaves out Q and R.
-    fit_method
-        gls fits variances by generalised least squares, with their covariance. adev fits
-        deviations, as some papers do, for comparison.
     fit_from
         Shortest averaging time to fit, or all. Raise it to leave out a spectral line or motion at
         short times (default: all times but those that a filter of the sensor shapes).
@@ -220,18 +213,12 @@ class Fitting:
     """
 
     terms: Annotated[str, Parameter(metavar="LETTERS")] = "QNBKR"
-    fit_method: Literal["gls", "adev"] = "gls"
     fit_from: Annotated[str | None, Parameter(metavar="DURATION")] = None
     fit_to: Annotated[str | None, Parameter(metavar="DURATION")] = None
 
     def options(self) -> dict[str, Any]:
         """Return the keyword arguments of `gyrostab.allan.fit.fit_noise`."""
-        return {
-            "terms": self.terms,
-            "method": self.fit_method,
-            "tau_min": self.fit_from,
-            "tau_max": self.fit_to,
-        }
+        return {"terms": self.terms, "tau_min": self.fit_from, "tau_max": self.fit_to}
 
 
 @Parameter(name="*", group=_RUNNING)

@@ -154,7 +154,6 @@ def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours:
 
     tau = window["tau"].values
     total = np.zeros(tau.size)
-    power = 0.5 if window.attrs.get("fit_method") == "adev" else 1.0  # deviations add in that fit
     responses = {"N": "white_response", "Q": "quantization_response", "R": "ramp_response"}
     columns = surface_columns(window)
     for number, (symbol, law) in enumerate(LAWS.items()):
@@ -163,7 +162,7 @@ def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours:
         term = columns[:, number] * np.nan_to_num(float(estimates[symbol])) ** 2
         response = window[responses[symbol]].values if responses.get(symbol) in window else 1.0
         term = term * np.where(np.isfinite(response), response, 1.0)
-        total += (term * (limit_response(window, tau) if symbol == "N" else 1.0)) ** power
+        total += term * (limit_response(window, tau) if symbol == "N" else 1.0)
         if state == OBSERVED:
             spread = f" ± {error:.1g}" if np.isfinite(error) else ""
             label = f"{symbol} = {value:.3g}{spread} {unit_symbol(law.label)} ({law.name})"
@@ -179,9 +178,7 @@ def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours:
             label = f"{symbol} < {upper:.3g} {unit_symbol(law.label)} ({law.name})"
             panel.plot([], [], linestyle="none", label=label)
     if np.nansum(total) > 0:
-        panel.plot(
-            tau, total ** (0.5 / power), color="black", linewidth=1.6, label=_name_curve(window)
-        )
+        panel.plot(tau, np.sqrt(total), color="black", linewidth=1.6, label=_name_curve(window))
 
 
 def _name_curve(window: xr.Dataset) -> str:

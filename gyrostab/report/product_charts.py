@@ -143,8 +143,6 @@ def _fitted_avar(part: xr.Dataset) -> NDArray[np.float64]:
     white = list(LAWS).index("N")
     filtered = (limit_response(part, part["tau"].values) - 1.0) * unit[white]
     curve = np.nan_to_num(squares)
-    if part.attrs.get("fit_method") == "adev":  # deviations add in that fit, without a filter
-        return np.where(fitted, (np.sqrt(curve) @ np.sqrt(unit)) ** 2, np.nan)
     curve = curve @ unit + curve[..., white, None] * np.atleast_2d(filtered)[:, None]
     return np.where(fitted, curve, np.nan)
 

@@ -30,6 +30,7 @@ from gyrostab.noise import LAWS, NORMAL_95, TERMS, model_avar
 from gyrostab.schema import OBSERVABLE
 from tests.reference import average_plainly, fit_window_plainly
 from tests.support.noise_records import flicker, lose, quantization, random_walk, white
+from tests.support.published import fit_deviations
 
 RATE = 100.0
 #: Sides of an interval: scores of its lower and upper bound.
@@ -395,7 +396,7 @@ def test_fit_of_deviations_of_the_2015_paper_is_biased():
     truth = {"N": 0.01, "K": 5.0}
     surface = windows_of(np.zeros((2, 300_000)), taus=list(np.round(tau, 2)))
     surface["avar"] = xr.zeros_like(surface.avar) + model_avar(surface.tau, truth)
-    good, paper = fit_noise(surface, terms="QNBK"), fit_noise(surface, method="adev")
+    good, paper = fit_noise(surface, terms="QNBK"), fit_deviations(surface)
     for term, value in truth.items():
         assert float(good[term][0, 0]) == pytest.approx(value, rel=1e-3)
     assert abs(float(paper["K"][0, 0]) / truth["K"] - 1) > 0.03

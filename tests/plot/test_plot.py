@@ -404,13 +404,3 @@ def test_points_are_drawn_where_the_fit_knows_the_channel():
     known = np.r_[1:11, 21:40]
     np.testing.assert_allclose(moved[known], known - 1.0)
     assert np.isnan(moved[[0, *range(11, 21)]]).all()
-
-
-def test_curve_of_a_fit_of_deviations_is_their_sum():
-    noise = np.random.default_rng(4).standard_normal(6000)
-    surface = davar(make_log(noise, rate=10.0, unit="deg/h"), window="2min", step="2min")
-    fitted = fit_noise(surface, terms="NB", method="adev")
-    line = plot_adev(fitted, "x").axes[0].lines[-1]
-    window = fitted.isel(axis=0, time=fitted.sizes["time"] // 2)
-    parts = (model_avar(fitted.tau.values, {term: float(window[term])}) for term in "NB")
-    np.testing.assert_allclose(line.get_ydata(), sum(map(np.sqrt, parts)), rtol=1e-9)

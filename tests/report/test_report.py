@@ -120,7 +120,6 @@ def test_page_lists_facts_gaps_and_notes(page):
     assert facts["Files"] == "bore_run_4a.csv, bore_run_4b.csv"
     assert facts["Window"] == "6 s"
     assert facts["Step"] == "30 s"
-    assert facts["Treatment of gaps"] == "weighted"
     (gap,) = [row for row in page.rows if len(row) == 5 and row[4] == "missing"]
     assert gap[2:4] == ["6.67 s", "2 000"]
     assert "2 rows could not be read, µ" in page.text

@@ -233,7 +233,7 @@ def test_a_part_of_a_variable_in_blocks_is_that_of_the_whole(tmp_path):
         read_box(array, (slice(0, 1), slice(0, 11), slice(0, 4)))
 
 
-@pytest.mark.parametrize("options", [{}, {"terms": "NK"}, {"method": "adev"}, {"tau_min": "0.1s"}])
+@pytest.mark.parametrize("options", [{}, {"terms": "NK"}, {"tau_min": "0.1s"}])
 def test_a_part_is_fitted_as_the_whole(options):
     from gyrostab import davar
 

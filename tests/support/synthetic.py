@@ -100,8 +100,6 @@ def product(*, windows: int = 40, taus: int = 12, axes: str = "xyz", seed: int =
         "window_samples": window,
         "step_samples": step,
         "kind": "rate",
-        "gaps": "weighted",
-        "method": "overlapping",
         "source_files": ["bore_run_4a.csv", "bore_run_4b.csv"],
         "history": "2026-09-21T14:13:20Z read",
         "notes": ["gyro_x [deg/h] taken as it stands", "2 rows could not be read, µ"],

@@ -63,8 +63,6 @@ class Unit(NamedTuple):
         The samples are cumulative angles, ``window + 1`` per window, instead of rates.
     interval : float
         Sampling interval [s], for angles.
-    zero_fill : bool
-        Divide by the number of terms without gaps, as the paper does, instead of the number used.
     min_strict, min_coverage : float
         Smallest share of terms in unbroken runs; smallest coverage of a reported cell.
     variance : str
@@ -77,7 +75,6 @@ class Unit(NamedTuple):
     shifts: NDArray[np.int64]
     angle: bool
     interval: float
-    zero_fill: bool
     min_strict: float
     min_coverage: float
     variance: str = "avar"
@@ -285,7 +282,8 @@ def surface_unit(
         The variance is in the square of the rate's unit (for angles: of angle per second). Without
         gaps only the variance differs between the windows.
     means : ndarray (2, n_windows)
-        As `window_means`.
+        Mean rate [unit of the rate; for angles: of angle per second], NaN where nothing is
+        present; share of samples present.
     """
     counts_only = np.issubdtype(x.dtype, np.integer)
     x, space = convert_to_native(x), space or Workspace()
@@ -326,7 +324,7 @@ def _cells_with_gaps(work: _Work, sums: Floats, counts: Floats, full: Floats) ->
     unit, starts, stops = work.unit, work.starts, work.stops
     cells = np.ones((len(Cells._fields), *counts.shape))
     with np.errstate(invalid="ignore", divide="ignore"):
-        np.divide(sums, full if unit.zero_fill else counts, out=cells[0])
+        np.divide(sums, counts, out=cells[0])
     cells[1], cells[2], cells[4] = counts, counts / full, STRICT
     order = (unit.spans, unit.order, VARIANCES[unit.variance].summed)
     _share_gaps(
@@ -335,15 +333,13 @@ def _cells_with_gaps(work: _Work, sums: Floats, counts: Floats, full: Floats) ->
     )  # fmt: skip
     cells[8] = _find_slopes(work, counts < full)
     poor = counts < unit.min_strict * full
-    bridge = unit.order == 2 and not unit.zero_fill and not unit.angle
-    if bridge and poor.any():
+    if unit.order == 2 and not unit.angle and poor.any():
         _bridge_gaps(work, _angle_of(work, np.flatnonzero(poor.any(axis=1))), poor, cells)
-    if not unit.zero_fill:
-        blank = ~(cells[2] >= unit.min_coverage)
-        cells[0][blank] = np.nan
-        cells[5:, blank] = np.nan
-        cells[4][blank] = NONE
-        cells[3][blank] = 0.0
+    blank = ~(cells[2] >= unit.min_coverage)
+    cells[0][blank] = np.nan
+    cells[5:, blank] = np.nan
+    cells[4][blank] = NONE
+    cells[3][blank] = 0.0
     return Cells(*cells)
 
 
@@ -370,7 +366,7 @@ def _bridge_gaps(work: _Work, theta: Floats, poor: NDArray[np.bool_], cells: Flo
 def _find_slopes(work: _Work, with_gaps: NDArray[np.bool_]) -> Floats:
     """Find the slope of the rate that the second differences of windows with gaps show."""
     x, unit, space, n_windows, starts, stops, offset = work
-    if unit.order == 3 or unit.zero_fill:
+    if unit.order == 3:
         return np.full(with_gaps.shape, np.nan)
     if unit.angle:
         angle = _line_removed(work)
@@ -415,16 +411,3 @@ def _angle_means(x: NDArray[np.generic], unit: Unit, n_windows: int) -> Floats:
                 (where[-1] - where[0]) * unit.interval
             )
     return out
-
-
-def window_means(x: NDArray[np.generic], unit: Unit) -> Floats:
-    """Compute mean rate and share of present samples of each window.
-
-    Returns
-    -------
-    ndarray (2, n_windows)
-        Mean [unit of the rate; for angles: of angle per second], NaN where nothing is present;
-        share of samples present.
-    """
-    x = convert_to_native(x)
-    return _average_windows(x, unit, _number_of_windows(x, unit))[0]

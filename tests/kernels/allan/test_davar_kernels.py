@@ -92,7 +92,6 @@ class TestKernels:
                 thin(ks) if octave else np.zeros_like(ks),
                 angle,
                 0.01,
-                False,
                 0.3,
                 0.1,
             )
