@@ -65,7 +65,6 @@ def next_block(
     first: int,
     count: int,
     units: Sequence[Units],
-    parts: Mapping[str, tuple[slice, Any]],
 ) -> tuple[Array, BlockState]:
     """Make the samples ``first`` to ``first + count`` of a log.
 
@@ -77,8 +76,6 @@ def next_block(
         Samples of the log.
     units : sequence of Units
         Random numbers of each axis.
-    parts : mapping
-        Stretches of the long channels, by name.
 
     Returns
     -------
@@ -90,10 +87,11 @@ def next_block(
     factor = plan.oversampling
     index = first * factor + np.arange(count * factor)
     instants = grid_times(plan.start, plan.rate * factor, index)
+    before = int(grid_times(plan.start, plan.rate * factor, max(first * factor - 1, 0)))
     channels = {}
     for name, source in plan.sources.items():
         channels[name], state.drivers[name] = source.at(
-            instants, parts.get(name), state.drivers.get(name)
+            instants, state.drivers.get(name), before=before
         )
     true = {axis: np.zeros(index.size) for axis in plan.axes}
     if plan.turning:

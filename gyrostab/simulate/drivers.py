@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import SchemaError
 from gyrostab.kernels.regression.smooth import smooth_curve
+from gyrostab.store.lazy import read_slice
 from gyrostab.time.grid import TimeGridIndex, grid_index, grid_times
 from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import INNER
@@ -42,29 +43,24 @@ class Source:
     first: float = np.nan  # first value that is a number
     size: int = 0  # number of its values
 
-    def stretch(self, before: int, end: int) -> slice | None:
-        """Find the values needed for times after `before` up to `end` [ns]; None if in memory."""
-        if self.stamps is not None:
-            return None
-        first, last = (
-            np.floor(grid_index(self.start, self.rate, [before, end])).astype(int).tolist()
-        )
-        size = self.size
-        return slice(min(max(first, 0), size - 1), min(max(last + 2, 1), size))
-
     def at(
-        self, instants: NDArray[np.int64], part: tuple[slice, Any] | None, carry: float | None
+        self,
+        instants: NDArray[np.int64],
+        carry: float | None = None,
+        *,
+        before: int | None = None,
     ) -> tuple[Array, float | None]:
         """Interpolate at increasing `instants` [ns since 1970].
 
-        For a long channel, `part` is what `stretch` asked for, with its values. `carry` is what the
-        call for the instants just before returned in addition to its values.
+        The values of a long channel are read from those for the time `before` the first instant on.
+        `carry` is what the call for the instants just before returned in addition to its values.
         """
         if self.stamps is not None:
             return self._interpolate_between(instants), None
-        assert part is not None
-        stretch, values = part
-        samples = np.asarray(values, dtype=np.float64)
+        ends = [instants[0] - 1 if before is None else before, instants[-1]]
+        low, high = np.floor(grid_index(self.start, self.rate, ends)).astype(int).tolist()
+        low, high = min(max(low, 0), self.size - 1), min(max(high + 2, 1), self.size)
+        samples = np.asarray(read_slice(self.values, low, high), dtype=np.float64)
         filled = _fill_gaps(np.concatenate([[self.first if carry is None else carry], samples]))
         position = grid_index(self.start, self.rate, instants)
         position = np.where(
@@ -72,7 +68,7 @@ class Source:
         )
         position = np.clip(position, 0, self.size - 1)
         base = np.floor(position).astype(np.int64)
-        place = base - stretch.start + 1
+        place = base - low + 1
         interpolated = filled[place]
         # from the number of the sample itself, so that the last bit is the same in every stretch
         if not self.held:
@@ -128,7 +124,7 @@ def make_source(log: xr.Dataset, name: str) -> Source:
     >>> from gyrostab.simulate.environment import ramps
     >>> ramp = ramps("temperature", "degC", [[0, 20], [4, 60]], duration=5.0)
     >>> warm = make_source(ramp, "temperature")
-    >>> warm.at(np.array([500_000_000, 1_500_000_000]), None, None)[0]
+    >>> warm.at(np.array([500_000_000, 1_500_000_000]))[0]
     array([25., 35.])
     """
     variable = log[name]

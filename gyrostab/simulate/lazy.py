@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.simulate.block import BlockState, Plan, next_block
-from gyrostab.simulate.drivers import SHORT
 from gyrostab.simulate.noise import NoiseState, draw
-from gyrostab.time.grid import grid_times
 
 #: Results that a chain keeps, for the threads that ask for them a little later.
 RECENT = 3
@@ -76,47 +73,13 @@ class Chain:
             self._states.pop(old, None)
 
 
-class _Channel:
-    """A long channel, chunk by chunk; each lazily computed chunk has a small separate graph."""
-
-    def __init__(self, values: Any):
-        import dask.array as da
-
-        array = da.asarray(values, chunks=SHORT)
-        self.edges = np.concatenate([[0], np.cumsum(array.chunks[0])])
-        graph = array.__dask_graph__()
-        self.chunks = [(graph.cull([key]).to_dict(), key) for key in array.__dask_keys__()]
-
-    def __call__(self, stretch: slice) -> NDArray[np.float64]:
-        from dask.local import get_sync
-
-        first, last = (
-            np.searchsorted(self.edges, [stretch.start, stretch.stop - 1], side="right") - 1
-        )
-        pieces = [get_sync(*self.chunks[number]) for number in range(first, last + 1)]
-        offset = int(self.edges[first])
-        return np.concatenate(pieces).astype(np.float64)[
-            stretch.start - offset : stretch.stop - offset
-        ]
-
-
 class _Log:
     """Blocks of a log: one chain of random numbers per axis, and the chain of the blocks."""
 
     def __init__(
         self, plan: Plan, state: BlockState, starts: Sequence[NoiseState], counts: Sequence[int]
     ):
-        long = {name: source for name, source in plan.sources.items() if source.stamps is None}
-        self.channels: Mapping[str, _Channel] = {
-            name: _Channel(source.values) for name, source in long.items()
-        }
-        self.plan = replace(
-            plan,
-            sources={
-                **plan.sources,
-                **{name: replace(source, values=None) for name, source in long.items()},
-            },
-        )
+        self.plan = plan
         self.firsts, self.counts = np.concatenate([[0], np.cumsum(counts)]).tolist(), list(counts)
         self.draws = [Chain(self._draw_numbers, start, len(counts)) for start in starts]
         self.blocks = Chain(self._compute_block, state, len(counts))
@@ -126,17 +89,8 @@ class _Log:
         return draw(state, self.firsts[number] * factor, self.counts[number] * factor)
 
     def _compute_block(self, number: int, state: BlockState) -> Any:
-        first, count, factor = self.firsts[number], self.counts[number], self.plan.oversampling
-        instants = np.array([max(first * factor - 1, 0), (first + count) * factor - 1])
-        before, end = grid_times(self.plan.start, self.plan.rate * factor, instants).tolist()
-        parts = {}
-        for name, channel in self.channels.items():
-            stretch = self.plan.sources[name].stretch(before, end)
-            assert stretch is not None
-            parts[name] = (stretch, channel(stretch))
-        return next_block(
-            self.plan, state, first, count, [draw(number) for draw in self.draws], parts
-        )
+        units = [draw(number) for draw in self.draws]
+        return next_block(self.plan, state, self.firsts[number], self.counts[number], units)
 
 
 def _go_draw(log: _Log, row: int, number: int, *predecessors: Any) -> None:

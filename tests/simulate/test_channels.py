@@ -52,8 +52,8 @@ def test_a_long_channel_does_not_depend_on_the_chunks(cuts, rate, held, seed):
     def run(edges: list[int]) -> np.ndarray:
         carry, parts = None, []
         for first, end in itertools.pairwise(edges):
-            stretch = source.stretch(int(instants[max(first - 1, 0)]), int(instants[end - 1]))
-            piece, carry = source.at(instants[first:end], (stretch, values[stretch]), carry)
+            before = int(instants[max(first - 1, 0)])
+            piece, carry = source.at(instants[first:end], carry, before=before)
             parts.append(piece)
         return np.concatenate(parts)
 

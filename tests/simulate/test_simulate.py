@@ -335,9 +335,9 @@ def test_writing_in_pieces_makes_each_block_once(tmp_path, monkeypatch):
     made: list[int] = []
     step = lazy.next_block
 
-    def counted(plan, state, first, count, units, parts):
+    def counted(plan, state, first, count, units):
         made.append(first)
-        return step(plan, state, first, count, units, parts)
+        return step(plan, state, first, count, units)
 
     monkeypatch.setattr(lazy, "next_block", counted)
     log = simulate({"noise": {"N": 0.01}}, duration="1h", rate=100.0, chunk=6000)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.reduce.log_blocks import finite_range, numeric_channels
 from gyrostab.errors import UnitError
 from gyrostab.simulate.drivers import Source, make_source
-from gyrostab.store import lazy
 from gyrostab.time.grid import first_stamp, grid_times
 from gyrostab.units import INNER, parse_unit
 
@@ -46,12 +45,8 @@ class RotationOrders:
     ) -> None:
         """Add blocks of the axes (axis, block, sample), zero where missing, and their samples."""
         index = np.arange(block_range.start * self.length, block_range.stop * self.length)
-        instants, source = grid_times(self.start, self.rate, index), self.source
-        stretch = source.stretch(int(instants[0]) - 1, int(instants[-1]))
-        part = None
-        if stretch is not None:
-            part = (stretch, lazy.read_slice(source.values, stretch.start, stretch.stop))
-        rotation, self.carry = source.at(instants, part, self.carry)
+        instants = grid_times(self.start, self.rate, index)
+        rotation, self.carry = self.source.at(instants, self.carry)
         inside = rotation * self.factor / (360.0 * self.rate)
         edges = np.cumsum(np.concatenate([[self.turns], inside]))
         self.turns = math.fmod(float(edges[-1]), 1.0)
