@@ -12,7 +12,6 @@ import math
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -192,35 +191,6 @@ def shape(
     return total, new_carry
 
 
-def _add_parts(
-    state: tuple[Any, ...],
-    first: int,
-    size: int,
-    *,
-    rate: float,
-    coefficients: Mapping[str, float],
-    markov: tuple[float, float] | None,
-    sinusoid: tuple[float, float, float] | None,
-) -> tuple[Array, tuple[Any, ...]]:
-    """Make the next `size` samples of `make_noise`, and the state after them."""
-    noise, carry, rng, position = copy.deepcopy(state)
-    units, noise = draw(noise, first, size)
-    level = {term: value**2 for term, value in coefficients.items()}
-    total, carry = shape(units, level, rate, carry, ramp=coefficients["R"])
-    if markov:
-        sigma, time = markov
-        means, position = ornstein_uhlenbeck_means(
-            rng.standard_normal((size, 2)), time * rate, position
-        )
-        total += sigma * means
-    if sinusoid:
-        amplitude, frequency, phase = sinusoid
-        cycles = frequency / rate
-        middle = (np.arange(first, first + size, dtype=np.float64) + 0.5) * cycles
-        total += amplitude * turn_means(middle, np.full(1, cycles), phase - math.pi / 2.0)
-    return total, (noise, carry, rng, position)
-
-
 def make_noise(
     *,
     rate: float,
@@ -235,9 +205,8 @@ def make_noise(
     gauss_markov: tuple[float, float] | None = None,
     sinusoid: tuple[float, float, float] | None = None,
     flicker_band: tuple[float, float] = (FLICKER_LOW, math.inf),
-    lazy: bool = False,
     chunk: int = CHUNK,
-) -> Any:
+) -> Array:
     """Make the noise of one gyro axis; each sample is the mean rate over its interval.
 
     The Allan variance is exactly that of the noise table at every averaging time: quantization
@@ -262,14 +231,12 @@ def make_noise(
         Amplitude [deg/h], frequency [Hz] and phase [rad].
     flicker_band : (float, float)
         Lowest and highest frequency of B [Hz].
-    lazy : bool
-        Return a dask array, whose chunks are made one after the other.
     chunk : int
         Samples made at a time; the result does not depend on it.
 
     Returns
     -------
-    ndarray or dask array, shape (size,)
+    ndarray, shape (size,)
         Rate [degree hour-1].
 
     Raises
@@ -303,21 +270,21 @@ def make_noise(
     terms = "".join(term for term in "QNBK" if coefficients[term] > 0.0)
     noise = begin_noise(seed, axis, rate=rate, terms=terms, flicker_band=flicker_band)
     rng = stream(seed, "noise", axis, "gauss_markov")
-    state: tuple[Any, ...] = (noise, {}, rng, float(rng.standard_normal()))
-    add = partial(
-        _add_parts, rate=rate, coefficients=coefficients, markov=gauss_markov, sinusoid=sinusoid
-    )
-    spans = [(first, min(chunk, size - first)) for first in range(0, size, chunk)]
-    if not lazy:
-        values = np.empty(size)
-        for first, count in spans:
-            values[first : first + count], state = add(state, first, count)
-        return values
-    import dask
-    import dask.array as da
-
-    add_later, blocks = dask.delayed(add, pure=False, nout=2), []
-    for first, count in spans:
-        block, state = add_later(state, first, count)
-        blocks.append(da.from_delayed(block, (count,), dtype=np.float64))
-    return da.concatenate(blocks)
+    position, carry = float(rng.standard_normal()), dict[str, float]()
+    level = {term: value**2 for term, value in coefficients.items()}
+    rates = np.empty(size)
+    for first in range(0, size, chunk):
+        part = rates[first : first + chunk]
+        units, noise = draw(noise, first, part.size)
+        part[:], carry = shape(units, level, rate, carry, ramp=R)
+        if gauss_markov:
+            sigma, time = gauss_markov
+            normal = rng.standard_normal((part.size, 2))
+            means, position = ornstein_uhlenbeck_means(normal, time * rate, position)
+            part += sigma * means
+        if sinusoid:
+            amplitude, frequency, phase = sinusoid
+            cycles = frequency / rate
+            middle = (np.arange(first, first + part.size, dtype=np.float64) + 0.5) * cycles
+            part += amplitude * turn_means(middle, np.full(1, cycles), phase - math.pi / 2.0)
+    return rates
