@@ -37,7 +37,7 @@ def analyse(log, run):
     log, began = log.compute(), time.process_time()
     davar = published_davar if "method" in run["davar"] else gyrostab.davar
     surface = davar(log, **run["davar"]).assign(windows=lambda made: made.sizes["time"])
-    surface = surface.assign(seconds=time.process_time() - began)
+    surface = surface.assign(seconds=time.process_time() - began).compute()
     if run.get("fit") == "deviations":
         return fit_deviations(surface)
     return gyrostab.fit_noise(surface, **{"observed_only": False, **run.get("fit", {})})

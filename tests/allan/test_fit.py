@@ -716,8 +716,6 @@ def test_wrong_arguments_are_explained():
     surface = windows_of(np.random.default_rng(16).standard_normal((3, 1000)))
     with pytest.raises(OptionError, match="Q, N, B, K, R"):
         fit_noise(surface, terms="NX")
-    with pytest.raises(OptionError, match="gls"):
-        fit_noise(surface, method="slope")
     with pytest.raises(SchemaError, match="avar"):
         fit_noise(surface.drop_vars("avar"))
     with pytest.raises(SchemaError, match="white_response"):

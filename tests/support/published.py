@@ -48,9 +48,9 @@ def published_davar(
     Returns
     -------
     xarray.Dataset
-        As from `gyrostab.davar`, with its degrees of freedom.
+        As from `gyrostab.davar`; what the algorithm does not give is lazy.
     """
-    surface = davar(log, **options)
+    surface = davar(log.chunk(time=-1), **options)
     window, step = (int(surface.attrs[f"{name}_samples"]) for name in ("window", "step"))
     ks = np.rint(surface["tau"].values * surface.attrs["sampling_rate_hz"]).astype(np.int64)
     run = {"direct": _direct_sums, "recursive": _recursive_sums}[method]
