@@ -27,10 +27,6 @@ _TERMS = 384
 _SECTION = 8
 # Places of the sections: spread evenly, but in step with no regular loss.
 _GOLDEN = 0.6180339887498949
-# Bits of a word whose place has the bit 1, 2, 4, 8, 16 or 32.
-_BITS = np.array(
-    [sum(1 << place for place in range(64) if place >> i & 1) for i in range(6)], dtype=np.uint64
-).view(np.int64)
 
 
 def cluster_strides(
@@ -51,33 +47,16 @@ def _count_ones(typing_context, word):  # type: ignore[no-untyped-def]
     return word(word), lambda context, builder, signature, args: builder.ctpop(args[0])
 
 
-@njit(**INNER)
-def _sum_places(word):  # type: ignore[no-untyped-def]
-    """Sum of the places (0 to 63) of the bits of a word that are set."""
-    total = np.int64(0)
-    for i in range(_BITS.size):
-        total += _count_ones(word & _BITS[i]) << i
-    return total
-
-
-@njit(**INNER)
-def _places_before(mask, row, low):  # type: ignore[no-untyped-def]
-    """Sum the numbers of the samples present before a sample, in earlier rows and below `low`."""
-    word = mask[row, 0] & low
-    return mask[row, 4] + (np.int64(row) << 6) * _count_ones(word) + _sum_places(word)
-
-
 @njit(**KERNEL)
 def pack_mask(starts, stops, n):  # type: ignore[no-untyped-def]
     """Pack the runs of present samples into a mask of 64 samples per row.
 
     Returns
     -------
-    int64 (n // 64 + 1, 5)
-        Bits of the samples present, and of those that begin a run; counts of both before this row;
-        sum of the numbers (0 to n - 1) of the samples present before this row.
+    int64 (n // 64 + 1, 4)
+        Bits of the samples present, and of those that begin a run; counts of both before this row.
     """
-    mask = np.zeros((n // 64 + 1, 5), np.int64)
+    mask = np.zeros((n // 64 + 1, 4), np.int64)
     bit = np.int64(1)
     for r in range(starts.size):
         first, last = starts[r] >> 6, (stops[r] - 1) >> 6
@@ -92,7 +71,6 @@ def pack_mask(starts, stops, n):  # type: ignore[no-untyped-def]
     for row in range(1, mask.shape[0]):
         mask[row, 2] = mask[row - 1, 2] + _count_ones(mask[row - 1, 0])
         mask[row, 3] = mask[row - 1, 3] + _count_ones(mask[row - 1, 1])
-        mask[row, 4] = _places_before(mask, row - 1, np.int64(-1))
     return mask
 
 
@@ -139,12 +117,7 @@ def _add_pairs(theta, places, mask, a, b, k, stride, row):  # type: ignore[no-un
         d = (theta[at2] - theta[at1]) * f1 - (
             theta[at1] - theta[at0]
         ) * f2  # n1 n2 times the difference of the means
-        if places.size:
-            before, behind = places[at1] - places[at0], places[at2] - places[at1]
-        else:
-            place1 = _places_before(mask, row1, low1)
-            before = float(place1 - _places_before(mask, row0, low0))
-            behind = float(_places_before(mask, row2, low2) - place1)
+        before, behind = places[at1] - places[at0], places[at2] - places[at1]
         apart = behind * f1 - before * f2  # and that of their centres
         # a run that a cluster cuts counts in both
         runs = mask[row1, 3] + _count_ones(mask[row1, 1] & low1)
@@ -177,9 +150,8 @@ def cluster_cells(theta, places, mask, window, step, k, stride, poor):  # type: 
     ----------
     theta : float64 (n + 1,)
         Integral of the rate over present samples; gaps add nothing.
-    places : float64 (n + 1,) or (0,)
-        Result of `integrate_places`, which is faster with more pairs than samples; without it, the
-        same numbers are taken from the mask.
+    places : float64 (n + 1,)
+        Result of `integrate_places`.
     mask
         Result of `pack_mask`.
     window, step, k, stride : int

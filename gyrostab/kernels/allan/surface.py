@@ -348,8 +348,7 @@ def _bridge_gaps(work: _Work, theta: Floats, poor: NDArray[np.bool_], cells: Flo
     unit, runs = work.unit, (work.starts, work.stops, theta.size - 1)
     mask = pack_mask(*runs)
     strides = cluster_strides(unit.window, unit.ks, unit.shifts)
-    pairs_per_sample = (poor.any(axis=0) / strides).sum()
-    places = integrate_places(*runs) if pairs_per_sample > 1.0 else np.empty(0)
+    places = integrate_places(*runs)
     for i in np.flatnonzero(poor.any(axis=0)):
         rows = np.ascontiguousarray(poor[:, i])
         pairs = unit.window, unit.step, unit.ks[i], strides[i]
