@@ -163,9 +163,8 @@ def _strict_sums(work: _Work, gaps: bool) -> tuple[Floats, Floats]:
     whole_blocks = lengths // unit.step
     head_lengths = lengths - whole_blocks * unit.step
     blocks = space.array("blocks", 4 if gaps else 2, n_windows + int(whole_blocks[0]), unit.ks.size)
-    add = _angle_blocks if unit.angle else _rate_blocks
-    if unit.order == 3:
-        add = _third_blocks
+    has_intervals = unit.order == 3 or (unit.angle and work.starts.size > 1)
+    add = _interval_blocks if has_intervals else _grouped_blocks
     add(work, Cut(unit.step, unit.ks, unit.shifts, head_lengths, whole_blocks, n_windows), blocks)
     sums = space.array("sums", len(blocks) // 2, n_windows, unit.ks.size)
     for heads_and_tails, out in zip((blocks[:2], blocks[2:]), sums, strict=False):
@@ -173,24 +172,22 @@ def _strict_sums(work: _Work, gaps: bool) -> tuple[Floats, Floats]:
     return sums[0], sums[1] if gaps else np.empty((0, 0))
 
 
-def _rate_blocks(work: _Work, cut: Cut, blocks: Floats) -> None:
-    """Sum heads and tails of rates, with an angle of two doubles where needed."""
+def _grouped_blocks(work: _Work, cut: Cut, blocks: Floats) -> None:
+    """Sum heads and tails of rates, or of angles without gaps."""
     x, unit, space, _, starts, stops, offset = work
     ks, shifts = unit.ks, unit.shifts
-    points = held_points(x.size + 1, unit.step, ks, shifts)
+    points = x.size if unit.angle else held_points(x.size + 1, unit.step, ks, shifts)
     places, size = pyramid_places(points, ks, shifts)
     flat = space.array("angle", size)
+    if unit.angle:
+        flat[:points] = _line_removed(work)
+        thin_pyramid(flat, points, int(shifts[-1]), 0, points)
+        x, offset = np.empty(0), 0.0
+    runs = starts, stops + (not unit.angle)
     groups = group_factors(ks, shifts)
-    runs = (starts, stops + 1)
     largest = grouped_blocks(x, offset, flat, points, places, *runs, cut, groups, blocks)
-    if not needs_two_doubles(largest, x):
-        return
-    places, size = pyramid_places(x.size + 1, ks, shifts)
-    high, low = space.array("angle", size), space.array("rest of the angle", size)
-    integrate_two(x, offset, starts, stops, high[: x.size + 1], low[: x.size + 1])
-    for part in (high, low):
-        thin_pyramid(part, x.size + 1, int(shifts[-1]), 0, x.size + 1)
-    _sum_intervals(work, high, low, places, cut, blocks)
+    if not unit.angle and needs_two_doubles(largest, x):
+        _interval_blocks(work, cut, blocks)
 
 
 def _angle_of(work: _Work, windows: Integers) -> Floats:
@@ -207,23 +204,8 @@ def _angle_of(work: _Work, windows: Integers) -> Floats:
     return angle
 
 
-def _angle_blocks(work: _Work, cut: Cut, blocks: Floats) -> None:
-    """Heads and tails of angles, which are all there already."""
-    x, unit, space, _, starts, stops, _ = work
-    ks, shifts = unit.ks, unit.shifts
-    places, size = pyramid_places(x.size, ks, shifts)
-    flat = space.array("angle", size)
-    flat[: x.size] = _line_removed(work)
-    thin_pyramid(flat, x.size, int(shifts[-1]), 0, x.size)
-    if starts.size > 1:
-        _sum_intervals(work, flat, flat[:0], places, cut, blocks)
-    else:
-        groups = group_factors(ks, shifts)
-        grouped_blocks(np.empty(0), 0.0, flat, x.size, places, starts, stops, cut, groups, blocks)
-
-
-def _third_blocks(work: _Work, cut: Cut, blocks: Floats) -> None:
-    """Heads and tails of third differences; the sum of the angle is held as two doubles."""
+def _interval_blocks(work: _Work, cut: Cut, blocks: Floats) -> None:
+    """Sum heads and tails interval by interval; a sum of the angle is held as two doubles."""
     x, unit, space, _, starts, stops, offset = work
     ks, shifts, summed = unit.ks, unit.shifts, VARIANCES[unit.variance].summed
     angles = x.size if unit.angle else x.size + 1
@@ -242,18 +224,10 @@ def _third_blocks(work: _Work, cut: Cut, blocks: Floats) -> None:
         sum_two(high[: angles + 1], low[: angles + 1])
     for part in (high, low) if precise else (high,):
         thin_pyramid(part, angles + summed, int(shifts[-1]), 0, angles + summed)
-    _sum_intervals(work, high, low if precise else low[:0], places, cut, blocks)
-
-
-def _sum_intervals(
-    work: _Work, high: Floats, low: Floats, places: Integers, cut: Cut, blocks: Floats
-) -> None:
-    """Sum heads and tails interval by interval, with `low` as the remainder of the angle `high`."""
-    unit = work.unit
     spans = unit.spans + unit.angle  # of angles instead of samples
     terms = (unit.order, spans, unit.points)
-    sums = single_blocks(high, low, places, work.starts, work.stops, *terms, cut)
-    blocks[:] = sums[: len(blocks)]
+    low = low if precise else low[:0]
+    blocks[:] = single_blocks(high, low, places, starts, stops, *terms, cut)[: len(blocks)]
 
 
 def convert_to_native(x: NDArray[np.generic]) -> NDArray[np.floating[Any]]:
