@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-#: A kernel of three functions.
+#: A kernel of two functions.
 SOLVE = """
 import hashlib
 import numpy as np
@@ -18,7 +18,7 @@ rng = np.random.default_rng(1)
 found = np.empty((60, 6))
 for row in found:
     columns = rng.standard_normal((9, 6))
-    solve_nonnegative(columns.T @ columns, columns.T @ rng.standard_normal(9), 63, row, 0)
+    solve_nonnegative(columns.T @ columns, columns.T @ rng.standard_normal(9), row)
 assert (found > 0.0).any() and not (found > 0.0).all()
 print(hashlib.sha256(found.tobytes()).hexdigest())
 """

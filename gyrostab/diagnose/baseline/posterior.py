@@ -104,7 +104,7 @@ def fit_squares(fit: Fit) -> tuple[Array, Array, Array]:
             free_columns, precision, fit.columns, fit.rest(), weight
         )
         solution = np.empty(width)
-        solve_nonnegative(normal, right, (1 << width) - 1, solution, 0)
+        solve_nonnegative(normal, right, solution)
         next_spectrum = np.asarray(fit.columns @ np.maximum(solution, 0.0), dtype=np.float64)
         if free_columns.shape[1] or fit.known is not None:
             next_spectrum = (

@@ -1,6 +1,6 @@
 """Non-negative least squares.
 
-The non-negative solution is exact: of five terms there are at most 31 subsets, and all are tried.
+The solution is exact: of five terms there are at most 31 subsets, and all are tried.
 """
 
 from __future__ import annotations
@@ -12,22 +12,16 @@ from gyrostab.kernels.compiled import INNER, KERNEL
 
 
 @njit(**INNER)
-def _list_members(subset, members):  # type: ignore[no-untyped-def]
-    n = 0
-    for i in range(members.size):
-        if subset >> i & 1:
-            members[n] = i
-            n += 1
-    return n
-
-
-@njit(**INNER)
 def _solve_subset(normal, right, subset, solution, work, members):  # type: ignore[no-untyped-def]
     """Solve the normal equations for the terms in the bit set `subset`; False if singular.
 
     `solution` is zero for the other terms; `work` (n, n) and `members` (n,) are scratch.
     """
-    n = _list_members(subset, members)
+    n = 0
+    for i in range(members.size):
+        if subset >> i & 1:
+            members[n] = i
+            n += 1
     solution[:] = 0.0
     for i in range(n):  # Cholesky factor and forward solution, row by row
         for j in range(i):
@@ -51,36 +45,16 @@ def _solve_subset(normal, right, subset, solution, work, members):  # type: igno
     return True
 
 
-@njit(**INNER)
-def _is_optimal(normal, right, allowed, subset, solution):  # type: ignore[no-untyped-def]
-    """Check the solution for `subset` by the Karush-Kuhn-Tucker conditions."""
-    for i in range(right.size):
-        if subset >> i & 1:
-            if solution[i] <= 0.0:
-                return False
-        elif allowed >> i & 1:
-            slope = right[i]
-            for j in range(right.size):
-                slope -= normal[i, j] * solution[j]
-            if slope > 0.0:
-                return False
-    return True
-
-
 @njit(**KERNEL)
-def solve_nonnegative(normal, right, allowed, solution, guess):  # type: ignore[no-untyped-def]
-    """Minimise ``s^T normal s - 2 right^T s`` over ``s >= 0``; returns the set of positive terms.
+def solve_nonnegative(normal, right, solution):  # type: ignore[no-untyped-def]
+    """Minimise ``s^T normal s - 2 right^T s`` over ``s >= 0``.
 
     Parameters
     ----------
     normal : float64 (n, n); right : float64 (n,)
         Normal equations.
-    allowed : int
-        Bit set of the terms that may be used.
     solution : float64 (n,)
         Overwritten with the minimiser.
-    guess : int
-        Bit set that is tried first; if it gives the minimiser, no other is tried. 0: no guess.
     """
     n = right.size
     room, members = np.empty((2 * n + 3, n)), np.empty(n, np.int64)
@@ -95,21 +69,10 @@ def solve_nonnegative(normal, right, allowed, solution, guess):  # type: ignore[
         scaled_right[i] = right[i] * scale[i]
         for j in range(n):
             scaled[i, j] = normal[i, j] * scale[i] * scale[j]
-    if (
-        guess
-        and _solve_subset(scaled, scaled_right, guess, trial, work, members)
-        and _is_optimal(scaled, scaled_right, allowed, guess, trial)
-    ):
-        for i in range(n):
-            solution[i] = trial[i] * scale[i]
-        return guess
     best = 0.0
-    chosen = 0
     solution[:] = 0.0
     for subset in range(1, 1 << n):
-        if subset & ~allowed or not _solve_subset(
-            scaled, scaled_right, subset, trial, work, members
-        ):
+        if not _solve_subset(scaled, scaled_right, subset, trial, work, members):
             continue
         gain = 0.0
         feasible = True
@@ -118,7 +81,5 @@ def solve_nonnegative(normal, right, allowed, solution, guess):  # type: ignore[
             gain += trial[i] * scaled_right[i]
         if feasible and gain > best:
             best = gain
-            chosen = subset
             for i in range(n):
                 solution[i] = trial[i] * scale[i]
-    return chosen
