@@ -6,8 +6,12 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
+from gyrostab.kernels.fit.mixture import Curves
+
+Floats = NDArray[np.float64]
 
 #: Largest number of Newton steps to a bound, and the change of the score that ends them.
 _STEPS, _TOLERANCE = 20, 1e-6
@@ -86,58 +90,38 @@ def estimate_bounds(estimate, null, linear, square, scores):  # type: ignore[no-
     return out
 
 
-@njit(**INNER)
-def chi_square_quantile(freedom, quantile):  # type: ignore[no-untyped-def]
+def chi_square_quantile(freedom: Floats, quantile: tuple[float, float, Floats]) -> Floats:
     """Interpolate the quantile of chi-square over its degrees of freedom nu, by a cubic.
 
     `quantile` has the first ln nu, the step of ln nu, and ``nu ln q(nu)``, which is smooth from few
-    degrees of freedom to many; nu must not be above the last node but two.
+    degrees of freedom to many; nu must not be above the last node but two. Zero below the table,
+    where the quantile is below the smallest number, and without degrees of freedom.
     """
     start, step, curve = quantile
-    if not freedom > 0.0:
-        return 0.0
-    position = (np.log(freedom) - start) / step
-    i = min(max(int(position), 1), curve.size - 3)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        position = np.nan_to_num((np.log(freedom) - start) / step, nan=-1.0, neginf=-1.0)
+    i = np.clip(position.astype(np.int64), 1, curve.size - 3)
     t = position - i
-    if t < -1.0:  # below the table, where the quantile is below the smallest number
-        return 0.0
-    before, lower = curve[i - 1], curve[i]
-    upper, beyond = curve[i + 1], curve[i + 2]
+    before, lower, upper, beyond = (curve[i + by] for by in (-1, 0, 1, 2))
     value = (
         -t * (t - 1.0) * (t - 2.0) / 6.0 * before + (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0 * lower
     )
     value += -(t + 1.0) * t * (t - 2.0) / 2.0 * upper + (t + 1.0) * t * (t - 1.0) / 6.0 * beyond
-    return np.exp(value / freedom)
+    inside = t >= -1.0
+    return np.where(inside, np.exp(value / np.where(inside, freedom, np.inf)), 0.0)
 
 
-@njit(**INNER)
-def _predict_cell(columns, white, quantization, ramp, squares, per_square):  # type: ignore[no-untyped-def]
-    """Compute the Allan variance of one cell under the fitted model, and `per_square`."""
-    model = 0.0
-    for a in range(5):
-        per_square[a] = columns[a] * (
-            quantization if a == 0 else white if a == 1 else ramp if a == 4 else 1.0
-        )
-        if squares[a] > 0.0:
-            model += per_square[a] * squares[a]
-    return model
-
-
-@njit(**INNER)
-def _cell_quantile(a, full_quantile, own_dof, share, dof, max_freedom, quantile):  # type: ignore[no-untyped-def]
-    """Find the quantile of a cell with term `a` alone; `full_quantile` without gaps.
-
-    For a ramp, the degrees of freedom of the cell are used.
-    """
-    if a == 4:
-        return chi_square_quantile(min(own_dof, max_freedom, dof), quantile)
-    if share == 1.0:
-        return full_quantile
-    return chi_square_quantile(min(own_dof, max_freedom), quantile)
-
-
-@njit(**KERNEL)
-def cell_limits(curves, squares, dof, columns, own_dof, ks, span, max_freedom, quantile):  # type: ignore[no-untyped-def]
+def cell_limits(
+    curves: Curves,
+    squares: Floats,
+    dof: Floats,
+    columns: Floats,
+    own_dof: Floats,
+    ks: Floats,
+    span: Floats,
+    max_freedom: float,
+    quantile: tuple[float, float, Floats],
+) -> Floats:
     """Find the upper limit of each squared coefficient from one cell, at least its own part.
 
     The cell is the one with the lowest limit under the fitted model, so that its scatter does not
@@ -172,37 +156,18 @@ def cell_limits(curves, squares, dof, columns, own_dof, ks, span, max_freedom, q
         Infinite where no cell gives a limit.
     """
     avar, white, quantization, ramp, factor = curves
-    n_windows, n_tau = avar.shape
-    out = np.full((n_windows, 5), np.inf)
-    full_quantiles, per_square, lowest = np.empty((n_tau, 5)), np.empty(5), np.empty(5)
-    for i in range(n_tau):
-        for a in range(5):
-            full_quantiles[i, a] = chi_square_quantile(min(own_dof[a, i], max_freedom), quantile)
-    for w in range(n_windows):
-        lowest[:] = np.inf
-        last = n_tau - 1
-        while last > 0 and not np.isfinite(avar[w, last]):
-            last -= 1
-        for i in range(n_tau):
-            if not np.isfinite(avar[w, i]):
-                continue
-            model = _predict_cell(
-                columns[i], white[w, i], quantization[w, i], ramp[w, i], squares[w], per_square
-            )
-            share = factor[w, i]
-            for a in range(5):
-                if ks[i] * span[a] < ks[last]:
-                    continue
-                # fewer degrees of freedom have a lower quantile
-                best = full_quantiles[i, a] if share <= 1.0 else 1.0
-                if model >= lowest[a] * best * per_square[a]:
-                    continue
-                lowest_share = _cell_quantile(
-                    a, full_quantiles[i, a], own_dof[a, i] * share, share, dof[w, i], max_freedom,
-                    quantile,
-                )  # fmt: skip
-                reach = 1.0 / (lowest_share * per_square[a]) if lowest_share > 0.0 else np.inf
-                if model * reach < lowest[a]:
-                    lowest[a] = model * reach
-                    out[w, a] = avar[w, i] * reach
-    return out
+    ones = np.ones_like(avar)
+    per_square = columns * np.stack([quantization, white, ones, ones, ramp], axis=-1)
+    model = (per_square * np.fmax(squares, 0.0)[:, None]).sum(axis=-1, keepdims=True)
+    freedom = np.minimum(own_dof.T * factor[..., None], max_freedom)
+    freedom[..., 4] = np.minimum(freedom[..., 4], dof)
+    finite = np.isfinite(avar)
+    longest = np.where(finite, ks, 0.0).max(axis=1)
+    usable = finite[..., None] & (ks[:, None] * span >= longest[:, None, None])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = 1.0 / (chi_square_quantile(freedom, quantile) * per_square)
+        expected = np.where(usable & np.isfinite(reach), model * reach, np.inf)
+        best = expected.argmin(axis=1, keepdims=True)
+        limits = np.take_along_axis(avar[..., None] * reach, best, axis=1)
+    has_limit = np.isfinite(np.take_along_axis(expected, best, axis=1))
+    return np.where(has_limit, limits, np.inf)[:, 0]
