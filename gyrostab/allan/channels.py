@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import dask
@@ -20,8 +20,6 @@ from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import HOUR, INNER
 
 TEMPERATURE_RATE = "K hour-1"
-#: Largest number of values of a channel that are read at once for all windows of a part.
-_MAX_VALUES_READ_AT_ONCE = 2**20
 
 
 def window_channels(
@@ -54,6 +52,12 @@ def window_channels(
     """
     out: dict[str, xr.Variable] = {}
     rate, start = float(log.attrs["sampling_rate_hz"]), first_stamp(log)
+    selected, inside = groups, slice(None)
+    if part is not None:
+        selected = [
+            group for group in groups if group.start < part.stop and group.stop > part.start
+        ]
+        inside = slice(part.start - selected[0].start, part.stop - selected[0].start)
     for name in log_channels(log):
         channel = log[name]
         if not np.issubdtype(channel.dtype, np.number):
@@ -67,18 +71,15 @@ def window_channels(
                     f"log.sortby('time_{name}')"
                 )
 
-        def ends(
-            group: slice, stamps: NDArray[np.int64] | None = stamps
-        ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        bounds = []
+        for group in selected:
             first = np.arange(group.start, group.stop) * step
-            if stamps is None:
-                return first, first + window
-            return tuple(
-                np.searchsorted(stamps, grid_times(start, rate, edge))
-                for edge in (first, first + window)
-            )  # type: ignore[return-value]
-
-        mean, slope = _average_windows(channel.data, stamps, rate, groups, ends, part)
+            edges = np.stack([first, first + window])
+            if stamps is not None:
+                edges = np.searchsorted(stamps, grid_times(start, rate, edges))
+            bounds.append(edges)
+        trends = _find_trends(channel.data, stamps, rate, bounds, lazy=part is None)
+        mean, slope = trends[:, inside]
         units = channel.attrs.get("units", "1")
         label = str(channel.attrs.get("long_name", name.replace("_", " ")))
         out[name] = xr.Variable(
@@ -108,42 +109,26 @@ def _fit_trends(
     return np.asarray(window_trend(data, seconds, a, b))
 
 
-def _average_windows(
+def _find_trends(
     data: Any,
     stamps: NDArray[np.int64] | None,
     rate: float,
-    groups: Sequence[slice],
-    ends: Callable[[slice], tuple[NDArray[np.int64], NDArray[np.int64]]],
-    part: slice | None,
-) -> tuple[Any, Any]:
-    """Compute mean and slope of each window; `ends` gives the bounds of the windows of a group."""
-    lazy = isinstance(data, da.Array) and part is None
-    selected = slice(0, groups[-1].stop) if part is None else part
-    chosen = [
-        group for group in groups if group.start < selected.stop and group.stop > selected.start
-    ]
-    bounds = [ends(group) for group in chosen]
-    first, last = int(bounds[0][0][0]), int(bounds[-1][1][-1])
-    together = (
-        None if lazy or last - first > _MAX_VALUES_READ_AT_ONCE else read_slice(data, first, last)
-    )
+    bounds: Sequence[NDArray[np.int64]],
+    *,
+    lazy: bool,
+) -> Any:
+    """Compute mean and slope of the windows of each group, with these `bounds` (2, n)."""
+    lazy = lazy and isinstance(data, da.Array)
     parts = []
-    for a, b in bounds:
-        low, high = int(a[0]), int(b[-1])
+    for edges in bounds:
+        low, high = int(edges[0, 0]), int(edges[1, -1])
         piece = None if stamps is None else stamps[low:high]
         if lazy:
             trends = dask.delayed(_fit_trends, pure=False)(
-                data[low:high], piece, rate, a - low, b - low
+                data[low:high], piece, rate, *(edges - low)
             )
-            parts.append(da.from_delayed(trends, (2, a.size), dtype=np.float64))
+            parts.append(da.from_delayed(trends, (2, edges.shape[1]), dtype=np.float64))
         else:
-            values = (
-                read_slice(data, low, high)
-                if together is None
-                else together[low - first : high - first]
-            )
-            parts.append(_fit_trends(values, piece, rate, a - low, b - low))
-    trends_of_windows = (da if lazy else np).concatenate(parts, axis=1)[
-        :, selected.start - chosen[0].start : selected.stop - chosen[0].start
-    ]
-    return trends_of_windows[0], trends_of_windows[1]
+            values = read_slice(data, low, high)
+            parts.append(_fit_trends(values, piece, rate, *(edges - low)))
+    return (da if lazy else np).concatenate(parts, axis=1)
