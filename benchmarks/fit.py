@@ -22,7 +22,8 @@ import numpy as np
 from page import machine, renew
 
 from gyrostab import davar, fit_noise, make_log
-from gyrostab.allan import fit, window_fit
+from gyrostab.allan import window_fit
+from gyrostab.allan.fit_inputs import fit_inputs
 from gyrostab.kernels.fit.covariance import product_tables
 from gyrostab.kernels.fit.least_squares import cell_freedoms, combine_diagonal, identify_noise
 from gyrostab.kernels.fit.mixture import Curves
@@ -56,7 +57,7 @@ def measure(x: np.ndarray, taus: int, repeats: int) -> tuple[int, list[float]]:
     the tables.
     """
     surface = davar(make_log(x, rate=RATE, unit="deg/h"), window="5min", step="15s", taus=taus)
-    cells, ks, rate, window = fit._fit_inputs(surface)
+    cells, ks, rate, window = fit_inputs(surface)
     flat = [np.ascontiguousarray(cell.reshape(-1, ks.size), dtype=np.float64) for cell in cells[:5]]
     trend, *responses, exact = (cell.reshape(-1) for cell in cells[5:])
     trends = [trend, np.stack(responses, axis=-1), exact]

@@ -15,7 +15,7 @@ over increments, ``(4 D(tau) - D(2 tau)) / (2 tau^2)``.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,10 +23,10 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import gammaincc
 
+from gyrostab.allan.window_fit import FitTables, run_kernel
+from gyrostab.kernels.fit.submodels import FIT_FIELDS
+
 Array = NDArray[np.float64]
-#: Fit of rows: (avar, responses of N, Q and R, gap factor), trend, its response, set of terms ->
-#: squared coefficients (row, term), chi-square and degrees of freedom (row, 2).
-Fit = Callable[[list[Array], Array, Array, int], tuple[Array, Array]]
 
 #: Largest number of windows that are averaged. More of them would find departures from the five
 #: terms that no window shows.
@@ -123,8 +123,7 @@ def find_band_limit(
     trend_responses: Array,
     *,
     allowed: int,
-    columns: Array,
-    fit: Fit,
+    tables: FitTables,
 ) -> BandLimit:
     """Find the band limit of an axis from windows that do not overlap.
 
@@ -144,10 +143,8 @@ def find_band_limit(
         Trend of the windows, and the responses of its variance to gaps.
     allowed : int
         Set of the terms to fit; without N there is no limit.
-    columns : ndarray (n_tau, 5)
-        Allan variance per squared coefficient.
-    fit : callable
-        Fit of rows.
+    tables : FitTables
+        Tables of the fit.
 
     Returns
     -------
@@ -155,25 +152,25 @@ def find_band_limit(
         The time constant is rounded to three digits.
     """
     unlimited = BandLimit(float(tau[0]), 0.0)
-    mean = _average_windows(cells, trend, trend_responses) if allowed & _N_BIT else None
-    if mean is None:
+    mean = _average_windows(tau, cells, trend, trend_responses, tables)
+    if mean is None or not allowed & _N_BIT:
         return unlimited
-    if not _fit_from(tau, mean, 0, np.zeros(1), allowed, fit)[2] < _NULL_PROBABILITY:
+    if not mean.fit(0, np.zeros(1), allowed)[2] < _NULL_PROBABILITY:
         return unlimited
     last = tau[-1] / _MIN_TAU_RATIO
     for shortest in tau[tau * _MEMORY_MARGIN <= last]:
         start = int(np.searchsorted(tau, shortest * _MEMORY_MARGIN * (1 - 1e-9)))
         first = int(np.searchsorted(tau, shortest))
-        if not _fit_constant(tau, mean, first, allowed, fit)[2] >= _MIN_PROBABILITY:
+        if not _fit_constant(mean, first, allowed)[2] >= _MIN_PROBABILITY:
             continue
-        constant, squares, probability = _fit_constant(tau, mean, start, allowed, fit)
+        constant, squares, probability = _fit_constant(mean, start, allowed)
         if probability >= _MIN_PROBABILITY:
-            unfiltered = columns[:start, 1:4] @ squares[1:4] * mean.rows[1][:start]
+            unfiltered = tables.columns[:start, 1:4] @ squares[1:4] * mean.rows[1][:start]
             ratio = mean.rows[0][:start] / unfiltered
             lacks_power = ratio[0] < _MAX_SHORTEST_RATIO and np.nanmax(ratio) < _MAX_RATIO
             if not lacks_power:
                 return unlimited
-            error = _find_white_error(tau, mean, start, constant, allowed, fit)
+            error = _find_white_error(mean, start, constant, allowed)
             return BandLimit(float(tau[start]), *map(_round_number, (constant, error)))
     return unlimited
 
@@ -185,13 +182,38 @@ def _round_number(value: float) -> float:
 class _Mean(NamedTuple):
     """Average of windows: rows as of a window, trend and its responses, number of windows."""
 
+    tau: Array
     rows: list[Array]
     trend: float
     responses: Array
     windows: int
+    tables: FitTables
+
+    def fit_each(self, start: int, constants: Array, terms: int) -> tuple[Array, Array, Array]:
+        """Fit from a position on: squares, chi-square and degrees of freedom of each constant."""
+        rows = [np.tile(values, (constants.size, 1)) for values in self.rows]
+        rows[0][:, :start] = np.nan
+        rows[1] *= filter_response(self.tau, constants[:, None])
+        responses = np.tile(self.responses, (constants.size, 1))
+        trend = np.full(constants.size, self.trend)
+        result, misfit, _ = run_kernel(rows, trend, responses, 0.0 * trend, self.tables, terms)
+        squares = result[:, FIT_FIELDS.index("square")]
+        return squares, misfit[:, 0] * self.windows, misfit[:, 1]
+
+    def fit(self, start: int, constants: Array, terms: int) -> tuple[int, Array, float]:
+        """Fit from a position on: best constant, squares, probability of its misfit.
+
+        The probability is NaN without degrees of freedom.
+        """
+        squares, chi2, dof = self.fit_each(start, constants, terms)
+        best = int(np.argmin(np.where(np.isfinite(chi2) & (dof > 0), chi2, np.inf)))
+        probability = gammaincc(dof[best] / 2.0, chi2[best] / 2.0) if dof[best] > 0 else np.nan
+        return best, np.nan_to_num(squares[best]), float(probability)
 
 
-def _average_windows(cells: Sequence[Array], trend: Array, responses: Array) -> _Mean | None:
+def _average_windows(
+    tau: Array, cells: Sequence[Array], trend: Array, responses: Array, tables: FitTables
+) -> _Mean | None:
     """Average the windows without motion, each over its variance at the shortest averaging time."""
     level = cells[0][:, 0]
     used = np.flatnonzero(np.isfinite(level) & (level > 0))
@@ -212,58 +234,29 @@ def _average_windows(cells: Sequence[Array], trend: Array, responses: Array) -> 
     rows[0][count == 0] = np.nan
     rows[4] *= count / used.size
     slope = np.sqrt(np.mean(trend[used] ** 2 / level[used]))
-    return _Mean(rows, float(slope), responses[used].mean(axis=0), used.size)
+    return _Mean(tau, rows, float(slope), responses[used].mean(axis=0), used.size, tables)
 
 
-def _fit_constants(
-    tau: Array, mean: _Mean, start: int, constants: Array, terms: int, fit: Fit
-) -> tuple[Array, Array, Array]:
-    """Fit the average from a position on: squares, chi-square and degrees of freedom of each."""
-    rows = [np.tile(values, (constants.size, 1)) for values in mean.rows]
-    rows[0][:, :start] = np.nan
-    rows[1] *= filter_response(tau, constants[:, None])
-    responses = np.tile(mean.responses, (constants.size, 1))
-    squares, misfit = fit(rows, np.full(constants.size, mean.trend), responses, terms)
-    return squares, misfit[:, 0] * mean.windows, misfit[:, 1]
-
-
-def _fit_from(
-    tau: Array, mean: _Mean, start: int, constants: Array, terms: int, fit: Fit
-) -> tuple[int, Array, float]:
-    """Fit the average from a position on: best constant, squares, probability of its misfit.
-
-    The probability is NaN without degrees of freedom.
-    """
-    squares, chi2, dof = _fit_constants(tau, mean, start, constants, terms, fit)
-    best = int(np.argmin(np.where(np.isfinite(chi2) & (dof > 0), chi2, np.inf)))
-    probability = gammaincc(dof[best] / 2.0, chi2[best] / 2.0) if dof[best] > 0 else np.nan
-    return best, np.nan_to_num(squares[best]), float(probability)
-
-
-def _find_white_error(
-    tau: Array, mean: _Mean, start: int, constant: float, allowed: int, fit: Fit
-) -> float:
+def _find_white_error(mean: _Mean, start: int, constant: float, allowed: int) -> float:
     """Compute the relative standard error of N by that of the time constant.
 
     The variance of the constant is twice the reciprocal of the second derivative of chi-square.
     """
-    step = _CURVATURE_STEP * tau[start]
+    step = _CURVATURE_STEP * mean.tau[start]
     constants = constant + step * np.array([-1.0, 0.0, 1.0])
-    squares, chi2, _ = _fit_constants(tau, mean, start, constants, allowed & ~_Q_BIT, fit)
+    squares, chi2, _ = mean.fit_each(start, constants, allowed & ~_Q_BIT)
     curvature = (chi2[0] - 2.0 * chi2[1] + chi2[2]) / step**2
     slope = np.log(squares[2, 1] / squares[0, 1]) / (2.0 * step)
     return float(0.5 * abs(slope) * np.sqrt(2.0 / curvature)) if curvature > 0 else 0.0
 
 
-def _fit_constant(
-    tau: Array, mean: _Mean, start: int, allowed: int, fit: Fit
-) -> tuple[float, Array, float]:
+def _fit_constant(mean: _Mean, start: int, allowed: int) -> tuple[float, Array, float]:
     """Fit the time constant of a filter from a position on, without Q."""
-    low, highest = 0.0, _MAX_TIME_CONSTANT * tau[start]
+    low, highest = 0.0, _MAX_TIME_CONSTANT * mean.tau[start]
     high = highest
     for _ in range(_GRID_STEPS):
         constants = np.linspace(low, high, _GRID_POINTS)
-        best, squares, probability = _fit_from(tau, mean, start, constants, allowed & ~_Q_BIT, fit)
+        best, squares, probability = mean.fit(start, constants, allowed & ~_Q_BIT)
         reach = 2.0 * (constants[1] - constants[0])
         low, high = max(constants[best] - reach, 0.0), min(constants[best] + reach, highest)
     return float(constants[best]), squares, probability

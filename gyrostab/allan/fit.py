@@ -10,22 +10,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.allan.band_limit import (
-    BandLimit,
-    choose_windows,
-    filter_response,
-    find_band_limit,
-)
-from gyrostab.allan.compute import TREND_RESPONSES
-from gyrostab.allan.freedoms import thin_factors
-from gyrostab.allan.window_fit import FitTables, fit_block, fit_tables, run_kernel
-from gyrostab.errors import OptionError, SchemaError
+from gyrostab.allan.band_limit import BandLimit, choose_windows, filter_response, find_band_limit
+from gyrostab.allan.fit_inputs import FIT_VARIABLES, check_options, prepare_fit, term_bits
+from gyrostab.allan.window_fit import fit_block
 from gyrostab.kernels.fit.covariance import STOCHASTIC
-from gyrostab.kernels.fit.submodels import FIT_FIELDS
 from gyrostab.noise import TERMS
-from gyrostab.schema import attributes, check_surface
-from gyrostab.time.durations import duration_seconds, thin
-from gyrostab.units import HOUR
+from gyrostab.schema import attributes
 
 #: Band limit of each axis, by its name.
 Bands = Mapping[str, tuple[float, ...]]
@@ -196,13 +186,13 @@ def _fit_checked(
     immediate: bool = False,
     bands: Bands | None = None,
 ) -> xr.Dataset:
-    fitted_terms, chosen = _check_options(surface, terms, tau_min, tau_max)
+    fitted_terms, chosen = check_options(surface, terms, tau_min, tau_max)
     if bands is None:
         bands = find_bands(surface, terms=fitted_terms, tau_min=tau_min, tau_max=tau_max)
     limits = [BandLimit(*bands[str(axis)]) for axis in surface["axis"].values]
     product = _fit_windows(
         surface,
-        _bits(fitted_terms),
+        term_bits(fitted_terms),
         chosen,
         limits,
         immediate=immediate,
@@ -255,164 +245,27 @@ def find_bands(
     >>> find_bands(davar(make_log(smooth, rate=100.0, unit="deg/h"), window="1min"))
     {'x': BandLimit(tau_min=0.13, time_constant=0.0292, white_error=0.0122)}
     """
-    fitted_terms, chosen = _check_options(surface, terms, tau_min, tau_max)
+    fitted_terms, chosen = check_options(surface, terms, tau_min, tau_max)
     tau, axes = surface["tau"].values, list(map(str, surface["axis"].values))
     allan = surface.attrs.get("variance", "avar") == "avar"
     if tau_min is not None or not allan:
         return {axis: BandLimit(float(tau[chosen[0]]), 0.0) for axis in axes}
     window = int(surface.attrs.get("window_samples", 1))
     step = int(surface.attrs.get("step_samples", window))
-    part = surface[[name for name in (*_FIT_VARIABLES, "difference_trend") if name in surface]]
+    part = surface[[name for name in (*FIT_VARIABLES, "difference_trend") if name in surface]]
     part = part.isel(time=choose_windows(part.sizes["time"], window, step)).compute()
-    cells, tables, chosen = _prepare_fit(part, chosen, _bits(fitted_terms))
-
-    def fit(
-        rows: list[NDArray[np.float64]],
-        trend: NDArray[np.float64],
-        responses: NDArray[np.float64],
-        allowed: int,
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        result, misfit, _ = run_kernel(rows, trend, responses, 0.0 * trend, tables, allowed)
-        return result[:, FIT_FIELDS.index("square")], misfit
-
+    cells, tables, chosen = prepare_fit(part, chosen, term_bits(fitted_terms))
     return {
         axis: find_band_limit(
             tau[chosen],
             [cell[row][:, chosen] for cell in cells[:5]],
             cells[5][row, :, 0],
             np.stack([cell[row, :, 0] for cell in cells[6:10]], axis=-1),
-            allowed=_bits(fitted_terms),
-            columns=tables.columns,
-            fit=fit,
+            allowed=term_bits(fitted_terms),
+            tables=tables,
         )
         for row, axis in enumerate(axes)
     }
-
-
-def _bits(terms: Iterable[str]) -> int:
-    return sum(1 << TERMS.index(term) for term in terms)
-
-
-def check_fit_options(
-    terms: str | Iterable[str] = "QNBKR",
-    tau_min: Any = None,
-    tau_max: Any = None,
-    **other: Any,
-) -> tuple[list[str], float, float]:
-    """Check options of `fit_noise` as far as they do not depend on the surface; ignore others.
-
-    Returns
-    -------
-    terms : list of str
-        Terms to fit.
-    low, high : float
-        Shortest and longest averaging time to fit [s].
-
-    Examples
-    --------
-    >>> check_fit_options("NB", tau_min="1min")
-    (['N', 'B'], 60.0, inf)
-    """
-    fitted_terms = list(dict.fromkeys(terms))
-    unknown = [term for term in fitted_terms if term not in TERMS]
-    if unknown or not fitted_terms:
-        raise OptionError(f"terms {unknown or fitted_terms}: choose among {', '.join(TERMS)}")
-    low = 0.0 if tau_min in (None, "all") else duration_seconds(tau_min, "tau_min (--fit-from)")
-    high = np.inf if tau_max is None else duration_seconds(tau_max, "tau_max (--fit-to)")
-    return fitted_terms, low, high
-
-
-def _check_options(
-    surface: xr.Dataset, terms: str | Iterable[str], tau_min: Any, tau_max: Any
-) -> tuple[list[str], NDArray[np.int64]]:
-    """Check the options of a fit; return the terms, and the positions of the averaging times."""
-    check_surface(surface)
-    fitted_terms, low, high = check_fit_options(terms, tau_min, tau_max)
-    if surface.attrs.get("variance") == "hadamard" and fitted_terms == ["R"]:
-        raise OptionError("terms 'R': the Hadamard variance does not see a ramp")
-    return fitted_terms, _select_taus(surface["tau"].values, low, high)
-
-
-def _select_taus(tau: NDArray[np.float64], low: float, high: float) -> NDArray[np.int64]:
-    """Find the positions of the averaging times to fit, from `low` to `high` [s]."""
-    chosen = np.flatnonzero((tau >= low * (1 - 1e-9)) & (tau <= high * (1 + 1e-9)))
-    if chosen.size == 0:
-        raise OptionError(
-            f"no averaging time of the surface lies between {low:g} s and {high:g} s; it has "
-            f"{tau[0]:g} s to {tau[-1]:g} s; change --fit-from or --fit-to"
-        )
-    return chosen
-
-
-def _fit_inputs(
-    surface: xr.Dataset, allowed: int = 31
-) -> tuple[list[Any], NDArray[np.int64], float, int]:
-    """Collect the cells as (axis, time, tau) arrays, averaging factors, rate and window length.
-
-    Trend and its responses follow, and whether its product with the noise is removed (axis, time,
-    1). The line of slope b through a window of which the second differences show the slope s adds
-    ``b (2 s - b) tau^2 / 2`` to the Allan variance. Without gaps s is near b, and its scatter is
-    known (`gyrostab.kernels.fit.trend`). Through gaps it is not, but s is measured, and what
-    exceeds ``b^2 tau^2 / 2`` is removed here.
-    """
-    try:
-        rate = float(surface.attrs["sampling_rate_hz"])
-        window = int(surface.attrs["window_samples"])
-    except KeyError as missing:
-        raise SchemaError(
-            f"the surface lacks the attribute {missing}; it is not what gyrostab.davar writes"
-        ) from missing
-    ks = np.round(np.asarray(surface["tau"].values) * rate).astype(np.int64)
-    absent = [name for name in _FIT_VARIABLES if name not in {*surface, *_LATER_VARIABLES}]
-    if absent:
-        raise SchemaError(
-            f"the surface lacks {absent}, which the fit needs to account for gaps and ramps; make "
-            "it with gyrostab.davar"
-        )
-    for name, similar in _LATER_VARIABLES.items():  # written by a version that took it as 1
-        if name not in surface:
-            surface = surface.assign({name: xr.ones_like(surface[similar])})
-    cells = [surface[name].data for name in _FIT_VARIABLES]
-    cells[5:] = [plane[..., None] for plane in cells[5:]]
-    if "difference_trend" in surface and allowed >> STOCHASTIC & 1:
-        trend, difference_trend = cells[5], surface["difference_trend"].data
-        excess = cells[3] * (surface["tau"].values / HOUR) ** 2 * trend * (difference_trend - trend)
-        cells[0] = cells[0] - np.nan_to_num(excess)
-        exact = np.isfinite(difference_trend).any(axis=-1, keepdims=True)
-    else:
-        exact = np.zeros_like(cells[5], dtype=bool)
-    return [*cells, exact], ks, rate, window
-
-
-#: Variables of a surface that a fit uses: by averaging time, and those of the trend by window.
-_FIT_VARIABLES = (
-    "avar",
-    "white_response",
-    "quantization_response",
-    "ramp_response",
-    "gap_factor",
-    "window_trend",
-    *TREND_RESPONSES,
-)
-#: Those that the first versions did not write, and others with their dimensions.
-_LATER_VARIABLES = {
-    "ramp_response": "white_response",
-    "trend_quantization_response": "trend_response",
-    "trend_flicker_response": "trend_response",
-    "trend_walk_response": "trend_response",
-}
-
-
-def _prepare_fit(
-    surface: xr.Dataset, within: NDArray[np.int64], allowed: int
-) -> tuple[list[Any], FitTables, NDArray[np.int64]]:
-    """Return the cells of a surface, and tables and positions of the averaging times to fit."""
-    cells, ks, rate, window = _fit_inputs(surface, allowed)
-    chosen = within[thin_factors(ks[within])]
-    shifts = thin(ks[chosen]) if surface.attrs.get("overlap") == "octave" else np.zeros_like(chosen)
-    variance = surface.attrs.get("variance", "avar")
-    tables = fit_tables(tuple(ks[chosen].tolist()), tuple(shifts.tolist()), rate, window, variance)
-    return cells, tables, chosen
 
 
 def _fit_windows(
@@ -426,7 +279,7 @@ def _fit_windows(
 ) -> xr.Dataset:
     if surface.attrs.get("variance") == "hadamard":  # which does not see a ramp
         allowed &= ~(1 << STOCHASTIC)
-    cells, tables, chosen = _prepare_fit(surface, within, allowed)
+    cells, tables, chosen = prepare_fit(surface, within, allowed)
     tau = surface["tau"].values
     tau_min, constant, error = (
         np.array(values)[:, None, None] for values in zip(*limits, strict=True)
@@ -447,7 +300,7 @@ def _fit_windows(
         )
         responses = np.stack(shares, axis=-1)
         fitted = np.empty((filtered.size, width))
-        for rows, terms in ((filtered == 0, allowed), (filtered > 0, allowed & ~_bits("Q"))):
+        for rows, terms in ((filtered == 0, allowed), (filtered > 0, allowed & ~term_bits("Q"))):
             if rows.any():
                 fitted[rows] = fit_block(
                     [a[rows] for a in flat],

@@ -22,7 +22,7 @@ def check_options(
     OptionError
         When one of them cannot be used.
     """
-    from gyrostab.allan.fit import check_fit_options
+    from gyrostab.allan.fit_inputs import check_fit_options
     from gyrostab.ingest.uniform import check_cut
 
     options = {

@@ -17,6 +17,7 @@ from gyrostab.allan import fit, window_fit
 from gyrostab.allan.confidence import confidence_interval
 from gyrostab.allan.davar import davar
 from gyrostab.allan.fit import fit_noise
+from gyrostab.allan.fit_inputs import fit_inputs
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.allan.pairs import white_pair_sum
@@ -544,7 +545,7 @@ def test_fast_fit_equals_the_reference_implementation(law, share, block):
 
 def cells_of(surface):
     """Arguments of `window_fit.run_kernel` for the windows of a surface with one axis."""
-    cells, ks, rate, window = fit._fit_inputs(surface)
+    cells, ks, rate, window = fit_inputs(surface)
     tables = window_fit.fit_tables(tuple(ks.tolist()), (0,) * ks.size, rate, window)
     flat = [np.ascontiguousarray(cell[0], dtype=np.float64) for cell in cells[:5]]
     trend, *responses, exact = (cell[0, :, 0] for cell in cells[5:])
@@ -740,7 +741,7 @@ def test_removing_the_trend_equals_removing_the_line_from_the_samples(kind):
     line = slope * hours[:4000] if kind == "rate" else slope * hours**2 / 2
     options = {"window": "40s", "step": "40s", "taus": list(surface.tau.values)}
     bare = surface_of(signal[: line.size] - line, **options)
-    cells, *_ = fit._fit_inputs(surface)
+    cells, *_ = fit_inputs(surface)
     ramp = surface.ramp_response[0, 0] * slope**2 * (surface.tau / 3600) ** 2 / 2
     np.testing.assert_allclose(cells[0][0, 0] - ramp, bare.avar[0, 0], rtol=1e-6)
 
