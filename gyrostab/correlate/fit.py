@@ -107,7 +107,7 @@ def fit_driver(
     limits = driver_limits(x[:, 0], blocks.pieces, driver.units, derived=driver.derived)
     timed = np.concatenate([blocks.offsets, blocks.trend], axis=1)
     nuisance = blocks.offsets if "no_reversal" in limits else timed
-    if not limits & {"constant", "too_few"}:
+    if "constant" not in limits:
         if x.shape[0] - nuisance.shape[1] - 1 < _MIN_BLOCKS // 2:
             limits = limits | {"too_few"}
         elif _largest_leverage(x[:, 0], nuisance) > _MAX_LEVERAGE:

@@ -27,7 +27,6 @@ LIMITS = {
     "other_channel": "another channel explains it equally well",
 }
 _READABLE = {"degree": "deg", "hour": "h", "degree_Celsius": "K", "standard_free_fall": "g"}
-_MIN_BLOCKS = 12
 _MIN_RANGE = {"degree_Celsius": 0.02}  # a channel with a smaller range counts as constant
 
 
@@ -51,10 +50,8 @@ def driver_limits(x: Array, pieces: NDArray[np.int64], units: str, *, derived: b
         Keys of `LIMITS`.
     """
     limits = set()
-    span = float(np.ptp(x)) if x.size else 0.0
-    if x.size < _MIN_BLOCKS:
-        limits.add("too_few")
-    if span <= max(_MIN_RANGE.get(units, 0.0), 1e-9 * float(np.abs(x).max(initial=0.0))):
+    span = float(np.ptp(x))
+    if span <= max(_MIN_RANGE.get(units, 0.0), 1e-9 * float(np.abs(x).max())):
         return limits | {"constant"}
     inside = sum(
         float(((x[pieces == piece] - x[pieces == piece].mean()) ** 2).sum())
@@ -66,7 +63,7 @@ def driver_limits(x: Array, pieces: NDArray[np.int64], units: str, *, derived: b
     fall = float((np.maximum.accumulate(x) - x).max())
     if min(rise, fall) < 0.25 * span:
         limits.add("no_reversal")
-    if not derived and x.size >= _MIN_BLOCKS:
+    if not derived:
         pace = np.abs(np.gradient(x))
         if np.mean(pace < 0.1 * np.quantile(pace, 0.95)) < 0.1:
             limits.add("no_plateau")
