@@ -112,7 +112,7 @@ def number_of_terms(parts: list[np.ndarray], unit: Unit) -> float:
     """Second differences that the kernel forms: those within unbroken runs, thinned."""
     total = 0.0
     for part in parts:
-        starts, stops = present_runs(part, part.size, np.full(1, -1.0))
+        starts, stops = present_runs(part)
         for k, shift in zip(unit.ks, unit.shifts, strict=True):
             total += np.maximum(stops - starts - 2 * k + 1, 0).sum() / 2.0**shift
     return float(total)

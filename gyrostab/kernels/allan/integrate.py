@@ -78,32 +78,27 @@ def block_sums(x, base, window, step, n_windows):  # type: ignore[no-untyped-def
 
 
 @njit(**INNER)
-def _find_runs(x, step, finite_counts, starts, stops):  # type: ignore[no-untyped-def]
+def _find_runs(x, starts, stops):  # type: ignore[no-untyped-def]
     """Count the runs of finite samples, and write as many as fit to `starts` and `stops`."""
     run = 0
     inside = False
-    for block in range(finite_counts.size):
-        first = block * step
-        last = min((block + 1) * step, x.size) if block + 1 < finite_counts.size else x.size
-        if inside and finite_counts[block] == last - first:
+    for a in range(0, x.size, _STRIP):
+        b = min(a + _STRIP, x.size)
+        finite = 0
+        for i in range(np.uint64(a), np.uint64(b)):
+            finite += np.isfinite(x[i])
+        if finite == (b - a if inside else 0):
             continue
-        for a in range(first, last, _STRIP):
-            b = min(a + _STRIP, last)
-            finite = 0
-            for i in range(np.uint64(a), np.uint64(b)):
-                finite += np.isfinite(x[i])
-            if finite == (b - a if inside else 0):
+        for i in range(a, b):
+            if np.isfinite(x[i]) == inside:
                 continue
-            for i in range(a, b):
-                if np.isfinite(x[i]) == inside:
-                    continue
-                if run < starts.size:
-                    if inside:
-                        stops[run] = i
-                    else:
-                        starts[run] = i
-                run += inside
-                inside = not inside
+            if run < starts.size:
+                if inside:
+                    stops[run] = i
+                else:
+                    starts[run] = i
+            run += inside
+            inside = not inside
     if inside:
         if run < starts.size:
             stops[run] = x.size
@@ -112,23 +107,13 @@ def _find_runs(x, step, finite_counts, starts, stops):  # type: ignore[no-untype
 
 
 @njit(**KERNEL)
-def present_runs(x, step, finite_counts):  # type: ignore[no-untyped-def]
-    """Find first and one-past-last index of every run of finite samples, as two int64 arrays.
-
-    Parameters
-    ----------
-    x : ndarray (n,)
-        Samples.
-    step : int
-        Samples of a block; the last one has the rest.
-    finite_counts : float64 (n_blocks,)
-        Finite samples of each block, or -1 if unknown; samples of complete blocks are not checked.
-    """
+def present_runs(x):  # type: ignore[no-untyped-def]
+    """Find first and one-past-last index of every run of finite samples, as two int64 arrays."""
     runs = np.empty((2, x.size // 256 + 16), np.int64)
-    count = _find_runs(x, step, finite_counts, runs[0], runs[1])
+    count = _find_runs(x, runs[0], runs[1])
     if count > runs.shape[1]:
         runs = np.empty((2, count), np.int64)
-        _find_runs(x, step, finite_counts, runs[0], runs[1])
+        _find_runs(x, runs[0], runs[1])
     return runs[0, :count], runs[1, :count]
 
 

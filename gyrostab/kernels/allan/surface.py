@@ -264,13 +264,8 @@ def surface_unit(
     n_windows = _number_of_windows(x, unit)
     if np.isnan(first_present(x)):
         return _empty_cells(n_windows, unit.ks.size)
-    means, mean, finite_counts = _average_windows(x, unit, n_windows)
-    gaps = int(finite_counts.sum()) < x.size
-    starts, stops = (
-        present_runs(x, unit.step if finite_counts.size > 1 else x.size, finite_counts)
-        if gaps
-        else (np.zeros(1, np.int64), np.full(1, x.size))
-    )
+    means, mean, gaps = _average_windows(x, unit, n_windows)
+    starts, stops = present_runs(x) if gaps else (np.zeros(1, np.int64), np.full(1, x.size))
     # integers less an integer: every sum is exact
     offset = float(np.rint(mean)) if counts_only else mean
     work = _Work(x, unit, space, n_windows, starts, stops, offset)
@@ -357,10 +352,10 @@ def _number_of_windows(x: NDArray[np.generic], unit: Unit) -> int:
 
 def _average_windows(
     x: NDArray[np.generic], unit: Unit, n_windows: int
-) -> tuple[Floats, float, Floats]:
-    """Average the windows: means, coverage, overall mean, and present samples by block."""
+) -> tuple[Floats, float, bool]:
+    """Average the windows: means and coverage, overall mean, and whether a sample is missing."""
     if unit.angle:
-        return _angle_means(x, unit, n_windows), np.nan, np.array([float(np.isfinite(x).sum())])
+        return _angle_means(x, unit, n_windows), np.nan, not np.isfinite(x).all()
     base = first_present(x)
     # less the first sample: small on a tool that turns
     heads, tails = block_sums(x, base, unit.window, unit.step, n_windows)
@@ -369,7 +364,7 @@ def _average_windows(
     windows_from_blocks(heads, tails, np.full(2, unit.window // unit.step), windows)
     with np.errstate(invalid="ignore", divide="ignore"):
         means = np.stack([base + windows[:, 0] / windows[:, 1], windows[:, 1] / unit.window])
-        return means, base + total / present, heads[:, 1] + tails[:, 1]
+        return means, base + total / present, present < x.size
 
 
 def _angle_means(x: NDArray[np.generic], unit: Unit, n_windows: int) -> Floats:

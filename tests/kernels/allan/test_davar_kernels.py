@@ -56,9 +56,7 @@ class TestKernels:
         rng = np.random.default_rng(seed)
         x = rng.integers(-5, 6, n).astype(np.float64)
         x[rng.random(n) < missing] = np.nan
-        step = int(rng.integers(1, n + 1))
-        known = np.array([float(np.isfinite(x[a : a + step]).sum()) for a in range(0, n, step)])
-        starts, stops = present_runs(x, step, known)
+        starts, stops = present_runs(x)
         edges = np.flatnonzero(np.diff(np.concatenate([[False], np.isfinite(x), [False]])))
         np.testing.assert_array_equal(starts, edges[::2])
         np.testing.assert_array_equal(stops, edges[1::2])
