@@ -90,7 +90,7 @@ def _second_differences(builder: Any, theta: Any, at: Any, lags: list[Any]) -> l
 
 
 def _consecutive_differences(builder: Any, theta: Any, at: Any, lags: list[Any]) -> list[Any]:
-    """The same of lags that follow each other, `CONSECUTIVE_LAGS` at most."""
+    """The same of lags that follow each other."""
     last_needed = len(lags) + LANES - 2
 
     def vectors(index: Any, reach: int) -> list[Any]:
@@ -261,9 +261,7 @@ def _intrinsic_of_lags(count: int, *, in_a_row: bool = False) -> Any:
 
 
 _one, _two, _three, _four = (_intrinsic_of_lags(count) for count in range(1, MAX_LAGS + 1))
-_eight_in_a_row, _four_in_a_row = (
-    _intrinsic_of_lags(count, in_a_row=True) for count in (CONSECUTIVE_LAGS, MAX_LAGS)
-)
+_eight_in_a_row = _intrinsic_of_lags(CONSECUTIVE_LAGS, in_a_row=True)
 
 
 @njit(**KERNEL)
@@ -288,8 +286,6 @@ def split_sums(theta, first, count, lags, at, splits, sizes, heads, tails, place
     """
     if count == 8:
         _eight_in_a_row(theta, first, lags, at, splits, sizes, heads, tails, place)
-    elif count == 4 and lags[at + 3] - lags[at] == 3:
-        _four_in_a_row(theta, first, lags, at, splits, sizes, heads, tails, place)
     elif count == 4:
         _four(theta, first, lags, at, splits, sizes, heads, tails, place)
     elif count == 3:
