@@ -45,7 +45,7 @@ from gyrostab.jobs.job import (
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool
 from gyrostab.kernels.workspace import Workspaces
 from gyrostab.progress import Stage, no_stage
-from gyrostab.store.netcdf_log import read_attribute
+from gyrostab.store.attributes import read_attribute
 from gyrostab.store.output import (
     check_output,
     find_foreign_item,

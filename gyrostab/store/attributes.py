@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import re
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,10 @@ import xarray as xr
 
 from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.schema import texts
+from gyrostab.store.hdf5_heaps import check_global_heaps
+from gyrostab.store.output.content import read_json
+from gyrostab.store.private import library_lock
+from gyrostab.store.remote import find_url
 from gyrostab.store.safe_names import is_storable, make_name_storable
 from gyrostab.time.clock import time_of_day
 from gyrostab.units import ON_DISK, on_disk
@@ -132,3 +137,23 @@ def decode_attributes(attrs: dict[str, Any]) -> dict[str, Any]:
     if "units" in attrs:
         attrs["units"] = inner.get(attrs["units"], attrs["units"])
     return attrs
+
+
+def read_attribute(path: Path, name: str) -> str:
+    """Read an attribute that gyrostab wrote for a NetCDF file or Zarr store; empty without it."""
+    import h5py
+
+    if find_url(path) or path.is_dir():
+        attributes = read_json(path / ".zattrs")
+        return str(attributes.get(name, "")) if isinstance(attributes, dict) else ""
+    try:
+        with library_lock(), h5py.File(path, "r") as file:
+            if name not in file.attrs:
+                return ""
+            kind = file.attrs.get_id(name).get_type()
+            if not hasattr(kind, "is_variable_str") or kind.is_variable_str():
+                check_global_heaps(path)
+            value = file.attrs[name]
+            return value.decode() if isinstance(value, bytes) else str(value)
+    except Exception:  # whatever the library raises on damaged bytes and other formats
+        return ""

@@ -30,7 +30,6 @@ from gyrostab.store.attributes import (
     make_global_attributes,
 )
 from gyrostab.store.lazy import transpose_lazy
-from gyrostab.store.netcdf_log import StoredLog
 from gyrostab.store.private import close_function, is_in_memory
 from gyrostab.store.safe_names import (
     make_names_storable,
@@ -147,7 +146,7 @@ def _make_lazy(variable: xr.Variable) -> xr.Variable:
     return variable if ready else variable.chunk("auto")
 
 
-def from_disk(stored: xr.Dataset | StoredLog, where: str) -> xr.Dataset:
+def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
     """Decode a dataset that was opened without decoding times and without indexes.
 
     `where` names the file in messages.

@@ -10,7 +10,7 @@ import threading
 import uuid
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -25,15 +25,12 @@ from gyrostab.store.blosc_chunks import check_blosc_chunks
 from gyrostab.store.hdf5_heaps import check_global_heaps
 from gyrostab.store.layout import ChunkCache, ChunkDamage, is_readable, read_chunk
 from gyrostab.store.lazy import FileVariable, RowSource, make_dask
-from gyrostab.store.netcdf_log import StoredLog, open_netcdf_log
-from gyrostab.store.private import close_function
+from gyrostab.store.private import close_function, library_lock
 from gyrostab.store.remote import ROOT_METADATA, find_store, find_url, reaching
 from gyrostab.store.times import decode_stamps, index_dim, parse_time_grids, replace_stamps
 from gyrostab.time.grid import grid_times
 from gyrostab.wording import list_some
 
-#: Dataset as it is on disk.
-Stored = xr.Dataset | StoredLog
 #: Values from which a variable is a dask array.
 MIN_LAZY_VALUES = 2**17
 #: Encodings that xarray decodes; gyrostab writes none of them in a log.
@@ -48,7 +45,7 @@ def open_stored(
     strict: bool = False,
     check: Callable[[Path, Mapping[Any, xr.Variable]], None] | None = None,
     lazy: bool = True,
-) -> Stored:
+) -> xr.Dataset:
     """Open a dataset as it is on disk: times not decoded, data lazy, chunks checked when read.
 
     Parameters
@@ -93,15 +90,9 @@ def _open_dataset(
     strict: bool,
     check: Callable[[Path, Mapping[Any, xr.Variable]], None] | None,
     lazy: bool,
-) -> Stored:
+) -> xr.Dataset:
     if path.is_file():
-        log = open_netcdf_log(path)
-        if log is not None:
-            if check is not None:
-                check(path, log.variables)
-            long = _find_long_variables(log, path, strict=strict)
-            return replace(log, variables=log.variables | long)
-        check_global_heaps(path)
+        check_global_heaps(path, skip=_find_data(path))
     elif not any((path / name).exists() for name in ROOT_METADATA):
         inside = sorted(item.name for item in path.iterdir() if item.suffix in (".nc", ".zarr"))
         raise DamageError(
@@ -140,6 +131,21 @@ def _open_dataset(
     return opened
 
 
+def _find_data(path: Path) -> list[tuple[int, int]]:
+    """Find first byte and size of the chunks in a NetCDF file; none in one that is damaged."""
+    import h5py
+
+    chunks: list[tuple[int, int]] = []
+    try:
+        with library_lock(), h5py.File(path, "r") as file:
+            for variable in file.values():
+                if variable.chunks:
+                    variable.id.chunk_iter(lambda chunk: chunks.append(chunk[2:]))
+    except Exception:  # the library raises errors of many kinds; the caller says what is wrong
+        return []
+    return sorted(chunks)
+
+
 def _make_variables_lazy(
     stored: xr.Dataset, long: dict[Any, xr.Variable], path: Path, *, small: int
 ) -> xr.Dataset:
@@ -175,7 +181,7 @@ def make_variable_lazy(variable: xr.Variable, path: Path) -> xr.Variable:
     return xr.Variable(variable.dims, lazy, variable.attrs, variable.encoding)
 
 
-def _find_long_variables(stored: Stored, path: Path, *, strict: bool) -> dict[Any, xr.Variable]:
+def _find_long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dict[Any, xr.Variable]:
     """Find the long variables of a log, as arrays that handle damage."""
     labels = [str(label) for label in stored.variables["axis"].values]
     opened = uuid.uuid4().hex
@@ -229,7 +235,7 @@ def _is_sampled(variable: xr.Variable) -> bool:
 
 
 def _find_chunk_spans(
-    stored: Stored, dim: str, length: int, path: Path
+    stored: xr.Dataset, dim: str, length: int, path: Path
 ) -> dict[str, Any] | tuple[tuple[int, int], ...]:
     """Find the rule of a computed time axis, or the first and last stamp [ns] of each chunk."""
     rules = {

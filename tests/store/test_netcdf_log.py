@@ -1,19 +1,14 @@
-"""NetCDF logs of gyrostab that are opened without xarray."""
+"""NetCDF logs of gyrostab: their summaries, stamps that were changed, and damage."""
 
 from __future__ import annotations
 
-import h5py
 import netCDF4
 import numpy as np
 import pytest
-import xarray as xr
 
 from gyrostab import make_log, open_log, to_netcdf
 from gyrostab.errors import FormatError
 from gyrostab.ingest.files import scan_file
-from gyrostab.ingest.formats import netcdf
-from gyrostab.store import read
-from gyrostab.store.netcdf_log import open_netcdf_log
 
 
 def _write_log(path, **options):
@@ -26,23 +21,9 @@ def _write_log(path, **options):
     to_netcdf(log, path, **options)
 
 
-@pytest.mark.parametrize("stamps", [True, False])
-def test_a_log_is_that_which_xarray_opens(tmp_path, monkeypatch, stamps):
-    path = tmp_path / "log.nc"
-    _write_log(path, stamps=stamps)
-    assert open_netcdf_log(path) is not None
-    direct = open_log(path)
-    monkeypatch.setattr(read, "open_netcdf_log", lambda path, **_: None)
-    slow = open_log(path)
-    xr.testing.assert_identical(direct, slow)
-    assert list(direct.variables) == list(slow.variables)
-    assert direct["rate"].encoding == slow["rate"].encoding
-    assert direct["rate"].dtype == slow["rate"].dtype
-
-
 @pytest.mark.filterwarnings("ignore:a file cannot hold a channel of this name")
 @pytest.mark.parametrize(("stamps", "named"), [(True, False), (False, False), (True, True)])
-def test_a_log_has_the_summary_of_its_samples(tmp_path, monkeypatch, stamps, named):
+def test_a_log_has_the_summary_of_its_samples(tmp_path, stamps, named):
     path = tmp_path / "log.nc"
     _write_log(path, stamps=stamps)
     with open_log(path) as log:
@@ -54,43 +35,21 @@ def test_a_log_has_the_summary_of_its_samples(tmp_path, monkeypatch, stamps, nam
     if named:
         log = log.rename(depth="a/b", time_depth="time_a/b")
     to_netcdf(log, path, overwrite=True, stamps=stamps)
-    direct = scan_file(path)
-    assert {column.unit for column in direct.columns} == {
+    summary = scan_file(path)
+    assert {column.unit for column in summary.columns} == {
         "degree hour-1", "degree_Celsius", "g", "m",
     }  # fmt: skip
-    assert len(direct.notes) == 2
-    monkeypatch.setattr(netcdf, "open_netcdf_log", lambda path, **_: None)
-    assert direct == scan_file(path)
+    assert len(summary.notes) == 2
     channels = ("temperature", "accel_x", "a/b" if named else "depth")
-    assert (direct.n_rows, direct.channels) == (5000, channels)
+    assert (summary.n_rows, summary.channels) == (5000, channels)
 
 
-def test_changed_stamps_are_left_to_xarray(tmp_path):
+def test_changed_stamps_are_those_of_the_file(tmp_path):
     path = tmp_path / "log.nc"
     _write_log(path)
     with netCDF4.Dataset(path, "a") as file:
         file["time"][:] += 3_600_000_000
-    assert open_netcdf_log(path) is None
-    assert open_netcdf_log(path, brief=True) is None
     assert str(open_log(path).time.values[0]).startswith("2026-01-01T01:00:00")
-
-
-def test_summaries_read_no_text_from_a_heap(tmp_path):
-    path = tmp_path / "log.nc"
-    _write_log(path)
-    assert open_netcdf_log(path, brief=True) is not None
-    with h5py.File(path, "r+") as file:
-        file["rate"].attrs["units"] = "degree hour-1"  # of variable length
-    assert open_netcdf_log(path) is not None
-    assert open_netcdf_log(path, brief=True) is None
-
-
-def test_files_of_other_programs_are_left_to_xarray(tmp_path):
-    path = tmp_path / "log.nc"
-    _write_log(path)
-    with open_log(path) as log:
-        log.load().to_netcdf(tmp_path / "copy.nc")
-    assert open_netcdf_log(tmp_path / "copy.nc") is None
 
 
 def test_a_damaged_heap_is_found(tmp_path):
@@ -101,4 +60,4 @@ def test_a_damaged_heap_is_found(tmp_path):
     data[begin + 16 : begin + 32] = bytes(16)  # an object 0 of size 0
     path.write_bytes(data)
     with pytest.raises(FormatError, match="global heap"):
-        open_netcdf_log(path)
+        open_log(path)

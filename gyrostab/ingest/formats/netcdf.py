@@ -20,7 +20,7 @@ from gyrostab.ingest.columns.headers import AXIS_PATTERN, split_header
 from gyrostab.ingest.columns.stamps import names_epoch
 from gyrostab.ingest.combine import with_channels
 from gyrostab.ingest.formats.netcdf_classic import read_classic_header
-from gyrostab.ingest.formats.netcdf_logs import open_log, summarise_log, summarise_stored
+from gyrostab.ingest.formats.netcdf_logs import open_log, summarise_log
 from gyrostab.ingest.formats.netcdf_variables import (
     StoredVariable,
     open_variables,
@@ -29,7 +29,6 @@ from gyrostab.ingest.formats.recognise import begins_like
 from gyrostab.ingest.formats.tables import Table, TableColumn, read_tables, scan_tables
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.schema import texts
-from gyrostab.store.netcdf_log import open_netcdf_log
 
 MAX_COLUMNS = 64
 #: Names of variables whose columns are gyro axes.
@@ -47,10 +46,6 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Summarise variables, sizes, and first and last stamps."""
     if path.is_file():
         read_classic_header(path)
-        stored = open_netcdf_log(path, brief=True)
-        summary = None if stored is None else summarise_stored(path, stored, options)
-        if summary is not None:
-            return summary
     log = open_log(path, options)
     if log is not None:
         with log:

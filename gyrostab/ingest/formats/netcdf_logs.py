@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,15 +21,12 @@ from gyrostab.ingest.limits import check_declared, check_stored
 from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
 from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name
-from gyrostab.store.attributes import decode_attributes, decode_json
+from gyrostab.store.attributes import decode_json, read_attribute
 from gyrostab.store.blosc_chunks import check_blosc_chunks
 from gyrostab.store.cf import from_disk
 from gyrostab.store.hdf5_heaps import check_global_heaps
-from gyrostab.store.netcdf_log import StoredLog, read_attribute
 from gyrostab.store.read import open_stored
 from gyrostab.store.remote import find_url
-from gyrostab.store.safe_names import ORIGINAL_NAME
-from gyrostab.store.times import index_dim, parse_time_grids
 from gyrostab.time.grid import grid_times, time_coordinate
 from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import ON_DISK
@@ -170,7 +166,7 @@ def _read_labels(path: Path, labels: xr.DataArray) -> NDArray[np.str_]:
     return np.array([str(label) for label in values], dtype=str)
 
 
-def _open_own(path: Path, stored: xr.Dataset | StoredLog) -> xr.Dataset:
+def _open_own(path: Path, stored: xr.Dataset) -> xr.Dataset:
     """Open a log that gyrostab wrote."""
     log = from_disk(stored, path.name)
     try:
@@ -207,83 +203,26 @@ def _with_uniform_time(log: xr.Dataset) -> xr.Dataset:
     return as_uniform(log)
 
 
-def summarise_stored(path: Path, stored: StoredLog, options: ReadOptions) -> FileSummary | None:
-    """Summarise a log as it is on disk; None where decoding finds more, or what is wrong."""
-    check_declared(path, stored.variables, given=options.limits)
-    rules = {rule["dim"]: rule for rule in parse_time_grids(stored.variables, path.name).values()}
-    signals = [name for name in SIGNAL_UNITS if name in stored.data_vars]
-    variables, labels = stored.variables, stored.variables.get("axis")
-    if "time" not in rules or len(signals) != 1 or labels is None or labels.ndim != 1:
-        return None
-    rule, (signal,) = rules["time"], signals
-    time = next((dim for dim in ("time", index_dim("time")) if dim in stored.sizes), "")
-    is_plain = (
-        variables[signal].dims == ("axis", time)
-        and stored.sizes[time] == rule["size"] > 0
-        and variables[signal].attrs.get("units") == ON_DISK.get(*2 * (SIGNAL_UNITS[signal],))
-        and len(set(labels.values.tolist())) == labels.size > 0
-        and not any(ORIGINAL_NAME in item.attrs for item in variables.values())
-    )
-    if not is_plain:
-        return None
-    ends = rule["first"] + rule["stride"] * np.array([0, rule["size"] - 1])
-    time_dims = {
-        dim: {time} | {f"time_{dim}", index_dim(f"time_{dim}")} for dim in stored.data_vars
-    }
-    channels = {
-        name: str(decode_attributes(dict(variables[name].attrs)).get("units", ""))
-        for name in stored.data_vars
-        if variables[name].ndim == 1 and variables[name].dims[0] in time_dims[name]
-    }
-    return _make_summary(
-        path,
-        signal,
-        labels.values.tolist(),
-        channels,
-        grid_times(rule["start_ns"], rule["rate_hz"], ends),
-        rule["size"],
-        decode_attributes(dict(stored.attrs)).get("notes", ()),
-    )
-
-
 def summarise_log(path: Path, log: xr.Dataset) -> FileSummary:
     """Summarise a regular log."""
-    return _make_summary(
-        path,
-        signal_name(log),
-        log["axis"].values.tolist(),
-        {name: str(log[name].attrs.get("units", "")) for name in log_channels(log)},
-        log_span(log),
-        log.sizes["time"],
-        log.attrs.get("notes", ()),
-    )
-
-
-def _make_summary(
-    path: Path,
-    signal: str,
-    labels: Sequence[Any],
-    channels: Mapping[str, str],
-    span: Iterable[int],
-    size: int,
-    notes: Iterable[str],
-) -> FileSummary:
-    axes = [
-        ColumnSummary(str(axis), f"gyro_{axis}", "gyro", signal, SIGNAL_UNITS[signal])
-        for axis in labels
+    signal, axes = signal_name(log), [str(axis) for axis in log["axis"].values]
+    columns = [
+        ColumnSummary(axis, f"gyro_{axis}", "gyro", signal, SIGNAL_UNITS[signal]) for axis in axes
     ]
-    channel_columns = [
-        ColumnSummary(name, name, "channel", None, units) for name, units in channels.items()
+    channels = log_channels(log)
+    columns += [
+        ColumnSummary(name, name, "channel", None, str(log[name].attrs.get("units", "")))
+        for name in channels
     ]
-    first, last = (np.datetime64(int(stamp), "ns") for stamp in span)
+    first, last = (np.datetime64(int(stamp), "ns") for stamp in log_span(log))
     return FileSummary(
         path=path,
         format="gyrostab log",
-        columns=(*axes, *channel_columns),
-        axes=tuple(map(str, labels)),
+        columns=tuple(columns),
+        axes=tuple(axes),
         channels=tuple(channels),
         first=first,
         last=last,
-        n_rows=size,
-        notes=tuple(notes),
+        n_rows=log.sizes["time"],
+        notes=tuple(log.attrs.get("notes", ())),
     )
