@@ -180,7 +180,7 @@ def read_own(files: list[Path], workers: int, repeat: int) -> tuple[float, float
     """Every chunk of every file as doubles, by gyrostab."""
     import dask
 
-    from gyrostab.io.datasets import open_log
+    from gyrostab.io.opening import open_log
 
     def work() -> None:
         logs = [open_log(file) for file in files]

@@ -204,7 +204,7 @@ def write_own(path: Path, hours: float, jitter_us: float) -> Path:
     if path.suffix == ".zarr":
         return write_store(path, hours)
     from gyrostab import to_netcdf
-    from gyrostab.io.datasets import open_log
+    from gyrostab.io.opening import open_log
 
     store = write_store(path.with_suffix(".tmp.zarr"), hours)
     to_netcdf(open_log(store), path)

@@ -30,7 +30,7 @@ from page import machine
 from scaling import table
 
 from gyrostab import to_netcdf
-from gyrostab.io.datasets import open_log
+from gyrostab.io.opening import open_log
 from gyrostab.kernels.encoding.counts import from_counts
 from gyrostab.store.lazy import read_into
 from gyrostab.store.private import library_lock

@@ -33,12 +33,12 @@ if TYPE_CHECKING:
     from gyrostab.ingest.grid.regularise import regularise as regularise
     from gyrostab.ingest.make_log import make_log as make_log
     from gyrostab.ingest.scan import scan as scan
-    from gyrostab.io.datasets import open_log as open_log
-    from gyrostab.io.datasets import open_product as open_product
-    from gyrostab.io.datasets import open_surface as open_surface
     from gyrostab.io.datasets import to_netcdf as to_netcdf
     from gyrostab.io.datasets import to_zarr as to_zarr
     from gyrostab.io.kalibr import to_kalibr as to_kalibr
+    from gyrostab.io.opening import open_log as open_log
+    from gyrostab.io.opening import open_product as open_product
+    from gyrostab.io.opening import open_surface as open_surface
     from gyrostab.io.survey_files import to_iscwsa as to_iscwsa
     from gyrostab.io.survey_terms import survey_terms as survey_terms
     from gyrostab.plot import plot_adev as plot_adev
@@ -69,9 +69,9 @@ _HOME = {
     "make_log": "ingest.make_log",
     "make_noise": "simulate",
     "open_diagnosis": "report.diagnosis_folder",
-    "open_log": "io.datasets",
-    "open_product": "io.datasets",
-    "open_surface": "io.datasets",
+    "open_log": "io.opening",
+    "open_product": "io.opening",
+    "open_surface": "io.opening",
     "plot_adev": "plot",
     "plot_coefficients": "plot",
     "plot_correlation": "plot",

@@ -104,7 +104,7 @@ class GyrostabBackend(BackendEntrypoint):
         strict: bool = False,
     ) -> xr.Dataset:
         """Open a NetCDF file or a Zarr directory that holds a log, a surface or a product."""
-        from gyrostab.io.datasets import open_content
+        from gyrostab.io.opening import open_content
 
         opened = open_content(os.fspath(filename_or_obj), strict=strict)
         lazy = opened.assign(

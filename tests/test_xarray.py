@@ -15,7 +15,8 @@ import xarray as xr
 
 import gyrostab
 from gyrostab.errors import FormatError, OptionError, SchemaError
-from gyrostab.io.datasets import open_log, open_product, open_surface, to_netcdf, to_zarr
+from gyrostab.io.datasets import to_netcdf, to_zarr
+from gyrostab.io.opening import open_log, open_product, open_surface
 from gyrostab.store import read
 from gyrostab.store.private import is_in_memory
 from gyrostab.time.grid import TimeGridIndex

@@ -1,9 +1,9 @@
-"""Write logs, surfaces and products to CF NetCDF or Zarr, and open them again.
+"""Write logs, surfaces and products to CF NetCDF or Zarr; `gyrostab.io.opening` opens them.
 
 On disk the dimensions are ``(axis, tau, time)``, every time is an exact integer, every unit string
 is one that UDUNITS reads rightly, only data carries a fill value, and lists stand in the attributes
-as JSON. `open_dataset` turns all of that back (`gyrostab.store.cf` and `.times` hold the rules;
-`gyrostab.store` the chunks of a log). A file takes its final name only once it is complete.
+as JSON (`gyrostab.store.cf` and `.times` hold the rules; `gyrostab.store` the chunks of a log). A
+file takes its final name only once it is complete.
 """
 
 from __future__ import annotations
@@ -12,29 +12,18 @@ import math
 import os
 import warnings
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from gyrostab.errors import (
-    DamageError,
-    FormatError,
-    OptionError,
-    SchemaError,
-    TimeError,
-    reading_of,
-)
+from gyrostab.errors import OptionError
 from gyrostab.ingest.convert import as_log
-from gyrostab.ingest.formats.text import matches as is_text_log
-from gyrostab.ingest.limits import check_declared
-from gyrostab.schema import SIGNAL_UNITS, check_log, check_product, check_surface
-from gyrostab.store.cf import find_kind, from_disk, to_disk
+from gyrostab.schema import SIGNAL_UNITS
+from gyrostab.store.cf import to_disk
 from gyrostab.store.output import find_foreign_item, find_sources, new_output
 from gyrostab.store.private import library_lock
-from gyrostab.store.read import open_stored
 from gyrostab.store.times import GRID, index_dim
 from gyrostab.store.write import (
     NotCountsError,
@@ -103,6 +92,7 @@ def to_netcdf(
     Examples
     --------
     >>> import tempfile
+    >>> from gyrostab.io.opening import open_log
     >>> from gyrostab.time.grid import time_coordinate
     >>> log = xr.Dataset(
     ...     {"rate": (("axis", "time"), np.zeros((1, 4)), {"units": "degree hour-1"})},
@@ -372,189 +362,3 @@ def _plan_chunks(variable: xr.Variable, rate: float | None) -> tuple[int, ...]:
         last if dim == variable.dims[-1] else 1 if dim in ("axis", "term") else size
         for dim, size in variable.sizes.items()
     )
-
-
-def open_dataset(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Dataset:
-    """Open a dataset that `to_netcdf` or `to_zarr` wrote; data stays on disk (dask) until used.
-
-    A dataset that xarray wrote by its own `to_netcdf` or `to_zarr` is opened too.
-
-    Parameters
-    ----------
-    strict : bool
-        What a chunk of a log does that turns out to be damaged or missing: raise `FormatError` as
-        it is read, or become a gap, of which a warning tells the file, the axis and the times.
-
-    Raises
-    ------
-    FormatError
-        When the file does not exist, or when it is damaged.
-
-    Examples
-    --------
-    >>> open_dataset("nothing.nc")
-    Traceback (most recent call last):
-    ...
-    gyrostab.errors.FormatError: nothing.nc: there is no such file
-    """
-    with reading_of(path):
-        return from_disk(open_stored(Path(path), strict=strict, check=check_declared), str(path))
-
-
-def open_product(path: str | os.PathLike[str]) -> xr.Dataset:
-    """Open a product: a dynamic Allan variance with the coefficients of every window.
-
-    Parameters
-    ----------
-    path : path-like
-        NetCDF file or Zarr directory that ``gyrostab run``, ``gyrostab fit``, `to_netcdf` or
-        `to_zarr` wrote.
-
-    Returns
-    -------
-    xarray.Dataset
-        ``avar(axis, time, tau)`` [degree2 hour-2], ``Q, N, B, K, R (axis, time)`` with errors and
-        limits, and the rest of ``docs/product.md``; data stays on disk (dask) until it is used.
-
-    Raises
-    ------
-    FormatError
-        When the file does not exist, when it is damaged, or when it holds something else.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from gyrostab.allan.davar import davar
-    >>> from gyrostab.allan.fit import fit_noise
-    >>> from gyrostab.ingest.make_log import make_log
-    >>> log = make_log(np.random.default_rng(1).standard_normal(6000), rate=100.0, unit="deg/h")
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     _ = to_netcdf(fit_noise(davar(log, window="60s")), folder + "/product.nc")
-    ...     with open_product(folder + "/product.nc") as product:
-    ...         print(product.N.dims, product.N.unit_label)
-    ('axis', 'time') deg/sqrt(h)
-    """
-    return _open_path(
-        path, "a product", check_product, "make one with 'gyrostab run' or 'gyrostab fit'"
-    )
-
-
-def open_surface(path: str | os.PathLike[str]) -> xr.Dataset:
-    """Open a dynamic Allan variance without coefficients, or a product, which holds one.
-
-    Parameters
-    ----------
-    path : path-like
-        NetCDF file or Zarr directory that ``gyrostab davar``, `to_netcdf` or `to_zarr` wrote, or a
-        product.
-
-    Returns
-    -------
-    xarray.Dataset
-        ``avar(axis, time, tau)`` [degree2 hour-2] with ``count``, ``coverage`` and ``edf``; data
-        stays on disk (dask) until it is used.
-
-    Raises
-    ------
-    FormatError
-        When the file does not exist, when it is damaged, or when it holds something else.
-    """
-    return _open_path(path, "a DAVAR surface", check_surface, "make one with 'gyrostab davar'")
-
-
-def open_log(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Dataset:
-    """Open a regular log.
-
-    Parameters
-    ----------
-    path : path-like
-        NetCDF file or Zarr directory that ``gyrostab ingest``, ``gyrostab simulate``, `to_netcdf`
-        or `to_zarr` wrote.
-    strict : bool
-        Raise `FormatError` where a chunk that is read turns out to be damaged or missing; by
-        default it becomes a gap, of which a warning tells the file, the axis and the times.
-
-    Returns
-    -------
-    xarray.Dataset
-        ``rate(axis, time)`` [degree hour-1] or ``angle`` [degree], NaN where a sample is missing,
-        with the channels and the table of gaps; data stays on disk (dask, the chunks of the file)
-        until it is used.
-
-    Raises
-    ------
-    FormatError
-        When the file does not exist, when it is damaged, or when it holds something else.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from gyrostab.ingest.make_log import make_log
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     log = make_log([[1.0, np.nan, 2.0]], rate=100.0, unit="deg/h")
-    ...     _ = to_netcdf(log, folder + "/log.nc")
-    ...     with open_log(folder + "/log.nc") as log:
-    ...         print(log.rate.values)
-    [[ 1. nan  2.]]
-    """
-    log = _open_path(
-        path,
-        "a regular log",
-        partial(check_log, rate=False),
-        "make one with 'gyrostab ingest'",
-        strict=strict,
-    )
-    return _restore_log(log, path)
-
-
-def open_content(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Dataset:
-    """Open a log, a surface or a product, whichever the file holds, as the functions above do.
-
-    Raises
-    ------
-    FormatError
-        When the file does not exist, when it is damaged, or when it holds something else.
-    SchemaError, TimeError
-        When it holds a log of other units, or one whose time is not uniform.
-    """
-    dataset = open_dataset(path, strict=strict)
-    if any(name in dataset.data_vars for name in SIGNAL_UNITS):
-        return _restore_log(dataset, path)
-    if "gyrostab_content" not in dataset.attrs and find_kind(dataset) == "dataset":
-        dataset.close()
-        raise FormatError(
-            f"{path}: holds no log, surface or product of gyrostab; gyrostab.read_log reads logs "
-            "of other programs"
-        )
-    return dataset
-
-
-def _restore_log(log: xr.Dataset, path: str | os.PathLike[str]) -> xr.Dataset:
-    try:
-        return as_log(log)
-    except (SchemaError, TimeError) as error:
-        log.close()
-        raise type(error)(f"{path}: {error}") from error
-
-
-def _open_path(
-    path: str | os.PathLike[str], content: str, check: Any, advice: str, *, strict: bool = False
-) -> xr.Dataset:
-    try:
-        dataset = open_dataset(path, strict=strict)
-    except DamageError as error:
-        if not is_text_log(Path(path)):
-            raise
-        raise FormatError(
-            f"{path}: is a text file, not {content}; if it is a log, {advice}"
-        ) from error
-    try:
-        with reading_of(path):
-            check(dataset)
-    except SchemaError as error:
-        kind = find_kind(dataset)
-        dataset.close()
-        if kind != "dataset":
-            raise FormatError(f"{path}: holds a {kind}, not {content}; {advice}") from error
-        raise FormatError(f"{path}: does not hold {content} ({error}); {advice}") from error
-    return dataset

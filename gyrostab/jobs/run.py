@@ -338,7 +338,7 @@ def _add_resume_advice(job: _Job, message: str) -> str:
 
 def _is_own_log(path: Path) -> bool:
     """Whether gyrostab wrote a log, so that every worker can open it."""
-    from gyrostab.io.datasets import open_log
+    from gyrostab.io.opening import open_log
 
     try:
         open_log(path).close()

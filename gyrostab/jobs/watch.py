@@ -26,8 +26,8 @@ from gyrostab.allan.plan import last_sample, make_plan, units_of_work
 from gyrostab.errors import FormatError, GyrostabError, OptionError, OutputError, TimeError
 from gyrostab.ingest.concat.lazy import GridSource
 from gyrostab.ingest.uniform import cut_log
-from gyrostab.io.datasets import open_product
 from gyrostab.io.growing import LayoutError, write_windows
+from gyrostab.io.opening import open_product
 from gyrostab.jobs.alarms import Alarm, check_alarms, describe_windows
 from gyrostab.jobs.checks import check_options
 from gyrostab.jobs.engine import compute_part, find_record_bands

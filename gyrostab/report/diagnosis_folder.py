@@ -12,7 +12,8 @@ import xarray as xr
 from gyrostab.diagnose.result.content import check_diagnosis
 from gyrostab.diagnose.result.diagnosis import Diagnosis, model_text
 from gyrostab.errors import FormatError, SchemaError
-from gyrostab.io.datasets import open_dataset, to_netcdf
+from gyrostab.io.datasets import to_netcdf
+from gyrostab.io.opening import open_dataset
 from gyrostab.report import write_diagnosis_report
 from gyrostab.store.output import new_output
 from gyrostab.store.output.content import read_json

@@ -15,7 +15,8 @@ import xarray as xr
 
 from gyrostab.errors import OutputError
 from gyrostab.ingest.columns.pieces import Buffers
-from gyrostab.io.datasets import open_log, open_product, to_netcdf
+from gyrostab.io.datasets import to_netcdf
+from gyrostab.io.opening import open_log, open_product
 from gyrostab.jobs.run import load_log
 from tests.support.command_line import RATE, WINDOW, call, stopped, write_log
 

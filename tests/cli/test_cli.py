@@ -22,7 +22,8 @@ import xarray as xr
 from gyrostab.__main__ import main as start
 from gyrostab.cli import app
 from gyrostab.ingest.make_log import make_log
-from gyrostab.io.datasets import open_log, open_product, open_surface, to_netcdf
+from gyrostab.io.datasets import to_netcdf
+from gyrostab.io.opening import open_log, open_product, open_surface
 from gyrostab.progress import show_progress
 from tests.support.command_line import N_TRUE, WINDOW, call, stopped, write_log
 

@@ -17,7 +17,8 @@ from gyrostab.ingest import read_log
 from gyrostab.ingest.columns.headers import split_header
 from gyrostab.ingest.files import scan_file
 from gyrostab.ingest.grid.regularise import regularise
-from gyrostab.io.datasets import open_log, to_netcdf
+from gyrostab.io.datasets import to_netcdf
+from gyrostab.io.opening import open_log
 
 
 def write(folder: Path, text: str, name: str = "log.csv") -> Path:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gyrostab.ingest.guess import guess_columns
 from gyrostab.ingest.guess_unit import EARTH_RATE_DPH, rate_plausibility
 from gyrostab.ingest.inspect import inspect_file
-from gyrostab.io.datasets import open_product
+from gyrostab.io.opening import open_product
 from tests.support.command_line import call
 
 RATE = 100.0

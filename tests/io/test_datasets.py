@@ -23,14 +23,8 @@ from hypothesis import strategies as st
 from gyrostab.errors import FormatError, OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.io import datasets as export
-from gyrostab.io.datasets import (
-    open_dataset,
-    open_log,
-    open_product,
-    open_surface,
-    to_netcdf,
-    to_zarr,
-)
+from gyrostab.io.datasets import to_netcdf, to_zarr
+from gyrostab.io.opening import open_dataset, open_log, open_product, open_surface
 from gyrostab.noise import LAWS, TERMS, model_avar
 from gyrostab.schema import VARIABLES, attributes
 from gyrostab.store import read, write

@@ -13,7 +13,8 @@ import xarray as xr
 
 import gyrostab
 from gyrostab.ingest.convert import as_log
-from gyrostab.io.datasets import MAX_STAMPED_SAMPLES, open_log, to_netcdf, to_zarr
+from gyrostab.io.datasets import MAX_STAMPED_SAMPLES, to_netcdf, to_zarr
+from gyrostab.io.opening import open_log
 from gyrostab.time.grid import TimeGridIndex
 from tests.support import synthetic
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from gyrostab.cli import main
-from gyrostab.io.datasets import open_product
+from gyrostab.io.opening import open_product
 from gyrostab.jobs.demo import FILES, sample_log
 from gyrostab.schema import OBSERVED
 

@@ -21,7 +21,7 @@ from gyrostab import make_log, to_netcdf, to_zarr
 from gyrostab.allan.davar import davar_parts
 from gyrostab.cli import main
 from gyrostab.errors import OptionError, WorkerError
-from gyrostab.io.datasets import open_log
+from gyrostab.io.opening import open_log
 from gyrostab.jobs import checkpoint, engine, fleet, schedule
 from gyrostab.jobs.fleet import process_run
 from gyrostab.jobs.fleet_table import read_table

@@ -18,7 +18,7 @@ import xarray as xr
 from gyrostab import davar, fit_noise, make_log, open_product, to_netcdf
 from gyrostab.allan.davar import davar_part, davar_parts
 from gyrostab.cli import main
-from gyrostab.io.datasets import open_log
+from gyrostab.io.opening import open_log
 from gyrostab.jobs import checkpoint, engine
 from gyrostab.jobs.job import job_folder, lock_job
 from gyrostab.time.grid import time_coordinate

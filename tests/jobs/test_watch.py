@@ -20,7 +20,8 @@ import pytest
 from gyrostab.cli import main
 from gyrostab.errors import FormatError, OptionError, OutputError
 from gyrostab.ingest.make_log import make_log
-from gyrostab.io.datasets import open_product, to_netcdf, to_zarr
+from gyrostab.io.datasets import to_netcdf, to_zarr
+from gyrostab.io.opening import open_product
 from gyrostab.jobs import follow as follow_module
 from gyrostab.jobs import watch as module
 from gyrostab.jobs.alarms import check_alarms, parse_alarm

@@ -11,7 +11,8 @@ import pytest
 
 from gyrostab.allan.fit import fit_noise
 from gyrostab.errors import OutputError, SchemaError
-from gyrostab.io.datasets import open_log, open_product, to_netcdf
+from gyrostab.io.datasets import to_netcdf
+from gyrostab.io.opening import open_log, open_product
 from gyrostab.report import write_report
 from tests.support import synthetic
 

@@ -15,7 +15,7 @@ from gyrostab.cli import main
 from gyrostab.errors import OptionError
 from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.make_log import make_log
-from gyrostab.io.datasets import open_log
+from gyrostab.io.opening import open_log
 from gyrostab.jobs.run import load_log
 from gyrostab.simulate import drivers, simulate
 from gyrostab.time.grid import time_coordinate

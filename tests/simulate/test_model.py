@@ -9,7 +9,7 @@ import pytest
 
 from gyrostab.errors import FormatError, OptionError, SchemaError, TimeError
 from gyrostab.ingest.grid.gaps import gap_table
-from gyrostab.io.datasets import open_log
+from gyrostab.io.opening import open_log
 from gyrostab.schema import check_log
 from gyrostab.simulate import read_model, simulate
 from gyrostab.simulate.model import PROFILES

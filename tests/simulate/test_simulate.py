@@ -20,7 +20,8 @@ from gyrostab.allan.davar import davar
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.make_log import make_log
-from gyrostab.io.datasets import open_log, to_netcdf
+from gyrostab.io.datasets import to_netcdf
+from gyrostab.io.opening import open_log
 from gyrostab.physics.registry import effects
 from gyrostab.schema import check_log
 from gyrostab.simulate import drivers, lazy, read_model, simulate

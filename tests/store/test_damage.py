@@ -17,7 +17,8 @@ import gyrostab
 import gyrostab.store.layout as layout_module
 import gyrostab.store.read as read_module
 from gyrostab.errors import DamageError, FormatError
-from gyrostab.io.datasets import open_log, open_product, to_netcdf, to_zarr
+from gyrostab.io.datasets import to_netcdf, to_zarr
+from gyrostab.io.opening import open_log, open_product
 from gyrostab.store.layout import ChunkCache
 from gyrostab.store.lazy import read_into
 from gyrostab.time.grid import time_coordinate

@@ -17,7 +17,7 @@ from gyrostab.ingest.concat import concatenate_logs
 from gyrostab.ingest.concat.lazy import place_on_grid
 from gyrostab.ingest.grid import fill
 from gyrostab.ingest.grid.place import Placement
-from gyrostab.io.datasets import open_log
+from gyrostab.io.opening import open_log
 from gyrostab.jobs import checkpoint
 from gyrostab.jobs.run import load_log, run
 from gyrostab.store import write

@@ -12,7 +12,8 @@ import xarray as xr
 from gyrostab import make_log
 from gyrostab.cli import main
 from gyrostab.errors import FormatError, OptionError, OutputError
-from gyrostab.io.datasets import open_log, open_product, to_netcdf, to_zarr
+from gyrostab.io.datasets import to_netcdf, to_zarr
+from gyrostab.io.opening import open_log, open_product
 from gyrostab.jobs.run import load_log, run
 from gyrostab.store.lazy import find_source
 from gyrostab.store.remote import find_url, upload

@@ -13,7 +13,8 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.io.datasets import open_log, to_netcdf
+from gyrostab.io.datasets import to_netcdf
+from gyrostab.io.opening import open_log
 from tests.support.stored import WRITERS, same_bits, stored_kinds
 
 

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from gyrostab.errors import OptionError, SchemaError, TimeError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.io import datasets
-from gyrostab.io.datasets import open_log, to_netcdf, to_zarr
+from gyrostab.io.datasets import to_netcdf, to_zarr
+from gyrostab.io.opening import open_log
 from gyrostab.kernels.encoding.counts import from_counts, to_counts
 from gyrostab.time.grid import TimeGridIndex, grid_times
 from tests.support import synthetic

@@ -34,7 +34,7 @@ def report(
     log
         Log from which the product was computed; adds a figure of the signal.
     """
-    from gyrostab.io.datasets import open_log, open_product
+    from gyrostab.io.opening import open_log, open_product
     from gyrostab.report import write_diagnosis_report, write_report
     from gyrostab.report.diagnosis_folder import open_diagnosis
     from gyrostab.store.output import check_output
@@ -92,7 +92,8 @@ def correlate(
     from gyrostab.correlate import correlate as compute
     from gyrostab.correlate import format_correlation, join
     from gyrostab.ingest.reading import read_channel
-    from gyrostab.io.datasets import open_product, to_netcdf
+    from gyrostab.io.datasets import to_netcdf
+    from gyrostab.io.opening import open_product
     from gyrostab.plot.correlation import plot_correlation
     from gyrostab.plot.style import save_png
     from gyrostab.store.output import check_output, new_output
@@ -146,7 +147,7 @@ def plot(
     width
         Width of the figures in millimetres: 180 for a page, 85 for a column.
     """
-    from gyrostab.io.datasets import open_product
+    from gyrostab.io.opening import open_product
     from gyrostab.plot.figures import save_figures
 
     with show_stages(common) as stage:
@@ -184,8 +185,9 @@ def export(
     log
         Log of the product, for kalibr: adds the noise of the channels accel_x, accel_y and accel_z.
     """
-    from gyrostab.io.datasets import open_log, open_product, to_zarr
+    from gyrostab.io.datasets import to_zarr
     from gyrostab.io.kalibr import to_kalibr
+    from gyrostab.io.opening import open_log, open_product
     from gyrostab.io.survey_files import SUFFIXES, to_iscwsa
     from gyrostab.jobs.fleet_table import open_fleet
     from gyrostab.store.output import check_output

@@ -130,7 +130,8 @@ def fit(
         NetCDF file or Zarr store (.zarr) to write.
     """
     from gyrostab.allan.fit import fit_noise
-    from gyrostab.io.datasets import open_surface, to_netcdf, to_zarr
+    from gyrostab.io.datasets import to_netcdf, to_zarr
+    from gyrostab.io.opening import open_surface
     from gyrostab.store.output import check_output
 
     target = check_output(output, suffixes=[".nc", ".zarr"], overwrite=common.overwrite)
@@ -158,7 +159,7 @@ def _print_product(target: Path) -> None:
     from shlex import quote
 
     from gyrostab.allan.summary import format_product
-    from gyrostab.io.datasets import open_product
+    from gyrostab.io.opening import open_product
     from gyrostab.store.remote import find_url
 
     with open_product(target) as product:

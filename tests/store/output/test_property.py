@@ -17,7 +17,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from gyrostab.io.datasets import open_dataset
+from gyrostab.io.opening import open_dataset
 from gyrostab.store import system
 from gyrostab.store.output import is_leftover
 from tests.support.command_line import call

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from gyrostab.errors import OutputError
-from gyrostab.io.datasets import open_surface, to_netcdf, to_zarr
+from gyrostab.io.datasets import to_netcdf, to_zarr
+from gyrostab.io.opening import open_surface
 from gyrostab.store.output import find_foreign_item, new_output
 from tests.support import synthetic
 
