@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from gyrostab.allan.confidence import interval_limits
 from gyrostab.allan.variance import surface_columns, variance_name
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+#: Term -> variable with its response to gaps.
+_RESPONSES = {"N": "white_response", "Q": "quantization_response", "R": "ramp_response"}
 _DASHES = ("--", "-.", ":", (0, (6, 2, 1, 2, 1, 2)), (0, (8, 3)))
 
 
@@ -90,10 +93,9 @@ def plot_adev(
         label=f"axis {name}, measured",
     )
     if "observable" in window:
-        from gyrostab.allan.fit import refit
-
-        estimates = refit(windows).isel(axis=0, time=0)
-        _draw_terms(panel, window, estimates, [shade for shade in COLOURS if shade != colour])
+        terms, total = fitted_curves(windows)
+        shades = [shade for shade in COLOURS if shade != colour]
+        _draw_terms(panel, window, terms[0, 0], total[0, 0], shades)
     shown = deviation[np.isfinite(deviation) & (deviation > 0)]
     panel.set_xlim(tau.min() / 1.3, tau.max() * 1.3)
     if not shown.size:
@@ -148,27 +150,52 @@ def _select_window(part: xr.Dataset, when: Any) -> int:
     return int(np.argmin(np.abs(time - stamp)))
 
 
-def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours: list[str]) -> None:
-    """Draw the fitted curve in black and observed terms dashed; list limits in the legend."""
-    from gyrostab.allan.band_limit import limit_response
+def fitted_curves(product: xr.Dataset) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Compute the Allan variance of the fitted terms [degree2 hour-2].
 
+    Returns
+    -------
+    terms : ndarray (axis, time, term, tau)
+        Each term, with its response to gaps.
+    total : ndarray (axis, time, tau)
+        Their sum as the filter of the sensor leaves it; NaN where nothing is fitted.
+    """
+    from gyrostab.allan.band_limit import limit_response
+    from gyrostab.allan.fit import refit
+
+    estimates, names = refit(product), list(LAWS)
+    squares = np.stack([estimates[name].values ** 2 for name in names], axis=-1)
+    terms = surface_columns(product).T * np.nan_to_num(squares)[..., None]
+    for name, response in _RESPONSES.items():
+        if response in product:
+            values = product[response].values
+            terms[:, :, names.index(name)] *= np.where(np.isfinite(values), values, 1.0)
+    left = terms.copy()
+    left[:, :, names.index("N")] *= np.atleast_2d(limit_response(product, product["tau"].values))[
+        :, None
+    ]
+    is_fitted = np.isfinite(squares).any(axis=-1)[..., None]
+    return terms, np.where(is_fitted, left.sum(axis=2), np.nan)
+
+
+def _draw_terms(
+    panel: Axes,
+    window: xr.Dataset,
+    terms: NDArray[np.float64],
+    total: NDArray[np.float64],
+    colours: list[str],
+) -> None:
+    """Draw the fitted curve in black and observed terms dashed; list limits in the legend."""
     tau = window["tau"].values
-    total = np.zeros(tau.size)
-    responses = {"N": "white_response", "Q": "quantization_response", "R": "ramp_response"}
-    columns = surface_columns(window)
     for number, (symbol, law) in enumerate(LAWS.items()):
         state = int(window["observable"].sel(term=symbol))
         value, error, upper = (float(window[f"{symbol}{end}"]) for end in ("", "_stderr", "_upper"))
-        term = columns[:, number] * np.nan_to_num(float(estimates[symbol])) ** 2
-        response = window[responses[symbol]].values if responses.get(symbol) in window else 1.0
-        term = term * np.where(np.isfinite(response), response, 1.0)
-        total += term * (limit_response(window, tau) if symbol == "N" else 1.0)
         if state == OBSERVED:
             spread = f" ± {error:.1g}" if np.isfinite(error) else ""
             label = f"{symbol} = {value:.3g}{spread} {unit_symbol(law.label)} ({law.name})"
             panel.plot(
                 tau,
-                np.sqrt(term),
+                np.sqrt(terms[number]),
                 linestyle=_DASHES[number],
                 color=colours[number],
                 linewidth=1.3,

@@ -11,8 +11,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.allan.confidence import interval_limits
-from gyrostab.allan.variance import surface_columns, variance_name
+from gyrostab.allan.variance import variance_name
 from gyrostab.noise import LAWS
+from gyrostab.plot.adev import fitted_curves
 from gyrostab.plot.coefficients import find_shown_values
 from gyrostab.plot.style import axis_names, axis_style, unit_label, unit_of_time, unit_symbol
 from gyrostab.report.charts import (
@@ -88,7 +89,7 @@ def window_data(product: xr.Dataset) -> str:
         "measured": part["avar"].values,
         "low": low,
         "high": high,
-        "fitted": _fitted_avar(part),
+        "fitted": fitted_curves(part)[1],
     }
     names = axis_names(part)
     content = {
@@ -131,27 +132,11 @@ def _describe_thinning(product: xr.Dataset, part: xr.Dataset) -> str:
     return f" One window in {every:.3g} is drawn." if every > 1 else ""
 
 
-def _fitted_avar(part: xr.Dataset) -> NDArray[np.float64]:
-    """Return the Allan variance of the fitted terms (axis, time, tau) [degree2 hour-2]."""
-    from gyrostab.allan.band_limit import limit_response
-    from gyrostab.allan.fit import refit
-
-    estimates = refit(part)
-    squares = np.stack([estimates[symbol].values ** 2 for symbol in LAWS], axis=-1)
-    unit = surface_columns(part).T
-    fitted = np.isfinite(squares).any(axis=-1, keepdims=True)
-    white = list(LAWS).index("N")
-    filtered = (limit_response(part, part["tau"].values) - 1.0) * unit[white]
-    curve = np.nan_to_num(squares)
-    curve = curve @ unit + curve[..., white, None] * np.atleast_2d(filtered)[:, None]
-    return np.where(fitted, curve, np.nan)
-
-
 def _draw_record(product: xr.Dataset) -> go.Figure:
     """Draw the Allan deviation of each axis over all windows, with the terms fitted to it."""
     record = _average_windows(product)
     measured, fitted = (
-        np.sqrt(part[:, 0]) for part in (record["avar"].values, _fitted_avar(record))
+        np.sqrt(part[:, 0]) for part in (record["avar"].values, fitted_curves(record)[1])
     )
     figure = new_chart(
         xaxis=log_axis(TAU_LABEL, record["tau"].values),

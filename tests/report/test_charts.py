@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 from gyrostab import davar, fit_noise, make_log
+from gyrostab.allan.fit import refit
 from gyrostab.jobs.archive import LogRun
 from gyrostab.jobs.fleet_table import list_effects, make_table, summarise_run
-from gyrostab.noise import model_avar
+from gyrostab.noise import LAWS, model_avar
 from gyrostab.plot.style import COLOURS
 from gyrostab.report import write_diagnosis_report, write_report
 from gyrostab.report.diagnosis_charts import diagnosis_charts
@@ -39,6 +40,19 @@ def _decode_numbers(packed):
         return np.array(packed, dtype=float)
     values = np.frombuffer(base64.b64decode(packed["bdata"]), dtype=packed["dtype"])
     return values.reshape([int(n) for n in str(packed.get("shape", values.size)).split(",")])
+
+
+def test_the_fitted_curve_of_a_window_is_seen_through_its_gaps():
+    draw = np.random.default_rng(1)
+    values = np.where(draw.random(6000) < 0.4, np.nan, draw.standard_normal(6000))
+    surface = davar(make_log(values, rate=10.0, unit="deg/h"), window="5min")
+    product = fit_noise(surface, terms="N")
+    text = json.loads(window_data(product))["values"][0]["fitted"]
+    response = product.white_response.values
+    assert np.nanmax(np.abs(response - 1.0)) > 0.05
+    white = LAWS["N"].avar(product.tau.values, refit(product).N.values[..., None])
+    curve = np.frombuffer(base64.b64decode(text), dtype="<f4").reshape(response.shape[1:])
+    np.testing.assert_allclose(curve, np.sqrt(white * response)[0], rtol=1e-5)
 
 
 def test_windows_of_every_axis_are_in_the_page():
