@@ -23,7 +23,7 @@ from gyrostab.ingest.options import ReadOptions
 from gyrostab.jobs.schedule import Pool, run_calls
 from gyrostab.progress import Stage
 from gyrostab.store.output import describe_file, read_json
-from gyrostab.store.output.content import is_store
+from gyrostab.store.output.content import METADATA, is_store
 from gyrostab.store.remote import (
     find_store,
     find_url,
@@ -103,11 +103,11 @@ def find_archive(paths: Sequence[str | Path]) -> Archive:
         for path in map(Path, matching):
             inside: Iterable[tuple[str, Path]] = ()
             if url:
-                inside = _walk_address(find_url(path) or url)
+                inside = _walk(path, visited) if is_folder(url) else [("file", path)]
             elif not path.exists():
                 raise FormatError(f"{path}: there is no such file or folder")
             elif path.is_dir() and not (is_store(path) or is_fleet(path)):
-                inside = _walk_folder(path, visited)
+                inside = _walk(path, visited)
             elif not (is_pattern and _is_inside_output(path)):
                 inside = [("file", path)]
             for kind, item_inside in inside:
@@ -133,46 +133,32 @@ def _find_base(item: str, *, is_pattern: bool, is_only_path: bool) -> Path:
     return path if is_only_path and is_archive else path.parent
 
 
-def _walk_address(url: str) -> Iterator[tuple[str, Path]]:
-    """Yield the files, Zarr stores and diagnoses at an address and below, without fleets."""
-    if not is_folder(url):
-        yield "file", Path(url)
-        return
-    for place, folders, names, is_zarr in walk_address(url):
-        is_fleet_folder, is_diagnosis = FLEET_MARK in names, "diagnosis.json" in names
-        is_output = is_fleet_folder or is_diagnosis
-        if is_diagnosis and not is_fleet_folder and _is_diagnosis(Path(place)):
-            yield DIAGNOSIS, Path(place)
-        if is_zarr and not is_output:
-            yield "file", Path(place)
-        for name in list(folders):
-            if is_zarr or is_output or name.startswith("."):
-                del folders[name]
-        if not (is_zarr or is_output):
-            yield from (
-                ("file", Path(f"{place}/{name}")) for name in names if not name.startswith(".")
-            )
-
-
-def _walk_folder(folder: Path, visited: set[str]) -> Iterator[tuple[str, Path]]:
-    """Yield the files, stores and diagnoses below a folder, each folder once."""
-    for place, folders, names in os.walk(folder):
-        if place in visited:
-            folders.clear()
-            continue
+def _walk(folder: Path, visited: set[str]) -> Iterator[tuple[str, Path]]:
+    """Yield the files, stores and diagnoses in a folder or at an address, each folder once."""
+    url = find_url(folder)
+    for place, folders, names in walk_address(url) if url else os.walk(folder):
+        here = Path(place)
+        kind = "visited" if place in visited else _find_kind(here, set(names))
         visited.add(place)
-        if "diagnosis.json" in names and _is_diagnosis(Path(place)):
-            folders.clear()
-            yield DIAGNOSIS, Path(place)
-            continue
-        for name in sorted(folders):
-            path = Path(place, name)
-            if name.startswith(".") or is_store(path) or is_fleet(path):
+        if kind in ("file", DIAGNOSIS):
+            yield kind, here
+        elif not kind:
+            yield from (("file", Path(here, name)) for name in names if not name.startswith("."))
+        for name in list(folders):
+            path = Path(here, name)
+            if kind or name.startswith("."):
                 folders.remove(name)
-                if is_store(path) and not (name.startswith(".") or is_fleet(path)):
-                    yield "file", path
-        folders.sort()
-        yield from (("file", Path(place, name)) for name in names if not name.startswith("."))
+            elif path.is_symlink() and _find_kind(path, set(os.listdir(path))) == "file":
+                yield "file", path  # os.walk does not follow links
+
+
+def _find_kind(folder: Path, names: set[str]) -> str:
+    """Find what a folder with files of these names is as a whole; empty for an ordinary one."""
+    if FLEET_MARK in names and is_fleet(folder):
+        return FLEET_MARK
+    if "diagnosis.json" in names and _is_diagnosis(folder):
+        return DIAGNOSIS
+    return "file" if names & METADATA and (find_url(folder) or is_store(folder)) else ""
 
 
 def _is_diagnosis(folder: Path) -> bool:

@@ -192,20 +192,12 @@ def is_folder(url: str) -> bool:
         return bool(filesystem.isdir(path))
 
 
-def walk_address(url: str) -> Iterator[tuple[str, dict[str, Any], list[str], bool]]:
-    """Walk the folders at an address, as `os.walk` does.
-
-    Yields
-    ------
-    tuple
-        Address of the folder, folders in it (those removed are not visited), names of files, and
-        whether the folder is a Zarr store.
-    """
+def walk_address(url: str) -> Iterator[tuple[str, list[str], list[str]]]:
+    """Walk the folders at an address, as `os.walk` does."""
     with _open_filesystem(url) as (filesystem, path):
         filesystem.invalidate_cache()
-        for place, folders, files in filesystem.walk(path, detail=True):
-            is_store = any(name in files for name in ROOT_METADATA)
-            yield filesystem.unstrip_protocol(place), folders, sorted(files), is_store
+        for place, folders, files in filesystem.walk(path):
+            yield filesystem.unstrip_protocol(place), folders, files
 
 
 def describe_address(url: str) -> dict[str, Any]:
