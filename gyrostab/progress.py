@@ -30,7 +30,7 @@ class Stage(Protocol):
         total : int
             Amount of work: samples over all axes, files, ...; 0 when unknown.
         done : int, optional
-            Amount that is done. Without it, the stage follows the finished tasks of dask.
+            Amount that is done.
         """
 
 
@@ -103,9 +103,14 @@ def watch_compiler(show: Callable[[bool], None]) -> Iterator[Callable[[], None]]
                 event.unregister(kind, installed[0])
 
 
-def _format_speed(amount: float, seconds: float, unit: str) -> str:
-    """Format the throughput of samples; empty for other units."""
-    return f"{amount / seconds / 1e6:.2f} Msamples/s" if unit == "samples" and seconds > 0 else ""
+def follow_share(stage: Stage, label: str, total: int) -> Callable[[float], None]:
+    """Begin a stage of so many samples; return a function that reports the share that is done."""
+    stage(label, total)
+    return lambda share: stage(label, total, round(share * total))
+
+
+def _format_speed(samples: float, seconds: float) -> str:
+    return f"{samples / seconds / 1e6:.2f} Msamples/s" if seconds > 0 else ""
 
 
 @contextmanager
@@ -130,7 +135,7 @@ def _show_lines() -> Iterator[Stage]:
                 print(f"{label} ...", file=sys.stderr, flush=True)
             if amount:
                 seconds = max(now - since, 1e-9)
-                speed = _format_speed(amount, seconds, "samples")
+                speed = _format_speed(amount, seconds)
                 worked = f" ({current}: {amount:,} samples in {seconds:.1f} s, {speed})"
             since, printed, current, first, amount = now, now, label, done or 0, 0
         if done is not None and first < done and now - printed > _LINE_INTERVAL_S:
@@ -149,7 +154,6 @@ def _show_lines() -> Iterator[Stage]:
 @contextmanager
 def _show_bar() -> Iterator[Stage]:
     """Show one bar per stage, with throughput and the time left."""
-    from dask.callbacks import Callback
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -167,59 +171,32 @@ def _show_bar() -> Iterator[Stage]:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
+    current, begun = "", 0.0
+    first: int | None = None
+    task: TaskID | None = None
+
+    def finish() -> None:
+        if task is not None:
+            progress.update(task, total=1.0, completed=1.0)
+
+    def announce(begins: bool) -> None:
+        progress.update(task or TaskID(0), speed=_COMPILING if begins else "")
+
+    def stage(label: str, total: int = 0, done: int | None = None, unit: str = "samples") -> None:
+        nonlocal current, begun, first, task
+        watch()
+        if label != current:
+            finish()
+            task = progress.add_task(f"{label:<10}", total=None, speed="") if label else None
+            current, begun, first = label, time.perf_counter(), done
+        if done is not None and total and task is not None:
+            first = done if first is None else first
+            speed = f"{unit[:-1]} {done} of {total}"
+            if unit == "samples":
+                speed = _format_speed(done - first, time.perf_counter() - begun)
+            progress.update(task, total=1.0, completed=done / total, speed=speed)
+
     with Progress(*columns, console=Console(stderr=True)) as progress:
-        now: dict[str, Any] = {
-            "label": "",
-            "task": None,
-            "total": 0,
-            "first": None,
-            "begun": 0.0,
-            "tasks": 0,
-            "ended": 0,
-        }
-
-        def finish() -> None:
-            if now["task"] is not None:
-                progress.update(now["task"], total=1.0, completed=1.0)
-
-        def show(share: float, amount: float, unit: str) -> None:
-            speed = _format_speed(amount, time.perf_counter() - now["begun"], unit)
-            progress.update(now["task"], total=1.0, completed=share, speed=speed)
-
-        def announce(begins: bool) -> None:
-            progress.update(now["task"] or TaskID(0), speed=_COMPILING if begins else "")
-
-        def stage(
-            label: str, total: int = 0, done: int | None = None, unit: str = "samples"
-        ) -> None:
-            watch()
-            if label != now["label"]:
-                finish()
-                task = progress.add_task(f"{label:<10}", total=None, speed="") if label else None
-                now.update(
-                    label=label,
-                    task=task,
-                    total=total,
-                    first=done,
-                    begun=time.perf_counter(),
-                    tasks=0,
-                    ended=0,
-                )
-            if done is not None and total:
-                now["first"] = done if now["first"] is None else now["first"]
-                show(done / total, done - now["first"], unit)
-                if unit != "samples":
-                    progress.update(now["task"], speed=f"{unit[:-1]} {done} of {total}")
-
-        def start(graph: Any, state: dict[str, Any]) -> None:
-            now["tasks"] += len(state["waiting"]) + len(state["ready"])
-
-        def after(key: Any, result: Any, graph: Any, state: Any, worker: Any) -> None:
-            now["ended"] += 1
-            if now["task"] is not None and now["tasks"] and now["first"] is None:
-                share = min(now["ended"] / now["tasks"], 1.0)
-                show(share, share * now["total"], "samples")
-
-        with Callback(start_state=start, posttask=after), watch_compiler(announce) as watch:
+        with watch_compiler(announce) as watch:
             yield stage
         finish()

@@ -145,12 +145,6 @@ def _encode_dataset(dataset: Any, verb: str, stamps: bool | None) -> tuple[xr.Da
 
 def _begin_netcdf(dataset: xr.Dataset, path: Path, encoding: dict[Any, dict[str, Any]]) -> None:
     """Write all but the long variables; `Dataset.to_netcdf` would load dask.distributed."""
-    if any(
-        variable.chunks is not None and variable.size >= CHUNK_VALUES
-        for variable in dataset.variables.values()
-    ):
-        dataset.to_netcdf(path, engine="netcdf4", format="NETCDF4", encoding=encoding)
-        return
     open_store: Any = xr.backends.NetCDF4DataStore.open
     store = open_store(path, mode="w", format="NETCDF4", lock=library_lock())
     try:
@@ -255,27 +249,16 @@ def to_zarr(
     stored, sources = _encode_dataset(dataset, "to_zarr", stamps)
 
     def write(packed: xr.Dataset) -> None:
-        large = large_variables(packed) if _find_rate(packed) is not None else {}
-        encoding = plan_zarr(packed)
+        large, encoding = large_variables(packed), plan_zarr(packed)
         short_encoding = {name: options for name, options in encoding.items() if name not in large}
-        lazy = {
-            name: packed[name].variable
-            for name in short_encoding
-            if packed[name].chunks is not None and "chunks" in encoding[name]
-        }
-        aligned = {
-            name: v.chunk(dict(zip(v.dims, encoding[name]["chunks"], strict=True)))
-            for name, v in lazy.items()
-        }
         with new_output(
             path, overwrite=overwrite, find_foreign=find_foreign_item, inputs=sources
         ) as temporary:
-            short_variables = packed.drop_vars(large).assign(aligned)
-            short_variables.to_zarr(
+            packed.drop_vars(large).load().to_zarr(
                 temporary,
                 mode="w",
                 zarr_format=2,
-                consolidated=not large,
+                consolidated=False,
                 encoding=short_encoding,
                 write_empty_chunks=True,
             )

@@ -135,10 +135,7 @@ def write_blocks(
     def tell(share: float) -> None:
         stage("writing", n_lazy, int(share * n_lazy), "variables")
 
-    if zarr:
-        stage("writing", 0)  # follows the tasks of dask
-    else:
-        tell(0.0)
+    tell(0.0)
     with dask.config.set(scheduler="synchronous"):  # which holds one chunk at a time
         (to_zarr if zarr else to_netcdf)(dataset, target, overwrite=overwrite, progress=tell)
     return dataset

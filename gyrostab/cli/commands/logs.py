@@ -101,6 +101,7 @@ def ingest(
     """
     from gyrostab.io.datasets import to_netcdf, to_zarr
     from gyrostab.jobs.run import count_samples, load_log
+    from gyrostab.progress import follow_share
     from gyrostab.store.output import check_output
 
     target = check_output(output, suffixes=[".nc", ".zarr"], overwrite=common.overwrite)
@@ -112,12 +113,7 @@ def ingest(
     with show_stages(common) as stage:
         stage("reading", 0)
         log = load_log(logs, **reading.options())
-        samples = count_samples(log)
-        stage("writing", samples)
-
-        def tell(share: float) -> None:
-            stage("writing", samples, round(share * samples))
-
+        tell = follow_share(stage, "writing", count_samples(log))
         write = to_zarr if zarr else partial(to_netcdf, compression=compression)
         write(log, target, overwrite=common.overwrite, stamps=stamps, progress=tell)
     print(target)
