@@ -32,41 +32,13 @@ import xarray as xr
 
 from gyrostab.errors import OptionError
 from gyrostab.io.survey_model import SurveyModel, SurveyTerm
-from gyrostab.io.survey_terms import survey_terms
+from gyrostab.io.survey_terms import TABLES, survey_terms
 from gyrostab.store.output import check_output, new_output
 from gyrostab.units import HOUR
 
 SUFFIXES = (".csv", ".json", ".xml")
-_H = "(EarthRate * Cos(Latitude))"
-_STEP = "(MD - MDPrev) / "
-_MEAN = "((Inc + IncPrev) / 2)"
-#: Code -> weighting function of the azimuth, SPE 90408, in the notation of ISCWSA.
-WEIGHTS = {
-    "GXYZ-XYRN": f"Sqr(1 - Sin(AzT) ^ 2 * Sin(Inc) ^ 2) / {_H}",
-    "GXYZ-XYB1": f"Sin(AzT) * Cos(Inc) / {_H}",
-    "GXYZ-XYB2": f"Cos(AzT) / {_H}",
-    "GXYZ-XYG1": f"Cos(AzT) * Sin(Inc) / {_H}",
-    "GXYZ-XYG2": f"Cos(AzT) * Cos(Inc) / {_H}",
-    "GXYZ-XYG3": f"Sin(AzT) * Cos(Inc) ^ 2 / {_H}",
-    "GXYZ-XYG4": f"Sin(AzT) * Sin(Inc) * Cos(Inc) / {_H}",
-    "GXYZ-ZRN": f"Sin(AzT) * Sin(Inc) / {_H}",
-    "GXYZ-ZB": f"Sin(AzT) * Sin(Inc) / {_H}",
-    "GXYZ-ZG1": f"Sin(AzT) * Sin(Inc) ^ 2 / {_H}",
-    "GXYZ-ZG2": f"Sin(AzT) * Sin(Inc) * Cos(Inc) / {_H}",
-    "GXYZ-GD": f"XYZ_Gyro_Drift + {_STEP}GXYRunningSpeed",
-    "GXYZ-GRW": f"Sqr(XYZ_Gyro_Random_Walk ^ 2 + {_STEP}GXYRunningSpeed)",
-    "GXY-RN": f"Sqr(1 - Cos(AzT) ^ 2 * Sin(Inc) ^ 2) / ({_H} * Cos(Inc))",
-    "GXY-B1": f"Sin(AzT) / ({_H} * Cos(Inc))",
-    "GXY-B2": f"Cos(AzT) / {_H}",
-    "GXY-G1": f"Cos(AzT) * Sin(Inc) / {_H}",
-    "GXY-G2": f"Cos(AzT) * Cos(Inc) / {_H}",
-    "GXY-G3": f"Sin(AzT) / {_H}",
-    "GXY-G4": f"Sin(AzT) * Tan(Inc) / {_H}",
-    "GXY-GD": f"XY_Gyro_Drift + {_STEP}(GXYRunningSpeed * Sin{_MEAN})",
-    "GXY-GRW": f"Sqr(XY_Gyro_Random_Walk ^ 2 + {_STEP}(GXYRunningSpeed * Sin{_MEAN} ^ 2))",
-    "GZ-GD": f"Z_Gyro_Drift + {_STEP}(GXYRunningSpeed * Cos{_MEAN})",
-    "GZ-GRW": f"Sqr(Z_Gyro_Random_Walk ^ 2 + {_STEP}(GXYRunningSpeed * Cos{_MEAN} ^ 2))",
-}
+#: Code -> weighting function of the azimuth.
+WEIGHTS = {code: weight for rows in TABLES.values() for code, _, _, weight in rows}
 #: Unit -> unit in the JSON of ISCWSA; g-dependent terms are per g, the acceleration in the weights.
 _JSON_UNITS = {"deg/h": "deg/hr", "deg/sqrt(h)": "deg/sqr(hr)", "deg/h/g": "deg/hr"}
 _WITSML_UNITS = {"deg/h": "dega/h", "deg/sqrt(h)": "dega/sqrt(h)", "deg/h/g": "dega/h/gn"}

@@ -69,35 +69,44 @@ _Z: _Groups = (("z",),)
 _AXIAL: _Groups = (("xz", "yz"),)
 
 # fmt: off
-#: Tool -> rows of code, kind and groups. Tables 3 and 6, 4 and 7, and 8 of the reference.
-_TABLES: dict[Tool, tuple[tuple[str, str, _Groups], ...]] = {
+_H = "(EarthRate * Cos(Latitude))"
+_STEP = "(MD - MDPrev) / "
+_MEAN = "((Inc + IncPrev) / 2)"
+#: Tool -> rows of code, kind, groups, and weighting function of the azimuth in the notation of
+#: ISCWSA. Tables 3 and 6, 4 and 7, and 8 of the reference.
+TABLES: dict[Tool, tuple[tuple[str, str, _Groups, str], ...]] = {
     "xyz": (
-        ("GXYZ-XYRN", "noise", _XY),
-        ("GXYZ-XYB1", "bias", _XY),
-        ("GXYZ-XYB2", "bias", _XY),
-        ("GXYZ-XYG1", "g", (("xy", "yx"),)),
-        ("GXYZ-XYG2", "g", _AXIAL),
-        ("GXYZ-XYG3", "g", _AXIAL),
-        ("GXYZ-XYG4", "g", (("xx", "yy"),)),
-        ("GXYZ-ZRN", "noise", _Z),
-        ("GXYZ-ZB", "bias", _Z),
-        ("GXYZ-ZG1", "g", (("zx", "zy"),)),
-        ("GXYZ-ZG2", "g", (("zz",),)),
-        ("GXYZ-GD", "drift", _XY + _Z),
-        ("GXYZ-GRW", "walk", _XY + _Z),
+        ("GXYZ-XYRN", "noise", _XY, f"Sqr(1 - Sin(AzT) ^ 2 * Sin(Inc) ^ 2) / {_H}"),
+        ("GXYZ-XYB1", "bias", _XY, f"Sin(AzT) * Cos(Inc) / {_H}"),
+        ("GXYZ-XYB2", "bias", _XY, f"Cos(AzT) / {_H}"),
+        ("GXYZ-XYG1", "g", (("xy", "yx"),), f"Cos(AzT) * Sin(Inc) / {_H}"),
+        ("GXYZ-XYG2", "g", _AXIAL, f"Cos(AzT) * Cos(Inc) / {_H}"),
+        ("GXYZ-XYG3", "g", _AXIAL, f"Sin(AzT) * Cos(Inc) ^ 2 / {_H}"),
+        ("GXYZ-XYG4", "g", (("xx", "yy"),), f"Sin(AzT) * Sin(Inc) * Cos(Inc) / {_H}"),
+        ("GXYZ-ZRN", "noise", _Z, f"Sin(AzT) * Sin(Inc) / {_H}"),
+        ("GXYZ-ZB", "bias", _Z, f"Sin(AzT) * Sin(Inc) / {_H}"),
+        ("GXYZ-ZG1", "g", (("zx", "zy"),), f"Sin(AzT) * Sin(Inc) ^ 2 / {_H}"),
+        ("GXYZ-ZG2", "g", (("zz",),), f"Sin(AzT) * Sin(Inc) * Cos(Inc) / {_H}"),
+        ("GXYZ-GD", "drift", _XY + _Z, f"XYZ_Gyro_Drift + {_STEP}GXYRunningSpeed"),
+        ("GXYZ-GRW", "walk", _XY + _Z, f"Sqr(XYZ_Gyro_Random_Walk ^ 2 + {_STEP}GXYRunningSpeed)"),
     ),
     "xy": (
-        ("GXY-RN", "noise", _XY),
-        ("GXY-B1", "bias", _XY),
-        ("GXY-B2", "bias", _XY),
-        ("GXY-G1", "g", (("xy", "yx"),)),
-        ("GXY-G2", "g", _AXIAL),
-        ("GXY-G3", "g", _AXIAL),
-        ("GXY-G4", "g", (("xx", "yy"),)),
-        ("GXY-GD", "drift", _XY),
-        ("GXY-GRW", "walk", _XY),
+        ("GXY-RN", "noise", _XY, f"Sqr(1 - Cos(AzT) ^ 2 * Sin(Inc) ^ 2) / ({_H} * Cos(Inc))"),
+        ("GXY-B1", "bias", _XY, f"Sin(AzT) / ({_H} * Cos(Inc))"),
+        ("GXY-B2", "bias", _XY, f"Cos(AzT) / {_H}"),
+        ("GXY-G1", "g", (("xy", "yx"),), f"Cos(AzT) * Sin(Inc) / {_H}"),
+        ("GXY-G2", "g", _AXIAL, f"Cos(AzT) * Cos(Inc) / {_H}"),
+        ("GXY-G3", "g", _AXIAL, f"Sin(AzT) / {_H}"),
+        ("GXY-G4", "g", (("xx", "yy"),), f"Sin(AzT) * Tan(Inc) / {_H}"),
+        ("GXY-GD", "drift", _XY, f"XY_Gyro_Drift + {_STEP}(GXYRunningSpeed * Sin{_MEAN})"),
+        ("GXY-GRW", "walk", _XY,
+         f"Sqr(XY_Gyro_Random_Walk ^ 2 + {_STEP}(GXYRunningSpeed * Sin{_MEAN} ^ 2))"),
     ),
-    "z": (("GZ-GD", "drift", _Z), ("GZ-GRW", "walk", _Z)),
+    "z": (
+        ("GZ-GD", "drift", _Z, f"Z_Gyro_Drift + {_STEP}(GXYRunningSpeed * Cos{_MEAN})"),
+        ("GZ-GRW", "walk", _Z,
+         f"Sqr(Z_Gyro_Random_Walk ^ 2 + {_STEP}(GXYRunningSpeed * Cos{_MEAN} ^ 2))"),
+    ),
 }
 #: Kind -> mode, propagation, unit, derivation.
 _KINDS = {
@@ -205,7 +214,7 @@ def survey_terms(
     magnitudes["g"] = _read_sensitivities(content or {})
     terms = [
         _make_term(code, kind, groups, magnitudes[kind])
-        for code, kind, groups in _TABLES[tool]
+        for code, kind, groups, _ in TABLES[tool]
         if any(name in magnitudes[kind] for group in groups for name in group)
     ]
     if all(math.isnan(term.value) for term in terms if term.unit != "deg/h/g"):
