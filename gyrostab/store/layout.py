@@ -11,7 +11,6 @@ import errno
 import json
 import os
 import threading
-import zlib
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -195,6 +194,8 @@ def _read_hdf5_layout(path: Path, name: str, opened: str) -> _Hdf5Layout:
 
 def find_hdf5_codecs(plist: Any) -> tuple[tuple[int, Any], ...]:
     """Make the codecs of the filters, in the order of reading, with their numbers."""
+    from numcodecs import Zlib, Zstd
+
     codecs: list[tuple[int, Any]] = []
     for number in reversed(range(plist.get_nfilters())):
         code, _, values, _ = plist.get_filter(number)
@@ -202,12 +203,10 @@ def find_hdf5_codecs(plist: Any) -> tuple[tuple[int, Any], ...]:
         if code == _SHUFFLE:
             codec = _Shuffle(values[0])
         elif code == _DEFLATE:
-            codec = _Deflate(*values[:1])
+            codec = Zlib(*values[:1])
         elif code == _FLETCHER32:
             codec = _Fletcher32()
         elif code == _ZSTD:
-            from numcodecs import Zstd
-
             codec = Zstd(*values[:1])
         codecs.append((number, codec))
     return tuple(codecs)
@@ -217,21 +216,6 @@ def has_known_filters(plist: Any) -> bool:
     """Whether all filters in the creation property list of an HDF5 dataset are known."""
     codes = {plist.get_filter(number)[0] for number in range(plist.get_nfilters())}
     return codes <= {_DEFLATE, _SHUFFLE, _FLETCHER32, _ZSTD}
-
-
-@dataclass(frozen=True)
-class _Deflate:
-    """The deflate filter."""
-
-    level: int = 4
-
-    def encode(self, data: Any) -> bytes:
-        """Compress the bytes."""
-        return zlib.compress(data, self.level)
-
-    def decode(self, data: Any) -> bytes:
-        """Decompress the bytes."""
-        return zlib.decompress(data)
 
 
 @dataclass(frozen=True)
