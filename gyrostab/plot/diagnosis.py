@@ -201,6 +201,21 @@ def plot_surfaces(
     )
 
 
+def find_change(surfaces: xr.Dataset, case: str) -> tuple[Array, Array]:
+    """Divide the Allan deviation of the recording by that of a simulation, (axis, window, tau).
+
+    The second array is the opacity of each cell, less inside the 95 % band of the simulation.
+    """
+    names = ["avar", "avar_low", "avar_high"]
+    cells = surfaces[names].transpose("case", "axis", "window", "tau")
+    recording = cells["avar"].sel(case="recording").values
+    avar, low, high = (cells[name].sel(case=case).values for name in names)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = np.sqrt(recording / avar)
+        is_usual = (recording >= low) & (recording <= high)
+    return ratio, np.where(is_usual, INSIDE_BAND_OPACITY, 1.0)
+
+
 @draws_figure
 def plot_change(
     surfaces: xr.Dataset, content: Mapping[str, Any], *, width: float = PAGE_MM
@@ -209,25 +224,10 @@ def plot_change(
     from matplotlib.colors import LogNorm
     from matplotlib.ticker import FixedLocator, NullFormatter
 
-    avar, low, high = (
-        surfaces[name].transpose("case", "axis", "window", "tau")
-        for name in ("avar", "avar_low", "avar_high")
-    )
-    recording = avar.sel(case="recording").values
-    columns = []
-    for name in ("before", "after"):
-        with np.errstate(invalid="ignore", divide="ignore"):
-            ratio = np.sqrt(recording / avar.sel(case=name).values)
-            usual = (recording >= low.sel(case=name).values) & (
-                recording <= high.sel(case=name).values
-            )
-        columns.append(
-            (
-                f"Recording over simulation {'without' if name == 'before' else 'with'} effects",
-                ratio,
-                np.where(usual, INSIDE_BAND_OPACITY, 1.0),
-            )
-        )
+    columns = [
+        (f"Recording over simulation {word} effects", *find_change(surfaces, case))
+        for case, word in (("before", "without"), ("after", "with"))
+    ]
     figure = _draw_maps(
         surfaces, content, columns, LogNorm(0.5, 2.0), "PuOr_r", "ratio of Allan deviations", width
     )

@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.noise import NORMAL_95
-from gyrostab.plot.diagnosis import INSIDE_BAND_OPACITY, select_channels
+from gyrostab.plot.diagnosis import find_change, select_channels
 from gyrostab.plot.style import COLOURS, axis_names, axis_style, unit_label
 from gyrostab.report.charts import (
     DEVIATION_LABEL,
@@ -70,16 +70,10 @@ def _draw_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
         horizontal_spacing=0.03, vertical_spacing=0.05,
         column_titles=["without the effects", "with the effects"],
     )  # fmt: skip
-    recording = surfaces["avar"].sel(case="recording").transpose("axis", "tau", "window")
     for column, case in enumerate(_CASES, start=1):
-        avar, low, high = (
-            surfaces[name].sel(case=case).transpose("axis", "tau", "window").values
-            for name in ("avar", "avar_low", "avar_high")
-        )
-        with np.errstate(invalid="ignore", divide="ignore"):
-            ratio = np.sqrt(recording.values / avar)
-            usual = (recording.values >= low) & (recording.values <= high)
-            colour = np.log2(ratio) * np.where(usual, INSIDE_BAND_OPACITY, 1.0)
+        ratio, opacity = (values.swapaxes(1, 2) for values in find_change(surfaces, case))
+        with np.errstate(divide="ignore"):
+            colour = np.log2(ratio) * opacity
         for row in range(len(names)):
             frame.add_heatmap(
                 x=_centre_stamps(surfaces, content), y=tau, z=single(colour[row]),
