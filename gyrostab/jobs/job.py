@@ -27,7 +27,7 @@ from gyrostab.store.attributes import find_version
 from gyrostab.store.output import describe_file, is_leftover, remove_leftovers, write_text
 from gyrostab.store.output.content import read_json
 from gyrostab.store.remote import find_url, full_name
-from gyrostab.store.system import lock_file, write_at
+from gyrostab.store.system import lock_file
 
 _SCHEMA = "gyrostab.job/1"
 _REMOVES_OPEN_FILES = os.name != "nt"
@@ -213,7 +213,8 @@ def lock_job(folder: Path) -> Iterator[None]:
     try:
         os.ftruncate(handle, 0)
         owner = f"process {os.getpid()} on {platform.node()}\n"
-        write_at(handle, owner.encode("ascii", "replace"), 0)
+        os.lseek(handle, 0, os.SEEK_SET)
+        os.write(handle, owner.encode("ascii", "replace"))
         yield
     finally:
         os.close(handle)

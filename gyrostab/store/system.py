@@ -11,7 +11,6 @@ import errno
 import importlib
 import os
 import sys
-import threading
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -35,8 +34,6 @@ _FLAGGED_RENAMES = {
 }
 _AT_FDCWD = -100
 _UNSUPPORTED_ERRNOS = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM)
-
-_SEEK_LOCK = threading.Lock()
 
 _M_MMAP_THRESHOLD = -3  # of malloc.h of glibc
 _LARGE_BYTES = 2**17  # its first value, which it raises up to 32 MiB unless it is set
@@ -133,29 +130,6 @@ def lock_file(handle: int) -> bool:
     except OSError:  # a file system without locks
         return True
     return True
-
-
-def read_at(handle: int, view: memoryview, offset: int) -> int:
-    """Read bytes at an offset of an open file into memory; return how many."""
-    if hasattr(os, "preadv"):
-        return os.preadv(handle, [view], offset)
-    if hasattr(os, "pread"):
-        data = os.pread(handle, view.nbytes, offset)
-    else:
-        with _SEEK_LOCK:
-            os.lseek(handle, offset, os.SEEK_SET)
-            data = os.read(handle, view.nbytes)
-    view[: len(data)] = data
-    return len(data)
-
-
-def write_at(handle: int, data: bytes | memoryview, offset: int) -> int:
-    """Write bytes at an offset of an open file; return how many."""
-    if hasattr(os, "pwrite"):
-        return os.pwrite(handle, data, offset)
-    with _SEEK_LOCK:
-        os.lseek(handle, offset, os.SEEK_SET)
-        return os.write(handle, data)
 
 
 def return_large_arrays() -> None:

@@ -19,41 +19,22 @@ from gyrostab.store.output import new_output
 from gyrostab.store.output.write import _describe_reason
 
 
-def test_without_positioned_reads_and_writes_a_file_holds_the_same(tmp_path, monkeypatch):
-    def move_column():
-        spool = Spool()
-        first = spool.store(np.arange(1000.0))
-        second = spool.store(np.arange(500.0) * 0.1)
-        return np.concatenate([first[:], second[100:400], first[7:9]])
-
-    before = move_column()
-    monkeypatch.delattr(os, "preadv", raising=False)
-    np.testing.assert_array_equal(move_column(), before)
-    monkeypatch.delattr(os, "pread", raising=False)
-    monkeypatch.delattr(os, "pwrite", raising=False)
-    np.testing.assert_array_equal(move_column(), before)
-
-
-def test_seeking_reads_of_several_threads_do_not_mix(tmp_path, monkeypatch):
-    for name in ("preadv", "pread", "pwrite"):
-        monkeypatch.delattr(os, name, raising=False)
-    data = np.random.default_rng(1).bytes(2**16)
-    (tmp_path / "data").write_bytes(data)
+def test_reads_of_a_temporary_file_in_several_threads_do_not_mix():
+    spool, data = Spool(), np.random.default_rng(1).standard_normal(2**13)
+    columns = [spool.store(data), spool.store(-data)]
     wrong = []
-    with (tmp_path / "data").open("rb") as file:
 
-        def read_pieces(offset):
-            for begin in range(offset, 2**16 - 64, 512):
-                piece = bytearray(64)
-                system.read_at(file.fileno(), memoryview(piece), begin)
-                if piece != data[begin : begin + 64]:
+    def read_pieces(offset):
+        for begin in range(offset, data.size - 64, 512):
+            for column, values in zip(columns, (data, -data), strict=True):
+                if not np.array_equal(column[begin : begin + 64], values[begin : begin + 64]):
                     wrong.append(begin)
 
-        threads = [threading.Thread(target=read_pieces, args=(64 * n,)) for n in range(4)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
+    threads = [threading.Thread(target=read_pieces, args=(64 * n,)) for n in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
     assert wrong == []
 
 
@@ -161,8 +142,6 @@ class WindowsLocks:
 def test_a_job_folder_is_locked_as_far_as_the_system_can(tmp_path, monkeypatch, locks):
     monkeypatch.setattr(system, "_FCNTL", None)
     monkeypatch.setattr(system, "_MSVCRT", locks)
-    for name in ("preadv", "pread", "pwrite"):
-        monkeypatch.delattr(os, name, raising=False)
     folder = tmp_path / ".product.nc.job"
     with lock_job(folder):
         if locks:
