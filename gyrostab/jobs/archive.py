@@ -25,10 +25,9 @@ from gyrostab.progress import Stage
 from gyrostab.store.output import describe_file, read_json
 from gyrostab.store.output.content import METADATA, is_store
 from gyrostab.store.remote import (
-    find_store,
+    find_kind,
     find_url,
     full_name,
-    is_folder,
     list_urls,
     read_bytes,
     remove_copies,
@@ -103,7 +102,7 @@ def find_archive(paths: Sequence[str | Path]) -> Archive:
         for path in map(Path, matching):
             inside: Iterable[tuple[str, Path]] = ()
             if url:
-                inside = _walk(path, visited) if is_folder(url) else [("file", path)]
+                inside = [("file", path)] if find_kind(url) == "file" else _walk(path, visited)
             elif not path.exists():
                 raise FormatError(f"{path}: there is no such file or folder")
             elif path.is_dir() and not (is_store(path) or is_fleet(path)):
@@ -126,10 +125,7 @@ def _find_base(item: str, *, is_pattern: bool, is_only_path: bool) -> Path:
         fixed = itertools.takewhile(lambda part: not glob.has_magic(part), path.parts)
         return Path(*fixed)
     url = find_url(item)
-    if url:
-        is_archive = is_folder(url) and not find_store(url)
-    else:
-        is_archive = path.is_dir() and not is_store(path)
+    is_archive = find_kind(url) == "folder" if url else path.is_dir() and not is_store(path)
     return path if is_only_path and is_archive else path.parent
 
 

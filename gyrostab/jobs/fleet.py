@@ -23,6 +23,7 @@ from typing import Any
 import pandas as pd
 
 from gyrostab.errors import FormatError, GyrostabError, OptionError, OutputError, WorkerError
+from gyrostab.io.opening import open_dataset
 from gyrostab.jobs.archive import (
     DIAGNOSIS,
     FLEET_MARK,
@@ -52,7 +53,6 @@ from gyrostab.jobs.job import check_job_folder, job_folder, lock_job, remove_job
 from gyrostab.jobs.run import find_job_name, read_job_name, run
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool, run_calls
 from gyrostab.progress import Stage, no_stage
-from gyrostab.store.cf import from_disk
 from gyrostab.store.output import (
     check_output,
     protect_inputs,
@@ -60,11 +60,10 @@ from gyrostab.store.output import (
     resolve_link,
     write_text,
 )
-from gyrostab.store.read import open_stored
 from gyrostab.store.remote import (
+    find_kind,
     find_url,
     full_name,
-    has_content,
     has_file,
     remove_address,
     remove_copies,
@@ -225,7 +224,7 @@ def _check_address(url: str, suffix: str, *, is_own: bool) -> None:
     """Check the address of an output: what another program wrote is never replaced."""
     if not url.lower().endswith(suffix):
         raise OptionError(f"output {url!r} must end in {suffix}; give another name with -o")
-    if not is_own and has_content(url):
+    if not is_own and find_kind(url, required=False, error=OutputError):
         raise OutputError(
             f"output {url!r} exists already, and gyrostab fleet or index did not make it; remove "
             "it first, or give another name with -o"
@@ -413,8 +412,8 @@ def _finish_run(path: Path, report: Path | None, plotly: str) -> dict[str, Any]:
     """Write the report of a product, and return what the table says of it."""
     from gyrostab.report import write_report
 
-    product = from_disk(open_stored(path, lazy=False), str(path))
-    product.close()
+    with open_dataset(path) as product:
+        product.load()
     if report is not None:
         _make_folder(report.parent)
         with upload_file(report) as place:

@@ -10,12 +10,11 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from gyrostab.io.opening import open_dataset
 from gyrostab.jobs.archive import LogRun, is_fleet, read_diagnosis
 from gyrostab.noise import LAWS
 from gyrostab.schema import texts
-from gyrostab.store.cf import from_disk
 from gyrostab.store.output import new_output
-from gyrostab.store.read import open_stored
 from gyrostab.store.remote import full_name, read_bytes, upload_file
 from gyrostab.units import DAY, INNER
 
@@ -90,7 +89,7 @@ def open_fleet(folder: Path) -> xr.Dataset | None:
     products = []
     for path in paths:
         if folder in path.parents:
-            with from_disk(open_stored(path, lazy=False), str(path)) as product:
+            with open_dataset(path) as product:
                 names = [name for name, item in product.variables.items() if "time" in item.dims]
                 products.append(product[names].isel(tau=slice(-1, None)).load())
     if not products:

@@ -26,13 +26,19 @@ from gyrostab.store.hdf5_heaps import check_global_heaps
 from gyrostab.store.layout import ChunkCache, ChunkDamage, is_readable, read_chunk
 from gyrostab.store.lazy import FileVariable, RowSource, make_dask
 from gyrostab.store.private import close_function, library_lock
-from gyrostab.store.remote import ROOT_METADATA, find_store, find_url, reaching
+from gyrostab.store.remote import ROOT_METADATA, find_kind, find_url, reaching
 from gyrostab.store.times import decode_stamps, index_dim, parse_time_grids, replace_stamps
 from gyrostab.time.grid import grid_times
 from gyrostab.wording import list_some
 
 #: Values from which a variable is a dask array.
 MIN_LAZY_VALUES = 2**17
+#: Options to open a file with xarray, without decoding times and without indexes.
+_AS_STORED: dict[str, Any] = {
+    "chunks": None,
+    "decode_times": False,
+    "create_default_indexes": False,
+}
 #: Encodings that xarray decodes; gyrostab writes none of them in a log.
 _FOREIGN_PACKING = {"_Unsigned", "add_offset", "missing_value"}
 #: Bytes of the cache of chunks of which only a part was requested.
@@ -44,7 +50,6 @@ def open_stored(
     *,
     strict: bool = False,
     check: Callable[[Path, Mapping[Any, xr.Variable]], None] | None = None,
-    lazy: bool = True,
 ) -> xr.Dataset:
     """Open a dataset as it is on disk: times not decoded, data lazy, chunks checked when read.
 
@@ -55,8 +60,6 @@ def open_stored(
     check : callable, optional
         Called with the path and the variables before any of its values is read; it raises
         `FormatError` when the declared sizes are out of proportion.
-    lazy : bool
-        False loads the long variables too, without dask.
 
     Raises
     ------
@@ -68,20 +71,17 @@ def open_stored(
     if not path.exists():
         raise FormatError(f"{path}: there is no such file")
     with reading_of(path):
-        return _open_dataset(path, strict=strict, check=check, lazy=lazy)
+        return _open_dataset(path, strict=strict, check=check)
 
 
 def _open_remote(path: Path, url: str) -> xr.Dataset:
     """Open a Zarr store at an address; the Zarr library reads its chunks."""
-    address = find_store(url)
-    if address is None:
+    if find_kind(url) != "store":
         raise FormatError(f"{url}: is not a Zarr store; copy the file here, and give the copy")
     with reaching(url), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # without consolidated metadata
-        stored = xr.open_dataset(
-            address, engine="zarr", chunks=None, decode_times=False, create_default_indexes=False
-        )
-        return _make_variables_lazy(replace_stamps(stored, path), {}, path, small=MIN_LAZY_VALUES)
+        stored = xr.open_dataset(url.rstrip("/"), engine="zarr", **_AS_STORED)
+        return _make_variables_lazy(replace_stamps(stored, path), {}, path)
 
 
 def _open_dataset(
@@ -89,7 +89,6 @@ def _open_dataset(
     *,
     strict: bool,
     check: Callable[[Path, Mapping[Any, xr.Variable]], None] | None,
-    lazy: bool,
 ) -> xr.Dataset:
     if path.is_file():
         check_global_heaps(path, skip=_find_data(path))
@@ -102,9 +101,7 @@ def _open_dataset(
     engine: Any = "zarr" if path.is_dir() else "netcdf4"
     name = "Zarr" if path.is_dir() else "NetCDF"
     try:
-        stored = xr.open_dataset(
-            path, engine=engine, chunks=None, decode_times=False, create_default_indexes=False
-        )
+        stored = xr.open_dataset(path, engine=engine, **_AS_STORED)
     except Exception as error:  # the backends raise errors of many kinds on damaged files
         raise DamageError(
             f"{path}: is not {name}, or is damaged or cut short ({error}); make or copy it again"
@@ -123,8 +120,7 @@ def _open_dataset(
     long = _find_long_variables(stored, path, strict=strict) if is_log else {}
     if path.is_dir() and sampled_names.difference(long):
         check_blosc_chunks(path, skip=list(long))
-    small = MIN_LAZY_VALUES if lazy else sys.maxsize
-    opened = _make_variables_lazy(stored, long, path, small=small)
+    opened = _make_variables_lazy(stored, long, path)
     if is_log:
         # opened again when needed: an archive of any length keeps only a few files open
         stored.close()
@@ -147,7 +143,7 @@ def _find_data(path: Path) -> list[tuple[int, int]]:
 
 
 def _make_variables_lazy(
-    stored: xr.Dataset, long: dict[Any, xr.Variable], path: Path, *, small: int
+    stored: xr.Dataset, long: dict[Any, xr.Variable], path: Path
 ) -> xr.Dataset:
     """Load small variables, and make dask arrays of the others, by the chunks on disk.
 
@@ -158,7 +154,7 @@ def _make_variables_lazy(
     }
     ready = {  # text is always small, and dask cannot find the size of its chunks
         name: item.load()
-        if item.size < small or item.dtype.kind in "OSU"
+        if item.size < MIN_LAZY_VALUES or item.dtype.kind in "OSU"
         else make_variable_lazy(item, path)
         for name, item in short_variables.items()
     }

@@ -16,7 +16,7 @@ import threading
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, Literal
 
 from gyrostab.errors import FormatError, GyrostabError, OptionError, OutputError
 
@@ -118,19 +118,29 @@ def _open_filesystem(
         yield filesystem, str(path).rstrip("/")
 
 
-def is_taken(url: str) -> bool:
-    """Whether there is something at an address; what an interrupted upload left does not count."""
-    with _open_filesystem(url, error=OutputError) as (filesystem, path):
-        if filesystem.isfile(path):
-            return True
-        return any(filesystem.exists(f"{path}/{name}") for name in ROOT_METADATA)
+def find_kind(
+    url: str, *, required: bool = True, error: type[GyrostabError] = FormatError
+) -> Literal["store", "folder", "file"] | None:
+    """Find what is at an address: a Zarr store, another folder, a file, or nothing.
 
-
-def has_content(url: str) -> bool:
-    """Whether there is an object at an address or below it."""
-    with _open_filesystem(url, error=OutputError) as (filesystem, path):
-        filesystem.invalidate_cache()
-        return bool(filesystem.exists(path))
+    Raises
+    ------
+    GyrostabError
+        Of the type `error`, when there is nothing although it is `required`, or the address cannot
+        be reached.
+    OptionError
+        When the library for it is missing.
+    """
+    with _open_filesystem(url, error=error) as (filesystem, path):
+        if not required:  # which concerns an output: an earlier listing may have changed
+            filesystem.invalidate_cache()
+        if any(filesystem.exists(f"{path}/{name}") for name in ROOT_METADATA):
+            return "store"
+        if filesystem.exists(path):
+            return "folder" if filesystem.isdir(path) else "file"
+        if required:
+            raise FileNotFoundError(url)
+    return None
 
 
 def has_file(path: Path) -> bool:
@@ -154,42 +164,10 @@ def read_bytes(path: str | Path, count: int | None = None) -> bytes:
     raise FileNotFoundError(url)
 
 
-def find_store(url: str) -> str | None:
-    """Find the Zarr store at an address: the address without a slash at the end; None if none is.
-
-    Raises
-    ------
-    FormatError
-        When there is nothing at the address, or it cannot be reached.
-    OptionError
-        When the library for it is missing.
-    """
-    with _open_filesystem(url) as (filesystem, path):
-        if any(filesystem.exists(f"{path}/{name}") for name in ROOT_METADATA):
-            return url.rstrip("/")
-        if not filesystem.exists(path):
-            raise FileNotFoundError(url)
-    return None
-
-
 def list_urls(url: str) -> list[str]:
     """List the addresses that match a pattern."""
     with _open_filesystem(url) as (filesystem, path):
         return [filesystem.unstrip_protocol(name) for name in sorted(filesystem.glob(path))]
-
-
-def is_folder(url: str) -> bool:
-    """Whether there is a folder at an address; a Zarr store is one.
-
-    Raises
-    ------
-    FormatError
-        When there is nothing at the address, or it cannot be reached.
-    """
-    with _open_filesystem(url) as (filesystem, path):
-        if not filesystem.exists(path):
-            raise FileNotFoundError(url)
-        return bool(filesystem.isdir(path))
 
 
 def walk_address(url: str) -> Iterator[tuple[str, list[str], list[str]]]:
