@@ -12,6 +12,8 @@ import math
 import os
 import warnings
 from collections.abc import Callable
+from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -104,17 +106,9 @@ def to_netcdf(
     np.datetime64('1970-01-01T00:00:00.003333333')
     """
     stored, sources = _encode_dataset(dataset, "to_netcdf", stamps)
-    filters = _make_filters(compression)
-
-    def write(packed: xr.Dataset) -> None:
-        encoding = _netcdf_encoding(packed, filters)
-        large = large_variables(packed)
-        short_encoding = {name: options for name, options in encoding.items() if name not in large}
-        with new_output(path, overwrite=overwrite, inputs=sources) as temporary:
-            _begin_netcdf(packed.drop_vars(large), temporary, short_encoding)
-            append_netcdf(temporary, large, encoding, progress=progress)
-
-    _write_counts(stored, write)
+    plan = partial(_netcdf_encoding, filters=_make_filters(compression))
+    output = partial(new_output, path, overwrite=overwrite, inputs=sources)
+    _write_counts(stored, output, plan, _begin_netcdf, partial(append_netcdf, progress=progress))
     return Path(path)
 
 
@@ -144,11 +138,11 @@ def _encode_dataset(dataset: Any, verb: str, stamps: bool | None) -> tuple[xr.Da
 
 
 def _begin_netcdf(dataset: xr.Dataset, path: Path, encoding: dict[Any, dict[str, Any]]) -> None:
-    """Write all but the long variables; `Dataset.to_netcdf` would load dask.distributed."""
+    """Write variables in memory to a new file; `Dataset.to_netcdf` would load dask.distributed."""
     open_store: Any = xr.backends.NetCDF4DataStore.open
     store = open_store(path, mode="w", format="NETCDF4", lock=library_lock())
     try:
-        dataset.load().dump_to_store(store, encoding=encoding)
+        dataset.dump_to_store(store, encoding=encoding)
     finally:
         store.close()
 
@@ -247,25 +241,23 @@ def to_zarr(
     ('axis', 'tau', 'time')
     """
     stored, sources = _encode_dataset(dataset, "to_zarr", stamps)
-
-    def write(packed: xr.Dataset) -> None:
-        large, encoding = large_variables(packed), plan_zarr(packed)
-        short_encoding = {name: options for name, options in encoding.items() if name not in large}
-        with new_output(
-            path, overwrite=overwrite, find_foreign=find_foreign_item, inputs=sources
-        ) as temporary:
-            packed.drop_vars(large).load().to_zarr(
-                temporary,
-                mode="w",
-                zarr_format=2,
-                consolidated=False,
-                encoding=short_encoding,
-                write_empty_chunks=True,
-            )
-            append_zarr(temporary, large, encoding, progress=progress)
-
-    _write_counts(stored, write)
+    output = partial(
+        new_output, path, overwrite=overwrite, find_foreign=find_foreign_item, inputs=sources
+    )
+    _write_counts(stored, output, plan_zarr, begin_zarr, partial(append_zarr, progress=progress))
     return Path(path)
+
+
+def begin_zarr(dataset: xr.Dataset, path: Path, encoding: dict[Any, dict[str, Any]]) -> None:
+    """Write variables in memory to a new Zarr store, without consolidated metadata."""
+    dataset.to_zarr(
+        path,
+        mode="w",
+        zarr_format=2,
+        consolidated=False,
+        encoding=encoding,
+        write_empty_chunks=True,
+    )
 
 
 def plan_zarr(stored: xr.Dataset) -> dict[Any, dict[str, Any]]:
@@ -289,15 +281,28 @@ def plan_zarr(stored: xr.Dataset) -> dict[Any, dict[str, Any]]:
     return encoding
 
 
-def _write_counts(stored: xr.Dataset, write: Callable[[xr.Dataset], None]) -> None:
-    """Write declared integer counts, in a wider type or as doubles if they do not fit."""
+def _write_counts(
+    stored: xr.Dataset,
+    output: Callable[[], AbstractContextManager[Path]],
+    plan: Callable[[xr.Dataset], dict[Any, dict[str, Any]]],
+    begin: Callable[[xr.Dataset, Path, dict[Any, dict[str, Any]]], None],
+    append: Callable[[Path, dict[str, xr.Variable], dict[Any, dict[str, Any]]], None],
+) -> None:
+    """Write a file: the short variables at once, then the large ones chunk by chunk.
+
+    Declared integer counts are written in a wider type or as doubles if they do not fit.
+    """
     while True:
         try:
-            return write(
-                stored.assign(
-                    {name: as_counts(str(name), v.variable) for name, v in stored.data_vars.items()}
-                )
+            packed = stored.assign(
+                {name: as_counts(str(name), v.variable) for name, v in stored.data_vars.items()}
             )
+            large, encoding = large_variables(packed), plan(packed)
+            short = {name: options for name, options in encoding.items() if name not in large}
+            with output() as temporary:
+                begin(packed.drop_vars(large).load(), temporary, short)
+                append(temporary, large, encoding)
+            return
         except NotCountsError as misfit:
             (name,) = misfit.args
             declared = stored[name].encoding

@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import SchemaError
-from gyrostab.io.datasets import plan_zarr
+from gyrostab.io.datasets import begin_zarr, plan_zarr
 from gyrostab.store.cf import to_disk
 from gyrostab.store.output import find_foreign_item, new_output
 
@@ -75,14 +75,7 @@ def _make_store(folder: Path, stored: xr.Dataset, chunk: int) -> None:
                 chunk if dim == "time" else 1 if dim in ("axis", "term") else length
                 for dim, length in variable.sizes.items()
             )
-    stored.to_zarr(
-        folder,
-        mode="w",
-        zarr_format=2,
-        consolidated=False,
-        encoding=encoding,
-        write_empty_chunks=True,
-    )
+    begin_zarr(stored, folder, encoding)
 
 
 def _write_part(group: Any, stored: xr.Dataset, windows: slice, size: int) -> None:
