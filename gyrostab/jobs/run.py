@@ -336,17 +336,6 @@ def _add_resume_advice(job: _Job, message: str) -> str:
     )
 
 
-def _is_own_log(path: Path) -> bool:
-    """Whether gyrostab wrote a log, so that every worker can open it."""
-    from gyrostab.io.opening import open_log
-
-    try:
-        open_log(path).close()
-    except GyrostabError:
-        return False
-    return True
-
-
 def _compute_missing(
     job: _Job,
     blocks: Blocks,
@@ -402,9 +391,9 @@ def _compute_missing(
 
     call: tuple[Any, ...] = (compute_own_part,)
     if pool.remote and len(blocks) < len(parts):
-        if not store.exists() and not any(
-            map(_is_own_log, job.files)
-        ):  # some may be damaged; the two kinds do not mix
+        # every worker can open logs of gyrostab, which do not mix with others
+        kinds = (read_attribute(path, "gyrostab_content") for path in job.files)
+        if not store.exists() and "log" not in kinds:
             stage("storing", 0)
             to_zarr(log, store, stamps=False)
             write_store_checksum(job.folder)
