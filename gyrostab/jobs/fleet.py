@@ -22,12 +22,10 @@ from typing import Any
 
 import pandas as pd
 
-from gyrostab.errors import FormatError, GyrostabError, OptionError, OutputError, WorkerError
+from gyrostab.errors import FormatError, GyrostabError, WorkerError
 from gyrostab.io.opening import open_dataset
 from gyrostab.jobs.archive import (
     DIAGNOSIS,
-    FLEET_MARK,
-    FLEET_SCHEMA,
     Archive,
     LogRun,
     find_archive,
@@ -36,6 +34,15 @@ from gyrostab.jobs.archive import (
     is_fleet,
 )
 from gyrostab.jobs.checks import check_options
+from gyrostab.jobs.fleet_output import (
+    PLOTLY_FILE,
+    REQUESTS,
+    begin_output,
+    check_address,
+    consolidate_metadata,
+    make_folder,
+    make_folders,
+)
 from gyrostab.jobs.fleet_table import (
     FILES,
     find_trends,
@@ -56,12 +63,9 @@ from gyrostab.progress import Stage, no_stage
 from gyrostab.store.output import (
     check_output,
     protect_inputs,
-    read_json,
     resolve_link,
-    write_text,
 )
 from gyrostab.store.remote import (
-    find_kind,
     find_url,
     full_name,
     has_file,
@@ -73,10 +77,7 @@ from gyrostab.store.remote import (
 #: Time after which the table of runs is written again [s]; a killed call loses rows of this time,
 #: which are made again from the products.
 _SAVE_SECONDS = 30.0
-_REQUESTS = 16  # to an object store at a time
 _MAX_NAMES = 3  # runs that an error message names
-_GROUP = {"zarr_format": 2}  # metadata of a Zarr group
-PLOTLY_FILE = "plotly.js"  # in the folder of the reports, which share it
 
 
 def write_file_table(
@@ -98,7 +99,7 @@ def write_file_table(
     scheduler = check_scheduler(scheduler)
     known_table = read_table(Path(output), content=FILES)
     if url := find_url(output):
-        _check_address(url, ".parquet", is_own=known_table is not None)
+        check_address(url, ".parquet", is_own=known_table is not None)
     else:
         check_output(output, suffixes=[".parquet"], overwrite=overwrite or known_table is not None)
     archive = find_archive(paths)
@@ -180,14 +181,14 @@ def run_fleet(
     scheduler = check_scheduler(scheduler)
     options = check_options(reading=reading, windows=windows, fitting=fitting)
     if url := find_url(output):
-        _check_address(url, ".zarr", is_own=is_fleet(Path(output)))
+        check_address(url, ".zarr", is_own=is_fleet(Path(output)))
     else:
         check_output(output, overwrite=True, find_foreign=_find_foreign)
     target = resolve_link(output)
     check_job_folder(job_folder(target))
     with protect_inputs(paths), lock_job(job_folder(target)):
         try:
-            _begin_output(target, reports=reports)
+            begin_output(target, reports=reports)
             archive, known_table = _open_archive(paths, target)
             with _open_workers(scheduler, workers, [target, *archive.files[:1]]) as pool:
                 table = index_files(
@@ -220,17 +221,6 @@ def run_fleet(
     return rows
 
 
-def _check_address(url: str, suffix: str, *, is_own: bool) -> None:
-    """Check the address of an output: what another program wrote is never replaced."""
-    if not url.lower().endswith(suffix):
-        raise OptionError(f"output {url!r} must end in {suffix}; give another name with -o")
-    if not is_own and find_kind(url, required=False, error=OutputError):
-        raise OutputError(
-            f"output {url!r} exists already, and gyrostab fleet or index did not make it; remove "
-            "it first, or give another name with -o"
-        )
-
-
 def _open_workers(
     scheduler: str, workers: int | None, paths: Sequence[Path]
 ) -> contextlib.AbstractContextManager[Pool]:
@@ -242,25 +232,6 @@ def _open_workers(
 def _find_foreign(folder: Path) -> str | None:
     """Return an item of a folder that is not a fleet; None for a fleet and an empty folder."""
     return None if is_fleet(folder) else min(os.listdir(folder), default=None)
-
-
-def _begin_output(target: Path, *, reports: bool) -> None:
-    from gyrostab.report.charts import plotly_script
-
-    if not find_url(target):
-        target.mkdir(exist_ok=True)
-    write_text(target / FLEET_MARK, json.dumps({"schema": FLEET_SCHEMA}))
-    if is_zarr(target):
-        write_text(target / ".zgroup", json.dumps(_GROUP))
-    if reports:
-        _make_folder(target / "reports")
-        write_text(target / "reports" / PLOTLY_FILE, plotly_script())
-
-
-def _make_folder(folder: Path) -> None:
-    """Make a folder, with those above it; an address needs none."""
-    if not find_url(folder):
-        folder.mkdir(parents=True, exist_ok=True)
 
 
 def _open_archive(paths: Sequence[str | Path], target: Path) -> tuple[Archive, pd.DataFrame | None]:
@@ -290,7 +261,7 @@ def _compute_runs(
 ) -> pd.DataFrame:
     """Compute the runs that are new or changed, and write the table and the page of all runs."""
     old_rows = read_rows(target)
-    with ThreadPoolExecutor(_REQUESTS if find_url(target) else 1) as threads:
+    with ThreadPoolExecutor(REQUESTS if find_url(target) else 1) as threads:
         is_current = threads.map(
             lambda item: (
                 not overwrite
@@ -332,7 +303,7 @@ def _compute_runs(
         write_rows(table, target)
         _write_overview(table, target)
         if is_zarr(target):
-            _consolidate_metadata(target, list(rows))
+            consolidate_metadata(target, list(rows))
     return table
 
 
@@ -375,7 +346,7 @@ def process_run(
     }
     run_options = json.loads(options)
     try:
-        _make_folders(Path(target), product.parent)
+        make_folders(Path(target), product.parent)
         row["job"] = find_job_name(item.files, **run_options)
         if (url := find_url(product)) and (overwrite or read_job_name(product) != row["job"]):
             remove_address(url)  # a run replaces nothing at an address
@@ -398,16 +369,6 @@ def process_run(
     return row
 
 
-def _make_folders(target: Path, folder: Path) -> None:
-    """Make the folders between the output and a run, in a Zarr store as groups."""
-    _make_folder(folder)
-    for group in [folder, *folder.parents] if is_zarr(target) else ():
-        if group == target:
-            break
-        if not has_file(group / ".zgroup"):
-            write_text(group / ".zgroup", json.dumps(_GROUP))
-
-
 def _finish_run(path: Path, report: Path | None, plotly: str) -> dict[str, Any]:
     """Write the report of a product, and return what the table says of it."""
     from gyrostab.report import write_report
@@ -415,7 +376,7 @@ def _finish_run(path: Path, report: Path | None, plotly: str) -> dict[str, Any]:
     with open_dataset(path) as product:
         product.load()
     if report is not None:
-        _make_folder(report.parent)
+        make_folder(report.parent)
         with upload_file(report) as place:
             write_report(product, place, overwrite=True, plotly=plotly)
     return summarise_run(product)
@@ -429,19 +390,3 @@ def _write_overview(table: pd.DataFrame, target: Path) -> None:
     write_table(effects, target / "effects.parquet", content="effects", overwrite=True)
     write_table(trends, target / "trends.parquet", content="trends", overwrite=True)
     write_overview(table, target / "index.html", effects=effects, trends=trends, overwrite=True)
-
-
-def _consolidate_metadata(target: Path, names: Sequence[str]) -> None:
-    """Write the metadata of all groups in one file, from those that each group has."""
-    metadata: dict[str, Any] = {".zgroup": _GROUP}
-    with ThreadPoolExecutor(_REQUESTS if find_url(target) else 1) as threads:
-        contents = list(threads.map(lambda name: read_json(target / name / ".zmetadata"), names))
-    for name, content in zip(names, contents, strict=True):
-        if content is None:
-            continue
-        parts = name.split("/")
-        for depth in range(1, len(parts)):
-            metadata["/".join([*parts[:depth], ".zgroup"])] = _GROUP
-        metadata |= {f"{name}/{key}": value for key, value in content["metadata"].items()}
-    content = {"zarr_consolidated_format": 1, "metadata": metadata}
-    write_text(target / ".zmetadata", json.dumps(content))

@@ -1,7 +1,8 @@
-"""Files of a live view: those of a folder that grow, and the rows of standard input."""
+"""Files of a live view, the rows of standard input, and which samples have changed."""
 
 from __future__ import annotations
 
+import hashlib
 import re
 import threading
 from collections.abc import Callable
@@ -9,14 +10,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
+import numpy as np
 import xarray as xr
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.pieces import Spool
 from gyrostab.ingest.combine import move_to_disk
+from gyrostab.ingest.concat.lazy import GridSource
 from gyrostab.ingest.files import read_file
 from gyrostab.ingest.options import ReadOptions
+from gyrostab.schema import log_channels, signal_name
+from gyrostab.store.lazy import find_source, read_slice
 from gyrostab.store.output.inputs import describe_file, match_files
+from gyrostab.time.grid import first_stamp, grid_times
+from gyrostab.time.stamps import to_nanoseconds
 
 #: Files written this long [s] before the newest one, or later, may still grow.
 _GROWING_SECONDS = 60.0
@@ -144,3 +151,33 @@ def _read_header(path: Path) -> bytes:
                 break
             lines.append(line)
     return b"".join(lines)
+
+
+def hash_samples(log: xr.Dataset, span: tuple[int, int], common: str) -> bytes:
+    """Hash what determines the samples of a span: where rows of text lie, or else the values.
+
+    Rows that were read are taken not to change; which row a sample comes from may change when late
+    rows come.
+    """
+    total = hashlib.sha256(repr((common, span)).encode())
+    start, rate = first_stamp(log), float(log.attrs["sampling_rate_hz"])
+    for name in [signal_name(log), *log_channels(log)]:
+        variable, (begin, end) = log.variables[name], span
+        if variable.dims[-1] != "time":
+            stamps = to_nanoseconds(log.variables[f"time_{name}"].values)
+            begin, end = np.searchsorted(stamps, grid_times(start, rate, np.array(span))).tolist()
+            total.update(stamps[begin:end].tobytes())
+        source = find_source(variable.data)
+        if isinstance(source, GridSource):
+            for _, _, runs in (part for row in source.rows for part in row):
+                first = np.searchsorted(runs[:, 0] + runs[:, 2], begin, side="right")
+                overlapping_runs = runs[first : np.searchsorted(runs[:, 0], end)].copy()
+                if len(overlapping_runs):
+                    ends = overlapping_runs[:, 0] + overlapping_runs[:, 2]
+                    cut = np.maximum(begin - overlapping_runs[:, 0], 0)
+                    overlapping_runs[:, :2] += cut[:, None]
+                    overlapping_runs[:, 2] = np.minimum(ends, end) - overlapping_runs[:, 0]
+                total.update(overlapping_runs.tobytes())
+        else:
+            total.update(read_slice(variable.data, begin, end).tobytes())
+    return total.digest()

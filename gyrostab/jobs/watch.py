@@ -9,7 +9,6 @@ which late rows fell.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import re
 import sys
@@ -24,14 +23,13 @@ import xarray as xr
 
 from gyrostab.allan.plan import last_sample, make_plan, units_of_work
 from gyrostab.errors import FormatError, GyrostabError, OptionError, OutputError, TimeError
-from gyrostab.ingest.concat.lazy import GridSource
 from gyrostab.ingest.uniform import cut_log
 from gyrostab.io.growing import LayoutError, write_windows
 from gyrostab.io.opening import open_product
 from gyrostab.jobs.alarms import Alarm, check_alarms, describe_windows
 from gyrostab.jobs.checks import check_options
 from gyrostab.jobs.engine import compute_part, find_record_bands
-from gyrostab.jobs.follow import FileMemory, FileStates, RowKeeper, list_files
+from gyrostab.jobs.follow import FileMemory, FileStates, RowKeeper, hash_samples, list_files
 from gyrostab.jobs.job import (
     describe_differences,
     job_folder,
@@ -42,13 +40,12 @@ from gyrostab.jobs.job import (
 from gyrostab.jobs.run import load_log
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.schema import log_channels, signal_name
-from gyrostab.store.lazy import find_source, read_slice
+from gyrostab.store.lazy import find_source
 from gyrostab.store.output import check_output, follow_inputs, resolve_link
 from gyrostab.store.remote import find_url
 from gyrostab.store.system import release_memory, return_large_arrays
 from gyrostab.time.durations import duration_seconds, samples
 from gyrostab.time.grid import first_stamp, grid_times
-from gyrostab.time.stamps import to_nanoseconds
 
 #: Attribute of the product with the options that made it.
 _OPTIONS = "gyrostab_watch"
@@ -325,7 +322,7 @@ class _View:
         common = repr(
             (start, rate, fitting, log["axis"].values.tolist(), log_channels(log), source)
         )
-        digests = [_hash_samples(log, span, common) for span in spans]
+        digests = [hash_samples(log, span, common) for span in spans]
         same_record, self.common = common == self.common, common
         self._write_product(used, units, digests, fitting or {}, same_record=same_record)
 
@@ -382,33 +379,3 @@ class _View:
             for event in (event for alarm in self.alarms for event in alarm.update(window)):
                 if not is_known:
                     self.listener.show_alarm(event)
-
-
-def _hash_samples(log: xr.Dataset, span: tuple[int, int], common: str) -> bytes:
-    """Hash what determines the samples of a span: where rows of text lie, or else the values.
-
-    Rows that were read are taken not to change; which row a sample comes from may change when late
-    rows come.
-    """
-    total = hashlib.sha256(repr((common, span)).encode())
-    start, rate = first_stamp(log), float(log.attrs["sampling_rate_hz"])
-    for name in [signal_name(log), *log_channels(log)]:
-        variable, (begin, end) = log.variables[name], span
-        if variable.dims[-1] != "time":
-            stamps = to_nanoseconds(log.variables[f"time_{name}"].values)
-            begin, end = np.searchsorted(stamps, grid_times(start, rate, np.array(span))).tolist()
-            total.update(stamps[begin:end].tobytes())
-        source = find_source(variable.data)
-        if isinstance(source, GridSource):
-            for _, _, runs in (part for row in source.rows for part in row):
-                first = np.searchsorted(runs[:, 0] + runs[:, 2], begin, side="right")
-                overlapping_runs = runs[first : np.searchsorted(runs[:, 0], end)].copy()
-                if len(overlapping_runs):
-                    ends = overlapping_runs[:, 0] + overlapping_runs[:, 2]
-                    cut = np.maximum(begin - overlapping_runs[:, 0], 0)
-                    overlapping_runs[:, :2] += cut[:, None]
-                    overlapping_runs[:, 2] = np.minimum(ends, end) - overlapping_runs[:, 0]
-                total.update(overlapping_runs.tobytes())
-        else:
-            total.update(read_slice(variable.data, begin, end).tobytes())
-    return total.digest()
