@@ -345,7 +345,7 @@ def memory(archive):
         to_zarr(log, "memory://rig/tool 1/run b/log.zarr")
     store.pipe("/rig/tool 1/README.txt", b"Logs of the spring campaign.")
     store.pipe("/rig/tool 1/diagnosis/diagnosis.json", b"{}")
-    store.pipe("/rig/old/fleet.json", b"{}")
+    store.pipe("/rig/old/fleet.json", b'{"schema": "gyrostab.fleet/1"}')
     store.pipe("/rig/old/run.nc", b"a product")
     return store
 
@@ -355,6 +355,7 @@ def test_a_fleet_of_an_object_store_is_that_of_its_folder(paths, memory, done, t
     archive = find_archive(paths)
     assert [find_url(path) for path in archive.files] == [
         "memory://rig/tool 1/README.txt",
+        "memory://rig/tool 1/diagnosis/diagnosis.json",  # of another program
         "memory://rig/tool 1/run a/1.nc",
         "memory://rig/tool 1/run a/2.nc",
         "memory://rig/tool 1/run b/log.zarr",
