@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -120,42 +120,29 @@ def assemble(blocks: Sequence[Block]) -> xr.Dataset:
     written.
     """
     first = blocks[0].header
-    small = sum(block.path.stat().st_size for block in blocks) <= _MAX_MEMORY_BYTES
-    long = {
-        name: described["dims"].index("time")
-        for name, described in first["variables"].items()
-        if "time" in described["dims"]
-    }
-    at_once = [name for name in long if small or name in first["coords"]]
-    read = [_read_variables(block, at_once) for block in blocks]
-    arrays: dict[str, Any] = _read_variables(blocks[0], first["variables"].keys() - long.keys())
-    for name, along in long.items():
-        arrays[name] = (
-            np.concatenate([part[name] for part in read], axis=along)
-            if name in at_once
-            else _make_lazy(blocks, name)
-        )
-    variables = {
-        name: xr.Variable(described["dims"], arrays[name], _decode_attributes(described["attrs"]))
-        for name, described in first["variables"].items()
-    }
+    is_small = sum(block.path.stat().st_size for block in blocks) <= _MAX_MEMORY_BYTES
+    variables = {}
+    for name, described in first["variables"].items():
+        if "time" not in described["dims"]:
+            data = _map_variable(blocks[0], name).copy()
+        elif is_small or name in first["coords"]:
+            parts = [_map_variable(block, name) for block in blocks]
+            data = np.concatenate(parts, axis=described["dims"].index("time"))
+        else:
+            data = _make_lazy(blocks, name)
+        attrs = _decode_attributes(described["attrs"])
+        variables[name] = xr.Variable(described["dims"], data, attrs)
     dataset = xr.Dataset(variables, attrs=_decode_attributes(first["attrs"]))
     return dataset.set_coords(first["coords"])
 
 
-def _read_variables(block: Block, names: Iterable[str]) -> dict[str, NDArray[Any]]:
-    """Copy variables of a block, because Windows does not remove a file that is mapped."""
-    content = np.memmap(block.path, mode="r")
-    return {name: _slice_variable(content, block, name).copy() for name in names}
-
-
-def _slice_variable(content: NDArray[np.uint8], block: Block, name: str) -> NDArray[Any]:
-    """Find a variable in the content of a block file."""
+def _map_variable(block: Block, name: str) -> NDArray[Any]:
+    """Map a variable of a block file, for a copy: Windows does not remove a file that is mapped."""
     described = block.header["variables"][name]
     dtype, shape = np.dtype(described["dtype"]), tuple(described["shape"])
     begin = block.begin + described["place"]
     size = math.prod(shape) * dtype.itemsize
-    values = content[begin : begin + size]
+    values = np.memmap(block.path, mode="r")[begin : begin + size]
     if values.size < size:
         raise OSError(f"{block.path}: is cut short")
     return np.asarray(values.view(dtype).reshape(shape))
@@ -198,9 +185,8 @@ class _BlockSource(Source):
         ):
             block, first = self.blocks[i], int(self.edges[i])
             inside = slice(max(begin - first, 0), end - first)
-            values = _slice_variable(np.memmap(block.path, mode="r"), block, self.name)
             chosen = [inside if n == self.along else part for n, part in enumerate(box)]
-            pieces.append(values[tuple(chosen)])
+            pieces.append(_map_variable(block, self.name)[tuple(chosen)])
         return np.concatenate(pieces, axis=self.along)
 
 
