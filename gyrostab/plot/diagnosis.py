@@ -52,6 +52,16 @@ def _window_edges(begin: Array, end: Array) -> Array:
     return np.concatenate([[begin[0]], inner, [end[-1]]])
 
 
+def find_regions(
+    content: Mapping[str, Any], axis: str, *, over_tau: bool
+) -> list[Mapping[str, Any]]:
+    """Find the mismatches of an axis over averaging times, or those of its mean rate."""
+    views = ("davar", "cross_axis") if over_tau else ("mean", "restart")
+    regions = [region for region in content["mismatches"] if axis in region["axes"]]
+    regions = [region for region in regions if region["view"] in views]
+    return [region for region in regions if not over_tau or region["tau_min_s"]]
+
+
 def _find_span(
     region: Mapping[str, Any], content: Mapping[str, Any], size: float
 ) -> tuple[float, float]:
@@ -89,13 +99,7 @@ def _frame_mismatches(
 
     low_edge, high_edge = log_edges(taus)[[0, -1]]
     left, right = panel.get_xlim()
-    for region in content["mismatches"]:
-        if (
-            axis not in region["axes"]
-            or region["view"] not in ("davar", "cross_axis")
-            or not region["tau_min_s"]
-        ):
-            continue
+    for region in find_regions(content, axis, over_tau=True):
         begin, end = _find_span(region, content, size)
         min_width = MIN_FRAME_SHARE * (right - left)
         if end - begin < min_width:
@@ -336,13 +340,11 @@ def select_channels(surfaces: xr.Dataset, content: Mapping[str, Any]) -> list[st
 
 
 def _mark_spans(panel: Axes, axis: str, content: Mapping[str, Any], size: float) -> None:
-    for region in content["mismatches"]:
-        if axis in region["axes"] and region["view"] in ("mean", "restart"):
-            begin, end = _find_span(region, content, size)
-            panel.axvspan(begin, end, color=_RED, alpha=0.05, lw=0)
-            panel.axvspan(begin, end, ymin=0.96, color=_RED, lw=0)
-            at_top = panel.get_xaxis_transform()
-            _number_mismatch(panel, region, (begin, 1.0), xycoords=at_top)
+    for region in find_regions(content, axis, over_tau=False):
+        begin, end = _find_span(region, content, size)
+        panel.axvspan(begin, end, color=_RED, alpha=0.05, lw=0)
+        panel.axvspan(begin, end, ymin=0.96, color=_RED, lw=0)
+        _number_mismatch(panel, region, (begin, 1.0), xycoords=panel.get_xaxis_transform())
 
 
 def _draw_cases(

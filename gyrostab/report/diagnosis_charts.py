@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.noise import NORMAL_95
-from gyrostab.plot.diagnosis import find_change, select_channels
+from gyrostab.plot.diagnosis import find_change, find_regions, select_channels
 from gyrostab.plot.style import COLOURS, axis_names, axis_style, unit_label
 from gyrostab.report.charts import (
     DEVIATION_LABEL,
@@ -86,9 +86,8 @@ def _draw_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
         frame.update_yaxes(title={"text": title, "font": {"size": 12}}, col=1, row=row)
     frame.update_xaxes(type="date")
     for row, name in enumerate(names):
-        for region in content["mismatches"]:
-            if name in region["axes"] and region["view"] in ("davar", "cross_axis"):
-                _frame_region(frame, region, row)
+        for region in find_regions(content, name, over_tau=True):
+            _frame_region(frame, region, row)
     figure = new_chart(
         height=170 * len(names) + 110,
         coloraxis={
@@ -102,8 +101,6 @@ def _draw_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
 
 
 def _frame_region(figure: go.Figure, region: Mapping[str, Any], row: int) -> None:
-    if not region["tau_min_s"]:
-        return
     for column in (0, 1):
         number = 2 * row + column + 1
         axis = str(number) if number > 1 else ""
@@ -171,13 +168,12 @@ def _draw_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
                 x=window, y=single(mean), name=f"{title}, 95 %",
                 line={"color": colour, "dash": "solid" if number else "dash"}, **common,
             )  # fmt: skip
-        for region in content["mismatches"]:
-            if name in region["axes"] and region["view"] in ("mean", "restart"):
-                figure.add_shape(
-                    type="rect", xref="x", yref=f"{panel} domain", x0=region["start"],
-                    x1=region["end"], y0=0, y1=1, fillcolor=_RED, opacity=0.12, line={"width": 0},
-                    label=_region_label(region),
-                )  # fmt: skip
+        for region in find_regions(content, name, over_tau=False):
+            figure.add_shape(
+                type="rect", xref="x", yref=f"{panel} domain", x0=region["start"],
+                x1=region["end"], y0=0, y1=1, fillcolor=_RED, opacity=0.12, line={"width": 0},
+                label=_region_label(region),
+            )  # fmt: skip
     for row, channel in enumerate(channels, start=len(names)):
         course = surfaces[f"channel_{channel}"]
         unit = unit_label(course.attrs.get("units"))
