@@ -62,7 +62,15 @@ def write_diagnosis_report(
     """
     content = diagnosis.content
     check_diagnosis(content)
-    rows = [_mismatch_row(region, content) for region in content["mismatches"]]
+    rows = [
+        {
+            "id": region["id"],
+            "statistic": _VIEW_TEXT[region["view"]],
+            "statement": without_chance(region["statement"]),
+            "chance": chance_share(region["p_value"]),
+        }
+        for region in content["mismatches"]
+    ]
     cards = [
         _effect_card(effect, others, content, rows)
         for effect, *others in group_families(content["effects"])
@@ -193,15 +201,6 @@ def _effect_card(
             for row, region in zip(rows, content["mismatches"], strict=True)
             if effect["name"] in region["explained_by"] and axes & set(region["axes"])
         ],
-    }
-
-
-def _mismatch_row(region: Mapping[str, Any], content: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        "id": region["id"],
-        "statistic": _VIEW_TEXT[region["view"]],
-        "statement": without_chance(region["statement"]),
-        "chance": chance_share(region["p_value"]),
     }
 
 

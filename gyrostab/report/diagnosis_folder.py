@@ -65,16 +65,13 @@ def write_diagnosis(
 
 def find_foreign_file(directory: Path) -> str | None:
     """Find an item in a folder that is not part of a diagnosis; None if there is none."""
-    names = sorted(item.name for item in directory.iterdir())
-    ours = is_diagnosis(directory)
-    return next(
-        (
-            name
-            for name in names
-            if not ours or name not in FILES or not _is_plain_file(directory / name)
-        ),
-        None,
+    ours = FILES if is_diagnosis(directory) else ()
+    foreign = (
+        item.name
+        for item in directory.iterdir()
+        if item.name not in ours or item.is_symlink() or not item.is_file()
     )
+    return min(foreign, default=None)
 
 
 def is_diagnosis(directory: Path) -> bool:
@@ -83,10 +80,6 @@ def is_diagnosis(directory: Path) -> bool:
     return isinstance(content, dict) and str(content.get("schema")).startswith(
         "gyrostab.diagnosis/"
     )
-
-
-def _is_plain_file(path: Path) -> bool:
-    return path.is_file() and not path.is_symlink()
 
 
 def _make_heading(diagnosis: Diagnosis) -> str:

@@ -44,7 +44,9 @@ def doctor(*, common: Common = Common()) -> None:
         missing = any(fault for _, fault in needed[extra])
         print(f"extra {extra}: {lines}" + f"; pip install 'gyrostab[{extra}]'" * missing)
     print(f"NetCDF with zstd: {'yes' if has_zstd() else 'no; logs are compressed with zlib'}")
-    print(f"engine for xarray: {'registered' if _has_engine() else 'install gyrostab again'}")
+    engines = metadata.entry_points(group="xarray.backends").names
+    engine = "registered" if "gyrostab" in engines else "install gyrostab again"
+    print(f"engine for xarray: {engine}")
     print(f"compiled kernels: {_describe_kernels()}")
     if faults:
         raise GyrostabError(f"{', '.join(faults)}: install gyrostab again with pip")
@@ -88,10 +90,6 @@ def _check_version(need: Requirement) -> tuple[str, bool]:
     if need.specifier.contains(version, prereleases=True):
         return f"{need.name} {version}", False
     return f"{need.name} {version} (needs {need.specifier})", True
-
-
-def _has_engine() -> bool:
-    return "gyrostab" in metadata.entry_points(group="xarray.backends").names
 
 
 def _describe_kernels() -> str:
