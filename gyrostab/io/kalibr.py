@@ -29,9 +29,8 @@ import json
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -39,7 +38,7 @@ import xarray as xr
 
 from gyrostab.allan.davar import davar
 from gyrostab.allan.fit import fit_noise
-from gyrostab.allan.summary import FitSummary, summarise_fit, summarise_terms
+from gyrostab.allan.summary import FitSummary, TermSummary, summarise_fit, summarise_terms
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.ingest.uniform import cut_log
@@ -68,30 +67,18 @@ _ACCELEROMETER_NAMES = {
 }
 
 
-@dataclass(frozen=True)
-class KalibrValue:
-    """One number for Kalibr."""
-
-    #: Median over the windows that observe the term, or of their upper limits where more windows
-    #: only bound it [unit of the key in `KEYS`]; NaN when there is neither.
-    value: float
-    meaning: Literal["observed", "upper_limit_only", "not_observable"]  # meaning of the value
-    share: float  # share of the windows that enter the median [1]
-
-
 def convert_terms(
     product: xr.Dataset, keys: Mapping[str, tuple[str, float, str]]
-) -> dict[str, dict[str, KalibrValue]]:
-    """Find axis -> key of `keys` -> value of a product in the units of Kalibr."""
+) -> dict[str, dict[str, TermSummary]]:
+    """Find axis -> key of `keys` -> term of a product, with median and limit in units of Kalibr."""
     by_symbol = {symbol: (key, factor) for key, (symbol, factor, _) in keys.items()}
-    values_by_axis: dict[str, dict[str, KalibrValue]] = {}
+    terms_by_axis: dict[str, dict[str, TermSummary]] = {}
     for term in summarise_terms(product):
         if term.symbol in by_symbol:
             key, factor = by_symbol[term.symbol]
-            shares = {"observed": term.observed_share, "upper_limit_only": term.limited_share}
-            value = KalibrValue(term.value * factor, term.status, shares.get(term.status, 0.0))
-            values_by_axis.setdefault(term.axis, {})[key] = value
-    return {axis: {key: values[key] for key in keys} for axis, values in values_by_axis.items()}
+            converted = replace(term, median=term.median * factor, limit=term.limit * factor)
+            terms_by_axis.setdefault(term.axis, {})[key] = converted
+    return {axis: {key: terms[key] for key in keys} for axis, terms in terms_by_axis.items()}
 
 
 def _fit_accelerometers(log: xr.Dataset, product: xr.Dataset) -> xr.Dataset:
@@ -224,22 +211,22 @@ def _describe_fit(fit: FitSummary) -> str:
     return text
 
 
-def _find_worst(values: list[KalibrValue]) -> KalibrValue:
+def _find_worst(values: list[TermSummary]) -> TermSummary:
     """Find the largest value or limit of any axis; an axis without one is left out."""
     known_values = [value for value in values if not math.isnan(value.value)]
     return max(known_values, key=lambda value: value.value) if known_values else values[0]
 
 
-def _format_entry(key: str, value: KalibrValue, *, indent: str) -> list[str]:
+def _format_entry(key: str, term: TermSummary, *, indent: str) -> list[str]:
     symbol, _, unit = (KEYS | ACCELEROMETER_KEYS)[key]
     name = _ACCELEROMETER_NAMES.get(key, LAWS[symbol].name)
     comment = {
         "observed": f"{unit}; {symbol}, {name}, "
-        f"observed in {100 * value.share:.0f} % of the windows",
+        f"observed in {100 * term.observed_share:.0f} % of the windows",
         "upper_limit_only": f"{unit}; 95 % UPPER LIMIT of {symbol} ({name}), "
-        f"in {100 * value.share:.0f} % of the windows",
+        f"in {100 * term.limited_share:.0f} % of the windows",
         "not_observable": f"{unit}; not observable in any window: "
         f"a longer --window may show {symbol} ({name})",
-    }[value.meaning]
-    number = "null" if math.isnan(value.value) else f"{value.value:.6e}"
-    return [f"{indent}{key}: {number}  # {comment}", f"{indent}{key}_meaning: {value.meaning}"]
+    }[term.status]
+    number = "null" if math.isnan(term.value) else f"{term.value:.6e}"
+    return [f"{indent}{key}: {number}  # {comment}", f"{indent}{key}_meaning: {term.status}"]

@@ -79,7 +79,7 @@ def test_median_over_observed_windows_only(product):
     product["observable"].loc[{"term": "N"}][0, 3:] = OBSERVABLE.index("not_observable")
     value = convert_terms(product, KEYS)["x"]["gyroscope_noise_density"]
     assert value.value == pytest.approx(2.0 * BY_HAND["gyroscope_noise_density"])
-    assert (value.meaning, value.share) == ("observed", 0.5)
+    assert (value.status, value.observed_share) == ("observed", 0.5)
 
 
 def test_file_has_the_worst_axis_at_the_top_and_every_axis_below(product, tmp_path):
