@@ -102,7 +102,8 @@ def find_archive(paths: Sequence[str | Path]) -> Archive:
         for path in map(Path, matching):
             inside: Iterable[tuple[str, Path]] = ()
             if url:
-                inside = [("file", path)] if find_kind(url) == "file" else _walk(path, visited)
+                is_file = find_kind(find_url(path) or url) == "file"
+                inside = [("file", path)] if is_file else _walk(path, visited)
             elif not path.exists():
                 raise FormatError(f"{path}: there is no such file or folder")
             elif path.is_dir() and not (is_store(path) or is_fleet(path)):
@@ -133,15 +134,15 @@ def _walk(folder: Path, visited: set[str]) -> Iterator[tuple[str, Path]]:
     """Yield the files, stores and diagnoses in a folder or at an address, each folder once."""
     url = find_url(folder)
     for place, folders, names in walk_address(url) if url else os.walk(folder):
-        here = Path(place)
-        kind = "visited" if place in visited else _find_kind(here, set(names))
+        current = Path(place)
+        kind = "visited" if place in visited else _find_kind(current, set(names))
         visited.add(place)
         if kind in ("file", DIAGNOSIS):
-            yield kind, here
+            yield kind, current
         elif not kind:
-            yield from (("file", Path(here, name)) for name in names if not name.startswith("."))
+            yield from (("file", Path(current, name)) for name in names if not name.startswith("."))
         for name in list(folders):
-            path = Path(here, name)
+            path = Path(current, name)
             if kind or name.startswith("."):
                 folders.remove(name)
             elif path.is_symlink() and _find_kind(path, set(os.listdir(path))) == "file":
