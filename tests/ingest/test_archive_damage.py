@@ -13,6 +13,7 @@ from gyrostab.ingest import read_log
 from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.io import datasets as export
+from gyrostab.io.opening import open_log
 from gyrostab.jobs.run import load_log
 from tests.support.regular_logs import RATE, cut, log_of, said, signal
 
@@ -171,7 +172,7 @@ def test_command_line_continues_unless_strict(
     command = ["ingest", *map(str, archive), "--quiet-progress"]
     assert main([*command, "-o", str(tmp_path / "log.nc")]) == 0
     assert "run_10.csv" in capsys.readouterr().err
-    with export.open_log(tmp_path / "log.nc") as log:
+    with open_log(tmp_path / "log.nc") as log:
         assert log.attrs["unreadable_files"] == ["run_10.csv"]
         assert "unreadable" in set(gap_table(log)["cause"])
     assert main([*command, "-o", str(tmp_path / "second.nc"), "--strict"]) == 2

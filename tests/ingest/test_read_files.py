@@ -354,13 +354,14 @@ def test_channels_of_a_zarr_store_come_in_the_order_of_their_names(tmp_path: Pat
 @pytest.mark.parametrize("name", ["log.nc", "log.zarr"])
 def test_exported_files_are_read(tmp_path: Path, name: str) -> None:
     from gyrostab.io import datasets as export
+    from gyrostab.io.opening import open_log
 
     log = regular_log()
     log["vibration"].attrs["units"] = "g"
     log.attrs |= {"source_files": ["a.csv", "b.csv"], "notes": ["a.csv: says something"]}
     write_log = export.to_netcdf if name.endswith(".nc") else export.to_zarr
     path = write_log(log, tmp_path / name)
-    back, opened = read_log(path), export.open_log(path)
+    back, opened = read_log(path), open_log(path)
     assert isinstance(back.xindexes["time"], TimeGridIndex)
     for variable in log.variables:
         np.testing.assert_array_equal(back[variable].values, log[variable].values)
