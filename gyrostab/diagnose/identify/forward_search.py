@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import xarray as xr
@@ -17,7 +18,7 @@ from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
 from gyrostab.diagnose.identify.selection import select_effects
 from gyrostab.diagnose.nulls.scores import fit_best_evidence
-from gyrostab.diagnose.predict.candidates import Candidate
+from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.search import compute_evidence, evidence_by_effect
 from gyrostab.diagnose.settings import DEFAULTS, Settings
@@ -101,29 +102,32 @@ def _score_null_records(
 ) -> tuple[Array, CountEvidence]:
     """Return the best evidence of any effect in each null record, sorted, and that of counts.
 
-    The evidence of counts needs the counts of all null records. It is added in a second pass, for
-    which the counts are kept.
+    The means and counts of all null records are kept. Their evidence comes last: that of counts
+    needs the counts of all records, and that of means whitens every design once for all records.
     """
-    linear = [candidate for candidate in candidates if not candidate.statistic.is_count]
-    counts = [candidate for candidate in candidates if candidate.statistic.is_count]
-    sums: list[dict[str, Array]] = []
-    count_chunks: list[xr.Dataset] = []
+    at_end: list[Candidate] = []
+    by_chunk: list[Candidate] = []
+    for candidate in candidates:
+        is_kept = candidate.statistic.is_count or candidate.statistic.null_variable == "mean"
+        (at_end if is_kept else by_chunk).append(candidate)
+    chunks: list[list[CandidateEvidence]] = []
+    kept: list[xr.Dataset] = []
     records = 0
     for chunk in nulls:
-        sums.append(evidence_by_effect(compute_evidence(linear, chunk, state, folds, rng=rng)))
-        count_chunks.append(chunk[[name for name in EXPECTED if name in chunk]])
+        chunks.append(compute_evidence(by_chunk, chunk, state, folds, rng=rng))
+        kept.append(chunk[[name for name in ("mean", *EXPECTED) if name in chunk]])
         records += chunk.sizes["record"]
         progress("naming", 0, records)
     rounded = rounded_rates(state.blocks, state.baseline, settings=state.settings)
-    count_evidence = CountEvidence.gathered(count_chunks, rounded)
-    best = []
-    for linear_sums, chunk in zip(sums, count_chunks, strict=True):
-        count_sums = evidence_by_effect(
-            compute_evidence(counts, chunk, state, folds, count_evidence=count_evidence)
-        )
-        zero = np.zeros(chunk.sizes["record"])
-        keys = {*linear_sums, *count_sums}
-        best.append(
-            np.max([linear_sums.get(key, zero) + count_sums.get(key, zero) for key in keys], axis=0)
-        )
-    return np.sort(np.concatenate(best)), count_evidence
+    count_evidence = CountEvidence.gathered(kept, rounded)
+    data = xr.concat(kept, "record", data_vars="minimal", coords="minimal", compat="override")
+    last = compute_evidence(at_end, data, state, folds, count_evidence=count_evidence)
+    counts = [evidence for evidence in last if evidence.candidate.statistic.is_count]
+    others = [evidence for evidence in last if not evidence.candidate.statistic.is_count]
+    for of_chunks in zip(*chunks, strict=True):
+        evidence_nats = np.concatenate([evidence.evidence_nats for evidence in of_chunks])
+        others.append(replace(of_chunks[0], evidence_nats=evidence_nats))
+    sums = [evidence_by_effect(others), evidence_by_effect(counts)]
+    zero = np.zeros(records)
+    best = [sum(part.get(key, zero) for part in sums) for key in {*sums[0], *sums[1]}]
+    return np.sort(np.max(best, axis=0)), count_evidence

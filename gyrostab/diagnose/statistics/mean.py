@@ -112,6 +112,7 @@ class Mean(BlockMeanStatistic):
     """Block means, which the Allan variance does not show."""
 
     name = "mean"
+    null_variable = "mean"
     is_in_means = True
     is_linear_in_means = True
     has_course = True

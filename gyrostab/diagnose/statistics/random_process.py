@@ -48,6 +48,7 @@ class RandomProcess(BlockMeanStatistic):
     explains = ("mean", "davar", "restart", "cross_axis")
     contained_in = ()
     nuisance_alternative = "~red"
+    null_variable = "mean"
     error_shows_in = ("random_process",)
     explains_motion = True
     has_course = True

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import xarray as xr
+from numpy.testing import assert_allclose
 
 from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks, fold_subsets
 from gyrostab.diagnose.evidence.mixture import Mixture
@@ -52,6 +53,15 @@ def test_noise_has_no_identification():
     assert identifications.identified == identifications.unknown == ()
     assert 3.0 < identifications.threshold < 15.0
     assert identifications.null_best.size == 40
+
+
+def test_null_records_may_come_in_parts(shaken):
+    blocks = record(VIBRATION, environment=WORLD["usual"], seed=1)
+    baseline, records = nulls(blocks, 40)
+    (together,) = records
+    parts = [together.isel(record=part) for part in (slice(0, 15), slice(15, None))]
+    best = name_effects(blocks, baseline, parts).null_best
+    assert_allclose(best, shaken.null_best, rtol=1e-9)
 
 
 def test_vibration_noise_is_identified_on_its_axis(shaken):
