@@ -39,6 +39,8 @@ class Point:
     sizes: Mixture
     share: float = 1.0  # length of the part of the grid that it represents, in steps
     unlikely: float = 0.0  # prior penalty [nats]
+    line: int = 0  # of the grid, that it is on
+    place: float = 0.0  # along that line, in steps
 
     @property
     def evidence(self) -> float:
@@ -52,14 +54,15 @@ class Point:
         )
 
 
-def _make_point(variant: Variant, sizes: Mixture) -> Point:
+def _make_point(variant: Variant, sizes: Mixture, line: int, place: float) -> Point:
     """Return a point with a prior that is uniform in size over standard error.
 
     The same size is another effect where a time constant is longer. With a prior uniform in size,
     slow forms would be preferred, of which the record shows only the beginning.
     """
     mean = np.einsum("g,gij->ij", sizes.weights(), sizes.covariance)
-    return Point(variant, sizes, unlikely=0.5 * float(np.linalg.slogdet(mean)[1]))
+    unlikely = 0.5 * float(np.linalg.slogdet(mean)[1])
+    return Point(variant, sizes, unlikely=unlikely, line=line, place=place)
 
 
 def refine_grid(component: Component, state: State, points: Sequence[Point]) -> list[Point]:
@@ -72,35 +75,24 @@ def refine_grid(component: Component, state: State, points: Sequence[Point]) -> 
     name = _find_scale(component, points)
     if name is None:
         return list(points)
-    placed_points = [
-        PlacedPoint(_make_point(point.variant, point.sizes), *place)
+    grid = [
+        _make_point(point.variant, point.sizes, *place)
         for point, place in zip(points, _place_points(points, name), strict=True)
     ]
-    for members in _split_lines(placed_points):
+    for members in _split_lines(grid):
         for down in (True, False) if len(members) > 1 else ():
-            placed_points += _extend_line(component, state, name, members, placed_points, down)
+            grid += _extend_line(component, state, name, members, grid, down)
     for _ in range(MAX_ROUNDS):
-        steps = _steps_to_halve(placed_points)[
-            : max(MAX_ADDED_POINTS - len(placed_points) + len(points), 0)
+        room = max(MAX_ADDED_POINTS - len(grid) + len(points), 0)
+        halved = [
+            _halve_step(component, state, name, left, right)
+            for left, right in _steps_to_halve(grid)[:room]
         ]
-        new = [
-            made
-            for left, right in steps
-            if (made := _halve_step(component, state, name, left, right)) is not None
-        ]
+        new = [point for point in halved if point is not None]
         if not new:
             break
-        placed_points += new
-    return _share_steps(placed_points)
-
-
-@dataclass(frozen=True)
-class PlacedPoint:
-    """A point with its line of the grid, and its place along that line in steps."""
-
-    point: Point
-    line: int
-    place: float
+        grid += new
+    return _share_steps(grid)
 
 
 def _find_scale(component: Component, points: Sequence[Point]) -> str | None:
@@ -143,24 +135,27 @@ def _value_at(point: Point, name: str) -> float:
     return float(point.variant.values[name])
 
 
-def _split_lines(placed_points: Sequence[PlacedPoint]) -> list[list[PlacedPoint]]:
+def _split_lines(grid: Sequence[Point]) -> list[list[Point]]:
     """Return the points of each line in order."""
-    ordered = sorted(placed_points, key=lambda placed: (placed.line, placed.place))
-    return [list(line) for _, line in groupby(ordered, key=lambda placed: placed.line)]
+    ordered = sorted(grid, key=lambda point: (point.line, point.place))
+    return [list(line) for _, line in groupby(ordered, key=lambda point: point.line)]
 
 
-def _steps_to_halve(placed_points: Sequence[PlacedPoint]) -> list[tuple[PlacedPoint, PlacedPoint]]:
+def _steps_to_halve(grid: Sequence[Point]) -> list[tuple[Point, Point]]:
     """Return the steps to be halved, the likeliest first."""
-    best = max(placed_points, key=lambda placed: placed.point.evidence)
-    top, first = best.point.evidence, not any(placed.place % 1.0 for placed in placed_points)
-    out = []
-    for left, right in (pair for line in _split_lines(placed_points) for pair in pairwise(line)):
-        likely = max(left.point.evidence, right.point.evidence) > top - LIKELY_NATS
-        if (first and (best is left or best is right)) or (
-            likely and _are_different(left.point, right.point)
-        ):
-            out.append((left, right))
-    return sorted(out, key=lambda pair: -max(placed.point.evidence for placed in pair))
+    best = max(grid, key=lambda point: point.evidence)
+    first = not any(point.place % 1.0 for point in grid)
+    out = [
+        (left, right)
+        for line in _split_lines(grid)
+        for left, right in pairwise(line)
+        if (first and (best is left or best is right))
+        or (
+            max(left.evidence, right.evidence) > best.evidence - LIKELY_NATS
+            and _are_different(left, right)
+        )
+    ]
+    return sorted(out, key=lambda pair: -max(point.evidence for point in pair))
 
 
 def _are_different(left: Point, right: Point) -> bool:
@@ -173,49 +168,43 @@ def _are_different(left: Point, right: Point) -> bool:
 
 
 def _halve_step(
-    component: Component, state: State, name: str, left: PlacedPoint, right: PlacedPoint
-) -> PlacedPoint | None:
+    component: Component, state: State, name: str, left: Point, right: Point
+) -> Point | None:
     """Return the point in the middle of a step, in the logarithm unless one end is near zero."""
-    low, high = sorted((_value_at(left.point, name), _value_at(right.point, name)))
+    low, high = sorted((_value_at(left, name), _value_at(right, name)))
     value = math.sqrt(low * high) if low > high / MAX_RATIO else 0.5 * (low + high)
-    return _place_point(component, state, name, left, value, 0.5 * (left.place + right.place))
+    return _add_point(component, state, name, left, value, 0.5 * (left.place + right.place))
 
 
 def _extend_line(
     component: Component,
     state: State,
     name: str,
-    line: Sequence[PlacedPoint],
-    placed_points: Sequence[PlacedPoint],
+    line: Sequence[Point],
+    grid: Sequence[Point],
     down: bool,
-) -> list[PlacedPoint]:
+) -> list[Point]:
     """Return points beyond an end of a line, in steps like the last one.
 
     They continue while the likelihood rises and is within `LIKELY_NATS` of the largest. A lag
     longer than the record is only another slope.
     """
     previous, last = (line[1], line[0]) if down else (line[-2], line[-1])
-    ratio = _value_at(last.point, name) / max(_value_at(previous.point, name), 1e-300)
-    top, out = (
-        max(placed.point.evidence for placed in placed_points) - LIKELY_NATS,
-        list[PlacedPoint](),
-    )
-    longest = float(state.blocks["end"].values[-1]) / _SECONDS.get(
-        _unit_of(component, name), math.nan
-    )
+    ratio = _value_at(last, name) / max(_value_at(previous, name), 1e-300)
+    top = max(point.evidence for point in grid) - LIKELY_NATS
+    unit = _SECONDS.get(_unit_of(component, name), math.nan)
+    longest = float(state.blocks["end"].values[-1]) / unit
+    out: list[Point] = []
     while (
         len(out) < MAX_ROUNDS
         and 1.0 / MAX_RATIO < ratio < MAX_RATIO
-        and last.point.evidence > max(previous.point.evidence + STEEP_NATS, top)
+        and last.evidence > max(previous.evidence + STEEP_NATS, top)
     ):
-        value = ratio * _value_at(last.point, name)
-        added = (
-            None
-            if value > longest
-            else _place_point(
-                component, state, name, last, value, last.place + (-1.0 if down else 1.0)
-            )
-        )
+        value = ratio * _value_at(last, name)
+        if value > longest:
+            break
+        place = last.place + (-1.0 if down else 1.0)
+        added = _add_point(component, state, name, last, value, place)
         if added is None:
             break
         out.append(added)
@@ -223,32 +212,30 @@ def _extend_line(
     return out
 
 
-def _place_point(
-    component: Component, state: State, name: str, like: PlacedPoint, value: float, place: float
-) -> PlacedPoint | None:
+def _add_point(
+    component: Component, state: State, name: str, like: Point, value: float, place: float
+) -> Point | None:
     """Return a point of another value on the same line, or None where the effect cannot have it."""
-    target_variant = replace(like.point.variant, values={**like.point.variant.values, name: value})
+    sought = replace(like.variant, values={**like.variant.values, name: value})
     try:
         variant = rebuild_variant(
-            component.candidate, target_variant, state.blocks, state.baseline["coefficient"]
+            component.candidate, sought, state.blocks, state.baseline["coefficient"]
         )
     except OptionError:
         return None
     if variant is None or variant.values.get(name) != value:
         return None
-    return PlacedPoint(
-        _make_point(variant, component_mixture(component, state, variant)), like.line, place
-    )
+    return _make_point(variant, component_mixture(component, state, variant), like.line, place)
 
 
-def _share_steps(placed_points: Sequence[PlacedPoint]) -> list[Point]:
+def _share_steps(grid: Sequence[Point]) -> list[Point]:
     """Return the points with their shares: half of both steps next to them, or half a step."""
     out = []
-    for ordered in _split_lines(placed_points):
-        place = np.array([placed.place for placed in ordered])
+    for line in _split_lines(grid):
+        place = np.array([point.place for point in line])
         edge = np.concatenate([[place[0] - 0.5], 0.5 * (place[1:] + place[:-1]), [place[-1] + 0.5]])
         out += [
-            replace(placed.point, share=float(share))
-            for placed, share in zip(ordered, np.diff(edge), strict=True)
+            replace(point, share=float(share))
+            for point, share in zip(line, np.diff(edge), strict=True)
         ]
     return out
