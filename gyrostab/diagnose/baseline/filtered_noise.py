@@ -27,31 +27,36 @@ def fit_filter_response(
 ) -> Array | None:
     """Return the response (band,) of the filter that describes the powers of all axes best.
 
-    All axes pass the one logger: None if the noise terms alone describe some axis better. If
-    several filters fit about as well, the one that needs least angle quantization is taken: Q rises
-    where a low-pass falls, so that one at too low a cutoff fits with much Q.
+    All axes pass the one logger: None if the noise terms alone describe some axis better.
     """
     responses = [
         band_response(LoggerFilter.example(**values), blocks)
         for values in LoggerFilter.example().points(make_windows(blocks, {}))
     ]
-    behind = np.array(  # (filter, axis, 2), the last without a filter
-        [
-            [_fit_behind(fit, response) for fit in fits]
-            for response in [*responses, np.ones(blocks.sizes["band"])]
-        ]
-    )
-    likelihood, quantization = behind[..., 0], behind[..., 1]
-    total = likelihood[:-1].sum(axis=1)
-    is_close = total > total.max() - settings.ambiguous_nats
-    chosen = int(np.where(is_close, quantization[:-1].sum(axis=1), np.inf).argmin())
-    return responses[chosen] if (likelihood[chosen] > likelihood[-1]).all() else None
+    behind = [
+        [fit_behind(fit, fit.columns * response[:, None]) for fit in fits] for response in responses
+    ]
+    chosen = choose_filter(behind, settings)
+    is_better = [
+        nats > fit_behind(fit, fit.columns)[0]
+        for fit, (nats, _) in zip(fits, behind[chosen], strict=True)
+    ]
+    return responses[chosen] if all(is_better) else None
 
 
-def _fit_behind(fit: Fit, response: Array) -> tuple[float, float]:
-    """Return the largest log likelihood of powers behind a filter, and the Q^2 that it needs."""
-    filtered = fit._replace(columns=fit.columns * response[:, None])
-    square = fit_squares(filtered)[0]
-    expected = filtered.columns @ square
+def fit_behind(fit: Fit, columns: Array) -> tuple[float, float]:
+    """Return the largest log likelihood of powers over noise of these columns, and its Q^2."""
+    square, _, expected = fit_squares(fit._replace(columns=columns))
     likelihood = -float((fit.weight * (np.log(expected) + fit.power / expected)).sum())
     return likelihood, float(square[0])
+
+
+def choose_filter(behind: Sequence[Sequence[tuple[float, float]]], settings: Settings) -> int:
+    """Return the place of the filter with the least Q^2 among those that fit about as well.
+
+    `behind` has the results of `fit_behind` for each filter and axis. Q rises where a low-pass
+    falls, so that one at too low a cutoff fits with much Q.
+    """
+    likelihood, quantization = np.array(behind).sum(axis=1).T
+    is_close = likelihood > likelihood.max() - settings.ambiguous_nats
+    return int(np.where(is_close, quantization, np.inf).argmin())

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.expected_statistics import band_columns, common_variance
-from gyrostab.diagnose.baseline.posterior import Fit, fit_squares
+from gyrostab.diagnose.baseline.filtered_noise import choose_filter, fit_behind
+from gyrostab.diagnose.baseline.posterior import Fit
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import State, unspread_share
@@ -31,9 +32,6 @@ def fit_filter_sizes(
 ) -> tuple[dict[str, tuple[float, ...]], dict[str, float]]:
     """Fit the cutoff or length of a filter to the powers of all its axes, with free noise.
 
-    If several filters fit about as well, the one that needs least angle quantization is taken: a
-    low-pass at far too low a cutoff with much of it passes what an average of two samples does.
-
     Returns
     -------
     sizes : dict of str to (float, float) or (float, float, float, float)
@@ -45,31 +43,22 @@ def fit_filter_sizes(
     kind = effects()[components[0].candidate.effect]
     fits = [_average_powers(component.row[0], state) for component in components]
 
-    def fits_behind(values: Mapping[str, Any]) -> list[Fit]:
-        filtered = (
-            band_columns(state.blocks)
-            * band_response(kind.example(**values), state.blocks)[:, None]
-        )
-        return [fit._replace(columns=mixing @ filtered) for fit, mixing in fits]
+    def fit_all(values: Mapping[str, Any]) -> list[tuple[float, float]]:
+        response = band_response(kind.example(**values), state.blocks)
+        filtered = band_columns(state.blocks) * response[:, None]
+        return [fit_behind(fit, mixing @ filtered) for fit, mixing in fits]
 
     def likelihood(values: Mapping[str, Any]) -> float:
-        return sum(map(_max_log_likelihood, fits_behind(values)))
-
-    def quantization(values: Mapping[str, Any]) -> float:
-        return sum(float(fit_squares(fit)[0][0]) for fit in fits_behind(values))
+        return sum(nats for nats, _ in fit_all(values))
 
     family = [
         variant.values
         for variant in components[0].candidate.variants
         if components[0].statistic.is_filter(variant)
     ]
-    log = [likelihood(values) for values in family]
-    close = [
-        values
-        for values, log_likelihood in zip(family, log, strict=True)
-        if log_likelihood > max(log) - state.settings.ambiguous_nats
-    ]
-    best = min(close, key=quantization)
+    behind = [fit_all(values) for values in family]
+    log = [sum(nats for nats, _ in axes) for axes in behind]
+    best = family[choose_filter(behind, state.settings)]
     name = "cutoff" if best["cutoff"] else "length"
     other_values = {key: float(value) for key, value in best.items() if key != name}
     if name == "length" and best["instrument"] == 1.0:
@@ -182,9 +171,3 @@ def _average_powers(axis: str, state: State) -> tuple[Fit, Array]:
         free_columns=free,
         start=mean(state.weight[row]),
     ), mixing
-
-
-def _max_log_likelihood(fit: Fit) -> float:
-    """Return the largest log likelihood of the powers over the noise."""
-    expected = fit_squares(fit)[2]
-    return float(-(fit.weight * (np.log(expected) + fit.power / expected)).sum())
