@@ -163,12 +163,8 @@ def calibrate_noise(
     >>> bool(abs(error) < 4.0), baseline.attrs["source"]
     (True, 'calibrated')
     """
-    chosen, reason = find_quiescent_blocks(blocks, quiet, settings=settings)
-    attrs = {
-        "source": "calibrated",
-        "calibrated_on": find_quiescent_spans(blocks, chosen),
-        "quiet_by": reason,
-    }
+    chosen = find_quiescent_blocks(blocks, quiet, settings=settings)
+    attrs = {"source": "calibrated", "calibrated_on": find_quiescent_spans(blocks, chosen)}
     posteriors = calibrate_axes(blocks, chosen, settings)
     return assemble_baseline(blocks, posteriors, quiet=chosen, attrs=attrs, settings=settings)
 

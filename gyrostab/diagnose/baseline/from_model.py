@@ -14,7 +14,7 @@ from gyrostab.diagnose.baseline.known_effects import expect_known_effects, with_
 from gyrostab.diagnose.baseline.known_lines import independent_line_share
 from gyrostab.diagnose.baseline.noise_level import quiescent_level, scale_axes
 from gyrostab.diagnose.baseline.posterior import Posterior
-from gyrostab.diagnose.baseline.quiescent import given_quiescent_blocks, use_given_blocks
+from gyrostab.diagnose.baseline.quiescent import find_quiescent_spans, given_quiescent_blocks
 from gyrostab.diagnose.reduce.schema import BASELINE, label_variables
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.errors import OptionError
@@ -71,7 +71,7 @@ def baseline_from_model(
     given_blocks = given_quiescent_blocks(blocks, quiet, settings=settings)
     if given_blocks is not None:
         chosen = given_blocks
-        use_given_blocks(blocks, chosen, attrs)
+        attrs["calibrated_on"] = find_quiescent_spans(blocks, chosen)
         posteriors = _scale_to_quiescent(blocks, parsed, posteriors, chosen)
     effects = expect_known_effects(
         blocks, parsed, np.stack([posterior.square for posterior in posteriors])

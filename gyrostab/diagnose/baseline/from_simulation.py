@@ -17,7 +17,6 @@ from gyrostab.diagnose.baseline.quiescent import (
     find_quiescent_spans,
     given_quiescent_blocks,
     noise_level_excess,
-    use_given_blocks,
 )
 from gyrostab.diagnose.baseline.simulated import (
     add_extra_statistics,
@@ -64,22 +63,21 @@ def baseline_from_simulation(
                 f"simulation: {name} {in_simulation[name]}, but {value} in the recording; "
                 "simulate with --like RECORDING"
             )
-    chosen, reason = find_quiescent_blocks(simulated, settings=settings)
+    chosen = find_quiescent_blocks(simulated, settings=settings)
     posteriors, level, unexplained = _calibrate_simulation(simulated, chosen, settings)
     squares = [posterior.square for posterior in posteriors]
     plain = sum_noise(noise_powers(simulated), squares) * level[..., None]
     shown = measure_extra_statistics(simulated, plain, unexplained, settings=settings)
     noise = sum_noise(noise_powers(blocks), squares)
-    attrs: dict[str, Any] = {
+    attrs = {
         "source": "simulation",
         "calibrated_on": find_quiescent_spans(simulated, chosen),
-        "quiet_by": reason,
     }
     spectrum = noise * level[..., None] * shown.form[:, None]
     given_blocks = given_quiescent_blocks(blocks, quiet, settings=settings)
     if given_blocks is not None:
         chosen = given_blocks
-        use_given_blocks(blocks, chosen, attrs)
+        attrs["calibrated_on"] = find_quiescent_spans(blocks, chosen)
         factor, error = quiescent_level(blocks, spectrum, 0.0 * spectrum, chosen)
         posteriors = scale_axes(blocks, posteriors, factor, error)
         spectrum = spectrum * factor[:, None, None]

@@ -15,8 +15,6 @@ from gyrostab.errors import OptionError
 from gyrostab.time.grid import stamp_ns
 
 Array = NDArray[np.float64]
-# Criterion of blocks that the user gave.
-GIVEN = "the given quiescent stretches"
 #: Blocks over which the noise level is averaged. Design choice.
 LEVEL_SPANS = (1, 5, 15)
 _MIN_GIVEN_SAMPLES = 100  # as in the shortest default block; they give N to 7 %
@@ -31,9 +29,9 @@ def _running_sum(values: Array, count: int) -> Array:
     return np.asarray(total[stop] - total[np.maximum(place - half, 0)])
 
 
-def _distance_from_rest(blocks: xr.Dataset, settings: Settings) -> dict[str, Array]:
-    """Return by channel how far each block is from rest, 1 at the limit."""
-    distances: dict[str, Array] = {}
+def _distance_from_rest(blocks: xr.Dataset, settings: Settings) -> list[Array]:
+    """Return for each channel how far each block is from rest, 1 at the limit."""
+    distances: list[Array] = []
     step = float(blocks["end"][0] - blocks["begin"][0])
     for name in (str(name) for name in blocks.data_vars):
         if not name.startswith("channel_"):
@@ -46,29 +44,31 @@ def _distance_from_rest(blocks: xr.Dataset, settings: Settings) -> dict[str, Arr
         filled = np.interp(place, place[good], values[good])
         if name.startswith("channel_vibration") or name == "channel_rotation_rate":
             size = np.abs(filled)
-            distances[name] = size / max(
+            limit = max(
                 settings.calm_ratio * float(np.quantile(size, settings.calm_share)),
                 settings.rest_share * float(size.max()),
                 np.finfo(float).tiny,
             )
+            distances.append(size / limit)
         elif name.startswith("channel_temperature"):
             smooth = _running_sum(filled, 5) / _running_sum(np.ones(values.size), 5)
             slope = np.abs(np.gradient(smooth, step))
             # Scatter of the slope by noise and digits.
             scatter = float(np.median(np.abs(np.diff(filled, 2)))) / (5.0 * step)
-            distances[name] = slope / max(
+            limit = max(
                 settings.calm_slope_share * float(np.quantile(slope, 1.0 - settings.rest_share)),
                 settings.clear_sigma * scatter,
                 np.finfo(float).tiny,
             )
+            distances.append(slope / limit)
     if "moving" in blocks:
         # More than 1: not at rest.
-        distances["motion"] = np.where(blocks["moving"].values.any(axis=0), 2.0, 0.0)
+        distances.append(np.where(blocks["moving"].values.any(axis=0), 2.0, 0.0))
     if blocks.sizes.get("restart", 0):
         since = blocks["begin"].values[:, None] - blocks["restart_end"].values
         since = np.where(since < -step, np.inf, np.maximum(since, 1.0)).min(axis=1)
         settling = min(settings.after_restart_s, _record_length(blocks) / 10.0)
-        distances["restarts"] = settling / since
+        distances.append(settling / since)
     return distances
 
 
@@ -146,8 +146,10 @@ def _drop_noisy_blocks(
 
 def find_quiescent_blocks(
     blocks: xr.Dataset, quiet: Any = None, *, settings: Settings = DEFAULTS
-) -> tuple[NDArray[np.bool_], str]:
-    """Find the quiescent blocks (axis, block), to calibrate on; describe the criterion.
+) -> NDArray[np.bool_]:
+    """Find the quiescent blocks (axis, block), to calibrate on.
+
+    Without `quiet` these are the blocks at rest, or the quietest where too few are.
 
     Parameters
     ----------
@@ -157,18 +159,13 @@ def find_quiescent_blocks(
     n = blocks.sizes["block"]
     given_blocks = given_quiescent_blocks(blocks, quiet, settings=settings)
     if given_blocks is not None:
-        return given_blocks, GIVEN
-    distances = _distance_from_rest(blocks, settings)
-    worst = np.max([*distances.values(), np.zeros(n)], axis=0)
+        return given_blocks
+    worst = np.max([*_distance_from_rest(blocks, settings), np.zeros(n)], axis=0)
     start = worst <= 1.0
-    names = [name.removeprefix("channel_") for name in distances]
-    criterion = ", ".join(names)
-    reason = f"quiescent {criterion}" if names else "the level of each block (no channel)"
     min_blocks = max(settings.min_quiescent_blocks, int(settings.quiescent_share * n))
     if start.sum() < min_blocks:
         start = worst <= np.sort(worst)[min(min_blocks, n) - 1]
-        reason = f"no quiescent block by {criterion}: the quietest blocks"
-    return _drop_noisy_blocks(blocks, start, settings), reason
+    return _drop_noisy_blocks(blocks, start, settings)
 
 
 def given_quiescent_blocks(
@@ -212,11 +209,6 @@ def given_quiescent_blocks(
     if not _is_usable(blocks, chosen, settings.min_quiescent_blocks):
         return None
     return np.broadcast_to(chosen, (blocks.sizes["axis"], n)).copy()
-
-
-def use_given_blocks(blocks: xr.Dataset, chosen: NDArray[np.bool_], attrs: dict[str, Any]) -> None:
-    """Write into the attributes of a baseline that it is calibrated on blocks given as quiet."""
-    attrs["quiet_by"], attrs["calibrated_on"] = GIVEN, find_quiescent_spans(blocks, chosen)
 
 
 def _is_usable(blocks: xr.Dataset, chosen: NDArray[np.bool_], better_count: int) -> bool:

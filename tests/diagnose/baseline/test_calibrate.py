@@ -129,13 +129,11 @@ def test_blocks_with_vibration_rotation_or_heating_are_not_quiescent():
         "points": [[0, 30], [2700, 30], [3600, 60]],
     }
     blocks = reduce_log(log(environment=[SHAKEN, warm], duration="1h"))
-    quiet, reason = find_quiescent_blocks(blocks)
+    quiet = find_quiescent_blocks(blocks)
     middle = ((blocks["begin"] + blocks["end"]) / 2.0).values
     assert not quiet[0, (middle > 1210) & (middle < 1490)].any()
     assert not quiet[0, middle > 2900].any()
     assert quiet[0, middle < 1100].mean() > 0.9
-    assert "vibration" in reason
-    assert "temperature" in reason
 
 
 def test_noisy_blocks_are_not_calibrated_on_without_channels():

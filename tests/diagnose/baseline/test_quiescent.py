@@ -142,7 +142,7 @@ def test_a_quiet_time_that_is_lost_is_ignored_with_a_note():
     blocks = reduce_log(recording)
     with pytest.warns(UserWarning, match="too few samples without losses for a spectrum.*ignored"):
         baseline = calibrate_noise(blocks, quiet=(0.0, 60.0))
-    assert baseline.attrs["quiet_by"] == calibrate_noise(blocks).attrs["quiet_by"]
+    assert baseline.attrs["calibrated_on"] == calibrate_noise(blocks).attrs["calibrated_on"]
 
 
 @pytest.mark.parametrize("quiet", [(4000.0, 5000.0), (-50.0, -10.0), (700.0, 100.0)])
