@@ -12,11 +12,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.expected_statistics import NOISE, band_columns
 from gyrostab.diagnose.baseline.known_lines import average_in_bands, expect_lines, resonance_density
-from gyrostab.diagnose.baseline.predicted_effects import (
-    complex_factors,
-    predict_effect,
-    sizes_by_axis,
-)
+from gyrostab.diagnose.baseline.predicted_effects import complex_factors, predict_effect
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import (
     cross_without,
@@ -111,6 +107,10 @@ class _ActingEffect(NamedTuple):
     axes: tuple[str, ...]
     prediction: Prediction
 
+    def sizes(self, name: str) -> Array:
+        """Return a parameter on each of the axes."""
+        return self.effect.expand_to_axes(name, self.axes)
+
 
 class _AddedPower(NamedTuple):
     """Power added by an effect."""
@@ -143,21 +143,15 @@ def _has_anomalous_samples(active: _ActingEffect) -> bool:
 def _shows_elsewhere(active: _ActingEffect) -> bool:
     """Return whether an effect also shows outside means, powers and cross-spectra."""
     prediction = active.prediction
+    # the variance describes random means of a constant correlation time without steps
+    is_steady = not prediction.levels and all(
+        _is_steady(*process) for process in prediction.wander.values()
+    )
     elsewhere = prediction.marks or prediction.transfer or prediction.order
-    if elsewhere or prediction.phase_locked or not _is_described_by_variance(prediction):
+    if elsewhere or prediction.phase_locked or not is_steady:
         return True
     is_shown = prediction.mean or prediction.level or prediction.spectrum
     return not is_shown and prediction.response is None
-
-
-def _is_described_by_variance(prediction: Prediction) -> bool:
-    """Return whether the variance fully describes what an effect does to the means at random.
-
-    It does for a constant correlation time without steps.
-    """
-    return not prediction.levels and all(
-        _is_steady(*process) for process in prediction.wander.values()
-    )
 
 
 def _is_steady(time: float, variance: Array) -> bool:
@@ -170,7 +164,7 @@ def _expected_means(acting: Sequence[_ActingEffect], blocks: xr.Dataset) -> Arra
     mean = np.zeros((blocks.sizes["axis"], blocks.sizes["block"]))
     for active in acting:
         for name, values in active.prediction.mean.items():
-            mean[active.rows] += sizes_by_axis(active.effect, name, active.axes)[:, None] * values
+            mean[active.rows] += active.sizes(name)[:, None] * values
     return mean
 
 
@@ -180,9 +174,8 @@ def _expected_squares(acting: Sequence[_ActingEffect], square: Array, blocks: xr
     for active in acting:
         for (term, name), values in active.prediction.level.items():
             axis_square = square[active.rows, None, NOISE.index(term)]
-            level[active.rows, :, NOISE.index(term)] += (
-                axis_square * sizes_by_axis(active.effect, name, active.axes)[:, None] * values
-            )
+            change = axis_square * active.sizes(name)[:, None] * values
+            level[active.rows, :, NOISE.index(term)] += change
     return level
 
 
@@ -242,7 +235,7 @@ def _add_up_wandering(acting: Sequence[_ActingEffect], blocks: xr.Dataset) -> Wa
             if prediction.levels or not _is_steady(memory, variance):
                 continue
             size = np.zeros(axes)
-            size[active.rows] = sizes_by_axis(active.effect, name, active.axes) ** 2
+            size[active.rows] = active.sizes(name) ** 2
             if np.isinf(memory):
                 walk += size[:, None] * variance
             else:

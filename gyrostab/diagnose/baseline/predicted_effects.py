@@ -1,4 +1,4 @@
-"""Predictions of the known effects of a model, and their sizes on each axis."""
+"""Predictions of the known effects of a model, and their factors on each axis."""
 
 from __future__ import annotations
 
@@ -39,22 +39,12 @@ def predict_effect(
     )
 
 
-def sizes_by_axis(effect: Effect, name: str, axes: tuple[str, ...]) -> Array:
-    """Return a parameter for each axis."""
-    parameters = {parameter.name: parameter for parameter in effect.parameters()}
-    return (
-        effect.expand_to_axes(name, axes)
-        if parameters[name].many
-        else np.full(len(axes), float(getattr(effect, name)))
-    )
-
-
 def complex_factors(effect: Effect, name: str, axes: tuple[str, ...]) -> NDArray[np.complex128]:
     """Return the complex factor of a spectrum for each axis: size, direction, phase."""
     parameters = {parameter.name: parameter for parameter in effect.parameters()}
-    factor = sizes_by_axis(effect, name, axes).astype(np.complex128)
+    factor = effect.expand_to_axes(name, axes).astype(np.complex128)
     if "direction" in parameters:
-        factor *= sizes_by_axis(effect, "direction", axes)
+        factor *= effect.expand_to_axes("direction", axes)
     if "phase" in parameters and parameters["phase"].many:
-        factor *= np.exp(1j * np.radians(sizes_by_axis(effect, "phase", axes)))
+        factor *= np.exp(1j * np.radians(effect.expand_to_axes("phase", axes)))
     return factor

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.baseline.predicted_effects import predict_effect, sizes_by_axis
+from gyrostab.diagnose.baseline.predicted_effects import predict_effect
 from gyrostab.physics.base import Effect
 from gyrostab.physics.logger import RateQuantization
 from gyrostab.units import HOUR
@@ -44,7 +44,8 @@ def constant_rates(
         effect_axes = tuple(axis for axis in axes if not effect.axes or axis in effect.axes)
         rows = [axes.index(axis) for axis in effect_axes]
         for name, design in predict_effect(effect, blocks, effect_axes).mean.items():
-            rate[rows] -= sizes_by_axis(effect, name, effect_axes)[:, None] * np.atleast_2d(design)
+            sizes = effect.expand_to_axes(name, effect_axes)
+            rate[rows] -= sizes[:, None] * np.atleast_2d(design)
     if turning in axes and "channel_rotation_rate" in blocks:
         rate[axes.index(turning)] -= HOUR * blocks["channel_rotation_rate"].values
     means = _average_blocks(blocks, rate)

@@ -21,11 +21,12 @@ from gyrostab.diagnose.baseline.expected_statistics import (
 from gyrostab.diagnose.baseline.posterior import (
     Fit,
     Posterior,
+    average_blocks,
     fit_squares,
     floor_square,
     noise_posterior,
 )
-from gyrostab.diagnose.baseline.predicted_effects import find_drivers
+from gyrostab.diagnose.baseline.predicted_effects import find_drivers, predict_effect
 from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_identifications
 from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.identify.identification import (
@@ -36,7 +37,7 @@ from gyrostab.diagnose.identify.identification import (
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import State, spread_by_gaps
-from gyrostab.diagnose.predict.windows import make_windows, rebuild_variant
+from gyrostab.diagnose.predict.windows import rebuild_variant
 from gyrostab.diagnose.reduce.block_statistics import MIN_BLOCKS
 from gyrostab.physics.base import Effect
 
@@ -213,12 +214,19 @@ def _collect_effects(
     # twice the error of the size, because power grows with its square
     doubt = 2.0 * identifications.state.settings.size_error_share
     out = AxisEffects(np.zeros(shape), np.ones(shape[1]), doubt)
+    start = identifications.start_state(baseline)
     touched = False
     for identification in identifications.identified:
         components = [component for component in identification.components if axis in component.row]
         touched |= bool(components)
         for component in components:
-            _add_component(out, component, identifications, baseline, axis)
+            if not component.is_filter:
+                known, free, means = component.statistic.noise_shares(
+                    component, axis, start, identifications.state.weight
+                )
+                out.known += known
+                out.free += [np.broadcast_to(column, shape) for column in free]
+                out.means += means
         numbers = next(
             (
                 effect_fit
@@ -247,36 +255,14 @@ def _collect_effects(
     return out if touched else None
 
 
-def _add_component(
-    out: AxisEffects,
-    component: Component,
-    identifications: Identifications,
-    baseline: xr.Dataset,
-    axis: str,
-) -> None:
-    """Add what a component takes from the noise of an axis."""
-    if component.is_filter:
-        return
-    state = identifications.start_state(baseline)
-    known_power, free, means = component.statistic.noise_shares(
-        component, axis, state, identifications.state.weight
-    )
-    out.known += known_power
-    out.free += [np.broadcast_to(column, out.known.shape) for column in free]
-    out.means += means
-
-
 def _effect_power(effect: Effect, blocks: xr.Dataset, axis: str) -> Array:
     """Return the power that an effect itself predicts on an axis, (block, band)."""
-    windows = replace(make_windows(blocks, find_drivers(effect)), axes=(axis,))
+    prediction = predict_effect(effect, blocks, (axis,), blocks["frequency"].values)
     out = np.zeros((blocks.sizes["block"], blocks.sizes["band"]))
-    many = {item.name: item.many for item in effect.parameters()}
-    for name, density in effect.explain(windows).spectrum.items():
-        size = getattr(effect, name)
-        if many[name]:
-            size = size[effect.axes.index(axis)] if len(size) > 1 else size[0]
+    for name, density in prediction.spectrum.items():
+        size = effect.expand_to_axes(name, effect.axes)[effect.axes.index(axis)]
         rows = np.asarray(density)
-        out = out + float(size) ** 2 * (rows[0] if rows.ndim == 3 else rows)
+        out += size**2 * (rows[0] if rows.ndim == 3 else rows)
     return np.asarray(spread_by_gaps(out[None], blocks.sel(axis=[axis]))[0])
 
 
@@ -291,14 +277,8 @@ def _fit_noise(
         return None
     columns = noise_powers(blocks, axis_effects.response)[row]
     common, shape_alone = (values[row] for values in common_variance(blocks))
-    fit = _average_groups(
-        power,
-        _reduced_shapes(shape, shape_alone, common),
-        columns,
-        state.weight[row],
-        axis_effects,
-        chosen,
-    )
+    reduced = _reduced_shapes(shape, shape_alone, common)
+    fit = _average_groups(power, reduced, columns, state.weight[row], axis_effects, chosen)
     square, information, _ = fit_squares(fit)
     plain = float(
         (
@@ -349,47 +329,22 @@ def _average_groups(
     groups = np.array_split(
         np.argsort(level, kind="stable")[: int(chosen.sum())], min(LEVEL_GROUPS, int(chosen.sum()))
     )
-    size = [max(float(np.abs(column).max()), 1e-300) for column in axis_effects.free]
-    components = [
-        power,
-        columns,
-        axis_effects.known,
-        expected,
-        *[column / top for column, top in zip(axis_effects.free, size, strict=True)],
+    free_columns = [
+        column / max(float(np.abs(column).max()), 1e-300) for column in axis_effects.free
     ]
-    means: list[list[Array]] = [[] for _ in components]
-    weights = []
-    for block_count in groups:
-        use = np.where(
-            np.isfinite(power[block_count]) & np.isfinite(shape[block_count]),
-            shape[block_count],
-            0.0,
-        )
-        total = use.sum(axis=0)
-        safe = np.where(total > 0.0, total, 1.0)
-        weights.append(total)
-        for place, component in enumerate(components):
-            wide = use[..., None] if component.ndim == 3 else use
-            by = safe[:, None] if component.ndim == 3 else safe
-            means[place].append((wide * np.nan_to_num(component[block_count])).sum(axis=0) / by)
-    weight = np.concatenate(weights)
-    has_weight = weight > 0.0
-    flat = [np.concatenate(group_means)[has_weight] for group_means in means]
-    free = np.stack(flat[4:], axis=1) if len(flat) > 4 else np.empty((int(has_weight.sum()), 0))
-    known_power = flat[2][:, None]
-    precision = np.zeros(free.shape[1])
-    if np.any(known_power > 0.0):  # the predicted power has an error too
-        free = np.concatenate([free, known_power], axis=1)
-        precision = np.append(precision, 1.0 / axis_effects.doubt**2)
-    return Fit(
-        flat[0],
-        flat[1],
-        weight[has_weight],
-        known=flat[2],
-        free_columns=free,
-        precision=precision,
-        start=flat[3],
+    effect_columns = np.stack([axis_effects.known, expected, *free_columns], axis=-1)
+    cells = np.nan_to_num(np.concatenate([columns, effect_columns], axis=-1))
+    fits = [average_blocks(power[group], shape[group], cells[group]) for group in groups]
+    mean, means, weight = (
+        np.concatenate([getattr(fit, name) for fit in fits])
+        for name in ("power", "columns", "weight")
     )
+    columns, known, start, free = means[:, :4], means[:, 4], means[:, 5], means[:, 6:]
+    precision = np.zeros(free.shape[1])
+    if np.any(known > 0.0):  # the predicted power has an error too
+        free = np.concatenate([free, known[:, None]], axis=1)
+        precision = np.append(precision, 1.0 / axis_effects.doubt**2)
+    return Fit(mean, columns, weight, known, free, precision, start)
 
 
 def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identifications:
