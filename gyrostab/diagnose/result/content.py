@@ -205,10 +205,6 @@ class Content(_Table):
         return self
 
 
-#: Keys of the held-out evidence.
-HELD_OUT = tuple(HeldOut.model_fields)
-
-
 def check_diagnosis(content: Mapping[str, Any]) -> None:
     """Raise `SchemaError`, naming the place, unless `content` is that of a `diagnosis.json`.
 

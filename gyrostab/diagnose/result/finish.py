@@ -25,7 +25,7 @@ from gyrostab.diagnose.identify.identification import Identifications, Selection
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.channel_use import unused_channels
 from gyrostab.diagnose.result.attribution import active_blocks, attribute_mismatches
-from gyrostab.diagnose.result.content import HELD_OUT, SCHEMA, check_diagnosis
+from gyrostab.diagnose.result.content import SCHEMA, check_diagnosis
 from gyrostab.diagnose.result.diagnosis import Diagnosis, plain
 from gyrostab.diagnose.result.held_out import held_out, select_forecast_start
 from gyrostab.diagnose.result.mismatch_tables import mismatch_tables
@@ -82,7 +82,7 @@ def finish_diagnosis(task: Task, comparison: Comparison, started: float) -> Diag
         },
         "rejected": rejected_tables(fit.identifications),
         "unused_channels": unused_channels(blocks, _used_channels(fit.identifications)),
-        "held_out": {name: held[name] for name in HELD_OUT},
+        "held_out": held,
         "seconds": round(time.perf_counter() - started, 3),
     }
     given_model = task.simulation if isinstance(task.simulation, Model) else None

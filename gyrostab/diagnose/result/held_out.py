@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -12,7 +13,6 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks
 from gyrostab.diagnose.evidence.products import mean_products
 from gyrostab.diagnose.evidence.wandering import expected_processes
-from gyrostab.diagnose.statistics.mean import window_means
 from gyrostab.diagnose.statistics.power import allan_surface
 from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score
 from gyrostab.errors import OptionError
@@ -68,8 +68,7 @@ def held_out(
         its ``stderr`` by the noise of the recording [nats]; ``misfit_before``, ``misfit_after``,
         the mean square of the scores of the Allan variance (1 for a model that fits), and
         ``coverage95_before``, ``coverage95_after``, the share of them inside the 95 % band;
-        ``mean_misfit_before`` and ``mean_misfit_after``, the mean square of the scores of the
-        stretch means; ``forecast_gain`` [nats] on the last 30 % of models fitted to the first 70 %.
+        ``forecast_gain`` [nats] on the last 30 % of models fitted to the first 70 %.
 
     Raises
     ------
@@ -84,68 +83,57 @@ def held_out(
     (41.2, 6.0)
     """
     windows = cut_stretches(blocks)
-    fold = np.arange(windows.first.size) % FOLDS
-    gains = Gain(more_gain, 2.0 * abs(more_gain))
-    squares: dict[str, list[Array]] = {
-        name: [] for name in ("before", "after", "mean_before", "mean_after")
-    }
-    moves = False
+    fold_of_window = np.arange(windows.first.size) % FOLDS
+    fold = np.repeat(fold_of_window, windows.length)
+    more = np.array([more_gain, 2.0 * abs(more_gain)])
+    gain, moves = more, False
+    squares: dict[str, list[Array]] = {"before": [], "after": []}
     for number in range(FOLDS):
-        held = Windows(windows.first[fold == number], windows.stop[fold == number])
-        out = _mask_windows(held, blocks.sizes["block"])
-        models = {"before": _fit_model(before, ~out), "after": _fit_model(after, ~out)}
-        gains = gains.plus(_compare_models(blocks, models["before"], models["after"], out))
+        held = fold == number
+        models = {"before": _fit_model(before, ~held), "after": _fit_model(after, ~held)}
+        gain = gain + _compare_models(blocks, models["before"], models["after"], held)
         moves |= not models["after"]["known_mean"].equals(models["before"]["known_mean"])
         if shown is not None:
-            models["after"] = _fit_model(shown, ~out)
+            models["after"] = _fit_model(shown, ~held)
+        chosen = fold_of_window == number
         for name, baseline in models.items():
-            squares[name].append(_allan_scores(blocks, baseline, held))
-            squares[f"mean_{name}"].append(_mean_scores(blocks, baseline, held))
-    evidence_nats, variance = max(
-        [gains, *(_gains_on_longer_stretches(blocks, before, after, more_gain) if moves else [])]
-    )
+            inside = Windows(windows.first[chosen], windows.stop[chosen])
+            squares[name].append(_allan_scores(blocks, baseline, inside))
+    gains = [gain]
+    for fold in fold_blocks(blocks).values[1:] if moves else ():
+        gain = more
+        for held in (fold == number for number in range(FOLDS)):
+            models = {"before": _fit_model(before, ~held), "after": _fit_model(after, ~held)}
+            gain = gain + _compare_models(blocks, models["before"], models["after"], held)
+        gains.append(gain)
+    evidence_nats, variance = max(gain.tolist() for gain in gains)
     return {
         "blocks": windows.first.size,
-        "log_likelihood_gain": float(evidence_nats),
-        "stderr": float(np.sqrt(variance)),
+        "log_likelihood_gain": evidence_nats,
+        "stderr": math.sqrt(variance),
         **_summarise_scores(squares),
         "forecast_gain": _forecast_gain(blocks, before, after if forecast is None else forecast),
     }
 
 
-class Gain(NamedTuple):
-    """A held-out gain [nats] and its variance."""
-
-    nats: float
-    variance: float
-
-    def plus(self, other: Gain) -> Gain:
-        """Add the gain of another, independent stretch."""
-        return Gain(self.nats + other.nats, self.variance + other.variance)
-
-
 def _compare_models(
     blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset, held: NDArray[np.bool_]
-) -> Gain:
-    """Return what one fitted model gains over another on the held-out blocks."""
+) -> Array:
+    """Return what one fitted model gains over another on held-out blocks [nats], and its variance.
+
+    For the powers the variance follows from the scatter of their cells about `after`; for normal
+    laws it is twice the gain.
+    """
     nats = log_likelihood(blocks, after, ~held, held) - log_likelihood(blocks, before, ~held, held)
-    return Gain(nats, _gain_variance(blocks, before, after, held, nats))
-
-
-def _gains_on_longer_stretches(
-    blocks: xr.Dataset, before: Trained, after: Trained, more_gain: float
-) -> list[Gain]:
-    """Return the gains on longer stretches, one for each length."""
-    gains = []
-    for fold in fold_blocks(blocks).values[1:]:
-        gain = Gain(more_gain, 2.0 * abs(more_gain))
-        for number in range(FOLDS):
-            held = fold == number
-            gain = gain.plus(
-                _compare_models(blocks, _fit_model(before, ~held), _fit_model(after, ~held), held)
-            )
-        gains.append(gain)
-    return gains
+    power, shape = (blocks[name].values for name in ("power", "shape"))
+    spectrum_after, spectrum_before = (baseline["spectrum"].values for baseline in (after, before))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        terms = np.square(
+            shape * (1.0 / spectrum_after - 1.0 / spectrum_before) * (power - spectrum_after)
+        )[:, held]
+    by_power = float((_power_terms(blocks, after) - _power_terms(blocks, before))[held].sum())
+    variance = float(terms[np.isfinite(terms)].sum()) + 2.0 * abs(nats - by_power)
+    return np.array([nats, variance])
 
 
 def cut_stretches(blocks: xr.Dataset) -> Windows:
@@ -193,35 +181,6 @@ def log_likelihood(
 
 def _fit_model(model: Trained, known: NDArray[np.bool_]) -> xr.Dataset:
     return model if isinstance(model, xr.Dataset) else model(known)
-
-
-def _mask_windows(windows: Windows, block_count: int) -> NDArray[np.bool_]:
-    inside = np.zeros(block_count, dtype=bool)
-    for first, stop in zip(windows.first, windows.stop, strict=True):
-        inside[first:stop] = True
-    return inside
-
-
-def _gain_variance(
-    blocks: xr.Dataset,
-    before: xr.Dataset,
-    after: xr.Dataset,
-    held: NDArray[np.bool_],
-    evidence_nats: float,
-) -> float:
-    """Return the variance of a gain.
-
-    For the powers it follows from the scatter of their cells about `after`; for normal laws it is
-    twice the gain.
-    """
-    power, shape = (blocks[name].values for name in ("power", "shape"))
-    spectrum_after, spectrum_before = (baseline["spectrum"].values for baseline in (after, before))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        terms = np.square(
-            shape * (1.0 / spectrum_after - 1.0 / spectrum_before) * (power - spectrum_after)
-        )[:, held]
-    by_power = float((_power_terms(blocks, after) - _power_terms(blocks, before))[held].sum())
-    return float(terms[np.isfinite(terms)].sum()) + 2.0 * abs(evidence_nats - by_power)
 
 
 def _power_terms(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:
@@ -329,24 +288,15 @@ def _allan_scores(blocks: xr.Dataset, baseline: xr.Dataset, held: Windows) -> Ar
     return np.asarray(z[np.isfinite(z)] ** 2)
 
 
-def _mean_scores(blocks: xr.Dataset, baseline: xr.Dataset, held: Windows) -> Array:
-    amount, information = window_means(blocks, baseline, held)
-    square = amount**2 / information
-    return np.asarray(square[np.isfinite(square)])
-
-
 def _summarise_scores(squares: dict[str, list[Array]]) -> dict[str, float]:
-    summary: dict[str, float] = {}
-    joined = {name: np.concatenate(components) for name, components in squares.items()}
-    for name in ("before", "after"):
-        cells = joined[name]
-        summary[f"misfit_{name}"] = float(cells.mean()) if cells.size else np.nan
-        summary[f"coverage95_{name}"] = (
-            float((cells < NORMAL_95**2).mean()) if cells.size else np.nan
-        )
-        means = joined[f"mean_{name}"]
-        summary[f"mean_misfit_{name}"] = float(means.mean()) if means.size else np.nan
-    return summary
+    def mean(values: NDArray[Any]) -> float:
+        return float(values.mean()) if values.size else np.nan
+
+    cells = {name: np.concatenate(parts) for name, parts in squares.items()}
+    misfit = {f"misfit_{name}": mean(values) for name, values in cells.items()}
+    return misfit | {
+        f"coverage95_{name}": mean(values < NORMAL_95**2) for name, values in cells.items()
+    }
 
 
 def select_forecast_start(blocks: xr.Dataset) -> NDArray[np.bool_]:

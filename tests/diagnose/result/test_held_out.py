@@ -44,9 +44,6 @@ def test_no_gain_and_good_fit_without_effects():
     results = [held_out(blocks, base, base) for _, blocks in map(_record, (11, 12, 13))]
     assert np.mean([result["misfit_before"] for result in results]) == pytest.approx(1.0, abs=0.06)
     assert 0.94 < np.mean([result["coverage95_before"] for result in results]) < 0.96
-    assert np.mean([result["mean_misfit_before"] for result in results]) == pytest.approx(
-        1.0, abs=0.4
-    )
 
 
 def test_gain_of_raised_noise_follows_the_gamma_law():
@@ -71,7 +68,6 @@ def test_gain_of_a_mean_follows_the_normal_law():
     result = held_out(blocks, base, _with_effects(base, height=height))
     expected = 0.5 * height**2 / VARIANCE * 30 * (1.0 - 30.0 / 180.0)
     assert result["log_likelihood_gain"] == pytest.approx(expected, rel=0.35)
-    assert result["mean_misfit_before"] > 3.0 * result["mean_misfit_after"]
     assert result["misfit_after"] == pytest.approx(1.0, abs=0.12)
 
 
