@@ -13,6 +13,7 @@ from scipy.special import ndtr, ndtri
 
 from gyrostab.diagnose.estimate.filter_sizes import fit_filter_sizes
 from gyrostab.diagnose.estimate.split_components import split_harmonics, split_steps
+from gyrostab.diagnose.identify.components import axes_of
 from gyrostab.diagnose.identify.identification import Identifications, Selection
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State
@@ -116,7 +117,7 @@ def _fit_identification(
         return [
             _fit_components(
                 identification,
-                _axes_shown(identification, components),
+                axes_of(components, identification.axes),
                 components,
                 state_beside,
                 identifications,
@@ -134,15 +135,6 @@ def _fit_identification(
         )
         for axis in identification.axes
     ]
-
-
-def _axes_shown(identification: Selection, components: Sequence[Component]) -> tuple[str, ...]:
-    """Return the axes of the identification that the components are on."""
-    return tuple(
-        axis
-        for axis in identification.axes
-        if any(axis in component.row for component in components)
-    )
 
 
 def _fit_components(

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.predict.sizes import component_mixture, component_size
 from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.diagnose.statistics.base import Competitor
 from gyrostab.diagnose.statistics.candidates import largest_size
@@ -93,8 +94,6 @@ def _is_rotation(component: Component) -> bool:
 
 def _rotation_share(component: Component, state: State) -> float:
     """Return the share of the rotation of the tool that an axis senses, or that an error is."""
-    from gyrostab.diagnose.predict.sizes import component_mixture, component_size
-
     if _is_rotation(component):
         return abs(component_size(component, state)[0])
     row = state.axes.index(component.row[0])
@@ -116,8 +115,6 @@ def _find_other_form(component: Component, state: State) -> tuple[str, float] | 
 
 def _is_possible(component: Component, state: State) -> bool:
     """Return whether physics allows the size of a component, and its cause is present."""
-    from gyrostab.diagnose.predict.sizes import component_size
-
     effect, statistic = component.candidate.effect, component.statistic
     if (
         effect == "misalignment"
@@ -147,8 +144,6 @@ def _is_possible(component: Component, state: State) -> bool:
 
 def _is_in_range(component: Component, state: State) -> bool:
     """Return whether the sizes can lie in the ranges of the registry and the settings."""
-    from gyrostab.diagnose.predict.sizes import component_mixture
-
     columns = component.variant.columns
     low, high = (
         np.array([_allowed_range(component, name, state) for name in columns]).reshape(-1, 2).T

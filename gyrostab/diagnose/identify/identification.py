@@ -76,13 +76,6 @@ class Identifications:
     #: What beats each effect that was examined and not identified.
     rejected: tuple[Rejection, ...] = ()
 
-    @property
-    def verdict(self) -> str:
-        """Return "no mismatch", "explained", "partly explained" or "unknown"."""
-        if not self.identified:
-            return "unknown" if self.unknown else "no mismatch"
-        return "partly explained" if self.unknown else "explained"
-
     def start_state(self, baseline: xr.Dataset) -> State:
         """Return the state without any effect."""
         return initial_state(self.state.blocks, baseline, settings=self.state.settings)
