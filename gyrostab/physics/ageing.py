@@ -38,15 +38,10 @@ class AgeingBias(Effect):
     size_parameters = ("slope", "logarithmic")
 
     slope: float = parameter(
-        "deg/h/day", "growth of the bias in a day", default=0.0, typical=0.005, low=-1e4, high=1e4
+        "deg/h/day", "growth of the bias in a day", default=0.0, typical=0.005, limit=1e4
     )
     logarithmic: float = parameter(
-        "deg/h",
-        "growth per factor e of t + time",
-        default=0.0,
-        typical=0.01,
-        low=-1e3,
-        high=1e3,
+        "deg/h", "growth per factor e of t + time", default=0.0, typical=0.01, limit=1e3
     )
     time: float = parameter(
         "h", "time after which the logarithm bends", default=24.0, low=1e-3, high=1e6

@@ -100,12 +100,20 @@ class Parameter:
 
 
 def parameter(
-    unit: str, meaning: str, *, default: Any = None, typical: Any = None, **options: Any
+    unit: str,
+    meaning: str,
+    *,
+    default: Any = None,
+    typical: Any = None,
+    limit: float | None = None,
+    **options: Any,
 ) -> Any:
     """Declare a field of an effect; see `Parameter`. The typical size is the default if not given.
 
-    Without a default a model must give it.
+    Without a default a model must give it. `limit` is the largest size of either sign.
     """
+    if limit is not None:
+        options |= {"low": -limit, "high": limit}
     typical = default if typical is None else typical
     definition = Parameter(unit, meaning, default, typical, **options)
     return field(

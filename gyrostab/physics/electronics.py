@@ -59,18 +59,14 @@ class SupplyBias(Effect):
     }
     size_parameters = ("voltage", "power", "ripple")
 
-    voltage: float = parameter(
-        "deg/h/V", "bias per volt", default=0.0, typical=0.01, low=-1e4, high=1e4
-    )
+    voltage: float = parameter("deg/h/V", "bias per volt", default=0.0, typical=0.01, limit=1e4)
     power: float = parameter(
-        "deg/h/uW", "bias per microwatt of light", default=0.0, typical=1e-3, low=-1e4, high=1e4
+        "deg/h/uW", "bias per microwatt of light", default=0.0, typical=1e-3, limit=1e4
     )
-    reference_voltage: float = parameter(
-        "V", "voltage without bias", default=24.0, low=-1e4, high=1e4
-    )
+    reference_voltage: float = parameter("V", "voltage without bias", default=24.0, limit=1e4)
     reference_power: float = parameter("uW", "power without bias", default=100.0, low=0.0, high=1e6)
     ripple: float = parameter(
-        "deg/h", "amplitude of the ripple", default=0.0, typical=0.05, low=-1e6, high=1e6
+        "deg/h", "amplitude of the ripple", default=0.0, typical=0.05, limit=1e6
     )
     frequency: float = parameter(
         "Hz", "frequency of the ripple", default=100.0, typical=3.3, low=1e-6, high=1e6
@@ -118,10 +114,6 @@ class SupplyBias(Effect):
         carry = state.get(name, (float(values[0]), np.zeros(1)))
         speed, state[name] = relax(values, chunk.rate, np.array([self.lag]), np.ones((1, 1)), carry)
         return np.asarray(values - self.lag * speed[0])
-
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """List ripple frequencies, one per band, and lags from 0 to minutes."""
-        return {"frequency": windows.frequency, "lag": _LAGS_S}
 
     def points(self, windows: Windows) -> list[Mapping[str, float | str]]:
         """List lags without ripple, and ripple frequencies without lag."""
@@ -264,7 +256,7 @@ class Clipping(Effect):
     limit: float = parameter(
         "deg/h", "largest distance from the centre; 0 for no limit", typical=5.0, low=0.0, high=1e12
     )
-    centre: float = parameter("deg/h", "middle of the range", default=0.0, low=-1e12, high=1e12)
+    centre: float = parameter("deg/h", "middle of the range", default=0.0, limit=1e12)
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Clip the signal [degree hour-1]."""
@@ -320,12 +312,9 @@ class ClockError(Effect):
         "relative error of a fast clock at the start; negative for slow",
         default=0.0,
         typical=50.0,
-        low=-1e5,
-        high=1e5,
+        limit=1e5,
     )
-    drift: float = parameter(
-        "ppm/h", "growth of the error", default=0.0, typical=1.0, low=-1e4, high=1e4
-    )
+    drift: float = parameter("ppm/h", "growth of the error", default=0.0, typical=1.0, limit=1e4)
     output: str = parameter(
         "text",
         "angle increments over the counted interval, or rates",

@@ -127,7 +127,7 @@ class BiasJump(Effect):
         "1/h", "shocks at random times", default=0.0, typical=2.0, low=0.0, high=1e6
     )
     step: tuple[float, ...] = parameter(
-        "deg/h", "jump at the time `at`", default=(), typical=(0.1,), low=-1e9, high=1e9, many=True
+        "deg/h", "jump at the time `at`", default=(), typical=(0.1,), limit=1e9, many=True
     )
     at: float = parameter(
         "s", "time of that jump since the start of the log", default=0.0, typical=100.0, low=0.0
@@ -219,7 +219,7 @@ class Telegraph(Effect):
     shapes_spectrum = True
 
     step: tuple[float, ...] = parameter(
-        "deg/h", "upper level over the lower", typical=(0.1,), low=-1e9, high=1e9, many=True
+        "deg/h", "upper level over the lower", typical=(0.1,), limit=1e9, many=True
     )
     low: float = parameter(
         "s", "mean time at the lower level, where the bias is 0", default=100.0, low=1e-3, high=1e9
@@ -314,12 +314,7 @@ class FringeHop(Effect):
     likeness: ClassVar[Mapping[str, Likeness]] = {"bias_jump": "size"}
 
     order: float = parameter(
-        "1",
-        "signed number of fringes",
-        default=1.0,
-        low=-1000.0,
-        high=1000.0,
-        whole="whole number of fringes",
+        "1", "signed number of fringes", default=1.0, limit=1000.0, whole="whole number of fringes"
     )
     length: float = parameter(
         "m", "length of the coil's fiber", default=500.0, low=1.0, high=1e5, source="Lefevre 2014"

@@ -68,7 +68,7 @@ class SpectralLine(Effect):
     likeness: ClassVar[Mapping[str, Likeness]] = {"real_motion": "always", "supply_bias": "always"}
 
     amplitude: tuple[float, ...] = parameter(
-        "deg/h", "amplitude, sqrt(2) times the rms", typical=0.2, low=-1e6, high=1e6, many=True
+        "deg/h", "amplitude, sqrt(2) times the rms", typical=0.2, limit=1e6, many=True
     )
     frequency: float = parameter("Hz", "frequency", typical=2.7, low=1e-6, high=1e5)
     quality: float = parameter(
@@ -78,8 +78,7 @@ class SpectralLine(Effect):
         "deg",
         "phase of a steady line at the start of the log; drawn, for all axes alike, if not given",
         default=(),
-        low=-1e6,
-        high=1e6,
+        limit=1e6,
         many=True,
     )
 
@@ -152,7 +151,7 @@ class RotationLine(Effect):
     size_parameters = ("amplitude",)
 
     amplitude: tuple[float, ...] = parameter(
-        "deg/h", "amplitude of the first line", typical=0.5, low=-1e6, high=1e6, many=True
+        "deg/h", "amplitude of the first line", typical=0.5, limit=1e6, many=True
     )
     order: float = parameter(
         "1", "frequency of the first line [per turn]", default=1.0, low=1e-3, high=1e3
@@ -161,10 +160,10 @@ class RotationLine(Effect):
         "1", "number of lines", default=1.0, low=1.0, high=100.0, whole="whole number of lines"
     )
     rolloff: float = parameter(
-        "1", "the k-th line is k^-rolloff of the first", default=1.0, low=-5.0, high=5.0
+        "1", "the k-th line is k^-rolloff of the first", default=1.0, limit=5.0
     )
     phase: tuple[float, ...] = parameter(
-        "deg", "phase of the first line at the start", default=(), low=-1e6, high=1e6, many=True
+        "deg", "phase of the first line at the start", default=(), limit=1e6, many=True
     )
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:

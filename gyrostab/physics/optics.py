@@ -50,7 +50,7 @@ class DeadZone(Effect):
     width: float = parameter(
         "deg/h", "half of the zone", typical=0.2, low=0.0, high=1e6, source="Cao et al. 2025"
     )
-    centre: float = parameter("deg/h", "rate that it sticks to", default=0.0, low=-1e6, high=1e6)
+    centre: float = parameter("deg/h", "rate that it sticks to", default=0.0, limit=1e6)
     bandwidth: float = parameter(
         "Hz", "bandwidth of the loop; inf for independent samples", default=math.inf, low=1e-9
     )
@@ -131,8 +131,7 @@ class FeedbackReset(Effect):
         "angle lost at once at a reset",
         default=0.0,
         typical=11.5,
-        low=-1e6,
-        high=1e6,
+        limit=1e6,
         source="blueSeis-3A",
     )
     tail: float = parameter(
@@ -140,8 +139,7 @@ class FeedbackReset(Effect):
         "angle lost slowly after it",
         default=0.0,
         typical=18.0,
-        low=-1e6,
-        high=1e6,
+        limit=1e6,
         source="blueSeis-3A",
     )
     decay: float = parameter(
@@ -152,8 +150,7 @@ class FeedbackReset(Effect):
         "error at the foot of the ramp, the opposite at its top",
         default=0.0,
         typical=0.01,
-        low=-1e6,
-        high=1e6,
+        limit=1e6,
     )
     diameter: float = parameter(
         "m", "diameter of the coil", default=0.1734, low=1e-3, high=10.0, source="blueSeis-3A"
@@ -392,8 +389,7 @@ class SharedSource(Effect):
         "deg/sqrt(h)",
         "angle random walk in common, with sign",
         typical=(1e-3,),
-        low=-1e4,
-        high=1e4,
+        limit=1e4,
         many=True,
     )
     bandwidth: float = parameter(

@@ -57,21 +57,16 @@ class ScaleFactor(Effect):
     size_parameters = ("linear", "asymmetry", "cubic", "thermal")
 
     linear: float = parameter(
-        "ppm", "error of the scale factor", default=0.0, typical=50.0, low=-1e6, high=1e6
+        "ppm", "error of the scale factor", default=0.0, typical=50.0, limit=1e6
     )
     asymmetry: float = parameter(
-        "ppm", "the same sign for both directions", default=0.0, typical=10.0, low=-1e6, high=1e6
+        "ppm", "the same sign for both directions", default=0.0, typical=10.0, limit=1e6
     )
     cubic: float = parameter(
-        "ppm/(deg/s)^2",
-        "growth with the square of the rate",
-        default=0.0,
-        typical=1e-5,
-        low=-1.0,
-        high=1.0,
+        "ppm/(deg/s)^2", "growth with the square of the rate", default=0.0, typical=1e-5, limit=1.0
     )
     thermal: float = parameter(
-        "ppm/degC", "growth with the temperature", default=0.0, typical=1.0, low=-1e4, high=1e4
+        "ppm/degC", "growth with the temperature", default=0.0, typical=1.0, limit=1e4
     )
     reference: float = parameter(
         "degC", "temperature of the calibration", default=25.0, low=-273.15, high=500.0
@@ -124,7 +119,7 @@ class ScaleFactor(Effect):
 
 def _declare_angle(axis: str) -> Any:
     meaning = f"misalignment angle towards axis {axis}"
-    return parameter("mrad", meaning, default=0.0, typical=0.5, low=-1e3, high=1e3)
+    return parameter("mrad", meaning, default=0.0, typical=0.5, limit=1e3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,9 +228,7 @@ class EarthRate(Effect):
     channels: ClassVar[Mapping[str, str]] = {"rotation_rate": INNER["rotation_rate"]}
     size_parameters = ("rate",)
 
-    latitude: float = parameter(
-        "deg", "latitude, north positive", typical=45.0, low=-90.0, high=90.0
-    )
+    latitude: float = parameter("deg", "latitude, north positive", typical=45.0, limit=90.0)
     inclination: float = parameter(
         "deg",
         "angle of the tool from straight down",
@@ -245,21 +238,16 @@ class EarthRate(Effect):
         high=180.0,
     )
     azimuth: float = parameter(
-        "deg",
-        "direction of the tool, clockwise from north",
-        default=0.0,
-        typical=60.0,
-        low=-360.0,
-        high=360.0,
+        "deg", "direction of the tool, clockwise from north", default=0.0, typical=60.0, limit=360.0
     )
     toolface: float = parameter(
-        "deg", "angle of x from the high side at the start", default=0.0, low=-360.0, high=360.0
+        "deg", "angle of x from the high side at the start", default=0.0, limit=360.0
     )
     off: tuple[float, ...] = parameter(
         "deg", "angle of each axis from the tool's", default=(), low=0.0, high=180.0, many=True
     )
     around: tuple[float, ...] = parameter(
-        "deg", "angle of each axis around the tool", default=(), low=-360.0, high=360.0, many=True
+        "deg", "angle of each axis around the tool", default=(), limit=360.0, many=True
     )
     rate: float = parameter(
         "deg/h",
@@ -345,7 +333,7 @@ class EarthRate(Effect):
 
 def _declare_tilt(axis: str) -> Any:
     meaning = f"tilt of the mounting per acceleration along {axis}"
-    return parameter("mrad/g", meaning, default=0.0, typical=0.01, low=-100.0, high=100.0)
+    return parameter("mrad/g", meaning, default=0.0, typical=0.01, limit=100.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -385,7 +373,7 @@ class RealMotion(Effect):
     size_parameters = ("sway", "spin", "x", "y", "z")
 
     direction: tuple[float, ...] = parameter(
-        "1", "share of each axis", default=(1.0,), low=-1.0, high=1.0, many=True
+        "1", "share of each axis", default=(1.0,), limit=1.0, many=True
     )
     sway: float = parameter(
         "deg/h", "rms rate of the sway", default=0.0, typical=10.0, low=0.0, high=1e7
@@ -399,8 +387,7 @@ class RealMotion(Effect):
         "share of the rotation rate, with scale-factor errors of gyro and channel",
         default=0.0,
         typical=1.0,
-        low=-1.1,
-        high=1.1,
+        limit=1.1,
     )
     x: float = _declare_tilt("x")
     y: float = _declare_tilt("y")

@@ -45,14 +45,12 @@ class TemperatureBias(Effect):
     channels: ClassVar[Mapping[str, str]] = {"temperature": INNER["temperature"]}
     size_parameters = ("sensitivity", "quadratic", "cubic")
 
-    sensitivity: float = parameter(
-        "deg/h/degC", "bias per degree", typical=1e-3, low=-1e4, high=1e4
-    )
+    sensitivity: float = parameter("deg/h/degC", "bias per degree", typical=1e-3, limit=1e4)
     quadratic: float = parameter(
-        "deg/h/degC^2", "bias per degree squared", default=0.0, typical=1e-5, low=-1e3, high=1e3
+        "deg/h/degC^2", "bias per degree squared", default=0.0, typical=1e-5, limit=1e3
     )
     cubic: float = parameter(
-        "deg/h/degC^3", "bias per degree cubed", default=0.0, typical=1e-7, low=-1e2, high=1e2
+        "deg/h/degC^3", "bias per degree cubed", default=0.0, typical=1e-7, limit=1e2
     )
     reference: float = parameter(
         "degC", "temperature at which the bias is zero", default=25.0, low=-273.15, high=500.0
@@ -117,8 +115,7 @@ class Shupe(Effect):
         "deg/h/(degC/min)",
         "bias at a steady ramp",
         typical=0.05,
-        low=-1e3,
-        high=1e3,
+        limit=1e3,
         source="Senol et al. 2024",
     )
     transient: float = parameter(
@@ -126,8 +123,7 @@ class Shupe(Effect):
         "bias per difference of ramps, outer minus inner half",
         default=0.0,
         typical=0.3,
-        low=-1e3,
-        high=1e3,
+        limit=1e3,
     )
     lag: float = parameter(
         "s", "relaxation time of the slowest mode", default=265.0, low=1e-3, high=1e6
@@ -258,15 +254,10 @@ class ThermalGradient(Effect):
     size_parameters = ("sensitivity", "change")
 
     sensitivity: float = parameter(
-        "deg/h/degC", "bias per difference", default=0.0, typical=0.05, low=-1e3, high=1e3
+        "deg/h/degC", "bias per difference", default=0.0, typical=0.05, limit=1e3
     )
     change: float = parameter(
-        "deg/h/(degC/min)",
-        "bias per change of the difference",
-        default=0.0,
-        typical=0.1,
-        low=-1e3,
-        high=1e3,
+        "deg/h/(degC/min)", "bias per change of the difference", default=0.0, typical=0.1, limit=1e3
     )
     lag: float = parameter("s", "lag of that change", default=60.0, low=1e-3, high=1e6)
 
@@ -346,7 +337,7 @@ class ThermalHysteresis(Effect):
     likeness: ClassVar[Mapping[str, Likeness]] = {"temperature_bias": "limit"}
 
     sensitivity: float = parameter(
-        "deg/h/degC", "bias per degree in the dead band", typical=3e-4, low=-1e4, high=1e4
+        "deg/h/degC", "bias per degree in the dead band", typical=3e-4, limit=1e4
     )
     width: float = parameter(
         "degC", "half of the dead band", default=3.0, low=0.0, high=500.0, difference=True

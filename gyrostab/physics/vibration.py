@@ -26,7 +26,7 @@ _FOLDED_POINTS = 1001  # of the spectrum of the samples, from which a sentence t
 
 
 def _declare_sensitivity(unit: str, meaning: str) -> Any:
-    return parameter(unit, meaning, default=0.0, typical=1e-3, low=-1e4, high=1e4)
+    return parameter(unit, meaning, default=0.0, typical=1e-3, limit=1e4)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,15 +132,10 @@ class VibrationRectification(Effect):
     size_parameters = ("sensitivity", "quartic")
 
     sensitivity: float = parameter(
-        "deg/h/g^2",
-        "bias per mean square",
-        typical=1.5e-3,
-        low=-10.0,
-        high=10.0,
-        source="Qin et al. 2026",
+        "deg/h/g^2", "bias per mean square", typical=1.5e-3, limit=10.0, source="Qin et al. 2026"
     )
     quartic: float = parameter(
-        "deg/h/g^4", "bias per mean square squared", default=0.0, typical=1e-7, low=-1.0, high=1.0
+        "deg/h/g^4", "bias per mean square squared", default=0.0, typical=1e-7, limit=1.0
     )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
@@ -200,7 +195,7 @@ class AliasedVibration(Effect):
     likeness: ClassVar[Mapping[str, Likeness]] = {"vibration_noise": "any spectrum"}
 
     sensitivity: tuple[float, ...] = parameter(
-        "deg/h/g", "rms rate in the band per rms g", typical=3.7, low=-1e6, high=1e6, many=True
+        "deg/h/g", "rms rate in the band per rms g", typical=3.7, limit=1e6, many=True
     )
     low: float = parameter(
         "Hz",

@@ -46,12 +46,10 @@ class WarmUp(Effect):
     )
     size_parameters = ("amplitude", "slow_amplitude")
 
-    amplitude: float = parameter(
-        "deg/h", "bias of a cold gyro at power-on", typical=0.1, low=-1e4, high=1e4
-    )
+    amplitude: float = parameter("deg/h", "bias of a cold gyro at power-on", typical=0.1, limit=1e4)
     time: float = parameter("s", "time constant", default=600.0, low=1e-3, high=1e6)
     slow_amplitude: float = parameter(
-        "deg/h", "amplitude of a second, slower part", default=0.0, typical=0.05, low=-1e4, high=1e4
+        "deg/h", "amplitude of a second, slower part", default=0.0, typical=0.05, limit=1e4
     )
     slow_time: float = parameter("s", "its time constant", default=HOUR, low=1e-3, high=1e7)
     cooling: float = parameter(
