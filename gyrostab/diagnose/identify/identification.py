@@ -155,30 +155,27 @@ def with_axes_of(
         if component.evidence_nats > settings.component_nats
         for axis in component.row
     }
-    components = tuple(
+    components = [
         component for component in identification.components if set(component.row) <= shown_axes
-    )
-    return (
-        replace(
-            identification,
-            components=components,
-            axes=tuple(axis for axis in identification.axes if axis in shown_axes),
-        )
-        if components
-        else identification
-    )
+    ]
+    if not components:
+        return identification
+    axes = [axis for axis in identification.axes if axis in shown_axes]
+    return reduce_selection(identification, components, axes)
 
 
 def reduce_selection(
     selection: Selection,
-    axes: Iterable[str],
     components: Iterable[Component],
-    evidence_nats: float,
+    axes: Iterable[str],
+    evidence_nats: float | None = None,
 ) -> Selection:
-    """Return a selection with some of its axes and components.
+    """Return a selection with some of its components and axes, and perhaps other evidence.
 
     Its alternatives are compared with it, and lose the same axes.
     """
+    if evidence_nats is None:
+        evidence_nats = selection.evidence_nats
     change_nats = evidence_nats - selection.evidence_nats
     return replace(
         selection,

@@ -16,7 +16,12 @@ from gyrostab.diagnose.identify.components import (
 )
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifiability import keep_physical
-from gyrostab.diagnose.identify.identification import Selection, components_of, with_axes_of
+from gyrostab.diagnose.identify.identification import (
+    Selection,
+    components_of,
+    reduce_selection,
+    with_axes_of,
+)
 from gyrostab.diagnose.identify.switching import renew_component
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
@@ -37,25 +42,17 @@ def without_pulses(chosen: Sequence[Selection], settings: Settings) -> list[Sele
         lines.update(dict.fromkeys(component.row, weight))
     out: list[Selection] = []
     for selection in chosen:
-        if selection.effect == "spikes":
-            remaining = tuple(
-                component
-                for component in selection.components
-                if lines[component.row[0]] < settings.min_comb_lines
-            )
-            out += (
-                [
-                    replace(
-                        selection,
-                        components=remaining,
-                        axes=tuple(component.row[0] for component in remaining),
-                    )
-                ]
-                if remaining
-                else []
-            )
-        else:
+        if selection.effect != "spikes":
             out.append(selection)
+            continue
+        remaining = [
+            component
+            for component in selection.components
+            if lines[component.row[0]] < settings.min_comb_lines
+        ]
+        if remaining:
+            axes = [component.row[0] for component in remaining]
+            out.append(reduce_selection(selection, remaining, axes))
     return out
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from gyrostab.diagnose.evidence.telegraph import telegraph_evidence
 from gyrostab.diagnose.identify.components import axes_of, evidence_of
 from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.identification import Selection, components_of
+from gyrostab.diagnose.identify.identification import Selection, components_of, reduce_selection
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
@@ -106,9 +106,13 @@ def drop_explained_jumps(chosen: Sequence[Selection], examination: Examination) 
     for component in [
         component for component in components_of(chosen) if component.statistic.is_switching
     ]:
-        jumps = _jumps_on_axis(component, out, examination.start)
+        jumps = [
+            other
+            for other in components_of(out)
+            if other.row == component.row and is_free_jump(other, examination.start)
+        ]
         for dropped_jumps in [jumps, *([jump] for jump in jumps if len(jumps) > 1)]:
-            if not dropped_jumps or not _contains_all(out, dropped_jumps):
+            if not dropped_jumps or not {*map(id, dropped_jumps)} <= {*map(id, components_of(out))}:
                 continue
             with_jumps, without_jumps = (
                 examination.state_with(_drop_components(out, left_out))
@@ -128,7 +132,13 @@ def drop_explained_jumps(chosen: Sequence[Selection], examination: Examination) 
                     evidence_nats=float(evidence.evidence_nats[0, row]),
                 )
                 out = [
-                    _replace_component(selection, component, instead)
+                    replace(
+                        selection,
+                        components=tuple(
+                            instead if other is component else other
+                            for other in selection.components
+                        ),
+                    )
                     for selection in _drop_components(out, dropped_jumps)
                 ]
                 component = instead
@@ -150,56 +160,25 @@ def _block_evidence(component: Component, state: State) -> float:
     return float(evidence_nats[0])
 
 
-def _contains_all(chosen: Sequence[Selection], components: Sequence[Component]) -> bool:
-    chosen_components = components_of(chosen)
-    return all(any(component is other for other in chosen_components) for component in components)
-
-
-def _replace_component(
-    identification: Selection, component: Component, instead: Component
-) -> Selection:
-    return replace(
-        identification,
-        components=tuple(
-            instead if other is component else other for other in identification.components
-        ),
-    )
-
-
-def _jumps_on_axis(
-    component: Component, chosen: Sequence[Selection], state: State
-) -> list[Component]:
-    return [
-        other
-        for other in components_of(chosen)
-        if other.row == component.row and is_free_jump(other, state)
-    ]
-
-
 def _drop_components(chosen: Sequence[Selection], left_out: Sequence[Component]) -> list[Selection]:
     """Drop some components from the selections, and selections that lose all."""
     out = []
     for selection in chosen:
-        remaining = tuple(
+        remaining = [
             component
             for component in selection.components
             if not any(component is other for other in left_out)
-        )
+        ]
         if len(remaining) < len(selection.components):
             evidence_nats = (
                 selection.evidence_nats
                 - sum(component.evidence_nats for component in selection.components)
                 + sum(component.evidence_nats for component in remaining)
             )
-            selection = replace(
-                selection,
-                components=remaining,
-                axes=axes_of(remaining, list(selection.axes)),
-                evidence_nats=evidence_nats,
-            )
-            if not remaining:
-                continue
-        out.append(selection)
+            axes = axes_of(remaining, selection.axes)
+            selection = reduce_selection(selection, remaining, axes, evidence_nats)
+        if remaining:
+            out.append(selection)
     return out
 
 

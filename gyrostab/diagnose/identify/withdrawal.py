@@ -169,7 +169,7 @@ def _without_part_of_drift(
         evidence_nats = sum(max(sum_evidence(layer), 0.0) for layer in split_layers(elsewhere))
         if evidence_nats >= threshold:
             axes = [name for name in identification.axes if name != axis]
-            remaining.append(reduce_selection(identification, axes, elsewhere, evidence_nats))
+            remaining.append(reduce_selection(identification, elsewhere, axes, evidence_nats))
     return remaining
 
 

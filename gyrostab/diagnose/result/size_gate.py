@@ -82,7 +82,7 @@ def keep_supported(
         if sum_evidence(supported) > identification.threshold:
             axes = [axis for axis in identification.axes if axis in good]
             evidence_nats = min(identification.evidence_nats, sum_evidence(supported))
-            identified.append(reduce_selection(identification, axes, supported, evidence_nats))
+            identified.append(reduce_selection(identification, supported, axes, evidence_nats))
         else:
             lost = identification.components
             rejected.append(
