@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -80,18 +80,19 @@ def predict_baseline(
             known_of += [any(identification is other for other in left_out)] * (
                 len(columns) - len(known_of)
             )
-    weight = _powers_without(state, is_left_out)
+    weight = state.weight.copy()
+    for row, axis in enumerate(state.axes):
+        dropped = np.array(is_left_out.get(("power", axis), []), np.bool_)
+        if dropped.any():
+            weight[row] = fit_powers(state, axis, dropped)
     state = replace(state, blocks=usable_blocks, masked=identifications.state.masked)
+    empty_state = replace(state, given={})
     mean = baseline["known_mean"].values.copy()
     for row, axis in enumerate(state.axes):
         columns = state.given.get(("mean", axis), [])
         is_kept = ~np.array(is_left_out.get(("mean", axis), []), np.bool_)
         if is_kept.any():
-            state_without_means = replace(
-                state,
-                given={key: value for key, value in state.given.items() if key != ("mean", axis)},
-            )
-            size, _ = mean_mixture(state_without_means, axis, columns).moments()
+            size, _ = mean_mixture(empty_state, axis, columns).moments()
             mean[row] += np.tensordot(size[is_kept], np.stack(columns)[is_kept], axes=1)
     predicted = state.baseline.assign(
         spectrum=baseline["spectrum"].copy(data=weight),
@@ -113,35 +114,20 @@ def predict_baseline(
     if not shared:
         return predicted
     expected = expected_cross(baseline)
-    cross = _cross_spectra(shared, state)
+    cross = _cross_spectra(shared, empty_state)
     return predicted.assign(
         cross=(("pair", "block", "band"), cross if expected is None else cross + expected)
     )
 
 
-def _powers_without(
-    state: State, is_left_out: Mapping[tuple[str, str], Sequence[bool]]
-) -> NDArray[np.float64]:
-    """Return the expected powers without some of the columns in the model."""
-    weight = state.weight.copy()
-    for row, axis in enumerate(state.axes):
-        chosen = np.array(is_left_out.get(("power", axis), []), np.bool_)
-        if chosen.any():
-            weight[row] = fit_powers(state, axis, chosen)
-    return weight
-
-
 def _cross_spectra(components: Sequence[Component], state: State) -> NDArray[np.complex128]:
-    """Return the cross-spectra of noise that axes have in common."""
+    """Return the cross-spectra of noise that axes have in common, in a state without effects."""
     shape = state.weight.shape[1:]
     pairs = pair_rows(state.blocks)
     total = np.zeros((len(pairs), *shape), np.complex128)
     for component in components:
         row = pairs.index(component.row)
-        state_without_cross = replace(
-            state, given={key: value for key, value in state.given.items() if key[0] != "cross"}
-        )
-        mean, _ = component_mixture(component, state_without_cross).moments()
+        mean, _ = component_mixture(component, state).moments()
         for size, design in zip(mean, component.variant.design, strict=True):
             total[row] += size * cross_column(design, row, state.blocks)
     return total

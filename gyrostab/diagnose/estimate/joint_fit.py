@@ -191,7 +191,8 @@ def _fit_components(
     settings = _model_settings(identification, by_statistic[statistic][0], state)
     if settings.get("phase") == "channel":
         rising = (values | likeliest).get("full", 1.0)  # a sign, or an average of signs
-        settings["full"] = math.copysign(_ramp_height(state), rising)
+        turns = state.blocks["ramp_turns"].attrs
+        settings["full"] = math.copysign(float(turns["high"]) - float(turns["low"]), rising)
     averaged = _make_effect(kind, values | settings, axes, identification.driver)
     effect = _make_effect(kind, values | likeliest | settings, axes, identification.driver)
     return Fitted(
@@ -267,7 +268,11 @@ def _model_settings(
     if identification.effect == "feedback_reset" and "ramp_turns" in state.blocks:
         return {"phase": "channel"}
     if identification.effect == "held_samples":
-        return {"fill": _fill_of(component, state)}
+        if component.variant.columns[0] == "filled":
+            return {"fill": "zero"}
+        counts = state.blocks.sel(axis=component.row[0])
+        are_frames = 2.0 * float(counts["resent"].sum()) > float(counts["repeats"].sum())
+        return {"fill": "frame" if are_frames else "repeat"}
     if identification.effect == "clipping":
         return {"centre": centre_of_range(state.blocks.sel(axis=component.row[0]))}
     if identification.effect == "misalignment":
@@ -287,47 +292,23 @@ def _model_settings(
     return {}
 
 
-def _ramp_height(state: State) -> float:
-    """Return the channel's reading of a full ramp."""
-    low, high = (float(state.blocks["ramp_turns"].attrs[name]) for name in ("low", "high"))
-    return high - low
-
-
-def _fill_of(component: Component, state: State) -> str:
-    """Return what lost samples are replaced by."""
-    if component.variant.columns[0] == "filled":
-        return "zero"
-    axis_blocks = state.blocks.sel(axis=component.row[0])
-    return (
-        "frame"
-        if 2.0 * float(axis_blocks["resent"].sum()) > float(axis_blocks["repeats"].sum())
-        else "repeat"
-    )
-
-
 def _make_effect(
     kind: type[Effect], values: Mapping[str, Any], axes: tuple[str, ...], driver: tuple[str, ...]
 ) -> Effect | None:
     parameters = {item.name: item for item in kind.parameters()}
-    clean = {}
-    for name, value in values.items():
-        if name in parameters:
-            item = parameters[name]
-            clean[name] = (
-                value if isinstance(value, str) else _clip_to_range(value, item.low, item.high)
-            )
+    clean = {
+        name: value
+        if isinstance(value, str)
+        else np.clip(value, parameters[name].low, parameters[name].high).tolist()
+        for name, value in values.items()
+        if name in parameters
+    }
     named = tuple(driver) if driver and all(driver) else ()
     size = {name: 0.0 for name in kind.required() if name not in clean}
     try:
         return kind(axes=axes, driver=named, **{**size, **clean})
     except (GyrostabError, TypeError):
         return None
-
-
-def _clip_to_range(value: Any, low: float, high: float) -> Any:
-    if isinstance(value, list | tuple):
-        return [min(max(float(element), low), high) for element in value]
-    return min(max(float(value), low), high)
 
 
 def _make_estimate(

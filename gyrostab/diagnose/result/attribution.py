@@ -228,6 +228,8 @@ def drop_expected(
     blocks, before : xarray.Dataset
         The recording, and the baseline with these effects.
     """
+    if not expected:
+        return located
     anomalous = [
         identification
         for identification in expected
@@ -237,20 +239,18 @@ def drop_expected(
             for component in identification.components
         )
     ]
-    not_anomalous = [
-        identification for identification in expected if identification not in anomalous
-    ]
+    others = [identification for identification in expected if identification not in anomalous]
     by_count, by_all = (
         attribute_mismatches(
             located, identified, blocks, before, null, level=level, settings=settings
         )
-        for identified in (anomalous, not_anomalous)
+        for identified in (anomalous, others)
     )
     is_expected = [
-        bool(named) or (bool(counted) and statistic == "distribution")
-        for statistic, counted, named in zip(located["view"].values, by_count, by_all, strict=True)
+        bool(named) or (bool(counted) and view == "distribution")
+        for view, counted, named in zip(located["view"].values, by_count, by_all, strict=True)
     ]
-    return located.isel(mismatch=~np.array(is_expected, np.bool_)) if expected else located
+    return located.isel(mismatch=~np.array(is_expected, np.bool_))
 
 
 def _is_caused_elsewhere(

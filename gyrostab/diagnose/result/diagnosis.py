@@ -153,17 +153,14 @@ def effect_table(effect: Effect) -> dict[str, Any]:
     >>> effect_table(make_effect(shupe))
     {'name': 'shupe', 'axes': ['x'], 'sensitivity': 0.4, 'lag': 180.0}
     """
-    kind = type(effect)
     table: dict[str, Any] = {"name": effect.name}
     if effect.axes:
         table["axes"] = list(effect.axes)
     if effect.driver:
         table["driver"] = list(effect.driver)
-    required = set(kind.required())
-    defaults = {name: item.default for name, item in kind.__dataclass_fields__.items()}
-    for parameter in kind.parameters():
+    for parameter in effect.parameters():
         value = getattr(effect, parameter.name)
-        if parameter.name in required or value != defaults[parameter.name]:
+        if value != parameter.default:  # None where a model must give it
             table[parameter.name] = list(value) if isinstance(value, tuple) else value
     return table
 

@@ -142,19 +142,14 @@ def refit_with_noise(
 ) -> Fit:
     """Calibrate the noise with the effects of the `first` fit in the model, and fit them again."""
     noise = recalibrate(identifications, baseline, first)
-    blocks = identifications.state.blocks
-    if noise is baseline:
-        return Fit(
-            identifications,
-            baseline,
-            refer_to_kept_noise(first, baseline, blocks),
-            fit_expected(identifications, baseline),
-        )
-    identifications = with_noise(identifications, noise)
+    fitted = first
+    if noise is not baseline:
+        identifications = with_noise(identifications, noise)
+        fitted = fit_identifications(identifications, noise)
     return Fit(
         identifications,
         noise,
-        refer_to_kept_noise(fit_identifications(identifications, noise), noise, blocks),
+        refer_to_kept_noise(fitted, noise, identifications.state.blocks),
         fit_expected(identifications, baseline),
     )
 
