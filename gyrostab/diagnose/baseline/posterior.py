@@ -15,7 +15,6 @@ from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
 _MIN_POWER_RATIO = 0.05  # of expected powers that fitted effects may leave; design choice
-_POINTS_AT_ONCE = 64  # points of the grid; limits memory
 _MIN_STEP = 1e-3  # shortest step towards the best fit
 _ROUNDING_SHARE = 1e-12  # rounding error of a log likelihood
 _PRIOR_PRECISION = 1e-9  # of effects in the means, over that of one mean; nearly free
@@ -192,18 +191,22 @@ def _likelihood_of_powers(
     free_columns, precision = fit.free()
     weight = fit.weight / spectrum**2
     fast_columns = np.concatenate([fit.columns[:, :2], free_columns], axis=1)
-    known_power = fit.power - fit.rest()
     normal = _normal_matrix(fast_columns, weight, precision)
-    without = _normal_matrix(fast_columns[:, 1:], weight, precision)
-    setup, count = (weight, known_power, spectrum), -(-B.size // _POINTS_AT_ONCE)
-    chunks = []
-    for b, k in zip(np.array_split(B, count), np.array_split(K, count), strict=True):
-        slow = np.outer(b**2, fit.columns[:, 2]) + np.outer(k**2, fit.columns[:, 3])
-        chunks.append(_likelihood_of_points(fit, slow, fast_columns, (normal, without), setup))
+    without_q = _normal_matrix(fast_columns[:, 1:], weight, precision)
+    slow = np.outer(B**2, fit.columns[:, 2]) + np.outer(K**2, fit.columns[:, 3])
+    right = (weight * (fit.rest() - slow)) @ fast_columns
+    best = np.linalg.solve(normal, right.T).T
+    best_without_q = np.linalg.solve(without_q, right[:, 1:].T).T
+    best_without_q[:, 0] = np.maximum(best_without_q[:, 0], 1e-12 * float(spectrum.max()) / HOUR)
+    is_inside = (best[:, :2] > 0.0).all(axis=1)
+    used = np.where(is_inside[:, None], best, np.pad(best_without_q, ((0, 0), (1, 0))))
+    expected = used @ fast_columns.T + slow + (fit.power - fit.rest())
+    if free_columns.shape[1] or fit.known is not None:
+        expected = np.maximum(expected, _MIN_POWER_RATIO * spectrum)
+    likelihood = -(fit.weight * (np.log(expected) + fit.power / expected)).sum(axis=1)
     if free_columns.shape[1]:
         normal = np.linalg.inv(np.linalg.inv(normal)[:2, :2])
-    likelihood, best = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
-    return likelihood, best, normal
+    return np.asarray(likelihood), np.asarray(best[:, :2]), normal
 
 
 def _normal_matrix(fast_columns: Array, weight: Array, precision: Array) -> Array:
@@ -213,31 +216,6 @@ def _normal_matrix(fast_columns: Array, weight: Array, precision: Array) -> Arra
         normal = normal + np.diag([*np.zeros(fast_columns.shape[1] - precision.size), *precision])
         normal += 1e-9 * np.diag(np.diagonal(normal))
     return normal
-
-
-def _likelihood_of_points(
-    fit: Fit,
-    slow: Array,
-    fast_columns: Array,
-    normals: tuple[Array, Array],
-    setup: tuple[Array, Array, Array],
-) -> tuple[Array, Array]:
-    """Compute some points of the grid; `slow` (point, cell) is the power of B and K."""
-    weight, known_power, spectrum = setup
-    right = (weight * (fit.rest() - slow)) @ fast_columns
-    best = np.linalg.solve(normals[0], right.T).T
-    best_without_q = np.linalg.solve(normals[1], right[:, 1:].T).T
-    best_without_q[:, 0] = np.maximum(best_without_q[:, 0], 1e-12 * float(spectrum.max()) / HOUR)
-    inside = np.asarray((best[:, :2] > 0.0).all(axis=1))
-    used = np.where(
-        inside[:, None], best, np.concatenate([np.zeros((len(best), 1)), best_without_q], axis=1)
-    )
-    expected = used @ fast_columns.T + slow + known_power
-    if fast_columns.shape[1] > 2 or fit.known is not None:
-        expected = np.maximum(expected, _MIN_POWER_RATIO * spectrum)
-    return np.asarray(
-        -(fit.weight * (np.log(expected) + fit.power / expected)).sum(axis=1)
-    ), np.asarray(best[:, :2])
 
 
 def _draw_near(mean: Array, covariance: Array, rng: np.random.Generator) -> Array:
