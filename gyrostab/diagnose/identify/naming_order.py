@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifiability import find_plainer_effect
-from gyrostab.diagnose.identify.logger_filters import without_slopes
 from gyrostab.diagnose.identify.switching import identify_switching, put_followers_first
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.condition import condition_on
@@ -46,7 +47,7 @@ def order_passing(
         counts
         or confirmed
         or switching
-        or without_slopes(
+        or _without_slopes(
             _without_locked_lines(passing, components, state),
             components,
             state,
@@ -101,6 +102,46 @@ def _without_locked_lines(
         for key in passing
         if key not in lines or not any(mask[components[key][0].place] for mask in masks)
     ]
+
+
+def _without_slopes(
+    passing: list[str],
+    components: Mapping[str, list[Component]],
+    state: State,
+    examination: Examination,
+) -> list[str]:
+    """Drop lines that a passing filter explains, or the filter if lines remain.
+
+    A line is compared with its neighbours, so that the steep slope of a filter, or the lobes of an
+    average, look like one. Lines that keep half of their evidence come before the filter: many of
+    them together leave a broad form in the powers too. All that explains less than the filter then
+    waits with it, because any other form would be named for the slope.
+    """
+    lines = [key for key in passing if components[key][0].candidate.statistic.is_line]
+    filters = [key for key in passing if any(component.is_filter for component in components[key])]
+    if not lines or not filters:
+        return passing
+    trial = condition_on(state, list(components[filters[0]]))
+    line_evidence = examination.compute_evidence(
+        [components[key][0].candidate for key in lines], trial
+    )
+    nats_after = {
+        evidence.candidate.key: float(np.maximum(evidence.evidence_nats[0], 0.0).sum())
+        for evidence in line_evidence
+    }
+    nats_before = {
+        key: sum(max(component.evidence_nats, 0.0) for component in components[key])
+        for key in lines
+    }
+    real = {
+        key
+        for key in lines
+        if nats_after.get(key, 0.0) > state.settings.majority_share * nats_before[key]
+    }
+    if not real:
+        return [key for key in passing if key not in lines]
+    stronger = passing[: passing.index(filters[0])]
+    return [key for key in passing if key in real or (key in stronger and key not in lines)]
 
 
 def _is_on_single_axis(components: Sequence[Component], candidates: Sequence[Candidate]) -> bool:
