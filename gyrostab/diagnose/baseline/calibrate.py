@@ -336,17 +336,14 @@ def assemble_baseline(
     expected = noise if spectrum is None else spectrum
     power, shape = blocks["power"].values, blocks["shape"].values
     floor = np.array([1e-3 * levels.min() / HOUR for levels in expected])
-    of_means = square.copy()
+    of_means, spectrum_of_means = square.copy(), expected.copy()
     for row, posterior in enumerate(posteriors):
         if posterior.of_means is not None:
             of_means[row] = posterior.of_means
+            spectrum_of_means[row] *= columns[row] @ posterior.of_means / noise[row]
     of_means[:, 1] = np.maximum(of_means[:, 1], floor)
     white = white_variance(blocks, of_means)
     white = white * np.maximum(expected[..., 0] / noise[..., 0], 0.1)
-    spectrum_of_means = expected.copy()
-    for row, posterior in enumerate(posteriors):
-        if posterior.of_means is not None:
-            spectrum_of_means[row] *= columns[row] @ posterior.of_means / noise[row]
     variance = white * np.stack(
         [
             _mean_noise_excess(*arrays, settings)
@@ -357,11 +354,16 @@ def assemble_baseline(
     densities = np.maximum([posterior.square[1] for posterior in posteriors], floor) * HOUR
     grids = _coarse_grids(posteriors, densities, span)
     common, shape_alone = common_variance(blocks)
-    value, error = _mean_coefficients(posteriors)
-    value[:, 4], error[:, 4] = 0.0, _ramp_error(blocks, white, value, quiet)
+    # without R; B and K are those of the block means
+    roots = [
+        np.sqrt(np.concatenate([posterior.draws[:, :2], posterior.slow], axis=1))
+        for posterior in posteriors
+    ]
+    value, error = np.mean(roots, axis=1), np.std(roots, axis=1)
+    ramp_error = _ramp_error(blocks, white, value, quiet)
     variables = {
-        "coefficient": value,
-        "stderr": error,
+        "coefficient": np.pad(value, ((0, 0), (0, 1))),
+        "stderr": np.column_stack([error, ramp_error]),
         "quiet": quiet,
         "spectrum": expected,
         "known_mean": np.zeros(quiet.shape) if known_mean is None else known_mean,
@@ -395,15 +397,6 @@ def assemble_baseline(
             ],
         },
     )
-
-
-def _mean_coefficients(posteriors: list[Posterior]) -> tuple[Array, Array]:
-    """Return values and errors (axis, term), without R; B and K are those of the block means."""
-    value, error = np.zeros((len(posteriors), 5)), np.zeros((len(posteriors), 5))
-    for row, posterior in enumerate(posteriors):
-        roots = np.sqrt(np.concatenate([posterior.draws[:, :2], posterior.slow], axis=1))
-        value[row, :4], error[row, :4] = roots.mean(axis=0), roots.std(axis=0)
-    return value, error
 
 
 def _ramp_error(blocks: xr.Dataset, white: Array, value: Array, quiet: NDArray[np.bool_]) -> Array:

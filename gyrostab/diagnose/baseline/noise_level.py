@@ -72,25 +72,10 @@ def _fit_factor(power: Array, noise: Array, added: Array, weight: Array) -> tupl
     return factor, 1.0 / (factor * math.sqrt(information))
 
 
-def _scale_noise(
-    noise: Posterior, factor: float, error: float, rng: np.random.Generator
-) -> Posterior:
-    """Scale the noise of an axis, with the relative error of the factor in its draws."""
-    scatter = rng.gamma(error**-2, error**2, (len(noise.draws), 1))
-    return noise._replace(
-        square=noise.square * factor,
-        error=np.hypot(noise.error, noise.square * error) * factor,
-        K=noise.K * np.sqrt(factor),
-        B=noise.B * np.sqrt(factor),
-        draws=noise.draws * factor * scatter,
-        slow=noise.slow * factor * scatter,
-    )
-
-
 def scale_axes(
     blocks: xr.Dataset, posteriors: list[Posterior], factor: Array, error: Array
 ) -> list[Posterior]:
-    """Scale the noise of all axes, with the errors of the factors, and say so."""
+    """Scale the noise of all axes, with the relative errors of the factors in the draws; say so."""
     sizes = ", ".join(
         f"{root:.3g} on axis {axis}"
         for axis, root in zip(blocks["axis"].values, np.sqrt(factor), strict=True)
@@ -100,8 +85,18 @@ def scale_axes(
         "stretches",
         stacklevel=2,
     )
-    scalings = zip(posteriors, factor.tolist(), error.tolist(), strict=True)
-    return [
-        _scale_noise(posterior, by, relative_error, np.random.default_rng(row))
-        for row, (posterior, by, relative_error) in enumerate(scalings)
-    ]
+    scaled = []
+    for row, (noise, by, relative) in enumerate(zip(posteriors, factor, error, strict=True)):
+        rng = np.random.default_rng(row)
+        scatter = rng.gamma(relative**-2, relative**2, (len(noise.draws), 1))
+        scaled.append(
+            noise._replace(
+                square=noise.square * by,
+                error=np.hypot(noise.error, noise.square * relative) * by,
+                K=noise.K * np.sqrt(by),
+                B=noise.B * np.sqrt(by),
+                draws=noise.draws * by * scatter,
+                slow=noise.slow * by * scatter,
+            )
+        )
+    return scaled

@@ -12,6 +12,7 @@ truncated towards zero, however fine: an angle has no zero.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -57,12 +58,12 @@ def _rounded_by_spectrum(
     rate = float(blocks.attrs["sampling_rate_hz"])
     white = baseline["square"].sel(noise="N").values * HOUR * rate
     quiet = baseline["quiet"].values
-    share = np.array(
-        [
-            _mean_angle_share(*row)
-            for row in zip(blocks["mean"].values, quiet, step, np.sqrt(white), strict=True)
-        ]
-    )
+    share = np.ones(step.size)
+    for row, mean in enumerate(blocks["mean"].values):
+        good = quiet[row] & np.isfinite(mean)
+        if step[row] > 0.0 and good.any():
+            scatter = math.sqrt(white[row]) / step[row]
+            share[row] = angle_share(mean[good] / step[row], scatter).mean()
     angle_square = np.where(step > 0.0, share * step**2 / 12.0 / (rate * URAD_PER_S) ** 2, np.nan)
     ratio = _fit_q_square(blocks, baseline) / angle_square
     error = baseline["square_stderr"].sel(noise="Q").values / angle_square
@@ -101,16 +102,6 @@ def _fit_q_square(blocks: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.float6
             else np.nan
         )
     return np.array(out)
-
-
-def _mean_angle_share(
-    mean: NDArray[Any], quiet: NDArray[np.bool_], step: float, scatter: float
-) -> float:
-    """Return `angle_share` averaged over the quiescent means of an axis."""
-    good = quiet & np.isfinite(mean)
-    if not step > 0.0 or not good.any():
-        return 1.0
-    return float(np.mean(angle_share(mean[good] / step, scatter / step)))
 
 
 def angle_share(mean: NDArray[Any], scatter: float) -> NDArray[np.float64]:

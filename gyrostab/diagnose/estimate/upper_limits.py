@@ -131,20 +131,13 @@ def _limit_row(component: Component, family: Sequence[Variant], state: State) ->
         if not component.statistic.is_linear_in_means
         or np.ptp(mean_columns(variant, state.axes.index(component.row[0]))[0]) > 0.0
     ]
-    sizes = [component_mixture(component, state, variant) for variant in moving]
-    moments = [
-        (float(mean[0]), math.sqrt(max(float(square[0, 0]), 0.0)))
-        for mean, square in (mixture.moments() for mixture in sizes)
-    ]
-    usable = [
-        place
-        for place, (mean, sd) in enumerate(moments)
-        if math.isfinite(mean) and math.isfinite(sd) and sd > 0.0
-    ]
-    if not usable:
-        return math.nan
-    mean, sd = np.array([moments[place] for place in usable]).T
-    evidence = np.array([sizes[place].evidence for place in usable]) - np.log(sd)
+    mixtures = [component_mixture(component, state, variant) for variant in moving]
+    moments = [mixture.moments() for mixture in mixtures]
+    mean = np.array([float(size[0]) for size, _ in moments])
+    sd = np.sqrt([max(float(square[0, 0]), 0.0) for _, square in moments])
+    is_usable = np.isfinite(mean) & np.isfinite(sd) & (sd > 0.0)
+    mean, sd = mean[is_usable], sd[is_usable]
+    evidence = np.array([mixture.evidence for mixture in mixtures])[is_usable] - np.log(sd)
     if not np.isfinite(evidence).any():
         return math.nan
     share = np.exp(evidence - np.logaddexp.reduce(evidence))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -205,20 +205,11 @@ def _usual_places(
 
 def _places_without_lag(family: Sequence[Variant]) -> list[int]:
     """Return the places of the variants without a lag; empty where the effect has no lags."""
-    lags = [_lag_values(variant.values) for variant in family]
-    return (
-        [
-            place
-            for place, variant_lags in enumerate(lags)
-            if variant_lags and max(variant_lags.values()) <= MAX_ZERO_LAG_S
-        ]
-        if any(lags)
-        else []
-    )
-
-
-def _lag_values(values: Mapping[str, float | str]) -> dict[str, float]:
-    return {name: float(value) for name, value in values.items() if _is_lag(name)}
+    lags = [
+        [float(value) for name, value in variant.values.items() if _is_lag(name)]
+        for variant in family
+    ]
+    return [place for place, values in enumerate(lags) if values and max(values) <= MAX_ZERO_LAG_S]
 
 
 def _is_lag(name: str) -> bool:
