@@ -83,11 +83,15 @@ def fit_identifications(identifications: Identifications, baseline: xr.Dataset) 
         One entry per axis of an effect with a single size for all of its axes; one entry for all
         axes where each has its own size.
     """
-    fitted: list[Fitted] = []
-    for identification in identifications.identified:
-        state = identifications.state_without(identification, baseline)
-        fitted += _fit_identification(identification, state, identifications)
-    return fitted
+    return [
+        fitted
+        for identification in identifications.identified
+        for fitted in _fit_identification(
+            identification,
+            identifications.state_without(identification, baseline),
+            identifications,
+        )
+    ]
 
 
 def fit_expected(identifications: Identifications, baseline: xr.Dataset) -> list[Fitted]:
@@ -101,17 +105,14 @@ def fit_expected(identifications: Identifications, baseline: xr.Dataset) -> list
 def _fit_identification(
     identification: Selection, state: State, identifications: Identifications
 ) -> list[Fitted]:
-    statistics = {component.statistic for component in identification.components}
     kind = effects()[identification.effect]
-    many = any(item.many for item in kind.parameters() if item.name in kind.size_parameters)
-    filtered = any(
-        component.is_filter for component in identification.components
-    )  # all axes pass the filter of the one logger
-    fitted_together = (
-        many
-        or filtered
-        or any(statistic.is_pairwise for statistic in statistics)
-        or any(not component.candidate.is_per_axis for component in identification.components)
+    fitted_together = any(
+        item.many for item in kind.parameters() if item.name in kind.size_parameters
+    ) or any(
+        component.is_filter  # all axes pass the filter of the one logger
+        or component.statistic.is_pairwise
+        or not component.candidate.is_per_axis
+        for component in identification.components
     )
     if fitted_together:
         return [

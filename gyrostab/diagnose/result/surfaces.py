@@ -112,41 +112,33 @@ def _predicted_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows)
 def _attach_labels(
     blocks: xr.Dataset, windows: Windows, tau: Array, squares: list[Any], means: list[Any]
 ) -> xr.Dataset:
-    cube, plane = ("case", "axis", "window", "tau"), ("case", "axis", "window")
+    dims = ("case", "axis", "window", "tau")
     begin, end = blocks["begin"].values[windows.first], blocks["end"].values[windows.stop - 1]
     start = np.datetime64(int(blocks.attrs["start_ns"]), "ns")
     middle = start + np.rint((begin + end) / 2.0 * 1e9).astype("timedelta64[ns]")
-    units = {"avar": "degree2 hour-2", "mean": "degree hour-1", "time": "s"}
-    names = (
-        ("avar", "Allan variance"),
-        ("avar_low", "lower end of the 95 % band"),
-        ("avar_high", "upper end of the 95 % band"),
-    )
-    data: dict[str, Any] = {
-        name: (
-            cube,
-            np.stack(np.broadcast_arrays(*values)),
-            {"units": units["avar"], "long_name": long_name},
-        )
-        for (name, long_name), values in zip(names, squares, strict=True)
+    names = {
+        "avar": ("degree2 hour-2", "Allan variance"),
+        "avar_low": ("degree2 hour-2", "lower end of the 95 % band"),
+        "avar_high": ("degree2 hour-2", "upper end of the 95 % band"),
+        "mean": ("degree hour-1", "mean rate"),
+        "mean_stderr": ("degree hour-1", "standard deviation of the mean"),
     }
-    for (name, long_name), values in zip(
-        (("mean", "mean rate"), ("mean_stderr", "standard deviation of the mean")),
-        means,
-        strict=True,
-    ):
-        data[name] = (plane, np.stack(values), {"units": units["mean"], "long_name": long_name})
+    data: dict[str, Any] = {}
+    for (name, (units, long_name)), cases in zip(names.items(), [*squares, *means], strict=True):
+        values = np.stack(np.broadcast_arrays(*cases))
+        data[name] = (dims[: values.ndim], values, {"units": units, "long_name": long_name})
     coordinates: dict[str, Any] = {
         "case": ("case", list(CASES)),
         "axis": ("axis", [str(axis) for axis in blocks["axis"].values]),
         "time": ("window", middle, {"long_name": "middle of the window"}),
-        "begin": (
-            "window",
-            begin,
-            {"units": "s", "long_name": "start of the window, since the start"},
-        ),
-        "end": ("window", end, {"units": "s", "long_name": "end of the window, since the start"}),
-        "tau": ("tau", tau, {"units": "s", "long_name": "averaging time"}),
+        **{
+            name: (dim, values, {"units": "s", "long_name": long_name})
+            for name, dim, values, long_name in (
+                ("begin", "window", begin, "start of the window, since the start"),
+                ("end", "window", end, "end of the window, since the start"),
+                ("tau", "tau", tau, "averaging time"),
+            )
+        },
     }
     attributes = {
         name: blocks.attrs[name]
@@ -170,12 +162,8 @@ def surfaces_with_blocks(
         density = np.stack([_average_where(case.values, has_data) for case in cases])
         lines = blocks["line_power"].weighted(blocks["line_weight"].fillna(0.0)).mean("part")
     step = -(-lines.sizes["line"] // MAX_LINES)
-    lines = lines.coarsen(line=step, boundary="trim").max() if step > 1 else lines
-    frequency = (
-        blocks["line_frequency"].coarsen(line=step, boundary="trim").mean()
-        if step > 1
-        else blocks["line_frequency"]
-    )
+    lines = lines.coarsen(line=step, boundary="trim").max()
+    frequency = blocks["line_frequency"].coarsen(line=step, boundary="trim").mean()
     added = xr.Dataset(
         {
             "block_mean": (("axis", "block"), blocks["mean"].values, dict(blocks["mean"].attrs)),
