@@ -46,7 +46,8 @@ class Settings:
         "1",
         "Share that makes a part the larger one: common time of two regions that are one, "
         "blocks that a motion may move, evidence that a filter leaves of a line, variance of "
-        "a switching course that another effect explains, Q^2 of an angle counter.",
+        "a switching course that another effect explains, Q^2 of an angle counter, equal share of "
+        "what several effects explain of a mismatch.",
         "nearer to the whole than to nothing; no other value separates two alternatives equally",
     )
     component_nats: float = _make_setting(
@@ -451,12 +452,6 @@ class Settings:
         "1",
         "Share of the score of a mismatch that an error of the form of its effect may leave.",
         "root of `spectrum_error_share`: evidence is the square of a score",
-    )
-    needed_share: float = _make_setting(
-        0.5,
-        "1",
-        "Share of an equal contribution from which an effect is needed to explain a mismatch.",
-        "choice: with two effects, a quarter of what they explain together",
     )
     coverage_tolerance: float = _make_setting(
         0.013,

@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.predict.windows import fill_linearly
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.errors import OptionError
 from gyrostab.time.grid import stamp_ns
@@ -40,8 +41,7 @@ def _distance_from_rest(blocks: xr.Dataset, settings: Settings) -> list[Array]:
         good = np.isfinite(values)
         if good.sum() < max(settings.min_quiescent_blocks, settings.quiescent_share * values.size):
             continue
-        place = np.arange(values.size)
-        filled = np.interp(place, place[good], values[good])
+        filled = fill_linearly(values)
         if name.startswith("channel_vibration") or name == "channel_rotation_rate":
             size = np.abs(filled)
             limit = max(

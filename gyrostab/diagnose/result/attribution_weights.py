@@ -174,7 +174,7 @@ def needed_effects(
     score_with_all = left(())[0]
     brought = left(weighed)[0] - score_with_all
     without = [left((identification,)) for identification in weighed]
-    fair = settings.needed_share * brought / len(shown)
+    fair = settings.majority_share * brought / len(shown)
     needed = [
         number
         for number, (score, limit) in enumerate(without)
