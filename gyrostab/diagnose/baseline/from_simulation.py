@@ -24,7 +24,6 @@ from gyrostab.diagnose.baseline.simulated import (
     worst_band,
 )
 from gyrostab.diagnose.settings import DEFAULTS, Settings
-from gyrostab.errors import SchemaError
 
 Array = NDArray[np.float64]
 
@@ -37,32 +36,14 @@ def baseline_from_simulation(
     Its stationary statistics other than the five noise terms are taken as measured: the shape of
     its spectrum, coherency of axes, steady lines. What a simulation does to the means over time is
     indistinguishable from its random walk and therefore not known; `baseline_from_model` knows it.
+    Both have the same blocks and axes (`gyrostab.diagnose.inputs.read_simulation`).
 
     Parameters
     ----------
     quiet : array_like of bool (block,), or (start, end) or several of these, optional
         Quiescent time of the recording: one factor for each axis fits the noise of the simulation
         to it.
-
-    Raises
-    ------
-    SchemaError
-        If the two differ in axes, sampling rate or length.
     """
-    in_recording, in_simulation = (
-        {
-            "sampling rate [Hz]": record.attrs["sampling_rate_hz"],
-            "blocks": (record.sizes["block"], record.attrs["block_samples"]),
-            "axes": list(record["axis"].values),
-        }
-        for record in (blocks, simulated)
-    )
-    for name, value in in_recording.items():
-        if in_simulation[name] != value:
-            raise SchemaError(
-                f"simulation: {name} {in_simulation[name]}, but {value} in the recording; "
-                "simulate with --like RECORDING"
-            )
     chosen = find_quiescent_blocks(simulated, settings=settings)
     posteriors, level, unexplained = _calibrate_simulation(simulated, chosen, settings)
     squares = [posterior.square for posterior in posteriors]

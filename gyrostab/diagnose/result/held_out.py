@@ -15,14 +15,12 @@ from gyrostab.diagnose.evidence.products import mean_products
 from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.statistics.power import allan_surface
 from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score
-from gyrostab.errors import OptionError
 from gyrostab.noise import NORMAL_95
 
 #: A baseline, or a function that fits one to the blocks where its argument, a mask, is true.
 Trained = xr.Dataset | Callable[[NDArray[np.bool_]], xr.Dataset]
 STRETCH_S = 100.0  # length of a held-out stretch; longer ones would hide a whole event
 MIN_STRETCHES = 36  # in records shorter than an hour the stretches are shorter instead
-MIN_BLOCKS = 12  # three held-out blocks in each of the four folds
 FORECAST_FROM_SHARE = 0.7  # share of the record that a forecast begins from
 SHORT_WINDOW_BLOCKS = 5  # length of the middle one of the three windows of the Allan variance
 
@@ -69,11 +67,6 @@ def held_out(
         the mean square of the scores of the Allan variance (1 for a model that fits), and
         ``coverage95_before``, ``coverage95_after``, the share of them inside the 95 % band;
         ``forecast_gain`` [nats] on the last 30 % of models fitted to the first 70 %.
-
-    Raises
-    ------
-    OptionError
-        When the record has too few blocks.
 
     Examples
     --------
@@ -137,20 +130,9 @@ def _compare_models(
 
 
 def cut_stretches(blocks: xr.Dataset) -> Windows:
-    """Cut a record into the stretches to hold out: 100 s long, shorter in records below an hour.
-
-    Raises
-    ------
-    OptionError
-        When there are too few blocks.
-    """
+    """Cut a record into the stretches to hold out: 100 s long, shorter in records below an hour."""
     block_count = blocks.sizes["block"]
-    span = blocks.sizes["block"] * float(blocks.attrs["block_s"])
-    if block_count < MIN_BLOCKS:
-        raise OptionError(
-            f"the record has {block_count} blocks, and {MIN_BLOCKS} are needed to hold some out; "
-            "give a longer record or shorter blocks"
-        )
+    span = block_count * float(blocks.attrs["block_s"])
     edge = np.rint(
         np.linspace(
             0, block_count, min(block_count, max(MIN_STRETCHES, round(span / STRETCH_S))) + 1
