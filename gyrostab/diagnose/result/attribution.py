@@ -39,8 +39,9 @@ def active_blocks(
     is_active = np.zeros(block_count, bool)
     for component in identification.components:
         design = component.variant.design
-        if component.statistic.is_rotation:
-            is_active |= _rotating_blocks(blocks, settings)
+        if component.statistic.is_rotation:  # harmonics are measured while the tool rotates
+            turn = np.abs(np.nan_to_num(blocks["channel_rotation_rate"].values))
+            is_active |= turn > settings.rest_share * turn.max(initial=0.0)
             continue
         if not component.statistic.has_course or design.size == 0:
             return np.ones(block_count, bool)
@@ -65,12 +66,6 @@ def _rest_level(size: Array, settings: Settings) -> Array:
     """
     still = np.abs(size) <= settings.rest_share * np.nanmax(np.abs(size), axis=0, initial=0.0)
     return np.where(still.mean(axis=0) >= settings.rest_share, 0.0, np.median(size, axis=0))
-
-
-def _rotating_blocks(blocks: xr.Dataset, settings: Settings) -> NDArray[np.bool_]:
-    """Return the blocks in which the tool rotates: its harmonics are measured in these."""
-    turn = np.abs(np.nan_to_num(blocks["channel_rotation_rate"].values))
-    return np.asarray(turn > settings.rest_share * turn.max(initial=0.0))
 
 
 def join_blocks(
@@ -189,7 +184,11 @@ def attribute_mismatches(
                 continue
             if (
                 moved
-                or any(_is_coincident(region, span, settings.overlap_share) for span in its_time)
+                or any(
+                    _overlap_seconds(region, (begin, end))
+                    >= settings.overlap_share * min(region["end"] - region["begin"], end - begin)
+                    for begin, end in its_time
+                )
                 or (
                     without is not None
                     and _is_caused_elsewhere(
@@ -282,14 +281,6 @@ def _explained_spans(
     if any(component.statistic.is_rotation for component in identification.components):
         return [(float(begin[0]), float(end[-1]))]
     return join_blocks(active_blocks(identification, blocks, settings=settings), begin, end)
-
-
-def _is_coincident(
-    region: Mapping[str, Any], span: tuple[float, float], overlap_share: float
-) -> bool:
-    return _overlap_seconds(region, span) >= overlap_share * min(
-        float(region["end"] - region["begin"]), span[1] - span[0]
-    )
 
 
 def _overlap_seconds(region: Mapping[str, Any], span: tuple[float, float]) -> float:

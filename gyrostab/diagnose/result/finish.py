@@ -67,6 +67,12 @@ def finish_diagnosis(task: Task, comparison: Comparison, started: float) -> Diag
     unexplained = [region["id"] for region in mismatches if not region["explained_by"]]
     held = measure_evidence(blocks, baseline, identifications, first)
     effects = effect_tables(fit.fitted, blocks, settings=task.settings)
+    # channels that an effect could follow, or was compared with
+    used = {
+        name
+        for candidate in fit.identifications.candidates
+        for name in (*candidate.driver, *candidate.reference)
+    }
     content = {
         "schema": SCHEMA,
         "recording": recording_table(blocks),
@@ -81,33 +87,20 @@ def finish_diagnosis(task: Task, comparison: Comparison, started: float) -> Diag
             name: asdict(limit) for name, limit in find_upper_limits(fit.identifications).items()
         },
         "rejected": rejected_tables(fit.identifications),
-        "unused_channels": unused_channels(blocks, _used_channels(fit.identifications)),
+        "unused_channels": unused_channels(blocks, used),
         "held_out": held,
         "seconds": round(time.perf_counter() - started, 3),
     }
+    rotation = task.log.get("rotation_rate", xr.DataArray())
+    turning = str(rotation.attrs.get("rotation_axis", ""))  # axis that feels this channel
     given_model = task.simulation if isinstance(task.simulation, Model) else None
     diagnosis = Diagnosis(
         plain(content),
         _make_surfaces_with_outliers(blocks, fit, before, after),
-        model_tables(fit.noise, fit.fitted, given_model, blocks, _turning_axis(task)),
+        model_tables(fit.noise, fit.fitted, given_model, blocks, turning),
     )
     check_diagnosis(diagnosis.content)
     return diagnosis
-
-
-def _turning_axis(task: Task) -> str:
-    """Return the axis that feels the channel ``rotation_rate``; empty without one."""
-    channel = task.log.get("rotation_rate")
-    return "" if channel is None else str(channel.attrs.get("rotation_axis", ""))
-
-
-def _used_channels(identifications: Identifications) -> set[str]:
-    """Return the channels that an effect could follow, or was compared with."""
-    return {
-        name
-        for candidate in identifications.candidates
-        for name in (*candidate.driver, *candidate.reference)
-    }
 
 
 def fit_supported(

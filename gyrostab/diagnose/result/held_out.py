@@ -100,12 +100,17 @@ def held_out(
             gain = gain + _compare_models(blocks, models["before"], models["after"], held)
         gains.append(gain)
     evidence_nats, variance = max(gain.tolist() for gain in gains)
+    known = select_forecast_start(blocks)
+    late, early = (
+        log_likelihood(blocks, _fit_model(model, known), known, ~known)
+        for model in (after if forecast is None else forecast, before)
+    )
     return {
         "blocks": windows.first.size,
         "log_likelihood_gain": evidence_nats,
         "stderr": math.sqrt(variance),
         **_summarise_scores(squares),
-        "forecast_gain": _forecast_gain(blocks, before, after if forecast is None else forecast),
+        "forecast_gain": late - early,
     }
 
 
@@ -286,11 +291,3 @@ def select_forecast_start(blocks: xr.Dataset) -> NDArray[np.bool_]:
     return np.asarray(
         np.arange(blocks.sizes["block"]) < round(FORECAST_FROM_SHARE * blocks.sizes["block"])
     )
-
-
-def _forecast_gain(blocks: xr.Dataset, before: Trained, after: Trained) -> float:
-    known = select_forecast_start(blocks)
-    late, early = (
-        log_likelihood(blocks, _fit_model(model, known), known, ~known) for model in (after, before)
-    )
-    return late - early

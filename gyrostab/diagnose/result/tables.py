@@ -24,7 +24,6 @@ from gyrostab.diagnose.result.text import effect_statement, span_text, unsized_s
 from gyrostab.diagnose.result.verdict import name_probability
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.noise import LAWS
-from gyrostab.physics.base import Effect
 from gyrostab.simulate.model import Model
 from gyrostab.units import HOUR
 
@@ -218,7 +217,11 @@ def model_tables(
     instrument = max(
         [
             int(own.log.get("oversampling", 1)) if own is not None else 1,
-            *map(_instrument_samples, added_effects),
+            # a filter runs at the rate of the instrument
+            *(
+                int(getattr(effect, "instrument", 1)) or FAST_INSTRUMENT_SAMPLES
+                for effect in added_effects
+            ),
         ]
     )
     log = {"log": {"oversampling": instrument}} if instrument > 1 else {}
@@ -231,11 +234,3 @@ def model_tables(
         "bias": {axis: float(f"{rate:.6g}") for axis, rate in rates.items()},
         "effect": [effect_table(effect) for effect in [*given_effects, *added_effects]],
     }
-
-
-def _instrument_samples(effect: Effect) -> int:
-    """Return the instrument samples per log sample that an effect needs.
-
-    A filter runs at the rate of the instrument.
-    """
-    return int(getattr(effect, "instrument", 1)) or FAST_INSTRUMENT_SAMPLES

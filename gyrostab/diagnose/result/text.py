@@ -56,12 +56,10 @@ def chance_share(p_value: float) -> str:
     if p_value < MIN_PRINTED_PROBABILITY:
         return "fewer than 1 in a million"
     number = 1.0 / p_value
-    return f"1 of {number:.2g}" if number < 99.5 else f"1 of {_round_to_two_digits(number)}"
-
-
-def _round_to_two_digits(number: float) -> str:
-    size = 10.0 ** (math.floor(math.log10(number)) - 1)
-    return f"{round(number / size) * size:,.0f}".replace(",", " ")
+    if number < 99.5:
+        return f"1 of {number:.2g}"
+    size = 10.0 ** (math.floor(math.log10(number)) - 1)  # two digits
+    return f"1 of {round(number / size) * size:,.0f}".replace(",", " ")
 
 
 def clock(seconds: float) -> str:

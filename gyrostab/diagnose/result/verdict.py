@@ -89,18 +89,16 @@ def name_probability(identification: Selection, *, settings: Settings = DEFAULTS
     True
     """
     evidence_nats = identification.evidence_nats
-    other_nats = [_evidence_instead(identification, name) for name in identification.alternatives]
+    other_nats = [
+        max(
+            (nats for key, nats in identification.instead.items() if key.partition("(")[0] == name),
+            default=evidence_nats,
+        )
+        for name in identification.alternatives
+    ]
     # E_k - E may be any number of nats.
     share = np.exp(evidence_nats - np.logaddexp.reduce([evidence_nats, *other_nats]))
     return float(settings.set_probability * share)
-
-
-def _evidence_instead(identification: Selection, effect: str) -> float:
-    """Return the evidence of an alternative in the place of an effect [nats]."""
-    nats_instead = [
-        nats for key, nats in identification.instead.items() if key.partition("(")[0] == effect
-    ]
-    return max(nats_instead, default=identification.evidence_nats)
 
 
 def decide_verdict(
