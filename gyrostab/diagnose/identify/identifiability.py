@@ -115,30 +115,26 @@ def _find_other_form(component: Component, state: State) -> tuple[str, float] | 
 
 def _is_possible(component: Component, state: State) -> bool:
     """Return whether physics allows the size of a component, and its cause is present."""
-    effect, statistic = component.candidate.effect, component.statistic
-    if (
+    effect, statistic, settings = component.candidate.effect, component.statistic, state.settings
+    is_at_rest = (
         effect == "misalignment"
         and statistic.is_transfer
         and not _is_moving(component.candidate.reference[0], state)
+    )
+    if is_at_rest or (
+        _is_rotation(component) and _rotation_share(component, state) < settings.min_rotation_share
     ):
         return False
-    if (
-        _is_rotation(component)
-        and _rotation_share(component, state) < state.settings.min_rotation_share
-    ):
-        return False
-    if (
+    is_too_large = (
         effect == "scale_factor"
         and statistic.is_linear_in_means
-        and _rotation_share(component, state) > state.settings.max_misalignment_share
-    ):
-        return False
-    if not _is_in_range(component, state):
-        return False
-    return not (
-        component.variant.squared
-        and statistic.is_power
-        and component_size(component, state)[0] <= 0.0
+        and _rotation_share(component, state) > settings.max_misalignment_share
+    )
+    is_added = component.variant.squared and statistic.is_power
+    return (
+        not is_too_large
+        and _is_in_range(component, state)
+        and not (is_added and component_size(component, state)[0] <= 0.0)
     )
 
 

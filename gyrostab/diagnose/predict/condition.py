@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.held_out import noise_columns
 from gyrostab.diagnose.predict.candidates import Component, Variant
-from gyrostab.diagnose.predict.linear_model import State, pair_rows
+from gyrostab.diagnose.predict.linear_model import State, pair_rows, select_row
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
@@ -34,9 +34,7 @@ def condition_on_components(state: State, components: Iterable[Component]) -> St
 
 def mean_columns(variant: Variant, row: int) -> list[Array]:
     """Return the columns of the mean on an axis, (block,) each."""
-    return [
-        np.asarray(design[row] if design.shape[0] > 1 else design[0]) for design in variant.design
-    ]
+    return [select_row(design, row) for design in variant.design]
 
 
 def free_covariance(state: State, axes: tuple[str, ...], density: Array) -> State:
@@ -126,26 +124,22 @@ def _fit_columns(state: State, row: int, axis: str, named: Array) -> tuple[Array
     """Fit the powers of an axis; return them before and after, and sizes of the named columns."""
     expected = axis_values(state.baseline, "spectrum", axis)
     level, precision = noise_columns(state.baseline, axis=axis)
-    columns = np.concatenate([level * expected[..., None], named], axis=-1).reshape(
-        expected.size, -1
-    )
+    level_count, flat = level.shape[2], expected.ravel()
+    columns = np.concatenate([level * expected[..., None], named], axis=-1).reshape(flat.size, -1)
     size = np.maximum(np.abs(columns).max(axis=0), 1e-300)
     columns = columns / size
     prior = np.zeros(columns.shape[1])
-    prior[: level.shape[2]] = np.diagonal(precision) / size[: level.shape[2]] ** 2
-    power = state.blocks["power"].values[row].ravel()
-    shape = state.blocks["shape"].values[row].ravel()
-    good = (
-        np.isfinite(power) & np.isfinite(shape) & ~np.repeat(state.masked[row], expected.shape[1])
-    )
-    fitted, sizes = expected.ravel().copy(), np.zeros(size.size)
+    prior[:level_count] = np.diagonal(precision) / size[:level_count] ** 2
+    power, shape = (state.blocks[name].values[row].ravel() for name in ("power", "shape"))
+    masked = np.repeat(state.masked[row], expected.shape[1])
+    good = np.isfinite(power) & np.isfinite(shape) & ~masked
+    fitted, sizes = flat, np.zeros(size.size)
     for _ in range(_ROUNDS):
         w = np.where(good, shape / fitted**2, 0.0)
         w = np.where(np.isfinite(w), w, 0.0)
         normal = (columns * w[:, None]).T @ columns + np.diag(prior)
         normal += 1e-9 * np.diag(np.maximum(np.diagonal(normal), 1e-300))
-        moved = columns.T @ (w * np.where(good, power - expected.ravel(), 0.0))
-        sizes = np.linalg.solve(normal, moved)
-        power_fitted = expected.ravel() + columns @ sizes
-        fitted = np.maximum(power_fitted, MIN_POWER_RATIO * expected.ravel())
-    return expected, power_fitted.reshape(expected.shape), (sizes / size)[level.shape[2] :]
+        sizes = np.linalg.solve(normal, columns.T @ (w * np.where(good, power - flat, 0.0)))
+        power_fitted = flat + columns @ sizes
+        fitted = np.maximum(power_fitted, MIN_POWER_RATIO * flat)
+    return expected, power_fitted.reshape(expected.shape), (sizes / size)[level_count:]

@@ -127,36 +127,19 @@ def collect_evidence(
     ]
     owner = np.repeat(np.arange(len(group)), [len(group_variants) for group_variants in variants])
     weight = np.array([variant.weight for group_variants in variants for variant in group_variants])
-    prior = _share_variants(factors, owner, weight)
+    weighted = list(zip(factors, _share_variants(factors, owner, weight), strict=True))
     # (candidate, record, row)
     evidence_nats = np.stack(
-        [
-            held_out_evidence(row_factors, owner, weight=row_prior)
-            for row_factors, row_prior in zip(factors, prior, strict=True)
-        ],
-        axis=-1,
+        [held_out_evidence(row, owner, weight=prior) for row, prior in weighted], axis=-1
     )
     # (design, row)
-    first = np.stack(
-        [
-            row_factors[0, :, 0] + np.log(row_prior[:, 0])
-            for row_factors, row_prior in zip(factors, prior, strict=True)
-        ],
-        axis=-1,
-    )
+    first = np.stack([row[0, :, 0] + np.log(prior[:, 0]) for row, prior in weighted], axis=-1)
     out = []
     for number, candidate in enumerate(group):
-        log_weight = first[owner == number]
-        best = tuple(variants[number][int(place)] for place in log_weight.argmax(axis=0))
-        out.append(
-            CandidateEvidence(
-                candidate,
-                rows,
-                evidence_nats[number],
-                best,
-                log_weight.argmax(axis=0)[None] if spread > 1 else np.empty((0, 0), np.int64),
-            )
-        )
+        place = first[owner == number].argmax(axis=0)
+        best = tuple(variants[number][at] for at in place.tolist())
+        lines = place[None] if spread > 1 else np.empty((0, 0), np.int64)
+        out.append(CandidateEvidence(candidate, rows, evidence_nats[number], best, lines))
     return out
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -134,25 +134,24 @@ def attribute_mismatches(
         {str(name): located[name].values[number] for name in located.data_vars}
         for number in range(located.sizes["mismatch"])
     ]
-    score_with = partial(statistic_scores, still=still, settings=settings)
-    scores_without: dict[tuple[int, ...], Scores] = {
-        (): score_with(blocks, after, null, regions, identified)
-    }
+
+    @cache
+    def scores_without(numbers: tuple[int, ...]) -> Scores:
+        left_out = [identified[number] for number in numbers]
+        remaining = [each for number, each in enumerate(identified) if number not in numbers]
+        baseline = without(left_out) if without is not None and left_out else after
+        return statistic_scores(
+            blocks, baseline, null, regions, remaining, still=still, settings=settings
+        )
 
     def score_without(region: Mapping[str, Any], out: Sequence[Selection]) -> tuple[float, float]:
-        chosen = tuple(
+        numbers = tuple(
             number
             for number, identification in enumerate(identified)
             if any(identification is left_out for left_out in out)
         )
-        if chosen not in scores_without and without is not None:
-            remaining = [
-                identification
-                for number, identification in enumerate(identified)
-                if number not in chosen
-            ]
-            scores_without[chosen] = score_with(blocks, without(out), null, regions, remaining)
-        return score_left(region, scores_without[chosen], null, level, settings.score_error_share)
+        scores = scores_without(numbers)
+        return score_left(region, scores, null, level, settings.score_error_share)
 
     when = [_explained_spans(identification, blocks, settings) for identification in identified]
     moves = [
