@@ -77,9 +77,7 @@ def predict_baseline(
     for identification, state in zip(identified, states, strict=True):
         for place, columns in state.given.items():
             known_of = is_left_out.setdefault(place, [])
-            known_of += [any(identification is other for other in left_out)] * (
-                len(columns) - len(known_of)
-            )
+            known_of += [identification in left_out] * (len(columns) - len(known_of))
     weight = state.weight.copy()
     for row, axis in enumerate(state.axes):
         dropped = np.array(is_left_out.get(("power", axis), []), np.bool_)
@@ -98,11 +96,7 @@ def predict_baseline(
         spectrum=baseline["spectrum"].copy(data=weight),
         known_mean=baseline["known_mean"].copy(data=mean),
     )
-    remaining = [
-        identification
-        for identification in identified
-        if not any(identification is other for other in left_out)
-    ]
+    remaining = [identification for identification in identified if identification not in left_out]
     filters = [component for component in components_of(remaining) if component.is_filter]
     if filters:  # one for all axes
         kind = effects()[filters[0].candidate.effect]

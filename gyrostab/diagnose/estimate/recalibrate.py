@@ -353,26 +353,23 @@ def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identi
     A share of N^2 is a share of the new one.
     """
     blocks = identifications.state.blocks
-    candidates: dict[int, Candidate] = {}  # by the identity of the old one
-    variants: dict[int, Variant] = {}
+    candidates: dict[Candidate, Candidate] = {}  # by the old one
+    variants: dict[Variant, Variant] = {}
     for component in components_of(identifications.identified):
         old = component.candidate
-        if old.statistic.is_power and id(old) not in candidates:
+        if old.statistic.is_power and old not in candidates:
             made = tuple(
                 rebuild_variant(old, variant, blocks, baseline["coefficient"]) or variant
                 for variant in old.variants
             )
-            candidates[id(old)] = replace(old, variants=made)
-            variants |= zip(map(id, old.variants), made, strict=True)
+            candidates[old] = replace(old, variants=made)
+            variants |= zip(old.variants, made, strict=True)
 
     def renew(component: Component) -> Component:
-        if id(component.candidate) not in candidates:
+        old = component.candidate
+        if old not in candidates:
             return component
-        return replace(
-            component,
-            candidate=candidates[id(component.candidate)],
-            variant=variants[id(component.variant)],
-        )
+        return replace(component, candidate=candidates[old], variant=variants[component.variant])
 
     return replace(
         identifications,
@@ -381,6 +378,6 @@ def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identi
             for identification in identifications.identified
         ),
         candidates=tuple(
-            candidates.get(id(candidate), candidate) for candidate in identifications.candidates
+            candidates.get(candidate, candidate) for candidate in identifications.candidates
         ),
     )

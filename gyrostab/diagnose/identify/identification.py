@@ -22,9 +22,12 @@ Array = NDArray[np.float64]
 _FILTER = "logger_filter"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Selection:
-    """What forward selection puts into the model: an effect, or a nuisance alternative."""
+    """What forward selection puts into the model: an effect, or a nuisance alternative.
+
+    It is equal only to itself.
+    """
 
     #: Name in the registry, or one of
     #: `gyrostab.diagnose.identify.nuisance_alternatives.NUISANCE_ALTERNATIVES`.

@@ -31,7 +31,7 @@ from gyrostab.diagnose.identify.settling import prune_selections, settle_selecti
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.identify.switching import drop_explained_jumps
 from gyrostab.diagnose.identify.withdrawal import withdraw_effects
-from gyrostab.diagnose.predict.candidates import CandidateEvidence, Component
+from gyrostab.diagnose.predict.candidates import CandidateEvidence, Component, Variant
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import reusable_evidence
@@ -66,7 +66,7 @@ def select_effects(
     state = examination.state_with([*identified, *unidentified])
     remaining, withdrawn = withdraw_effects(examination, state, identified, unidentified)
     unidentified += withdrawn
-    if withdrawn or [*map(id, remaining)] != [*map(id, identified)]:
+    if withdrawn or remaining != identified:
         state = examination.state_with([*remaining, *unidentified])
     remaining = sorted(remaining, key=lambda identification: -identification.evidence_nats)
     is_unchanged = _variants_by_row(selected) == _variants_by_row([*remaining, *unidentified])
@@ -155,11 +155,11 @@ def score_candidates(
     Powers are weighted with the strongest effect in the powers, because its noise is in every
     statistic.
     """
-    is_known = {id(evidence.candidate) for evidence in known_evidence}
+    known = {evidence.candidate for evidence in known_evidence}
     sought = [
         candidate
         for candidate in examination.candidates
-        if candidate.key not in barred and id(candidate) not in is_known
+        if candidate.key not in barred and candidate not in known
     ]
     all_evidence = [
         *(evidence for evidence in known_evidence if evidence.candidate.key not in barred),
@@ -265,10 +265,10 @@ def _find_shifted(
     return None if shifts.passed else ("a time-shifted channel", shifts.nats)
 
 
-def _variants_by_row(chosen: Sequence[Selection]) -> set[tuple[str, tuple[str, ...], int]]:
-    """Return what the selections put into the model: rows and identities of the variants."""
+def _variants_by_row(chosen: Sequence[Selection]) -> set[tuple[str, tuple[str, ...], Variant]]:
+    """Return what the selections put into the model: rows and variants."""
     return {
-        (component.candidate.key, component.row, id(component.variant))
+        (component.candidate.key, component.row, component.variant)
         for component in components_of(chosen)
     }
 

@@ -112,7 +112,7 @@ def drop_explained_jumps(chosen: Sequence[Selection], examination: Examination) 
             if other.row == component.row and is_free_jump(other, examination.start)
         ]
         for dropped_jumps in [jumps, *([jump] for jump in jumps if len(jumps) > 1)]:
-            if not dropped_jumps or not {*map(id, dropped_jumps)} <= {*map(id, components_of(out))}:
+            if not dropped_jumps or not {*dropped_jumps} <= {*components_of(out)}:
                 continue
             with_jumps, without_jumps = (
                 examination.state_with(_drop_components(out, left_out))
@@ -164,11 +164,7 @@ def _drop_components(chosen: Sequence[Selection], left_out: Sequence[Component])
     """Drop some components from the selections, and selections that lose all."""
     out = []
     for selection in chosen:
-        remaining = [
-            component
-            for component in selection.components
-            if not any(component is other for other in left_out)
-        ]
+        remaining = [component for component in selection.components if component not in left_out]
         if len(remaining) < len(selection.components):
             evidence_nats = (
                 selection.evidence_nats

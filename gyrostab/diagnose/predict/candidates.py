@@ -1,4 +1,7 @@
-"""Candidates: what an effect predicts for a statistic, and where a record shows it."""
+"""Candidates: what an effect predicts for a statistic, and where a record shows it.
+
+Variants, candidates and components hold arrays: each is equal only to itself.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ Array = NDArray[Any]
 TIME_PARAMETER = "at"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Variant:
     """One point of the grid of nuisance parameters."""
 
@@ -59,7 +62,7 @@ class Prospect(NamedTuple):
     coefficient: xr.DataArray  # ``(axis, term)``: noise of the baseline
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Candidate:
     """An effect in one statistic."""
 
@@ -86,7 +89,7 @@ class Candidate:
         return {name for variant in self.variants for name in variant.columns}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Component:
     """One row of a statistic in which a named effect shows."""
 

@@ -136,21 +136,15 @@ def attribute_mismatches(
     ]
 
     @cache
-    def scores_without(numbers: tuple[int, ...]) -> Scores:
-        left_out = [identified[number] for number in numbers]
-        remaining = [each for number, each in enumerate(identified) if number not in numbers]
-        baseline = without(left_out) if without is not None and left_out else after
+    def scores_without(out: tuple[Selection, ...]) -> Scores:
+        remaining = [identification for identification in identified if identification not in out]
+        baseline = without(out) if without is not None and out else after
         return statistic_scores(
             blocks, baseline, null, regions, remaining, still=still, settings=settings
         )
 
     def score_without(region: Mapping[str, Any], out: Sequence[Selection]) -> tuple[float, float]:
-        numbers = tuple(
-            number
-            for number, identification in enumerate(identified)
-            if any(identification is left_out for left_out in out)
-        )
-        scores = scores_without(numbers)
+        scores = scores_without(tuple(out))
         return score_left(region, scores, null, level, settings.score_error_share)
 
     when = [_explained_spans(identification, blocks, settings) for identification in identified]

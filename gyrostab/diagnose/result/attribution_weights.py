@@ -182,10 +182,8 @@ def needed_effects(
     ]
     if not needed and len(weighed) == len(shown):
         needed = [int(np.argmax([score for score, _ in without]))]
-    dropped = [
-        id(identification) for number, identification in enumerate(weighed) if number not in needed
-    ]
-    return [identification for identification, _ in shown if id(identification) not in dropped]
+    dropped = [selection for number, selection in enumerate(weighed) if number not in needed]
+    return [identification for identification, _ in shown if identification not in dropped]
 
 
 def _is_weighed(component: Component, region: Region) -> bool:
