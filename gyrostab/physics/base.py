@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cache
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,15 +43,7 @@ Stage = Literal["motion", "noise", "rate", "sensor", "electronics", "sampling", 
 Likeness = Literal["always", "any spectrum", "limit", "single event", "size"]
 
 #: Stages of the signal path, in order.
-STAGES: tuple[Stage, ...] = (
-    "motion",
-    "noise",
-    "rate",
-    "sensor",
-    "electronics",
-    "sampling",
-    "logger",
-)
+STAGES: tuple[Stage, ...] = get_args(Stage)
 
 
 @dataclass(frozen=True)
