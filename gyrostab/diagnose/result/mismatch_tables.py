@@ -46,7 +46,6 @@ def _make_mismatch(
     p_value: float,
     statement: str,
     *,
-    ratio: float | None = None,
     explained_by: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return a mismatch as a table, without its id; span and averaging times in s."""
@@ -57,7 +56,7 @@ def _make_mismatch(
         "end": iso(blocks, span[1]),
         "tau_min_s": taus[0],
         "tau_max_s": taus[1],
-        "ratio": ratio,
+        "ratio": None,
         "p_value": p_value,
         "explained_by": list(explained_by),
         "statement": statement,
@@ -90,20 +89,11 @@ def _located_mismatches(
             for name in mismatches.data_vars
             if mismatches[name].dtype.kind != "M"
         }
-        region["axes"] = str(region["axes"]).split()
-        out.append(
-            _make_mismatch(
-                blocks,
-                region["view"],
-                region["axes"],
-                (region["begin"], region["end"]),
-                (region["tau_min_s"], region["tau_max_s"]),
-                region["p_value"],
-                mismatch_statement(region, record_s),
-                ratio=region["ratio"],
-                explained_by=names,
-            )
-        )
+        axes = region["axes"] = str(region["axes"]).split()
+        span, taus = ((region["begin"], region["end"]), (region["tau_min_s"], region["tau_max_s"]))
+        text = mismatch_statement(region, record_s)
+        table = _make_mismatch(blocks, region["view"], axes, span, taus, region["p_value"], text)
+        out.append(table | {"ratio": region["ratio"], "explained_by": list(names)})
     return out
 
 
@@ -127,30 +117,15 @@ def identified_mismatches(
         ):
             continue
         strongest = max(identification.components, key=lambda component: component.evidence_nats)
-        view = strongest.statistic.view
+        view, axes, names = strongest.statistic.view, identification.axes, [identification.effect]
         taus = strongest.statistic.averaging_times(strongest, blocks)
         p_value = float(null.probability(identification.evidence_nats))
-        for span in join_blocks(
-            active_blocks(identification, blocks, settings=settings), begin, end
-        ):
-            text = named_statement(
-                view,
-                identification.effect,
-                identification.axes,
-                span_text(*span, float(end[-1])),
-                p_value,
-            )
+        acting = active_blocks(identification, blocks, settings=settings)
+        for span in join_blocks(acting, begin, end):
+            when = span_text(*span, float(end[-1]))
+            text = named_statement(view, identification.effect, axes, when, p_value)
             out.append(
-                _make_mismatch(
-                    blocks,
-                    view,
-                    identification.axes,
-                    span,
-                    taus,
-                    p_value,
-                    text,
-                    explained_by=[identification.effect],
-                )
+                _make_mismatch(blocks, view, axes, span, taus, p_value, text, explained_by=names)
             )
     return out
 
