@@ -44,8 +44,6 @@ from gyrostab.noise import TERMS
 from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
-#: Number of draws from the posterior of the noise of an axis; limits memory.
-DRAWS = 512
 #: Values of K and B on the coarse grid, as multiples of the calibrated ones. Design choice.
 _FACTORS = {"K": (0.0, 1.0 / 3.0, 1.0, 3.0, 10.0, 30.0), "B": (0.0, 1.0, 3.0, 10.0)}
 #: Share of the draws that may lie beyond the coarse grid: a tenth of the share of null records that
@@ -173,28 +171,15 @@ def calibrate_axes(
     blocks: xr.Dataset, chosen: NDArray[np.bool_], settings: Settings
 ) -> list[Posterior]:
     """Compute the noise of every axis from the chosen blocks (axis, block)."""
-    mean = blocks["mean"].values
-    step = float(blocks.attrs["block_s"])
     posteriors = []
     for row, fit in enumerate(_fit_quiescent_powers(blocks, chosen, settings)):
-        use = chosen[row]
         explained = _keep_explained_bands(fit, settings)
         square = np.maximum(fit_squares(explained)[0], [0.0, floor_square(explained), 0.0, 0.0])
-        variance = white_variance(blocks, np.tile(square, (len(mean), 1)))[row]
-        present = use & np.isfinite(mean[row])
-        posteriors.append(
-            noise_posterior(
-                fit,
-                mean[row],
-                variance,
-                present,
-                step=step,
-                draws=DRAWS,
-                rng=np.random.default_rng(row),
-                effects=_level_columns(use, settings.min_quiescent_blocks),
-                max_disagreement_nats=settings.disagreement_nats,
-            )._replace(of_means=None if explained is fit else square)
-        )
+        variance = white_variance(blocks, np.tile(square, (len(chosen), 1)))[row]
+        levels = _level_columns(chosen[row], settings.min_quiescent_blocks)
+        posterior = noise_posterior(fit, blocks, row, variance, chosen[row], levels, settings)
+        of_means = None if explained is fit else square
+        posteriors.append(posterior._replace(of_means=of_means))
     return posteriors
 
 

@@ -8,12 +8,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.baseline.calibrate import DRAWS, assemble_baseline
+from gyrostab.diagnose.baseline.calibrate import assemble_baseline
 from gyrostab.diagnose.baseline.expected_statistics import NOISE, line_columns
 from gyrostab.diagnose.baseline.known_effects import expect_known_effects, with_wandering
 from gyrostab.diagnose.baseline.known_lines import independent_line_share
 from gyrostab.diagnose.baseline.noise_level import quiescent_level, scale_axes
-from gyrostab.diagnose.baseline.posterior import Posterior
+from gyrostab.diagnose.baseline.posterior import DRAWS, Posterior
 from gyrostab.diagnose.baseline.quiescent import find_quiescent_spans, given_quiescent_blocks
 from gyrostab.diagnose.reduce.schema import BASELINE, label_variables
 from gyrostab.diagnose.settings import DEFAULTS, Settings

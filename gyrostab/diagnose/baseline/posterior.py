@@ -5,15 +5,18 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from gyrostab.diagnose.evidence.products import marginalise, mean_products, scale_columns
-from gyrostab.diagnose.settings import DEFAULTS
+from gyrostab.diagnose.settings import Settings
 from gyrostab.kernels.regression.nonnegative import solve_nonnegative
 from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
+#: Number of draws from the posterior of the noise of an axis; limits memory.
+DRAWS = 512
 _MIN_POWER_RATIO = 0.05  # of expected powers that fitted effects may leave; design choice
 _MIN_STEP = 1e-3  # shortest step towards the best fit
 _ROUNDING_SHARE = 1e-12  # rounding error of a log likelihood
@@ -232,27 +235,28 @@ def _draw_near(mean: Array, covariance: Array, rng: np.random.Generator) -> Arra
 
 def noise_posterior(
     fit: Fit,
-    mean: Array,
+    blocks: xr.Dataset,
+    row: int,
     variance: Array,
-    present: NDArray[np.bool_],
-    *,
-    step: float,
-    draws: int,
-    rng: np.random.Generator,
-    effects: Array | None = None,
-    max_disagreement_nats: float = DEFAULTS.disagreement_nats,
+    use: NDArray[np.bool_],
+    effects: Array | None,
+    settings: Settings,
 ) -> Posterior:
-    """Compute the posterior of Q, N, B, K from the band powers and means of quiescent blocks.
+    """Compute the posterior of Q, N, B, K of an axis from band powers and block means.
 
     Parameters
     ----------
-    mean, variance : ndarray, shape (block,)
-        Block means [degree hour-1] and their white variance.
+    fit : Fit
+        The powers.
+    variance : ndarray, shape (block,)
+        White variance of the means [degree2 hour-2].
+    use : ndarray of bool, shape (block,)
+        Blocks whose means are used.
     effects : ndarray, shape (block, column), optional
         Designs of effects in the means, of any size.
-    max_disagreement_nats : float
-        Of spectrum and means about B and K, up to which both together determine them.
     """
+    mean, step = blocks["mean"].values[row], float(blocks.attrs["block_s"])
+    present, rng = use & np.isfinite(mean), np.random.default_rng(row)
     square, information, spectrum = fit_squares(fit)
     density = HOUR * max(float(square[1]), floor_square(fit))
     coarse_K, coarse_B = _fine_grid(density, mean.size * step, step)
@@ -267,12 +271,12 @@ def noise_posterior(
     products = marginalise(products, columns.shape[1], precision)
     slow = -0.5 * (products.square[:, 0] + products.log_determinant)
     fast, best, normal = _likelihood_of_powers(fit, spectrum, K, B)
-    joined = bool(slow.max() + fast.max() - (slow + fast).max() < max_disagreement_nats)
+    joined = bool(slow.max() + fast.max() - (slow + fast).max() < settings.disagreement_nats)
     log = slow + fast if joined else slow
     weight = np.exp(log - log.max())
     weight /= weight.sum()
-    cell = rng.choice(weight.size, draws, p=weight)
-    jitter = rng.random((draws, 2)) - 0.5
+    cell = rng.choice(weight.size, DRAWS, p=weight)
+    jitter = rng.random((DRAWS, 2)) - 0.5
     inner = np.exp(2.0 * jitter * np.log([coarse_B[1] / coarse_B[0], coarse_K[1] / coarse_K[0]]))
     slow_draws = np.stack([B[cell] ** 2, K[cell] ** 2], axis=1) * inner
     scale = np.sqrt(np.diag(information))
@@ -282,6 +286,6 @@ def noise_posterior(
         spread = np.asarray(np.linalg.inv(normal), dtype=np.float64)
         squares = np.concatenate([_draw_near(best[cell], spread, rng), slow_draws], axis=1)
     else:
-        squares = np.maximum(square + error * rng.standard_normal((draws, 4)), 0.0)
+        squares = np.maximum(square + error * rng.standard_normal((DRAWS, 4)), 0.0)
     squares[:, 1] = np.maximum(squares[:, 1], 0.01 * square[1])
     return Posterior(square, error, K, B, weight, squares, slow_draws, joined)

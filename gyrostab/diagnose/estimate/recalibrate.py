@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.baseline.calibrate import DRAWS, assemble_baseline
+from gyrostab.diagnose.baseline.calibrate import assemble_baseline
 from gyrostab.diagnose.baseline.expected_statistics import (
     common_variance,
     noise_powers,
@@ -292,19 +292,8 @@ def _fit_noise(
     count = blocks.sizes["axis"]
     variance = white_variance(blocks, np.tile(square, (count, 1)))[row]
     variance = variance * np.maximum(state.weight[row, :, 0] / (columns[:, 0] @ square), 0.1)
-    mean = blocks["mean"].values[row]
     effect_means = np.stack(axis_effects.means, axis=1) if axis_effects.means else None
-    return noise_posterior(
-        fit,
-        mean,
-        variance,
-        chosen & np.isfinite(mean),
-        step=float(blocks.attrs["block_s"]),
-        draws=DRAWS,
-        rng=np.random.default_rng(row),
-        effects=effect_means,
-        max_disagreement_nats=state.settings.disagreement_nats,
-    )
+    return noise_posterior(fit, blocks, row, variance, chosen, effect_means, state.settings)
 
 
 def _reduced_shapes(shape: Array, shape_alone: Array, common: Array) -> Array:
