@@ -18,6 +18,7 @@ from gyrostab.diagnose.baseline.expected_statistics import (
     NOISE,
     common_variance,
     noise_powers,
+    separate_share,
     sum_noise,
     white_variance,
 )
@@ -243,7 +244,8 @@ def _average_quiescent(blocks: xr.Dataset, chosen: NDArray[np.bool_], columns: A
                 "too few to calibrate on; give other stretches with --quiet, or diagnose a part "
                 "of the record with fewer gaps"
             )
-        fits.append(_reduce_weights(fit, shape[row][use], shape_alone[row][use], common[row][use]))
+        share = separate_share(shape[row][use], shape_alone[row][use], common[row][use])
+        fits.append(fit._replace(weight=fit.weight * share))
     return fits
 
 
@@ -285,15 +287,6 @@ def _keep_explained_bands(fit: Fit, settings: Settings) -> Fit:
 def _power_ratio(fit: Fit) -> Array:
     """Return the powers over those of the noise terms that fit them best."""
     return np.asarray(fit.power / (fit.columns @ fit_squares(fit)[0]))
-
-
-def _reduce_weights(fit: Fit, shape: Array, shape_alone: Array, common: Array) -> Fit:
-    """Reduce the weights of a fit by the common variance of the bands."""
-    block_weight = np.nansum(shape_alone, axis=1)
-    effective_shape = (block_weight / (1.0 + common * block_weight)).sum()
-    return fit._replace(
-        weight=fit.weight * min(1.0, float(effective_shape / max(np.nansum(shape), 1e-300)))
-    )
 
 
 def assemble_baseline(

@@ -73,6 +73,16 @@ def common_variance(blocks: xr.Dataset) -> tuple[Array, Array]:
     return common, np.asarray(1.0 / (1.0 / shape - common[..., None]))
 
 
+def separate_share(shape: Array, shape_alone: Array, common: Array) -> float:
+    """Return the share of the shapes (block, band) of an axis that its average powers have.
+
+    The rest is lost to the scatter that all bands of a block have in common; see `common_variance`.
+    """
+    block_shape = np.nansum(shape_alone, axis=1)
+    separate = float((block_shape / (1.0 + common * block_shape)).sum())
+    return min(1.0, separate / max(float(np.nansum(shape)), 1e-300))
+
+
 def white_variance(blocks: xr.Dataset, square: Array) -> Array:
     """Return the variance of block means due to Q and N (axis, block) [degree2 hour-2].
 

@@ -8,7 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.baseline.expected_statistics import band_columns, common_variance
+from gyrostab.diagnose.baseline.expected_statistics import (
+    band_columns,
+    common_variance,
+    separate_share,
+)
 from gyrostab.diagnose.baseline.filtered_noise import choose_filter, fit_behind
 from gyrostab.diagnose.baseline.posterior import Fit
 from gyrostab.diagnose.predict.candidates import Component
@@ -144,11 +148,7 @@ def _average_powers(axis: str, state: State) -> tuple[Fit, Array]:
     )
     total = np.maximum(use.sum(axis=0), 1e-300)
     common, shape_alone = (values[row] for values in common_variance(blocks))
-    block_shape = np.nansum(shape_alone, axis=1)
-    share = min(
-        1.0,
-        float((block_shape / (1.0 + common * block_shape)).sum() / max(np.nansum(shape), 1e-300)),
-    )
+    share = separate_share(shape, shape_alone, common)
 
     def mean(values: Array) -> Array:
         return np.asarray(
