@@ -21,20 +21,11 @@ SHIFT_RANGE = (0.05, 0.95)  # of the record
 
 
 class TimeShifts(NamedTuple):
-    """Result of the time-shift test.
+    """Result of the time-shift test."""
 
-    Attributes
-    ----------
-    passed : bool
-        Also true where no surrogate can be made.
-    p_value : float
-        Share of the surrogates that explain as much; NaN where too few of them differ from the
-        channel.
-    nats : float
-        By how much the best of them explains more than the channel [nats]; NaN as above.
-    """
-
-    passed: bool
+    passed: bool  # also true where no surrogate can be made
+    #: Share of the surrogates that explain as much, and by how much the best of them explains more
+    #: than the channel [nats]; NaN where too few of them differ from the channel.
     p_value: float = np.nan
     nats: float = np.nan
 
