@@ -50,9 +50,9 @@ class Selection:
 
 
 class Rejection(NamedTuple):
-    """An effect that was examined and not named."""
+    """An effect that was examined and not named, with the keys of its table in a diagnosis."""
 
-    effect: str  # name in the registry
+    name: str  # in the registry
     axes: tuple[str, ...]
     beaten_by: str  # what explains more: an effect, "noise", or another form in words
     #: By how much it explains more [nats]; NaN where physics excludes the effect. Below zero, an

@@ -168,18 +168,10 @@ def _families_of(fitted: Sequence[Fitted], blocks: xr.Dataset) -> list[str | Non
 def rejected_tables(identifications: Identifications) -> list[dict[str, Any]]:
     """Return what beats each effect that was examined and not named, the closest first."""
     named = {identification.effect for identification in identifications.identified}
-    return [
-        {
-            "name": rejection.effect,
-            "axes": list(rejection.axes),
-            "beaten_by": rejection.beaten_by,
-            "nats": rejection.nats,
-        }
-        for rejection in sorted(
-            identifications.rejected, key=lambda rejection: (rejection.nats, rejection.effect)
-        )
-        if rejection.effect not in named
-    ]
+    closest_first = sorted(
+        identifications.rejected, key=lambda rejection: (rejection.nats, rejection.name)
+    )
+    return [rejection._asdict() for rejection in closest_first if rejection.name not in named]
 
 
 def model_tables(

@@ -74,7 +74,7 @@ def test_vibration_noise_is_identified_on_its_axis(shaken):
 
 
 def test_every_other_effect_is_rejected_for_a_competitor(shaken):
-    rejected = {rejection.effect: rejection for rejection in shaken.rejected}
+    rejected = {rejection.name: rejection for rejection in shaken.rejected}
     assert "vibration_noise" not in rejected
     noise = rejected["temperature_bias"]
     assert noise.beaten_by == "noise"
