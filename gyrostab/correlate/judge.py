@@ -49,7 +49,7 @@ def driver_limits(x: Array, pieces: NDArray[np.int64], units: str, *, derived: b
     set of str
         Keys of `LIMITS`.
     """
-    limits = set()
+    limits: set[str] = set()
     span = float(np.ptp(x))
     if span <= max(_MIN_RANGE.get(units, 0.0), 1e-9 * float(np.abs(x).max())):
         return limits | {"constant"}

@@ -201,7 +201,7 @@ def _likelihood_of_powers(
     best = np.linalg.solve(normal, right.T).T
     best_without_q = np.linalg.solve(without_q, right[:, 1:].T).T
     best_without_q[:, 0] = np.maximum(best_without_q[:, 0], 1e-12 * float(spectrum.max()) / HOUR)
-    is_inside = (best[:, :2] > 0.0).all(axis=1)
+    is_inside = np.all(best[:, :2] > 0.0, axis=1)
     used = np.where(is_inside[:, None], best, np.pad(best_without_q, ((0, 0), (1, 0))))
     expected = used @ fast_columns.T + slow + (fit.power - fit.rest())
     if free_columns.shape[1] or fit.known is not None:

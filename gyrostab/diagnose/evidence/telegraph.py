@@ -109,7 +109,8 @@ def telegraph_courses(
         attempts.append(_maximise(fit, y, weight, columns_given, _TRIAL_ROUNDS, min_scatter))
     chosen = np.argmax([log for _, log in attempts], axis=0)
     by_attempt = zip(*((fit.size, fit.times, fit.scale) for fit, _ in attempts), strict=True)
-    best = _Fit(*(_select_by_record(arrays, chosen) for arrays in by_attempt))
+    size, times, scale = (_select_by_record(arrays, chosen) for arrays in by_attempt)
+    best = _Fit(size, times, scale)
     best, _ = _maximise(best, y, weight, columns_given, _ROUNDS, min_scatter)
     if parts > PARTS_PER_BLOCK:
         finer = best._replace(scale=np.ones(len(y)), parts=parts)

@@ -111,16 +111,16 @@ def _score_null_records(
         is_kept = candidate.statistic.is_count or candidate.statistic.null_variable == "mean"
         (at_end if is_kept else by_chunk).append(candidate)
     chunks: list[list[CandidateEvidence]] = []
-    kept: list[xr.Dataset] = []
+    small: list[xr.Dataset] = []
     records = 0
     for chunk in nulls:
         chunks.append(compute_evidence(by_chunk, chunk, state, folds, rng=rng))
-        kept.append(chunk[[name for name in ("mean", *EXPECTED) if name in chunk]])
+        small.append(chunk[[name for name in ("mean", *EXPECTED) if name in chunk]])
         records += chunk.sizes["record"]
         progress("naming", 0, records)
     rounded = rounded_rates(state.blocks, state.baseline, settings=state.settings)
-    count_evidence = CountEvidence.gathered(kept, rounded)
-    data = xr.concat(kept, "record", data_vars="minimal", coords="minimal", compat="override")
+    count_evidence = CountEvidence.gathered(small, rounded)
+    data = xr.concat(small, "record", data_vars="minimal", coords="minimal", compat="override")
     last = compute_evidence(at_end, data, state, folds, count_evidence=count_evidence)
     counts = [evidence for evidence in last if evidence.candidate.statistic.is_count]
     others = [evidence for evidence in last if not evidence.candidate.statistic.is_count]
@@ -129,5 +129,5 @@ def _score_null_records(
         others.append(replace(of_chunks[0], evidence_nats=evidence_nats))
     sums = [evidence_by_effect(others), evidence_by_effect(counts)]
     zero = np.zeros(records)
-    best = [sum(part.get(key, zero) for part in sums) for key in {*sums[0], *sums[1]}]
+    best = [sums[0].get(key, zero) + sums[1].get(key, zero) for key in {*sums[0], *sums[1]}]
     return np.sort(np.max(best, axis=0)), count_evidence
