@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +17,7 @@ from gyrostab.diagnose.predict.linear_model import State
 Array = NDArray[np.float64]
 _TAIL_VARIABLES = ("kurtosis", "outliers")  # not used by the evidence of means
 _MEAN_STATISTICS = ("mean", "sub_block")  # that the evidence of means uses
+_COLUMNS_AT_ONCE = 300  # limits memory and time, which grow with the square
 _MIN_ROW_NATS = 1.5  # that another axis or statistic must add; design choice
 
 
@@ -58,8 +59,17 @@ def compute_evidence(
     return [
         evidence
         for group in groups.values()
-        for evidence in group[0].statistic.evidence(group, trial)
+        for part in _split_group(group)
+        for evidence in part[0].statistic.evidence(part, trial)
     ]
+
+
+def _split_group(group: Sequence[Candidate]) -> Iterator[list[Candidate]]:
+    """Split candidates into parts of few columns, each with at least one candidate."""
+    columns = [sum(len(variant.design) for variant in candidate.variants) for candidate in group]
+    part = np.cumsum(columns) // _COLUMNS_AT_ONCE
+    for number in np.unique(part):
+        yield [candidate for candidate, own in zip(group, part, strict=True) if own == number]
 
 
 def reusable_evidence(
