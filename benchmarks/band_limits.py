@@ -8,19 +8,13 @@ A record is 24 independent windows of 60 s or 600 s at 100 Hz, simulated outside
 
 from __future__ import annotations
 
-import argparse
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 import numpy as np
 import xarray as xr
-from page import renew
+from page import make_parser, renew, table
 from scipy.signal import butter, firwin, lfilter
 
 from gyrostab import davar, fit_noise, make_log
-from tests.support.noise_records import flicker, lose, quantization, random_walk, white
+from tests.support.noise_records import lose, mixture
 
 RATE, WINDOWS, SETTLING = 100.0, 24, 500
 _POLE = np.exp(-2 * np.pi * 10 / RATE)
@@ -54,16 +48,9 @@ TRIALS = 200
 
 def simulate(rng: np.random.Generator, seconds: int, truth: dict[str, float]) -> np.ndarray:
     n = int(seconds * RATE) + SETTLING
-    makers = {"N": white, "Q": quantization, "K": random_walk}
-    x = np.zeros((WINDOWS, n))
-    for term, value in truth.items():
-        if term in makers:
-            x += makers[term](rng, WINDOWS, n, **{term: value}, rate=RATE)
-        elif term == "B":
-            x += flicker(rng, WINDOWS, n, B=value)
-        else:
-            x += value * np.sin(2 * np.pi * 12.3 * np.arange(n) / RATE)
-    return x
+    terms = {term: value for term, value in truth.items() if term != "line"}
+    line = truth.get("line", 0.0) * np.sin(2 * np.pi * 12.3 * np.arange(n) / RATE)
+    return mixture(rng, WINDOWS, n, rate=RATE, **terms) + line
 
 
 def analyse(x: np.ndarray, **options: object) -> xr.Dataset:
@@ -80,7 +67,7 @@ def describe_term(product: xr.Dataset, term: str, truth: dict[str, float]) -> st
     return f"{value:.3f} in {float(is_observed.mean()):.2f}"
 
 
-def make_row(name: str, seconds: int, terms: str) -> str:
+def make_row(name: str, seconds: int, terms: str) -> list[str]:
     records, B, K = LENGTHS[seconds]
     truth = {term: {"N": N, "B": B, "K": K}[term] for term in terms}
     products, ignored = [], []
@@ -95,22 +82,20 @@ def make_row(name: str, seconds: int, terms: str) -> str:
     flagged = (product.observable == 2).any("term") == 0
     limits = [float(part.fit_tau_min.item()) for part in products]
     constants = [float(part.filter_time_constant.item()) for part in products]
-    return " | ".join(
-        [
-            name,
-            f"{seconds} s",
-            "".join(terms),
-            f"{min(limits):.2f} .. {max(limits):.2f} s" if max(constants) else "none",
-            f"{np.mean(constants) * 1e3:.1f} ms",
-            *(describe_term(product, term, truth) for term in "NBK"),
-            f"{float(ratio.median()):.2f}",
-            f"{float(flagged.mean()):.3f}",
-            f"{float(plain.N.mean()) / N:.2f}; {plain_ratio:.3g}",
-        ]
-    )
+    return [
+        name,
+        f"{seconds} s",
+        terms,
+        f"{min(limits):.2f} .. {max(limits):.2f} s" if max(constants) else "none",
+        f"{np.mean(constants) * 1e3:.1f} ms",
+        *(describe_term(product, term, truth) for term in "NBK"),
+        f"{float(ratio.median()):.2f}",
+        f"{float(flagged.mean()):.3f}",
+        f"{float(plain.N.mean()) / N:.2f}; {plain_ratio:.3g}",
+    ]
 
 
-def count_false_alarms(name: str) -> str:
+def count_false_alarms(name: str) -> list[str]:
     truth, share, block = PLAIN[name]
     constants, shifted = [], []
     for trial in range(TRIALS):
@@ -119,35 +104,26 @@ def count_false_alarms(name: str) -> str:
         product = analyse(x)
         constants.append(float(product.filter_time_constant.item()) > 0)
         shifted.append(float(product.fit_tau_min.item()) > float(product.tau[0]))
-    return f"{name} | {np.mean(constants):.3f} | {np.mean(shifted):.3f}"
+    return [name, f"{np.mean(constants):.3f}", f"{np.mean(shifted):.3f}"]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--output", type=Path, help="document whose parts are renewed")
-    options = parser.parse_args()
-    lines = [
-        "| filter | window | terms | fitted from | time constant | N | B | K | chi2/dof | flagged "
-        "| filter ignored: N; chi2/dof |",
-        "|---" * 11 + "|",
+    output = make_parser(__doc__).parse_args().output
+    head = ["filter", "window", "terms", "fitted from", "time constant", "N", "B", "K", "chi2/dof",
+            "flagged", "filter ignored: N; chi2/dof"]  # fmt: skip
+    rows = [
+        make_row(name, seconds, terms)
+        for name in FILTERS
+        for seconds in LENGTHS
+        for terms in ("N", "NB", "NK")
     ]
-    for name in FILTERS:
-        for seconds in LENGTHS:
-            for terms in ("N", "NB", "NK"):
-                lines.append(f"| {make_row(name, seconds, terms)} |")
-                print(lines[-1], flush=True)
-    alarms = [
-        "| noise without a filter | filter found | shorter averaging times left out |",
-        "|---|---|---|",
-    ]
-    for name in PLAIN:
-        alarms.append(f"| {count_false_alarms(name)} |")
-        print(alarms[-1], flush=True)
-    if options.output:
-        renew(options.output, "bands", "\n".join(lines))
-        renew(options.output, "alarms", "\n".join(alarms))
+    bands = table(head, rows)
+    print(bands, flush=True)
+    head = ["noise without a filter", "filter found", "shorter averaging times left out"]
+    alarms = table(head, map(count_false_alarms, PLAIN))
+    print(alarms)
+    renew(output, "bands", bands)
+    renew(output, "alarms", alarms)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Measure what docs/temperature.md claims, and write its tables between their markers.
 
-    python benchmarks/correlation.py --records 160 --output docs/temperature.md
+    python benchmarks/correlation.py --output docs/temperature.md
 
 False claims and coverage of the intervals against Pearson, ordinary least squares and Newey-West
 (statsmodels), and power against an oracle that knows the noise; all on simulated records
@@ -10,21 +10,17 @@ tables.
 
 from __future__ import annotations
 
-import argparse
 import os
-import sys
 from collections.abc import Callable
 from functools import partial
 from multiprocessing import Pool
-from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # one process a core instead
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 import statsmodels.api as sm
-from page import renew
+from page import make_parser, renew, table
 from scipy.stats import pearsonr
 
 import gyrostab
@@ -114,55 +110,41 @@ def share(spread: Callable[..., Any], job: Callable[..., Any], records: int) -> 
     return np.mean(spread(job, range(SEED, SEED + records), chunksize=5), axis=0)
 
 
-def compare(spread: Callable[..., Any], records: int) -> list[str]:
-    rows = [
-        "| noise | temperature | Pearson | least squares | Newey-West | gyrostab | whole search |",
-        "|---|---|---|---|---|---|---|",
-    ]
+def compare(spread: Callable[..., Any], records: int) -> str:
+    rows = []
     for noises, name in NAMES.items():
         for heat, course in HEATS.items():
             wrong = share(spread, partial(judge, noises, heat), records)
-            cells = " | ".join(f"{value:.1%}" for value in wrong)
-            rows.append(f"| {name} | {course} | {cells} |")
-            print(rows[-1], file=sys.stderr, flush=True)
-    return rows
+            rows.append([name, course, *(f"{value:.1%}" for value in wrong)])
+    methods = ("Pearson", "least squares", "Newey-West", "gyrostab", "whole search")
+    return table(["noise", "temperature", *methods], rows)
 
 
-def power(spread: Callable[..., Any], records: int) -> list[str]:
-    rows = [
-        "| noise | temperature | "
-        + " | ".join(f"{strength} errors: swing, oracle, gyrostab" for strength in STRENGTHS)
-        + " |"
-    ]
-    rows.append("|---|---|" + "---|" * len(STRENGTHS))
+def power(spread: Callable[..., Any], records: int) -> str:
+    rows = []
     for noises in ("white", "walk", "flicker"):
         inverse = whitener(noises)
         for heat in ("sine", "ramps"):
-            parts = [
-                share(spread, partial(seen, noises, heat, inverse, strength), records // 4)
-                for strength in STRENGTHS
-            ]
-            cells = " | ".join(
-                f"{swing:.1f}, {oracle:.0%}, {ours:.0%}" for oracle, ours, swing in parts
-            )
-            rows.append(f"| {NAMES[noises]} | {HEATS[heat]} | {cells} |")
-    return rows
+            row = [NAMES[noises], HEATS[heat]]
+            for strength in STRENGTHS:
+                job = partial(seen, noises, heat, inverse, strength)
+                oracle, ours, swing = share(spread, job, records // 4)
+                row.append(f"{swing:.1f}, {oracle:.0%}, {ours:.0%}")
+            rows.append(row)
+    heads = [f"{strength} errors: swing, oracle, gyrostab" for strength in STRENGTHS]
+    return table(["noise", "temperature", *heads], rows)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Make the tables of docs/temperature.md.")
+    parser = make_parser(__doc__)
     parser.add_argument("--records", type=int, default=160)
-    parser.add_argument(
-        "--output", type=Path, help="page to put the tables into; printed only when not given"
-    )
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     chosen = parser.parse_args()
     with Pool(chosen.processes) as pool:
-        for name, table in {"compared": compare, "power": power}.items():
-            text = "\n".join(table(pool.map, chosen.records))
+        for name, make_table in {"compared": compare, "power": power}.items():
+            text = make_table(pool.map, chosen.records)
             print(f"{name}\n{text}\n", flush=True)
-            if chosen.output:
-                renew(chosen.output, name, text)
+            renew(chosen.output, name, text)
 
 
 if __name__ == "__main__":

@@ -16,9 +16,6 @@ it stands the same by gyrostab's own reader, chunk by chunk through dask.
 from __future__ import annotations
 
 import argparse
-import json
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -26,131 +23,69 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
-import make_archive
-from page import machine, renew
+from make_archive import make_archive
+from page import in_new_process, machine, make_parser, renew, table
 
 FORMATS = {"nc": "NetCDF, int32, zstd", "zarr": "Zarr, int32, blosc", "csv": "CSV"}
 TARGETS = {"nc": 2.0, "zarr": 2.0, "csv": 1.5}
+Timing = tuple[float, float]  # least seconds of some runs: on the clock, and of the processor
 
 
 def main() -> None:
     """Make the archives, measure, print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument(
         "--hours", type=float, default=48.0, help="length of the NetCDF and Zarr archives"
     )
     parser.add_argument("--csv-hours", type=float, default=12.0, help="length of the CSV archive")
-    parser.add_argument("--rate", type=float, default=400.0)
+    parser.add_argument("--rate", type=int, default=400)
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--formats", nargs="+", choices=FORMATS, default=list(FORMATS))
     parser.add_argument("--repeat", type=int, default=3)
-    parser.add_argument(
-        "--output", type=Path, help="document whose part between the marks is renewed"
-    )
-    parser.add_argument(
-        "--measure", nargs=3, metavar=("WHAT", "WORKERS", "FOLDER"), help=argparse.SUPPRESS
-    )
     options = parser.parse_args()
-    if options.measure:
-        work, workers, folder = options.measure
-        files = sorted(Path(folder).glob("log-*"))
-        works = {
-            "xarray": read_xarray,
-            "own": read_own,
-            "pyarrow": read_arrow,
-            "full": partial(run_whole, "full"),
-            "octave": partial(run_whole, "octave"),
-        }
-        print(json.dumps(works[work](files, int(workers), options.repeat)))
-        return
     with tempfile.TemporaryDirectory(prefix="gyrostab-io-") as root:
         rows = [row for form in options.formats for row in compare(form, Path(root, form), options)]
-    head = (
-        "| archive | hours | workers | terms | peer reads [s] | own reader [s] | whole run [s] | "
-        "Msamples/s | run / peer | target "
-        "| run / own reader | processor: peer [s] | own reader [s] | run [s] | run / peer |"
-    )
-    summary = (
+    head = [
+        "archive", "hours", "workers", "terms", "peer reads [s]", "own reader [s]",
+        "whole run [s]", "Msamples/s", "run / peer", "target", "run / own reader",
+        "processor: peer [s]", "own reader [s]", "run [s]", "run / peer",
+    ]  # fmt: skip
+    text = (
         f"{machine()}; {options.rate:g} Hz, 3 axes, files of one hour with gaps; best of "
-        f"{options.repeat}."
+        f"{options.repeat}.\n\n{table(head, rows)}"
     )
-    text = "\n".join([f"{summary}\n", head, "|" + "---|" * 15, *rows])
     print(text)
-    if options.output:
-        renew(options.output, "end to end", text)
+    renew(options.output, "end to end", text)
 
 
-def compare(form: str, folder: Path, options: argparse.Namespace) -> list[str]:
+def compare(form: str, folder: Path, options: argparse.Namespace) -> list[list[str]]:
     """The rows of one format."""
     hours = options.csv_hours if form == "csv" else options.hours
-    make_archive.main(
-        [
-            str(folder),
-            "--hours",
-            str(hours),
-            "--rate",
-            str(options.rate),
-            "--format",
-            form,
-            "--gaps",
-            "0.02",
-        ]
-    )
+    files = make_archive(folder, form, hours, options.rate, gaps=0.02)
     samples = 3 * hours * 3600 * options.rate / 1e6
     rows = []
     for workers in options.workers:
-        peer = measure("pyarrow" if form == "csv" else "xarray", workers, folder, options)
-        own = None if form == "csv" else measure("own", workers, folder, options)
+
+        def measure(work: Callable[..., Timing], workers: int = workers) -> Timing:
+            return in_new_process(work, files, workers, options.repeat)
+
+        peer = measure(read_arrow if form == "csv" else read_xarray)
+        own = None if form == "csv" else measure(read_own)
         for terms in ("full", "octave"):
-            run = measure(terms, workers, folder, options)
+            run = measure(partial(run_whole, terms))
             clock, processor = (
                 [f"{timing[i]:.2f}" if timing else "" for timing in (peer, own, run)]
                 for i in range(2)
             )
-            ratios = [
-                f"{run[0] / peer[0]:.2f}",
-                f"<= {TARGETS[form]:g}",
-                f"{run[0] / own[0]:.2f}" if own else "",
-            ]
-            cells = [
-                FORMATS[form],
-                f"{hours:g}",
-                str(workers),
-                terms,
-                *clock,
-                f"{samples / run[0]:.1f}",
-                *ratios,
-                *processor,
-            ]
-            rows.append("| " + " | ".join([*cells, f"{run[1] / peer[1]:.2f}"]) + " |")
+            rows.append([
+                FORMATS[form], f"{hours:g}", str(workers), terms, *clock,
+                f"{samples / run[0]:.1f}", f"{run[0] / peer[0]:.2f}", f"<= {TARGETS[form]:g}",
+                f"{run[0] / own[0]:.2f}" if own else "", *processor, f"{run[1] / peer[1]:.2f}",
+            ])  # fmt: skip
     return rows
 
 
-def measure(
-    work: str, workers: int, folder: Path, options: argparse.Namespace
-) -> tuple[float, float]:
-    """Seconds on the clock and of the processor, measured in a separate process."""
-    command = [
-        sys.executable,
-        __file__,
-        "--repeat",
-        str(options.repeat),
-        "--measure",
-        work,
-        str(workers),
-        str(folder),
-    ]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SystemExit(done.stderr)
-    clock, processor = json.loads(done.stdout.splitlines()[-1])
-    return float(clock), float(processor)
-
-
-def best(work: Callable[[], object], repeat: int) -> tuple[float, float]:
-    """Least seconds of some runs: on the clock, and of the processor."""
+def best(work: Callable[[], object], repeat: int) -> Timing:
     clock, processor = [], []
     for _ in range(repeat):
         begun, used = time.perf_counter(), time.process_time()
@@ -160,7 +95,7 @@ def best(work: Callable[[], object], repeat: int) -> tuple[float, float]:
     return min(clock), min(processor)
 
 
-def read_xarray(files: list[Path], workers: int, repeat: int) -> tuple[float, float]:
+def read_xarray(files: list[Path], workers: int, repeat: int) -> Timing:
     """Every file as doubles, by what xarray reads it with."""
     import xarray as xr
 
@@ -176,7 +111,7 @@ def read_xarray(files: list[Path], workers: int, repeat: int) -> tuple[float, fl
     return best(work, repeat)
 
 
-def read_own(files: list[Path], workers: int, repeat: int) -> tuple[float, float]:
+def read_own(files: list[Path], workers: int, repeat: int) -> Timing:
     """Every chunk of every file as doubles, by gyrostab."""
     import dask
 
@@ -195,41 +130,25 @@ def read_own(files: list[Path], workers: int, repeat: int) -> tuple[float, float
     return best(work, repeat)
 
 
-def read_arrow(files: list[Path], workers: int, repeat: int) -> tuple[float, float]:
+def read_arrow(files: list[Path], workers: int, repeat: int) -> Timing:
     """Every file as a table of pyarrow."""
     import pyarrow
     from pyarrow import csv
 
     pyarrow.set_cpu_count(workers)
-
-    def work() -> None:
-        for file in files:
-            csv.read_csv(file)
-
-    return best(work, repeat)
+    return best(lambda: [csv.read_csv(file).num_rows for file in files], repeat)
 
 
-def run_whole(terms: str, files: list[Path], workers: int, repeat: int) -> tuple[float, float]:
+def run_whole(terms: str, files: list[Path], workers: int, repeat: int) -> Timing:
     """Time ``gyrostab run`` with this ``--overlap``, after a first run on the first file."""
     from gyrostab.cli import main as command
 
     with tempfile.TemporaryDirectory(prefix="gyrostab-io-") as folder:
-        options = [
-            "-o",
-            f"{folder}/product.nc",
-            "--window",
-            "10min",
-            "--step",
-            "1min",
-            "--overlap",
-            terms,
-            "--workers",
-            str(workers),
-        ]
+        options = f"--window 10min --step 1min --overlap {terms} --workers {workers}".split()
+        options += ["-o", f"{folder}/product.nc", "--overwrite", "--quiet-progress"]
 
         def work(names: list[Path]) -> None:
-            code = command(["run", *map(str, names), *options, "--overwrite", "--quiet-progress"])
-            if code:
+            if code := command(["run", *map(str, names), *options]):
                 raise SystemExit(code)
 
         work(files[:1])

@@ -9,19 +9,15 @@ Allan variances are those of `davar`; the times of the estimators do not include
 
 from __future__ import annotations
 
-import argparse
-import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 import numpy as np
+import xarray as xr
 from fit_coverage import choose_squares, make_units, surface_of
 from numpy.typing import NDArray
-from page import renew
+from page import make_parser, renew, table
 from scipy.fft import dct
 from scipy.optimize import least_squares, nnls
 from scipy.stats import chi2
@@ -44,6 +40,7 @@ class Records(NamedTuple):
 
     values: Array
     rate: float
+    surface: xr.Dataset  # with the averaging times that `davar` chooses
     #: At up to 100 averaging times up to a tenth of the record, and at 1, 2, 4, ... samples up to a
     #: quarter of it: averaging factors, and Allan variance (n_records, n_factors).
     dense: tuple[NDArray[np.int64], Array]
@@ -84,11 +81,12 @@ def make_records(values: Array, rate: float) -> Records:
     dense = np.unique(np.round(np.geomspace(1, n // 10, 100)).astype(np.int64))
     octaves = 2 ** np.arange(int(np.log2(n)) - 1)
     factors = (dense, octaves, np.array([n // 4]))
-    return Records(values, rate, *((ks, measure_avar(values, rate, ks)) for ks in factors))
+    curves = ((ks, measure_avar(values, rate, ks)) for ks in factors)
+    return Records(values, rate, surface_of(values, rate), *curves)
 
 
 def fit_gyrostab(records: Records) -> Estimates:
-    product = fit_noise(surface_of(records.values, records.rate), observed_only=False)
+    product = fit_noise(records.surface, observed_only=False)
     value, error = (
         np.stack([product[term + name].values[0] for term in TERMS], axis=1)
         for name in ("", "_stderr")
@@ -313,19 +311,16 @@ def _default_factors(record: Array, rate: float) -> tuple[tuple[int, ...], tuple
 
 def summarise(cells: dict[str, list[tuple[str, Array]]], times: dict[str, list[float]]) -> str:
     """Tabulate median efficiency, largest bias and mean coverage of each term and estimator."""
-    lines = [
-        "| estimator | " + " | ".join(TERMS) + " | time of a record |",
-        "|---|" + "---|" * (len(TERMS) + 1),
-    ]
+    rows = []
     for name, figures in cells.items():
-        row = []
+        row = [name]
         for term in TERMS:
             own = np.array([values for symbol, values in figures if symbol == term])
             bias = own[np.abs(own[:, 0]).argmax(), 0]
             text = f"{np.median(own[:, 2]):.2f}; {bias:+.0%}"
             row.append(text + ("" if np.isnan(own[0, 3]) else f"; {own[:, 3].mean():.2f}"))
-        lines.append(f"| {name} | {' | '.join(row)} | {np.mean(times[name]) * 1e3:.2f} ms |")
-    return "\n".join(lines)
+        rows.append([*row, f"{np.mean(times[name]) * 1e3:.2f} ms"])
+    return table(["estimator", *TERMS, "time of a record"], rows)
 
 
 def describe(figures: Array) -> str:
@@ -335,26 +330,23 @@ def describe(figures: Array) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Compare estimators with the Cramer-Rao bound.")
-    parser.add_argument("--output", type=Path, help="page to put the tables into")
-    options = parser.parse_args()
+    output = make_parser(__doc__).parse_args().output
     cells: dict[str, list[tuple[str, Array]]] = {name: [] for name in ESTIMATORS}
     times: dict[str, list[float]] = {name: [] for name in ESTIMATORS}
-    heads = ["record", "terms on N", "term", "bound", *ESTIMATORS]
-    lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
+    rows = []
     for seconds, rate, trials in LENGTHS:
         for mixture, term, bound, figures, spent in compare(seconds, rate, trials):
             for name, own in figures.items():
                 cells[name].append((term, own))
                 times[name].append(spent[name])
-            row = " | ".join(describe(own) for own in figures.values())
-            lines.append(f"| {seconds:g} s | {mixture} | {term} | {bound:.1%} | {row} |")
-            print(lines[-1], flush=True)
-    print(summarise(cells, times))
+            figures = map(describe, figures.values())
+            rows.append([f"{seconds:g} s", mixture, term, f"{bound:.1%}", *figures])
+            print(*rows[-1], sep=" | ", flush=True)
+    print(summary := summarise(cells, times))
     print(f"{time.process_time():.0f} s of processor time")
-    if options.output:
-        renew(options.output, "estimators", summarise(cells, times))
-        renew(options.output, "estimator-cells", "\n".join(lines))
+    renew(output, "estimators", summary)
+    head = ["record", "terms on N", "term", "bound", *ESTIMATORS]
+    renew(output, "estimator-cells", table(head, rows))
 
 
 if __name__ == "__main__":

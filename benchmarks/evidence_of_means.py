@@ -1,6 +1,6 @@
 """Evidence of effects in block means of three axes, and where it goes.
 
-    python benchmarks/evidence_of_means.py --records 100
+    python benchmarks/evidence_of_means.py
 
 Half an hour of block means in angle and rate random walk, with an effect on one or three axes.
 First the evidence of noise alone, then for each effect and strength: what the blind test expects in
@@ -10,13 +10,13 @@ axis alone, and as the diagnosis computes it, and the share above 8 nats.
 
 from __future__ import annotations
 
-import argparse
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from page import make_parser, table
 
 from gyrostab.blindtest.generator.detection_limits import NATS, learned_nats
 from gyrostab.diagnose.baseline.calibrate import grid_values
@@ -135,13 +135,14 @@ def expected_nats(mean: Array) -> float:
         rate=RATE,
         missing=np.zeros(samples.size, bool),
         noise=[{"N": N, "B": 0.0, "K": K}],
+        measured=None,
     )
     return learned_nats(scenario, samples[None])
 
 
 def main() -> None:
     """Print the quantiles of noise, and a row for each effect, strength and number of axes."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__, has_page=False)
     parser.add_argument("--records", type=int, default=100)
     records = parser.parse_args().records
     rng, baseline = np.random.default_rng(5), make_baseline()
@@ -149,21 +150,20 @@ def main() -> None:
     for name, evidence in zip(("alone", "now"), none, strict=True):
         quantiles = np.quantile(evidence.max(axis=0), (0.5, 0.9, 0.99)).round(1)
         print(f"noise, {name}: best of all effects at 50, 90, 99 %: {quantiles} nats")
-    print("| effect | axes | strength | expected | alone | now | above 8, alone | now |")
-    print("|---|---|---|---|---|---|---|---|")
+    rows = []
     for number, (name, shapes) in enumerate(SHAPES.items()):
         shape = shapes[len(shapes) * 2 // 5]
         for count in (1, AXES):
             for strength in (3.0, 4.0, 6.0, 8.0):
                 mean = size_at(shape, strength) / np.sqrt(count) * shape
-                separate, now = compute_evidence(
-                    [draw_noise(rng, records) + mean * (row < count) for row in range(AXES)],
-                    baseline,
-                )
-                print(f"| {name} | {count} | {strength:g} | {count * expected_nats(mean):.0f} | "
-                      f"{np.median(separate[number]):.1f} | {np.median(now[number]):.1f} | "
-                      f"{(separate[number] > 8).mean():.2f} | {(now[number] > 8).mean():.2f} |",
-                      flush=True)  # fmt: skip
+                axes = [draw_noise(rng, records) + mean * (row < count) for row in range(AXES)]
+                evidences = [evidence[number] for evidence in compute_evidence(axes, baseline)]
+                medians = [f"{np.median(evidence):.1f}" for evidence in evidences]
+                shares = [f"{(evidence > 8).mean():.2f}" for evidence in evidences]
+                expected = f"{count * expected_nats(mean):.0f}"
+                rows.append([name, count, f"{strength:g}", expected, *medians, *shares])
+    head = ["effect", "axes", "strength", "expected", "alone", "now", "above 8, alone", "now"]
+    print(table(head, rows))
 
 
 if __name__ == "__main__":

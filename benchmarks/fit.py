@@ -1,7 +1,6 @@
 """Time the fit of windows: the kernel, the limits, and what is made once for a surface.
 
-    python benchmarks/fit.py                                  # a minute
-    python benchmarks/fit.py --output docs/performance.md     # update the part between the markers
+    python benchmarks/fit.py --output docs/performance.md     # a minute
 
 Windows of 5 min at 400 Hz of quantization noise, angle and rate random walk; processor time of one
 thread, the best of several runs.
@@ -9,17 +8,12 @@ thread, the best of several runs.
 
 from __future__ import annotations
 
-import argparse
-import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import dask
 import numpy as np
-from page import machine, renew
+from page import machine, make_parser, renew, table
 
 from gyrostab import davar, fit_noise, make_log
 from gyrostab.allan import window_fit
@@ -27,7 +21,7 @@ from gyrostab.allan.fit_inputs import fit_inputs
 from gyrostab.kernels.fit.covariance import product_tables
 from gyrostab.kernels.fit.least_squares import cell_freedoms, combine_diagonal, identify_noise
 from gyrostab.kernels.fit.mixture import Curves
-from tests.support.noise_records import lose, quantization, random_walk, white
+from tests.support.noise_records import lose, mixture
 
 RATE, SAMPLES = 400.0, 6_000_000
 
@@ -45,8 +39,7 @@ def best(call: Callable[[], object], repeats: int) -> float:
 
 def record(missing: bool) -> np.ndarray:
     rng = np.random.default_rng(2)
-    x = white(rng, 1, SAMPLES, N=0.01, rate=RATE) + quantization(rng, 1, SAMPLES, Q=0.3, rate=RATE)
-    x += random_walk(rng, 1, SAMPLES, K=2.0, rate=RATE)
+    x = mixture(rng, 1, SAMPLES, rate=RATE, N=0.01, Q=0.3, K=2.0)
     return lose(rng, x, 0.1, 1000.0) if missing else x
 
 
@@ -90,35 +83,22 @@ def measure(x: np.ndarray, taus: int, repeats: int) -> tuple[int, list[float]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--output", type=Path, help="document whose part between the marks is renewed"
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--repeats", type=int, default=5)
     arguments = parser.parse_args()
-    lines = [
-        "| gaps | averaging times | fit_noise, us a window | kernel | limits | rest | quick fit "
-        "in davar | tables, once, s |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    rows = []
     with dask.config.set(scheduler="sync"):
-        for missing in (False, True):
-            x = record(missing)
+        for name in ("none", "10 % in blocks of 1000"):
+            x = record(name != "none")
             for taus in (24, 40, 48):
-                size, (whole, kernel, limits, rest, quick, once) = measure(
-                    x, taus, arguments.repeats
-                )
-                name = "10 % in blocks of 1000" if missing else "none"
-                lines.append(
-                    f"| {name} | {size} | {whole:.0f} | {kernel:.0f} | {limits:.1f} | {rest:.1f} "
-                    f"| {quick:.1f} | {once:.2f} |"
-                )
-    text = f"{machine()}; best of {arguments.repeats}.\n\n" + "\n".join(lines)
+                size, (whole, kernel, *parts, once) = measure(x, taus, arguments.repeats)
+                times = [f"{whole:.0f}", f"{kernel:.0f}", *(f"{part:.1f}" for part in parts)]
+                rows.append([name, size, *times, f"{once:.2f}"])
+    head = ["gaps", "averaging times", "fit_noise, us a window", "kernel", "limits", "rest",
+            "quick fit in davar", "tables, once, s"]  # fmt: skip
+    text = f"{machine()}; best of {arguments.repeats}.\n\n{table(head, rows)}"
     print(text)
-    if arguments.output:
-        renew(arguments.output, "fit", text)
+    renew(arguments.output, "fit", text)
 
 
 if __name__ == "__main__":

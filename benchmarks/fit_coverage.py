@@ -10,16 +10,11 @@ and cross terms are added for every mixture, because `davar` is quadratic in the
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 import xarray as xr
-from page import renew
+from page import make_parser, renew, table
 from scipy.optimize import brentq
 
 from gyrostab import davar, fit_noise, make_log
@@ -28,6 +23,8 @@ from gyrostab.noise import NORMAL_95, TERMS
 from tests.support.noise_records import flicker, lose, quantization, random_walk, white
 
 N = 0.01
+#: Length [s], rate [Hz] and number of windows.
+LENGTHS = ((40.0, 100.0, 1000), (600.0, 100.0, 200), (7200.0, 10.0, 200))
 PAIRS = list(itertools.combinations_with_replacement(range(5), 2))
 MIXTURES = ("", "Qm", "Qs", "Bm", "Bs", "Km", "Ks", "Rm", "Rs", "QmBmKmRm", "QsBsKsRs", "KsRm")
 
@@ -118,54 +115,40 @@ def judge(product: xr.Dataset, squares: np.ndarray) -> list[str]:
     return cells
 
 
-def summarise_claims(lines: list[str]) -> str:
+def summarise_claims(rows: list[list[str]]) -> str:
     """Tabulate how often a term is observed that is absent: mean and largest share of the rows."""
     claims: dict[tuple[str, str], list[list[float]]] = {}
-    for line in lines[2:]:
-        window, missing, _, *cells = line.strip("| ").split(" | ")
+    for window, missing, _, *cells in rows:
         own = claims.setdefault((window, missing), [[] for _ in TERMS])
         for shares, cell in zip(own, cells, strict=True):
             if cell.startswith("claimed"):
                 shares.append(float(cell.split()[1]))
-    out = ["| window | missing | Q | B | K | R |", "|---|---|---|---|---|---|"]
-    for (window, missing), own in claims.items():
-        cells = [f"{np.mean(shares):.1%}; {max(shares):.1%}" for shares in own if shares]
-        out.append(f"| {window} | {missing} | {' | '.join(cells)} |")
-    return "\n".join(out)
+    return table(
+        ["window", "missing", "Q", "B", "K", "R"],
+        [
+            [*case, *(f"{np.mean(shares):.1%}; {max(shares):.1%}" for shares in own if shares)]
+            for case, own in claims.items()
+        ],
+    )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--output", type=Path, help="document whose part between the marks is renewed"
-    )
-    parser.add_argument("--seconds", type=float, nargs="+", default=[40.0, 600.0, 7200.0])
-    parser.add_argument("--trials", type=int, nargs="+", default=[1000, 200, 150])
-    parser.add_argument("--rates", type=float, nargs="+", default=[100.0, 100.0, 10.0])
-    options = parser.parse_args()
-    lines = [
-        "| window | missing | terms on N | Q | N | B | K | R |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    cases = zip(options.seconds, options.trials, options.rates, strict=True)
-    for seconds, trials, rate in cases:
+    output = make_parser(__doc__).parse_args().output
+    rows = []
+    for (seconds, rate, trials), share in itertools.product(LENGTHS, (0.0, 0.3)):
         n = int(seconds * rate)
-        for share in (0.0, 0.3):
-            rng = np.random.default_rng([n, int(10 * share)])
-            whole, parts, trends = simulate_units(rng, trials, n, rate, share)
-            ks = np.round(whole.tau.values * rate).astype(np.int64)
-            tables = window_fit.fit_tables(tuple(ks.tolist()), (0,) * ks.size, rate, n)
-            for mixture in MIXTURES:
-                squares = choose_squares(tables, mixture)
-                product = fit_noise(mix(whole, parts, trends, squares), observed_only=False)
-                cells = " | ".join(judge(product, squares))
-                lines.append(f"| {seconds:g} s | {share:.0%} | {mixture or 'none'} | {cells} |")
-                print(lines[-1], flush=True)
-    if options.output:
-        renew(options.output, "coverage", "\n".join(lines))
-        renew(options.output, "claims", summarise_claims(lines))
+        rng = np.random.default_rng([n, int(10 * share)])
+        whole, parts, trends = simulate_units(rng, trials, n, rate, share)
+        ks = np.round(whole.tau.values * rate).astype(np.int64)
+        tables = window_fit.fit_tables(tuple(ks.tolist()), (0,) * ks.size, rate, n)
+        for mixture in MIXTURES:
+            squares = choose_squares(tables, mixture)
+            product = fit_noise(mix(whole, parts, trends, squares), observed_only=False)
+            cells = judge(product, squares)
+            rows.append([f"{seconds:g} s", f"{share:.0%}", mixture or "none", *cells])
+            print(*rows[-1], sep=" | ", flush=True)
+    renew(output, "coverage", table(["window", "missing", "terms on N", *TERMS], rows))
+    renew(output, "claims", summarise_claims(rows))
 
 
 if __name__ == "__main__":

@@ -8,21 +8,16 @@ the package (tests/support/noise_records.py).
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 import xarray as xr
-from page import renew
+from page import make_parser, renew, table
 
 from gyrostab import confidence_interval, davar, fit_noise, make_log
 from gyrostab.allan.window_fit import is_described
 from gyrostab.noise import NORMAL_95, TERMS, model_avar
-from tests.support.noise_records import flicker, lose, quantization, random_walk, white
+from tests.support.noise_records import lose, mixture
 
 RATE, SAMPLES, TRIALS = 100.0, 4000, 1000
 MIXTURES: dict[str, dict[str, float]] = {
@@ -54,20 +49,6 @@ LOSSES: dict[str, slice | tuple[float, float]] = {
 }
 
 
-def simulate(rng: np.random.Generator, truth: dict[str, float], trials: int) -> np.ndarray:
-    x = np.zeros((trials, SAMPLES))
-    for term, value in truth.items():
-        if term == "Q":
-            x += quantization(rng, trials, SAMPLES, Q=value, rate=RATE)
-        elif term == "N":
-            x += white(rng, trials, SAMPLES, N=value, rate=RATE)
-        elif term == "B":
-            x += flicker(rng, trials, SAMPLES, B=value)
-        else:
-            x += random_walk(rng, trials, SAMPLES, K=value, rate=RATE)
-    return x
-
-
 def fit_windows(x: np.ndarray, **options: str) -> xr.Dataset:
     length = f"{SAMPLES}samples"
     surface = davar(
@@ -76,11 +57,11 @@ def fit_windows(x: np.ndarray, **options: str) -> xr.Dataset:
     return fit_noise(surface, observed_only=False, **options)
 
 
-def judge_trend(name: str, loss: str) -> str:
+def judge_trend(name: str, loss: str) -> list[str]:
     """Describe how often a ramp that is absent is observed, and whether intervals hold."""
     rng = np.random.default_rng([2026, list(TREND_NOISES).index(name), list(LOSSES).index(loss)])
     truth, lost = TREND_NOISES[name], LOSSES[loss]
-    x = simulate(rng, truth, TREND_TRIALS)
+    x = mixture(rng, TREND_TRIALS, SAMPLES, rate=RATE, **truth)
     if isinstance(lost, slice):
         x[:, lost] = np.nan
     else:
@@ -94,7 +75,7 @@ def judge_trend(name: str, loss: str) -> str:
         held = float((abs(value - true) <= NORMAL_95 * product[f"{term}_stderr"]).mean())
         mean = f"{term} {float(value.mean()) / true:.2f}; " if true else ""
         cells.append(f"{mean}{held:.3f}")
-    return " | ".join([cells[0], cells[1], ", ".join(cells[2:]), f"{fails:.3f}"])
+    return [name, loss, *cells[:2], ", ".join(cells[2:]), f"{fails:.3f}"]
 
 
 def seen_law(product: xr.Dataset, truth: dict[str, float]) -> xr.DataArray:
@@ -107,15 +88,19 @@ def seen_law(product: xr.Dataset, truth: dict[str, float]) -> xr.DataArray:
     return sum(parts[1:], parts[0])
 
 
-def row(rng: np.random.Generator, truth: dict[str, float], share: float, block: float) -> str:
-    product = fit_windows(lose(rng, simulate(rng, truth, TRIALS), share, block))
+def judge_noise(name: str, gap: str) -> list[str]:
+    """Describe intervals of the cells, and for each term its z-scores and how often it is seen."""
+    truth, (share, block) = MIXTURES[name], GAPS[gap]
+    rng = np.random.default_rng([2026, list(MIXTURES).index(name), int(block)])
+    x = mixture(rng, TRIALS, SAMPLES, rate=RATE, **truth)
+    product = fit_windows(lose(rng, x, share, block))
     limits, law = confidence_interval(product), seen_law(product, truth)
     hit = (
         ((limits.avar_lower <= law) & (law <= limits.avar_upper))
         .where(product.avar.notnull())
         .mean(("axis", "time"))
     )
-    cells = [f"{float(hit.min()):.3f} .. {float(hit.max()):.3f}"]
+    cells = [name, gap, f"{float(hit.min()):.3f} .. {float(hit.max()):.3f}"]
     for term in TERMS:
         flags = product.observable.sel(term=term)
         claimed = float((flags == 2).mean())
@@ -133,36 +118,21 @@ def row(rng: np.random.Generator, truth: dict[str, float], share: float, block: 
                 f"{float((product[f'{term}_upper'] >= truth[term]).where(flags == 1).mean()):.3f}"
             )
         cells.append(text)
-    return " | ".join(cells)
+    return cells
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--output", type=Path, help="document whose part between the marks is renewed"
-    )
-    options = parser.parse_args()
-    lines = [
-        "| noise | missing | 95 % intervals of the cells | Q | N | B | K | R |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for number, (name, truth) in enumerate(MIXTURES.items()):
-        for gap, (share, block) in GAPS.items():
-            rng = np.random.default_rng([2026, number, int(block)])
-            lines.append(f"| {name} | {gap} | {row(rng, truth, share, block)} |")
-            print(lines[-1], flush=True)
-    trends = [
-        "| noise | missing | R claimed | R holds | mean; holds | misfit |",
-        "|---|---|---|---|---|---|",
-    ]
-    for name, loss in itertools.product(TREND_NOISES, LOSSES):
-        trends.append(f"| {name} | {loss} | {judge_trend(name, loss)} |")
-        print(trends[-1], flush=True)
-    if options.output:
-        renew(options.output, "table", "\n".join(lines))
-        renew(options.output, "trends", "\n".join(trends))
+    output = make_parser(__doc__).parse_args().output
+    cases = itertools.product(MIXTURES, GAPS)
+    head = ["noise", "missing", "95 % intervals of the cells", *TERMS]
+    noises = table(head, itertools.starmap(judge_noise, cases))
+    print(noises, flush=True)
+    losses = itertools.product(TREND_NOISES, LOSSES)
+    head = ["noise", "missing", "R claimed", "R holds", "mean; holds", "misfit"]
+    trends = table(head, itertools.starmap(judge_trend, losses))
+    print(trends)
+    renew(output, "table", noises)
+    renew(output, "trends", trends)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """What a fleet costs a run, and what 10 000 runs would take.
 
-    python benchmarks/fleet.py [--runs 100 1000] [--output docs/scaling.md]
+    python benchmarks/fleet.py --output docs/scaling.md
 
 Synthetic runs of 10 min (three axes, 10 Hz, one NetCDF log each, fifty runs a tool) are analysed
 with windows of 1 min, one after the other in this process. Two numbers of runs give the fixed cost
@@ -11,8 +11,6 @@ worker processes. The peak of the memory is that of this process from its start.
 
 from __future__ import annotations
 
-import argparse
-import resource
 import tempfile
 import time
 from collections.abc import Callable
@@ -21,7 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from page import machine, renew
+from page import machine, make_parser, memory, renew, table
 
 RATE_HZ, MINUTES, RUNS_PER_TOOL, TARGET = 10.0, 10, 50, 10_000
 WINDOW = {"window": "1min", "step": "30s", "taus": "20"}
@@ -55,7 +53,7 @@ def measure(call: Callable[..., object], *arguments: object, **options: object) 
     begun = time.process_time(), time.monotonic()
     call(*arguments, scheduler="threads", **options)
     spent = time.process_time() - begun[0], time.monotonic() - begun[1]
-    return Cost(*spent, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+    return Cost(*spent, memory())
 
 
 def measure_all(archive: Path, output: Path, *, reports: bool) -> dict[str, Cost]:
@@ -74,56 +72,39 @@ def measure_all(archive: Path, output: Path, *, reports: bool) -> dict[str, Cost
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--runs", type=int, nargs=2, default=[100, 1000])
-    parser.add_argument("--output", type=Path)
+    parser = make_parser(__doc__)
+    parser.add_argument("--runs", type=int, nargs=2, default=[60, 1000])
     given = parser.parse_args()
     few, many = sorted(given.runs)
-    measurements = []
+    measured: dict[str, list[tuple[int, Cost]]] = {}
     with tempfile.TemporaryDirectory() as name:
         for runs in (1, few, many):  # the first compiles
             archive, output = Path(name, f"archive{runs}"), Path(name, f"fleet{runs}")
             write_archive(archive, runs)
-            measurements.append(measure_all(archive, output, reports=runs < many))
-            print(runs, measurements[-1], flush=True)
+            for step, cost in measure_all(archive, output, reports=runs < many).items():
+                measured.setdefault(step, []).append((runs, cost))
+                print(runs, step, cost, flush=True)
         size = sum(path.stat().st_size for path in output.glob("tool*/*")) / many
         pages = [path.stat().st_size for path in Path(name).glob("fleet*/reports/*/*")]
     rows = []
-    for step in measurements[0]:
-        sizes = [
-            runs
-            for runs, measurement in zip((1, few, many), measurements, strict=True)
-            if step in measurement
-        ][-2:]
-        before, after = [
-            measurement[step].processor for measurement in measurements if step in measurement
-        ][-2:]
-        cost = (after - before) / (sizes[1] - sizes[0])
-        fixed = max(after - sizes[1] * cost, 0.0)
-        total = (fixed + TARGET * cost) / 60.0
-        _, elapsed, peak = next(
-            measurement[step] for measurement in reversed(measurements) if step in measurement
-        )
-        rows.append(
-            f"| {step} | {sizes[1]} | {after:.1f} | {elapsed:.1f} | {peak:.0f} "
-            f"| {fixed:.2f} | {1e3 * cost:.1f} | {total:.1f} |"
-        )
-    head = (
-        "| step | runs | processor [s] | elapsed [s] | peak [MiB] "
-        f"| fixed [s] | a run [ms] | {TARGET} runs [min] |"
-    )
-    text = "\n".join([head, 8 * "|---" + "|", *rows])
-    text += (
-        f"\n\nThe last three columns are processor time, from calls with {few} and {many} runs of "
+    for step, costs in measured.items():
+        (fewer, before), (runs, after) = costs[-2:]
+        per_run = (after.processor - before.processor) / (runs - fewer)
+        fixed = max(after.processor - runs * per_run, 0.0)
+        spent = [f"{after.processor:.1f}", f"{after.elapsed:.1f}", f"{after.peak:.0f}"]
+        total = (fixed + TARGET * per_run) / 60.0
+        rows.append([step, runs, *spent, f"{fixed:.2f}", f"{1e3 * per_run:.1f}", f"{total:.1f}"])
+    head = ["step", "runs", "processor [s]", "elapsed [s]", "peak [MiB]", "fixed [s]", "a run [ms]",
+            f"{TARGET} runs [min]"]  # fmt: skip
+    text = (
+        f"{table(head, rows)}\n\n"
+        f"The last three columns are processor time, from calls with {few} and {many} runs of "
         f"{MINUTES} min, for reports with 1 and {few}. "
-        f"A product takes {size / 1e3:.0f} kB, a report {np.mean(pages) / 1e3:.0f} kB."
-        f"\n\n{machine()}."
+        f"A product takes {size / 1e3:.0f} kB, a report {np.mean(pages) / 1e3:.0f} kB.\n\n"
+        f"{machine()}."
     )
     print(text)
-    if given.output:
-        renew(given.output, "fleet", text)
+    renew(given.output, "fleet", text)
 
 
 if __name__ == "__main__":

@@ -1,95 +1,52 @@
 """Time and peak memory of `gyrostab run` on files of other programs, one stamp per sample.
 
-    python benchmarks/foreign.py [--hours 12 48] [--formats own-zarr own-netcdf netcdf ...]
-    [--rounds 1] [--jitter 0]
-                                 [--folder FOLDER] [--output docs/scaling.md]
+    python benchmarks/foreign.py --hours 12 200 --output docs/scaling.md --folder FOLDER
 
 For each length and format the script writes one archive of three axes at 400 Hz (int64 nanoseconds,
 doubles in deg/h), runs `gyrostab run` on it in a child process, reads the same file with xarray in
-another child process, records the time and the peak resident memory of both, and deletes the
-archive before it writes the next one. Archives are written block by block, so memory stays below 1
-GiB at any length. 200 h need up to 10 GB of disk for one archive and 10 GB for temporary columns; a
-CSV file of 200 h has 18 GB. Give --folder on a disk with 60 GB free: TMPDIR of the child processes
-is set to it.
-
-    python benchmarks/foreign.py --hours 12 48                                    # a few minutes
-    python benchmarks/foreign.py --hours 200 --output docs/scaling.md \\
-        --formats own-zarr netcdf zarr2 zarr3 parquet hdf5 matlab csv
-
-The table is Markdown; `--output docs/scaling.md` puts it in its place there.
+another child process, records the time (after imports) and the peak resident memory of both, and
+deletes the archive before it writes the next one. Archives are written block by block, so memory
+stays below 1 GiB at any length. 200 h need up to 10 GB of disk for one archive and 10 GB for
+temporary columns; a CSV file of 200 h has 18 GB. Give --folder on a disk with 60 GB free: it is
+TMPDIR of the runs. The first format is the reference. `--hours 12` takes a few minutes.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import shutil
-import subprocess
-import sys
 import tempfile
+import time
+import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from page import machine, renew
-from scaling import AXES, COUNT, RATE, WINDOW, table, write_store
+from page import in_new_process, machine, make_parser, memory, renew, table
+from scaling import AXES, COUNT, RATE, WINDOW, run_log, write_store
 
 START_NS = 1_777_593_600_000_000_000  # 2026-05-01
 BLOCK_ROWS = 2**19
 AXIS_NAMES = "xyz"[:AXES]
 MAP = [f"gyro_{axis}" for axis in AXIS_NAMES]
-
-#: A run of the command line's main job, or a pass of xarray over every value; prints seconds and
-#: peak memory [MiB].
-_CHILD = """
-import json, resource, sys, time
-def run(path, target, windows, workers):
-    from gyrostab.jobs.run import run
-    run([path], target, windows=windows, overwrite=True, workers=workers)
-def read_xarray(path, target, windows, workers):
-    import xarray as xr
-    engine = "zarr" if path.endswith(".zarr") else None
-    with xr.open_dataset(path, chunks={"time": 2**21}, engine=engine) as data:
-        print([float(data[name].mean()) for name in data.data_vars], file=sys.stderr)
-def peak():
-    try:  # the peak that getrusage gives includes that of the parent before the exec
-        with open("/proc/self/status") as status:
-            return next(int(line.split()[1]) for line in status if line.startswith("VmHWM")) / 1024
-    except OSError:
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-begun, used = time.perf_counter(), time.process_time()
-work, *given = json.loads(sys.argv[1])
-import warnings
-warnings.simplefilter("ignore")
-globals()[work](*given)
-print(json.dumps({
-    "seconds": time.perf_counter() - begun,
-    "processor": time.process_time() - used,
-    "peak": peak(),
-}))
-"""
-
 Block = tuple[int, NDArray[np.int64], NDArray[np.float64]]
 
 
-def blocks(hours: float, jitter_us: float) -> Iterator[Block]:
+def blocks(hours: float) -> Iterator[Block]:
     """First row, stamps [ns since 1970] and values [deg/h], shape (axis, row), block by block."""
     rows = round(hours * 3600 * RATE)
     for number, begin in enumerate(range(0, rows, BLOCK_ROWS)):
         draw = np.random.default_rng((7, number))
         size = min(BLOCK_ROWS, rows - begin)
         stamps = START_NS + np.arange(begin, begin + size) * round(1e9 / RATE)
-        if jitter_us:
-            stamps += np.rint(1e3 * jitter_us * draw.standard_normal(size)).astype(np.int64)
         yield begin, stamps, COUNT * np.rint(180.0 * draw.standard_normal((AXES, size)) + 300.0)
 
 
-def write_netcdf(
-    path: Path, hours: float, jitter_us: float, *, kind: str = "NETCDF4", packed: bool = False
-) -> Path:
+def write_netcdf(path: Path, hours: float, *, kind: str = "NETCDF4", packed: bool = False) -> Path:
     """Write a CF file with one variable per axis: doubles, or packed and deflated counts."""
     import netCDF4
 
@@ -111,14 +68,14 @@ def write_netcdf(
             variable.units = "deg/h"
             if packed:
                 variable.scale_factor = COUNT
-        for begin, stamps, values in blocks(hours, jitter_us):
+        for begin, stamps, values in blocks(hours):
             time[begin : begin + stamps.size] = stamps
             for variable, axis in zip(gyro, values, strict=True):
                 variable[begin : begin + stamps.size] = axis
     return path
 
 
-def write_zarr(path: Path, hours: float, jitter_us: float, *, version: int) -> Path:
+def write_zarr(path: Path, hours: float, *, version: int) -> Path:
     """A store as xarray writes it, with the default codecs of its version."""
     import zarr
 
@@ -133,13 +90,13 @@ def write_zarr(path: Path, hours: float, jitter_us: float, *, version: int) -> P
         arrays[name].attrs["units"] = "nanoseconds since 1970-01-01" if name == "time" else "deg/h"
         if version == 2:
             arrays[name].attrs["_ARRAY_DIMENSIONS"] = ["time"]
-    for begin, stamps, values in blocks(hours, jitter_us):
+    for begin, stamps, values in blocks(hours):
         for name, part in zip(arrays, (stamps, *values), strict=True):
             arrays[name][begin : begin + stamps.size] = part
     return path
 
 
-def write_parquet(path: Path, hours: float, jitter_us: float) -> Path:
+def write_parquet(path: Path, hours: float) -> Path:
     """Nanosecond timestamps and doubles in row groups of the default size."""
     import pyarrow as pa
     from pyarrow import parquet
@@ -149,13 +106,13 @@ def write_parquet(path: Path, hours: float, jitter_us: float) -> Path:
         *(pa.field(name, pa.float64(), metadata={"units": "deg/h"}) for name in MAP),
     ]
     with parquet.ParquetWriter(path, pa.schema(fields)) as file:
-        for _, stamps, values in blocks(hours, jitter_us):
+        for _, stamps, values in blocks(hours):
             columns = [pa.array(stamps.view("datetime64[ns]")), *map(pa.array, values)]
             file.write_table(pa.table(columns, schema=pa.schema(fields)))
     return path
 
 
-def write_hdf5(path: Path, hours: float, jitter_us: float, *, matlab: bool = False) -> Path:
+def write_hdf5(path: Path, hours: float, *, matlab: bool = False) -> Path:
     """Vectors as h5py lays them out, or row vectors in deflated chunks as MATLAB does."""
     import h5py
 
@@ -174,7 +131,7 @@ def write_hdf5(path: Path, hours: float, jitter_us: float, *, matlab: bool = Fal
                 arrays[name].attrs["MATLAB_class"] = np.bytes_(
                     b"int64" if kind == "i8" else b"double"
                 )
-        for begin, stamps, values in blocks(hours, jitter_us):
+        for begin, stamps, values in blocks(hours):
             for name, part in zip(arrays, (stamps, *values), strict=True):
                 arrays[name][begin : begin + stamps.size] = part[:, None] if matlab else part
     if matlab:
@@ -183,7 +140,7 @@ def write_hdf5(path: Path, hours: float, jitter_us: float, *, matlab: bool = Fal
     return path
 
 
-def write_csv(path: Path, hours: float, jitter_us: float) -> Path:
+def write_csv(path: Path, hours: float) -> Path:
     """Nanoseconds since 1970 and decimals."""
     import pyarrow as pa
     from pyarrow import csv
@@ -192,14 +149,14 @@ def write_csv(path: Path, hours: float, jitter_us: float) -> Path:
         file.write(
             ",".join(["time [ns]", *(f"{name} [{COUNT:g} deg/h]" for name in MAP)]).encode() + b"\n"
         )
-        for _, stamps, values in blocks(hours, jitter_us):
+        for _, stamps, values in blocks(hours):
             counts = np.rint(values / COUNT).astype(np.int64)
             text = pa.table([pa.array(stamps), *map(pa.array, counts)], names=["time", *MAP])
             csv.write_csv(text, file, csv.WriteOptions(include_header=False, quoting_style="none"))
     return path
 
 
-def write_own(path: Path, hours: float, jitter_us: float) -> Path:
+def write_own(path: Path, hours: float) -> Path:
     """The working store of gyrostab: Zarr, or NetCDF by way of it."""
     if path.suffix == ".zarr":
         return write_store(path, hours)
@@ -213,140 +170,96 @@ def write_own(path: Path, hours: float, jitter_us: float) -> Path:
 
 
 #: Name in the table -> ending of the archive, and what writes it.
-FORMATS: dict[str, tuple[str, Callable[[Path, float, float], Path]]] = {
+FORMATS: dict[str, tuple[str, Callable[[Path, float], Path]]] = {
     "own-zarr": ("zarr", write_own),
     "own-netcdf": ("nc", write_own),
     "netcdf": ("nc", write_netcdf),
-    "netcdf-packed": (
-        "nc",
-        lambda path, hours, jitter: write_netcdf(path, hours, jitter, packed=True),
-    ),
-    "netcdf-classic": (
-        "nc",
-        lambda path, hours, jitter: write_netcdf(path, hours, jitter, kind="NETCDF3_64BIT_DATA"),
-    ),
-    "zarr2": ("zarr", lambda path, hours, jitter: write_zarr(path, hours, jitter, version=2)),
-    "zarr3": ("zarr", lambda path, hours, jitter: write_zarr(path, hours, jitter, version=3)),
+    "netcdf-packed": ("nc", partial(write_netcdf, packed=True)),
+    "netcdf-classic": ("nc", partial(write_netcdf, kind="NETCDF3_64BIT_DATA")),
+    "zarr2": ("zarr", partial(write_zarr, version=2)),
+    "zarr3": ("zarr", partial(write_zarr, version=3)),
     "parquet": ("parquet", write_parquet),
     "hdf5": ("h5", write_hdf5),
-    "matlab": ("mat", lambda path, hours, jitter: write_hdf5(path, hours, jitter, matlab=True)),
+    "matlab": ("mat", partial(write_hdf5, matlab=True)),
     "csv": ("csv", write_csv),
 }
 
 
-def measure(work: str, path: Path, given: argparse.Namespace) -> dict[str, float] | None:
-    """Return the shortest time and the largest peak of several runs; None if the work fails."""
-    results = []
-    for _ in range(given.rounds):
-        request = json.dumps(
-            [work, str(path), str(path.with_name("product.nc")), WINDOW, given.workers]
-        )
-        environment = {**os.environ, "TMPDIR": str(path.parent)}
-        done = subprocess.run(
-            [sys.executable, "-c", _CHILD, request],
-            capture_output=True,
-            text=True,
-            check=False,
-            env=environment,
-        )
-        if done.returncode:
-            print(f"{work} {path.name}: {done.stderr.strip().splitlines()[-1:]}", file=sys.stderr)
-            return None
-        results.append(json.loads(done.stdout.splitlines()[-1]))
+def run_file(path: Path, workers: int) -> dict[str, float]:
+    """Run in this process, with temporary files next to the file."""
+    os.environ["TMPDIR"] = tempfile.tempdir = str(path.parent)
+    warnings.simplefilter("ignore")
+    return run_log(path, WINDOW, {"workers": workers})
+
+
+def read_xarray(path: Path, _: int) -> dict[str, float]:
+    """Read every value once in this process."""
+    import xarray as xr
+
+    begun = time.perf_counter()
+    engine = "zarr" if path.suffix == ".zarr" else None
+    with xr.open_dataset(path, chunks={"time": 2**21}, engine=engine) as data:
+        for name in data.data_vars:
+            float(data[name].mean())
+    return {"seconds": time.perf_counter() - begun, "peak": memory()}
+
+
+def measure(
+    work: Callable[[Path, int], dict[str, float]], path: Path, given: argparse.Namespace
+) -> dict[str, float]:
+    """Return the shortest time and the largest peak of several runs."""
+    results = [in_new_process(work, path, given.workers) for _ in range(given.rounds)]
     return {
         **min(results, key=lambda result: result["seconds"]),
         "peak": max(result["peak"] for result in results),
     }
 
 
-def size_of(path: Path) -> int:
-    """Bytes of a file or of the files of a store."""
-    return (
-        sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
-        if path.is_dir()
-        else path.stat().st_size
-    )
-
-
 def compare(folder: Path, hours: float, given: argparse.Namespace) -> list[list[str]]:
     """One row of the table for each format."""
     rows = []
-    reference: float | None = None
+    reference = 0.0
     for name in given.formats:
         ending, write = FORMATS[name]
-        path = write(folder / f"{name}.{ending}", hours, given.jitter)
+        path = write(folder / f"{name}.{ending}", hours)
         os.sync()  # so that the run does not compete with the writing of its input
-        size = size_of(path)
-        run = measure("run", path, given)
-        peer = (
-            measure("read_xarray", path, given)
-            if ending in ("nc", "zarr") and not name.startswith("own")
-            else None
-        )
+        size = sum(file.stat().st_size for file in (path, *path.rglob("*")) if file.is_file())
+        run = measure(run_file, path, given)
+        read = ["", ""]
+        if ending in ("nc", "zarr") and not name.startswith("own"):
+            peer = measure(read_xarray, path, given)
+            read = [f"{peer['seconds']:.2f}", f"{peer['peak']:.0f}"]
         shutil.rmtree(path) if path.is_dir() else path.unlink()
-        reference = reference or (run["seconds"] if run else None)
-        ran = ["failed", "", "", ""]
-        if run and reference:
-            ran = [
-                f"{run['seconds']:.2f}",
-                f"{run['seconds'] / reference:.1f}",
-                f"{run['processor']:.2f}",
-                f"{run['peak']:.0f}",
-            ]
-        read = [f"{peer['seconds']:.2f}", f"{peer['peak']:.0f}"] if peer else ["", ""]
-        rows.append([f"{hours:g} h", name, f"{size / 1e9:.2f}", *ran, *read])
-        print(rows[-1], flush=True)
+        reference = reference or run["seconds"]
+        rows.append([
+            f"{hours:g} h", name, f"{size / 1e9:.2f}", f"{run['seconds']:.2f}",
+            f"{run['seconds'] / reference:.1f}", f"{run['processor']:.2f}", f"{run['peak']:.0f}",
+            *read,
+        ])  # fmt: skip
+        print(*rows[-1], sep=" | ", flush=True)
     return rows
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--hours", type=float, nargs="+", default=[12.0, 48.0])
-    parser.add_argument(
-        "--formats",
-        nargs="+",
-        choices=list(FORMATS),
-        default=list(FORMATS),
-        help="the first is the reference",
-    )
-    parser.add_argument(
-        "--jitter",
-        type=float,
-        default=0.0,
-        help="standard deviation of the stamps about the grid [us]",
-    )
+    parser = make_parser(__doc__)
+    parser.add_argument("--hours", type=float, nargs="+", default=[12.0])
+    parser.add_argument("--formats", nargs="+", choices=list(FORMATS), default=list(FORMATS))
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=1)
-    parser.add_argument(
-        "--folder",
-        type=Path,
-        help="where the archives are made; the system's temporary folder by default",
-    )
-    parser.add_argument("--output", type=Path)
+    parser.add_argument("--folder", type=Path, help="where the archives are made")
     given = parser.parse_args()
     rows = []
     for hours in given.hours:
         with tempfile.TemporaryDirectory(dir=given.folder) as name:
             rows += compare(Path(name), hours, given)
     head = [
-        "length",
-        "format",
-        "GB",
-        "seconds",
-        "times own",
-        "processor [s]",
-        "peak MiB",
-        "xarray: seconds",
-        "peak MiB",
-    ]
-    text = "\n\n".join(
-        [table(head, rows), f"{machine()}; {given.workers} workers, best of {given.rounds}."]
-    )
+        "length", "format", "GB", "seconds", "times own", "processor [s]", "peak MiB",
+        "xarray: seconds", "peak MiB",
+    ]  # fmt: skip
+    machine_line = f"{machine()}; {given.workers} workers, best of {given.rounds}."
+    text = f"{table(head, rows)}\n\n{machine_line}"
     print(text)
-    if given.output:
-        renew(given.output, "foreign", text)
+    renew(given.output, "foreign", text)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Measure what losses do to N, B and K, for each way to treat them; write the table of a page.
 
-    python benchmarks/gap_treatment.py --records 100 --output docs/how-to/rate-data-with-gaps.md
+    python benchmarks/gap_treatment.py --output docs/how-to/rate-data-with-gaps.md
 
 Every record has 60 s at 100 Hz on a mean rate of 10 deg/h: white noise (N = 0.01 deg/sqrt(h)),
 alone or with bias instability (B = 1.5 deg/h) or rate random walk (K = 150 deg/h^1.5). The same
@@ -9,17 +9,12 @@ averaging times and the same fit are used for all treatments.
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 import xarray as xr
-from page import renew
+from page import make_parser, renew, table
 
 import gyrostab
 from gyrostab.noise import NORMAL_95
@@ -128,27 +123,22 @@ def measure(rows: np.ndarray, term: str, truth: float, treat: Treatment) -> tupl
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Measure what losses do to N, B and K.")
+    parser = make_parser(__doc__)
     parser.add_argument("--records", type=int, default=100)
-    parser.add_argument("--output", type=Path, help="page to put the table into")
     chosen = parser.parse_args()
-    lines = [f"| | treatment | {' | '.join(LOSSES)} |", "|---|---|" + "---|" * len(LOSSES)]
-    edges = "| | scatter next to gaps over the rest |"
+    rows = []
+    edges = ["", "scatter next to gaps over the rest"]
     for term in TRUTH:
         made = [make_records(term, loss, chosen.records) for loss in LOSSES.values()]
         for name, treat in TREATMENTS.items():
-            line = f"| {term} | {name} |"
-            for rows, truth in made:
-                cell, ratio = measure(rows, term, truth, treat)
-                line += f" {cell} |"
-                if (term, treat) == ("N", make_surface):
-                    edges += f" {ratio:.2f} |" if np.isfinite(ratio) else " |"
-            lines.append(line)
-            print(line, flush=True)
-    text = "\n".join([*lines, edges])
+            measured = [measure(rows, term, truth, treat) for rows, truth in made]
+            if (term, treat) == ("N", make_surface):
+                edges += ["" if np.isnan(ratio) else f"{ratio:.2f}" for _, ratio in measured]
+            rows.append([term, name, *(cell for cell, _ in measured)])
+            print(*rows[-1], sep=" | ", flush=True)
+    text = table(["", "treatment", *LOSSES], [*rows, edges])
     print(text)
-    if chosen.output:
-        renew(chosen.output, "gaps", text)
+    renew(chosen.output, "gaps", text)
 
 
 if __name__ == "__main__":

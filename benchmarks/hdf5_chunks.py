@@ -1,6 +1,6 @@
 """Readers of the chunks of NetCDF (HDF5) logs, side by side, with one thread and with two.
 
-    python benchmarks/hdf5_chunks.py [--hours 5] [--rounds 12] [--folder FOLDER]
+    python benchmarks/hdf5_chunks.py --output docs/decisions/0010-hdf5-chunks.md
 
 Every reader reads `rate` of a log as doubles, chunk by chunk. The readers take turns in one
 process, and the table has the least wall and processor time of all rounds. `xarray` is a slice of a
@@ -12,7 +12,6 @@ shorter one would be served.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from collections.abc import Callable
@@ -26,8 +25,7 @@ import numpy as np
 import xarray as xr
 from foreign import write_own
 from numpy.typing import NDArray
-from page import machine
-from scaling import table
+from page import machine, make_parser, renew, table
 
 from gyrostab import to_netcdf
 from gyrostab.io.opening import open_log
@@ -89,14 +87,14 @@ def measure(read: Read, spans: list[tuple[int, int, int]], threads: int) -> tupl
 
 def main() -> None:
     """Write the logs, let the readers take turns, and print the table."""
-    options = argparse.ArgumentParser(description=__doc__)
+    options = make_parser(__doc__)
     options.add_argument("--hours", type=float, default=5.0)
-    options.add_argument("--rounds", type=int, default=12)
+    options.add_argument("--rounds", type=int, default=10)
     options.add_argument("--folder", type=Path)
     given = options.parse_args()
     lines = []
     with tempfile.TemporaryDirectory(dir=given.folder) as folder:
-        zlib = write_own(Path(folder, "zlib.nc"), given.hours, 0.0)
+        zlib = write_own(Path(folder, "zlib.nc"), given.hours)
         zstd = to_netcdf(open_log(zlib), Path(folder, "zstd.nc"), compression="zstd")
         for path in (zlib, zstd):
             readers, spans = readers_of(path)
@@ -113,8 +111,10 @@ def main() -> None:
                     ratio = wall / best["gyrostab"][0]
                     figures = (f"{1e3 * wall:.0f}", f"{1e3 * used:.0f}", f"{ratio:.2f}")
                     lines.append([path.stem, str(threads), name, *figures])
-    print(table(["compression", "threads", "reader", "ms", "processor [ms]", "ratio"], lines))
-    print(machine())
+    head = ["compression", "threads", "reader", "ms", "processor [ms]", "ratio"]
+    text = f"{table(head, lines)}\n\n{machine()}"
+    print(text)
+    renew(given.output, "readers", text)
 
 
 if __name__ == "__main__":

@@ -9,16 +9,11 @@ noise, to which an effect is added; the fit knows the effect, not its size, and 
 "Wrong" forms are those that a fit cannot reproduce.
 """
 
-import argparse
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from page import renew
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from page import make_parser, renew, table
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
@@ -79,69 +74,36 @@ def cases(reduced):
 
     for level, size in (("low", 0.1), ("high", 0.5)):
         for form, power in (("right", 2.0), ("wrong", 1.9)):
-            yield (
-                "vibration_rectification",
-                "mean",
-                "sensitivity",
-                level,
-                form,
-                size / 36.0,
-                shifted(size * (g / 6.0) ** power),
-            )
+            change = shifted(size * (g / 6.0) ** power)
+            yield "vibration_rectification", "mean", "sensitivity", level, form, size / 36.0, change
     for level, share in (("low", 0.2), ("high", 1.0)):
         for form, power in (("right", 2.0), ("wrong", 1.9)):
-            yield (
-                "vibration_noise",
-                "power",
-                "white",
-                level,
-                form,
-                0.003 * share**0.5 / 6.0,
-                scale_noise(1.0 + share * (g / 6.0) ** power),
-            )
+            change, size = scale_noise(1.0 + share * (g / 6.0) ** power), 0.003 * share**0.5 / 6.0
+            yield "vibration_noise", "power", "white", level, form, size, change
     for level, size in (("low", 0.3), ("high", 2.0)):
         for form, bend in (("right", 0.0), ("wrong", 0.06)):
             shape = size * (warm + bend * (warm - warm.min()) * (warm.max() - warm))
-            yield (
-                "temperature_bias",
-                "mean",
-                "sensitivity",
-                level,
-                form,
-                size / np.ptp(heat),
-                shifted(shape),
-            )
+            slope = size / np.ptp(heat)
+            yield "temperature_bias", "mean", "sensitivity", level, form, slope, shifted(shape)
 
 
 def main():
     """Fit, print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--records", type=int, default=200)
-    parser.add_argument(
-        "--output", type=Path, help="document whose part between the marks is renewed"
-    )
     options = parser.parse_args()
     count, reduced = options.records, record([])
-    baseline = calibrate_noise(reduced)
-    drawn = next(
-        iter(
-            null_records(reduced, baseline, count=count, rng=np.random.default_rng(8), chunk=count)
-        )
-    )
-    lines = [
-        f"| effect | signal | form | inside 95 %, of {count} | bias | scatter |",
-        "| --- | --- | --- | --- | --- | --- |",
-    ]
+    baseline, rng = calibrate_noise(reduced), np.random.default_rng(8)
+    (drawn,) = null_records(reduced, baseline, count=count, rng=rng, chunk=count)
+    rows = []
     for effect, statistic, column, level, form, truth, change in cases(reduced):
         share, bias, scatter = held(
             reduced, baseline, drawn, effect, statistic, column, truth, change
         )
-        lines.append(f"| {effect} | {level} | {form} | {share:.1%} | {bias:+.1%} | {scatter:.1%} |")
-        print(lines[-1], flush=True)
-    if options.output:
-        renew(options.output, "intervals", "\n".join(lines))
+        rows.append([effect, level, form, f"{share:.1%}", f"{bias:+.1%}", f"{scatter:.1%}"])
+        print(*rows[-1], sep=" | ", flush=True)
+    head = ["effect", "signal", "form", f"inside 95 %, of {count}", "bias", "scatter"]
+    renew(options.output, "intervals", table(head, rows))
 
 
 if __name__ == "__main__":

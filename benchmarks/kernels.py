@@ -5,17 +5,13 @@ multi-day log of three axes at 400 Hz. The bare loop squares and adds second dif
 averaging factor in the first-level cache, in numba and, if gcc is installed, in C: what a processor
 can do that is given one averaging factor at a time. Run it on an idle machine:
 
-    make bench                                                      # ten minutes or so
-    python benchmarks/kernels.py --quick                            # short records, one repeat
-    python benchmarks/kernels.py --output docs/performance.md   # update the part between markers
+    python benchmarks/kernels.py --quick                        # short records, one repeat
+    python benchmarks/kernels.py --output docs/performance.md
 """
 
 from __future__ import annotations
 
-import argparse
 import ctypes
-import functools
-import os
 import shutil
 import subprocess
 import sys
@@ -24,7 +20,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from datetime import date
 from functools import partial
 from pathlib import Path
 
@@ -35,14 +30,13 @@ import dask
 import numba
 import numpy as np
 import xarray as xr
-from page import renew
+from page import machine, make_parser, renew, table
 
 from gyrostab import davar, make_log
-from gyrostab.allan.plan import last_sample, units_of_work
+from gyrostab.allan.plan import last_sample, make_plan, units_of_work
 from gyrostab.kernels.allan.integrate import present_runs
 from gyrostab.kernels.allan.surface import Unit, surface_unit
 from gyrostab.kernels.workspace import Workspace
-from gyrostab.time.durations import averaging_factors, thin
 from tests.support.published import published_davar
 
 RATE = 100.0
@@ -79,17 +73,6 @@ def numba_loop(theta, n, k, turns):
     return total
 
 
-def seconds(call: Callable[[], object], repeats: int) -> float:
-    """Median wall time of a call, after one that compiles and warms up."""
-    call()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return float(np.median(times))
-
-
 def in_turns(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
     """Return the best wall time of each call; calls alternate, so that load affects all alike."""
     best = dict.fromkeys(calls, np.inf)
@@ -122,50 +105,19 @@ def rooflines() -> dict[str, float]:
     """Terms per second of the bare loop [1e9/s], n = 1000, k = 100."""
     n, k, turns = 1000, 100, 20_000
     theta = np.cumsum(np.random.default_rng(0).standard_normal(n + 2 * k + 8))
-    speeds = {"numba": n * turns / seconds(lambda: numba_loop(theta, n, k, turns), 9) / 1e9}
-    if shutil.which("gcc"):
-        with tempfile.TemporaryDirectory() as folder:
-            for width in ("256", "512"):
-                library = Path(folder) / f"loop{width}.so"
-                flags = [
-                    "-O3",
-                    "-march=native",
-                    "-ffast-math",
-                    f"-mprefer-vector-width={width}",
-                    "-shared",
-                    "-fPIC",
-                    "-x",
-                    "c",
-                ]
-                if subprocess.run(
-                    ["gcc", *flags, "-o", library, "-"],
-                    input=C_LOOP.encode(),
-                    capture_output=True,
-                    check=False,
-                ).returncode:
-                    continue  # a processor without such vectors
+    loops: dict[str, Callable[[], object]] = {"numba": lambda: numba_loop(theta, n, k, turns)}
+    pointer = theta.ctypes.data_as(ctypes.c_void_p)
+    arguments = [ctypes.c_long(value) for value in (n, k, turns)]
+    with tempfile.TemporaryDirectory() as folder:
+        for width in ("256", "512") if shutil.which("gcc") else ():
+            library = Path(folder) / f"loop{width}.so"
+            flags = f"-O3 -march=native -ffast-math -mprefer-vector-width={width} -shared -fPIC"
+            command = ["gcc", *flags.split(), "-x", "c", "-o", library, "-"]
+            if not subprocess.run(command, input=C_LOOP.encode(), capture_output=True).returncode:
                 loop = ctypes.CDLL(str(library)).energy
                 loop.restype = ctypes.c_double
-                pointer = theta.ctypes.data_as(ctypes.c_void_p)
-                arguments = [ctypes.c_long(value) for value in (n, k, turns)]
-                took = seconds(functools.partial(loop, pointer, *arguments), 9)
-                speeds[f"C, {width}-bit vectors"] = n * turns / took / 1e9
-    return speeds
-
-
-def make_unit(ks: np.ndarray, window: int, step: int, rate: float, octave: bool) -> Unit:
-    shifts = thin(ks) if octave else np.zeros_like(ks)
-    ks = np.unique(ks >> shifts << shifts)
-    return Unit(
-        window,
-        step,
-        ks,
-        thin(ks) if octave else np.zeros_like(ks),
-        False,
-        1 / rate,
-        0.3,
-        0.1,
-    )
+                loops[f"C, {width}-bit vectors"] = partial(loop, pointer, *arguments)
+    return {name: n * turns / took / 1e9 for name, took in in_turns(loops, 9).items()}
 
 
 def pieces(x: np.ndarray, unit: Unit) -> list[np.ndarray]:
@@ -235,16 +187,12 @@ def shape(name: str, taus: str, repeats: int, quick: bool) -> Iterator[str]:
         "tau_max": (window // 2 - 1) / RATE,
     }
     tau = np.asarray(davar(log, **options).tau)
-    unit = make_unit(np.round(tau * RATE).astype(np.int64), window, step, RATE, octave=False)
+    unit = make_plan(log, **options).unit
     parts = pieces(x, unit)
-    few = max(1, repeats // 3)
-    slow: dict[str, tuple[Callable[[], object], int]] = {
-        "`allantools.oadev`, a loop": (lambda: allantools_loop(x, window, step, tau), few),
-        "classical, numpy": (lambda: published_davar(log, method="direct", **options), few),
-        "published recursion, numba": (
-            lambda: published_davar(log, method="recursive", **options),
-            repeats,
-        ),
+    slow: dict[str, Callable[[], object]] = {
+        "`allantools.oadev`, a loop": lambda: allantools_loop(x, window, step, tau),
+        "classical, numpy": lambda: published_davar(log, method="direct", **options),
+        "published recursion, numba": lambda: published_davar(log, method="recursive", **options),
     }
     fast: dict[str, Callable[[], object]] = {
         "every window anew, numba": lambda: recompute(x, window, step, unit.ks),
@@ -255,22 +203,19 @@ def shape(name: str, taus: str, repeats: int, quick: bool) -> Iterator[str]:
     if taus == "octave":
         fast = {"FAVAR, every window": lambda: favar(x, window, step, tau.size), **fast}
     yield f"\n**{name}**, {n} samples, window {window}, step {step}, {tau.size} averaging times\n"
-    yield (
-        "| one thread | seconds | times as fast as allantools | as the recursion "
-        "| as every window anew | share of the bare loop |\n|---|---|---|---|---|---|"
-    )
     with dask.config.set(scheduler="sync"):
-        took = {label: seconds(call, times) for label, (call, times) in slow.items()} | in_turns(
-            fast, 2 * repeats + 3
-        )
-    rivals = [took[next(iter(slow))], took["published recursion, numba"]]
-    rivals.append(took["every window anew, numba"])
+        took = in_turns(slow, max(1, repeats // 2)) | in_turns(fast, 2 * repeats + 3)
+    rivals = (next(iter(slow)), "published recursion, numba", "every window anew, numba")
+    rows = []
     for label, value in took.items():
-        ratios = " | ".join(f"{rival / value:.1f}" for rival in rivals)
-        share = (
-            f"{took['bare loop, as many terms'] / value:.2f}" if label.startswith("block") else ""
-        )
-        yield f"| {label} | {value:.4f} | {ratios} | {share} |"
+        share = took["bare loop, as many terms"] / value
+        rows.append([
+            label, f"{value:.4f}", *(f"{took[rival] / value:.1f}" for rival in rivals),
+            f"{share:.2f}" if label.startswith("block") else "",
+        ])  # fmt: skip
+    head = ["one thread", "seconds", "times as fast as allantools", "as the recursion",
+            "as every window anew", "share of the bare loop"]  # fmt: skip
+    yield table(head, rows)
 
 
 def with_gaps(x: np.ndarray) -> np.ndarray:
@@ -286,25 +231,16 @@ def with_gaps(x: np.ndarray) -> np.ndarray:
 def archive(repeats: int, quick: bool) -> Iterator[str]:
     samples = 1_500_000 if quick else 6_000_000
     x = np.random.default_rng(1).standard_normal((3, samples)).astype(np.float32)
-    window, step = 120_000, 24_000
-    ks = averaging_factors(40, rate=400.0, window=window, tau_max=None)
-    yield (
-        f"\n**archive**, 3 axes of {samples} samples (float32) at 400 Hz, window 5 min, "
-        f"step 1 min, {ks.size} averaging times to 100 s\n"
-    )
-    yield (
-        "| terms | missing | terms per sample | kernel, 1 thread | 2 threads | ratio | "
-        "share of the bare loop | `davar`, 1 | `davar`, 2 |"
-    )
-    yield "|---|---|---|---|---|---|---|---|---|"
     records = {"none": x, "in blocks": with_gaps(x)}
-    for octave in (False, True):
-        unit = make_unit(ks, window, step, 400.0, octave)
-        options = {"window": "5min", "step": "1min", "overlap": "octave" if octave else "full"}
+    rows = []
+    for overlap in ("full", "octave"):
+        options = {"window": "5min", "step": "1min", "overlap": overlap}
         calls: dict[str, Callable[[], object]] = {}
         terms = {}
         for name, record in records.items():
-            parts, log = pieces(record, unit), make_log(record, rate=400.0, unit="deg/h")
+            log = make_log(record, rate=400.0, unit="deg/h")
+            unit = make_plan(log, **options).unit
+            parts = pieces(record, unit)
             terms[name] = number_of_terms(parts, unit)
             for workers in (1, 2):
                 calls[f"{name} kernel {workers}"] = partial(run_kernel, parts, unit, workers)
@@ -312,18 +248,24 @@ def archive(repeats: int, quick: bool) -> Iterator[str]:
             calls[f"{name} bare"] = bare(terms[name])
         took = in_turns(calls, repeats + 2)
         for name, record in records.items():
-            speeds = [
+            single, double, davar_single, davar_double = (
                 record.size / took[f"{name} {work} {workers}"] / 1e6
                 for work in ("kernel", "davar")
                 for workers in (1, 2)
-            ]
-            share = took[f"{name} bare"] / took[f"{name} kernel 1"]
-            yield (
-                f"| {options['overlap']} | {np.isnan(record).mean():.0%} | "
-                f"{terms[name] / record.size:.1f} | {speeds[0]:.0f} "
-                f"| {speeds[1]:.0f} | {speeds[1] / speeds[0]:.2f} | {share:.2f} | "
-                f"{speeds[2]:.0f} | {speeds[3]:.0f} |"
             )
+            share = took[f"{name} bare"] / took[f"{name} kernel 1"]
+            rows.append([
+                overlap, f"{np.isnan(record).mean():.0%}", f"{terms[name] / record.size:.1f}",
+                f"{single:.0f}", f"{double:.0f}", f"{double / single:.2f}", f"{share:.2f}",
+                f"{davar_single:.0f}", f"{davar_double:.0f}",
+            ])  # fmt: skip
+    yield (
+        f"\n**archive**, 3 axes of {samples} samples (float32) at 400 Hz, window 5 min, "
+        f"step 1 min, {unit.ks.size} averaging times to {unit.ks[-1] / 400:g} s\n"
+    )
+    head = ["terms", "missing", "terms per sample", "kernel, 1 thread", "2 threads", "ratio",
+            "share of the bare loop", "`davar`, 1", "`davar`, 2"]  # fmt: skip
+    yield table(head, rows)
 
 
 def run_kernel(parts: list[np.ndarray], unit: Unit, workers: int) -> None:
@@ -344,62 +286,32 @@ def run_davar(log: xr.Dataset, options: dict[str, str], workers: int) -> None:
         davar(log, **options)
 
 
-def processor() -> str:
-    info = Path("/proc/cpuinfo")
-    names = (
-        [
-            line.split(":")[1].strip()
-            for line in info.read_text().splitlines()
-            if line.startswith("model name")
-        ]
-        if info.exists()
-        else []
-    )
-    return (
-        f"{names[0] if names else 'processor not named'}, {os.cpu_count()} cores, numba "
-        f"{numba.__version__}, numpy {np.__version__}"
-    )
-
-
 def report(quick: bool) -> Iterator[str]:
     repeats = 1 if quick else 5
-    yield (
-        f"{processor()}; {date.today().isoformat()}; 1-minute load before: "
-        f"{os.getloadavg()[0]:.2f}; medians of {repeats}.\n"
-    )
-    roofs = rooflines()
-    yield (
-        "Bare loop, 1e9 terms per second: "
-        + ", ".join(f"{name} {value:.2f}" for name, value in roofs.items())
-        + "."
-    )
+    versions = f"numba {numba.__version__}, numpy {np.__version__}"
+    yield f"{machine()}; {versions}; best of several turns.\n"
+    roofs = ", ".join(f"{name} {value:.2f}" for name, value in rooflines().items())
+    yield f"Bare loop, 1e9 terms per second: {roofs}."
     for name in SHAPES:
         for taus in ("32", "octave", "all"):
             yield from shape(name, taus, repeats, quick)
     yield from archive(repeats, quick)
     yield (
-        "\nShares are of the numba loop on as many terms (best of several turns); "
-        "the archive is in 10^6 samples a second."
+        "\nShares are of the numba loop on as many terms; the archive is in 10^6 samples a second."
     )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument(
         "--quick", action="store_true", help="records of a tenth or a quarter, one repeat"
-    )
-    parser.add_argument(
-        "--output", type=Path, help="Markdown document whose part between the marks is renewed"
     )
     arguments = parser.parse_args()
     lines = []
     for line in report(arguments.quick):
         print(line, flush=True)
         lines.append(line)
-    if arguments.output:
-        renew(arguments.output, "kernels", "\n".join(lines))
+    renew(arguments.output, "kernels", "\n".join(lines))
 
 
 if __name__ == "__main__":

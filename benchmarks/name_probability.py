@@ -12,7 +12,6 @@ of `gyrostab prove` below 1 000 000 are for such tuning.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from pathlib import Path
@@ -20,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from page import make_parser
 from scipy.optimize import minimize
 from scipy.special import expit
 
@@ -42,9 +42,7 @@ class Names(NamedTuple):
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__, has_page=False)
     parser.add_argument("runs", type=Path, nargs="+", help="folders of blind tests")
     names = collect_names(parser.parse_args().runs)
     best = fit_law(names)

@@ -10,14 +10,13 @@ describes another run.
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
 from datetime import date
 from pathlib import Path
 from typing import Any
 
-from page import renew
+from page import make_parser, renew
 
 from gyrostab.blindtest.runner.folder import FIRST_PUBLIC_SEED
 
@@ -37,9 +36,7 @@ REGISTER = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__, has_page=False)
     parser.add_argument("run", type=Path, help="folder of a finished run")
     parser.add_argument(
         "--docs", type=Path, default=DOCS, help="folder of the page and its figures"
@@ -74,11 +71,7 @@ def publish(run: Path, docs: Path) -> None:
     pictures = [f"![{name} of the diagnosis](figures/proof-{name}.png)" for name in FIGURES]
     for name in FIGURES:
         shutil.copyfile(run / f"{name}.png", docs / "figures" / f"proof-{name}.png")
-    renew(
-        page,
-        "proof",
-        "\n\n".join([table, *pictures]),
-    )
+    renew(page, "proof", "\n\n".join([table, *pictures]))
     register(page, job, table)
 
 

@@ -1,52 +1,27 @@
 """How time and memory of a run grow with log length, averaging times and window over step.
 
-    python benchmarks/scaling.py [--hours 1 2 5 10 20 50 100 200] [--workers 2] [--rounds 3]
-    [--output docs/scaling.md]
+    python benchmarks/scaling.py --output docs/scaling.md
 
 Each run is the whole `gyrostab run` (read, DAVAR, fit, write) in a separate process, from a Zarr
 store of integer counts of three axes at 400 Hz, so that its peak memory is its own. The best of
-several rounds counts. The constant cost of any run (tables, compiled kernels) is fitted together
-with the exponent. The processor time of all threads is given next to the wall time; it is the
-better measure on a busy machine. The tables are Markdown; `--output docs/scaling.md` inserts them
-there.
+several rounds counts, after imports. The constant cost of any run (tables, compiled kernels) is
+fitted together with the exponent. The processor time of all threads is given next to the wall time;
+it is the better measure on a busy machine.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import subprocess
-import sys
 import tempfile
+import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from page import machine, renew
+from page import in_new_process, machine, make_parser, memory, renew, table
 
 RATE, AXES, COUNT = 400.0, 3, 0.02
 WINDOW = {"window": "10min", "step": "1min", "taus": "40"}
-
-# One run; prints its seconds, on the clock, of the processor and stage by stage, and its peak
-# memory [MiB].
-_RUN = """
-import json, resource, sys, time
-def work(paths, output, windows, options):
-    from gyrostab.jobs.run import run
-    stages = []
-    def stage(label, total=0, done=None, unit="samples"):
-        if not stages or stages[-1][0] != label:
-            stages.append((label, time.perf_counter()))
-    start, used = time.perf_counter(), time.process_time()
-    run(paths, output, windows=windows, overwrite=True, stage=stage, **options)
-    end = time.perf_counter()
-    following = [*stages[1:], ("", end)]
-    spans = {label: after - before for (label, before), (_, after) in zip(stages, following)}
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    used = time.process_time() - used
-    print(json.dumps({"seconds": end - start, "processor": used, "peak": peak, "spans": spans}))
-if __name__ == "__main__":
-    work(*json.loads(sys.argv[1]))
-"""
 
 
 def write_store(path: Path, hours: float) -> Path:
@@ -79,23 +54,33 @@ def write_store(path: Path, hours: float) -> Path:
     return to_zarr(log, path, overwrite=True)
 
 
-def measure(store: Path, windows: dict[str, str], options: dict[str, object], rounds: int) -> dict:
+def run_log(path: Path, windows: dict[str, str], options: dict[str, Any]) -> dict[str, float]:
+    """Run in this process: seconds on the clock, of the processor and of each stage; MiB."""
+    from gyrostab.jobs.run import run
+
+    stages: list[tuple[str, float]] = []
+
+    def stage(label: str, *_: object, **__: object) -> None:
+        if not stages or stages[-1][0] != label:
+            stages.append((label, time.perf_counter()))
+
+    begun, used = time.perf_counter(), time.process_time()
+    output = path.with_name("product.nc")
+    run([str(path)], str(output), windows=windows, overwrite=True, stage=stage, **options)
+    end, used = time.perf_counter(), time.process_time() - used
+    spans = {
+        label: after - before
+        for (label, before), (_, after) in zip(stages, [*stages[1:], ("", end)], strict=True)
+    }
+    return {**spans, "seconds": end - begun, "processor": used, "peak": memory()}
+
+
+def measure(path: Path, windows: dict[str, str], given: argparse.Namespace) -> dict[str, float]:
     """Return the best wall and processor time of several runs, and their largest memory peak."""
-    results = []
-    for _ in range(rounds):
-        command = [
-            sys.executable,
-            "-c",
-            _RUN,
-            json.dumps([[str(store)], str(store.with_name("product.nc")), windows, options]),
-        ]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise SystemExit(done.stderr)
-        results.append(json.loads(done.stdout.splitlines()[-1]))
-    quickest = min(results, key=lambda result: result["seconds"])
+    options = {"workers": given.workers, "scheduler": given.scheduler}
+    results = [in_new_process(run_log, path, windows, options) for _ in range(given.rounds)]
     return {
-        **quickest,
+        **min(results, key=lambda result: result["seconds"]),
         "processor": min(result["processor"] for result in results),
         "peak": max(result["peak"] for result in results),
     }
@@ -117,58 +102,37 @@ def exponent(hours: list[float], seconds: list[float]) -> str:
     )
 
 
-def table(head: list[str], rows: list[list[str]]) -> str:
-    return "\n".join(
-        [
-            "| " + " | ".join(head) + " |",
-            "|" + "---|" * len(head),
-            *("| " + " | ".join(row) + " |" for row in rows),
-        ]
-    )
-
-
-def against_length(folder: Path, given: argparse.Namespace, options: dict[str, object]) -> str:
+def against_length(folder: Path, given: argparse.Namespace) -> str:
     rows: list[list[str]] = []
     times: dict[str, list[float]] = {"seconds": [], "processor": []}
     for hours in given.hours:
-        result = measure(write_store(folder / "log.zarr", hours), WINDOW, options, given.rounds)
+        result = measure(write_store(folder / "log.zarr", hours), WINDOW, given)
         samples = AXES * hours * 3600 * RATE
         for name, values in times.items():
             values.append(result[name])
-        spans = [result["spans"].get(name, 0.0) for name in ("reading", "computing", "writing")]
-        rows.append(
-            [
-                f"{hours:g} h",
-                f"{samples / 1e6:.1f}",
-                f"{result['seconds']:.2f}",
-                *(f"{span:.2f}" for span in spans),
-                f"{samples / result['seconds'] / 1e6:.1f}",
-                f"{result['processor']:.2f}",
-                f"{1e9 * result['processor'] / samples:.1f}",
-                f"{result['peak']:.0f}",
-            ]
-        )
-        print(rows[-1], flush=True)
-    head = [
-        "length",
-        "10^6 samples",
-        "seconds",
-        "of that open",
-        "compute",
-        "write",
-        "Msamples/s",
-        "processor [s]",
-        "processor [ns a sample]",
-        "peak MiB",
-    ]
-    text = table(head, rows)
+        rows.append([
+            f"{hours:g} h", f"{samples / 1e6:.1f}", f"{result['seconds']:.2f}",
+            *(f"{result.get(stage, 0.0):.2f}" for stage in ("reading", "computing", "writing")),
+            f"{samples / result['seconds'] / 1e6:.1f}", *costs(result, samples),
+        ])  # fmt: skip
+        print(*rows[-1], sep=" | ", flush=True)
+    head = ["length", "10^6 samples", "seconds", "of that open", "compute", "write", "Msamples/s"]
+    text = table([*head, *COSTS], rows)
     for name, label in (("seconds", "Time"), ("processor", "Processor time")):
         if len(given.hours) > 4:
             text += f"\n\n{label}: {exponent(given.hours, times[name])}."
     return text
 
 
-def against_options(folder: Path, given: argparse.Namespace, options: dict[str, object]) -> str:
+COSTS = ("processor [s]", "processor [ns a sample]", "peak MiB")
+
+
+def costs(result: dict[str, float], samples: float) -> list[str]:
+    used = result["processor"]
+    return [f"{used:.2f}", f"{1e9 * used / samples:.1f}", f"{result['peak']:.0f}"]
+
+
+def against_options(folder: Path, given: argparse.Namespace) -> str:
     hours = given.option_hours
     store = write_store(folder / "log.zarr", hours)
     rows = []
@@ -181,41 +145,16 @@ def against_options(folder: Path, given: argparse.Namespace, options: dict[str, 
         ),
         {"overlap": "octave"},
     ):
-        windows = {**WINDOW, **change}
-        result = measure(store, windows, options, given.rounds)
-        samples = AXES * hours * 3600 * RATE
-        named = [
-            windows["window"],
-            windows["step"],
-            windows["taus"],
-            windows.get("overlap", "full"),
-        ]
-        cost = [
-            f"{result['seconds']:.2f}",
-            f"{result['processor']:.2f}",
-            f"{1e9 * result['processor'] / samples:.1f}",
-            f"{result['peak']:.0f}",
-        ]
-        rows.append([*named, *cost])
-    return f"Log of {hours:g} h.\n\n" + table(
-        [
-            "window",
-            "step",
-            "taus",
-            "overlap",
-            "seconds",
-            "processor [s]",
-            "processor [ns a sample]",
-            "peak MiB",
-        ],
-        rows,
-    )
+        windows = {**WINDOW, "overlap": "full", **change}
+        result = measure(store, windows, given)
+        cost = costs(result, AXES * hours * 3600 * RATE)
+        rows.append([*windows.values(), f"{result['seconds']:.2f}", *cost])
+    head = ["window", "step", "taus", "overlap", "seconds", *COSTS]
+    return f"Log of {hours:g} h.\n\n{table(head, rows)}"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument(
         "--hours", type=float, nargs="+", default=[1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0]
     )
@@ -228,29 +167,17 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--scheduler", default="threads")
-    parser.add_argument("--only", choices=("length", "options"))
-    parser.add_argument("--output", type=Path)
     given = parser.parse_args()
-    options: dict[str, object] = {"workers": given.workers, "scheduler": given.scheduler}
-    parts = []
     with tempfile.TemporaryDirectory() as name:
-        if given.only != "options":
-            parts.append(
-                "### Time and memory against length\n\n"
-                + against_length(Path(name), given, options)
-            )
-        if given.only != "length":
-            parts.append(
-                "### Against averaging times, and window over step\n\n"
-                + against_options(Path(name), given, options)
-            )
-    parts.append(
-        f"{machine()}; {given.scheduler}, {given.workers} workers, best of {given.rounds}."
-    )
-    text = "\n\n".join(parts)
+        text = "\n\n".join([
+            "### Time and memory against length",
+            against_length(Path(name), given),
+            "### Against averaging times, and window over step",
+            against_options(Path(name), given),
+            f"{machine()}; {given.scheduler}, {given.workers} workers, best of {given.rounds}.",
+        ])  # fmt: skip
     print(text)
-    if given.output:
-        renew(given.output, "scaling", text)
+    renew(given.output, "scaling", text)
 
 
 if __name__ == "__main__":

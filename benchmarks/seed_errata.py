@@ -9,15 +9,14 @@ should be.
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from page import make_parser, renew, table
 
 from gyrostab.allan.davar import davar
 from gyrostab.allan.fit import fit_noise
@@ -331,22 +330,12 @@ _SHOWN: tuple[Callable[[], Erratum], ...] = (
 
 
 def main() -> None:
-    from page import renew
-
-    parser = argparse.ArgumentParser(description="Make the table of errata of docs/seeds.md.")
-    parser.add_argument(
-        "--output", type=Path, help="page to put the table into; printed only when not given"
-    )
-    chosen = parser.parse_args()
-    rows = [
-        "| where | printed | right | shown by | as printed | right |",
-        "| --- | --- | --- | --- | --- | --- |",
-    ]
-    for slip in errata():
-        rows.append(f"| {' | '.join(slip[:4])} | {slip.as_printed:.4g} | {slip.in_truth:.4g} |")
-    print("\n".join(rows))
-    if chosen.output:
-        renew(chosen.output, "errata", "\n".join(rows))
+    output = make_parser(__doc__).parse_args().output
+    head = ["where", "printed", "right", "shown by", "as printed", "right"]
+    rows = [[*slip[:4], f"{slip.as_printed:.4g}", f"{slip.in_truth:.4g}"] for slip in errata()]
+    text = table(head, rows)
+    print(text)
+    renew(output, "errata", text)
 
 
 if __name__ == "__main__":

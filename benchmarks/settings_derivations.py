@@ -10,10 +10,8 @@ freedom as a band has lines, so that all but `line_nats` follow in closed form.
 
 from __future__ import annotations
 
-import argparse
-
 import numpy as np
-from page import machine
+from page import machine, make_parser
 from scipy.optimize import brentq
 from scipy.stats import gamma
 
@@ -48,9 +46,7 @@ def level_correlation(lowest: float) -> float:
 
 def main() -> None:
     """Print the probabilities."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__, has_page=False)
     parser.add_argument("--records", type=int, default=400)
     records = parser.parse_args().records
     print(f"{machine()}\n")

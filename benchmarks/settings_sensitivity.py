@@ -12,7 +12,6 @@ Markdown table; a cell lists the records whose verdict or names change, or is em
 
 from __future__ import annotations
 
-import argparse
 import ast
 import importlib
 import pkgutil
@@ -26,7 +25,7 @@ from types import ModuleType
 from typing import Any
 
 import xarray as xr
-from page import machine
+from page import machine, make_parser, table
 
 import gyrostab
 from gyrostab.diagnose.settings import DEFAULTS, Settings
@@ -50,9 +49,7 @@ EFFECTS: dict[str, tuple[list[dict[str, Any]], list[dict[str, Any]]]] = {
 
 def main() -> None:
     """Diagnose each record with the defaults and with every number scaled; print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__, has_page=False)
     parser.add_argument("--factors", type=float, nargs="+", default=[0.5, 0.8, 1.25, 2.0])
     parser.add_argument("--records", nargs="+", choices=EFFECTS, default=list(EFFECTS))
     parser.add_argument("--only", nargs="+", help="settings, or modules with --local")
@@ -64,8 +61,7 @@ def main() -> None:
     print(f"{machine()}; 100 null records.\n")
     for name, decision in usual.items():
         print(f"- {name}: {decision[0]}, {', '.join(map(' '.join, decision[1])) or 'no effect'}")
-    factors = " | ".join(f"times {factor:g}" for factor in options.factors)
-    print(f"\n| number | {factors} |\n|---|{'---|' * len(options.factors)}")
+    rows = []
     kind = modules() if options.local else {item.name: item.name for item in fields(Settings)}
     for name, target in kind.items():
         if options.only and name not in options.only:
@@ -78,7 +74,9 @@ def main() -> None:
                 if decide_scaled(logs[record], target, factor) != usual[record]
             ]
             cells.append(", ".join(changed))
-        print(f"| `{name}` | {' | '.join(cells)} |", flush=True)
+        rows.append([f"`{name}`", *cells])
+        print(*rows[-1], sep=" | ", flush=True)
+    print(table(["number", *(f"times {factor:g}" for factor in options.factors)], rows))
 
 
 def make_record(name: str) -> xr.Dataset:

@@ -1,16 +1,18 @@
 """Evidence for effects on the mean, with everything known about the noise and with less and less.
 
-Prints a row for each effect and strength: medians over records of an hour at 10 Hz, summed over the
-axes [nats].
+    python benchmarks/slow_effects.py --output docs/diagnosis-method.md
+
+A row for each effect and strength: medians over records of an hour at 10 Hz, summed over the axes
+[nats].
 """
 
 from __future__ import annotations
 
-import argparse
 from typing import Any
 
 import numpy as np
 import xarray as xr
+from page import make_parser, renew, table
 
 from gyrostab.blindtest.scenarios.case import make_case
 from gyrostab.blindtest.scenarios.plan import plan_case
@@ -89,7 +91,7 @@ def ladder(name: str, strength: float, number: int) -> list[float]:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument(
         "--records", type=int, default=8, help="records of each effect and strength"
     )
@@ -97,12 +99,14 @@ def main() -> None:
         "--strengths", type=float, nargs="+", default=[1.5, 2.5], help="in units of the limit"
     )
     given = parser.parse_args()
-    print(f"| effect | strength | {' | '.join(COLUMNS)} |\n| --- | --- {'| --- ' * len(COLUMNS)}|")
+    rows = []
     for name in EFFECTS:
         for strength in given.strengths:
-            rows = [ladder(name, strength, number) for number in range(given.records)]
-            cells = " | ".join(f"{value:.1f}" for value in np.median(rows, axis=0))
-            print(f"| {name} | {strength:g} | {cells} |", flush=True)
+            evidence = [ladder(name, strength, number) for number in range(given.records)]
+            medians = np.median(evidence, axis=0)
+            rows.append([name, f"{strength:g}", *(f"{value:.1f}" for value in medians)])
+            print(*rows[-1], sep=" | ", flush=True)
+    renew(given.output, "slow effects", table(["effect", "strength", *COLUMNS], rows))
 
 
 if __name__ == "__main__":

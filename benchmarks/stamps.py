@@ -1,15 +1,17 @@
-"""Rows kept, rate and losses found where stamps are times of arrival: the table in docs/method.md.
+"""Rows kept, rate and losses found where stamps are times of arrival.
 
-Run with ``python -m benchmarks.stamps [ROWS]``; 20 000 rows a case by default. A cell is the worst
-of all scatters and units of time: samples too many or few, and the largest displacement of a row.
+    python benchmarks/stamps.py --output docs/method.md
+
+A cell is the worst of all scatters and units of time: samples too many or few, and the largest
+displacement of a row.
 """
 
 from __future__ import annotations
 
 import itertools
-import sys
 
 import numpy as np
+from page import make_parser, renew, table
 
 from gyrostab.ingest.grid.regularise import regularise
 from tests.support.raw_rows import raw_log
@@ -50,24 +52,29 @@ def measure(
 
 def main() -> None:
     """Print the table."""
-    rows = int(sys.argv[1]) if len(sys.argv) > 1 else 20_000
-    print(f"| jitter | {' | '.join(LOSSES)} |")
-    print(f"|---{'|---' * len(LOSSES)}|")
-    kept_shares, rate_errors = [], []
+    parser = make_parser(__doc__)
+    parser.add_argument("--rows", type=int, default=20_000, help="rows of a record")
+    options = parser.parse_args()
+    cases = list(enumerate(itertools.product(SCATTERS, UNITS)))
+    rows, kept_shares, rate_errors = [], [], []
     for jitter in JITTER:
         cells = []
         for losses in LOSSES:
-            cases = itertools.product(SCATTERS, UNITS)
-            results = [
-                measure(jitter, losses, scatter, unit, rows, seed)
-                for seed, (scatter, unit) in enumerate(cases)
-            ]
-            shares, error, size, row_error = (list(column) for column in zip(*results, strict=True))
+            shares, errors, sizes, displacements = zip(
+                *(
+                    measure(jitter, losses, scatter, unit, options.rows, seed)
+                    for seed, (scatter, unit) in cases
+                ),
+                strict=True,
+            )
             kept_shares += shares
-            rate_errors += error
-            cells.append(f"{max(size)}; {max(row_error)}")
-        print(f"| {jitter} | {' | '.join(cells)} |", flush=True)
+            rate_errors += errors
+            cells.append(f"{max(sizes)}; {max(displacements)}")
+        rows.append([jitter, *cells])
+    text = table(["jitter", *LOSSES], rows)
+    print(text)
     print(f"rows kept: {100 * min(kept_shares):.2f} %; rate error: {max(rate_errors):.2f} ppm")
+    renew(options.output, "stamps", text)
 
 
 if __name__ == "__main__":

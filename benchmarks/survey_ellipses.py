@@ -1,6 +1,7 @@
 """Compare ellipses of position from the terms of a log with those of simulated surveys.
 
-    python benchmarks/survey_ellipses.py --output docs/how-to/survey-error-model.md
+    python benchmarks/survey_ellipses.py --output docs/how-to/survey-error-model.md \\
+        --figure docs/figures/survey-ellipses.png
 
 A gyro of known N, B and K is logged at rest, and `to_iscwsa` makes its terms from that log. welleng
 propagates them along a well. The truth is the scatter of surveys with the noise of the same gyro:
@@ -10,20 +11,16 @@ Needs welleng.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
-import sys
 import tempfile
 import textwrap
 import warnings
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 import numpy as np
 import welleng
-from page import renew
+from page import make_parser, renew, table
 
 from gyrostab import davar, fit_noise, make_log, make_noise, to_iscwsa
 from gyrostab.plot.style import COLOURS, INCH_MM, PAGE_MM, draws_figure, new_figure, save_png
@@ -214,9 +211,8 @@ def draw(curves: dict[str, list[np.ndarray]], generic: np.ndarray, own: np.ndarr
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--surveys", type=int, default=1000)
-    parser.add_argument("--output", type=Path)
     parser.add_argument("--figure", type=Path)
     options = parser.parse_args()
     depth, curves, models = make_well()[0], {}, {}
@@ -230,16 +226,15 @@ def main() -> None:
             ([], lambda term: not term["name"].startswith("GXY-G")),
         )
     )
-    lines = [
-        "1σ across the well [m]:\n",
-        "| survey | depth [m] | simulated surveys | terms of the log | ratio | generic OWSG |",
-        "|---|---|---|---|---|---|",
-    ]
+    head = ["survey", "depth [m]", "simulated surveys", "terms of the log", "ratio", "generic OWSG"]
+    rows = []
     for mode, values in curves.items():
         for k in (40, 60, 80, 100):
             truth, terms, owsg = (value[k] for value in values)
-            row = f"{truth:.3g} | {terms:.3g} | {terms / truth:.2f} | {owsg:.3g}"
-            lines.append(f"| {mode} | {depth[k]:.0f} | {row} |")
+            ratio = f"{terms / truth:.2f}"
+            rows.append(
+                [mode, f"{depth[k]:.0f}", f"{truth:.3g}", f"{terms:.3g}", ratio, f"{owsg:.3g}"]
+            )
     axes = [2.0 * np.sqrt(np.linalg.eigvalsh(part[-1])) for part in (own, generic)]
     (own_minor, own_major), (minor, major) = axes
     sentence = (
@@ -247,10 +242,9 @@ def main() -> None:
         f"g-dependent terms: {major:.0f} m and {minor:.0f} m as published, {own_major:.0f} m and "
         f"{own_minor:.0f} m with noise and bias of this gyro."
     )
-    lines += ["", textwrap.fill(sentence, 120)]
-    print(*lines, sep="\n")
-    if options.output:
-        renew(options.output, "ellipses", "\n".join(lines))
+    text = f"1σ across the well [m]:\n\n{table(head, rows)}\n\n{textwrap.fill(sentence, 120)}"
+    print(text)
+    renew(options.output, "ellipses", text)
     if options.figure:
         save_png(draw(curves, generic, own), options.figure)
 

@@ -6,23 +6,22 @@ last digit). pandas does so for ISO 8601 and whole numbers; its decimal stamps a
 files hold a cell ``****`` in one row of a thousand. pyarrow and pandas stop there unless they read
 the columns as text; they do so here, and convert no cell to a number.
 
-    python benchmarks/text_parsers.py [--rows N] [--rounds N]
+    python benchmarks/text_parsers.py --output docs/decisions/0007-text-parsing.md
 """
 
 from __future__ import annotations
 
-import argparse
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
+from page import in_new_process, machine, make_parser, memory, renew, table
 from pyarrow import csv
 
 from gyrostab.ingest.formats import text
@@ -75,7 +74,7 @@ def parsers(path: Path, shape: Shape) -> dict[str, Callable[[], int]]:
     """Return name -> function that parses the file and returns the number of rows."""
     options = ReadOptions()
     layout, plan = text._plan_file(path, options)
-    parser = BlockParser(layout, plan, options)
+    parser = BlockParser(layout, plan)
 
     def own() -> int:
         blocks = text._read_blocks(path, layout.offset)
@@ -113,62 +112,44 @@ def parsers(path: Path, shape: Shape) -> dict[str, Callable[[], int]]:
     return {"gyrostab": own, "pyarrow open_csv": stream, "pandas": frames}
 
 
-def peak_memory(name: str, path: Path, shape: Shape) -> float:
-    """Return by how much a parse of the file raises the peak memory of a new process [MiB]."""
-    call = [sys.executable, __file__, "--peak", name, str(path), shape.stamps, str(shape.columns)]
-    return float(subprocess.run(call, check=True, capture_output=True, text=True).stdout)
-
-
-def print_peak(name: str, path: str, stamps: str, columns: str) -> None:
-    """Run one parser and print by how much the peak memory of this process grew [MiB]."""
-    work = parsers(Path(path), Shape(stamps, int(columns), False))[name]
+def grown_memory(name: str, path: Path, shape: Shape) -> float:
+    """Return by how much one parse of the file raises the peak memory of this process [MiB]."""
+    work = parsers(path, shape)[name]
     before = memory("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")  # the peak begins here
     work()
-    print(memory("VmHWM") - before)
-
-
-def memory(key: str) -> float:
-    """Return a size of this process [MiB]."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith(key))
+    return memory() - before
 
 
 def main() -> None:
     """Print a table of CPU times and memory."""
-    options = argparse.ArgumentParser(description=__doc__)
+    options = make_parser(__doc__)
     options.add_argument("--rows", type=int, default=1_000_000)
-    options.add_argument("--rounds", type=int, default=5)
-    options.add_argument("--peak", nargs=4, help=argparse.SUPPRESS)
+    options.add_argument("--rounds", type=int, default=3)
     chosen = options.parse_args()
     pa.set_cpu_count(1)
-    if chosen.peak:
-        print_peak(*chosen.peak)
-        return
-    print("| file | parser | CPU [s] | ratio | peak memory [MiB] |\n|---|---|---|---|---|")
-    shapes = [
-        Shape(stamps, columns, damaged)
-        for damaged in (False, True)
-        for stamps in ("iso", "seconds", "microseconds")
-        for columns in (3, 11)
-    ]
+    rows = []
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "log.csv"
-        for shape in shapes:
+        for damaged, stamps, columns in product(
+            (False, True), ("iso", "seconds", "microseconds"), (3, 11)
+        ):
+            shape = Shape(stamps, columns, damaged)
             write_file(path, shape, chosen.rows)
             works = parsers(path, shape)
-            for work in works.values():
-                assert work() == chosen.rows
             best = dict.fromkeys(works, np.inf)
-            for _ in range(chosen.rounds):
+            for turn in range(chosen.rounds + 1):
                 for name, work in works.items():
                     begin = time.process_time()
-                    work()
-                    best[name] = min(best[name], time.process_time() - begin)
-            for name in works:
-                ratio = best[name] / best["gyrostab"]
-                grown = "" if shape.damaged else f"{peak_memory(name, path, shape):.0f}"
-                print(f"| {shape.name} | {name} | {best[name]:.2f} | {ratio:.1f} | {grown} |")
+                    assert work() == chosen.rows
+                    if turn:  # the first warms up
+                        best[name] = min(best[name], time.process_time() - begin)
+            peaks = [in_new_process(grown_memory, name, path, shape) for name in works]
+            cells = [f"{cpu:.2f} (x {cpu / best['gyrostab']:.1f})" for cpu in best.values()]
+            rows.append([shape.name, *cells, ", ".join(f"{peak:.0f}" for peak in peaks)])
+            print(*rows[-1], sep=" | ", flush=True)
+    text = f"{table(['file', *works, 'peak memory [MiB]'], rows)}\n\nCPU time [s]. {machine()}"
+    renew(chosen.output, "parsers", text)
 
 
 if __name__ == "__main__":

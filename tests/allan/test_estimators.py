@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
 from scipy.fft import dct
@@ -12,18 +10,14 @@ from scipy.linalg import toeplitz
 from gyrostab.allan import window_fit
 from gyrostab.kernels.spectra.expected import sample_covariance
 from gyrostab.noise import LAWS, TERMS
-from tests.support.scripts import ROOT, load_script
+from tests.support.scripts import load_script
 
 RATE, SAMPLES = 10.0, 400
 
 
 @pytest.fixture(scope="module")
 def estimators():
-    sys.path.insert(0, str(ROOT / "benchmarks"))
-    try:
-        yield load_script("benchmarks/estimators.py")
-    finally:
-        sys.path.remove(str(ROOT / "benchmarks"))
+    return load_script("benchmarks/estimators.py")
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import warnings
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import xarray as xr
 import gyrostab
 from gyrostab.io.datasets import to_netcdf
 from gyrostab.io.opening import open_log
+from tests.support.scripts import load_script
 from tests.support.stored import WRITERS, same_bits, stored_kinds
 
 
@@ -128,23 +128,11 @@ def test_ingest_writes_the_working_store(tmp_path, capsys):
 @pytest.mark.parametrize("form", ["nc", "zarr", "csv"])
 def test_a_small_archive(tmp_path, form):
     """Archives of `benchmarks`: overlaps, gaps in and between files, read as one log."""
-    sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-    import make_archive
-
-    sys.path.pop(0)
-    options = {
-        "hours": 0.1,
-        "rate": 50,
-        "axes": 2,
-        "file-hours": 0.025,
-        "gaps": 0.05,
-        "overlap": "5s",
-        "seed": 3,
-        "scale": 0.02,
-    }
-    given = [f"--{name}={value}" for name, value in {**options, "format": form}.items()]
-    files = make_archive.main([str(tmp_path / "a"), *given])
-    make_archive.main([str(tmp_path / "b"), *given])
+    archive = load_script("benchmarks/make_archive.py")
+    archive.GAP_SECONDS = (0.5, 2.0)
+    options = {"axes": "xy", "file_hours": 0.025, "gaps": 0.05, "overlap_s": 5.0}
+    files = archive.make_archive(tmp_path / "a", form, 0.1, 50, **options)
+    archive.make_archive(tmp_path / "b", form, 0.1, 50, **options)
     assert len(files) == 4
     log, second_log = (
         gyrostab.regularise(gyrostab.read_log(sorted((tmp_path / name).iterdir()))) for name in "ab"

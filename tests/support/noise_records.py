@@ -52,12 +52,29 @@ def flicker(rng: np.random.Generator, trials: int, n: int, *, B: float) -> NDArr
     return out
 
 
+def mixture(
+    rng: np.random.Generator, trials: int, n: int, *, rate: float, **terms: float
+) -> NDArray[np.float64]:
+    """Return the sum of Q, N, B and K, drawn in the order in which they are given."""
+    laws = {"Q": quantization, "N": white, "K": random_walk}
+    x = np.zeros((trials, n))
+    for term, value in terms.items():
+        if term == "B":
+            x += flicker(rng, trials, n, B=value)
+        else:
+            x += laws[term](rng, trials, n, **{term: value}, rate=rate)
+    return x
+
+
 def lose(
     rng: np.random.Generator, x: NDArray[np.float64], share: float, block: float
 ) -> NDArray[np.float64]:
     """Lose blocks of geometric length until `share` of each row is NaN."""
     for row in x:
-        while share and np.isnan(row).mean() < share:
+        lost = np.count_nonzero(np.isnan(row))
+        while share and lost / row.size < share:
             start = int(rng.integers(0, row.size))
-            row[start : start + int(rng.geometric(1 / block))] = np.nan
+            piece = row[start : start + int(rng.geometric(1 / block))]
+            lost += np.count_nonzero(np.isfinite(piece))
+            piece[:] = np.nan
     return x
