@@ -1,18 +1,16 @@
 """Kill, damage, starve and disturb the commands that write, and count the losses.
 
-Writes the table of docs/durability.md.
-
-    python benchmarks/durability.py [--kills 50] [--seed 1] [--minutes 8] [--write
-    docs/durability.md]
+    python benchmarks/durability.py --output docs/durability.md
 
 Every trial is a child of this process, which has loaded and compiled all that it needs. A kill is
-SIGKILL at a moment drawn evenly over the time that an undisturbed command takes. The log is short;
-`gyrostab run` cuts it into parts of one unit of work, so that it has as many as a long log.
+SIGKILL, also of worker processes, at a moment drawn evenly over the time that an undisturbed
+command takes. The log is short; `gyrostab run` cuts it into parts of one unit of work, and stores
+each at once, so that it has as many as a long log. Needs root, for the full disk and the locked
+folder.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import os
@@ -24,19 +22,22 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from page import make_parser, renew, table
 
 QUIET = "--quiet-progress"
 WINDOW = ("--window", "4000samples", "--step", "4000samples", "--taus", "12", "--workers", "1")
 DIAGNOSE = ("--nulls", "100", "--seed", "1", "--workers", "1")
-_AFTER_KILL = {"run": " with `--resume`", "diagnose": " (one time in five)"}
-_FINISHED = (
-    5  # one in so many killed diagnoses is made again: it takes long, and begins from nothing
-)
-START, END = "<!-- durability: begin -->", "<!-- durability: end -->"
+PROCESSES = ("--scheduler", "processes")
+COMMANDS = {
+    "run": (["run", "log.nc", *WINDOW, QUIET], "product.nc"),
+    "ingest": (["ingest", "log.csv", QUIET], "log.nc"),
+    "diagnose": (["diagnose", "short.nc", *DIAGNOSE, QUIET], "found"),
+}
 
 
 class Outcome(NamedTuple):
@@ -57,8 +58,8 @@ class Trials:
         if not good:
             self.wrong.append(detail)
 
-    def row(self) -> str:
-        return f"| {self.what} | {self.count} | {self.expected} | {self.count - len(self.wrong)} |"
+    def row(self) -> list[object]:
+        return [self.what, self.count, self.expected, self.count - len(self.wrong)]
 
 
 def write_inputs(folder: Path) -> None:
@@ -126,7 +127,7 @@ def read_tree(folder: Path) -> dict[str, bytes]:
     }
 
 
-def is_hidden(folder: Path, name: str) -> bool:
+def is_hidden(name: str) -> bool:
     """Whether what lies next to an output is a leftover or the folder of a run."""
     from gyrostab.store.output import is_leftover
 
@@ -137,39 +138,28 @@ class Bench:
     """The inputs, undisturbed outputs, and how long they took."""
 
     def __init__(self, folder: Path, seed: int):
-        self.inputs, self.folder, self.draw = (
-            folder / "inputs",
-            folder / "trials",
-            random.Random(seed),
-        )
+        from gyrostab.cli import main
+
+        self.inputs, self.folder = folder / "inputs", folder / "trials"
+        self.draw, self.reused = random.Random(seed), 0
         self.inputs.mkdir()
         self.folder.mkdir()
         write_inputs(self.inputs)
-        self.commands = {
-            "run": (["run", self.inputs / "log.nc", *WINDOW, QUIET], "product.nc"),
-            "ingest": (["ingest", self.inputs / "log.csv", QUIET], "log.nc"),
-            "diagnose": (["diagnose", self.inputs / "short.nc", *DIAGNOSE, QUIET], "found"),
-        }
-        from gyrostab.cli import main
-
-        self.whole, self.seconds = {}, {}
-        for name, (command, output) in self.commands.items():
-            with contextlib.redirect_stdout(io.StringIO()):
-                assert (
-                    main(
-                        [
-                            *map(str, command),
-                            "-o",
-                            str(folder / f"first-{name}{Path(output).suffix}"),
-                        ]
-                    )
-                    == 0
-                )  # loads and compiles
+        self.commands, self.whole, self.seconds = {}, {}, {}
+        for name, ((word, log, *options), output) in COMMANDS.items():
+            command = [word, self.inputs / log, *options]
+            self.commands[name] = command, output
+            with contextlib.redirect_stdout(io.StringIO()):  # loads and compiles
+                first = folder / f"first-{name}{Path(output).suffix}"
+                assert main([*map(str, command), "-o", str(first)]) == 0
             begun = time.perf_counter()
             outcome = call(*command, "-o", folder / f"{name}-{output}")
             self.seconds[name] = time.perf_counter() - begun
             assert outcome.code == 0, outcome.message
             self.whole[name] = self.content(name, folder / f"{name}-{output}")
+        begun = time.perf_counter()
+        assert call(*self.commands["run"][0], *PROCESSES, "-o", folder / "processes.nc").code == 0
+        self.seconds["processes"] = time.perf_counter() - begun
 
     def content(self, name: str, output: Path) -> object:
         """Return what is compared of an output: all bytes, but of a diagnosis only its content."""
@@ -193,45 +183,53 @@ class Bench:
         yield folder
         shutil.rmtree(folder)
 
-    def kill(self, name: str, kills: int, deadline: float) -> Trials:
-        """Kill a command at random moments; then let it finish, and compare."""
+    def kill(self, name: str, kills: int) -> Trials:
+        """Kill a command at random moments; then let it finish, and compare.
+
+        Two of three runs are killed again when they continue; one in three has worker processes.
+        """
         command, output = self.commands[name]
-        resume_flags = ["--resume"] if name == "run" else []
-        trials = Trials(f"`kill -9` of `{name}` at a random moment, then the same "
-                        f"command{_AFTER_KILL.get(name, '')}",
-                        "no output or the whole one after the kill, inputs unchanged, the same "
-                        "output in the end")  # fmt: skip
+        after_kill = " with `--resume`" if name == "run" else ""
+        trials = Trials(
+            f"`kill -9` of `{name}` at random moments, then the same command{after_kill}",
+            "no output or the whole one after the kill, inputs unchanged, the same output in the "
+            "end",
+        )
         inputs = read_tree(self.inputs)
-        while trials.count < kills and time.monotonic() < deadline:
+        while trials.count < kills:
+            seconds, options, flags = self.seconds[name], (), []
+            if name == "run":
+                flags = ["--resume"]
+                if trials.count % 3 == 2:
+                    seconds, options = self.seconds["processes"], PROCESSES
             with self.trial() as folder:
                 target = folder / output
-                begun = begin(*command, "-o", target)
-                time.sleep(self.draw.uniform(0.0, self.seconds[name]))
-                with contextlib.suppress(ProcessLookupError):
-                    os.killpg(begun[0], signal.SIGKILL)
-                if finish(begun).code != -signal.SIGKILL:
+                for _ in range(1 + trials.count % 3 if name == "run" else 1):
+                    begun = begin(*command, "-o", target, *options, *flags)
+                    time.sleep(self.draw.uniform(0.0, seconds))
+                    with contextlib.suppress(ProcessLookupError):
+                        os.killpg(begun[0], signal.SIGKILL)
+                    is_killed = finish(begun).code == -signal.SIGKILL
+                    if not is_killed:
+                        break
+                if not is_killed:
                     continue  # it was faster
+                self.reused += len(list(folder.glob(".*.job/*.block")))
                 after = self.content(name, target)
-                strange = [
-                    item.name
-                    for item in folder.iterdir()
-                    if item.name != output and not is_hidden(folder, item.name)
-                ]
-                flags = resume_flags or (["--overwrite"] if after is not None else [])
-                good = (
+                names = {item.name for item in folder.iterdir()} - {output}
+                strange = [item for item in names if not is_hidden(item)]
+                if after is not None and name != "run":
+                    flags = ["--overwrite"]
+                outcome = call(*command, "-o", target, *options, *flags)
+                trials.add(
                     after in (None, self.whole[name])
                     and not strange
                     and read_tree(self.inputs) == inputs
+                    and outcome.code == 0
+                    and self.content(name, target) == self.whole[name]
+                    and (name != "run" or len(list(folder.iterdir())) == 1),
+                    f"{name}: left {strange}, {outcome}",
                 )
-                outcome = None
-                if name != "diagnose" or trials.count % _FINISHED == 0:
-                    outcome = call(*command, "-o", target, *flags)
-                    good = (
-                        good
-                        and outcome.code == 0
-                        and self.content(name, target) == self.whole[name]
-                    )
-                trials.add(good, f"{name}: left {strange}, {outcome}")
         return trials
 
     def interrupted_run(self, folder: Path, parts: int = 3) -> Path:
@@ -241,7 +239,6 @@ class Bench:
         def arm() -> None:
             from gyrostab.jobs import checkpoint, engine
 
-            engine._MAX_HELD_SECONDS = 0.0
             done = []
 
             def write(*arguments: object, **options: object) -> object:
@@ -283,80 +280,53 @@ class Bench:
         return kinds
 
     def full_disk(self, count: int) -> Trials:
-        """Write to a full file system: a small tmpfs where possible, else a file size limit."""
-        import resource
-
+        """Write to a full file system, a small tmpfs."""
         mount = self.folder / "small"
         mount.mkdir()
         trials = Trials(
             "disk full (tmpfs of random size), `run` and `ingest`",
             "exit code 2, one message, no output, the old output unchanged",
         )
-        size = {name: len(self.whole[name]) for name in ("run", "ingest")}
         for number in range(count):
             name = ("run", "ingest")[number % 2]
             command, output = self.commands[name]
-            room = int(size[name] * self.draw.uniform(0.1, 0.9)) // 4096 * 4096 + 4096
-            mounted = (
-                subprocess.run(
-                    ["mount", "-t", "tmpfs", "-o", f"size={room}", "tmpfs", mount],
-                    capture_output=True,
-                ).returncode
-                == 0
+            room = int(len(self.whole[name]) * self.draw.uniform(0.1, 0.9)) // 4096 * 4096 + 4096
+            subprocess.run(
+                ["mount", "-t", "tmpfs", "-o", f"size={room}", "tmpfs", mount], check=True
             )
-            if not mounted:
-                trials.what = trials.what.replace(
-                    "tmpfs of random size", "by a limit of the file size"
-                )
-            try:
-                old = mount / output
-                if number % 4 > 1:
-                    old.write_text("old")
-                limit = (
-                    None
-                    if mounted
-                    else (lambda room=room: resource.setrlimit(resource.RLIMIT_FSIZE, (room, room)))
-                )
-                outcome = call(*command, "-o", old, "--overwrite", before=limit)
-                is_kept = old.read_text() == "old" if number % 4 > 1 else not old.exists()
-                left = [
-                    item.name
-                    for item in mount.iterdir()
-                    if item.name != output and not item.name.endswith(".job")
-                ]
-                has_one_line = (
-                    sum(not line.startswith("note: ") for line in outcome.message.splitlines()) == 1
-                )
-                trials.add(
-                    outcome.code == 2
-                    and is_kept
-                    and not left
-                    and has_one_line
-                    and "cannot be written" in outcome.message,
-                    f"{name}: {left}, {outcome}",
-                )
-            finally:
-                if mounted:
-                    subprocess.run(["umount", mount], check=True)
-                else:
-                    shutil.rmtree(mount)
-                    mount.mkdir()
+            old, has_old = mount / output, number % 4 > 1
+            if has_old:
+                old.write_text("old")
+            outcome = call(*command, "-o", old, "--overwrite")
+            is_kept = old.read_text() == "old" if has_old else not old.exists()
+            names = {item.name for item in mount.iterdir()} - {output}
+            left = [name for name in names if not name.endswith(".job")]
+            lines = [line for line in outcome.message.splitlines() if not line.startswith("note: ")]
+            trials.add(
+                outcome.code == 2
+                and is_kept
+                and not left
+                and len(lines) == 1
+                and "cannot be written" in outcome.message,
+                f"{name}: {left}, {outcome}",
+            )
+            subprocess.run(["umount", mount], check=True)
         return trials
 
     def read_only(self) -> Trials:
-        """Write into a folder without permission, as another user where this one is root."""
+        """Write, as another user, into a folder without permission."""
         trials = Trials(
             "output in a folder without permission to write",
             "exit code 2, one message, nothing written",
         )
         for name, (command, output) in self.commands.items():
             with self.trial() as folder:
-                (folder / "locked").mkdir(mode=0o555)
-                user = (lambda: os.seteuid(65534)) if os.geteuid() == 0 else None
+                locked = folder / "locked"
+                locked.mkdir(mode=0o555)
                 self.folder.parent.chmod(0o755), self.folder.chmod(0o755), folder.chmod(0o755)
-                outcome = call(*command, "-o", folder / "locked" / output, before=user)
+                outcome = call(*command, "-o", locked / output, before=lambda: os.seteuid(65534))
                 trials.add(
-                    outcome.code == 2 and not list((folder / "locked").iterdir()),
+                    outcome.code == 2 and not list(locked.iterdir()),
                     f"{name}: {outcome}",
                 )
         return trials
@@ -422,66 +392,42 @@ class Bench:
         return kinds
 
 
-def publish(page: Path, trials: list[Trials], summary: str) -> None:
-    """Put the table between the two marks of a page."""
-    table = [
-        "| what was done | trials | what must follow | so it was |",
-        "|---|---|---|---|",
-        *(kind.row() for kind in trials),
-    ]
-    text = page.read_text()
-    head, tail = text.partition(START)[0], text.partition(END)[2]
-    page.write_text(f"{head}{START}\n{summary}\n\n" + "\n".join(table) + f"\n{END}{tail}")
-
-
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument(
-        "--minutes", type=float, default=20.0, help="longest time for the kills of each command"
-    )
-    parser.add_argument("--write", type=Path)
     given = parser.parse_args()
     os.environ["SOURCE_DATE_EPOCH"] = "1700000000"
     from gyrostab.allan.davar import davar_parts
+    from gyrostab.jobs import engine
 
     davar_parts.__kwdefaults__["samples"] = 1
+    engine._MAX_HELD_SECONDS = 0.0
     with tempfile.TemporaryDirectory() as name:
         bench = Bench(Path(name), given.seed)
-        print(
-            {command: f"{seconds:.2f} s" for command, seconds in bench.seconds.items()}, flush=True
-        )
+        times = [f"`{command}` {seconds:.1f} s" for command, seconds in bench.seconds.items()]
+        print(*times, flush=True)
         trials: list[Trials] = []
         steps: list[Callable[[], Trials | list[Trials]]] = [
+            *(partial(bench.kill, command, given.kills) for command in bench.commands),
             lambda: bench.damage(10),
             lambda: bench.full_disk(12),
             bench.read_only,
             lambda: bench.changed_input(10),
             lambda: bench.two_at_once(10),
         ]
-        kills = [
-            lambda name=name: bench.kill(name, given.kills, time.monotonic() + 60 * given.minutes)
-            for name in bench.commands
-        ]
-        for step in (*kills, *steps):
+        for step in steps:
             result = step()
             for kind in result if isinstance(result, list) else [result]:
                 trials.append(kind)
-                print(kind.row(), *kind.wrong, sep="\n", flush=True)
-    if given.write:
-        seconds = ", ".join(
-            f"`{command}` {value:.1f} s" for command, value in bench.seconds.items()
-        )
-        publish(
-            given.write,
-            trials,
-            f"Made by `python benchmarks/durability.py --kills {given.kills} --seed {given.seed} "
-            f"--minutes {given.minutes:g}`;"
-            f"\nundisturbed, {seconds}.",
-        )
+                print(*kind.row(), *kind.wrong, sep="\n", flush=True)
+    head = ["what was done", "trials", "what must follow", "so it was"]
+    text = (
+        f"Made by `python benchmarks/durability.py --kills {given.kills} --seed {given.seed}`;\n"
+        f"undisturbed, {', '.join(times)}. The killed runs reused {bench.reused} finished parts."
+        f"\n\n{table(head, [kind.row() for kind in trials])}"
+    )
+    renew(given.output, "durability", text)
     return 1 if any(kind.wrong for kind in trials) else 0
 
 
