@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,7 @@ from gyrostab.jobs.fleet_table import read_table
 from gyrostab.jobs.run import run
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool, run_calls
 from tests.support.crashing import WINDOW, WINDOW_OPTIONS
+from tests.support.stored import CHUNK, counts_log, spoil
 
 distributed = pytest.importorskip("distributed")
 PARTS = 5
@@ -181,6 +182,26 @@ def assert_same_arrays(left: Path, right: Path) -> None:
         xr.open_dataset(right, decode_times=False) as b,
     ):
         xr.testing.assert_equal(a, b)
+
+
+def test_a_worker_tells_the_client_of_a_damaged_chunk(address, tmp_path):
+    path = to_zarr(counts_log(samples=2 * CHUNK), tmp_path / "log.zarr")
+    spoil(path, 1, 1, how="remove")
+
+    def compute(client):
+        rates = client.compute(log.rate.data).result()
+        time.sleep(1.0)  # the message takes its own way
+        return rates
+
+    missing = r"axis y: the chunk from .* is missing: no file rate/1\.1"
+    with (
+        distributed.Client(address) as client,
+        open_log(path) as log,
+        pytest.warns(UserWarning, match=missing),
+    ):
+        rates = compute(client)
+    assert np.isnan(rates[1, CHUNK:]).all()
+    assert not np.isnan(rates[1, :CHUNK]).any()
 
 
 def test_a_killed_worker_does_not_lose_the_run(address, log, whole, tmp_path, monkeypatch):
@@ -367,8 +388,12 @@ def test_a_scheduler_that_dies_is_explained_and_resume_goes_on(
     assert [path.name for path in output.parent.iterdir()] == [output.name]
 
 
-def test_a_fleet_whose_scheduler_dies_goes_on(tmp_path, monkeypatch, capfd):
-    """The message says how many runs are done, and the same command computes the others."""
+@pytest.mark.parametrize("is_real", [False, pytest.param(True, marks=pytest.mark.full)])
+def test_a_fleet_whose_scheduler_dies_goes_on(tmp_path, monkeypatch, capfd, is_real):
+    """The message says how many runs are done, and the same command computes the others.
+
+    The test above has the error that the death of a real scheduler causes.
+    """
     for number in range(6):
         folder = tmp_path / "archive" / f"run{number}"
         folder.mkdir(parents=True)
@@ -377,12 +402,15 @@ def test_a_fleet_whose_scheduler_dies_goes_on(tmp_path, monkeypatch, capfd):
     command += [*WINDOW_OPTIONS]
     monkeypatch.setattr(schedule, "_CONNECT_TIMEOUT_S", 4.0)  # also that of a reconnection
     real = fleet.run_calls
-    with start_cluster(tmp_path, workers=1) as (address, scheduler):
+    cluster = start_cluster(tmp_path, workers=1) if is_real else nullcontext(("threads", None))
+    with cluster as (address, scheduler):
 
         def kill_after_two(pool, calls):
             for number, answer in enumerate(real(pool, calls)):
                 yield answer
                 if number == 1:
+                    if not is_real:
+                        raise WorkerError("the dask scheduler has died")
                     os.killpg(scheduler.pid, signal.SIGKILL)
                     scheduler.wait()
 

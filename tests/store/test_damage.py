@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-import time
 import warnings
 
 import dask
@@ -190,37 +189,6 @@ def test_a_damaged_store_goes_on_to_a_product(tmp_path):
     assert (coverage[0, 5:10] == 0).all()
     assert (coverage[1] == 1).all()
     assert (coverage[0, 10:] == 1).all()
-
-
-def test_a_worker_of_a_cluster_tells_the_client(tmp_path):
-    distributed = pytest.importorskip("distributed")
-    path = to_zarr(counts_log(samples=2 * CHUNK), tmp_path / "log.zarr")
-    spoil(path, 1, 1, how="remove")
-    settings = {
-        "n_workers": 1,
-        "threads_per_worker": 2,
-        "processes": True,
-        "dashboard_address": None,
-        "memory_limit": 0,
-    }
-
-    def compute(client):
-        rates = client.compute(log.rate.data).result()
-        time.sleep(1.0)  # the message takes its own way
-        return rates
-
-    with (
-        distributed.LocalCluster(**settings) as cluster,
-        distributed.Client(cluster) as client,
-        open_log(path) as log,
-    ):
-        with pytest.warns(
-            UserWarning, match=r"axis y: the chunk from .* is missing: no file rate/1\.1"
-        ):
-            rates = compute(client)
-        assert client.scheduler_info(n_workers=-1)["workers"]
-    assert np.isnan(rates[1, CHUNK:]).all()
-    assert not np.isnan(rates[1, :CHUNK]).any()
 
 
 def test_what_stands_behind_a_chunk_that_is_cut_short_is_not_read():
