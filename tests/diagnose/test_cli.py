@@ -155,18 +155,23 @@ def test_python_opens_the_output_folder(folder: Path):
     )
 
 
-def test_noise_without_channels_has_no_mismatch():
+def test_noise_without_channels_has_no_mismatch_and_a_constant_axis_is_left_out():
     labels: list[str] = []
-    diagnosis = diagnose(
-        white(seconds=600.0, seed=2),
-        nulls=100,
-        block="20s",
-        progress=lambda label, *rest, **more: labels.append(label),
-    )
+    log = white(2, seed=2)
+    log["rate"][1] = 3.0
+    with pytest.warns(UserWarning, match="the same on axis y: left out"):
+        diagnosis = diagnose(
+            log,
+            nulls=100,
+            block="20s",
+            progress=lambda label, *rest, **more: labels.append(label),
+        )
     check_diagnosis(diagnosis.content)
     assert diagnosis.verdict == "no mismatch"
     assert diagnosis.effects == []
     assert diagnosis.content["recording"]["channels"] == []
+    assert diagnosis.content["recording"]["axes"] == ["x"]
+    assert list(diagnosis.content["baseline"]["noise"]) == ["x"]
     assert diagnosis.content["not_found"]["shupe"]["upper_limit"] is None
     assert list(dict.fromkeys(labels)) == [
         "reducing",
@@ -175,25 +180,12 @@ def test_noise_without_channels_has_no_mismatch():
         "naming",
         "fitting",
     ]
+    with pytest.raises(SchemaError, match="the same on axis y: without noise"):
+        diagnose(log.isel(axis=[1]), nulls=100)
 
 
 # --------------------------------------------------------------------------------
 # manners
-
-
-def test_constant_axis_is_left_out():
-    log = white(2)
-    log["rate"][1] = 3.0
-    with pytest.warns(UserWarning, match="the same on axis y: left out"):
-        diagnosis = diagnose(log, nulls=100, seed=1)
-    assert diagnosis.verdict == "no mismatch"
-    assert (
-        diagnosis.content["recording"]["axes"]
-        == list(diagnosis.content["baseline"]["noise"])
-        == ["x"]
-    )
-    with pytest.raises(SchemaError, match="the same on axis y: without noise"):
-        diagnose(log.isel(axis=[1]), nulls=100)
 
 
 def test_existing_folder_is_kept(folder: Path, recording: Path, capfd: pytest.CaptureFixture[str]):

@@ -10,6 +10,7 @@ from gyrostab.diagnose.result.diagnosis import Diagnosis
 from gyrostab.simulate import simulate
 
 N = 0.003  # deg/sqrt(h)
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")

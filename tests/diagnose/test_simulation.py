@@ -68,7 +68,8 @@ def test_steady_effects_of_the_simulation_are_not_mismatches(seed):
     assert diagnosis.verdict == "no mismatch"
 
 
-@pytest.mark.parametrize("lacking", ["shared_source", pytest.param("line", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("lacking", ["shared_source", "line"])
 def test_effect_in_addition_to_the_simulation_is_identified(lacking):
     names = ("shared_source", "line", "bump")
     simulation = simulate_axes(111, *(name for name in names if name != lacking))

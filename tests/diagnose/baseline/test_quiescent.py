@@ -52,10 +52,9 @@ def test_quiet_time_scales_the_noise_of_a_model():
     recording = log(effects=[SHAKE_NOISE], environment=[SHAKEN])
     blocks = reduce_log(recording)
     model = {"noise": {name: 0.8 * size for name, size in NOISE.items()}, "effect": [SHAKE_NOISE]}
-    raw, scaled = (
-        baseline_from_model(blocks, model),
-        baseline_from_model(blocks, model, quiet=(0.0, 1100.0)),
-    )
+    raw = baseline_from_model(blocks, model)
+    with pytest.warns(UserWarning, match=r"simulation is multiplied by 1\.[23]\d* on axis x"):
+        scaled = baseline_from_model(blocks, model, quiet=(0.0, 1100.0))
     assert value_of(raw, "N") == (pytest.approx(0.0024), 0.0)
     for term, size in NOISE.items():
         value, error = value_of(scaled, term)
@@ -106,6 +105,7 @@ def test_a_simulated_log_is_scaled_to_quiet_time():
     ]
 
 
+@pytest.mark.slow
 def test_a_simulation_and_quiet_time_can_be_combined():
     recording = log({"N": 0.003}, duration="15min")
     with pytest.warns(UserWarning, match=r"simulation is multiplied by 1\.[45]\d* on axis x"):

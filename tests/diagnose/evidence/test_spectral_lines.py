@@ -160,8 +160,8 @@ def test_another_line_in_a_free_band_changes_the_evidence_of_lines_only() -> Non
 
 def test_more_lines_than_are_named_do_not_end_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(selection, "MAX_LINES", 1)
-    blocks = sines({0.7: 0.3, 2.03: 0.25}, size=12_000, jump=0.25)
-    baseline, records = nulls(blocks, 40)
+    blocks = sines({0.7: 0.3, 2.03: 0.25}, size=12_000, axes=1, jump=0.25)
+    baseline, records = nulls(blocks, 20)
     identified = name_effects(blocks, baseline, records).identified
     assert sorted(identification.effect for identification in identified) == [
         "bias_jump",

@@ -14,6 +14,7 @@ from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.simulate import simulate
 from tests.support.candidates import find_components
+from tests.support.repetitions import first_of
 
 SHAKE = {
     "profile": "vibration",
@@ -37,7 +38,7 @@ def shaken_log(seed: int, effects: tuple[dict[str, object], ...]) -> xr.Dataset:
 WALK = {"name": "vibration_random_walk", "sensitivity": 0.15}
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", first_of(1, 2, 3))
 def test_levels_between_quiescent_stretches_are_no_random_walk(seed: int) -> None:
     baseline = calibrate_noise(reduce_log(shaken_log(seed, (WALK,))))
     K = baseline.sel(axis="x", term="K")
@@ -45,7 +46,7 @@ def test_levels_between_quiescent_stretches_are_no_random_walk(seed: int) -> Non
     assert float(K.coefficient) + 3.0 * float(K.stderr) < 0.25
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", first_of(1, 2, 3))
 def test_walk_under_vibration_has_evidence_in_the_means(seed: int) -> None:
     evidence = []
     for effects in ((WALK,), ()):
@@ -63,6 +64,7 @@ def test_walk_under_vibration_has_evidence_in_the_means(seed: int) -> None:
     assert evidence[1] < 3.0
 
 
+@pytest.mark.slow
 def test_walk_under_vibration_is_named_and_sized() -> None:
     found = diagnose(shaken_log(2, (WALK,)), nulls=100)
     assert found.verdict == "explained"

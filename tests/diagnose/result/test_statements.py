@@ -22,6 +22,7 @@ from gyrostab.ingest.make_log import make_log
 from gyrostab.physics.registry import make_effect
 from tests.support.diagnosed import content, model, surfaces
 from tests.support.named import nulls
+from tests.support.repetitions import first_of
 
 RATE = 50.0
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -41,9 +42,7 @@ def shaken_blocks(seed: int, *, band_hz: tuple[float, float] | None) -> xr.Datas
     return reduce_log(log, block="20s")
 
 
-@pytest.mark.parametrize(
-    "seed", [1, *(pytest.param(seed, marks=pytest.mark.full) for seed in (2, 3))]
-)
+@pytest.mark.parametrize("seed", first_of(1, 2, 3))
 @pytest.mark.parametrize("band_hz", [None, (600.0, 725.0)])
 def test_only_known_frequencies_of_aliased_vibration_are_stated(
     seed: int, band_hz: tuple[float, float] | None
@@ -140,7 +139,7 @@ def test_coarse_grid_of_angles_is_stated_beside_what_is_not_explained() -> None:
     assert "angle counter" in str(Diagnosis(made, surfaces(), model()))
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.full)])
+@pytest.mark.parametrize("seed", first_of(1, 2))
 def test_coarse_angle_counter_is_recognised(seed: int) -> None:
     """Two values of the log: the counter advances by a step in some samples only."""
     rng = np.random.default_rng(seed)

@@ -14,16 +14,19 @@ from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.identifiability import keep_physical
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.linear_model import State, initial_state
+from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.diagnose.statistics.jump_forms import is_free_jump
 from gyrostab.ingest.make_log import make_log
 from tests.support.candidates import find_components, winning_forms
+from tests.support.repetitions import first_of
 
 MODEL = {"noise": {"N": 0.003, "B": 0.004, "K": 0.02}, "log": {"axes": ["x", "y"]}}
 MIDDLE = 905.0  # inside a block
 RATE = 2.0
 RESTARTS = ((3000.0, 3090.0), (6200.0, 6500.0), (8500.0, 8560.0))
+SIZES = np.array([(1.6, -1.9, 1.1), (-1.1, 1.7, -2.0)])  # of the jumps at the restarts, x and y
 
 
 def try_jumps(blocks: xr.Dataset, baseline: xr.Dataset) -> tuple[Candidate, State]:
@@ -120,37 +123,40 @@ def levels(sizes: tuple[float, ...], times: tuple[float, ...], seconds: float) -
     return sum(size * (second >= at) for size, at in zip(sizes, times, strict=True))
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", first_of(1, 2, 3))
 def test_jumps_at_every_restart_compete_as_one_design(seed: int) -> None:
     """One jump alone is no larger than the random walk that would explain the others."""
     times = tuple(end for _, end in RESTARTS)
-    steps = np.stack(
-        [levels(sizes, times, 10_800.0) for sizes in ((1.6, -1.9, 1.1), (-1.1, 1.7, -2.0))]
-    )
+    steps = np.stack([levels(tuple(row), times, 10_800.0) for row in SIZES])
     blocks = reduce_log(drifting_log(seed, steps, RESTARTS))
     jumps, state = try_jumps(blocks, calibrate_noise(blocks))
     components = find_components([jumps], state)[jumps.key]
     assert {component.row for component in components} == {("x",), ("y",)}
     assert all(len(component.variant.columns) == 3 for component in components)
     assert sum_evidence(components) > 15.0
+    for component in components:
+        mean, covariance = component_mixture(component, state).moments()
+        error = np.sqrt(np.diag(covariance))
+        assert (np.abs(mean - SIZES["xy".index(component.row[0])]) < 4.0 * error).all()
+        assert (error < 0.5).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1])
 def test_jumps_at_all_restarts_are_sized(seed: int) -> None:
     times = tuple(end for _, end in RESTARTS)
-    sizes = np.array([(1.6, -1.9, 1.1), (-1.1, 1.7, -2.0)])
-    steps = np.stack([levels(tuple(row), times, 10_800.0) for row in sizes])
+    steps = np.stack([levels(tuple(row), times, 10_800.0) for row in SIZES])
     found = diagnose(drifting_log(seed, steps, RESTARTS), nulls=100)
     assert [effect["name"] for effect in found.effects] == ["bias_jump"] * 3
     assert [effect["at"] for effect in found.model["effect"]] == list(times)
-    for effect, truth in zip(found.effects, sizes.T, strict=True):
+    for effect, truth in zip(found.effects, SIZES.T, strict=True):
         for axis, size in zip(("x", "y"), truth, strict=True):
             estimate = effect["parameters"][f"step.{axis}"]
             assert abs(estimate["value"] - size) < 4.0 * estimate["stderr"]
             assert estimate["stderr"] < 0.5
 
 
-@pytest.mark.parametrize("seed", [2, pytest.param(3, marks=pytest.mark.full)])
+@pytest.mark.parametrize("seed", first_of(2, 3))
 def test_two_jumps_beat_a_course_of_levels(seed: int) -> None:
     steps = levels((2.6, -2.1), (9500.0, 11_800.0), 14_400.0)[None]
     found = diagnose(drifting_log(seed, steps, ()), nulls=100)
