@@ -9,17 +9,21 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.core import diagnose
+from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.identify.ambiguity import find_equivalent_effects
 from gyrostab.diagnose.identify.components import sum_evidence
+from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import keep_physical
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.result.tables import effect_tables
 from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.diagnose.statistics.jump_forms import is_free_jump
 from gyrostab.ingest.make_log import make_log
 from tests.support.candidates import find_components, winning_forms
+from tests.support.named import nulls
 from tests.support.repetitions import first_of
 
 MODEL = {"noise": {"N": 0.003, "B": 0.004, "K": 0.02}, "log": {"axes": ["x", "y"]}}
@@ -159,11 +163,13 @@ def test_jumps_at_all_restarts_are_sized(seed: int) -> None:
 @pytest.mark.parametrize("seed", first_of(2, 3))
 def test_two_jumps_beat_a_course_of_levels(seed: int) -> None:
     steps = levels((2.6, -2.1), (9500.0, 11_800.0), 14_400.0)[None]
-    found = diagnose(drifting_log(seed, steps, ()), nulls=100)
+    blocks = reduce_log(drifting_log(seed, steps, ()))
+    baseline, records = nulls(blocks, 10)
+    fitted = fit_identifications(name_effects(blocks, baseline, records), baseline)
     sizes = {
-        effect["parameters"]["at"]["value"]: effect["parameters"]["step"]
-        for effect in found.effects
-        if effect["name"] == "bias_jump"
+        table["parameters"]["at"]["value"]: table["parameters"]["step"]
+        for table in effect_tables(fitted, blocks)
+        if table["name"] == "bias_jump"
     }
     assert len(sizes) == 2
     for (at, estimate), truth_at, truth in zip(
