@@ -48,7 +48,7 @@ def test_only_known_frequencies_of_aliased_vibration_are_stated(
     seed: int, band_hz: tuple[float, float] | None
 ) -> None:
     blocks = shaken_blocks(seed, band_hz=band_hz)
-    baseline, records = nulls(blocks, 30)
+    baseline, records = nulls(blocks, 10)
     identifications = name_effects(blocks, baseline, records)
     (table,) = effect_tables(fit_identifications(identifications, baseline), blocks)
     assert table["name"] == "aliased_vibration"
