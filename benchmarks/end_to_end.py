@@ -16,6 +16,8 @@ it stands the same by gyrostab's own reader, chunk by chunk through dask.
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import tempfile
 import time
 from collections.abc import Callable
@@ -148,7 +150,9 @@ def run_whole(terms: str, files: list[Path], workers: int, repeat: int) -> Timin
         options += ["-o", f"{folder}/product.nc", "--overwrite", "--quiet-progress"]
 
         def work(names: list[Path]) -> None:
-            if code := command(["run", *map(str, names), *options]):
+            with contextlib.redirect_stdout(io.StringIO()):
+                code = command(["run", *map(str, names), *options])
+            if code:
                 raise SystemExit(code)
 
         work(files[:1])
