@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincinv, logsumexp
+from scipy.special import gammaincinv
 
 from gyrostab.kernels.spectra.line_levels import LEAK_LINES, level_around
 from gyrostab.kernels.spectra.periodogram import ordinates, taper
@@ -190,8 +190,8 @@ def sine_factors(ratio: Array, count: Array | float) -> Array:
     >>> sine_factors(np.array([1.0, 40.0]), 1).round(1).tolist()  # noise, and a sine of 39 nats
     [-2.6, 33.8]
     """
-    log_factors = [
-        count * (ratio * strength / (count + strength) - np.log1p(strength / count))
-        for strength in _STRENGTHS
-    ]
-    return np.asarray(logsumexp(log_factors, axis=0) - math.log(len(_STRENGTHS)))
+    total = np.full(np.broadcast_shapes(np.shape(ratio), np.shape(count)), -np.inf)
+    for strength in _STRENGTHS:  # one at a time: there are millions of ratios
+        factor = count * (ratio * strength / (count + strength) - np.log1p(strength / count))
+        np.logaddexp(total, factor, out=total)
+    return total - math.log(len(_STRENGTHS))
