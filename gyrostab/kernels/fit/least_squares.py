@@ -34,6 +34,7 @@ from gyrostab.kernels.fit.mixture import (
     observe,
     root_squares,
     root_units,
+    whole_degrees_of_freedom,
 )
 from gyrostab.kernels.fit.submodels import FIT_FIELDS, average_submodels, make_submodels
 
@@ -220,8 +221,22 @@ def cell_freedoms(squares, curves, columns, to_samples, diagonal):  # type: igno
     avar = curves.avar
     n_windows, n_tau = avar.shape
     out = np.empty(avar.shape)
+    if curves.white.shape[0] == n_windows:
+        for w in range(n_windows):
+            degrees_of_freedom(squares[w], curves, w, columns, to_samples, diagonal, out[w])
+    else:
+        eight_squares, lanes = eights(_TERMS), eights(_ONE)
+        columns = columns.ravel()
+        diagonal = diagonal.ravel()
+        for start in range(0, n_windows, PLACES):
+            count = min(PLACES, n_windows - start)
+            for place in range(count):
+                for a in range(5):
+                    eight_squares[a, place] = squares[start + place, a]
+            whole_degrees_of_freedom(
+                eight_squares, columns, to_samples, diagonal, lanes, out[start : start + count]
+            )
     for w in range(n_windows):
-        degrees_of_freedom(squares[w], curves, w, columns, to_samples, diagonal, out[w])
         shares = curves.factor[min(w, curves.factor.shape[0] - 1)]
         for i in range(n_tau):
             if not (avar[w, i] > 0.0 and avar[w, i] < np.inf and shares[i] > 0.0):

@@ -263,9 +263,8 @@ def compress_products(cells, room, tables, has_excess):  # type: ignore[no-untyp
 @njit(**INNER)
 def degrees_of_freedom(squares, curves, w, columns, to_samples, diagonal, out):  # type: ignore[no-untyped-def]
     """Compute the degrees of freedom of each finite cell of window w, ``2 mean^2 / variance``."""
-    row = min(w, curves.white.shape[0] - 1)
-    avar, white, quantization = curves.avar[w], curves.white[row], curves.quantization[row]
-    ramp, factor = curves.ramp[row], curves.factor[row]
+    avar, white, quantization = curves.avar[w], curves.white[w], curves.quantization[w]
+    ramp, factor = curves.ramp[w], curves.factor[w]
     amounts = np.empty(5)
     for i in range(avar.size):
         if not np.isfinite(avar[i]):
@@ -285,3 +284,31 @@ def degrees_of_freedom(squares, curves, w, columns, to_samples, diagonal, out): 
                 variance += amounts[a] * amounts[b] * diagonal[i, table]
                 table += 1
         out[i] = 2.0 * mean * mean / variance * factor[i] if variance > 0.0 else 0.0
+
+
+@njit(**INNER)
+def whole_degrees_of_freedom(squares, columns, to_samples, diagonal, freedom, out):  # type: ignore[no-untyped-def]
+    """Compute the degrees of freedom of the cells of up to eight windows without gaps.
+
+    `squares` holds their squared coefficients (row ``term``), `freedom` is scratch; tables are
+    flat.
+    """
+    s0, s1, s2, s3 = take_four(squares, np.int64(0), np.int64(1))
+    s4 = take(squares, 4)
+    a0 = s0 * number(to_samples, 0)
+    a1 = s1 * number(to_samples, 1)
+    a2 = s2 * number(to_samples, 2)
+    a3 = s3 * number(to_samples, 3)
+    a4 = s4 * number(to_samples, 4)
+    for i in range(out.shape[1]):
+        mean = (
+            s0 * number(columns, 5 * i)
+            + s1 * number(columns, 5 * i + 1)
+            + s2 * number(columns, 5 * i + 2)
+            + s3 * number(columns, 5 * i + 3)
+            + s4 * number(columns, 5 * i + 4)
+        )
+        variance = _sum_products(diagonal, PRODUCTS * i, a0, a1, a2, a3, a4)
+        put(freedom, 0, where_above(variance, 0.0, 2.0 * mean * mean / variance, 0.0))
+        for place in range(out.shape[0]):
+            out[place, i] = freedom[0, place]
