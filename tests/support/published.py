@@ -53,15 +53,13 @@ def published_davar(
     surface = davar(log.chunk(time=-1), **options)
     window, step = (int(surface.attrs[f"{name}_samples"]) for name in ("window", "step"))
     ks = np.rint(surface["tau"].values * surface.attrs["sampling_rate_hz"]).astype(np.int64)
-    run = {"direct": _direct_sums, "recursive": _recursive_sums}[method]
     surface = surface.isel(time=slice(surface.sizes["time"] - paper))
-    points = window + 1 - paper
-    shape = points, step, surface.sizes["time"], ks
+    shape = method, window, step, surface.sizes["time"], ks
     cells = [
-        run(*_integrate(np.asarray(x, np.float64), paper=paper), *shape) for x in log["rate"].data
+        published_sums(np.asarray(x, np.float64), *shape, paper=paper) for x in log["rate"].data
     ]
     sums, counts = (np.stack(part) for part in zip(*cells, strict=True))
-    full = (points - 2 * ks).astype(np.float64)
+    full = (window + 1 - paper - 2 * ks).astype(np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
         avar = sums / (2.0 * ks.astype(np.float64) ** 2 * (full if zero_fill else counts))
     coverage = counts / full
@@ -76,6 +74,21 @@ def published_davar(
         **{f"{name}_response": ones for name in ("white", "quantization", "ramp")},
     }
     return surface.assign({name: surface[name].copy(data=cube) for name, cube in cubes.items()})
+
+
+def published_sums(
+    x: NDArray[np.float64],
+    method: str,
+    window: int,
+    step: int,
+    n_windows: int,
+    ks: NDArray[np.int64],
+    *,
+    paper: bool = False,
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Sum and count the squared second differences of a record alone, (n_windows, n_tau)."""
+    run = {"direct": _direct_sums, "recursive": _recursive_sums}[method]
+    return run(*_integrate(x, paper=paper), window + 1 - paper, step, n_windows, ks)
 
 
 def _integrate(
