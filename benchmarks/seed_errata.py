@@ -53,7 +53,7 @@ def _averages(rate: Array, k: int) -> Array:
     return np.convolve(rate, np.full(k, 1.0 / k), mode="valid")
 
 
-def _avar(values: Array, k: int, *, kind: str = "rate", zero_fill: bool = False) -> float:
+def _estimate_avar(values: Array, k: int, *, kind: str = "rate", zero_fill: bool = False) -> float:
     """Allan variance of samples at 100 Hz over all of the record, as one window.
 
     With `zero_fill`, the sum is divided by the number of terms without gaps.
@@ -86,7 +86,7 @@ def _divided_twice() -> Erratum:
         "they are averages already; only the angle (Eq. 16, 17) is divided",
         "Allan variance of x1 at 0.1 s [deg²/h²]; 1/k = 0.1",
         float(printed),
-        _avar(rate, k),
+        _estimate_avar(rate, k),
     )
 
 
@@ -99,7 +99,7 @@ def _one_average() -> Erratum:
         "ω̄[m+k] − ω̄[m]",
         "Allan variance of a ramp of 1 deg/h a sample, k = 10 [deg²/h²]; k²/2 = 50",
         float(np.mean((mean[k:] - mean[k]) ** 2) / 2.0),
-        _avar(rate, k),
+        _estimate_avar(rate, k),
     )
 
 
@@ -198,8 +198,8 @@ def _canyon() -> Erratum:
         "lost differences are zero, the divisor stays N_w − 2k",
         "divide by the number of differences that are there",
         "Allan variance of x1 at 0.1 s, half of it lost [deg²/h²]; 0.1",
-        _avar(rate, 10, zero_fill=True),
-        _avar(rate, 10),
+        _estimate_avar(rate, 10, zero_fill=True),
+        _estimate_avar(rate, 10),
     )
 
 
@@ -213,8 +213,8 @@ def _angle_across_gaps() -> Erratum:
         "a log of rates loses the angle in a gap: all 2k samples must be there, or clusters be "
         "weighted",
         "Allan variance at 1 s over 0.01, mean rate 10 deg/h, 5 % lost",
-        100.0 * _avar(angle, 100, kind="angle"),
-        100.0 * _avar(rate, 100),
+        100.0 * _estimate_avar(angle, 100, kind="angle"),
+        100.0 * _estimate_avar(rate, 100),
     )
 
 

@@ -103,11 +103,11 @@ def find_archive(paths: Sequence[str | Path]) -> Archive:
             inside: Iterable[tuple[str, Path]] = ()
             if url:
                 is_file = find_kind(find_url(path) or url) == "file"
-                inside = [("file", path)] if is_file else _walk(path, visited)
+                inside = [("file", path)] if is_file else _walk_folder(path, visited)
             elif not path.exists():
                 raise FormatError(f"{path}: there is no such file or folder")
             elif path.is_dir() and not (is_store(path) or is_fleet(path)):
-                inside = _walk(path, visited)
+                inside = _walk_folder(path, visited)
             elif not (is_pattern and _is_inside_output(path)):
                 inside = [("file", path)]
             for kind, item_inside in inside:
@@ -130,7 +130,7 @@ def _find_base(item: str, *, is_pattern: bool, is_only_path: bool) -> Path:
     return path if is_only_path and is_archive else path.parent
 
 
-def _walk(folder: Path, visited: set[str]) -> Iterator[tuple[str, Path]]:
+def _walk_folder(folder: Path, visited: set[str]) -> Iterator[tuple[str, Path]]:
     """Yield the files, stores and diagnoses in a folder or at an address, each folder once."""
     url = find_url(folder)
     for place, folders, names in walk_address(url) if url else os.walk(folder):

@@ -158,7 +158,7 @@ def fitted_curves(product: xr.Dataset) -> tuple[NDArray[np.float64], NDArray[np.
     terms : ndarray (axis, time, term, tau)
         Each term, with its response to gaps.
     total : ndarray (axis, time, tau)
-        Their sum as the filter of the sensor leaves it; NaN where nothing is fitted.
+        Their sum as the filter of the sensor leaves it; NaN without a fit.
     """
     from gyrostab.allan.band_limit import limit_response
     from gyrostab.allan.fit import refit

@@ -88,10 +88,10 @@ def published_sums(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Sum and count the squared second differences of a record alone, (n_windows, n_tau)."""
     run = {"direct": _direct_sums, "recursive": _recursive_sums}[method]
-    return run(*_integrate(x, paper=paper), window + 1 - paper, step, n_windows, ks)
+    return run(*_integrate_rates(x, paper=paper), window + 1 - paper, step, n_windows, ks)
 
 
-def _integrate(
+def _integrate_rates(
     x: NDArray[np.float64], *, paper: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
     """Integrate a record, with the missing samples before the first and after the last angle.

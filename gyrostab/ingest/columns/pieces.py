@@ -73,7 +73,7 @@ class Spool:
     def store(self, values: NDArray[Any]) -> PiecewiseColumn:
         """Write a column to the file and return it as a piecewise column."""
         bits = np.ascontiguousarray(values).view(np.int64)
-        return PiecewiseColumn(values.dtype, [_spooled(bits, self)])
+        return PiecewiseColumn(values.dtype, [_move_to_spool(bits, self)])
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ def _memory_bytes(piece: Piece) -> int:
     return piece.nbytes if isinstance(piece, np.ndarray) else 0
 
 
-def _spooled(piece: Piece, spool: Spool) -> Piece:
+def _move_to_spool(piece: Piece, spool: Spool) -> Piece:
     """Return a piece with the values that are in memory moved to a spool."""
     if not isinstance(piece, np.ndarray) or not piece.size:
         return piece
@@ -164,7 +164,7 @@ class PiecewiseColumn(RowSource):
 
     def move_to(self, spool: Spool) -> None:
         """Move the pieces in memory to a file."""
-        self._pieces[:] = [_spooled(piece, spool) for piece in self._pieces]
+        self._pieces[:] = [_move_to_spool(piece, spool) for piece in self._pieces]
 
     def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
         """Read samples of one row from `begin` on into `out`."""
@@ -203,11 +203,13 @@ class Buffers:
         self.rows += next(iter(pieces.values())).size if pieces else 0
         self._held += sum(map(_memory_bytes, pieces.values()))
         for key, piece in pieces.items():
-            self._pieces[key].append(piece if self._spool is None else _spooled(piece, self._spool))
+            self._pieces[key].append(
+                piece if self._spool is None else _move_to_spool(piece, self._spool)
+            )
         if self._spool is None and self._held > self.limit:
             self._spool = spool = Spool()
             for column in self._pieces.values():
-                column[:] = [_spooled(piece, spool) for piece in column]
+                column[:] = [_move_to_spool(piece, spool) for piece in column]
 
     def _as_piece(self, key: Any, values: NDArray[Any]) -> NDArray[np.int64]:
         plain = np.ascontiguousarray(values, dtype=self.dtypes[key])

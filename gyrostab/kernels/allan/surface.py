@@ -256,8 +256,8 @@ def surface_unit(
         The variance is in the square of the rate's unit (for angles: of angle per second). Without
         gaps only the variance differs between the windows.
     means : ndarray (2, n_windows)
-        Mean rate [unit of the rate; for angles: of angle per second], NaN where nothing is
-        present; share of samples present.
+        Mean rate [unit of the rate; for angles: of angle per second], NaN without a sample; share
+        of samples present.
     """
     counts_only = np.issubdtype(x.dtype, np.integer)
     x, space = convert_to_native(x), space or Workspace()

@@ -19,9 +19,10 @@ from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import _is_possible, keep_physical
 from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
+from gyrostab.diagnose.predict import search
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import condition_on
-from gyrostab.diagnose.predict.search import combine_rows
+from gyrostab.diagnose.predict.search import combine_rows, compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.statistics import find_statistic
@@ -61,6 +62,18 @@ def test_null_records_may_come_in_parts(shaken):
     parts = [together.isel(record=part) for part in (slice(0, 15), slice(15, None))]
     best = name_effects(blocks, baseline, parts).null_best
     assert_allclose(best, shaken.null_best, rtol=1e-9)
+
+
+def test_evidence_does_not_depend_on_the_parts_of_a_group(shaken, monkeypatch):
+    state = shaken.state
+    candidates = [item for item in shaken.candidates if item.statistic.null_variable]
+    arguments = candidates, state.blocks, state, fold_blocks(state.blocks)
+    whole = compute_evidence(*arguments)
+    monkeypatch.setattr(search, "_COLUMNS_AT_ONCE", 20)
+    parts = compute_evidence(*arguments)
+    assert [item.candidate for item in parts] == [item.candidate for item in whole]
+    for one, other in zip(parts, whole, strict=True):
+        assert_allclose(one.evidence_nats, other.evidence_nats, rtol=1e-6, atol=1e-6)
 
 
 def test_vibration_noise_is_identified_on_its_axis(shaken):
