@@ -94,7 +94,7 @@ class Settings:
         0.04,
         "1",
         "Error of the form of an effect as a share of its size, added to its standard error.",
-        "coverage of the intervals with wrong forms: docs/diagnosis-method.md, benchmarks/intervals.py",
+        "coverage of intervals with wrong forms: docs/diagnosis-method.md, benchmarks/intervals.py",
     )
     clear_sigma: float = _make_setting(
         3.0,
