@@ -73,7 +73,7 @@ lint: $(VENV)/.installed-lint  ## style, types, imports and wording
 	$(BIN)/lint-imports
 	$(BIN)/python -m tests.language
 
-bench: $(VENV)/.installed-test  ## measure docs/performance.md and docs/scaling.md again; 20 minutes on an idle machine
+bench: $(VENV)/.installed-test  ## measure docs/performance.md and docs/scaling.md again, on an idle machine
 	$(BIN)/python benchmarks/kernels.py --output docs/performance.md
 	$(BIN)/python benchmarks/fit.py --output docs/performance.md
 	$(BIN)/python benchmarks/end_to_end.py --output docs/performance.md

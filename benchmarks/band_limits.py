@@ -1,6 +1,6 @@
 """Measure the fit of simulated logs behind six filters, for the table of docs/statistics.md.
 
-    python benchmarks/band_limits.py --output docs/statistics.md      # about ten minutes
+    python benchmarks/band_limits.py --output docs/statistics.md
 
 A record is 24 independent windows of 60 s or 600 s at 100 Hz, simulated outside the package
 (tests/support/noise_records.py) and filtered by SciPy.

@@ -1,6 +1,6 @@
 """False alarms of the diagnosis on simulated records that hold nothing but noise.
 
-    python benchmarks/diagnose_null.py --output docs/diagnosis-method.md      # 17 minutes
+    python benchmarks/diagnose_null.py --output docs/diagnosis-method.md
 
 Half of the records have random gaps. Prints each record in which something was found, and a table
 of how many there are.

@@ -1,6 +1,6 @@
 """Compare estimators of the five coefficients with each other and with the Cramer-Rao bound.
 
-    python benchmarks/estimators.py --output docs/statistics.md      # three minutes
+    python benchmarks/estimators.py --output docs/statistics.md
 
 Every estimator gets the same simulated records and fits all five terms. What other tools do is
 written again from their sources, with the constants of IEEE Std 952 where they have others. All

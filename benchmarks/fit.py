@@ -1,6 +1,6 @@
 """Time the fit of windows: the kernel, the limits, and what is made once for a surface.
 
-    python benchmarks/fit.py --output docs/performance.md     # a minute
+    python benchmarks/fit.py --output docs/performance.md
 
 Windows of 5 min at 400 Hz of quantization noise, angle and rate random walk; processor time of one
 thread, the best of several runs.

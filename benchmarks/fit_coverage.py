@@ -1,6 +1,6 @@
 """Measure how often the interval and the limit of each coefficient hold the truth.
 
-    python benchmarks/fit_coverage.py --output docs/statistics.md      # about five minutes
+    python benchmarks/fit_coverage.py --output docs/statistics.md
 
 Each term is absent, marginal or strong: its squared coefficient is 2.5 or 8 standard errors of a
 fit of white noise and that term alone (for a ramp: its slope exceeds that of the other noise 2.5 or

@@ -1,6 +1,6 @@
 """Check every statistical claim of the fit by simulation, for the tables of docs/statistics.md.
 
-    python benchmarks/fit_statistics.py --output docs/statistics.md      # about a minute
+    python benchmarks/fit_statistics.py --output docs/statistics.md
 
 Each row is 1000 (trend through gaps: 300) independent windows of 40 s at 100 Hz, simulated outside
 the package (tests/support/noise_records.py).

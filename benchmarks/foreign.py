@@ -8,7 +8,7 @@ another child process, records the time (after imports) and the peak resident me
 deletes the archive before it writes the next one. Archives are written block by block, so memory
 stays below 1 GiB at any length. 200 h need up to 10 GB of disk for one archive and 10 GB for
 temporary columns; a CSV file of 200 h has 18 GB. Give --folder on a disk with 60 GB free: it is
-TMPDIR of the runs. The first format is the reference. `--hours 12` takes a few minutes.
+TMPDIR of the runs. The first format is the reference.
 """
 
 from __future__ import annotations
