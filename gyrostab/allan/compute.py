@@ -17,7 +17,7 @@ from gyrostab.kernels.allan.gap_edges import gap_edge_ratio
 from gyrostab.kernels.allan.outlier_count import count_outliers
 from gyrostab.kernels.allan.surface import Cells, Unit, convert_to_native, surface_unit
 from gyrostab.kernels.allan.trend import window_trends
-from gyrostab.kernels.workspace import Workspace
+from gyrostab.kernels.workspace import Workspace, Workspaces
 from gyrostab.store.lazy import find_source, keep_sources, read_into, read_slice
 from gyrostab.units import HOUR
 
@@ -89,6 +89,13 @@ def compute_unit(
     return fields, np.concatenate([means, _describe_windows(x, unit)])
 
 
+def _compute_in_thread(
+    x: NDArray[np.generic], unit: Unit, tables: NoiseTables, spaces: Workspaces
+) -> tuple[list[Floats], Floats]:
+    """`compute_unit` with the working memory of the calling thread."""
+    return compute_unit(x, unit, tables, spaces.own)
+
+
 def _stack_unit(x: NDArray[np.generic], unit: Unit, tables: NoiseTables) -> tuple[Floats, Floats]:
     """`compute_unit` with all fields in one array (10, n_windows, n_tau)."""
     fields, means = compute_unit(x, unit, tables)
@@ -96,17 +103,17 @@ def _stack_unit(x: NDArray[np.generic], unit: Unit, tables: NoiseTables) -> tupl
 
 
 def join_units(
-    results: Sequence[tuple[list[Floats], Floats]], n_axes: int
+    results: Sequence[tuple[list[Floats], Floats]], plan: Plan
 ) -> tuple[list[NDArray[Any]], Floats]:
     """Join units, axis by axis: fields (axis, time, tau), plane fields (9, axis, time).
 
     A field that is the same in all windows is stored once, and repeated as a view.
     """
-    sizes = [plane.shape[1] for _, plane in results]
-    fields = [
-        _join_field([unit[i] for unit, _ in results], sizes, n_axes, FIELD_TYPES.get(name, float))
-        for i, name in enumerate(CELL_FIELDS)
-    ]
+    sizes, n_axes = [plane.shape[1] for _, plane in results], plan.signal.shape[0]
+    fields = []
+    for i, name in enumerate(CELL_FIELDS):
+        parts = [unit[i][:, plan.reported] for unit, _ in results]
+        fields.append(_join_field(parts, sizes, n_axes, FIELD_TYPES.get(name, float)))
     means = np.concatenate([plane for _, plane in results], axis=1)
     return fields, means.reshape(len(PLANE_FIELDS), n_axes, -1)
 
@@ -147,15 +154,16 @@ def run_units(data: Any, plan: Plan) -> tuple[Any, Any]:
     units = units_of_work(data.shape[1], unit)
     spans = [slice(part.start * unit.step, last_sample(part, unit)) for part in units]
     if not lazy:
+        spaces = Workspaces()
         tasks = [
-            partial(compute_unit, data[row, span], unit, tables)
+            partial(_compute_in_thread, data[row, span], unit, tables, spaces)
             for row in range(data.shape[0])
             for span in spans
         ]
         if len(tasks) == 1:  # a short call does not wait for a graph
-            return join_units([tasks[0]()], 1)
+            return join_units([tasks[0]()], plan)
         run = dask.compute(*(dask.delayed(task, pure=False)() for task in tasks))
-        return join_units(run, data.shape[0])
+        return join_units(run, plan)
     shared = dask.delayed(tables, pure=True, traverse=False)
     work = dask.delayed(_stack_unit, nout=2, pure=False)
     rows_cells, rows_means = [], []
@@ -172,4 +180,5 @@ def run_units(data: Any, plan: Plan) -> tuple[Any, Any]:
     stacked = da.stack(rows_cells, axis=1), da.stack(rows_means, axis=1)
     cells_array, means_array = (keep_sources(data, part) for part in stacked)
     kinds = [FIELD_TYPES.get(name, np.float64) for name in CELL_FIELDS]
-    return [cells_array[i].astype(kind) for i, kind in enumerate(kinds)], means_array
+    fields = [cells_array[i, ..., plan.reported].astype(kind) for i, kind in enumerate(kinds)]
+    return fields, means_array

@@ -236,7 +236,7 @@ def davar_part(
     spans = [(windows.start * unit.step, last_sample(windows, unit)) for windows in units]
     space = space or Workspace()
     results = [compute_unit(x, unit, tables, space) for x in read_spans(data, spans, space)]
-    cells, means = join_units(results, data.shape[0])
+    cells, means = join_units(results, plan)
     selected = slice(part.start - units[0].start, part.stop - units[0].start)
     return _attach_labels(
         [field[:, selected] for field in cells], means[:, :, selected], log, plan, part=part
@@ -260,7 +260,7 @@ def davar_sample(log: xr.Dataset, *, numbers: Sequence[int], **options: Any) -> 
         results.append(
             [compute_unit(x, unit, tables, space) for x in read_spans(data, [span], space)]
         )
-    cells, means = join_units(list(chain.from_iterable(zip(*results, strict=True))), data.shape[0])
+    cells, means = join_units(list(chain.from_iterable(zip(*results, strict=True))), plan)
     return _attach_labels(cells, means, log, plan, numbers=numbers)
 
 
@@ -274,7 +274,7 @@ def _attach_labels(
     numbers: Sequence[int] | None = None,
 ) -> xr.Dataset:
     cube, plane = ("axis", "time", "tau"), ("axis", "time")
-    signal, unit, rate, _, reported = plan
+    signal, unit, rate, *_ = plan
     start, begin = first_stamp(log), 0 if part is None else part.start
     first = (
         begin + np.arange(means.shape[2]) if numbers is None else np.array(numbers)
@@ -286,7 +286,7 @@ def _attach_labels(
     variables: dict[str, Any] = {
         name: (
             cube,
-            values[..., reported],
+            values,
             attributes(name, variance=VARIANCES[unit.variance].text),
         )
         for name, values in zip(CELL_FIELDS, cells, strict=True)

@@ -34,7 +34,7 @@ class Plan(NamedTuple):
     rate: float
     attrs: dict[str, Any]
     #: Averaging factors of `unit` that were asked for; the noise is identified from all of them.
-    reported: NDArray[np.int64]
+    reported: slice | NDArray[np.int64]
 
     @property
     def taus(self) -> NDArray[np.float64]:
@@ -89,7 +89,9 @@ def make_plan(
         "overlap": overlap, "min_strict": min_strict, "min_coverage": min_coverage,
         "variance": variance,
     }  # fmt: skip
-    return Plan(signal, unit, rate, attrs, np.searchsorted(ks, asked))
+    # a slice copies nothing
+    reported = slice(None) if np.array_equal(ks, asked) else np.searchsorted(ks, asked)
+    return Plan(signal, unit, rate, attrs, reported)
 
 
 def _thin_terms(ks: NDArray[np.int64], overlap: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

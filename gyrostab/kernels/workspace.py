@@ -38,7 +38,10 @@ class Workspace:
 
 
 class Workspaces(threading.local):
-    """A separate `Workspace` for each thread, as ``own``."""
+    """A separate `Workspace` for each thread, as ``own``; another process begins with empty ones."""
 
     def __init__(self) -> None:
         self.own = Workspace()
+
+    def __reduce__(self) -> tuple[type[Workspaces], tuple[()]]:
+        return Workspaces, ()

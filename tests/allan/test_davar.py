@@ -570,3 +570,20 @@ def test_long_averaging_times_alone_have_the_degrees_of_freedom_of_the_same_nois
     for name in ("avar", "edf", "count"):
         np.testing.assert_allclose(few[name], octaves[name].sel(tau=few.tau), rtol=1e-6)
     assert fit_noise(few).edf.equals(few.edf)  # two averaging times do not show five terms
+
+
+@pytest.mark.parametrize("taus", ["all", [0.01, 5.0]])
+def test_fields_that_all_windows_share_are_stored_once(taus):
+    log = make_log(np.random.default_rng(3).standard_normal(3000), rate=100.0, unit="deg/h")
+    surface = davar(log, window="10s", step="1s", taus=taus)
+    for name in ("count", "coverage", "estimator", "white_response", "gap_factor"):
+        assert surface[name].values.strides[:2] == (0, 0), name
+    assert surface.avar.values.strides[1] > 0
+
+
+def test_units_of_work_run_in_other_processes():
+    log = make_log(np.random.default_rng(4).standard_normal((2, 3000)), rate=100.0, unit="deg/h")
+    options = {"window": "10s", "step": "1s", "taus": 5}
+    with dask.config.set(scheduler="processes", num_workers=1):
+        surface = davar(log, **options)
+    assert surface.identical(davar(log, **options))
