@@ -13,7 +13,6 @@ from gyrostab.diagnose.nulls.scores import NullScores, standardise
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS, Statistic
 from gyrostab.diagnose.statistics.mean import region_mean
-from gyrostab.errors import OptionError
 from gyrostab.kernels.spectra.line_levels import LEAK_LINES
 
 Array = NDArray[np.float64]
@@ -71,11 +70,6 @@ def locate_mismatches(
         ``z``, ``ratio`` (observed over expected; for means and restarts the number of standard
         deviations), ``estimate`` (depends on the statistic), ``p_value``.
 
-    Raises
-    ------
-    OptionError
-        When `level` is not between 0 and 0.5.
-
     Examples
     --------
     >>> null = null_scores(baseline, null_records(blocks, baseline, rng=rng))  # doctest: +SKIP
@@ -83,17 +77,11 @@ def locate_mismatches(
     >>> found.axes.values, found.begin.values, found.end.values  # doctest: +SKIP
     (array(['x']), array([1500.]), array([1800.]))
     """
-    if not 0.0 < level < 0.5:
-        raise OptionError(
-            f"level {level!r}: give a false-alarm probability above 0 and below 0.5, "
-            "for instance 0.01"
-        )
     regions: list[dict[str, Any]] = []
     for statistic in STATISTICS:
         if statistic.name in null.statistics:
-            find = _locate_mean_regions if statistic.is_linear_in_means else _locate_regions
             prepared = statistic.prepare(blocks, baseline, regions)
-            regions += find(statistic, prepared, baseline, null, level, settings)
+            regions += _locate_regions(statistic, prepared, baseline, null, level, settings)
     merged = merge_regions(regions, settings=settings)
     return _make_table(merged[:MAX_MISMATCHES], blocks, null, level)
 
@@ -106,62 +94,50 @@ def _locate_regions(
     level: float,
     settings: Settings,
 ) -> list[dict[str, Any]]:
-    """Locate the regions of one statistic, row by row."""
+    """Locate the regions of one statistic, row by row.
+
+    A step at one place shifts the mean of the whole record: each region of the mean is located with
+    the ones before it removed.
+    """
     scores = statistic.score(blocks, baseline)
     if scores is None:
         return []
     z = standardise(scores, null.statistics[statistic.name])
     regions = []
     for row in range(z.shape[0]):
-        remaining = z[row].copy()
+        now, row_z = baseline, z[row]
+        remaining = row_z.copy()
         for _ in range(MAX_PER_ROW):
-            region = _take_region(statistic, scores, row, remaining, z[row], null, level, settings)
+            region = _take_region(statistic, scores, row, remaining, row_z, null, level, settings)
             if region is None:
                 break
             regions.append(region)
-    return regions
+            if statistic.is_linear_in_means:
+                now = _without_region(region, blocks, now, row)
+                scores = statistic.score(blocks, now)
+                row_z = standardise(scores, null.statistics[statistic.name])[row]
+                remaining = row_z.copy()
+    return (
+        merge_wandering_regions(regions, settings=settings)
+        if statistic.is_linear_in_means
+        else regions
+    )
 
 
-def _locate_mean_regions(
-    statistic: Statistic,
-    blocks: xr.Dataset,
-    baseline: xr.Dataset,
-    null: NullScores,
-    level: float,
-    settings: Settings,
-) -> list[dict[str, Any]]:
-    """Locate the regions of the mean, each with the ones before it removed.
-
-    A step at one place shifts the mean of the whole record.
-    """
-    regions = []
+def _without_region(
+    region: dict[str, Any], blocks: xr.Dataset, baseline: xr.Dataset, row: int
+) -> xr.Dataset:
+    """Complete a region of the mean, and return the baseline with its mean in it."""
+    inside = (blocks["begin"].values >= region["begin"] - 1e-9) & (
+        blocks["end"].values <= region["end"] + 1e-9
+    )
+    region |= {
+        "estimate": region_mean(blocks, baseline, row, inside),
+        "tau_max_s": max(region["end"] - region["begin"], region["tau_min_s"]),
+    }
     known_mean = baseline["known_mean"].copy(deep=True)
-    open_rows = set(range(blocks.sizes["axis"]))
-    for _ in range(MAX_PER_ROW):
-        now = baseline.assign(known_mean=known_mean)
-        scores = statistic.score(blocks, now)
-        if scores is None:
-            break
-        z = standardise(scores, null.statistics[statistic.name])
-        for row in sorted(open_rows):
-            region = _take_region(
-                statistic, scores, row, z[row].copy(), z[row], null, level, settings
-            )
-            if region is None:
-                open_rows.discard(row)
-                continue
-            inside = (blocks["begin"].values >= region["begin"] - 1e-9) & (
-                blocks["end"].values <= region["end"] + 1e-9
-            )
-            region |= {
-                "estimate": region_mean(blocks, now, row, inside),
-                "tau_max_s": max(region["end"] - region["begin"], region["tau_min_s"]),
-            }
-            known_mean.values[row] += np.where(inside, region["estimate"], 0.0)
-            regions.append(region)
-        if not open_rows:
-            break
-    return merge_wandering_regions(regions, settings=settings)
+    known_mean.values[row] += np.where(inside, region["estimate"], 0.0)
+    return baseline.assign(known_mean=known_mean)
 
 
 def _take_region(
