@@ -16,7 +16,7 @@ from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import drop_changed_tails
 from gyrostab.diagnose.predict.linear_model import pair_rows
 from gyrostab.diagnose.settings import DEFAULTS, Settings
-from gyrostab.diagnose.statistics import STATISTICS
+from gyrostab.diagnose.statistics import STATISTICS, find_statistic
 from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
 
 Scores = Sequence[tuple[str, xr.Dataset, NDArray[np.float64]]]
@@ -114,7 +114,7 @@ def score_left(
     largest_score, limit = 0.0, np.inf
     for name, statistic, z in scores:
         if (
-            statistic.attrs["view"] != region["view"]
+            find_statistic(name).view != region["view"]
             or str(region["what"]) not in statistic["what"].values
         ):
             continue

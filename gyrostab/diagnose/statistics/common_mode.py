@@ -87,7 +87,6 @@ class CommonMode(Statistic):
             rows = [*rows, " ".join(axes)]
         block = float(blocks.attrs["block_s"])
         return statistic_dataset(
-            "cross_axis",
             blocks,
             rows=rows,
             windows=windows,

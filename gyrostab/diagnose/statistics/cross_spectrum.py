@@ -108,7 +108,6 @@ class CrossSpectrum(Statistic):
         low = np.maximum(low, 0.5 / float(blocks.attrs["block_s"]))
         f_min, f_max = np.append(low, low[0]), np.append(high, high[-1])
         return statistic_dataset(
-            "cross_axis",
             blocks,
             rows=rows,
             windows=windows,

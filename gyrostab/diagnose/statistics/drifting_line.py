@@ -87,7 +87,6 @@ class DriftingLine(Statistic):
             z = np.where(path_count > 0, exponential_score(-np.log(p_value)), np.nan)
         block_count = -(-np.arange(power.shape[-2] + 1) * blocks.sizes["block"] // power.shape[-2])
         return statistic_dataset(
-            "spectrum",
             blocks,
             rows=axes,
             windows=Windows(block_count[parts[:1]], block_count[parts[-1:] + 1]),

@@ -145,7 +145,6 @@ class Mean(BlockMeanStatistic):
             estimate = (amount / information)[..., None]
         block = float(blocks.attrs["block_s"])
         return statistic_dataset(
-            "mean",
             blocks,
             windows=windows,
             columns={
@@ -156,7 +155,6 @@ class Mean(BlockMeanStatistic):
             z=z,
             ratio=np.abs(z),
             estimate=estimate,
-            units="degree hour-1",
         )
 
     def design(self, case: Prospect) -> Iterator[Variant]:
@@ -196,7 +194,7 @@ class Mean(BlockMeanStatistic):
                     folds=trial.folds,
                 )[:, 1:]
             )
-        return collect_evidence(group, [(axis,) for axis in trial.state.axes], factors)
+        return collect_evidence(group, self.rows(group[0], trial.state), factors)
 
     def describe(self, region: Region, when: str) -> str:
         """Describe another mean, or one that wanders."""

@@ -117,7 +117,6 @@ class Power(Statistic):
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = surface["observed"] / surface["expected"]
         return statistic_dataset(
-            "davar",
             blocks,
             windows=surface["windows"],
             columns=surface["columns"],

@@ -94,14 +94,12 @@ class RampPhase(Statistic):
             np.concatenate(values, axis=-1) for values in zip(*scored, strict=True)
         )
         return statistic_dataset(
-            "spectrum",
             blocks,
             windows=windows,
             columns={"what": kinds, "tau_min_s": tau_min, "tau_max_s": tau_max},
             z=z,
             ratio=ratio,
             estimate=estimate,
-            units="degree hour-1",
             one_sided=True,
         )
 

@@ -87,7 +87,7 @@ class RandomProcess(BlockMeanStatistic):
                 )
                 evidence_nats.append(np.logaddexp.reduce(factors, axis=0))
                 best.append(_plain_or_best(candidate, factors[:, 0], trial.state.settings))
-            rows: list[tuple[str, ...]] = [(axis,) for axis in trial.state.axes]
+            rows = self.rows(candidate, trial.state)
             out.append(
                 CandidateEvidence(candidate, rows, np.stack(evidence_nats, axis=-1), tuple(best))
             )

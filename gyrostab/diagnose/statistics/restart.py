@@ -54,14 +54,12 @@ class Restart(Statistic):
         scores[..., place, column], size[..., place, column] = z, estimate
         tau = np.array([*_DECAY_BLOCKS, _SIDE_BLOCKS], dtype=float) * block
         return statistic_dataset(
-            "restart",
             blocks,
             windows=windows,
             columns={"what": kinds, "tau_min_s": block, "tau_max_s": tau},
             z=scores,
             ratio=np.abs(scores),
             estimate=size,
-            units="degree hour-1",
         )
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:

@@ -115,7 +115,6 @@ class SampleCounts(Statistic):
         hidden = np.stack([hidden_by_grid(blocks, name) for name in (*COUNTS, "kurtosis")], axis=-1)
         z = np.where(hidden[:, None, :], np.nan, z)
         return statistic_dataset(
-            "distribution",
             blocks,
             windows=windows,
             columns={
@@ -139,7 +138,7 @@ class SampleCounts(Statistic):
         if trial.counts is None:
             return []
         subsets = fold_subsets(trial.folds)
-        rows: list[tuple[str, ...]] = [(axis,) for axis in trial.state.axes]
+        rows = self.rows(group[0], trial.state)
         out = []
         for candidate in group:
             evidence_nats, best = [], []

@@ -116,7 +116,6 @@ def exponential_score(value: Array) -> Array:
 
 
 def statistic_dataset(
-    name: str,
     blocks: xr.Dataset,
     *,
     windows: Windows,
@@ -125,15 +124,12 @@ def statistic_dataset(
     ratio: Array,
     rows: Sequence[str] | None = None,
     estimate: Array | None = None,
-    units: str = "1",
     one_sided: bool = False,
 ) -> xr.Dataset:
     """Assemble ``z``, ``ratio`` and ``estimate`` of a statistic by (record), row, window, tau.
 
     Parameters
     ----------
-    name : str
-        Key ``view`` of its mismatches in diagnosis.json.
     columns : dict
         ``what`` (str), ``tau_min_s``, ``tau_max_s`` [s] and ``frequency`` [Hz] of each column, and
         ``floor``, the smallest standard deviation that null records may give a score.
@@ -142,40 +138,29 @@ def statistic_dataset(
     rows : sequence of str, optional
         Axes of each row, separated by blanks; by default a row is an axis of the record.
     estimate : ndarray, optional
-        Size of the mismatch, in `units`.
+        Size of the mismatch.
     one_sided : bool
         Whether only an excess is a mismatch.
     """
     dims = ("record", "row", "window", "tau") if z.ndim == 4 else ("row", "window", "tau")
     begin, end = blocks["begin"].values, blocks["end"].values
     size = z.shape[-1]
-    label = {key: np.broadcast_to(np.asarray(value), size) for key, value in columns.items()}
+    labels = {"frequency": np.nan, "floor": 0.2} | columns
     dataset = xr.Dataset(
-        {
-            "z": (
-                dims,
-                z,
-                {
-                    "units": "1",
-                    "long_name": "score, near-normal where recording and simulation agree",
-                },
-            ),
-            "ratio": (dims, ratio, {"units": "1", "long_name": "observed over expected"}),
-        },
+        {"z": (dims, z), "ratio": (dims, ratio)},
         coords={
             "axes": ("row", np.asarray(blocks["axis"].values if rows is None else rows, dtype=str)),
-            "begin": ("window", begin[windows.first], {"units": "s"}),
-            "end": ("window", end[windows.stop - 1], {"units": "s"}),
+            "begin": ("window", begin[windows.first]),
+            "end": ("window", end[windows.stop - 1]),
             "first": ("window", windows.first),
             "stop": ("window", windows.stop),
-            "what": ("tau", label["what"]),
-            "tau_min_s": ("tau", label["tau_min_s"], {"units": "s"}),
-            "tau_max_s": ("tau", label["tau_max_s"], {"units": "s"}),
-            "frequency": ("tau", label.get("frequency", np.full(size, np.nan)), {"units": "Hz"}),
-            "floor": ("tau", label.get("floor", np.full(size, 0.2))),
+            **{
+                name: ("tau", np.broadcast_to(np.asarray(values), size))
+                for name, values in labels.items()
+            },
         },
-        attrs={"view": name, "one_sided": int(one_sided)},
+        attrs={"one_sided": int(one_sided)},
     )
     if estimate is not None:
-        dataset["estimate"] = (dims, np.broadcast_to(estimate, z.shape), {"units": units})
+        dataset["estimate"] = (dims, np.broadcast_to(estimate, z.shape))
     return dataset

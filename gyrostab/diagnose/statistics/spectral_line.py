@@ -88,14 +88,12 @@ class SpectralLine(Statistic):
         z = cube_root_score(ratio, count / (1.0 + 1.0 / (2.0 * _AROUND_LINES)))
         half = SINE_TAU_CYCLES / frequency  # at which the Allan variance of a sine is largest
         return statistic_dataset(
-            "spectrum",
             blocks,
             windows=windows,
             columns={"what": "line", "tau_min_s": half, "tau_max_s": half, "frequency": frequency},
             z=z,
             ratio=ratio,
             estimate=2.0 * np.sqrt(np.maximum(excess, 0.0) / float(blocks.attrs["block_s"])),
-            units="degree hour-1",
             one_sided=True,
         )
 
@@ -128,7 +126,7 @@ class SpectralLine(Statistic):
         place = np.maximum(evidence_nats, 0.0).sum(axis=1).argmax(axis=-1)
         best = np.take_along_axis(evidence_nats, place[:, None, None], axis=2)[..., 0]
         best = np.where(np.isfinite(best), best, -np.log(power.shape[-1]))
-        rows: list[tuple[str, ...]] = [(axis,) for axis in trial.state.axes]
+        rows = self.rows(group[0], trial.state)
         places = np.repeat(place[:, None], len(rows), axis=1)
         return [
             CandidateEvidence(

@@ -85,7 +85,6 @@ class VarianceStability(Statistic):
         f_low = np.append([low[used][group].min() for group in members], low[used][0])
         f_high = np.append([high[used][group].max() for group in members], high[used][-1])
         return statistic_dataset(
-            "davar",
             blocks,
             rows=rows,
             windows=windows,
