@@ -166,10 +166,6 @@ class Statistic:
         """Return a candidate with what its statistic adds to it; by default nothing."""
         return candidate
 
-    def candidates_without_channel(self, kind: type[Effect], blocks: xr.Dataset) -> list[Candidate]:
-        """Return the candidates of an effect none of whose channels is in the record."""
-        return []
-
     def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
         """Return generic changes of noise and bias that compete with effects in this statistic."""
         return []

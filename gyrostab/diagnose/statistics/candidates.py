@@ -148,17 +148,11 @@ def _candidates_of_effect(
     settings: Settings,
 ) -> tuple[list[Candidate], str]:
     """Build the candidates of an effect with its channels, by statistic; or say why not."""
-    if kind.channels and not drivers:
-        candidates = [
-            candidate
-            for statistic in STATISTICS
-            for candidate in statistic.candidates_without_channel(kind, blocks)
-        ]
-        return candidates, missing_channel_reason(tuple(kind.channels), blocks)
     windows = make_windows(blocks, drivers)
     predictions: list[tuple[dict[str, Any], Prediction]] = []
-    obstacle = ""
-    for values in _nuisance_grid(kind, windows):
+    is_missing = bool(kind.channels) and not drivers
+    obstacle = missing_channel_reason(tuple(kind.channels), blocks) if is_missing else ""
+    for values in () if is_missing else _nuisance_grid(kind, windows):
         try:
             effect = kind.example(**values)
             prediction = with_band_response(predict_exogenous(effect, windows), effect, blocks)

@@ -69,7 +69,10 @@ class Transfer(Statistic):
         blocks: xr.Dataset,
         coefficient: xr.DataArray,
     ) -> list[Candidate]:
-        """Return candidates of rates that follow another channel or axis at every frequency."""
+        """Return candidates of rates that follow another channel or axis at every frequency.
+
+        Channels of no known effect, such as a seismometer, may see real motion without any other.
+        """
         usable = set(_reference_channels(blocks))
         usable |= set(windows.axes) if "cross" in blocks else set()
         by_channel: dict[str, list[Variant]] = {}
@@ -79,7 +82,8 @@ class Transfer(Statistic):
                     by_channel.setdefault(channel, []).append(
                         Variant(values, (parameter,), np.asarray(transfer)[None])
                     )
-        if by_channel and kind.stage == "motion":
+        is_without_channel = kind.name == "real_motion" and not driver
+        if is_without_channel or (by_channel and kind.stage == "motion"):
             for channel in [*by_channel, *_unknown_channels(blocks)]:
                 by_channel[channel] = by_channel.get(channel, []) + _any_transfer(
                     windows.frequency.size
@@ -87,16 +91,6 @@ class Transfer(Statistic):
         return [
             Candidate(kind.name, self, driver, distinct_variants(variants), reference=(channel,))
             for channel, variants in by_channel.items()
-        ]
-
-    def candidates_without_channel(self, kind: type[Effect], blocks: xr.Dataset) -> list[Candidate]:
-        """Build real motion that only channels of no known effect see, such as a seismometer."""
-        if kind.name != "real_motion":
-            return []
-        variants = distinct_variants(_any_transfer(blocks.sizes["band"]))
-        return [
-            Candidate(kind.name, self, (), variants, reference=(channel,))
-            for channel in _unknown_channels(blocks)
         ]
 
     def model(
