@@ -9,7 +9,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,31 +42,29 @@ def estimate_shared_factors(
     name = components[0].variant.columns[0]
     rows = [row for row in pair_rows(state.blocks) if set(row) <= set(axes)]
     rng = np.random.default_rng(0)
-    bandwidths = _weight_bandwidths(components[0], rows, axes, state)
-    chosen = rng.choice(bandwidths.share.size, size=DRAWS, p=bandwidths.share)
-    product = bandwidths.product[chosen] + bandwidths.error[chosen] * rng.standard_normal(
-        (DRAWS, len(rows))
-    )
-    limit = bandwidths.limit[chosen]
+    width, share, product, error, limit = _weight_bandwidths(components[0], rows, axes, state)
+    chosen = rng.choice(share.size, size=DRAWS, p=share)
+    product = product[chosen] + error[chosen] * rng.standard_normal((DRAWS, len(rows)))
+    limit = limit[chosen]
     factor = (
         _draw_pair_factors(product[:, 0], limit, rng)
         if len(axes) == 2
         else _solve_factors(product, rows, axes, limit)
     )
-    white = np.isinf(bandwidths.width)
+    white = np.isinf(width)
     factor *= np.exp(np.where(white[chosen], 0.0, ORDER_ERROR) * rng.standard_normal(DRAWS))[
         :, None
     ]
-    plain = bool(bandwidths.share[white].sum() >= 0.5)
+    plain = bool(share[white].sum() >= 0.5)
     is_likelier = white[chosen] == plain
     sizes: dict[str, tuple[float, ...]] = {
         name if len(axes) == 1 else f"{name}.{axis}": _summarise_draws(factor[:, k], is_likelier)
         for k, axis in enumerate(axes)
     }
     if "bandwidth" in components[0].variant.values:
-        width = bandwidths.width[chosen][is_likelier]
+        likely = width[chosen][is_likelier]
         sizes["bandwidth"] = (
-            (math.inf, 0.0) if plain else _summarise_draws(width, np.ones(width.size, np.bool_))
+            (math.inf, 0.0) if plain else _summarise_draws(likely, np.ones(likely.size, np.bool_))
         )
     return sizes
 
@@ -85,23 +82,21 @@ def _summarise_draws(
     )
 
 
-class CrossEvidence(NamedTuple):
-    """What the cross-spectra show for white noise and low-passes."""
-
-    width: Array  # (point,): bandwidth [Hz]
-    share: Array  # (point,): probability
-    #: (point, pair): products of the factors, and their errors.
-    product: Array
-    error: Array
-    limit: Array  # (point, axis): the largest factor that the power of the axis allows
-
-
 def _weight_bandwidths(
     component: Component, rows: Sequence[tuple[str, ...]], axes: tuple[str, ...], state: State
-) -> CrossEvidence:
+) -> tuple[Array, Array, Array, Array, Array]:
     """Weight the bandwidths by their likelihood, interpolated between those of the grid.
 
     White noise has the same prior probability as all low-passes together.
+
+    Returns
+    -------
+    width, share : ndarray, shape (point,)
+        Bandwidths [Hz] and their probabilities.
+    product, error : ndarray, shape (point, pair)
+        Products of the factors, and their errors.
+    limit : ndarray, shape (point, axis)
+        The largest factor that the power of the axis allows.
     """
     from scipy.interpolate import CubicSpline
 
@@ -123,13 +118,8 @@ def _weight_bandwidths(
         prior = np.append(np.full(fine.size, -math.log(fine.size)), 0.0)
     log, count = prior + table[:, 0], len(rows)
     share = np.exp(log - np.logaddexp.reduce(log))
-    return CrossEvidence(
-        widths,
-        share,
-        table[:, 1 : 1 + count],
-        table[:, 1 + count : 1 + 2 * count],
-        table[:, 1 + 2 * count :],
-    )
+    product, error, limit = np.split(table[:, 1:], [count, 2 * count], axis=1)
+    return widths, share, product, error, limit
 
 
 def _score_bandwidth(
