@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -105,28 +106,32 @@ def sum_evidence(components: Sequence[Component]) -> float:
     )
 
 
-def evidence_of(components: Sequence[Component], like: Component) -> float:
-    """Return the evidence of the component with the same statistic, row and reference channel."""
-    place = like.candidate.statistic, like.row, like.candidate.reference
-    return next(
-        (
-            component.evidence_nats
-            for component in components
-            if (component.candidate.statistic, component.row, component.candidate.reference)
-            == place
-        ),
-        like.evidence_nats,
-    )
+def renew_component(component: Component, components: Sequence[Component]) -> Component:
+    """Return a component with its evidence among `components`, and the course of its switching.
+
+    These were found with all other effects in the model; the one with the same statistic, row and
+    reference channel counts.
+    """
+    for other in components:
+        if _place_of(other) == _place_of(component):
+            is_switching = component.statistic.is_switching
+            variant = other.variant if is_switching else component.variant
+            return replace(component, evidence_nats=other.evidence_nats, variant=variant)
+    return component
+
+
+def _place_of(component: Component) -> tuple[object, ...]:
+    return component.statistic, component.row, component.candidate.reference
 
 
 def candidates_of(components: Sequence[Component]) -> list[Candidate]:
     """Return the candidates that the components come from, each once."""
-    distinct_candidates: dict[tuple[object, ...], Candidate] = {}
-    for component in components:
-        distinct_candidates[
-            component.candidate.key, component.statistic, component.candidate.reference
-        ] = component.candidate
-    return list(distinct_candidates.values())
+    candidates = [component.candidate for component in components]
+    by_statistic = {
+        (candidate.key, candidate.statistic, candidate.reference): candidate
+        for candidate in candidates
+    }
+    return list(by_statistic.values())
 
 
 def axes_of(components: Sequence[Component], order: Sequence[str]) -> tuple[str, ...]:
@@ -140,7 +145,7 @@ def split_layers(components: Sequence[Component]) -> list[list[Component]]:
     out: list[list[Component]] = []
     occurrences: Counter[tuple[object, ...]] = Counter()
     for component in components:
-        place = component.statistic, component.row, component.candidate.reference
+        place = _place_of(component)
         if occurrences[place] == len(out):
             out.append([])
         out[occurrences[place]].append(component)

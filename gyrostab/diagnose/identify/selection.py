@@ -222,31 +222,29 @@ def _select_next(
     if not passing:
         return None
     rivals = order_rivals(passing, components, state, examination)
-    pair = [] if rivals else find_pair(examination, passing, components, required, state)
-    if pair:
+    options = [[(key, components[key], state)] for key in rivals]
+    if not rivals:
+        options = [find_pair(examination, passing, components, required, state)]
+    failed: dict[str, tuple[str, float]] = {}
+    for option in filter(None, options):
         shifted = {
             key: beaten_by
-            for key, effect_components, with_other in pair
+            for key, effect_components, with_other in option
             if (beaten_by := _find_shifted(effect_components, with_other, examination))
         }
         if shifted:
-            return [], shifted
-        return [
-            make_selection(effect_components, required[key]) for key, effect_components, _ in pair
-        ], {}
-    failed: dict[str, tuple[str, float]] = {}
-    for key in rivals:
-        beaten_by = _find_shifted(components[key], state, examination)
-        if beaten_by:
-            failed[key] = beaten_by
+            failed |= shifted
             continue
-        min_nats = sum_evidence(components[key]) - settings.ambiguous_nats
+        min_nats = sum_evidence(option[0][1]) - settings.ambiguous_nats
         close = [
             components[other][0].candidate.effect
             for other in rivals
-            if other != key and other not in failed and sum_evidence(components[other]) >= min_nats
+            if other not in failed and sum_evidence(components[other]) >= min_nats
         ]
-        return [make_selection(components[key], required[key], alternatives=close)], failed
+        return [
+            make_selection(effect_components, required[key], alternatives=close)
+            for key, effect_components, _ in option
+        ], failed
     if failed:
         return [], failed
     alternative = passing[0]

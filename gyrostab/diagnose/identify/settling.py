@@ -11,6 +11,7 @@ from gyrostab.diagnose.identify.ambiguity import find_equivalent_effects, find_s
 from gyrostab.diagnose.identify.components import (
     PLAIN_LINE,
     candidates_of,
+    renew_component,
     split_layers,
     sum_evidence,
 )
@@ -22,7 +23,6 @@ from gyrostab.diagnose.identify.identification import (
     reduce_selection,
     with_axes_of,
 )
-from gyrostab.diagnose.identify.switching import renew_component
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
@@ -147,7 +147,7 @@ def _finish_identification(
     alternatives = dict.fromkeys([*identification.alternatives, *rivals])
     alternatives.pop(identification.effect, None)
     components = tuple(
-        renew_component(layer_components, component)
+        renew_component(component, layer_components)
         for layer, layer_components in zip(
             split_layers(identification.components), layers, strict=True
         )

@@ -1,8 +1,4 @@
-"""Order telegraph biases among the other effects, and find their course again.
-
-An effect that follows a channel comes first. The course of the switching is found again with all
-other effects in the model.
-"""
+"""Order telegraph biases among the other effects: one that follows a channel comes first."""
 
 from __future__ import annotations
 
@@ -11,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from gyrostab.diagnose.evidence.telegraph import telegraph_evidence
-from gyrostab.diagnose.identify.components import axes_of, evidence_of
+from gyrostab.diagnose.identify.components import axes_of
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identification import Selection, components_of, reduce_selection
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.statistics.jump_forms import is_free_jump
+from gyrostab.diagnose.statistics.telegraph import search_block_means
 
 
 def put_followers_first(
@@ -118,11 +114,15 @@ def drop_explained_jumps(chosen: Sequence[Selection], examination: Examination) 
                 examination.state_with(_drop_components(out, left_out))
                 for left_out in ([component], [component, *dropped_jumps])
             )
-            own_nats = _block_evidence(component, with_jumps)
+            # in block means: sub-blocks know more, and are not always available
+            own_nats, nats_without = (
+                float(search_block_means(state, component.row[0])[0][0])
+                for state in (with_jumps, without_jumps)
+            )
             if (
                 np.isfinite(own_nats)
                 and own_nats + sum(jump.evidence_nats for jump in dropped_jumps)
-                < _block_evidence(component, without_jumps) + examination.threshold
+                < nats_without + examination.threshold
             ):
                 (evidence,) = examination.compute_evidence([component.candidate], without_jumps)
                 row = evidence.rows.index(component.row)
@@ -145,21 +145,6 @@ def drop_explained_jumps(chosen: Sequence[Selection], examination: Examination) 
     return out
 
 
-def _block_evidence(component: Component, state: State) -> float:
-    """Return the evidence of two levels in the block means [nats].
-
-    It can be compared; that of sub-blocks knows more, and is not always available.
-    """
-    evidence_nats, _ = telegraph_evidence(
-        state.blocks,
-        state.baseline,
-        axis=component.row[0],
-        given=state.given_to("mean", component.row[0]),
-        settings=state.settings,
-    )
-    return float(evidence_nats[0])
-
-
 def _drop_components(chosen: Sequence[Selection], left_out: Sequence[Component]) -> list[Selection]:
     """Drop some components from the selections, and selections that lose all."""
     out = []
@@ -176,21 +161,3 @@ def _drop_components(chosen: Sequence[Selection], left_out: Sequence[Component])
         if remaining:
             out.append(selection)
     return out
-
-
-def renew_component(components: Sequence[Component], component: Component) -> Component:
-    """Return a component with its evidence, and the course of its switching, among `components`.
-
-    These were found with all other effects in the model.
-    """
-    fresh = replace(component, evidence_nats=evidence_of(components, component))
-    if not component.statistic.is_switching:
-        return fresh
-    return next(
-        (
-            replace(fresh, variant=other.variant)
-            for other in components
-            if other.statistic.is_switching and other.row == component.row
-        ),
-        fresh,
-    )

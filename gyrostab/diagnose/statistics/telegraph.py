@@ -71,15 +71,8 @@ class Telegraph(BlockMeanStatistic):
                 within.evidence_nats if within is not None and _is_resolved(within, state) else 0.0
             )
         else:
-            given = state.with_columns("mean", axis, [component.variant.design[0, 0]])
-            evidence_nats, _ = telegraph_evidence(
-                state.blocks,
-                state.baseline,
-                axis=axis,
-                given=given.given_to("mean", axis),
-                settings=settings,
-            )
-            nats = float(evidence_nats[0])
+            with_two = state.with_columns("mean", axis, [component.variant.design[0, 0]])
+            nats = float(search_block_means(with_two, axis)[0][0])
         yield Competitor("more than two levels", nats, allowed)
 
     def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
@@ -103,17 +96,11 @@ class Telegraph(BlockMeanStatistic):
             if "record" in trial.data.dims
             else trial.data
         )
-        rows: list[tuple[str, ...]] = [(axis,) for axis in trial.state.axes]
+        rows = self.rows(group[0], trial.state)
         evidence_nats = np.full((records, len(rows)), -np.inf)
         courses: list[tuple[TelegraphCourses, SwitchingEvidence | None]] = []
         for row, axis in enumerate(trial.state.axes):
-            axis_nats, course = telegraph_evidence(
-                searched,
-                trial.state.baseline,
-                axis=axis,
-                given=trial.state.given_to("mean", axis),
-                settings=trial.state.settings,
-            )
+            axis_nats, course = search_block_means(trial.state, axis, searched)
             evidence_nats[: axis_nats.size, row] = axis_nats
             within, refuted = _search_fast_switching(
                 searched, trial.state, axis, course, float(axis_nats[0])
@@ -215,8 +202,7 @@ def _with_free_levels(evidence: CandidateEvidence, trial: Trial) -> CandidateEvi
     for row, (axis,) in enumerate(evidence.rows):
         if not np.isfinite(evidence_nats[0, row]):
             continue
-        given = trial.state.given_to("mean", axis)
-        visits = _compare_visits(_course_of(best[row]), axis, trial.data, trial.state, given)
+        visits = _compare_visits(_course_of(best[row]), axis, trial.data, trial.state)
         evidence_nats[0, row] += visits.unequal_nats
         best[row] = replace(
             best[row],
@@ -248,23 +234,16 @@ def _unequal_nats(component: Component, state: State) -> float:
     """
     variant, axis = component.variant, component.row[0]
     given_columns = state.given.get(("mean", axis), [])
-    courses = [(_course_of(variant), given_columns)]
+    courses = [(_course_of(variant), state)]
     without_jumps = [
         column for column in given_columns if np.count_nonzero(np.diff(column)) > _JUMP_CHANGES
     ]
     if len(without_jumps) < len(given_columns) and not variant.inside.size:
-        _, telegraph = telegraph_evidence(
-            state.blocks,
-            state.baseline,
-            axis=axis,
-            given=np.stack(without_jumps, axis=-1) if without_jumps else None,
-            settings=state.settings,
-        )
-        courses.append((telegraph.share[0], without_jumps))
+        state_tried = replace(state, given={**state.given, ("mean", axis): without_jumps})
+        courses.append((search_block_means(state_tried, axis)[1].share[0], state_tried))
     nats = []
-    for share, columns in courses:
-        given = np.stack(columns, axis=-1) if columns else None
-        visits = _compare_visits(share, axis, state.blocks, state, given)
+    for share, state_tried in courses:
+        visits = _compare_visits(share, axis, state.blocks, state_tried)
         is_known = visits.switch_count >= state.settings.min_switches
         nats.append(visits.unequal_nats if is_known else max(visits.unequal_nats, 0.0))
     return min(nats)
@@ -275,16 +254,14 @@ def _course_of(variant: Variant) -> Array:
     return variant.inside if variant.inside.size else np.asarray(variant.design[0, 0])
 
 
-def _compare_visits(
-    share: Array, axis: str, data: xr.Dataset, state: State, given: Array | None
-) -> Visits:
+def _compare_visits(share: Array, axis: str, data: xr.Dataset, state: State) -> Visits:
     return compare_visits(
         axis_values(data, "mean", axis),
         state.baseline,
         share,
         axis=axis,
         block_s=float(state.blocks.attrs["block_s"]),
-        given=given,
+        given=state.given_to("mean", axis),
     )
 
 
@@ -300,6 +277,19 @@ def _is_resolved(switching: SwitchingEvidence, state: State) -> bool:
     """Return whether sub-blocks resolve two levels; anything shorter is a spike."""
     sub_block = float(state.blocks.attrs["block_s"]) / switching.share.shape[1]
     return bool(np.isfinite(switching.evidence_nats)) and float(switching.times.min()) >= sub_block
+
+
+def search_block_means(
+    state: State, axis: str, data: xr.Dataset | None = None
+) -> tuple[Array, TelegraphCourses]:
+    """Return evidence and courses of two levels in block means, by default those of the state."""
+    return telegraph_evidence(
+        state.blocks if data is None else data,
+        state.baseline,
+        axis=axis,
+        given=state.given_to("mean", axis),
+        settings=state.settings,
+    )
 
 
 def _search_sub_blocks(data: xr.Dataset, state: State, axis: str) -> SwitchingEvidence | None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
-from gyrostab.diagnose.identify.components import evidence_of, split_layers
+from gyrostab.diagnose.identify.components import renew_component, split_layers
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identification import Selection, with_axes_of
 from gyrostab.diagnose.nulls.records import null_records
@@ -50,7 +50,7 @@ def test_repeated_rows_form_new_layers():
 def test_evidence_is_kept_apart_by_reference_channel():
     components = [component(40.0, reference="z"), component(9.0, reference="seismometer")]
     assert [
-        evidence_of(components, component(1.0, reference=name))
+        renew_component(component(1.0, reference=name), components).evidence_nats
         for name in ("z", "seismometer", "y")
     ] == [
         40.0,
