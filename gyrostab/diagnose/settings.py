@@ -38,7 +38,7 @@ class Settings:
     --------
     >>> strict = Settings(ambiguous_nats=4.6)  # odds of 100 to 1
     >>> strict.ambiguous_nats, strict.reject_nats
-    (4.6, 6.0)
+    (4.6, 9.2)
     """
 
     majority_share: float = _make_setting(
@@ -47,7 +47,8 @@ class Settings:
         "Share that makes a part the larger one: common time of two regions that are one, "
         "blocks that a motion may move, evidence that a filter leaves of a line, variance of "
         "a switching course that another effect explains, Q^2 of an angle counter, equal share of "
-        "what several effects explain of a mismatch.",
+        "what several effects explain of a mismatch, correlation of a time-shifted surrogate with "
+        "its channel, amplitude at the averaging times of a region over the largest.",
         "nearer to the whole than to nothing; no other value separates two alternatives equally",
     )
     component_nats: float = _make_setting(
@@ -63,13 +64,6 @@ class Settings:
         "form must be better than a jump or two levels.",
         "odds of 20 to 1, ln 20 = 3.0 (strong evidence: Kass and Raftery, 1995, "
         "doi:10.1080/01621459.1995.10476572)",
-    )
-    reject_nats: float = _make_setting(
-        6.0,
-        "nat",
-        "Evidence that rejects the simpler of two forms: one term in place of two, one filter for "
-        "all axes.",
-        "odds of 400 to 1 (ln 400 = 6.0), the square of the odds of `ambiguous_nats`",
     )
     disagreement_nats: float = _make_setting(
         8.0,
@@ -124,23 +118,11 @@ class Settings:
         "twice the 5 nats of very strong evidence (Kass and Raftery, 1995), as an "
         "autoregression fits the spectrum of the rival, normal noise",
     )
-    refuting_nats: float = _make_setting(
-        20.0,
-        "nat",
-        "Evidence of means within blocks, not those of two levels, that refutes a telegraph bias.",
-        "choice: twice `two_level_nats`",
-    )
     surrogate_share: float = _make_setting(
         0.01,
         "1",
         "Share of the time-shifted surrogates that may explain as much as the channel.",
         "the default false-alarm probability; two of the 200 surrogates",
-    )
-    surrogate_correlation: float = _make_setting(
-        0.5,
-        "1",
-        "Correlation with the channel above which a time-shifted surrogate is not a control.",
-        "choice: such a surrogate has 0.25 of the evidence of the channel, the correlation squared",
     )
     term_correlation: float = _make_setting(
         0.999,
@@ -173,12 +155,6 @@ class Settings:
         "block",
         "Mean time on a level up to which sub-blocks can refute a telegraph bias.",
         "choice: sub-blocks show every switch, blocks of one level only from there",
-    )
-    misfit_nats: float = _make_setting(
-        0.2,
-        "nat",
-        "Model error of two levels that each switch may have.",
-        "choice: with five switches 1 nat, a factor of e in the odds",
     )
     max_level_sigma: float = _make_setting(
         8.0,
@@ -389,12 +365,6 @@ class Settings:
         "Score by which a part of the record must exceed the whole to be the region.",
         "choice; moves the ends of regions",
     )
-    region_excess_share: float = _make_setting(
-        0.25,
-        "1",
-        "Share of the largest excess that the other averaging times of a region must have.",
-        "choice: half of the largest deviation in amplitude; moves the averaging times of regions",
-    )
     gap_time_share: float = _make_setting(
         0.25,
         "1",
@@ -427,13 +397,6 @@ class Settings:
         "Share of the largest contribution of an effect above which it acts, and of its largest "
         "step above which it moves the rate within a block.",
         "choice: 1 % of the largest power",
-    )
-    rest_share: float = _make_setting(
-        0.05,
-        "1",
-        "Share of the largest contribution below which an effect rests, and share of the blocks at "
-        "rest that makes zero its level at rest.",
-        "choice: half of `active_share`",
     )
     overlap_share: float = _make_setting(
         0.3,
@@ -474,6 +437,35 @@ class Settings:
             value = getattr(self, item.name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{item.name}={value!r}: give a number from 0 up")
+
+    @property
+    def reject_nats(self) -> float:
+        """Evidence that rejects the simpler of two forms, such as one filter for all axes [nats].
+
+        The square of the odds of `ambiguous_nats`.
+        """
+        return 2.0 * self.ambiguous_nats
+
+    @property
+    def refuting_nats(self) -> float:
+        """Evidence of means within blocks, not of two levels, that refutes a telegraph bias [nats].
+
+        The square of the odds of `two_level_nats`.
+        """
+        return 2.0 * self.two_level_nats
+
+    @property
+    def misfit_nats(self) -> float:
+        """Model error of two levels that each switch may have: 1 nat with the fewest switches."""
+        return 1.0 / max(self.min_switches, 1.0)
+
+    @property
+    def rest_share(self) -> float:
+        """Share of the largest contribution below which an effect rests: half of `active_share`.
+
+        Also the share of the blocks at rest that makes zero its level at rest.
+        """
+        return 0.5 * self.active_share
 
     @classmethod
     def table(cls) -> str:

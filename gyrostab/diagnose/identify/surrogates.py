@@ -53,7 +53,7 @@ def passes_time_shift_test(
     )
     real, shifted = 0.0, np.zeros(shifts.size)
     valid = np.ones(shifts.size, np.bool_)
-    limit = state.settings.surrogate_correlation
+    limit = state.settings.majority_share
     for component in following_components:
         surrogates = make_surrogates(component, state.blocks, state.baseline["coefficient"], shifts)
         row = state.axes.index(component.row[0])

@@ -282,7 +282,7 @@ def _find_columns(
         upper += 1
     grown = np.arange(lower, upper + 1)
     excess = np.abs(ratio - 1.0) if statistic.is_ratio else np.abs(combined)
-    region = grown[excess[grown] >= settings.region_excess_share * excess[column]]
+    region = grown[excess[grown] >= settings.majority_share**2 * excess[column]]
     if kinds[column] == "line":
         first, last = max(lower - LEAK_LINES, 0), min(upper + LEAK_LINES + 1, kinds.size)
         return np.array([column]), np.arange(first, last)
