@@ -15,7 +15,6 @@ from gyrostab.diagnose.evidence.held_out import (
     linear_model_factors,
     mean_factors,
     noise_columns,
-    stack_designs,
     with_independent_cells,
 )
 from gyrostab.diagnose.evidence.products import Array, held_out_evidence
@@ -27,7 +26,6 @@ def power_factors(
     designs: Sequence[Array],
     *,
     axis: str,
-    tier: Tier = "free",
     given: Array | None = None,
     folds: xr.DataArray | None = None,
 ) -> Array:
@@ -41,7 +39,7 @@ def power_factors(
         ``spectrum``, ``shape_alone``, ``common``, and the variables of `noise_columns`.
     designs : sequence of ndarray, shape (block, band) or (block, band, column)
         Relative change of the spectrum per unit of the factor.
-    axis, tier, given, folds
+    axis, given, folds
         As in `mean_factors`; `given` has the shape (block, band, column), and the level of the
         noise is always given.
 
@@ -57,19 +55,17 @@ def power_factors(
     weight = np.asarray(
         baseline["shape_alone"].sel(axis=axis).transpose("block", "band").values, dtype=np.float64
     )
-    level, precision = noise_columns(baseline, axis=axis, tier=tier)
+    level, precision = noise_columns(baseline, axis=axis)
     columns_given = (
         np.empty((*shape, 0))
         if given is None
         else np.asarray(given, dtype=np.float64).reshape(*shape, -1)
     )
     widest_limits = np.diag([*np.diagonal(precision), *[-1.0] * columns_given.shape[2]])
-    columns, numbers = stack_designs(designs, shape)
-    design_columns = [columns[:, chosen].reshape(*shape, -1) for chosen in numbers]
     model = LinearModel(
         values,
         weight,
-        design_columns,
+        [np.asarray(design, dtype=np.float64).reshape(*shape, -1) for design in designs],
         np.concatenate([level, columns_given], axis=2),
         widest_limits,
     )
@@ -126,11 +122,8 @@ def power_evidence(
     candidates: Mapping[str, Sequence[Array]],
     *,
     axis: str,
-    tier: Tier = "free",
     **more: Any,
 ) -> xr.DataArray:
     """Compute the held-out evidence of candidates in the band powers, as `mean_evidence`."""
     designs = [design for shapes in candidates.values() for design in shapes]
-    return _label_evidence(
-        power_factors(data, baseline, designs, axis=axis, tier=tier, **more), candidates
-    )
+    return _label_evidence(power_factors(data, baseline, designs, axis=axis, **more), candidates)

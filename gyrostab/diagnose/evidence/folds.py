@@ -9,8 +9,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.errors import SchemaError
-
 #: Folds of each length; consecutive intervals belong to them in turn.
 FOLDS = 4
 #: Length of an interval [s], and its largest share of the record. Design choice.
@@ -22,11 +20,6 @@ def fold_blocks(blocks: xr.Dataset) -> xr.DataArray:
 
     The coordinate ``length`` of an interval [s] is a whole number of blocks.
 
-    Raises
-    ------
-    SchemaError
-        If there are fewer blocks than folds.
-
     Examples
     --------
     >>> edges = np.arange(181) * 20.0
@@ -37,11 +30,6 @@ def fold_blocks(blocks: xr.Dataset) -> xr.DataArray:
     """
     begin, end = blocks["begin"].values, blocks["end"].values
     n = begin.size
-    if n < FOLDS:
-        raise SchemaError(
-            f"the record has {n} blocks, fewer than the {FOLDS} parts of which each is held out "
-            "in turn; give a longer record"
-        )
     step = float(end[0] - begin[0])
     span = n * step
     block_count = [max(1, round(min(seconds, share * span) / step)) for seconds, share in LENGTHS]

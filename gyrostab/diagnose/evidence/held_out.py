@@ -38,30 +38,18 @@ from gyrostab.diagnose.evidence.products import (
     remove_common_part,
 )
 from gyrostab.diagnose.reduce.schema import axis_values
-from gyrostab.errors import OptionError
 
 #: "free": the noise may differ from the calibrated one (to name an effect); "calibrated": it is the
 #: calibrated one (to detect an effect).
 Tier = Literal["free", "calibrated"]
 
 
-def stack_designs(
-    designs: Sequence[Array], shape: tuple[int, ...]
-) -> tuple[Array, list[NDArray[np.int64]]]:
-    """Concatenate designs as (cell, column); return them with the column indices of each."""
-    products, numbers, first = [], [], 0
-    for design in designs:
-        array = np.asarray(design, dtype=np.float64)
-        if array.shape[: len(shape)] != shape or array.ndim > len(shape) + 1:
-            raise OptionError(
-                f"a design has the shape {array.shape}; it must be {shape}, "
-                "or that with the number of its columns behind"
-            )
-        flat = array.reshape(int(np.prod(shape)), -1)
-        products.append(np.where(np.isfinite(flat), flat, 0.0))
-        numbers.append(np.arange(first, first + flat.shape[1]))
-        first += flat.shape[1]
-    return np.concatenate([*products, np.empty((int(np.prod(shape)), 0))], axis=1), numbers
+def _number_columns(designs: Sequence[Array]) -> list[NDArray[np.int64]]:
+    """Return the indices of the columns of each design, the last dimension, among those of all."""
+    ends = np.cumsum([design.shape[-1] for design in designs])
+    return [
+        np.arange(end - design.shape[-1], end) for design, end in zip(designs, ends, strict=True)
+    ]
 
 
 def mean_residual(data: xr.Dataset, baseline: xr.Dataset, axis: str) -> Array:
@@ -73,8 +61,6 @@ def mean_residual(data: xr.Dataset, baseline: xr.Dataset, axis: str) -> Array:
 
 def noise_weight(baseline: xr.Dataset, axis: str, tier: Tier) -> Array:
     """Return the log weights of the grid of K and B, (grid,)."""
-    if tier not in ("free", "calibrated"):
-        raise OptionError(f"tier={tier!r}: there are 'free' and 'calibrated'")
     name = "grid_prior" if tier == "free" else "grid_calibrated"
     return np.asarray(axis_values(baseline, name, axis), dtype=np.float64)
 
@@ -106,12 +92,14 @@ def mean_factors(
     """
     n = data.sizes["block"]
     values = mean_residual(data, baseline, axis)
-    columns, numbers = stack_designs(designs, (n,))
+    flat = [np.asarray(design, dtype=np.float64).reshape(n, -1) for design in designs]
     columns_given = (
         np.empty((n, 0)) if given is None else np.asarray(given, dtype=np.float64).reshape(n, -1)
     )
-    design_width = columns.shape[1]
-    columns = np.concatenate([columns, columns_given], axis=1)
+    columns = np.concatenate(
+        [*(np.where(np.isfinite(design), design, 0.0) for design in flat), columns_given], axis=1
+    )
+    numbers, design_width = _number_columns(flat), columns.shape[1] - columns_given.shape[1]
     present = np.asarray(np.isfinite(values).all(axis=1))
     setup = axis_noise(baseline, axis) | {
         "step": float(data["end"][0] - data["begin"][0]),
@@ -154,13 +142,12 @@ def _factors_by_subset(
     return out
 
 
-def noise_columns(baseline: xr.Dataset, *, axis: str, tier: Tier = "free") -> tuple[Array, Array]:
+def noise_columns(baseline: xr.Dataset, *, axis: str) -> tuple[Array, Array]:
     """Return the relative change of the spectrum per noise coefficient, and its prior precision.
 
-    In the tier "free", N may take any value; Q changes by its value and error, B and K by three
-    times that, because the spectrum cannot fall below what the other terms leave. The error of Q is
-    that of its posterior, which ends at zero: Q cannot explain a spectrum that falls towards its
-    end, as after a filter. In the tier "calibrated" all change by their errors.
+    N may take any value; Q changes by its value and error, B and K by three times that, because the
+    spectrum cannot fall below what the other terms leave. The error of Q is that of its posterior,
+    which ends at zero: Q cannot explain a spectrum that falls towards its end, as after a filter.
 
     Returns
     -------
@@ -173,13 +160,12 @@ def noise_columns(baseline: xr.Dataset, *, axis: str, tier: Tier = "free") -> tu
     columns = axis_values(baseline, "columns", axis) / spectrum[..., None]
     square = axis_values(baseline, "square", axis)
     error = axis_values(baseline, "square_stderr", axis)
-    if tier == "free":
-        names = [str(name) for name in baseline["noise"].values]
-        freedom = np.array([{"Q": 1.0, "N": 1e3, "B": 3.0, "K": 3.0}[name] for name in names])
-        if "posterior" in baseline:
-            within = axis_values(baseline, "posterior", axis).std(axis=0)
-            error = np.where(np.array(names) == "Q", np.minimum(error, within), error)
-        error = freedom * np.hypot(square, error)
+    names = [str(name) for name in baseline["noise"].values]
+    freedom = np.array([{"Q": 1.0, "N": 1e3, "B": 3.0, "K": 3.0}[name] for name in names])
+    if "posterior" in baseline:
+        within = axis_values(baseline, "posterior", axis).std(axis=0)
+        error = np.where(np.array(names) == "Q", np.minimum(error, within), error)
+    error = freedom * np.hypot(square, error)
     free = error > 0.0
     return columns[..., free], np.diag(1.0 / np.square(error[free]))
 
@@ -222,10 +208,7 @@ def linear_model_factors(model: LinearModel, folds: xr.DataArray) -> Array:
     count = model.given.shape[2]
     flat = [np.where(np.isfinite(array), array, 0.0) for array in (*model.designs, model.given)]
     columns = np.concatenate(flat, axis=2)
-    ends = np.cumsum([array.shape[2] for array in model.designs])
-    numbers = [
-        np.arange(end - array.shape[2], end) for array, end in zip(model.designs, ends, strict=True)
-    ]
+    numbers = _number_columns(model.designs)
     classes, member = np.unique(folds.values.T, axis=0, return_inverse=True)
     products = []
     for number in range(len(classes)):
