@@ -7,7 +7,8 @@ error.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,7 +60,6 @@ class _NullSetup(NamedTuple):
     baseline: xr.Dataset
     # Shapes of the gamma parts that each band has in common with the first, second, ... above it.
     ties: list[Array]
-    columns: Array
     effects: Array  # expected power over that of the noise alone
     sd: Array  # standard deviations of a sample and of a difference of neighbours, by axis
     # Excess kurtosis of a block beyond that of white Gaussian noise, and its scatter over that of
@@ -112,16 +112,8 @@ def repeatable_null_records(
         return null_records(blocks, baseline, count=count, rng=rng, chunk=batch)
 
     # with lines and cross-spectra, a null record takes about three times as much as its powers
-    if count * power_bytes * 3 > MAX_KEPT_NULL_BYTES:
-        return draw
-    records: list[xr.Dataset] = []
-
-    def recall() -> Iterable[xr.Dataset]:
-        if not records:
-            records.extend(draw())
-        return records
-
-    return recall
+    is_large = count * power_bytes * 3 > MAX_KEPT_NULL_BYTES
+    return draw if is_large else cache(lambda: list(draw()))
 
 
 def _prepare_nulls(
@@ -146,7 +138,7 @@ def _prepare_nulls(
     tails = np.array([_kurtosis_excess(blocks, axis_density, rng) for axis_density in density])
     ties = _common_shapes(baseline["shape_alone"].values, int(blocks.attrs["block_samples"]))
     shared = find_shared_noise(blocks, baseline)
-    return _NullSetup(blocks, baseline, ties, columns, effects, np.array(sd), tails, shared)
+    return _NullSetup(blocks, baseline, ties, effects, np.array(sd), tails, shared)
 
 
 def _common_shapes(shape: Array, size: int) -> list[Array]:
@@ -177,7 +169,7 @@ def _common_shapes(shape: Array, size: int) -> list[Array]:
     return [tie * np.minimum(low, high) for low, high, tie in _pairs_of_bands(factor, ties)]
 
 
-def _pairs_of_bands(values: Array, ties: list[Array]) -> Iterator[tuple[Array, Array, Array]]:
+def _pairs_of_bands(values: Array, ties: Sequence[Array]) -> Iterator[tuple[Array, Array, Array]]:
     """Yield the lower and the upper band of each tie as array slices, with the tie."""
     for apart, tie in enumerate(ties, start=1):
         yield values[..., : tie.shape[-1]], values[..., apart : apart + tie.shape[-1]], tie
@@ -211,14 +203,13 @@ def _draw_records(setup: _NullSetup, count: int, rng: np.random.Generator) -> xr
     squares, slow = (
         baseline[name].values[np.arange(axes), chosen] for name in ("posterior", "posterior_slow")
     )
-    expected = np.einsum("abfn,ran->rabf", setup.columns, squares) * setup.effects
+    expected = np.einsum("abfn,ran->rabf", baseline["columns"].values, squares) * setup.effects
     if "form_shape" in baseline:  # the form of the spectrum was measured on a simulated log
         form = baseline["form_shape"].values
         expected *= _draw_gamma(form, np.ones((count, *form.shape)), rng)[:, :, None]
     between: Complex | None = None
     if setup.shared is None:
-        shape_alone = baseline["shape_alone"].values
-        power = _draw_correlated_gamma(shape_alone, setup.ties, expected, rng)
+        power = _draw_gamma(baseline["shape_alone"].values, expected, rng, setup.ties)
     else:
         power, between = draw_shared_spectra(setup.shared, count, rng)
         power *= expected
@@ -257,17 +248,13 @@ def _draw_records(setup: _NullSetup, count: int, rng: np.random.Generator) -> xr
     )
 
 
-def _draw_gamma(shape: Array, mean: Array, rng: np.random.Generator) -> Array:
-    """Draw gamma variables with these shapes and means."""
-    safe = np.where(np.isfinite(shape) & (shape > 0.0), shape, 1.0)
-    drawn = rng.standard_gamma(np.broadcast_to(safe, mean.shape)) / safe
-    return np.asarray(np.where(np.isinf(shape), 1.0, drawn) * mean)
-
-
-def _draw_correlated_gamma(
-    shape: Array, ties: list[Array], mean: Array, rng: np.random.Generator
+def _draw_gamma(
+    shape: Array, mean: Array, rng: np.random.Generator, ties: Sequence[Array] = ()
 ) -> Array:
-    """Draw gamma variables with common parts, whose shapes add up at equal scale."""
+    """Draw gamma variables with these shapes and means; parts in `ties` are common to two bands.
+
+    Shapes of variables of equal scale add up.
+    """
     safe = np.where(np.isfinite(shape) & (shape > 0.0), shape, 1.0)
     shape_alone = safe.copy()
     for low, high, tie in _pairs_of_bands(shape_alone, ties):
@@ -278,7 +265,7 @@ def _draw_correlated_gamma(
         common_part = rng.standard_gamma(np.broadcast_to(tie, (len(mean), *tie.shape)))
         low += common_part
         high += common_part
-    return np.asarray(drawn / safe * mean)
+    return np.asarray(np.where(np.isinf(shape), 1.0, drawn / safe) * mean)
 
 
 def _draw_means(setup: _NullSetup, squares: Array, slow: Array, rng: np.random.Generator) -> Array:
@@ -328,14 +315,13 @@ def _draw_means(setup: _NullSetup, squares: Array, slow: Array, rng: np.random.G
 
 def _draw_lines(setup: _NullSetup, squares: Array, rng: np.random.Generator) -> Array:
     """Draw the mean periodograms of the parts of the record."""
-    blocks = setup.blocks
+    blocks, baseline = setup.blocks, setup.baseline
     weight = blocks["line_weight"].values
     part_count, n = weight.shape[1], blocks.sizes["block"]
-    columns = line_columns(blocks)
     part_of = np.arange(n) * part_count // n
     neighbours = blocks["neighbours"].values
     frequency, bands = np.log(blocks["line_frequency"].values), np.log(blocks["frequency"].values)
-    plain = squares @ columns.T
+    plain = squares @ line_columns(blocks).T
     flat = plain.mean(axis=-1, keepdims=True)
     out = np.full((*plain.shape[:2], part_count, plain.shape[2]), np.nan)
     for axis, part in np.ndindex(*weight.shape):
@@ -344,17 +330,14 @@ def _draw_lines(setup: _NullSetup, squares: Array, rng: np.random.Generator) -> 
             continue
         share = neighbours[axis, chosen].mean()
         over = setup.effects[axis, chosen].mean(axis=0)
-        if "line_spectrum" in setup.baseline:
-            noise = (setup.columns[axis, chosen] @ setup.baseline["square"].values[axis]).mean(
-                axis=0
-            )
-            over = np.maximum(
-                over - setup.baseline["line_spectrum"].values[axis] / noise, 0.01 * over
-            )
+        if "line_spectrum" in baseline:
+            columns = baseline["columns"].values[axis, chosen]
+            noise = (columns @ baseline["square"].values[axis]).mean(axis=0)
+            over = np.maximum(over - baseline["line_spectrum"].values[axis] / noise, 0.01 * over)
         effects = np.interp(frequency, bands, over)
         out[:, axis, part] = (share * plain[:, axis] + (1.0 - share) * flat[:, axis]) * effects
-        if "peaks" in setup.baseline:
-            out[:, axis, part] += setup.baseline["peaks"].values[axis]
+        if "peaks" in baseline:
+            out[:, axis, part] += baseline["peaks"].values[axis]
     drawn = _draw_gamma(weight[..., None], np.ones(out.shape), rng)
     return _correlate_lines(drawn, int(blocks.attrs["block_samples"])) * out
 
