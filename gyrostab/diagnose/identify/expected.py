@@ -34,24 +34,18 @@ def identify_expected_effects(known: Sequence[Effect], examination: Examination)
     while remaining and rounds > 0:
         rounds -= 1
         choices = [(_best_components(effect, examination, state), effect) for effect in remaining]
-        remaining = [effect for components, effect in choices if sum_evidence(components) > needed]
-        components, effect = max(
-            choices,
-            key=lambda choice: (_are_anomalous_samples(choice[0], needed), sum_evidence(choice[0])),
-        )
-        if sum_evidence(components) <= needed:
+        choices = [choice for choice in choices if sum_evidence(choice[0]) > needed]
+        if not choices:
             break
+        components, effect = max(
+            choices, key=lambda choice: (choice[0][0].statistic.is_count, sum_evidence(choice[0]))
+        )
         identified.append(make_selection(components, needed, order=state.axes))
         state = condition_on(state, components)
-        if _are_anomalous_samples(components, needed):  # their counts cannot be taken out
-            remaining = [other for other in remaining if other is not effect]
+        # counts of anomalous samples cannot be taken out
+        ended = effect if components[0].statistic.is_count else None
+        remaining = [other for _, other in choices if other is not ended]
     return replace(examination, expected=tuple(identified), start=state)
-
-
-def _are_anomalous_samples(components: Sequence[Component], needed: float) -> bool:
-    return (
-        bool(components) and components[0].statistic.is_count and sum_evidence(components) > needed
-    )
 
 
 def _is_candidate_of(candidate: Candidate, effect: Effect) -> bool:

@@ -50,7 +50,12 @@ def keep_physical(
     )
     if other_course:
         return [], other_course
-    forms = [_find_other_form(component, state) for component in components]
+    forms = [
+        _find_winner(component.statistic.axis_competitors(component, state))
+        if _is_possible(component, state)
+        else ("an impossible size", math.nan)
+        for component in components
+    ]
     remaining = [component for component, form in zip(components, forms, strict=True) if not form]
     return remaining, next(iter(forms), None) if not remaining else None
 
@@ -104,13 +109,6 @@ def _rotation_share(component: Component, state: State) -> float:
         if variant.columns == ("linear",)
     )
     return float(np.nanstd(error) / (_PPM * np.nanstd(per_ppm)))
-
-
-def _find_other_form(component: Component, state: State) -> tuple[str, float] | None:
-    """Return what excludes a component, and by how much it explains more [nats]."""
-    if not _is_possible(component, state):
-        return "an impossible size", math.nan
-    return _find_winner(component.statistic.axis_competitors(component, state))
 
 
 def _is_possible(component: Component, state: State) -> bool:

@@ -232,19 +232,15 @@ def form_error(
     decimators. A filter, or another noise of the same channel, would explain what this leaves over
     frequency.
     """
-    statistics = [
-        (component.statistic, set(component.row), component.candidate)
-        for component in components
-        if not component.statistic.is_line
-    ]
     error = 0.0
     for selection in chosen:
         for component in selection.components:
             affected_candidates = [
-                candidate
-                for statistic, axes, candidate in statistics
-                if statistic.error_shows_in[0] in component.statistic.error_shows_in
-                and axes & set(component.row)
+                own.candidate
+                for own in components
+                if not own.statistic.is_line
+                and own.statistic.error_shows_in[0] in component.statistic.error_shows_in
+                and {*own.row} & {*component.row}
             ]
             of_spectrum = (
                 component.statistic.is_power

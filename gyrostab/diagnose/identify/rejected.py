@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from gyrostab.diagnose.identify.components import axes_of, sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.identification import Rejection, Selection, form_error
+from gyrostab.diagnose.identify.identification import Rejection, Selection
 from gyrostab.diagnose.identify.nuisance_alternatives import NUISANCE_ALTERNATIVES
 from gyrostab.diagnose.identify.settling import evidence_instead
 from gyrostab.diagnose.predict.candidates import Component
@@ -43,30 +43,30 @@ def find_rejections(
             for selection in unidentified
         ),
     ]
-    selections = [*examination.expected, *chosen]
-    threshold = examination.threshold
-    named = {selection.effect for selection in selections if selection.is_named}
+    named = {
+        selection.effect for selection in (*examination.expected, *chosen) if selection.is_named
+    }
     out: dict[str, tuple[float, Rejection]] = {}
     for key, effect_components in components.items():
         effect = effect_components[0].candidate.effect
         if key.startswith("~") or effect in named:
             continue
         added_nats = sum_evidence(effect_components)
-        error = form_error(effect_components, selections, settings=state.settings)
+        required = examination.required_nats(effect_components, chosen)
         winner = max(
             chosen, key=lambda selection: selection.instead.get(key, -math.inf), default=None
         )
         instead = winner.instead.get(key, -math.inf) if winner else -math.inf
-        if added_nats > threshold + error:
+        if added_nats > required:
             name, nats = (
                 _find_withdrawn(effect, chosen)
                 or beaten.get(key)
                 or _find_strongest(effect_components, chosen)
             )
-        elif winner and instead > threshold:
+        elif winner and instead > examination.threshold:
             name, nats = _name_of(winner), winner.evidence_nats - instead
         else:
-            name, nats = _NOISE, threshold + error - added_nats
+            name, nats = _NOISE, required - added_nats
         best = max(added_nats, instead)
         if effect not in out or best > out[effect][0]:
             out[effect] = (

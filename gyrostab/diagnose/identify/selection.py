@@ -259,8 +259,8 @@ def _find_shifted(
     components: Sequence[Component], state: State, examination: Examination
 ) -> tuple[str, float] | None:
     """Return the time-shifted channel that beats an effect, and by how much [nats]."""
-    shifts = passes_time_shift_test(components, state, examination.folds)
-    return None if shifts.passed else ("a time-shifted channel", shifts.nats)
+    passed, _, nats = passes_time_shift_test(components, state, examination.folds)
+    return None if passed else ("a time-shifted channel", nats)
 
 
 def _variants_by_row(chosen: Sequence[Selection]) -> set[tuple[str, tuple[str, ...], Variant]]:

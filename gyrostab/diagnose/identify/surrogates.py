@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -20,19 +19,9 @@ TIME_SHIFTS = 200
 SHIFT_RANGE = (0.05, 0.95)  # of the record
 
 
-class TimeShifts(NamedTuple):
-    """Result of the time-shift test."""
-
-    passed: bool  # also true where no surrogate can be made
-    #: Share of the surrogates that explain as much, and by how much the best of them explains more
-    #: than the channel [nats]; NaN where too few of them differ from the channel.
-    p_value: float = np.nan
-    nats: float = np.nan
-
-
 def passes_time_shift_test(
     components: Sequence[Component], state: State, folds: xr.DataArray
-) -> TimeShifts:
+) -> tuple[bool, float, float]:
     """Test whether an effect explains more than time-shifted surrogates of its channel.
 
     Parameters
@@ -41,10 +30,18 @@ def passes_time_shift_test(
         Components of the effect.
     state : State
         What is in the model without it.
+
+    Returns
+    -------
+    passed : bool
+        Also true where no surrogate can be made.
+    p_value, nats : float
+        Share of the surrogates that explain as much, and by how much the best of them explains more
+        than the channel [nats]; NaN where too few of them differ from the channel.
     """
     following_components = [component for component in components if _follows_channel(component)]
     if not following_components:
-        return TimeShifts(True)
+        return True, np.nan, np.nan
     block_count = state.blocks.sizes["block"]
     shifts = np.unique(
         np.linspace(block_count * SHIFT_RANGE[0], block_count * SHIFT_RANGE[1], TIME_SHIFTS).astype(
@@ -78,10 +75,10 @@ def passes_time_shift_test(
         real += float(values[0])
         shifted += values[1:]
     if valid.sum() < state.settings.min_surrogates:
-        return TimeShifts(True)
+        return True, np.nan, np.nan
     p_value = float(np.mean(shifted[valid] >= real))
-    passed = p_value <= state.settings.surrogate_share
-    return TimeShifts(passed, p_value, float(shifted[valid].max() - real))
+    nats = float(shifted[valid].max() - real)
+    return p_value <= state.settings.surrogate_share, p_value, nats
 
 
 def _follows_channel(component: Component) -> bool:
