@@ -312,10 +312,7 @@ def _surface_of_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows
         table = _gamma_shape(np.arange(int(count.max(initial=0)) + 1), k)
         surfaces["shape"].append(np.where(fits, table[count.astype(np.int64)], np.nan))
     joined: dict[str, Any] = {
-        name: np.stack(np.broadcast_arrays(*values), axis=-1)
-        if sizes
-        else np.empty((*means.shape[:-1], windows.first.size, 0))
-        for name, values in surfaces.items()
+        name: np.stack(np.broadcast_arrays(*values), axis=-1) for name, values in surfaces.items()
     }
     tau = np.array(sizes, dtype=float) * block
     joined["columns"] = {
