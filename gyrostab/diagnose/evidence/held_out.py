@@ -226,9 +226,8 @@ def linear_model_factors(model: LinearModel, folds: xr.DataArray) -> Array:
     for length in range(classes.shape[1]):
         for number in range(FOLDS):
             of_fold = zip(products, classes[:, length] == number, strict=True)
-            held = [part for part, is_held in of_fold if is_held]
-            left = zip(total, _sum_products(held), strict=True) if held else ()
-            subset_products.append(Products(*(a - b for a, b in left)) if held else total)
+            held = _sum_products([part for part, is_held in of_fold if is_held])
+            subset_products.append(Products(*(a - b for a, b in zip(total, held, strict=True))))
     return _factors_by_subset(subset_products, precision, numbers, limits, np.zeros(1))
 
 

@@ -51,14 +51,12 @@ class DriftingLine(Statistic):
         Paths begin anywhere, cover 4 lines or more in either direction, and accelerate or slow down
         by up to a half of their mean speed. The largest sum from one eighth of the spectrum to
         another is the score of that column, and ``ratio``. Several axes have a row of all together.
-        None without lines, or with spectra of fewer than 6 parts of the record.
+        None with spectra of fewer than 6 parts of the record.
 
         Every line is relative to the lines around it in its part and to its own mean over the
         parts, and its contribution is limited: neither a steady line nor a noisier part of the
         record is a drifting line.
         """
-        if "line_power" not in blocks:
-            return None
         power, weight = blocks["line_power"].values, blocks["line_weight"].values
         present = np.isfinite(power).reshape(-1, *power.shape[-3:]).all(axis=(0, 3)) & (weight > 0)
         parts = np.flatnonzero(present.all(axis=0))

@@ -59,13 +59,11 @@ class SpectralLine(Statistic):
     has_size = False
     uses_line_spectra = True
 
-    def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
+    def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
         """Score every line of the spectrum, in parts of the record and in the whole.
 
         ``estimate`` is the amplitude of a sine with the same excess [degree hour-1].
         """
-        if "line_power" not in blocks:
-            return None
         power, weight = blocks["line_power"].values, blocks["line_weight"].values
         frequency = blocks["line_frequency"].values
         windows = _part_windows(blocks)
@@ -101,7 +99,6 @@ class SpectralLine(Statistic):
         """Yield a line of constant frequency; the spectrum itself determines the frequency."""
         if (
             case.prediction.line is None
-            or "line_power" not in case.blocks
             or not case.prediction.coherent
             or np.ptp(case.prediction.line) > 0
         ):

@@ -239,7 +239,6 @@ def test_short_records_have_no_score(base):
         is None
     )
     blocks = _some_records(base, 2, 1)
-    assert find_statistic("drifting_line").score(blocks.drop_vars("line_power"), base) is None
     blocks["line_weight"][:, 4:] = 0.0
     assert find_statistic("drifting_line").score(blocks, base) is None
 
