@@ -99,13 +99,13 @@ def _locate_regions(
     A step at one place shifts the mean of the whole record: each region of the mean is located with
     the ones before it removed.
     """
-    scores = statistic.score(blocks, baseline)
-    if scores is None:
+    first = statistic.score(blocks, baseline)
+    if first is None:
         return []
-    z = standardise(scores, null.statistics[statistic.name])
+    z = standardise(first, null.statistics[statistic.name])
     regions = []
     for row in range(z.shape[0]):
-        now, row_z = baseline, z[row]
+        now, scores, row_z = baseline, first, z[row]
         remaining = row_z.copy()
         for _ in range(MAX_PER_ROW):
             region = _take_region(statistic, scores, row, remaining, row_z, null, level, settings)
@@ -114,7 +114,10 @@ def _locate_regions(
             regions.append(region)
             if statistic.is_linear_in_means:
                 now = _without_region(region, blocks, now, row)
-                scores = statistic.score(blocks, now)
+                rescored = statistic.score(blocks, now)
+                if rescored is None:
+                    break
+                scores = rescored
                 row_z = standardise(scores, null.statistics[statistic.name])[row]
                 remaining = row_z.copy()
     return (

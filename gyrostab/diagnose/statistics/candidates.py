@@ -152,7 +152,7 @@ def _candidates_of_effect(
     predictions: list[tuple[dict[str, Any], Prediction]] = []
     is_missing = bool(kind.channels) and not drivers
     obstacle = missing_channel_reason(tuple(kind.channels), blocks) if is_missing else ""
-    for values in () if is_missing else _nuisance_grid(kind, windows):
+    for values in [] if is_missing else list(_nuisance_grid(kind, windows)):
         try:
             effect = kind.example(**values)
             prediction = with_band_response(predict_exogenous(effect, windows), effect, blocks)
