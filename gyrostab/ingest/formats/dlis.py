@@ -18,17 +18,14 @@ from pathlib import Path
 from typing import Any
 
 from gyrostab.ingest.columns.headers import is_time_unit
-from gyrostab.ingest.formats.recognise import begins_like
+from gyrostab.ingest.formats.recognise import make_matcher
 from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, library, make_reader
 from gyrostab.ingest.options import ReadOptions
 
 #: Held while the settings of the process are changed.
 _LOCK = threading.Lock()
 
-
-def matches(path: Path) -> bool:
-    """Return whether the file has the label of a DLIS storage unit, or such a suffix."""
-    return begins_like(path, rb"(?s).{4}V1\.00RECORD", ".dlis")
+matches = make_matcher(rb"(?s).{4}V1\.00RECORD", ".dlis")  # label of a storage unit
 
 
 def _read_frames(path: Path, options: ReadOptions) -> TablesOfFile:

@@ -16,16 +16,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.ingest.formats.recognise import begins_like
+from gyrostab.ingest.formats.recognise import make_matcher
 from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, library, make_reader
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.time.grid import grid_times
 
-SUFFIXES = (".mseed", ".miniseed", ".msd", ".ms", ".mseed3")
-_HEAD = re.compile(rb"\d{6}[DRQM][ \0]|MS\x03")
+_HEAD = rb"\d{6}[DRQM][ \0]|MS\x03"  # versions 2 and 3
 _MAX_RECORD_BYTES = 2**20  # version 2 allows longer records, which nobody writes
 _ROTATION = re.compile(r"[A-Z]J([A-Z0-9])")  # band, instrument J, orientation: SEED, appendix A
 _MAX_START_DIFFERENCE = 0.1  # of channels that share their stamps [samples]
+
+matches = make_matcher(_HEAD, ".mseed", ".miniseed", ".msd", ".ms", ".mseed3")
 
 
 @dataclass
@@ -37,11 +38,6 @@ class _Trace:
     starts: list[int] = field(default_factory=list)
     sizes: list[int] = field(default_factory=list)
     values: list[NDArray[Any]] = field(default_factory=list)
-
-
-def matches(path: Path) -> bool:
-    """Return whether the file begins like miniSEED 2 or 3, or has such a suffix."""
-    return begins_like(path, _HEAD, *SUFFIXES)
 
 
 def _make_tables(path: Path, options: ReadOptions, *, unpack: bool) -> TablesOfFile:
@@ -58,7 +54,7 @@ def _cut_note(path: Path) -> list[str]:
     pymseed = library("pymseed", path, extra="miniseed")
     with path.open("rb") as file:
         head = file.read(_MAX_RECORD_BYTES)
-    if not head or not _HEAD.match(head):
+    if not head or not re.match(_HEAD, head):
         return []
     try:
         first = next(iter(pymseed.MS3Record.from_buffer(head)), None)

@@ -25,7 +25,7 @@ from gyrostab.ingest.formats.netcdf_variables import (
     StoredVariable,
     open_variables,
 )
-from gyrostab.ingest.formats.recognise import begins_like
+from gyrostab.ingest.formats.recognise import make_matcher
 from gyrostab.ingest.formats.tables import Table, TableColumn, read_tables, scan_tables
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.schema import texts
@@ -34,12 +34,14 @@ MAX_COLUMNS = 64
 #: Names of variables whose columns are gyro axes.
 _SIGNALS = ("gyro", "rate")
 
+_is_netcdf = make_matcher(b"CDF", ".nc", ".nc4", ".cdf", ".netcdf")
+
 
 def matches(path: Path) -> bool:
     """Return whether the path is a NetCDF file, by suffix or first bytes, or a Zarr store."""
     if path.is_dir():
         return any((path / name).exists() for name in ("zarr.json", ".zgroup", ".zmetadata"))
-    return begins_like(path, b"CDF", ".nc", ".nc4", ".cdf", ".netcdf")
+    return _is_netcdf(path)
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:

@@ -22,7 +22,7 @@ from gyrostab.ingest.columns.typed import (
     read_batches,
     summarise_columns,
 )
-from gyrostab.ingest.formats.recognise import begins_like
+from gyrostab.ingest.formats.recognise import make_matcher
 from gyrostab.ingest.limits import check_stored
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
@@ -30,10 +30,7 @@ from gyrostab.ingest.options import FileSummary, ReadOptions
 #: may be the whole log.
 _BUFFER_BYTES = 2**20
 
-
-def matches(path: Path) -> bool:
-    """Return whether the file begins like Parquet or has such a suffix."""
-    return begins_like(path, b"PAR1", ".parquet", ".pq")
+matches = make_matcher(b"PAR1", ".parquet", ".pq")
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:

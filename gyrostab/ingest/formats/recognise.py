@@ -6,6 +6,7 @@ import bz2
 import lzma
 import re
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 from gyrostab.errors import FormatError
@@ -28,10 +29,11 @@ def read_head(path: Path) -> bytes:
         return file.read(_HEAD_BYTES)
 
 
-def begins_like(path: Path, pattern: bytes | re.Pattern[bytes], *suffixes: str) -> bool:
-    """Return whether a file begins with a regular expression or has one of the suffixes.
+def make_matcher(pattern: bytes, *suffixes: str) -> Callable[[Path], bool]:
+    """Make the function `matches` of a format whose files begin with a regular expression.
 
-    Suffixes are in lower case, with a dot. A folder never matches.
+    Files with one of the suffixes match too; these are in lower case, with a dot. A folder never
+    matches.
 
     Examples
     --------
@@ -39,12 +41,16 @@ def begins_like(path: Path, pattern: bytes | re.Pattern[bytes], *suffixes: str) 
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     path = Path(folder, "log.bin")
     ...     _ = path.write_bytes(b"PAR1...")
-    ...     begins_like(path, b"PAR1"), begins_like(path, b"TDSm", ".bin")
+    ...     make_matcher(b"PAR1")(path), make_matcher(b"TDSm", ".bin")(path)
     (True, True)
     """
-    if not path.is_file():
-        return False
-    return path.suffix.lower() in suffixes or bool(re.match(pattern, read_head(path)))
+
+    def matches(path: Path) -> bool:
+        """Return whether the file has this format."""
+        is_named = path.suffix.lower() in suffixes
+        return path.is_file() and (is_named or bool(re.match(pattern, read_head(path))))
+
+    return matches
 
 
 def refuse_unread(path: Path) -> None:

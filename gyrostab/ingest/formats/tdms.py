@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.stamps import NAT
-from gyrostab.ingest.formats.recognise import begins_like
+from gyrostab.ingest.formats.recognise import make_matcher
 from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, library, make_reader
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.time.stamps import to_nanoseconds
@@ -26,9 +26,7 @@ _FIRST_DATE = np.datetime64(
 )  # LabVIEW counts from 1904, and writes 1904 if it has no clock
 
 
-def matches(path: Path) -> bool:
-    """Return whether the file begins like TDMS or has such a suffix."""
-    return begins_like(path, b"TDSm", ".tdms")
+matches = make_matcher(b"TDSm", ".tdms")
 
 
 @contextmanager

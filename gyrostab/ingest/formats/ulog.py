@@ -8,16 +8,11 @@ from __future__ import annotations
 import io
 from pathlib import Path
 
-from gyrostab.ingest.formats.recognise import begins_like
+from gyrostab.ingest.formats.recognise import make_matcher
 from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, library, make_reader
 from gyrostab.ingest.options import ReadOptions
 
-MAGIC = b"ULog\x01\x12\x35"
-
-
-def matches(path: Path) -> bool:
-    """Return whether the file begins like a PX4 log or has such a suffix."""
-    return begins_like(path, MAGIC, ".ulg")
+matches = make_matcher(rb"ULog\x01\x12\x35", ".ulg")
 
 
 class _PaddedFile(io.BufferedReader):

@@ -17,18 +17,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from gyrostab.ingest.columns.stamps import NAT
-from gyrostab.ingest.formats.recognise import begins_like
+from gyrostab.ingest.formats.recognise import make_matcher
 from gyrostab.ingest.formats.tables import Messages, TablesOfFile, make_reader
 from gyrostab.ingest.options import ReadOptions
 
-_HEAD = re.compile(rb"^\s*&&\s*\n\s*\d{4}")
 _ITEM = re.compile(r"^\s*(\d\d)(\d\d)\s?(.*?)\s*$")
 _LONGEST_LINE = 1000
 
 
-def matches(path: Path) -> bool:
-    """Return whether the file begins with a frame of items."""
-    return begins_like(path, _HEAD)
+matches = make_matcher(rb"\s*&&\s*\n\s*\d{4}")
 
 
 def _read_records(path: Path, options: ReadOptions) -> TablesOfFile:

@@ -9,7 +9,6 @@ Energistics, WITSML data schema 1.4.1.1, object log.
 
 from __future__ import annotations
 
-import re
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -19,16 +18,11 @@ import pandas as pd
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.stamps import texts_to_ns
-from gyrostab.ingest.formats.recognise import begins_like
+from gyrostab.ingest.formats.recognise import make_matcher
 from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, make_reader
 from gyrostab.ingest.options import ReadOptions
 
-_HEAD = re.compile(rb"(?is)^(?:\xef\xbb\xbf)?\s*<.*witsml")
-
-
-def matches(path: Path) -> bool:
-    """Return whether the file is an XML document that names WITSML near its beginning."""
-    return begins_like(path, _HEAD)
+matches = make_matcher(rb"(?is)(?:\xef\xbb\xbf)?\s*<.*witsml")  # an XML document
 
 
 def _read_logs(path: Path, options: ReadOptions) -> TablesOfFile:
