@@ -11,13 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, OptionError, TimeError, UnitError
-from gyrostab.ingest.columns.pieces import (
-    CHUNK_ROWS,
-    PiecewiseColumn,
-    Spool,
-    as_lazy,
-    pieces_of,
-)
+from gyrostab.ingest.columns.pieces import CHUNK_ROWS, Spool, as_lazy
 from gyrostab.ingest.concat import absence_notes, group_axes, merge_notes, split_axes
 from gyrostab.ingest.concat.channels import check_units
 from gyrostab.ingest.overlap import drop_repeats, first_known_stamp, stamp_span
@@ -29,20 +23,15 @@ from gyrostab.wording import list_some
 
 def memory_bytes(part: xr.Dataset) -> int:
     """Return the size of the columns of a raw log that are in memory [bytes]; 0 for other logs."""
-    arrays = sum(
-        variable.nbytes for variable in _list_columns(part).values() if variable.chunks is None
-    )
-    return arrays + sum(pieces.memory_bytes for pieces in _columns_in_pieces(part))
+    return sum(variable.nbytes for variable in _columns_in_memory(part).values())
 
 
-def _list_columns(part: xr.Dataset) -> dict[Any, xr.Variable]:
-    return {name: variable for name, variable in part.variables.items() if "row" in variable.dims}
-
-
-def _columns_in_pieces(part: xr.Dataset) -> list[PiecewiseColumn]:
-    return [
-        pieces for variable in _list_columns(part).values() for pieces in pieces_of(variable.data)
-    ]
+def _columns_in_memory(part: xr.Dataset) -> dict[Any, xr.Variable]:
+    return {
+        name: variable
+        for name, variable in part.variables.items()
+        if "row" in variable.dims and variable.chunks is None
+    }
 
 
 def move_to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
@@ -52,12 +41,8 @@ def move_to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
         rows = [as_lazy(spool.store(row)) for row in np.atleast_2d(variable.values)]
         return stack_rows(rows) if variable.ndim == 2 else rows[0]
 
-    for pieces in _columns_in_pieces(part):
-        pieces.move_to(spool)
-    long = {
-        name: variable for name, variable in _list_columns(part).items() if variable.chunks is None
-    }
-    return part.assign({name: (v.dims, moved(v), v.attrs, v.encoding) for name, v in long.items()})
+    columns = _columns_in_memory(part).items()
+    return part.assign({name: (v.dims, moved(v), v.attrs, v.encoding) for name, v in columns})
 
 
 def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:

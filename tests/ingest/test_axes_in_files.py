@@ -13,7 +13,6 @@ from pyarrow import parquet
 import gyrostab
 from gyrostab.errors import SchemaError, TimeError
 from gyrostab.ingest import ReadOptions, read_log, reading, scan_file
-from gyrostab.ingest.columns import pieces
 from gyrostab.ingest.concat import group_axes
 from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.regularise import regularise
@@ -160,7 +159,6 @@ def test_axes_recorded_one_after_the_other_are_concatenated_in_time(tmp_path):
 
 
 def test_long_files_stay_on_disk_and_are_read_lazily(tmp_path, monkeypatch):
-    monkeypatch.setattr(pieces, "_MAX_PLAIN_VALUES", 0)
     monkeypatch.setattr(reading, "SPILL_BYTES", 1000)
     paths = [write(tmp_path / f"{axis}.csv", axis) for axis in "xyz"]
     raw = read_log(paths)

@@ -33,20 +33,19 @@ def bits(values: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("where", ["memory", "disk", "both"])
 def test_pieces_of_every_kind_in_memory_and_on_disk(where):
     spool = Spool()
+
+    def piece(values, *, on_disk):
+        return spool.store(values)._pieces[0] if on_disk else bits(values)
+
     values = np.array([1.5, np.nan, 1 / 3, 0.25])
-    pieces = PiecewiseColumn(np.float64, [bits(values[:3]), bits(values[3:])])
+    first, last = (
+        piece(part, on_disk=where in kinds)
+        for part, kinds in ((values[:3], ("disk", "both")), (values[3:], ("disk",)))
+    )
+    pieces = PiecewiseColumn(np.float64, [first, last])
     stamps = np.array([5, 10, 15, 20, 100, 200])
-    times = PiecewiseColumn("datetime64[ns]", [EvenPiece(5, 5, 4), stamps[4:].copy()])
-    if where == "both":
-        first = PiecewiseColumn(np.float64, pieces._pieces[:1])
-        first.move_to(spool)
-        pieces = PiecewiseColumn(np.float64, [*first._pieces, bits(values[3:])])
-    if where == "disk":
-        held = pieces.memory_bytes
-        pieces.move_to(spool)
-        times.move_to(spool)
-        assert held == 8 * 4
-        assert pieces.memory_bytes == times.memory_bytes == 0
+    uneven = piece(stamps[4:].copy(), on_disk=where == "disk")
+    times = PiecewiseColumn("datetime64[ns]", [EvenPiece(5, 5, 4), uneven])
     for begin, end in [(0, 4), (2, 4), (3, 4), (2, 2)]:
         np.testing.assert_array_equal(bits(pieces[begin:end]), bits(values[begin:end]))
     for begin, end in [(0, 6), (2, 4), (3, 6), (5, 5)]:
@@ -81,17 +80,16 @@ def text_log(path: Path, first: int, rows: int, *, decimals: int) -> Path:
     return path
 
 
-@pytest.mark.parametrize("limit", [100, 10**9])
+@pytest.mark.parametrize("module", [pieces, reading])
 @pytest.mark.parametrize("decimals", [3, 12])
-def test_log_in_pieces_equals_the_plain_log(tmp_path, monkeypatch, limit, decimals):
+def test_log_in_pieces_equals_the_plain_log(tmp_path, monkeypatch, module, decimals):
     paths = [
         text_log(tmp_path / f"{number}.csv", 1100 * number, 1000, decimals=decimals)
         for number in range(3)
     ]
     plain = read_log(paths)
     assert isinstance(plain.rate.data, np.ndarray)
-    monkeypatch.setattr(pieces, "_MAX_PLAIN_VALUES", 0)
-    monkeypatch.setattr(reading, "SPILL_BYTES", limit)
+    monkeypatch.setattr(module, "SPILL_BYTES", 100)
     piecewise = read_log(paths)
     assert piecewise.rate.chunks is not None
     xr.testing.assert_identical(piecewise.compute(), plain)

@@ -1,4 +1,4 @@
-"""Growing columns of 8-byte values in pieces, in memory or on disk.
+"""Growing columns of 8-byte values, in memory as arrays or on disk in pieces.
 
 Files are read back, not mapped: the pages of a mapped file count as memory of this process, and
 their number grows as a long log is read. Each map also holds a file handle, so hundreds of files
@@ -18,16 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import OutputError
-from gyrostab.store.lazy import RowSource, find_source, make_dask
+from gyrostab.store.lazy import RowSource, make_dask
 
 #: Largest total size of the columns of one file that is held in memory [bytes].
-SPILL_BYTES = 128 * 2**20
+SPILL_BYTES = 64 * 2**20
 
 #: Rows of one dask chunk of a piecewise column.
 CHUNK_ROWS = 2**21
-
-#: Largest number of values of all columns of a file for which `finish` returns plain arrays.
-_MAX_PLAIN_VALUES = 2**21
 
 
 class Spool:
@@ -109,10 +106,6 @@ class EvenPiece:
 Piece = NDArray[np.int64] | SpooledPiece | EvenPiece
 
 
-def _memory_bytes(piece: Piece) -> int:
-    return piece.nbytes if isinstance(piece, np.ndarray) else 0
-
-
 def _move_to_spool(piece: Piece, spool: Spool) -> Piece:
     """Return a piece with the values that are in memory moved to a spool."""
     if not isinstance(piece, np.ndarray) or not piece.size:
@@ -145,11 +138,6 @@ class PiecewiseColumn(RowSource):
         ).tolist()  # first row of each piece, and the end of the last
         self.shape = (self._rows[-1],)
 
-    @property
-    def memory_bytes(self) -> int:
-        """Bytes in memory."""
-        return sum(map(_memory_bytes, self._pieces))
-
     def find_line(self) -> tuple[int, int] | None:
         """Return first value and step if all values are evenly spaced, otherwise None."""
         lines = [piece for piece in self._pieces if isinstance(piece, EvenPiece)]
@@ -161,10 +149,6 @@ class PiecewiseColumn(RowSource):
             for row, line in zip(self._rows, lines, strict=False)
         )
         return (first, step) if is_even else None
-
-    def move_to(self, spool: Spool) -> None:
-        """Move the pieces in memory to a file."""
-        self._pieces[:] = [_move_to_spool(piece, spool) for piece in self._pieces]
 
     def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
         """Read samples of one row from `begin` on into `out`."""
@@ -182,8 +166,7 @@ class PiecewiseColumn(RowSource):
 class Buffers:
     """Columns of 8-byte numbers that grow block by block.
 
-    Up to `SPILL_BYTES` they stay in memory; beyond it they are appended to a spool. Small columns
-    in memory are returned as arrays.
+    Up to `SPILL_BYTES` they stay in memory; beyond it they are appended to a spool.
     """
 
     def __init__(self, dtypes: Mapping[Any, Any]):
@@ -201,7 +184,9 @@ class Buffers:
             for key, values in block.items()
         }
         self.rows += next(iter(pieces.values())).size if pieces else 0
-        self._held += sum(map(_memory_bytes, pieces.values()))
+        self._held += sum(
+            piece.nbytes for piece in pieces.values() if isinstance(piece, np.ndarray)
+        )
         for key, piece in pieces.items():
             self._pieces[key].append(
                 piece if self._spool is None else _move_to_spool(piece, self._spool)
@@ -218,24 +203,18 @@ class Buffers:
         return plain.view(np.int64)
 
     def finish(self) -> dict[Any, NDArray[Any] | PiecewiseColumn]:
-        """Return the columns: plain arrays if they are small, otherwise piecewise columns."""
-        columns = {
-            key: PiecewiseColumn(self.dtypes[key], pieces) for key, pieces in self._pieces.items()
-        }
-        self._pieces.clear()
-        if self._spool is not None or self.rows * len(columns) > _MAX_PLAIN_VALUES:
-            return dict(columns)
-        return {key: column[:] for key, column in columns.items()}
+        """Return the columns: arrays if they are in memory, otherwise piecewise columns.
+
+        Of a long log, stamps at even steps stay a piecewise column, which takes no memory.
+        """
+        columns: dict[Any, NDArray[Any] | PiecewiseColumn] = {}
+        for key, dtype in self.dtypes.items():
+            column = PiecewiseColumn(dtype, self._pieces.pop(key))
+            is_line = self.rows > CHUNK_ROWS and column.find_line() is not None
+            columns[key] = column[:] if self._spool is None and not is_line else column
+        return columns
 
 
 def as_lazy(values: NDArray[Any] | PiecewiseColumn) -> Any:
     """Wrap a piecewise column in a dask array; return an array in memory unchanged."""
     return make_dask(values, CHUNK_ROWS) if isinstance(values, PiecewiseColumn) else values
-
-
-def pieces_of(array: Any) -> list[PiecewiseColumn]:
-    """Return the piecewise columns that a lazy array reads."""
-    source = find_source(array)
-    if isinstance(source, PiecewiseColumn):
-        return [source]
-    return [] if source is None else [column for part in source.parts for column in pieces_of(part)]

@@ -25,7 +25,7 @@ from gyrostab.ingest.columns.plan_draft import Column
 from gyrostab.ingest.columns.stamps import NAT
 from gyrostab.ingest.options import FileSummary
 from gyrostab.schema import SIGNAL_UNITS
-from gyrostab.store.lazy import Converted, Stacked, make_dask
+from gyrostab.store.lazy import Converted, make_dask, stack_rows
 from gyrostab.store.write import declare_counts
 
 Values = dict[int, NDArray[np.float64]]
@@ -186,15 +186,9 @@ class RawLogBuilder:
         coords: dict[str, Any] = {}
         if self.gyro and self.plan.signal is not None:
             axes = [column.name for column in self.gyro]
-            rows = [columns[column.source] for column in self.gyro]
-            stack = (
-                np.stack(rows)
-                if isinstance(rows[0], np.ndarray)
-                else make_dask(Stacked(rows), (1, CHUNK_ROWS))
-            )
             data[self.plan.signal] = (
                 ("axis", "row"),
-                stack,
+                stack_rows([columns[column.source] for column in self.gyro]),
                 {"units": SIGNAL_UNITS[self.plan.signal]},
                 self._packing_of(self.gyro),
             )
