@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,8 @@ from gyrostab.store.lazy import RowSource, can_read_directly, find_source, make_
 #: An array (time), or (axis, time) with the row to read, and its runs: first sample of the grid,
 #: first of the array, length.
 PlacedArray = tuple[Any, int | None, NDArray[np.int64]]
+#: One run, as above.
+Run = tuple[int, int, int]
 
 _MIN_CHUNK_SAMPLES, _MAX_CHUNK_SAMPLES = 2**16, 2**22
 #: Samples of an array that are read at once where a gap of the grid divides them; bounds memory.
@@ -61,19 +62,30 @@ class GridSource(RowSource):
         self.parts = [array for parts in self.rows for array, _, _ in parts]
 
     def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
-        """Read samples of one row from `begin` on into `out`."""
-        runs = [
-            (which, *entry)
-            for which, part in enumerate(self.rows[row])
-            for entry in _overlapping_runs(part, begin, begin + out.size)
-        ]
-        _fill(out, runs)
+        """Read samples of one row from `begin` on into `out`; the first that is not NaN counts."""
+        end, done = begin + out.size, 0
+        parts = [(array, own, _clip_runs(runs, begin, end)) for array, own, runs in self.rows[row]]
+        parts = [part for part in parts if part[2]]
+        if len(parts) != 1 or parts[0][2][0][2] < out.size:
+            out[:] = np.nan
+        for array, own_row, runs in parts:
+            for group in _group_runs(array, runs):
+                (at, low, length), last_run = group[0], group[-1]
+                if len(group) == 1 and at >= done:
+                    read_into(array, own_row or 0, low, out[at : at + length])
+                else:
+                    values = np.empty(last_run[1] + last_run[2] - low)
+                    read_into(array, own_row or 0, low, values)
+                    for at, first, length in group:
+                        place, read = out[at : at + length], values[first - low :][:length]
+                        np.copyto(place, read, where=np.isnan(place))
+                done = max(done, last_run[0] + last_run[2])
         if self.convert is not None:
             self.convert(out)
 
     def has_samples(self, begin: int, end: int) -> bool:
         """Whether any row has a sample in a range of the grid."""
-        return any(_overlapping_runs(part, begin, end) for row in self.rows for part in row)
+        return any(_clip_runs(runs, begin, end) for row in self.rows for _, _, runs in row)
 
 
 def place_on_grid(
@@ -119,14 +131,11 @@ def _chunk_of_dask(
     import dask.array as da
 
     pieces = []
-    for part in parts:
-        runs = [
-            (at, first, length) for *_, first, at, length in _overlapping_runs(part, begin, end)
-        ]
-        if runs:
+    for array, row, all_runs in parts:
+        if runs := _clip_runs(all_runs, begin, end):
             # one slice for all runs, because each slice of a dask array takes time
             low, high = min(run[1] for run in runs), max(run[1] + run[2] for run in runs)
-            line = da.asarray(part[0] if part[0].ndim == 1 else part[0][part[1] or 0])
+            line = da.asarray(array if array.ndim == 1 else array[row or 0])
             pieces.append((line[low:high], np.array(runs) - [0, low, 0]))
     placed = dask.delayed(_place_pieces, pure=False)(pieces, end - begin, convert)
     return da.from_delayed(placed, (end - begin,), np.float64)
@@ -141,66 +150,27 @@ def _place_pieces(
     return GridSource([parts], (size,), convert)[:]
 
 
-def _fill(
-    out: NDArray[np.float64],
-    runs: Sequence[tuple[int, Any, int, int, int, int]],
-) -> None:
-    """Read runs (number of the part, array, row, first, place in `out`, length) into `out`."""
-    ends = sorted((at, at + length) for *_, at, length in runs)
-    overlap = any(stop > start for (_, stop), (start, _) in pairwise(ends))
-    if overlap:
-        out[:] = np.nan
-    else:
-        for (_, stop), (start, _) in pairwise([(0, 0), *ends, (out.size, 0)]):
-            out[stop:start] = np.nan
-    for _, array, row, at_source, at, length in _read_ahead(runs):
-        place = out[at : at + length]
-        if overlap:  # the first value that is not NaN counts
-            values = np.empty(length)
-            read_into(array, row, at_source, values)
-            np.copyto(place, values, where=np.isnan(place))
-        else:
-            read_into(array, row, at_source, place)
-
-
-def _read_ahead(
-    runs: Sequence[tuple[int, Any, int, int, int, int]],
-) -> Iterator[tuple[int, Any, int, int, int, int]]:
-    """Yield the runs; short ones that follow each other in a file come from one slice of it.
+def _group_runs(array: Any, runs: Sequence[Run]) -> Iterator[Sequence[Run]]:
+    """Group the runs to read at once: short ones that follow each other in a file.
 
     Each slice of a file takes milliseconds, and a log with many gaps has many runs.
     """
     begin = 0
-    while begin < len(runs):
-        number, array, row, source_begin, *_, length = runs[begin]
-        stop, end = begin + 1, source_begin + length
-        while (
-            not isinstance(array, np.ndarray)
-            and stop < len(runs)
-            and (runs[stop][0], runs[stop][3]) == (number, end)
-            and end + runs[stop][5] - source_begin <= _READ_AHEAD_SAMPLES
-        ):
-            end += runs[stop][5]
-            stop += 1
-        if stop > begin + 1:
-            array, row, first = np.empty(end - source_begin), 0, source_begin
-            read_into(runs[begin][1], runs[begin][2], source_begin, array)
-        else:
-            first = 0
-        for _, _, _, at_source, at, length in runs[begin:stop]:
-            yield number, array, row, at_source - first, at, length
+    for stop in range(1, len(runs) + 1):
+        if stop < len(runs) and not isinstance(array, np.ndarray):
+            end, (_, first, length) = runs[stop - 1][1] + runs[stop - 1][2], runs[stop]
+            if first == end and end + length - runs[begin][1] <= _READ_AHEAD_SAMPLES:
+                continue
+        yield runs[begin:stop]
         begin = stop
 
 
-def _overlapping_runs(
-    part: PlacedArray, begin: int, end: int
-) -> list[tuple[Any, int, int, int, int]]:
-    """Return array, row, first array sample, offset after `begin` and length of runs in a range."""
-    array, row, runs = part
+def _clip_runs(runs: NDArray[np.int64], begin: int, end: int) -> list[Run]:
+    """Return the parts of runs in a range of the grid, by their offset after `begin`."""
     low = np.searchsorted(runs[:, 0] + runs[:, 2], begin, side="right")
     high = np.searchsorted(runs[:, 0], end, side="left")
-    overlapping = []
+    clipped = []
     for sample, at_source, length in runs[low:high].tolist():
         a, b = max(sample, begin), min(sample + length, end)
-        overlapping.append((array, row or 0, at_source + a - sample, a - begin, b - a))
-    return overlapping
+        clipped.append((a - begin, at_source + a - sample, b - a))
+    return clipped
