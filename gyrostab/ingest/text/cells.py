@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
+from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +12,7 @@ from numpy.typing import NDArray
 
 from gyrostab.ingest.columns.dates import DAY_FIRST, YEAR_FIRST
 from gyrostab.ingest.columns.plan import Plan
-from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, from_fortran, integers_to_ns
+from gyrostab.ingest.columns.stamps import cells_to_ns, from_fortran, integers_to_ns
 from gyrostab.ingest.text.layout import BLANK, VOID_CELLS, Layout
 
 
@@ -35,8 +37,10 @@ class BlockParser:
         self.channels = {column.source for column in plan.of("channel")}
         self.time = plan.time.source if plan.time else None
         self.unit = plan.time.time_unit if plan.time else None
-        digits = self.unit.digits if self.unit else None
-        self.digits = digits if digits is not None and digits <= 9 else 0
+        #: Decimals of times that the kernel reads, and unit of the whole numbers that it returns.
+        self.digits, self.counted = 0, self.unit
+        if self.unit is not None and (digits := self.unit.digits) is not None and digits <= 9:
+            self.digits, self.counted = digits, replace(self.unit, ns=Fraction(1))
         self.order = plan.time.date_order if plan.time else YEAR_FIRST
         self.roles = np.full(layout.width, rows.SKIPPED, dtype=np.int64)
         self.roles[self.sources] = rows.NUMBER
@@ -75,24 +79,12 @@ class BlockParser:
                 other_lines[row], starts[row] = line, at
                 row += 1
             at = end
-        stamps = None if self.time is None else self._since_epoch(counts[:row])
+        stamps = None if self.time is None else counts[:row]
+        if stamps is not None and self.counted is not None:
+            stamps = integers_to_ns(stamps, self.counted, self.epoch)
         words = self._parse_cells(other_lines, values, stamps) if other_lines else 0
         columns = dict(zip(self.sources, values[:, :row], strict=True))
         return ParsedBlock(columns, stamps, words, starts[:row], lines)
-
-    def _since_epoch(self, counts: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Convert counts of nanoseconds or of a non-decimal unit to stamps [ns since 1970]."""
-        unit = self.unit
-        if unit is None:
-            return counts
-        if unit.digits is None or unit.ns != 10**self.digits:
-            return np.where(counts == NAT, NAT, integers_to_ns(counts, unit, self.epoch))
-        zero = self.epoch if unit.epoch is None else unit.epoch
-        if zero == 0:
-            return counts
-        limit = 2**63 - 1 - abs(zero)
-        fits = (counts <= limit) & (counts >= -limit)  # NAT does not
-        return np.where(fits, counts + np.int64(zero), NAT)
 
     def _parse_cells(
         self,
