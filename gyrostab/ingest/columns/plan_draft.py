@@ -74,6 +74,11 @@ class PlanDraft:
         self.used_map: set[str] = set()
         self.used_units: set[str] = set()
 
+    def unit_key(self, names: Sequence[str]) -> str | None:
+        """Return the key of ``--unit`` that is the first of some names, in any case of letters."""
+        keys_by_name = {key.lower(): key for key in self.options.unit}
+        return next(filter(None, (keys_by_name.get(name.lower()) for name in names)), None)
+
     def find_unit(
         self,
         column: Header,
@@ -84,8 +89,7 @@ class PlanDraft:
         prefer_given: bool = False,
     ) -> str | None:
         """Return the unit of a column: from its header if usable, otherwise from the user."""
-        keys_by_name = by_lower_name(self.options.unit)
-        key = next((keys_by_name[low] for low in map(str.lower, keys) if low in keys_by_name), None)
+        key = self.unit_key(keys)
         if key is None:
             return written or column.stored
         self.used_units.add(key)
@@ -157,11 +161,6 @@ class PlanDraft:
             )
         place = {column.header.strip(): index for index, column in enumerate(columns)}
         self.summaries.sort(key=lambda summary: place.get(summary.header, -1))
-
-
-def by_lower_name(names: Mapping[str, str]) -> dict[str, str]:
-    """Return lower-case name -> name."""
-    return {name.lower(): name for name in names}
 
 
 def name_columns(

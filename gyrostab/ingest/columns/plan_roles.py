@@ -27,7 +27,7 @@ from gyrostab.ingest.columns.headers import (
     stored_name,
     unit_quantity,
 )
-from gyrostab.ingest.columns.plan_draft import MAX_HEADERS, Column, PlanDraft, by_lower_name
+from gyrostab.ingest.columns.plan_draft import MAX_HEADERS, Column, PlanDraft
 from gyrostab.ingest.limits import limit_value
 from gyrostab.units import HOUR, INNER, known_units, parse_unit
 from gyrostab.wording import list_some
@@ -160,7 +160,7 @@ def plan_channels(draft: PlanDraft, rest: list[Header]) -> None:
             text = "1"  # any scale will do
         asked = (
             column.mapped
-            or any(key.lower() in by_lower_name(draft.options.unit) for key in keys)
+            or draft.unit_key(keys) is not None
             or (is_known and draft.options.channels_only)
         )
         if text is None and asked:
@@ -190,11 +190,9 @@ def _note_temperatures(draft: PlanDraft, rest: list[Header]) -> None:
     is_named = any(quantity_of(column.low) == "temperature" for column in rest)
     if is_named or options.channels_only or options.channel:  # a file of channels may hold it
         return
-    given = by_lower_name(options.unit)
     temperatures = []
     for column in rest:
-        keys = (column.low, column.key.lower(), column.header.lower())
-        key = next((given[low] for low in keys if low in given), None)
+        key = draft.unit_key((column.low, column.key, column.header))
         unit = column.unit or column.stored or (options.unit[key] if key else "")
         if is_unit_of(unit, ("temperature",)):
             temperatures.append(column)

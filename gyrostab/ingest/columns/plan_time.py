@@ -18,7 +18,7 @@ from gyrostab.ingest.columns.headers import (
     is_time_unit,
     split_header,
 )
-from gyrostab.ingest.columns.plan_draft import Column, PlanDraft, by_lower_name
+from gyrostab.ingest.columns.plan_draft import Column, PlanDraft
 from gyrostab.ingest.columns.stamps import TimeUnit, names_epoch, parse_time_unit
 
 
@@ -112,9 +112,8 @@ def _is_clock(draft: PlanDraft, column: Header) -> bool:
 
 def _date_order(draft: PlanDraft, column: Header) -> str:
     """Return the order of day, month and year: from the user, the header, or the dates."""
-    keys_by_name = by_lower_name(draft.options.unit)
-    keys = [column.name, column.key, column.header, "time"]
-    for key in (keys_by_name[low] for low in map(str.lower, keys) if low in keys_by_name):
+    names = [column.name, column.key, column.header, "time"]
+    for key in filter(None, (draft.unit_key([name]) for name in names)):
         if order := parse_order(draft.options.unit[key]):
             draft.used_units.add(key)
             return order
