@@ -60,11 +60,7 @@ def _make_table(frame: Any) -> Table | None:
         return None
     values = frame.curves()
     columns = [
-        TableColumn(
-            (frame.name, channel.name),
-            values[channel.name],
-            str(channel.units or "").strip() or None,
-        )
+        TableColumn((frame.name, channel.name), values[channel.name], channel.units)
         for channel in channels
     ]
     kind = str(frame.index_type or "").upper()

@@ -53,7 +53,7 @@ def _read_curves(path: Path, options: ReadOptions) -> TablesOfFile:
         TableColumn(
             ("" if any(curve is clock for clock in clocks) else str(curve.mnemonic),),
             np.asarray(curve.data),
-            None if holds_dates(curve.data) else str(curve.unit or "").strip() or None,
+            None if holds_dates(curve.data) else curve.unit,
         )
         for curve in curves
     ]

@@ -39,19 +39,22 @@ class TableColumn:
 
     name: tuple[str, ...]
     values: Any  # what can be sliced, or a function of the first row and the row after the last
-    unit: str | None = None
+    unit: str | None = None  # as the format has it, without blanks around it; "" becomes None
     target: str | None = None  # by a code of the format, in the form of ``--map``
     #: Type and CF attributes of stored numbers, which are packed.
     dtype: Any = None
     attributes: Mapping[str, Any] | None = None
     parallel: bool = False  # whether several threads can read it
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "unit", str(self.unit or "").strip() or None)
+
     @classmethod
     def of_rows(
         cls, name: str, rows: Rows, dtype: Any, attributes: Mapping[str, Any]
     ) -> TableColumn:
         """Make a column of stored numbers; the file must be open for rows of a library."""
-        unit = attribute_text(attributes.get("units")) or None
+        unit = attribute_text(attributes.get("units"))
         parallel = not isinstance(rows, LibraryRows)
         return cls((name,), rows.read, unit, None, dtype, attributes, parallel)
 
@@ -231,7 +234,7 @@ def _plan_tables(path: Path, tables: Sequence[Table], options: ReadOptions) -> _
         for name, column in zip(own_names, table.columns, strict=True):
             calendar = attribute_text((column.attributes or {}).get("calendar")) or None
             stored.append(column)
-            described.append(FileColumn(name, column.unit or None, calendar, target=column.target))
+            described.append(FileColumn(name, column.unit, calendar, target=column.target))
     if not filled:
         raise FormatError(
             f"{path.name}: it holds no values; copy it again, or check what the logger wrote"

@@ -77,9 +77,7 @@ def _waveform_clock(path: Path, channel: Any) -> tuple[float, Any] | None:
 def _make_table(path: Path, channels: list[Any]) -> Table:
     columns = [
         TableColumn(
-            (channel.group_name, channel.name),
-            channel,
-            str(channel.properties.get("unit_string") or "").strip() or None,
+            (channel.group_name, channel.name), channel, channel.properties.get("unit_string")
         )
         for channel in channels
     ]

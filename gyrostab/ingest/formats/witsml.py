@@ -66,9 +66,7 @@ def _make_table(log: Any) -> Table | None:
     place = names.index(index) if index in names else 0
     stamps = texts_to_ns(cells[place].astype(str).tolist()).view("datetime64[ns]")
     columns = [
-        TableColumn(
-            (name,), cells[number].to_numpy(), _child_text(curves.get(name), "unit") or None
-        )
+        TableColumn((name,), cells[number].to_numpy(), _child_text(curves.get(name), "unit"))
         for number, name in enumerate(names)
         if number != place
     ]
