@@ -21,7 +21,7 @@ from gyrostab.ingest.limits import check_declared, check_stored
 from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
 from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name
-from gyrostab.store.attributes import decode_json, read_attribute
+from gyrostab.store.attributes import decode_attributes, read_attribute
 from gyrostab.store.blosc_chunks import check_blosc_chunks
 from gyrostab.store.cf import from_disk
 from gyrostab.store.hdf5_heaps import check_global_heaps
@@ -29,7 +29,6 @@ from gyrostab.store.read import open_stored
 from gyrostab.store.remote import find_url
 from gyrostab.time.grid import grid_times, time_coordinate
 from gyrostab.time.stamps import to_nanoseconds
-from gyrostab.units import ON_DISK
 
 CHECKED_BLOCKS = 33
 #: Options to open a file with xarray; numbers and stamps are decoded when they are read.
@@ -93,20 +92,12 @@ def _as_in_memory(path: Path, log: xr.Dataset) -> xr.Dataset:
     """Convert units, names of axes and attributes to their form in memory."""
     if path.is_dir():
         log = log[sorted(log.variables, key=str)]  # the order within a directory is arbitrary
-    for name in log.variables:
-        units = log[name].attrs.get("units")
-        if units in ON_DISK.values():
-            log[name].attrs["units"] = next(
-                inner for inner, disk in ON_DISK.items() if disk == units
-            )
+    for variable in log.variables.values():
+        variable.attrs = decode_attributes(variable.attrs)
     log = log.assign_coords(
         axis=_read_labels(path, log["axis"]) if log["axis"].ndim else str(log["axis"].values)
     )
-    decode_json(log.attrs)
-    log.attrs = {
-        name: value.item() if isinstance(value, np.generic) else value
-        for name, value in log.attrs.items()
-    }
+    log.attrs = decode_attributes(log.attrs)
     log.attrs.setdefault("source_files", [path.name])
     return log
 
