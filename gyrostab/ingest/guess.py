@@ -27,6 +27,7 @@ from gyrostab.ingest.columns.headers import (
     is_time_unit,
     is_unit_of,
 )
+from gyrostab.ingest.columns.stamps import parse_time_unit
 from gyrostab.ingest.guess_unit import given_unit, guess_unit, name_unit
 from gyrostab.ingest.inspect import ColumnInspection, FileInspection
 from gyrostab.time.grid import MAX_RATE_HZ
@@ -169,7 +170,14 @@ def guess_columns(
 
 
 def _unit_seconds(unit: str | None) -> float:
-    return _SECONDS.get(unit or "s", 1.0)
+    """Return the seconds of a unit of time, which is seconds if None.
+
+    Examples
+    --------
+    >>> _unit_seconds("min"), _unit_seconds(None)
+    (60.0, 1.0)
+    """
+    return float(parse_time_unit(unit or "s").ns) / 1e9
 
 
 def _guess_time(
