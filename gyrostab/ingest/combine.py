@@ -11,12 +11,12 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, OptionError, TimeError, UnitError
-from gyrostab.ingest.columns.pieces import CHUNK_ROWS, Spool, as_lazy
+from gyrostab.ingest.columns.pieces import CHUNK_ROWS, Spool
 from gyrostab.ingest.concat import absence_notes, group_axes, merge_notes, split_axes
 from gyrostab.ingest.concat.channels import check_units
 from gyrostab.ingest.overlap import drop_repeats, first_known_stamp, stamp_span
 from gyrostab.schema import SIGNAL_UNITS
-from gyrostab.store.lazy import concatenate_columns, select_part, stack_rows
+from gyrostab.store.lazy import concatenate_columns, make_dask, select_part, stack_rows
 from gyrostab.store.write import common_packing
 from gyrostab.wording import list_some
 
@@ -38,7 +38,8 @@ def move_to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
     """Return the raw log with its columns moved to a temporary file."""
 
     def moved(variable: xr.Variable) -> Any:
-        rows = [as_lazy(spool.store(row)) for row in np.atleast_2d(variable.values)]
+        stored = map(spool.store, np.atleast_2d(variable.values))
+        rows = [make_dask(piece, CHUNK_ROWS) for piece in stored]
         return stack_rows(rows) if variable.ndim == 2 else rows[0]
 
     columns = _columns_in_memory(part).items()

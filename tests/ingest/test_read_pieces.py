@@ -14,15 +14,11 @@ from hypothesis import strategies as st
 
 from gyrostab.ingest import read_log, reading
 from gyrostab.ingest.columns import pieces
-from gyrostab.ingest.columns.pieces import (
-    EvenPiece,
-    PiecewiseColumn,
-    Spool,
-    find_even,
-)
+from gyrostab.ingest.columns.pieces import EvenPiece, Spool, find_even, find_line
 from gyrostab.ingest.columns.raw_log import clean_column
 from gyrostab.ingest.formats import text
 from gyrostab.kernels.grid.stamps import NO_STAMP, new_state, place
+from gyrostab.store.lazy import concatenate_columns, read_into, read_slice
 from gyrostab.store.threads import map_in_order
 
 
@@ -33,32 +29,34 @@ def bits(values: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("where", ["memory", "disk", "both"])
 def test_pieces_of_every_kind_in_memory_and_on_disk(where):
     spool = Spool()
-
-    def piece(values, *, on_disk):
-        return spool.store(values)._pieces[0] if on_disk else bits(values)
-
     values = np.array([1.5, np.nan, 1 / 3, 0.25])
-    first, last = (
-        piece(part, on_disk=where in kinds)
-        for part, kinds in ((values[:3], ("disk", "both")), (values[3:], ("disk",)))
+    stamps = np.array([5, 10, 15, 20, 100, 200]).view("datetime64[ns]")
+    first, last, uneven = (
+        spool.store(part) if where in kinds else part
+        for part, kinds in (
+            (values[:3], ("disk", "both")),
+            (values[3:], ("disk",)),
+            (stamps[4:], ("disk",)),
+        )
     )
-    pieces = PiecewiseColumn(np.float64, [first, last])
-    stamps = np.array([5, 10, 15, 20, 100, 200])
-    uneven = piece(stamps[4:].copy(), on_disk=where == "disk")
-    times = PiecewiseColumn("datetime64[ns]", [EvenPiece(5, 5, 4), uneven])
+    column = concatenate_columns([first, last], 3)
+    times = concatenate_columns([EvenPiece(5, 5, 4), uneven], 3)
     for begin, end in [(0, 4), (2, 4), (3, 4), (2, 2)]:
-        np.testing.assert_array_equal(bits(pieces[begin:end]), bits(values[begin:end]))
+        np.testing.assert_array_equal(bits(read_slice(column, begin, end)), bits(values[begin:end]))
     for begin, end in [(0, 6), (2, 4), (3, 6), (5, 5)]:
-        np.testing.assert_array_equal(times[begin:end].view(np.int64), stamps[begin:end])
+        np.testing.assert_array_equal(read_slice(times, begin, end), stamps[begin:end])
     apart = np.empty((6, 2), "datetime64[ns]")
-    times.read_into(0, 0, apart[:, 1])
-    np.testing.assert_array_equal(apart[:, 1].view(np.int64), stamps)
+    read_into(times, 0, 0, apart[:, 1])
+    np.testing.assert_array_equal(apart[:, 1], stamps)
 
 
 def test_stamps_at_even_steps_are_one_piece():
     stamps = np.arange(7, 5000, 5).view("datetime64[ns]")
-    assert find_even(stamps) == EvenPiece(7, 5, 999)
-    assert find_even(stamps[:1]) == EvenPiece(7, 0, 1)
+    assert find_line([find_even(stamps)]) == (7, 5)
+    assert find_line([find_even(stamps[:1])]) == (7, 0)
+    assert find_line([find_even(part) for part in (stamps[:9], stamps[9:10])]) == (7, 5)
+    assert find_line([find_even(part) for part in (stamps[:9], stamps[10:])]) is None
+    assert find_line([find_even(stamps[:9]), stamps[9:]]) is None
     uneven = np.delete(stamps, 3)
     assert find_even(uneven) is uneven
     uneven = np.where(np.arange(999) == 3, np.datetime64("NaT"), stamps)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from gyrostab import make_log, open_product, to_netcdf, to_zarr
 from gyrostab.allan.fit import fit_noise, fit_part
-from gyrostab.ingest.columns.pieces import Spool, as_lazy
+from gyrostab.ingest.columns.pieces import Spool
 from gyrostab.ingest.concat import concatenate_logs
 from gyrostab.ingest.concat.lazy import place_on_grid
 from gyrostab.ingest.grid import fill
@@ -297,7 +297,7 @@ def test_rows_are_put_on_the_grid_directly_as_by_dask(storage, scale, unit, monk
     ]
     columns = [
         [
-            as_lazy(spool.store(piece[row])) if spooled else piece[row]
+            make_dask(spool.store(piece[row]), 2**21) if spooled else piece[row]
             for piece, spooled in zip(pieces, on_disk, strict=True)
         ]
         for row in (0, 1)

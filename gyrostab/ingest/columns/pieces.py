@@ -9,21 +9,19 @@ from __future__ import annotations
 
 import tempfile
 import threading
-from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import OutputError
-from gyrostab.store.lazy import RowSource, make_dask
+from gyrostab.store.lazy import RowSource, concatenate_columns
 
 #: Largest total size of the columns of one file that is held in memory [bytes].
 SPILL_BYTES = 64 * 2**20
 
-#: Rows of one dask chunk of a piecewise column.
+#: Rows of one dask chunk of a column in pieces.
 CHUNK_ROWS = 2**21
 
 
@@ -36,12 +34,12 @@ class Spool:
         self._lock = threading.Lock()
 
     def add(self, values: NDArray[Any]) -> int:
-        """Append an array and return its byte offset."""
+        """Append a contiguous array and return its byte offset."""
         try:
             with self._lock:
                 if self.file is None:
                     self.file = tempfile.TemporaryFile(prefix="gyrostab-", buffering=0)  # noqa: SIM115
-                begin, view = self.end, values.data.cast("B")
+                begin, view = self.end, values.view(np.uint8).data
                 self.file.seek(begin)
                 while view.nbytes:
                     count = self.file.write(view)
@@ -58,7 +56,7 @@ class Spool:
     def read_into(self, begin: int, out: NDArray[Any]) -> None:
         """Read the bytes of a contiguous array from an offset on; threads take turns."""
         assert self.file is not None
-        view = out.data.cast("B")
+        view = out.view(np.uint8).data
         with self._lock:
             self.file.seek(begin)
             while view.nbytes:
@@ -67,50 +65,41 @@ class Spool:
                     raise OSError("the temporary file of a long log is shorter than it was")
                 view = view[got:]
 
-    def store(self, values: NDArray[Any]) -> PiecewiseColumn:
-        """Write a column to the file and return it as a piecewise column."""
-        bits = np.ascontiguousarray(values).view(np.int64)
-        return PiecewiseColumn(values.dtype, [_move_to_spool(bits, self)])
+    def store(self, values: NDArray[Any]) -> SpooledPiece:
+        """Write a column of 8-byte values to the file."""
+        return SpooledPiece(self, np.ascontiguousarray(values))
 
 
-@dataclass(frozen=True)
-class SpooledPiece:
+class SpooledPiece(RowSource):
     """Rows of a column in a spool, which take no memory."""
 
-    spool: Spool
-    begin: int  # byte of the first row
-    size: int
+    def __init__(self, spool: Spool, values: NDArray[Any]):
+        self.spool, self.begin = spool, spool.add(values)
+        self.shape, self.dtype = values.shape, values.dtype
 
-    def read_into(self, first: int, out: NDArray[np.int64]) -> None:
-        """Read the values from row `first` on into `out`."""
-        line = out if out.flags.c_contiguous else np.empty(out.size, np.int64)
-        self.spool.read_into(self.begin + 8 * first, line)
+    def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
+        """Read the values from `begin` on into `out`."""
+        line = out if out.flags.c_contiguous else np.empty_like(out)
+        self.spool.read_into(self.begin + 8 * begin, line)
         if line is not out:
             out[:] = line
 
 
-@dataclass(frozen=True)
-class EvenPiece:
-    """Rows of stamps at even steps."""
+class EvenPiece(RowSource):
+    """Rows of stamps at even steps [ns]."""
 
-    first: int
-    step: int
-    size: int
+    dtype = np.dtype("datetime64[ns]")
 
-    def read_into(self, first: int, out: NDArray[np.int64]) -> None:
-        """Read the values from row `first` on into `out`."""
-        out[:] = self.first + self.step * np.arange(first, first + out.size)
+    def __init__(self, first: int, step: int, size: int):
+        self.first, self.step, self.shape = first, step, (size,)
 
-
-#: Consecutive rows of a column, by their bits (int64).
-Piece = NDArray[np.int64] | SpooledPiece | EvenPiece
+    def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
+        """Read the values from `begin` on into `out`."""
+        out.view(np.int64)[:] = self.first + self.step * np.arange(begin, begin + out.size)
 
 
-def _move_to_spool(piece: Piece, spool: Spool) -> Piece:
-    """Return a piece with the values that are in memory moved to a spool."""
-    if not isinstance(piece, np.ndarray) or not piece.size:
-        return piece
-    return SpooledPiece(spool, spool.add(piece), piece.size)
+#: Consecutive rows of a column.
+Piece = NDArray[Any] | SpooledPiece | EvenPiece
 
 
 def find_even(stamps: NDArray[np.datetime64]) -> NDArray[np.datetime64] | EvenPiece:
@@ -118,8 +107,9 @@ def find_even(stamps: NDArray[np.datetime64]) -> NDArray[np.datetime64] | EvenPi
 
     Examples
     --------
-    >>> find_even(np.array([5, 10, 15], dtype="datetime64[ns]"))
-    EvenPiece(first=5, step=5, size=3)
+    >>> piece = find_even(np.array([5, 10, 15], dtype="datetime64[ns]"))
+    >>> piece.first, piece.step, piece.shape
+    (5, 5, (3,))
     """
     bits = stamps.view(np.int64)
     steps = np.diff(bits)
@@ -127,40 +117,17 @@ def find_even(stamps: NDArray[np.datetime64]) -> NDArray[np.datetime64] | EvenPi
     return stamps if (steps != step).any() else EvenPiece(int(bits[0]), step, bits.size)
 
 
-class PiecewiseColumn(RowSource):
-    """A column in pieces, as a lazy source."""
-
-    def __init__(self, dtype: Any, pieces: Sequence[Piece]):
-        self.dtype = np.dtype(dtype)
-        self._pieces = [piece for piece in pieces if piece.size]
-        self._rows = np.cumsum(
-            [0, *(piece.size for piece in self._pieces)]
-        ).tolist()  # first row of each piece, and the end of the last
-        self.shape = (self._rows[-1],)
-
-    def find_line(self) -> tuple[int, int] | None:
-        """Return first value and step if all values are evenly spaced, otherwise None."""
-        lines = [piece for piece in self._pieces if isinstance(piece, EvenPiece)]
-        if not lines or len(lines) < len(self._pieces):
+def find_line(pieces: Sequence[Any]) -> tuple[int, int] | None:
+    """Return first value and step if pieces are stamps that are evenly spaced, otherwise None."""
+    lines = [piece for piece in pieces if isinstance(piece, EvenPiece)]
+    if not lines or len(lines) < len(pieces):
+        return None
+    first, step, row = lines[0].first, lines[0].step, 0
+    for line in lines:
+        if line.first != first + row * step or (line.step != step and line.shape != (1,)):
             return None
-        first, step = lines[0].first, lines[0].step
-        is_even = all(
-            line.first == first + row * step and (line.step == step or line.size == 1)
-            for row, line in zip(self._rows, lines, strict=False)
-        )
-        return (first, step) if is_even else None
-
-    def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
-        """Read samples of one row from `begin` on into `out`."""
-        bits, done, number = out.view(np.int64), 0, bisect_right(self._rows, begin) - 1
-        while done < out.size:
-            piece, first = self._pieces[number], begin + done - self._rows[number]
-            part = bits[done : done + piece.size - first]
-            if isinstance(piece, np.ndarray):
-                part[:] = piece[first : first + part.size]
-            else:
-                piece.read_into(first, part)
-            done, number = done + part.size, number + 1
+        row += line.shape[0]
+    return first, step
 
 
 class Buffers:
@@ -179,42 +146,38 @@ class Buffers:
 
     def add(self, block: Mapping[Any, NDArray[Any] | EvenPiece]) -> None:
         """Append one block, in which all columns have the same length."""
-        pieces: dict[Any, Piece] = {
-            key: self._as_piece(key, values) if isinstance(values, np.ndarray) else values
-            for key, values in block.items()
-        }
-        self.rows += next(iter(pieces.values())).size if pieces else 0
-        self._held += sum(
-            piece.nbytes for piece in pieces.values() if isinstance(piece, np.ndarray)
-        )
-        for key, piece in pieces.items():
+        for key, values in block.items():
             self._pieces[key].append(
-                piece if self._spool is None else _move_to_spool(piece, self._spool)
+                self._as_piece(key, values) if isinstance(values, np.ndarray) else values
             )
+        self.rows += next(iter(block.values())).shape[0] if block else 0
         if self._spool is None and self._held > self.limit:
             self._spool = spool = Spool()
             for column in self._pieces.values():
-                column[:] = [_move_to_spool(piece, spool) for piece in column]
+                column[:] = [
+                    spool.store(piece) if isinstance(piece, np.ndarray) else piece
+                    for piece in column
+                ]
 
-    def _as_piece(self, key: Any, values: NDArray[Any]) -> NDArray[np.int64]:
+    def _as_piece(self, key: Any, values: NDArray[Any]) -> NDArray[Any] | SpooledPiece:
         plain = np.ascontiguousarray(values, dtype=self.dtypes[key])
+        if self._spool is not None:
+            return self._spool.store(plain)
         if isinstance(plain.base, np.ndarray) and plain.base.nbytes > plain.nbytes:
             plain = plain.copy()  # a view would keep its whole base in memory
-        return plain.view(np.int64)
+        self._held += plain.nbytes
+        return plain
 
-    def finish(self) -> dict[Any, NDArray[Any] | PiecewiseColumn]:
-        """Return the columns: arrays if they are in memory, otherwise piecewise columns.
+    def finish(self) -> dict[Any, Any]:
+        """Return the columns: arrays if they are in memory, otherwise lazy arrays.
 
-        Of a long log, stamps at even steps stay a piecewise column, which takes no memory.
+        Of a long log, stamps at even steps stay pieces, which take no memory.
         """
-        columns: dict[Any, NDArray[Any] | PiecewiseColumn] = {}
-        for key, dtype in self.dtypes.items():
-            column = PiecewiseColumn(dtype, self._pieces.pop(key))
-            is_line = self.rows > CHUNK_ROWS and column.find_line() is not None
-            columns[key] = column[:] if self._spool is None and not is_line else column
+        columns = {}
+        for key in list(self._pieces):
+            pieces = self._pieces.pop(key)
+            is_line = self.rows > CHUNK_ROWS and find_line(pieces) is not None
+            if self._spool is None and not is_line:
+                pieces = [piece[:] for piece in pieces]
+            columns[key] = concatenate_columns(pieces, CHUNK_ROWS)
         return columns
-
-
-def as_lazy(values: NDArray[Any] | PiecewiseColumn) -> Any:
-    """Wrap a piecewise column in a dask array; return an array in memory unchanged."""
-    return make_dask(values, CHUNK_ROWS) if isinstance(values, PiecewiseColumn) else values

@@ -13,13 +13,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.clock import TurningClock
 from gyrostab.ingest.columns.faults import Faults, Locate, Quote, describe_codes
-from gyrostab.ingest.columns.pieces import (
-    CHUNK_ROWS,
-    Buffers,
-    PiecewiseColumn,
-    as_lazy,
-    find_even,
-)
+from gyrostab.ingest.columns.pieces import CHUNK_ROWS, Buffers, find_even
 from gyrostab.ingest.columns.plan import Plan
 from gyrostab.ingest.columns.plan_draft import Column
 from gyrostab.ingest.columns.stamps import NAT
@@ -156,9 +150,7 @@ class RawLogBuilder:
         if self.options.start is not None and self.time is not None:
             notes.append("--start is not used: the file has its own time column")
         stamps = self._finish_stamps(columns)
-        dataset = self._make_dataset(
-            {key: as_lazy(column) for key, column in columns.items()}, stamps
-        )
+        dataset = self._make_dataset(columns, stamps)
         dataset.attrs.update(
             source_files=[name],
             row_start=[0],
@@ -170,12 +162,12 @@ class RawLogBuilder:
         )
         return dataset
 
-    def _finish_stamps(self, columns: dict[int, NDArray[Any] | PiecewiseColumn]) -> Any:
+    def _finish_stamps(self, columns: dict[int, Any]) -> Any:
         if self.time is None:
             return None
         stamps = columns.pop(self.time.source)
         if not self.faults.rows.total or self.low > self.high:
-            return as_lazy(stamps)
+            return stamps
         hide = partial(_hide_others, low=self.low, high=self.high)
         if isinstance(stamps, np.ndarray):
             return hide(stamps)

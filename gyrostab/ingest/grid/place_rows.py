@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import TimeError
-from gyrostab.ingest.columns.pieces import PiecewiseColumn
+from gyrostab.ingest.columns.pieces import find_line
 from gyrostab.ingest.grid.jitter import MIN_SIGMA, JitterModel
 from gyrostab.ingest.grid.notes import describe_rate
 from gyrostab.ingest.grid.place import (
@@ -72,7 +72,7 @@ class RowPlacer:
         """
         raw, scanned = self.raw, self.scanned
         clock = find_source(raw["time"].data) if "time" in raw.variables else None
-        line = clock.find_line() if isinstance(clock, PiecewiseColumn) else None
+        line = None if clock is None else find_line(clock.parts)
         if line is None or scanned.absent or scanned.repeated or scanned.rows <= _EVEN_ROWS:
             return None
         start, step = line
