@@ -7,18 +7,29 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
 from gyrostab.errors import GyrostabError
+from gyrostab.ingest.columns.plan_roles import scan_advice
+from gyrostab.ingest.files import expand, scan_file
+from gyrostab.ingest.formats.text import read_head
+from gyrostab.ingest.grid.fill import count_present
+from gyrostab.ingest.grid.gaps import gap_table
+from gyrostab.ingest.grid.regularise import regularise
+from gyrostab.ingest.grid.scan_pass import find_spans
+from gyrostab.ingest.guess import Guess, guess_columns
+from gyrostab.ingest.guess_unit import temperature_unit
+from gyrostab.ingest.inspect import FileInspection, inspect_file
+from gyrostab.ingest.options import ReadOptions
+from gyrostab.ingest.reading import read_log
+from gyrostab.ingest.uniform import cut_log
+from gyrostab.schema import log_channels, signal_name, texts
 from gyrostab.store.remote import given_name
-
-if TYPE_CHECKING:
-    from gyrostab.ingest.guess import Guess
-    from gyrostab.ingest.inspect import FileInspection
+from gyrostab.units import HOUR
 
 #: Largest share of missing samples at a plausible sampling rate; above it, the mean rate of the
 #: rows is tried.
@@ -123,9 +134,6 @@ def scan_and_inspect(
     Errors of unreadable files are collected, not raised. The first of files with the same columns
     is inspected.
     """
-    from gyrostab.ingest.columns.plan_roles import scan_advice
-    from gyrostab.ingest.files import expand
-
     rows: list[dict[str, Any]] = []
     errors: list[GyrostabError] = []
     inspected: dict[Any, InspectedFile | None] = {}
@@ -154,10 +162,6 @@ def _inspect_once(
     path: Path, reading: dict[str, Any], inspected: dict[Any, InspectedFile | None]
 ) -> InspectedFile | None:
     """Inspect a file, unless one with the same columns was inspected."""
-    from gyrostab.ingest import ReadOptions, scan_file
-    from gyrostab.ingest.guess import guess_columns
-    from gyrostab.ingest.inspect import inspect_file
-
     options = ReadOptions(**_select_reading(reading))
     try:
         headers = tuple(
@@ -182,8 +186,6 @@ def _try_guess(
     path: Path, inspection: FileInspection, guess: Guess, reading: dict[str, Any]
 ) -> InspectedFile:
     """Read a file by the guess, also with its mean rate if many samples seem to be missing."""
-    from gyrostab.ingest.guess_unit import temperature_unit
-
     axes = guess.axes.items()
     mapped = {column.key: f"gyro_{axis}" for axis, column in axes if column.role != "gyro"}
     if guess.time is not None and guess.time.role != "time":
@@ -228,8 +230,6 @@ def _named_rate(path: Path) -> float | None:
 
     If it names several frequencies, only one of them may be in a phrase on a rate or on sampling.
     """
-    from gyrostab.ingest.formats.text import read_head
-
     rates: dict[float, bool] = {}  # whether a phrase says that this is a rate
     for phrase in re.split(r"[\n,;]", read_head(path)):
         for match in _FREQUENCY.finditer(phrase):
@@ -241,14 +241,6 @@ def _named_rate(path: Path) -> float | None:
 
 
 def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
-    from gyrostab.ingest import ReadOptions, read_log, scan_file
-    from gyrostab.ingest.grid.fill import count_present
-    from gyrostab.ingest.grid.gaps import gap_table
-    from gyrostab.ingest.grid.regularise import regularise
-    from gyrostab.ingest.grid.scan_pass import find_spans
-    from gyrostab.ingest.uniform import cut_log
-    from gyrostab.schema import log_channels, signal_name, texts
-
     max_gap = reading.get("max_gap", "10D")
     cut = {name: reading[name] for name in _CUTTING if name in reading}
     reading = _select_reading(reading)
@@ -295,9 +287,6 @@ def _measure_white_noise(log: xr.Dataset) -> dict[str, float]:
     more elsewhere: the smallest of averaging times a factor of two apart is taken, up to a
     hundredth of the samples.
     """
-    from gyrostab.schema import signal_name
-    from gyrostab.units import HOUR
-
     signal = log[signal_name(log)]
     rate, size = float(log.attrs["sampling_rate_hz"]), signal.sizes["time"]
     begin = max(0, (size - _MAX_NOISE_SAMPLES) // 2)
