@@ -17,6 +17,7 @@ from gyrostab.ingest.columns import pieces
 from gyrostab.ingest.columns.pieces import EvenPiece, Spool, find_even, find_line
 from gyrostab.ingest.columns.raw_log import clean_column
 from gyrostab.ingest.formats import text
+from gyrostab.ingest.text.cells import BlockParser
 from gyrostab.kernels.grid.stamps import NO_STAMP, new_state, place
 from gyrostab.store.lazy import concatenate_columns, read_into, read_slice
 from gyrostab.store.threads import map_in_order
@@ -99,18 +100,18 @@ def test_reading_ahead_stops_with_an_error(tmp_path, monkeypatch):
         text_log(tmp_path / f"{number}.csv", 2000 * number, 2000, decimals=3) for number in range(3)
     ]
     sizes: list[int] = []
-    take = text._parse_block
+    take = BlockParser.parse
 
-    def slowly(block, **options):
+    def slowly(self, block):
         time.sleep(0.005)
         sizes.append(len(block))
-        return take(block, **options)
+        return take(self, block)
 
     def refuse(number, count, path):
         if number == 2:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(text, "_parse_block", slowly)
+    monkeypatch.setattr(BlockParser, "parse", slowly)
     monkeypatch.setattr(text, "BLOCK_BYTES", 256)
     with pytest.raises(KeyboardInterrupt):
         read_log(paths, on_file=refuse)

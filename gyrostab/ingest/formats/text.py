@@ -35,7 +35,7 @@ from gyrostab.ingest.columns.plan_draft import Column
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
 from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, from_fortran
 from gyrostab.ingest.options import FileSummary, ReadOptions
-from gyrostab.ingest.text.cells import BlockParser
+from gyrostab.ingest.text.cells import BlockParser, ParsedBlock
 from gyrostab.ingest.text.layout import (
     VOID_CELLS,
     Layout,
@@ -97,17 +97,18 @@ def read(
 ) -> xr.Dataset:
     """Return the raw log of a text file; raise `CancelledError` once `stop` returns true."""
     layout, plan = _plan_file(path, options)
-    builder = RawLogBuilder(plan)
-    parse = partial(_parse_block, parser=BlockParser(layout, plan), builder=builder)
-    line = layout.line
-    for converted, block, starts, lines in map_in_order(
-        parse, _read_blocks(path, layout.offset, growing=options.growing)
-    ):
+    builder, parser, line = RawLogBuilder(plan), BlockParser(layout, plan), layout.line
+
+    def parse(block: bytes) -> tuple[ParsedBlock, ConvertedBlock]:
+        parsed = parser.parse(block)
+        return parsed, builder.prepare(parsed.values, parsed.stamps, words=parsed.words)
+
+    blocks = _read_blocks(path, layout.offset, growing=options.growing)
+    for parsed, converted in map_in_order(parse, blocks):
         if stop is not None and stop():
             raise CancelledError
-        quote = partial(_quote_line, block, starts)
-        builder.add(converted, partial(_line_names, block, starts, line), quote)
-        line += lines
+        builder.add(converted, partial(parsed.name_lines, line), parsed.quote_line)
+        line += parsed.lines
     raw = builder.finish(layout.notes)
     if plan.time is not None and plan.time.time_unit is None:
         cells = [row[plan.time.source] for row in layout.full_samples]
@@ -265,22 +266,3 @@ def _read_blocks(path: Path, offset: int, *, growing: bool = False) -> Iterator[
             rest = chunk[cut:]
         if rest.strip() and not growing:
             yield rest + b"\n"
-
-
-def _parse_block(
-    block: bytes, parser: BlockParser, builder: RawLogBuilder
-) -> tuple[ConvertedBlock, bytes, NDArray[np.int64], int]:
-    values, stamps, words, starts, lines = parser.parse(block)
-    return builder.prepare(values, stamps, words=words), block, starts, lines
-
-
-def _quote_line(block: bytes, starts: NDArray[np.int64], row: int) -> str:
-    start = int(starts[row])
-    return repr(block[start : block.index(b"\n", start)].decode("latin-1").strip())
-
-
-def _line_names(
-    block: bytes, starts: NDArray[np.int64], first: int, rows: Sequence[int]
-) -> list[str]:
-    above = (block.count(b"\n", 0, int(starts[row])) for row in rows)
-    return [f"line {first + lines}" for lines in above]

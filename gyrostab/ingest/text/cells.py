@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
 from typing import NamedTuple
@@ -22,8 +23,19 @@ class ParsedBlock(NamedTuple):
     values: dict[int, NDArray[np.float64]]  # column number -> numbers, NaN where missing
     stamps: NDArray[np.int64] | None  # stamps [ns since 1970]
     words: int  # channel cells that are neither a number nor void
+    block: bytes
     starts: NDArray[np.int64]  # position of each row in the block
     lines: int  # number of lines, with comments and empty lines
+
+    def name_lines(self, first: int, rows: Sequence[int]) -> list[str]:
+        """Name rows by their lines; `first` is the number of the first line of the block."""
+        above = (self.block.count(b"\n", 0, int(self.starts[row])) for row in rows)
+        return [f"line {first + lines}" for lines in above]
+
+    def quote_line(self, row: int) -> str:
+        """Return a row as it is written, in quotes."""
+        start = int(self.starts[row])
+        return repr(self.block[start : self.block.index(b"\n", start)].decode("latin-1").strip())
 
 
 class BlockParser:
@@ -84,7 +96,7 @@ class BlockParser:
             stamps = integers_to_ns(stamps, self.counted, self.epoch)
         words = self._parse_cells(other_lines, values, stamps) if other_lines else 0
         columns = dict(zip(self.sources, values[:, :row], strict=True))
-        return ParsedBlock(columns, stamps, words, starts[:row], lines)
+        return ParsedBlock(columns, stamps, words, block, starts[:row], lines)
 
     def _parse_cells(
         self,
