@@ -171,7 +171,7 @@ class Buffers:
     def finish(self) -> dict[Any, Any]:
         """Return the columns: arrays if they are in memory, otherwise lazy arrays.
 
-        Of a long log, stamps at even steps stay pieces, which take no memory.
+        Stamps at even steps stay pieces if the log is long, as these take no memory.
         """
         columns = {}
         for key in list(self._pieces):

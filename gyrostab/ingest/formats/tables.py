@@ -39,7 +39,7 @@ class TableColumn:
 
     name: tuple[str, ...]
     values: Any  # what can be sliced, or a function of the first row and the row after the last
-    unit: str | None = None  # as the format has it, without blanks around it; "" becomes None
+    unit: str | None = None  # blanks around it are removed; None in place of an empty text
     target: str | None = None  # by a code of the format, in the form of ``--map``
     #: Type and CF attributes of stored numbers, which are packed.
     dtype: Any = None
