@@ -38,7 +38,7 @@ class Workspace:
 
 
 class Workspaces(threading.local):
-    """A separate `Workspace` for each thread, as ``own``; another process begins with empty ones."""
+    """A separate `Workspace` for each thread, as ``own``; empty in another process."""
 
     def __init__(self) -> None:
         self.own = Workspace()
