@@ -35,7 +35,6 @@ Array = NDArray[np.float64]
 _MAX_TRIES = 60
 _EQUAL_RANGE_SHARE = 1e-9  # difference of equal values
 _MAX_STEP_ERROR = 1e-3  # of multiples of the step
-_MAX_LEVELS_PER_SAMPLE = 0.2  # more levels mean that the record is not quantized
 
 
 def estimate_noise(record: Array, *, rate: float) -> dict[str, float]:
@@ -122,6 +121,8 @@ def quantization_step(values: Array) -> float:
     >>> rng = np.random.default_rng(0)
     >>> quantization_step(rng.integers(-9, 9, 1000) * 0.25)
     0.25
+    >>> round(quantization_step(rng.normal(0, 1, 1000).round(3)), 9)  # hardly two are equal
+    0.001
     >>> quantization_step(rng.normal(0, 1, 1000))
     0.0
     """
@@ -130,7 +131,7 @@ def quantization_step(values: Array) -> float:
     gaps = gaps[
         gaps > _EQUAL_RANGE_SHARE * max(float(np.ptp(levels)) if levels.size else 0.0, 1e-300)
     ]
-    if gaps.size == 0 or gaps.size > _MAX_LEVELS_PER_SAMPLE * values.size:
+    if gaps.size == 0:
         return 0.0
     step = float(gaps.min())
     step = float(np.ptp(levels)) / round(float(np.ptp(levels)) / step)
