@@ -50,7 +50,6 @@ class RandomProcess(BlockMeanStatistic):
     nuisance_alternative = "~red"
     null_variable = "mean"
     error_shows_in = ("random_process",)
-    explains_motion = True
     has_course = True
     has_size = False
     takes_noise = False

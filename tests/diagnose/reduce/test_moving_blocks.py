@@ -141,6 +141,7 @@ def test_effect_explains_motion_if_it_leaves_almost_nothing(reduced):
         identification("bias_jump", "mean", "z", course=step),
         identification("warm_up", "mean", "x", course=bump),
         identification("light_power_noise", "power", "z"),
+        identification("vibration_random_walk", "random_process", "z"),
     ):
         np.testing.assert_array_equal(unexplained_motion(whole, [other]), moving)
 
