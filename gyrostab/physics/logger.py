@@ -13,6 +13,8 @@ from gyrostab.errors import OptionError
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
 from gyrostab.units import HOUR
 
+#: Samples of a fast instrument (`instrument = 0`) per sample of the log: they resolve its low-pass.
+FAST_INSTRUMENT_SAMPLES = 16
 #: Mean lengths of a frame sent twice, to which its geometric law is cut: longer ones have a
 #: probability of 2e-9.
 _FRAME_LENGTHS = 20.0
@@ -27,8 +29,8 @@ class LoggerFilter(Effect):
     instrument (integrate and dump), or with ``pick = 1`` every n-th of them, where n is the
     `oversampling` of the model; what passes the filter above half of the log's rate is then
     aliased. All filters are causal and keep their state between chunks. To explain a recording,
-    `instrument` takes the place of n: 1 for a filter at the rate of the log, 0 for a much faster
-    instrument.
+    `instrument` takes the place of n: 1 for a filter at the rate of the log, 0 for a fast
+    instrument (n = 16).
 
     References
     ----------
@@ -72,7 +74,7 @@ class LoggerFilter(Effect):
     )
     instrument: float = parameter(
         "1",
-        "n, to explain a recording; 0: many",
+        "n, to explain a recording; 0: 16, a fast instrument",
         default=0.0,
         low=0.0,
         high=1000.0,
@@ -148,34 +150,13 @@ class LoggerFilter(Effect):
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict the factor on the spectrum of white noise."""
-        from gyrostab.kernels.random.coloured import folded_psd
-
         if not (self.cutoff or self.length):
             return Prediction()
-        if self.instrument:
-            return Prediction(response=self._digital_response(windows.frequency, windows.rate))
-        highest = min(
-            20.0 * self.cutoff if self.cutoff else math.inf,
-            50.0 / self.length if self.length else math.inf,
-        )
+        n = int(self.instrument) or FAST_INSTRUMENT_SAMPLES
+        return Prediction(response=self._digital_response(windows.frequency, windows.rate, n))
 
-        def gain(f: Array) -> Array:
-            low = 1.0 / (1.0 + (f / self.cutoff) ** (2 * int(self.order))) if self.cutoff else 1.0
-            return np.asarray(low * np.sinc(f * self.length) ** 2)
-
-        return Prediction(
-            response=folded_psd(
-                gain,
-                windows.frequency,
-                windows.rate,
-                max(highest, windows.rate),
-                average=not self.pick,
-            )
-        )
-
-    def _digital_response(self, frequency: Array, rate: float) -> Array:
-        """Sum the response over all aliases, for `instrument` samples per sample of the log."""
-        n = int(self.instrument)
+    def _digital_response(self, frequency: Array, rate: float, n: int) -> Array:
+        """Sum the response over all aliases, for `n` samples of the instrument per log sample."""
         fast = n * rate
         if self.cutoff >= fast / 2.0:
             raise OptionError(

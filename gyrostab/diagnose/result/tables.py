@@ -24,13 +24,11 @@ from gyrostab.diagnose.result.text import effect_statement, span_text, unsized_s
 from gyrostab.diagnose.result.verdict import name_probability
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.noise import LAWS
+from gyrostab.physics.logger import FAST_INSTRUMENT_SAMPLES
 from gyrostab.simulate.model import Model
 from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
-#: Samples of an instrument that is "much faster than the log" (`instrument = 0`): a low-pass of the
-#: instrument is then resolved in the samples of the log.
-FAST_INSTRUMENT_SAMPLES = 16
 
 
 def recording_table(blocks: xr.Dataset) -> dict[str, Any]:
