@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -22,7 +22,7 @@ from gyrostab.diagnose.estimate.conditioned_baseline import expected_baseline, w
 from gyrostab.diagnose.estimate.forms import settle_forms
 from gyrostab.diagnose.estimate.recalibrate import remove_fast_switching
 from gyrostab.diagnose.estimate.unexplained_motion import unexplained_motion
-from gyrostab.diagnose.identify.forward_search import name_effects
+from gyrostab.diagnose.identify.forward_search import identify_effects, prepare_examination
 from gyrostab.diagnose.identify.identification import components_of
 from gyrostab.diagnose.inputs import check_options, read_simulation, varying_axes
 from gyrostab.diagnose.locate.mismatches import locate_mismatches
@@ -35,7 +35,13 @@ from gyrostab.diagnose.result.attribution import drop_expected
 from gyrostab.diagnose.result.diagnosis import Diagnosis
 from gyrostab.diagnose.result.finish import finish_diagnosis
 from gyrostab.diagnose.settings import DEFAULTS, Settings
-from gyrostab.diagnose.task import Comparison, Task, lines_without_motion, take_lines_at_rest
+from gyrostab.diagnose.task import (
+    Comparison,
+    NamedBlocks,
+    Task,
+    lines_without_motion,
+    take_lines_at_rest,
+)
 from gyrostab.errors import SchemaError
 from gyrostab.ingest.convert import as_log
 from gyrostab.progress import Stage, no_stage
@@ -130,11 +136,10 @@ def _run_steps(task: Task, block: Any) -> Diagnosis:
     """Run the seven steps in their order; each reason to compare again occurs at most once."""
     started = time.perf_counter()
     task, blocks = _reduce_recording(task, block)
-    comparison = _compare_blocks(task, *_calibrate_baseline(task, blocks))
+    named = _identify_effects(task, *_calibrate_baseline(task, blocks))
     for revise in (_leave_out_motion, _leave_motion_out_of_lines, _take_out_fast_switching):
-        revised = revise(task, comparison)
-        if revised is not None:
-            comparison = _compare_blocks(task, *revised)
+        named = revise(task, named) or named
+    comparison = _locate_mismatches(task, named)
     task.progress("fitting", 0)
     return finish_diagnosis(task, comparison, started)
 
@@ -182,36 +187,42 @@ def _make_baseline(task: Task, blocks: xr.Dataset) -> xr.Dataset:
     return baseline_from_simulation(blocks, simulated, quiet=task.quiet, settings=task.settings)
 
 
-def _compare_blocks(task: Task, blocks: xr.Dataset, baseline: xr.Dataset) -> Comparison:
-    """Steps 3 to 5: draw null records, identify effects, and locate the mismatches.
-
-    Identified effects and located mismatches have half of the false-alarm level each.
-    """
-    level = task.level / 2.0
-    blocks_without_lines = remove_known_lines(blocks, baseline, settings=task.settings)
-    records = repeatable_null_records(blocks_without_lines, baseline, task.nulls, task.seed)
-    task.progress("comparing", 0)
-    null = null_scores(baseline, records(), settings=task.settings)
+def _identify_effects(task: Task, blocks: xr.Dataset, baseline: xr.Dataset) -> NamedBlocks:
+    """Steps 3 and 4: draw null records, and identify effects with half of the false-alarm level."""
+    blocks_without_lines, records = _without_lines(task, blocks, baseline)
     task.progress("naming", 0)
     known_effects = task.simulation.effects if isinstance(task.simulation, Model) else ()
-    named = name_effects(
+    examination = prepare_examination(
         blocks_without_lines,
         baseline,
         records(),
-        level=level,
+        level=task.level / 2.0,
         seed=task.seed,
         known=[effect for effect in known_effects if effect.name in baseline.attrs["left_out"]],
         progress=task.progress,
         settings=task.settings,
     )
-    identifications = settle_forms(named, baseline)
-    expected = identifications.expected
+    identifications = settle_forms(identify_effects(examination), baseline)
+    return NamedBlocks(blocks, baseline, records, examination, identifications)
+
+
+def _without_lines(
+    task: Task, blocks: xr.Dataset, baseline: xr.Dataset
+) -> tuple[xr.Dataset, Callable[[], Iterable[xr.Dataset]]]:
+    """Return the blocks without the lines of the baseline, and their null records."""
+    blocks = remove_known_lines(blocks, baseline, settings=task.settings)
+    return blocks, repeatable_null_records(blocks, baseline, task.nulls, task.seed)
+
+
+def _locate_mismatches(task: Task, named: NamedBlocks) -> Comparison:
+    """Step 5: locate the mismatches, with the other half of the false-alarm level."""
+    level = task.level / 2.0
+    blocks, baseline = named.examination.start.blocks, named.baseline
+    identifications, expected = named.identifications, named.identifications.expected
+    task.progress("comparing", 0)
+    null = null_scores(baseline, named.null_records(), settings=task.settings)
     conditioned_baseline = expected_baseline(identifications, baseline)
-    at_rest = (
-        lines_without_motion(task, blocks_without_lines, conditioned_baseline)
-        if expected
-        else blocks_without_lines
-    )
+    at_rest = lines_without_motion(task, blocks, conditioned_baseline) if expected else blocks
     mismatches = locate_mismatches(
         without_expected(at_rest, baseline, expected, task.settings),
         conditioned_baseline,
@@ -222,38 +233,37 @@ def _compare_blocks(task: Task, blocks: xr.Dataset, baseline: xr.Dataset) -> Com
     mismatches = drop_expected(
         mismatches,
         expected,
-        blocks_without_lines,
+        blocks,
         conditioned_baseline,
         null,
         level=level,
         settings=task.settings,
     )
-    return Comparison(blocks, baseline, mismatches, identifications, null)
+    return Comparison(named.blocks, baseline, mismatches, identifications, null)
 
 
-def _leave_out_motion(task: Task, comparison: Comparison) -> tuple[xr.Dataset, xr.Dataset] | None:
-    """Return blocks and baseline without unexplained motion; None without any, or with too few."""
+def _leave_out_motion(task: Task, named: NamedBlocks) -> NamedBlocks | None:
+    """Identify without unexplained motion; None without any, or if too little is left."""
     if task.simulation is not None:
         return None
-    blocks, identified = comparison.blocks, comparison.identifications.identified
+    blocks, identified = named.blocks, named.identifications.identified
     moving = unexplained_motion(blocks, identified, settings=task.settings)
     if not moving.any():
         return None
     try:
-        return _calibrate_baseline(task, _at_rest(task, blocks, moving))
+        calibrated = _calibrate_baseline(task, _at_rest(task, blocks, moving))
     except SchemaError as error:
         warnings.warn(
             f"the diagnosis includes unexplained motion: without it too little is left ({error})",
             stacklevel=4,
         )
         return None
+    return _identify_effects(task, *calibrated)
 
 
-def _leave_motion_out_of_lines(
-    task: Task, comparison: Comparison
-) -> tuple[xr.Dataset, xr.Dataset] | None:
-    """Return blocks with the lines of axes at rest; None if no effect moves an axis with lines."""
-    identifications = comparison.identifications
+def _leave_motion_out_of_lines(task: Task, named: NamedBlocks) -> NamedBlocks | None:
+    """Identify with the lines of axes at rest; None if no effect moves an axis with lines."""
+    identifications = named.identifications
     with_lines = [
         component.row[0]
         for component in components_of(identifications.identified)
@@ -261,19 +271,21 @@ def _leave_motion_out_of_lines(
     ]
     moving = (
         identifications.state.masked
-        & np.isin(comparison.blocks["axis"].values.astype(str), with_lines)[:, None]
+        & np.isin(named.blocks["axis"].values.astype(str), with_lines)[:, None]
     )
     if not moving.any():
         return None
-    return take_lines_at_rest(task, comparison.blocks, moving), comparison.baseline
+    blocks, baseline = take_lines_at_rest(task, named.blocks, moving), named.baseline
+    blocks_without_lines, records = _without_lines(task, blocks, baseline)
+    examination = named.examination.with_blocks(blocks_without_lines)
+    identifications = settle_forms(identify_effects(examination), baseline)
+    return NamedBlocks(blocks, baseline, records, examination, identifications)
 
 
-def _take_out_fast_switching(
-    task: Task, comparison: Comparison
-) -> tuple[xr.Dataset, xr.Dataset] | None:
-    """Return the blocks and a baseline calibrated free of switching within blocks, if any."""
-    baseline = remove_fast_switching(comparison.identifications, comparison.baseline)
-    return None if baseline is comparison.baseline else (comparison.blocks, baseline)
+def _take_out_fast_switching(task: Task, named: NamedBlocks) -> NamedBlocks | None:
+    """Identify with a baseline calibrated free of switching within blocks; None without any."""
+    baseline = remove_fast_switching(named.identifications, named.baseline)
+    return None if baseline is named.baseline else _identify_effects(task, named.blocks, baseline)
 
 
 def _at_rest(task: Task, blocks: xr.Dataset, moving: NDArray[np.bool_]) -> xr.Dataset:

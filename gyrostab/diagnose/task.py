@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion
 from gyrostab.diagnose.baseline.known_lines import remove_known_lines
+from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.nulls.scores import NullScores
 from gyrostab.diagnose.reduce.moving_blocks import without_motion
@@ -34,6 +36,16 @@ class Task:
     level: float
     progress: Stage
     settings: Settings
+
+
+class NamedBlocks(NamedTuple):
+    """A recording with the effects that are identified in it."""
+
+    blocks: xr.Dataset
+    baseline: xr.Dataset  # what the simulation predicts for the blocks
+    null_records: Callable[[], Iterable[xr.Dataset]]  # the same ones on each call
+    examination: Examination  # of the blocks without the lines that the baseline contains
+    identifications: Identifications  # the effects that explain the differences
 
 
 class Comparison(NamedTuple):

@@ -176,8 +176,8 @@ def test_noise_without_channels_has_no_mismatch_and_a_constant_axis_is_left_out(
     assert list(dict.fromkeys(labels)) == [
         "reducing",
         "calibrating",
-        "comparing",
         "naming",
+        "comparing",
         "fitting",
     ]
     with pytest.raises(SchemaError, match="the same on axis y: without noise"):

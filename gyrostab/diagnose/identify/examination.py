@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Any
 
+import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.components import group_components
@@ -14,6 +17,9 @@ from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, C
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.settings import Settings
+from gyrostab.physics.base import Effect
+
+Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -24,13 +30,24 @@ class Examination:
     folds: xr.DataArray  # from `gyrostab.diagnose.evidence.folds.fold_blocks`
     count_evidence: CountEvidence
     threshold: float  # evidence [nats] that noise alone exceeds with the false-alarm probability
-    start: State  # with the expected effects in the model
-    expected: tuple[Selection, ...] = ()  # effects that the simulation contains as well
+    start: State  # with the expected effects in the model, once they are identified
+    known: tuple[Effect, ...] = ()  # effects that the simulation contains but not the baseline
+    null_best: Array = field(default_factory=lambda: np.empty(0))  # as in `Identifications`
+    reasons: dict[str, str] = field(default_factory=dict)  # effect -> why it cannot show
+    expected: tuple[Selection, ...] = ()  # those of the known effects that the record shows
+    memory: dict[bytes, object] = field(default_factory=dict)  # of `compute_evidence`
 
     @property
     def settings(self) -> Settings:
         """Numbers that decide what is named."""
         return self.start.settings
+
+    def with_blocks(self, blocks: xr.Dataset) -> Examination:
+        """Return the examination of the record with other line spectra, before any effect.
+
+        The threshold is that of the null records so far.
+        """
+        return replace(self, start=replace(self.start, blocks=blocks))
 
     def state_with(
         self, selections: Sequence[Selection], *, without: Selection | None = None
@@ -43,7 +60,12 @@ class Examination:
     ) -> list[CandidateEvidence]:
         """Compute the held-out evidence of candidates on the record."""
         return compute_evidence(
-            candidates, state.blocks, state, self.folds, count_evidence=self.count_evidence
+            candidates,
+            state.blocks,
+            state,
+            self.folds,
+            count_evidence=self.count_evidence,
+            memory=self.memory,
         )
 
     def find_components(

@@ -5,7 +5,6 @@ These are anomalous samples, lines locked to the rotation, and telegraph biases.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 from gyrostab.diagnose.identify.components import sum_evidence
@@ -19,16 +18,16 @@ from gyrostab.physics.base import Effect
 MAX_ROUNDS_PER_EFFECT = 6  # components of one kind that an effect may add, one in each round
 
 
-def identify_expected_effects(known: Sequence[Effect], examination: Examination) -> Examination:
+def identify_expected_effects(examination: Examination) -> Examination:
     """Identify effects that are expected, and put them into the model before any others.
 
     Their sizes are free: the model says how often something happens, and the recording when. The
     strongest comes first, but anomalous samples before all others, because they raise powers and
     means too. An effect with several components of a kind, such as two jumps, is taken as long as
-    it adds evidence. `known` are the effects of the model that its baseline leaves out.
+    it adds evidence.
     """
     identified: list[Selection] = []
-    state, remaining = examination.start, list(known)
+    state, remaining = examination.start, list(examination.known)
     needed = examination.settings.component_nats
     rounds = MAX_ROUNDS_PER_EFFECT * len(remaining)
     while remaining and rounds > 0:

@@ -46,6 +46,34 @@ def name_effects(
     Effects are selected one after the other by how much better they predict held-out data. The
     best evidence in null records gives the threshold.
 
+    It is `prepare_examination` followed by `identify_effects`, with their parameters.
+    """
+    examination = prepare_examination(
+        blocks,
+        baseline,
+        nulls,
+        level=level,
+        seed=seed,
+        known=known,
+        progress=progress,
+        settings=settings,
+    )
+    return identify_effects(examination)
+
+
+def prepare_examination(
+    blocks: xr.Dataset,
+    baseline: xr.Dataset,
+    nulls: Iterable[xr.Dataset],
+    *,
+    level: float = 0.005,
+    seed: int = 0,
+    known: Sequence[Effect] = (),
+    progress: Stage = no_stage,
+    settings: Settings = DEFAULTS,
+) -> Examination:
+    """Collect the candidates for a recording, and the threshold that null records give.
+
     Parameters
     ----------
     nulls : iterable of xarray.Dataset
@@ -74,19 +102,24 @@ def name_effects(
             else "not identifiable: the quantization grid is that of angles, or too fine to show"
         )
     threshold = fit_best_evidence(best, settings=settings).level(level)
-    examination = identify_expected_effects(
-        known, Examination(candidates, folds, count_evidence, threshold, start)
+    return Examination(
+        candidates, folds, count_evidence, threshold, start, tuple(known), best, reasons
     )
+
+
+def identify_effects(examination: Examination) -> Identifications:
+    """Identify the effects of a recording that is prepared for it."""
+    examination = identify_expected_effects(examination)
     identified, unidentified, rejected, state = select_effects(examination)
     return Identifications(
         tuple(identified),
         tuple(unidentified),
-        threshold,
-        best,
-        reasons,
-        tuple(candidates),
+        examination.threshold,
+        examination.null_best,
+        examination.reasons,
+        tuple(examination.candidates),
         state,
-        count_evidence,
+        examination.count_evidence,
         examination.expected,
         tuple(rejected),
     )

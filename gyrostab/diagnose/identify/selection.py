@@ -21,7 +21,6 @@ from gyrostab.diagnose.identify.identification import (
     Rejection,
     Selection,
     add_selection,
-    components_of,
     make_selection,
 )
 from gyrostab.diagnose.identify.naming_order import order_passing, order_rivals
@@ -31,10 +30,9 @@ from gyrostab.diagnose.identify.settling import prune_selections, settle_selecti
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.identify.switching import drop_explained_jumps
 from gyrostab.diagnose.identify.withdrawal import withdraw_effects
-from gyrostab.diagnose.predict.candidates import CandidateEvidence, Component, Variant
+from gyrostab.diagnose.predict.candidates import CandidateEvidence, Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.search import reusable_evidence
 
 # Limits of the time of a search; a record has fewer effects.
 MAX_EFFECTS = 10
@@ -59,7 +57,7 @@ def select_effects(
     state : State
         With all of these in the model.
     """
-    selected, all_evidence, beaten = _select_all(examination)
+    selected, beaten = _select_all(examination)
     chosen = without_pulses(drop_explained_jumps(selected, examination), examination.settings)
     chosen, identified = settle_selections(examination, prune_selections(examination, chosen))
     unidentified = [selection for selection in chosen if not selection.is_named]
@@ -69,8 +67,7 @@ def select_effects(
     if withdrawn or remaining != identified:
         state = examination.state_with([*remaining, *unidentified])
     remaining = sorted(remaining, key=lambda identification: -identification.evidence_nats)
-    is_unchanged = _variants_by_row(selected) == _variants_by_row([*remaining, *unidentified])
-    all_evidence = score_candidates(examination, state, (), all_evidence if is_unchanged else ())
+    all_evidence = score_candidates(examination, state, ())
     components = merge_lines(group_components(all_evidence, settings=examination.settings))
     rejected = find_rejections(components, remaining, unidentified, beaten, state, examination)
     return remaining, unidentified, rejected, state
@@ -78,20 +75,18 @@ def select_effects(
 
 def _select_all(
     examination: Examination,
-) -> tuple[list[Selection], list[CandidateEvidence], dict[str, tuple[str, float]]]:
+) -> tuple[list[Selection], dict[str, tuple[str, float]]]:
     """Select the best candidate, put it into the model, and repeat while one passes.
 
     Returns
     -------
     chosen : list of Selection
-    all_evidence : list of CandidateEvidence
-        Evidence of the others, with all of these in the model.
     beaten : dict of str to (str, float)
         Key of each candidate that passed the threshold and was not selected -> another form or a
         time-shifted channel, and by how much it explained more [nats].
     """
     chosen: list[Selection] = []
-    state = previous = examination.start
+    state = examination.start
     barred = {
         key
         for identification in examination.expected
@@ -101,14 +96,12 @@ def _select_all(
         )
     }
     effects_left, lines_left = MAX_EFFECTS, MAX_LINES
-    all_evidence: list[CandidateEvidence] = []
     beaten: dict[str, tuple[str, float]] = {}
     while effects_left > 0:
-        known_evidence = reusable_evidence(all_evidence, previous, state)
-        all_evidence, previous = score_candidates(examination, state, barred, known_evidence), state
+        all_evidence = score_candidates(examination, state, barred)
         selected = _select_next(examination, all_evidence, state, chosen, beaten)
         if selected is None:
-            return chosen, all_evidence, beaten
+            break
         selections, shifted = selected
         beaten |= shifted
         barred |= shifted.keys()
@@ -121,7 +114,7 @@ def _select_all(
             chosen = add_selection(chosen, selection)
             barred |= _explained_count_keys(examination, selection)
             state = condition_on(state, list(selection.components))
-    return chosen, [], beaten
+    return chosen, beaten
 
 
 def _explained_count_keys(examination: Examination, selection: Selection) -> set[str]:
@@ -148,23 +141,14 @@ def score_candidates(
     examination: Examination,
     state: State,
     barred: Collection[str],
-    known_evidence: Sequence[CandidateEvidence] = (),
 ) -> list[CandidateEvidence]:
-    """Compute the evidence of all candidates that are not barred; `known_evidence` is reused.
+    """Compute the evidence of all candidates that are not barred.
 
     Powers are weighted with the strongest effect in the powers, because its noise is in every
     statistic.
     """
-    known = {evidence.candidate for evidence in known_evidence}
-    sought = [
-        candidate
-        for candidate in examination.candidates
-        if candidate.key not in barred and candidate not in known
-    ]
-    all_evidence = [
-        *(evidence for evidence in known_evidence if evidence.candidate.key not in barred),
-        *examination.compute_evidence(sought, state),
-    ]
+    sought = [candidate for candidate in examination.candidates if candidate.key not in barred]
+    all_evidence = examination.compute_evidence(sought, state)
     weighted = [
         evidence.candidate
         for evidence in all_evidence
@@ -172,8 +156,7 @@ def score_candidates(
     ]
     settings = examination.settings
     min_nats = settings.reweight_thresholds * examination.threshold
-    is_new = any(candidate.statistic.is_power_weighted for candidate in sought)
-    for _ in range(2 if is_new else 0):
+    for _ in range(2):
         powers = [evidence for evidence in all_evidence if evidence.candidate.statistic.is_power]
         strongest = max(powers, key=_positive_evidence, default=None)
         if strongest is None or _positive_evidence(strongest) < min_nats:
@@ -259,16 +242,10 @@ def _find_shifted(
     components: Sequence[Component], state: State, examination: Examination
 ) -> tuple[str, float] | None:
     """Return the time-shifted channel that beats an effect, and by how much [nats]."""
-    passed, _, nats = passes_time_shift_test(components, state, examination.folds)
+    passed, _, nats = passes_time_shift_test(
+        components, state, examination.folds, examination.memory
+    )
     return None if passed else ("a time-shifted channel", nats)
-
-
-def _variants_by_row(chosen: Sequence[Selection]) -> set[tuple[str, tuple[str, ...], Variant]]:
-    """Return what the selections put into the model: rows and variants."""
-    return {
-        (component.candidate.key, component.row, component.variant)
-        for component in components_of(chosen)
-    }
 
 
 def _positive_evidence(evidence: CandidateEvidence) -> float:

@@ -20,7 +20,10 @@ SHIFT_RANGE = (0.05, 0.95)  # of the record
 
 
 def passes_time_shift_test(
-    components: Sequence[Component], state: State, folds: xr.DataArray
+    components: Sequence[Component],
+    state: State,
+    folds: xr.DataArray,
+    memory: dict[bytes, object] | None = None,
 ) -> tuple[bool, float, float]:
     """Test whether an effect explains more than time-shifted surrogates of its channel.
 
@@ -30,6 +33,8 @@ def passes_time_shift_test(
         Components of the effect.
     state : State
         What is in the model without it.
+    memory : dict, optional
+        As in `compute_evidence`.
 
     Returns
     -------
@@ -70,6 +75,7 @@ def passes_time_shift_test(
             state.blocks,
             state,
             folds,
+            memory=memory,
         )
         values = np.array([evidence.evidence_nats[0, row] for evidence in all_evidence])
         real += float(values[0])

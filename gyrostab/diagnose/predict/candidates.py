@@ -5,8 +5,10 @@ Variants, candidates and components hold arrays: each is equal only to itself.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -83,6 +85,14 @@ class Candidate:
         named = ",".join(filter(None, (*self.driver, *self.reference)))
         return f"{self.effect}({named})" if named else self.effect
 
+    @cached_property
+    def digest(self) -> bytes:
+        """Digest of the statistic and of all designs."""
+        digest = hashlib.blake2b(self.statistic.name.encode(), digest_size=16)
+        for variant in self.variants:
+            update_digest(digest, variant.design)
+        return digest.digest()
+
     @property
     def columns(self) -> set[str]:
         """Columns of all variants."""
@@ -126,6 +136,15 @@ class CandidateEvidence:
     best: tuple[Variant, ...]  # best variant of each row for the first record
     #: (record, row): index of the line for lines; otherwise empty.
     place: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 0), np.int64))
+
+
+def update_digest(digest: hashlib.blake2b, array: Array | None) -> None:
+    """Add an array, with its type and shape, to a digest."""
+    if array is None:
+        digest.update(b"none")
+    else:
+        digest.update(f"{array.dtype.str}{array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).data)
 
 
 def numbered_columns(count: int) -> tuple[str, ...]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
-from typing import NamedTuple
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 import xarray as xr
@@ -11,12 +12,11 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.products import held_out_evidence
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
-from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence
+from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, update_digest
 from gyrostab.diagnose.predict.linear_model import State
 
 Array = NDArray[np.float64]
-_TAIL_VARIABLES = ("kurtosis", "outliers")  # not used by the evidence of means
-_MEAN_STATISTICS = ("mean", "sub_block")  # that the evidence of means uses
+Result = TypeVar("Result")
 _COLUMNS_AT_ONCE = 300  # limits memory and time, which grow with the square
 _MIN_ROW_NATS = 1.5  # that another axis or statistic must add; design choice
 
@@ -29,6 +29,30 @@ class Trial(NamedTuple):
     folds: xr.DataArray
     counts: CountEvidence | None = None
     rng: np.random.Generator | None = None
+    memory: dict[bytes, object] | None = None
+
+    def recall(
+        self,
+        compute: Callable[[], Result],
+        group: Sequence[Candidate],
+        *inputs: NDArray[Any] | None,
+    ) -> Result:
+        """Compute something for candidates, or recall it from the same inputs.
+
+        Most of what a search tries again has not changed: an effect on one axis changes nothing on
+        the others, and a line nothing in the means.
+        """
+        if self.memory is None:
+            return compute()
+        digest = hashlib.blake2b(digest_size=16)
+        for candidate in group:
+            digest.update(candidate.digest)
+        for array in inputs:
+            update_digest(digest, array)
+        key = digest.digest()
+        if key not in self.memory:
+            self.memory[key] = compute()
+        return cast(Result, self.memory[key])
 
 
 def compute_evidence(
@@ -39,6 +63,7 @@ def compute_evidence(
     *,
     count_evidence: CountEvidence | None = None,
     rng: np.random.Generator | None = None,
+    memory: dict[bytes, object] | None = None,
 ) -> list[CandidateEvidence]:
     """Compute the evidence of candidates on data.
 
@@ -50,8 +75,11 @@ def compute_evidence(
         Without it, sample counts are left out.
     rng : numpy.random.Generator, optional
         For null records: generator of the statistics they do not have.
+    memory : dict, optional
+        Results of earlier calls with the same blocks and folds, to which those of this one are
+        added.
     """
-    trial = Trial(data, state, folds, count_evidence, rng)
+    trial = Trial(data, state, folds, count_evidence, rng, memory)
     groups: dict[tuple[object, ...], list[Candidate]] = {}
     for candidate in candidates:
         kind = (candidate.statistic, candidate.reference, candidate.is_per_axis)
@@ -70,45 +98,6 @@ def _split_group(group: Sequence[Candidate]) -> Iterator[list[Candidate]]:
     part = np.cumsum(columns) // _COLUMNS_AT_ONCE
     for number in np.unique(part):
         yield [candidate for candidate, own in zip(group, part, strict=True) if own == number]
-
-
-def reusable_evidence(
-    all_evidence: Sequence[CandidateEvidence], before: State, now: State
-) -> list[CandidateEvidence]:
-    """Return the evidence that is still valid in another state.
-
-    A line changes nothing in the means, and in a band that is free already nothing but lines.
-    """
-    if before.baseline is not now.baseline or not _is_given_alike(before, now, _MEAN_STATISTICS):
-        return []
-    is_same_model = (
-        _is_given_alike(before, now, {name for name, _ in (*before.given, *now.given)} - {"line"})
-        and np.array_equal(before.weight, now.weight)
-        and np.array_equal(before.masked, now.masked)
-    )
-    if is_same_model and before.blocks.equals(now.blocks):
-        return [evidence for evidence in all_evidence if not evidence.candidate.statistic.is_line]
-    left, right = (
-        state.blocks.drop_vars(_TAIL_VARIABLES, errors="ignore") for state in (before, now)
-    )
-    return (
-        [evidence for evidence in all_evidence if evidence.candidate.statistic.is_in_means]
-        if left.equals(right)
-        else []
-    )
-
-
-def _is_given_alike(before: State, now: State, statistics: Collection[str]) -> bool:
-    """Return whether the same columns are given to some statistics in two states."""
-    left, right = (
-        {
-            key: [id(column) for column in columns]
-            for key, columns in state.given.items()
-            if key[0] in statistics and columns
-        }
-        for state in (before, now)
-    )
-    return left == right
 
 
 def evidence_by_effect(all_evidence: Sequence[CandidateEvidence]) -> dict[str, Array]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -193,15 +193,27 @@ class Statistic:
         factors = []
         spread = 1
         for row in range(len(rows)):
-            is_given = trial.rng is None or self.null_variable in trial.data
-            model = self.model(
-                group, row, trial.data if is_given else trial.state.blocks, trial.state
-            )
-            if not is_given and trial.rng is not None:
-                model = simulate_noise(model, trial.rng, trial.data.sizes["record"])
-            factors.append(linear_model_factors(model, trial.folds)[:, 1:])
+            factors.append(self._row_factors(group, row, trial)[:, 1:])
             spread = factors[-1].shape[1] // sum(len(candidate.variants) for candidate in group)
         return collect_evidence(group, rows, factors, spread)
+
+    def _row_factors(self, group: Sequence[Candidate], row: int, trial: Trial) -> Array:
+        """Return the factors of all variants in one row, as `linear_model_factors` does."""
+        state = trial.state
+        is_drawn = trial.rng is not None and self.null_variable not in trial.data
+        data = state.blocks if is_drawn else trial.data
+
+        def compute_factors() -> Array:
+            model = self.model(group, row, data, state)
+            if is_drawn and trial.rng is not None:
+                model = simulate_noise(model, trial.rng, trial.data.sizes["record"])
+            return linear_model_factors(model, trial.folds)
+
+        if trial.memory is None:
+            return compute_factors()
+        bare = self.model([replace(group[0], variants=())], row, data, state)
+        inputs = bare.values, bare.weight, bare.given, bare.precision
+        return trial.recall(compute_factors, group, np.array(row), *inputs)
 
     def competitors(
         self, components: Sequence[Component], state: State, error: float

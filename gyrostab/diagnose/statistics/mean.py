@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.evidence.held_out import mean_factors
+from gyrostab.diagnose.evidence.held_out import mean_factors, mean_residual, noise_weight
 from gyrostab.diagnose.evidence.mixture import Mixture
+from gyrostab.diagnose.evidence.products import axis_noise
 from gyrostab.diagnose.evidence.wandering import block_mean_variance, expected_processes
 from gyrostab.diagnose.predict.candidates import (
     TIME_PARAMETER,
@@ -184,16 +186,16 @@ class Mean(BlockMeanStatistic):
                 for candidate in group
                 for variant in candidate.variants
             ]
-            factors.append(
-                mean_factors(
-                    trial.data,
-                    trial.state.baseline,
-                    designs,
-                    axis=axis,
-                    given=trial.state.given_to("mean", axis),
-                    folds=trial.folds,
-                )[:, 1:]
+            compute = partial(
+                mean_factors,
+                trial.data,
+                trial.state.baseline,
+                designs,
+                axis=axis,
+                given=trial.state.given_to("mean", axis),
+                folds=trial.folds,
             )
+            factors.append(trial.recall(compute, group, *mean_inputs(trial, axis))[:, 1:])
         return collect_evidence(group, self.rows(group[0], trial.state), factors)
 
     def describe(self, region: Region, when: str) -> str:
@@ -209,6 +211,20 @@ class Mean(BlockMeanStatistic):
             f"The mean rate of {axes} is {size}{'above' if is_higher(region) else 'below'} its "
             f"expected value {when}, more than drift and noise allow"
         )
+
+
+def mean_inputs(trial: Trial, axis: str) -> list[Array | None]:
+    """Return all that the evidence of means of an axis is computed from, but for the designs."""
+    baseline = trial.state.baseline
+    noise = axis_noise(baseline, axis)
+    return [
+        np.array(trial.state.axes.index(axis)),
+        mean_residual(trial.data, baseline, axis),
+        trial.state.given_to("mean", axis),
+        noise_weight(baseline, axis, "free"),
+        *(noise[name] for name in ("variance", "K", "B")),
+        *noise["wander"],
+    ]
 
 
 def _with_steps_at_restarts(

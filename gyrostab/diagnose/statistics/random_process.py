@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import Trial
 from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.statistics.base import SizeFit, Sizes
-from gyrostab.diagnose.statistics.mean import BlockMeanStatistic
+from gyrostab.diagnose.statistics.mean import BlockMeanStatistic, mean_inputs
 from gyrostab.units import HOUR
 
 Array = NDArray[Any]
@@ -75,10 +76,8 @@ class RandomProcess(BlockMeanStatistic):
             prior = np.array([variant.weight for variant in candidate.variants])
             evidence_nats, best = [], []
             for axis in trial.state.axes:
-                of_sizes = [
-                    _walk_factors(variant, axis, trial.data, trial.state, _WALK_FACTORS)[1]
-                    for variant in candidate.variants
-                ]
+                compute = partial(_factors_by_variant, candidate, axis, trial)
+                of_sizes = trial.recall(compute, [candidate], *mean_inputs(trial, axis))
                 # (variant, record)
                 factors = np.stack([np.logaddexp.reduce(by_size, axis=0) for by_size in of_sizes])
                 factors = (
@@ -128,6 +127,14 @@ def _plain_or_best(candidate: Candidate, evidence_nats: Array, settings: Setting
         if evidence_nats[place] > evidence_nats[best] - settings.ambiguous_nats
     ]
     return candidate.variants[plain[0] if plain else best]
+
+
+def _factors_by_variant(candidate: Candidate, axis: str, trial: Trial) -> list[Array]:
+    """Return the factors of each variant, (size, record)."""
+    return [
+        _walk_factors(variant, axis, trial.data, trial.state, _WALK_FACTORS)[1]
+        for variant in candidate.variants
+    ]
 
 
 def _walk_factors(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import xarray as xr
@@ -33,7 +34,7 @@ from gyrostab.diagnose.predict.search import Trial
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.statistics.base import Competitor, SizeFit, Sizes
-from gyrostab.diagnose.statistics.mean import BlockMeanStatistic
+from gyrostab.diagnose.statistics.mean import BlockMeanStatistic, mean_inputs
 from gyrostab.diagnose.statistics.scores import Array
 
 _LEVELS = "~levels"  # nuisance alternative: an arbitrary course
@@ -100,11 +101,18 @@ class Telegraph(BlockMeanStatistic):
         evidence_nats = np.full((records, len(rows)), -np.inf)
         courses: list[tuple[TelegraphCourses, SwitchingEvidence | None]] = []
         for row, axis in enumerate(trial.state.axes):
-            axis_nats, course = search_block_means(trial.state, axis, searched)
-            evidence_nats[: axis_nats.size, row] = axis_nats
-            within, refuted = _search_fast_switching(
-                searched, trial.state, axis, course, float(axis_nats[0])
+            axis_nats, course, within, refuted = trial.recall(
+                partial(_search_axis, searched, trial.state, axis),
+                group,
+                *mean_inputs(trial, axis),
+                trial.state.given_to("sub_block", axis),
+                *(
+                    axis_values(searched, name, axis)
+                    for name in ("samples", "sub_block_samples", "sub_block_mean")
+                    if name in searched
+                ),
             )
+            evidence_nats[: axis_nats.size, row] = axis_nats
             if refuted:
                 evidence_nats[0, row] = -np.inf
             if within is not None:
@@ -170,6 +178,15 @@ class Telegraph(BlockMeanStatistic):
             time: (float(first.values[time]), float(first.values[time]) / math.sqrt(stays))
             for time in ("low", "high")
         }
+
+
+def _search_axis(
+    data: xr.Dataset, state: State, axis: str
+) -> tuple[Array, TelegraphCourses, SwitchingEvidence | None, bool]:
+    """Search an axis for two levels in block means, and then within blocks."""
+    evidence_nats, course = search_block_means(state, axis, data)
+    within, refuted = _search_fast_switching(data, state, axis, course, float(evidence_nats[0]))
+    return evidence_nats, course, within, refuted
 
 
 def _search_fast_switching(

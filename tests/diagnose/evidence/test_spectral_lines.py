@@ -11,15 +11,17 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence, line_skirt
+from gyrostab.diagnose.evidence.wandering import with_walk
 from gyrostab.diagnose.identify import selection
-from gyrostab.diagnose.identify.components import group_components, merge_lines
+from gyrostab.diagnose.identify.components import merge_lines
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identification import Selection, add_selection, form_error
+from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.filter_response import undo_filter
 from gyrostab.diagnose.predict.linear_model import initial_state
-from gyrostab.diagnose.predict.search import compute_evidence, reusable_evidence
+from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.diagnose.statistics.candidates import effect_candidates
@@ -117,45 +119,41 @@ def test_each_line_is_a_separate_identification(lines: tuple[Selection, ...]) ->
     )  # three lines may be a comb
 
 
-def test_a_line_does_not_change_the_evidence_of_means() -> None:
-    blocks = sines({0.7: 0.4}, size=9_000, axes=1)
-    state, folds = initial_state(blocks, calibrate_noise(blocks)), fold_blocks(blocks)
-    candidates, _ = effect_candidates(blocks, state.baseline["coefficient"])
-    evidence = compute_evidence(candidates, blocks, state, folds)
-    line, jump = (
-        group_components(evidence)[effect][0] for effect in ("spectral_line", "bias_jump")
-    )
-    assert line.evidence_nats > 10.0
-    named = condition_on(state, [line])
-    reusable = reusable_evidence(evidence, state, named)
-    assert {result.candidate.statistic.name for result in reusable} == {"mean", "telegraph"}
-    recomputed = compute_evidence(
-        [result.candidate for result in reusable], named.blocks, named, folds
-    )
-    for reused, other in zip(reusable, recomputed, strict=True):
-        np.testing.assert_array_equal(reused.evidence_nats, other.evidence_nats)
-    assert not reusable_evidence(evidence, state, condition_on(state, [jump]))
-    lost = replace(state, blocks=blocks.assign(mean=blocks["mean"].where(blocks["begin"] > 0.0)))
-    assert not reusable_evidence(evidence, state, lost)
-
-
-def test_another_line_in_a_free_band_changes_the_evidence_of_lines_only() -> None:
+def test_evidence_is_recalled_only_where_nothing_has_changed() -> None:
     blocks = sines({3.4: 0.4}, size=9_000, axes=2)
-    state, folds = initial_state(blocks, calibrate_noise(blocks)), fold_blocks(blocks)
-    candidates, _ = effect_candidates(blocks, state.baseline["coefficient"])
-    line = find_components(candidates, state)["spectral_line"][0]
-    first = condition_on(state, [line])
-    second = condition_on(first, [replace(line, place=line.place + 1)])
-    evidence = compute_evidence(candidates, blocks, first, folds)
-    reusable = reusable_evidence(evidence, first, second)
-    assert {result.candidate.statistic.name for result in evidence} - {
-        result.candidate.statistic.name for result in reusable
-    } == {"spectral_line"}
-    recomputed = compute_evidence(
-        [result.candidate for result in reusable], second.blocks, second, folds
-    )
-    for reused, other in zip(reusable, recomputed, strict=True):
-        np.testing.assert_array_equal(reused.evidence_nats, other.evidence_nats)
+    start, folds = initial_state(blocks, calibrate_noise(blocks)), fold_blocks(blocks)
+    candidates, _ = effect_candidates(blocks, start.baseline["coefficient"])
+    candidates += nuisance_alternatives(blocks)
+    components = find_components(candidates, start)
+    line = components["spectral_line"][0]
+    with_line = condition_on(start, [line])
+    with_jump = condition_on(start, components["bias_jump"][:1])
+    lost = blocks.assign(mean=blocks["mean"].where(blocks["begin"] > 0.0))
+    states = {
+        "line": with_line,
+        "another line in its band": condition_on(with_line, [replace(line, place=line.place + 1)]),
+        "jump": with_jump,
+        "lost block": replace(start, blocks=lost),
+        "other weights": replace(start, weight=1.1 * start.weight),
+        "masked": replace(start, masked=start.masked | (np.arange(start.masked.shape[1]) < 2)),
+        "random walk": replace(
+            start, baseline=with_walk(start.baseline, "x", np.full(start.masked.shape[1], 1e-3))
+        ),
+    }
+    memory: dict[bytes, object] = {}
+    compute_evidence(candidates, blocks, start, folds, memory=memory)
+    added = {}
+    for name, state in states.items():
+        before = len(memory)
+        recalled = compute_evidence(candidates, state.blocks, state, folds, memory=memory)
+        added[name] = len(memory) - before
+        fresh = compute_evidence(candidates, state.blocks, state, folds)
+        for one, other in zip(recalled, fresh, strict=True):
+            assert one.candidate is other.candidate
+            np.testing.assert_array_equal(one.evidence_nats, other.evidence_nats)
+    first = len(memory) - sum(added.values())
+    assert added["another line in its band"] == 0
+    assert all(0 < added[name] < first for name in states if name != "another line in its band")
 
 
 def test_more_lines_than_are_named_do_not_end_the_search(monkeypatch: pytest.MonkeyPatch) -> None:

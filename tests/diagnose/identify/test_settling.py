@@ -146,6 +146,5 @@ def test_rejected_channels_do_not_use_up_the_number_of_effects(monkeypatch):
 
     monkeypatch.setattr(selecting, "_select_next", select_next)
     monkeypatch.setattr(selecting, "score_candidates", lambda *_: [])
-    monkeypatch.setattr(selecting, "reusable_evidence", lambda *_: [])
     selecting._select_all(SimpleNamespace(start=None, expected=()))
     assert next(rounds) == 2 * selecting.MAX_EFFECTS + 1
