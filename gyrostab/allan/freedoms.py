@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.allan.variance import covariance_tables, variance_columns, white_freedoms
+from gyrostab.allan.variance import variance_columns, white_freedoms
 from gyrostab.kernels.allan.surface import Cells
+from gyrostab.kernels.fit.covariance import product_tables
 from gyrostab.kernels.fit.least_squares import cell_freedoms, combine_diagonal, identify_noise
 from gyrostab.kernels.fit.mixture import Curves
 from gyrostab.noise import sample_squares
@@ -59,7 +60,7 @@ def tabulate_noise(
     """Make the tables for the degrees of freedom, once for all parts of a log."""
     ks, shifts = np.array(factors, dtype=np.int64), np.array(thinning, dtype=np.int64)
     columns = variance_columns(variance, ks, rate)
-    pairs, ramps = covariance_tables(variance, window, ks, shifts, diagonal=True)
+    pairs, ramps = product_tables(window, ks, shifts, variance=variance, diagonal=True)
     weight = white_freedoms(variance, window, ks, pairs)
     diagonal = combine_diagonal(pairs, ramps)
     return NoiseTables(thin_factors(ks), columns, weight, sample_squares(rate), diagonal)

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.allan.pairs import white_pair_sum
 from gyrostab.kernels.allan.variances import VARIANCES
-from gyrostab.kernels.fit.covariance import product_tables
-from gyrostab.kernels.fit.third_differences import third_columns, third_tables
+from gyrostab.kernels.fit.covariance import third_columns
 from gyrostab.noise import avar_columns, sample_squares
 
 if TYPE_CHECKING:
@@ -45,26 +44,12 @@ def white_freedoms(
     """Compute the degrees of freedom under white noise, (n_tau,).
 
     `pairs` (4, 4, n_tau) holds the variance of each cell per product of squares, see
-    `covariance_tables`.
+    `gyrostab.kernels.fit.covariance.product_tables`.
     """
     if variance == "avar":
         terms = window - 2 * ks + 1
         return np.array([n**2 / white_pair_sum(n, k) for n, k in zip(terms, ks, strict=True)])
     return np.asarray(2.0 * third_columns(variance, ks)[:, 1] ** 2 / pairs[1, 1])
-
-
-def covariance_tables(
-    variance: str,
-    window: int,
-    ks: NDArray[np.int64],
-    shifts: NDArray[np.int64],
-    *,
-    diagonal: bool = False,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Compute the `gyrostab.kernels.fit.covariance.product_tables` of a variance."""
-    if variance == "avar":
-        return product_tables(window, ks, shifts, diagonal=diagonal)
-    return third_tables(variance, window, ks, shifts, diagonal=diagonal)
 
 
 def variance_name(surface: xr.Dataset) -> str:

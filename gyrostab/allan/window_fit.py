@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincc, gammaincinv
 
-from gyrostab.allan.variance import covariance_tables, variance_columns, white_freedoms
+from gyrostab.allan.variance import variance_columns, white_freedoms
 from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.compile_ahead import await_compilation
-from gyrostab.kernels.fit.covariance import STOCHASTIC
+from gyrostab.kernels.fit.autocovariance import STOCHASTIC
+from gyrostab.kernels.fit.covariance import product_tables
 from gyrostab.kernels.fit.least_squares import combine_diagonal, fit_windows
 from gyrostab.kernels.fit.limits import cell_limits, estimate_bounds
 from gyrostab.kernels.fit.mixture import Curves
@@ -70,7 +71,7 @@ class FitTables:
     ):  # fmt: skip
         self.columns = variance_columns(variance, ks, rate)
         self.to_samples = sample_squares(rate)
-        self.pairs, self.ramps = covariance_tables(variance, window, ks, shifts)
+        self.pairs, self.ramps = product_tables(window, ks, shifts, variance=variance)
         diagonal = np.einsum("abii->abi", self.pairs)
         self.diagonal = combine_diagonal(diagonal, np.einsum("aii->ai", self.ramps))
         self._detrend = partial(

@@ -13,7 +13,7 @@ from gyrostab import davar, fit_noise, make_log
 from gyrostab.allan.variance import surface_columns, variance_name
 from gyrostab.errors import OptionError
 from gyrostab.kernels.allan.surface import Unit, surface_unit
-from gyrostab.kernels.fit.third_differences import third_columns, third_tables
+from gyrostab.kernels.fit.covariance import product_tables, third_columns
 from gyrostab.noise import sample_squares
 from gyrostab.plot import plot_adev
 from gyrostab.time.durations import thin
@@ -137,7 +137,7 @@ def test_mean_and_scatter_are_those_of_the_tables(variance, term, place):
     unit = Unit(window, window, ks, shifts, False, 1.0, 0.3, 0.0, variance)
     records = noise_record(np.random.default_rng(7), (count, window), **{term: 1.0})
     cells = np.concatenate([surface_unit(x, unit)[0].avar for x in records])
-    want = third_tables(variance, window, ks, shifts)[0][place, place]
+    want = product_tables(window, ks, shifts, variance=variance)[0][place, place]
     sigma = np.sqrt(want.diagonal())
     error = (cells.mean(axis=0) - third_columns(variance, ks)[:, place]) / sigma
     assert np.abs(error).max() < 4.0 / np.sqrt(count)
@@ -156,7 +156,7 @@ def test_degrees_of_freedom_with_gaps_are_those_of_simulated_records(variance):
     unit = Unit(window, window, ks, np.zeros_like(ks), False, 1.0, 0.0, 0.0, variance)
     surfaces = [surface_unit(row, unit)[0] for row in x]
     avar = np.concatenate([cells.avar for cells in surfaces])
-    pairs, _ = third_tables(variance, window, ks, np.zeros_like(ks))
+    pairs, _ = product_tables(window, ks, np.zeros_like(ks), variance=variance)
     own = 2.0 * third_columns(variance, ks)[:, 1] ** 2 / pairs[1, 1].diagonal()
     edf = 2.0 * avar.mean(axis=0) ** 2 / avar.var(axis=0)
     np.testing.assert_allclose(own * surfaces[0].gap_factor[0], edf, rtol=0.12)

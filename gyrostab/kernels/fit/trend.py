@@ -4,18 +4,17 @@ The square b^2 of the least-squares slope of a window estimates R^2 plus the var
 under the other terms. ``z = avar - b^2 tau^2 / 2`` therefore has no part of a ramp; its mean per
 squared coefficient is that of the Allan variance less ``v tau^2 / 2``. All quantities are exact for
 windows without gaps, in units of one sample, from the autocovariances of
-`gyrostab.kernels.fit.covariance`.
+`gyrostab.kernels.fit.autocovariance`.
 """
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.kernels.fit.covariance import STOCHASTIC
+from gyrostab.kernels.fit.autocovariance import STOCHASTIC, angle_covariances
 
 #: Second differences are taken at steps of this share of k, and at this many places at least.
 _STEPS, _PLACES = 32, 2**16
@@ -27,23 +26,6 @@ class TrendTables(NamedTuple):
     variance: NDArray[np.float64]
     pairs: NDArray[np.float64]
     ramps: NDArray[np.float64]
-
-
-def angle_covariances(term: int, lags: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Compute the generalised autocovariance of the angle under Q, N, B or K (0 to 3)."""
-    if term == 0:
-        return np.where(lags == 0, 1.0, 0.0)
-    if term == 1:
-        return -0.5 * lags
-    out = np.maximum(lags, 1.0) if term == 2 else lags * lags
-    if term == 2:
-        np.log(out, out=out)
-        out *= lags * lags
-        out /= 2.0 * math.pi
-    else:
-        out *= lags
-        out /= 12.0
-    return out
 
 
 def _slope_covariances(window: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from gyrostab.kernels.fit.covariance import product_tables
-from gyrostab.kernels.fit.third_differences import third_tables
 from gyrostab.kernels.fit.trend import detrend_tables
 
 WINDOW, KS = 90, np.array([1, 3, 8, 20])
@@ -63,7 +62,9 @@ def test_tables_of_a_long_window_need_less_than_100_bytes_a_sample():
     ks = np.array([1, 100, 2**16])
     calls = {
         "pairs": lambda window: product_tables(window, ks, 0 * ks, diagonal=True),
-        "third": lambda window: third_tables("modified", window, ks, 0 * ks, diagonal=True),
+        "third": lambda window: product_tables(
+            window, ks, 0 * ks, variance="modified", diagonal=True
+        ),
         "trend": lambda window: detrend_tables(
             window, ks, np.ones((4, 4, ks.size, ks.size)), np.ones((4, ks.size, ks.size))
         ),
