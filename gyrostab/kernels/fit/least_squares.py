@@ -436,7 +436,7 @@ def fit_windows(  # type: ignore[no-untyped-def]
     fit = _Fit(eights(_TERMS), eights(_TERMS), eights(_TERMS), eights(_STOCHASTIC))
     room = _make_room(size)
     chi2, valid, squares = eights(_ONE), np.empty(PLACES, np.int64), np.empty(5)
-    submodels, start, form = make_submodels(), np.empty(4), np.empty(10)
+    submodels, start = make_submodels(), np.empty(4)
     stochastic = allowed & 15
     for first in range(0, n_windows, PLACES):
         _observe_eight(first, curves, columns, to_samples, cells, trend, valid)
@@ -456,7 +456,7 @@ def fit_windows(  # type: ignore[no-untyped-def]
             misfit[w, 1] = max(misfit[w, 1], 0.0)  # also with more terms than cells
             _take_window(place, fit, cells, room, submodels, start)
             average_submodels(
-                allowed, start, cells.trend[4, place], low_sigma, submodels, form, result[w]
+                allowed, start, cells.trend[4, place], low_sigma, submodels, result[w]
             )
             for a in range(5):
                 squares[a] = result[w, 0, a] if result[w, 0, a] > 0.0 else 0.0

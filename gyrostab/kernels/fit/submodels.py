@@ -31,8 +31,8 @@ from gyrostab.kernels.fit.mixture import PRODUCTS
 #: Rows of the per-term result of a fit.
 FIT_FIELDS = (
     "square",
-    "free",
     "likelihood_ratio",
+    "free",
     "variance_null",
     "variance_linear",
     "variance_square",
@@ -42,6 +42,11 @@ FIT_FIELDS = (
     "low_square",
     "separation",
 )
+#: First rows of the law of a term, and of that for the lower end of its interval: estimate, and the
+#: three parts of the variance.
+_LAW, _LOW_LAW = np.int64(2), np.int64(6)
+#: Columns of `Submodels.weights`: in the mean of a term, and in its variance.
+_IN_MEAN, _IN_VARIANCE = np.int64(0), np.int64(1)
 #: Sets of four terms.
 _SETS = 16
 #: Passes in which the covariance of a submodel is updated to that of its estimates.
@@ -60,18 +65,22 @@ class Submodels(NamedTuple):
     whitener: NDArray[np.float64]
     design: NDArray[np.float64]
     inner: NDArray[np.float64]
-    #: Estimates, what negative ones cost, their weights on the data, log-likelihood, and mean and
-    #: variance of the trend's variance, of each set; its weights in a mean and a law of scatter.
+    #: Estimates, what negative ones cost, their weights on the data, log-likelihood of each set,
+    #: also -inf unless all its estimates are positive, mean and variance of the trend's variance;
+    #: weights of the sets in a mean and a law of scatter.
     estimates: NDArray[np.float64]
     penalties: NDArray[np.float64]
     rows: NDArray[np.float64]
     likelihood: NDArray[np.float64]
+    feasible: NDArray[np.float64]
     slope: NDArray[np.float64]
     weights: NDArray[np.float64]
     squares: NDArray[np.float64]
     #: Product of the covariance with a row on the data, and covariance of a term with the others.
     image: NDArray[np.float64]
     shared: NDArray[np.float64]
+    #: Quadratic form that turns a covariance of the data into a variance of a term.
+    form: NDArray[np.float64]
 
 
 @njit(**INNER)
@@ -91,11 +100,13 @@ def make_submodels():  # type: ignore[no-untyped-def]
         np.zeros((_SETS, 4)),
         np.zeros((_SETS, 4, 4)),
         np.zeros(_SETS),
+        np.zeros(_SETS),
         np.zeros((_SETS, 2)),
         np.zeros((_SETS, 2)),
         np.zeros(5),
         np.zeros(4),
         np.zeros(4),
+        np.zeros(10),
     )
 
 
@@ -162,12 +173,17 @@ def _factor_data(room):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _inverse_entry(factor, p, q, size):  # type: ignore[no-untyped-def]
-    """Compute entry (p, q) of an inverse matrix from the inverse of its Cholesky factor."""
-    total = 0.0
-    for r in range(max(p, q), size):
-        total += factor[r, p] * factor[r, q]
-    return total
+def _invert_matrix(matrix, n):  # type: ignore[no-untyped-def]
+    """Replace a matrix by its inverse; whether it is positive definite."""
+    if not _invert_factor(matrix, n) < np.inf:
+        return False
+    for p in range(n):
+        for q in range(p + 1):
+            total = 0.0
+            for r in range(p, n):
+                total += matrix[r, p] * matrix[r, q]
+            matrix[p, q] = matrix[q, p] = total
+    return True
 
 
 @njit(**INNER)
@@ -194,14 +210,14 @@ def _solve_set(members, size, index, room):  # type: ignore[no-untyped-def]
                 total += design[i, p] * design[i, q]
             inner[p, q] = total
         inner[p, p] *= 1.0 + 1e-12
-    if not _invert_factor(inner, size) < np.inf:
+    if not _invert_matrix(inner, size):
         return False
     for p in range(size):
         estimate = 0.0
         for i in range(4):
             total = 0.0
             for q in range(size):
-                total += _inverse_entry(inner, p, q, size) * design[i, q]
+                total += inner[p, q] * design[i, q]
             room.rows[index, members[p], i] = total
             estimate += total * design[i, 4]
         room.estimates[index, members[p]] = estimate
@@ -212,6 +228,7 @@ def _solve_set(members, size, index, room):  # type: ignore[no-untyped-def]
 @njit(**INNER)
 def _describe_set(members, size, index, half, room):  # type: ignore[no-untyped-def]
     """Write likelihood, penalties, variance of the trend, and rows on the data of a set."""
+    inner, is_feasible = room.inner, True
     square = mean = variance = 0.0
     for i in range(4):
         misfit = room.design[i, 4]
@@ -219,18 +236,20 @@ def _describe_set(members, size, index, half, room):  # type: ignore[no-untyped-
             misfit -= room.design[i, p] * room.estimates[index, members[p]]
         square += misfit * misfit
     for p in range(size):
-        below = min(room.estimates[index, members[p]], 0.0)
-        room.penalties[index, members[p]] = below * below / _inverse_entry(room.inner, p, p, size)
+        estimate = room.estimates[index, members[p]]
+        is_feasible = is_feasible and estimate > 0.0
+        room.penalties[index, members[p]] = min(estimate, 0.0) ** 2 / inner[p, p]
         trend, row = room.trend[members[p]], room.rows[index, members[p]]
-        mean += trend * room.estimates[index, members[p]]
+        mean += trend * estimate
         for q in range(size):
-            variance += trend * room.trend[members[q]] * _inverse_entry(room.inner, p, q, size)
+            variance += trend * room.trend[members[q]] * inner[p, q]
         for c in range(4):
             total = 0.0
             for i in range(c, 4):
                 total += row[i] * room.whitener[i, c]
             row[c] = total
     room.likelihood[index] = -half - 0.5 * square
+    room.feasible[index] = room.likelihood[index] if is_feasible else -np.inf
     room.slope[index, 0], room.slope[index, 1] = mean, variance
 
 
@@ -245,7 +264,6 @@ def _fit_set(members, index, start, ramp, room):  # type: ignore[no-untyped-def]
             members[size] = a
             room.squares[a] = start[a] if start[a] > 0.0 else 0.1
             size += 1
-    room.likelihood[index] = -np.inf
     half = 0.0
     for _ in range(_PASSES):
         _mix_products(room.products, room.squares, room.covariance)
@@ -256,15 +274,6 @@ def _fit_set(members, index, start, ramp, room):  # type: ignore[no-untyped-def]
         if not _solve_set(members, size, index, room):
             return
     _describe_set(members, size, index, half, room)
-
-
-@njit(**INNER)
-def _is_feasible(index, room):  # type: ignore[no-untyped-def]
-    """Whether a set was fitted with positive estimates."""
-    feasible = room.likelihood[index] > -np.inf
-    for a in range(4):
-        feasible &= not index >> a & 1 or room.estimates[index, a] > 0.0
-    return feasible
 
 
 @njit(**INNER)
@@ -291,20 +300,12 @@ def _weigh_sets(a, room):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _quadratic_form(form, products, table):  # type: ignore[no-untyped-def]
-    total = 0.0
-    for entry in range(10):
-        total += form[entry] * products[table, entry]
-    return total
-
-
-@njit(**INNER)
 def _best_likelihood(a, has_term, room):  # type: ignore[no-untyped-def]
     """Find the largest likelihood of the feasible sets with the term `a`, or without it."""
     best = -np.inf
     for index in range(1, _SETS):
-        if (index >> a & 1) == has_term and _is_feasible(index, room):
-            best = max(best, room.likelihood[index])
+        if (index >> a & 1) == has_term:
+            best = max(best, room.feasible[index])
     return best
 
 
@@ -323,9 +324,9 @@ def _average_estimates(a, column, room):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _average_forms(a, room, form):  # type: ignore[no-untyped-def]
+def _average_forms(a, room):  # type: ignore[no-untyped-def]
     """Average the quadratic form that turns a covariance of the data into a variance of a term."""
-    total = 0.0
+    form, total = room.form, 0.0
     for entry in range(10):
         form[entry] = 0.0
     for index in range(1, _SETS):
@@ -343,13 +344,15 @@ def _average_forms(a, room, form):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _expand_variance(a, base, room, form):  # type: ignore[no-untyped-def]
+def _expand_variance(a, base, room):  # type: ignore[no-untyped-def]
     """Expand the variance of a term as a polynomial in its square, others as in `base`."""
     null = linear = quadratic = 0.0
     table = np.int64(0)
     for b in range(4):
         for c in range(b, 5):
-            value = _quadratic_form(form, room.products, table)
+            value = 0.0
+            for entry in range(10):
+                value += room.form[entry] * room.products[table, entry]
             if b == a and c == a:
                 quadratic = value
             elif b == a or c == a:
@@ -413,39 +416,35 @@ def _weigh_low_end(a, base, low_sigma, room):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _repeat_law(a, result):  # type: ignore[no-untyped-def]
-    """Take estimate and variance of a term for the lower end of its interval too."""
-    result[6, a], result[7, a] = result[1, a], result[3, a]
-    result[8, a], result[9, a] = result[4, a], result[5, a]
+def _write_law(a, column, base, room, result, row):  # type: ignore[no-untyped-def]
+    """Write estimate and variance of a term under the squares `base` (5,), from a row on."""
+    mean, between = _average_estimates(a, column, room)
+    _average_forms(a, room)
+    null, linear, quadratic = _expand_variance(a, base, room)
+    scale = room.scale[a]
+    result[row, a], result[row + 1, a] = mean / scale, (null + between) / scale**2
+    result[row + 2, a], result[row + 3, a] = linear / scale, quadratic
 
 
 @njit(**INNER)
-def _judge_term(a, base, low_sigma, room, form, result):  # type: ignore[no-untyped-def]
-    """Write estimate, likelihood ratio and variances of a term under the squares `base` (5,)."""
+def _repeat_law(a, result):  # type: ignore[no-untyped-def]
+    """Take estimate and variance of a term for the lower end of its interval too."""
+    for row in range(4):
+        result[_LOW_LAW + row, a] = result[_LAW + row, a]
+
+
+@njit(**INNER)
+def _judge_term(a, base, low_sigma, room, result):  # type: ignore[no-untyped-def]
+    """Write likelihood ratio and both laws of a term under the squares `base` (5,)."""
     if not _weigh_sets(a, room):
         return
-    mean, between = _average_estimates(a, np.int64(0), room)
-    _average_forms(a, room, form)
-    null, linear, quadratic = _expand_variance(a, base, room, form)
-    present = _best_likelihood(a, np.int64(1), room)
-    scale = room.scale[a]
-    result[1, a] = mean / scale
-    result[2, a] = (
-        2.0 * (present - _best_likelihood(a, np.int64(0), room)) if present > -np.inf else 0.0
-    )
-    result[3, a] = (null + between) / scale**2
-    result[4, a] = linear / scale
-    result[5, a] = quadratic
-    if not _weigh_low_end(a, base, low_sigma, room):
+    present, absent = _best_likelihood(a, np.int64(1), room), _best_likelihood(a, np.int64(0), room)
+    result[1, a] = 2.0 * (present - absent) if present > -np.inf else 0.0
+    _write_law(a, _IN_MEAN, base, room, result, _LAW)
+    if _weigh_low_end(a, base, low_sigma, room):
+        _write_law(a, _IN_VARIANCE, room.squares, room, result, _LOW_LAW)
+    else:
         _repeat_law(a, result)
-        return
-    mean, between = _average_estimates(a, np.int64(1), room)
-    _average_forms(a, room, form)
-    null, linear, quadratic = _expand_variance(a, room.squares, room, form)
-    result[6, a] = mean / scale
-    result[7, a] = (null + between) / scale**2
-    result[8, a] = linear / scale
-    result[9, a] = quadratic
 
 
 @njit(**INNER)
@@ -453,12 +452,11 @@ def _average_sets(room, base, result):  # type: ignore[no-untyped-def]
     """Average squares and variance of the trend over the feasible sets."""
     best = -np.inf
     for index in range(1, _SETS):
-        if _is_feasible(index, room):
-            best = max(best, room.likelihood[index])
+        best = max(best, room.feasible[index])
     total = mean = square = 0.0
     for index in range(1, _SETS):
-        if _is_feasible(index, room):
-            weight = math.exp(room.likelihood[index] - best)
+        if room.feasible[index] > -np.inf:
+            weight = math.exp(room.feasible[index] - best)
             total += weight
             for a in range(4):
                 base[a] += weight * room.estimates[index, a]
@@ -486,10 +484,9 @@ def _find_separations(allowed, members, room, result):  # type: ignore[no-untype
         for q in range(p + 1):
             inner[p, q] = room.normal[members[p], members[q]]
         inner[p, p] *= 1.0 + 1e-12
-    solvable = _invert_factor(inner, size) < np.inf
+    solvable = _invert_matrix(inner, size)
     for p in range(size):
-        share = _inverse_entry(inner, p, p, size)
-        result[10, members[p]] = 1.0 / max(share, 1.0) if solvable else 0.0
+        result[10, members[p]] = 1.0 / max(inner[p, p], 1.0) if solvable else 0.0
 
 
 @njit(**INNER)
@@ -521,7 +518,7 @@ def _scale_window(allowed, room):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def average_submodels(allowed, start, trend_square, low_sigma, room, form, result):  # type: ignore[no-untyped-def]
+def average_submodels(allowed, start, trend_square, low_sigma, room, result):  # type: ignore[no-untyped-def]
     """Average one window over the submodels.
 
     Parameters
@@ -536,14 +533,12 @@ def average_submodels(allowed, start, trend_square, low_sigma, room, form, resul
         Standard errors from an estimate to the lower end of its interval.
     room : Submodels
         With ``data``, ``normal``, ``products`` and ``trend`` of the window, which are scaled here.
-    form : float64 (10,)
-        Scratch.
     result : float64 (11, 5)
-        Rows as `FIT_FIELDS`: squared coefficient, averaged over all submodels; its average over
-        those with the term, where it may be negative; twice the log of the likelihood ratio of the
-        best submodels with and without the term; variance of the second number without the term,
-        its growth per unit of the square, per unit of its square; the second number and its
-        variance again, for the lower end of an interval; share of the column that the other terms
+        Rows as `FIT_FIELDS`: squared coefficient, averaged over all submodels; twice the log of the
+        likelihood ratio of the best submodels with and without the term; average of the coefficient
+        over those with the term, where it may be negative; its variance without the term, its
+        growth per unit of the square, per unit of its square; average and variance again, for the
+        lower end of an interval; share of the column that the other terms
         cannot reproduce. For a ramp, rows 3 and 4 are the variance of the trend under the other
         terms and the variance of that.
     """
@@ -555,7 +550,7 @@ def average_submodels(allowed, start, trend_square, low_sigma, room, form, resul
         base[4] -= room.trend[a] * start[a]
     base[4] = max(base[4], 0.0)
     for index in range(1, _SETS):
-        room.likelihood[index] = -np.inf
+        room.likelihood[index] = room.feasible[index] = -np.inf
         if not index & ~allowed:
             _fit_set(members, index, start, base[4], room)
     _average_sets(room, base, result)
@@ -563,11 +558,11 @@ def average_submodels(allowed, start, trend_square, low_sigma, room, form, resul
     for a in range(4):
         if allowed >> a & 1:
             result[0, a] = base[a] / room.scale[a]
-            _judge_term(a, base, low_sigma, room, form, result)
+            _judge_term(a, base, low_sigma, room, result)
     _find_separations(allowed, members, room, result)
     if allowed >> 4 & 1:
         result[0, 4] = max(trend_square - result[3, 4], 0.0)
-        result[1, 4] = trend_square
-        result[2, 4] = result[5, 4] = 0.0
+        result[_LAW, 4] = trend_square
+        result[1, 4] = result[5, 4] = 0.0
         _repeat_law(np.int64(4), result)
         result[10, 4] = 1.0
