@@ -19,7 +19,8 @@ from gyrostab import davar, fit_noise, make_log
 from gyrostab.allan import window_fit
 from gyrostab.allan.fit_inputs import fit_inputs
 from gyrostab.kernels.fit.covariance import product_tables
-from gyrostab.kernels.fit.least_squares import cell_freedoms, combine_diagonal, identify_noise
+from gyrostab.kernels.fit.freedoms import cell_freedoms, combine_diagonal
+from gyrostab.kernels.fit.least_squares import identify_noise
 from gyrostab.kernels.fit.mixture import Curves
 from tests.support.noise_records import lose, mixture
 

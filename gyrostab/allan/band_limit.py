@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaincc
 
 from gyrostab.allan.window_fit import FitTables, run_kernel
-from gyrostab.kernels.fit.submodels import FIT_FIELDS
+from gyrostab.kernels.fit.averages import FIT_FIELDS
 
 Array = NDArray[np.float64]
 

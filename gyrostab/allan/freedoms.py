@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from gyrostab.allan.variance import variance_columns, white_freedoms
 from gyrostab.kernels.allan.surface import Cells
 from gyrostab.kernels.fit.covariance import product_tables
-from gyrostab.kernels.fit.least_squares import cell_freedoms, combine_diagonal, identify_noise
+from gyrostab.kernels.fit.freedoms import cell_freedoms, combine_diagonal
+from gyrostab.kernels.fit.least_squares import identify_noise
 from gyrostab.kernels.fit.mixture import Curves
 from gyrostab.noise import sample_squares
 

@@ -13,11 +13,12 @@ from gyrostab.allan.variance import variance_columns, white_freedoms
 from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.compile_ahead import await_compilation
 from gyrostab.kernels.fit.autocovariance import STOCHASTIC
+from gyrostab.kernels.fit.averages import FIT_FIELDS
 from gyrostab.kernels.fit.covariance import product_tables
-from gyrostab.kernels.fit.least_squares import combine_diagonal, fit_windows
+from gyrostab.kernels.fit.freedoms import combine_diagonal
+from gyrostab.kernels.fit.least_squares import fit_windows
 from gyrostab.kernels.fit.limits import cell_limits, estimate_bounds
 from gyrostab.kernels.fit.mixture import Curves
-from gyrostab.kernels.fit.submodels import FIT_FIELDS
 from gyrostab.kernels.fit.trend import TrendTables, detrend_tables
 from gyrostab.noise import NORMAL_95, TERMS, sample_squares
 from gyrostab.units import HOUR

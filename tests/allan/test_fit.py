@@ -21,10 +21,10 @@ from gyrostab.allan.fit_inputs import fit_inputs
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.allan.pairs import white_pair_sum
+from gyrostab.kernels.fit.averages import FIT_FIELDS
 from gyrostab.kernels.fit.covariance import product_tables
 from gyrostab.kernels.fit.limits import cell_limits, chi_square_quantile, estimate_bounds
 from gyrostab.kernels.fit.mixture import Curves
-from gyrostab.kernels.fit.submodels import FIT_FIELDS
 from gyrostab.kernels.regression.nonnegative import solve_nonnegative
 from gyrostab.noise import LAWS, NORMAL_95, TERMS, model_avar
 from gyrostab.schema import OBSERVABLE

@@ -126,24 +126,6 @@ def put(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
 
 
 @intrinsic
-def number(typing_context: Any, array: Any, index: Any) -> Any:
-    """Load element `index` of a flat array, without the test for negative indices."""
-    if not (
-        isinstance(array, types.Array)
-        and array.ndim == 1
-        and array.layout == "C"
-        and isinstance(index, types.Integer)
-    ):
-        return None
-
-    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        return builder.load(builder.gep(data, [args[1]]))
-
-    return types.float64(array, types.intp), emit
-
-
-@intrinsic
 def root(typing_context: Any, value: Any) -> Any:
     """Square roots."""
 

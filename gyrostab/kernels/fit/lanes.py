@@ -12,7 +12,7 @@ from gyrostab.kernels.compiled import INNER
 __all__ = ["PLACES", "eights", "number", "put", "root", "take", "take_four", "where_above"]
 
 try:
-    from gyrostab.kernels.fit.eights import PLACES, eights, number, put, root, take, where_above
+    from gyrostab.kernels.fit.eights import PLACES, eights, put, root, take, where_above
 except (ImportError, AttributeError):  # numba or llvmlite has moved what the vectors are built with
     PLACES = 1
 
@@ -32,11 +32,6 @@ except (ImportError, AttributeError):  # numba or llvmlite has moved what the ve
         array[index, 0] = value
 
     @njit(**INNER)
-    def number(array, index):  # type: ignore[no-untyped-def]
-        """Load element `index` of a flat array."""
-        return array[index]
-
-    @njit(**INNER)
     def root(value):  # type: ignore[no-untyped-def]
         """Square root."""
         return math.sqrt(value)
@@ -45,6 +40,12 @@ except (ImportError, AttributeError):  # numba or llvmlite has moved what the ve
     def where_above(x, y, yes, no):  # type: ignore[no-untyped-def]
         """`yes` where ``x > y``, otherwise `no`, also where x or y is NaN."""
         return yes if x > y else no
+
+
+@njit(**INNER)
+def number(array, index):  # type: ignore[no-untyped-def]
+    """Load element `index` of a flat array, without the test for negative indices."""
+    return array[np.uint64(index)]
 
 
 @njit(**INNER)

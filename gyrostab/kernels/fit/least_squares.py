@@ -17,11 +17,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
+from gyrostab.kernels.fit.averages import FIT_FIELDS, average_submodels
 from gyrostab.kernels.fit.eight_solvers import (
     back_substitute,
     eliminate,
     solve_nonnegative_eights,
 )
+from gyrostab.kernels.fit.freedoms import degrees_of_freedom
 from gyrostab.kernels.fit.lanes import PLACES, eights, put, take, where_above
 from gyrostab.kernels.fit.mixture import (
     DATA,
@@ -30,13 +32,11 @@ from gyrostab.kernels.fit.mixture import (
     combine_products,
     compress_products,
     covariance_rows,
-    degrees_of_freedom,
     observe,
     root_squares,
     root_units,
-    whole_degrees_of_freedom,
 )
-from gyrostab.kernels.fit.submodels import FIT_FIELDS, average_submodels, make_submodels
+from gyrostab.kernels.fit.submodels import make_submodels
 
 #: Sizes as numpy integers: numba compiles `eights` again for each literal.
 _ONE, _STOCHASTIC, _TERMS, _MATRIX, _SCRATCH = (np.int64(size) for size in (1, 4, 5, 25, 75))
@@ -55,29 +55,13 @@ class _Cells(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """Eight fits: squared coefficients, positive terms, and the squares behind the covariance."""
+    """Eight fits: squared coefficients, sets of positive terms, normal equations, and scratch."""
 
     squares: NDArray[np.float64]
     terms: NDArray[np.float64]
-    basis: NDArray[np.float64]
-    #: Whether a fit still moves (row 0), was hopeless (1); its jitter (2), whether its covariance
-    #: was positive definite (3).
-    state: NDArray[np.float64]
-
-
-class _Room(NamedTuple):
-    """Matrices and scratch of eight fits."""
-
-    units: NDArray[np.float64]
-    roots: NDArray[np.float64]
-    whole: NDArray[np.float64]
     normal: NDArray[np.float64]
     right: NDArray[np.float64]
     scratch: NDArray[np.float64]
-    rows: NDArray[np.float64]
-    factors: NDArray[np.float64]
-    scaled: NDArray[np.float64]
-    products: NDArray[np.float64]
 
 
 @njit(**INNER)
@@ -93,30 +77,18 @@ def _make_cells(size):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _make_room(size):  # type: ignore[no-untyped-def]
-    units, roots, augmented = eights(5 * size), eights(5 * size), eights(size * (size + WIDTH))
-    return _Room(
-        units,
-        roots,
-        augmented,
-        eights(_MATRIX),
-        eights(_TERMS),
-        eights(_SCRATCH),
-        eights(4 * size),
-        eights(6 * size),
-        eights(4 * size),
-        eights(10 * PRODUCTS),
-    )
+def _make_fit():  # type: ignore[no-untyped-def]
+    return _Fit(eights(_TERMS), eights(_TERMS), eights(_MATRIX), eights(_TERMS), eights(_SCRATCH))
 
 
 @njit(**INNER)
-def _fit_diagonal(cells, weight, allowed, normal, right, fit, scratch):  # type: ignore[no-untyped-def]
+def _fit_diagonal(cells, weight, allowed, fit):  # type: ignore[no-untyped-def]
     """Fit with a diagonal covariance, ``y^2`` over the degrees of freedom of white noise.
 
     No noise falls faster than quantization noise. A cell below that fall from a shorter averaging
     time is low by chance, and must not get the weight that its square implies.
     """
-    system, inverse, terms = cells.system, cells.inverse, fit.terms
+    system, inverse, (squares, terms, normal, right, scratch) = cells.system, cells.inverse, fit
     for row in range(25):
         put(normal, row, 0.0)
     for a in range(5):
@@ -131,7 +103,7 @@ def _fit_diagonal(cells, weight, allowed, normal, right, fit, scratch):  # type:
         w = where_above(y, 0.0, weight[i] / (take(inverse, i) * expected * expected), 0.0)
         _add_equation(system, WIDTH * i, w, normal, right)
     _mirror_triangle(normal)
-    solve_nonnegative_eights(normal, right, allowed, terms, fit.squares, scratch)
+    solve_nonnegative_eights(normal, right, allowed, terms, squares, scratch)
 
 
 @njit(**INNER)
@@ -151,15 +123,6 @@ def _mirror_triangle(normal):  # type: ignore[no-untyped-def]
     for a in range(5):
         for b in range(a):
             put(normal, 5 * a + b, take(normal, 5 * b + a))
-
-
-def combine_diagonal(pairs: NDArray[np.float64], ramps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Combine the diagonals (4, 4, n_tau) and (4, n_tau) of `product_tables`: (n_tau, 14)."""
-    columns: list[NDArray[np.float64]] = []
-    for a in range(4):
-        columns += [pairs[a, b] * (1.0 if a == b else 2.0) for b in range(a, 4)]
-        columns.append(ramps[a])
-    return np.stack(columns, axis=1)
 
 
 @njit(**KERNEL)
@@ -184,63 +147,15 @@ def identify_noise(curves, columns, weight, to_samples):  # type: ignore[no-unty
     """
     n_windows, n_tau = curves.avar.shape
     out = np.empty((n_windows, 5))
-    cells, fit = (
-        _make_cells(n_tau),
-        _Fit(eights(_TERMS), eights(_TERMS), eights(_TERMS), eights(_STOCHASTIC)),
-    )
-    normal, right, scratch = eights(_MATRIX), eights(_TERMS), eights(_SCRATCH)
+    cells, fit = _make_cells(n_tau), _make_fit()
     trend, valid = np.zeros((n_windows, 6)), np.empty(PLACES, np.int64)
     allowed = np.int64(31 if columns[0, 4] > 0.0 else 15)  # some variances do not see a ramp
     for start in range(0, n_windows, PLACES):
         _observe_eight(start, curves, columns, to_samples, cells, trend, valid)
-        _fit_diagonal(cells, weight, allowed, normal, right, fit, scratch)
+        _fit_diagonal(cells, weight, allowed, fit)
         for w in range(start, min(start + PLACES, n_windows)):
             for a in range(5):
                 out[w, a] = fit.squares[a, w - start]
-    return out
-
-
-@njit(**KERNEL)
-def cell_freedoms(squares, curves, columns, to_samples, diagonal):  # type: ignore[no-untyped-def]
-    """Compute the degrees of freedom of each cell from the squared coefficients of its window.
-
-    Parameters
-    ----------
-    squares : float64 (n_windows, 5)
-        Squared coefficients.
-    curves, columns, to_samples
-        As for `identify_noise`.
-    diagonal : float64 (n_tau, 14)
-        Result of `combine_diagonal`.
-
-    Returns
-    -------
-    float64 (n_windows, n_tau)
-        NaN without a variance above zero.
-    """
-    avar = curves.avar
-    n_windows, n_tau = avar.shape
-    out = np.empty(avar.shape)
-    if curves.white.shape[0] == n_windows:
-        for w in range(n_windows):
-            degrees_of_freedom(squares[w], curves, w, columns, to_samples, diagonal, out[w])
-    else:
-        eight_squares, lanes = eights(_TERMS), eights(_ONE)
-        columns = columns.ravel()
-        diagonal = diagonal.ravel()
-        for start in range(0, n_windows, PLACES):
-            count = min(PLACES, n_windows - start)
-            for place in range(count):
-                for a in range(5):
-                    eight_squares[a, place] = squares[start + place, a]
-            whole_degrees_of_freedom(
-                eight_squares, columns, to_samples, diagonal, lanes, out[start : start + count]
-            )
-    for w in range(n_windows):
-        shares = curves.factor[min(w, curves.factor.shape[0] - 1)]
-        for i in range(n_tau):
-            if not (avar[w, i] > 0.0 and avar[w, i] < np.inf and shares[i] > 0.0):
-                out[w, i] = np.nan
     return out
 
 
@@ -256,16 +171,16 @@ def _observe_eight(start, curves, columns, to_samples, cells, trend, valid):  # 
 
 
 @njit(**INNER)
-def _factor_covariance(cells, fit, room, tables):  # type: ignore[no-untyped-def]
-    """Eliminate the covariance of the noise `fit.basis` with columns and data; sets `fit.state`."""
-    system, inverse, augmented, state = cells.system, cells.inverse, room.whole, fit.state
+def _factor_covariance(cells, basis, state, units, roots, augmented, tables):  # type: ignore[no-untyped-def]
+    """Eliminate the covariance of the noise `basis` with columns and data; sets `state`."""
+    system, inverse = cells.system, cells.inverse
     n = inverse.shape[0]
     width = n + WIDTH
     put(state, 2, 1e-7)  # the sums over lags are good to about this; a strong ramp may need more
-    root_squares(fit.basis, cells.responses, room.units, room.roots)
+    root_squares(basis, cells.responses, units, roots)
     needs_retry = True
     while needs_retry:
-        covariance_rows(room.roots, inverse, tables, augmented, width)
+        covariance_rows(roots, inverse, tables, augmented, width)
         jitter = take(state, 2)
         for i in range(n):
             at, y = width * i, take(cells.avar, i)
@@ -303,10 +218,15 @@ def _normal_equations(augmented, n, normal, right):  # type: ignore[no-untyped-d
 
 
 @njit(**INNER)
-def _refit_windows(allowed, cells, fit, room, tables):  # type: ignore[no-untyped-def]
-    """Refit until the covariance is that of the fitted noise; converged fits keep their numbers."""
-    squares, terms, basis, state = fit
-    trial, tried = eights(_TERMS), eights(_TERMS)
+def _refit_windows(allowed, cells, fit, units, augmented, tables):  # type: ignore[no-untyped-def]
+    """Refit until the covariance is that of the fitted noise; converged fits keep their numbers.
+
+    Returns whether a fit still moves (row 0), was hopeless (1); its jitter (2), whether its
+    covariance was positive definite (3).
+    """
+    squares, terms, normal, right, scratch = fit
+    trial, tried, basis = eights(_TERMS), eights(_TERMS), eights(_TERMS)
+    state, roots = eights(_STOCHASTIC), eights(units.shape[0])
     n = cells.inverse.shape[0]
     put(state, 0, 1.0)
     put(state, 1, 0.0)
@@ -316,9 +236,9 @@ def _refit_windows(allowed, cells, fit, room, tables):  # type: ignore[no-untype
             put(basis, a, where_above(moves, 0.5, take(squares, a), take(basis, a)))
             put(tried, a, take(terms, a))
         _find_ramp(cells.trend, basis)
-        _factor_covariance(cells, fit, room, tables)
-        _normal_equations(room.whole, n, room.normal, room.right)
-        solve_nonnegative_eights(room.normal, room.right, allowed, tried, trial, room.scratch)
+        _factor_covariance(cells, basis, state, units, roots, augmented, tables)
+        _normal_equations(augmented, n, normal, right)
+        solve_nonnegative_eights(normal, right, allowed, tried, trial, scratch)
         moved = moves * 0.0
         for a in range(4):
             put(squares, a, where_above(moves, 0.5, take(trial, a), take(squares, a)))
@@ -328,6 +248,7 @@ def _refit_windows(allowed, cells, fit, room, tables):  # type: ignore[no-untype
         put(state, 0, where_above(take(state, 1), 0.5, 0.0, moved))
         if not _has_positive(state, np.int64(0)):
             break
+    return state
 
 
 @njit(**INNER)
@@ -349,42 +270,43 @@ def _has_positive(rows, row):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _measure_misfit(cells, fit, room, chi2):  # type: ignore[no-untyped-def]
+def _measure_misfit(squares, augmented, n, chi2):  # type: ignore[no-untyped-def]
     """Compute chi-square from the eliminated covariance, columns and data."""
-    n = cells.inverse.shape[0]
-    total = take(fit.squares, 0) * 0.0
+    total = take(squares, 0) * 0.0
     for i in range(n):
         at = (n + WIDTH) * i + n
-        misfit = take(room.whole, at + DATA)
+        misfit = take(augmented, at + DATA)
         for a in range(4):
-            misfit = misfit - take(fit.squares, a) * take(room.whole, at + a)
+            misfit = misfit - take(squares, a) * take(augmented, at + a)
         total = total + misfit * misfit
     put(chi2, 0, total)
 
 
 @njit(**INNER)
-def _reduce_windows(cells, room, tables):  # type: ignore[no-untyped-def]
-    """Reduce the cells to four weighted sums, with the products of their covariance."""
+def _reduce_windows(cells, units, augmented, tables, products):  # type: ignore[no-untyped-def]
+    """Reduce the cells to four weighted sums, with the `products` of their covariance."""
     n = cells.inverse.shape[0]
-    back_substitute(room.whole, n, n + WIDTH)
+    back_substitute(augmented, n, n + WIDTH)
+    rows = eights(4 * n)
     for i in range(n):
         for a in range(4):
-            put(room.rows, 4 * i + a, take(room.whole, (n + WIDTH) * i + n + a))
-    compress_products(cells, room, tables, _has_positive(cells.excess, np.int64(0)))
+            put(rows, 4 * i + a, take(augmented, (n + WIDTH) * i + n + a))
+    has_excess = _has_positive(cells.excess, np.int64(0))
+    compress_products(cells, rows, units, tables, has_excess, products)
 
 
 @njit(**INNER)
-def _take_window(place, fit, cells, room, submodels, start):  # type: ignore[no-untyped-def]
+def _take_window(place, fit, cells, products, submodels, start):  # type: ignore[no-untyped-def]
     """Copy the reduced window in one place of the eights."""
     for a in range(4):
         start[a] = fit.squares[a, place]
-        submodels.data[a] = room.right[a, place]
+        submodels.data[a] = fit.right[a, place]
         submodels.trend[a] = cells.trend[a, place]
         for b in range(4):
-            submodels.normal[a, b] = room.normal[5 * a + b, place]
+            submodels.normal[a, b] = fit.normal[5 * a + b, place]
     for table in range(PRODUCTS):
         for entry in range(10):
-            submodels.products[table, entry] = room.products[10 * table + entry, place]
+            submodels.products[table, entry] = products[10 * table + entry, place]
 
 
 @njit(**KERNEL)
@@ -432,29 +354,28 @@ def fit_windows(  # type: ignore[no-untyped-def]
     result = np.full((n_windows, len(FIT_FIELDS), 5), np.nan)
     misfit = np.full((n_windows, 2), np.nan)
     dof = np.full((n_windows, n_tau), np.nan)
-    cells = _make_cells(size)
-    fit = _Fit(eights(_TERMS), eights(_TERMS), eights(_TERMS), eights(_STOCHASTIC))
-    room = _make_room(size)
+    cells, fit, units = _make_cells(size), _make_fit(), eights(5 * size)
+    augmented, products = eights(size * (size + WIDTH)), eights(10 * PRODUCTS)
     chi2, valid, squares = eights(_ONE), np.empty(PLACES, np.int64), np.empty(5)
     submodels, start = make_submodels(), np.empty(4)
     stochastic = allowed & 15
     for first in range(0, n_windows, PLACES):
         _observe_eight(first, curves, columns, to_samples, cells, trend, valid)
-        root_units(cells.responses, room.units)
-        _fit_diagonal(cells, weight, stochastic, room.normal, room.right, fit, room.scratch)
-        _refit_windows(stochastic, cells, fit, room, tables)
-        _measure_misfit(cells, fit, room, chi2)
-        _reduce_windows(cells, room, tables)
+        root_units(cells.responses, units)
+        _fit_diagonal(cells, weight, stochastic, fit)
+        state = _refit_windows(stochastic, cells, fit, units, augmented, tables)
+        _measure_misfit(fit.squares, augmented, size, chi2)
+        _reduce_windows(cells, units, augmented, tables, products)
         for w in range(first, min(first + PLACES, n_windows)):
             place = w - first
             misfit[w, 1] = 0.0
-            if valid[place] == 0 or fit.state[1, place] > 0.5:
+            if valid[place] == 0 or state[1, place] > 0.5:
                 continue
             misfit[w, 0], misfit[w, 1] = chi2[0, place], valid[place]
             for a in range(4):
                 misfit[w, 1] -= 1.0 if fit.terms[a, place] > 0.5 else 0.0
             misfit[w, 1] = max(misfit[w, 1], 0.0)  # also with more terms than cells
-            _take_window(place, fit, cells, room, submodels, start)
+            _take_window(place, fit, cells, products, submodels, start)
             average_submodels(
                 allowed, start, cells.trend[4, place], low_sigma, submodels, result[w]
             )

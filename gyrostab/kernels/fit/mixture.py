@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER
-from gyrostab.kernels.fit.lanes import number, put, root, take, take_four, where_above
+from gyrostab.kernels.fit.lanes import eights, number, put, root, take, take_four, where_above
 
 #: Products of the four stochastic terms with each other and with a ramp, which does not scatter
 #: alone: (a, b) for a in 0..3 and b in a..4.
@@ -142,7 +142,7 @@ def root_squares(squares, responses, units, roots):  # type: ignore[no-untyped-d
 
 
 @njit(**INNER)
-def _sum_products(tables, at, a0, a1, a2, a3, a4):  # type: ignore[no-untyped-def]
+def sum_products(tables, at, a0, a1, a2, a3, a4):  # type: ignore[no-untyped-def]
     """Compute the covariance of two cells without their share of degrees of freedom."""
     first = (
         a0 * number(tables, at)
@@ -188,7 +188,7 @@ def covariance_rows(roots, inverse, tables, out, width):  # type: ignore[no-unty
     n = inverse.shape[0]
     for i in range(n):
         for j in range(i, n):
-            total = _sum_products(tables, PRODUCTS * (i * n + j), *_multiply_roots(roots, i, j))
+            total = sum_products(tables, PRODUCTS * (i * n + j), *_multiply_roots(roots, i, j))
             put(out, width * i + j, total * _find_share(inverse, i, j))
 
 
@@ -228,16 +228,16 @@ def _add_products(rows, first, second, inverse, tables, table, factor, scaled, o
 
 
 @njit(**INNER)
-def compress_products(cells, room, tables, has_excess):  # type: ignore[no-untyped-def]
+def compress_products(cells, rows, units, tables, has_excess, out):  # type: ignore[no-untyped-def]
     """Compute ``A C_ab A^T`` for every product (a, b) of terms of the covariance C of the cells.
 
-    A has four weighted sums of the cells (``room.rows``, row ``4 cell + row``). The result goes to
-    ``room.products`` (row ``10 product + entry``, entries in the order of the upper triangle).
-    `has_excess`: gaps add to quantization noise what counts as white, see `observe`.
+    A has four weighted sums of the cells (`rows`, row ``4 cell + row``). The result goes to `out`
+    (row ``10 product + entry``, entries in the order of the upper triangle). `units` is that of
+    `root_units`; `has_excess`: gaps add to quantization noise what counts as white, see `observe`.
     """
-    rows, units, roots, scaled = room.rows, room.units, room.factors, room.scaled
-    responses, inverse, out = cells.responses, cells.inverse, room.products
+    responses, inverse = cells.responses, cells.inverse
     n = inverse.shape[0]
+    roots, scaled = eights(6 * n), eights(4 * n)
     for i in range(n):
         for a in range(5):
             put(roots, n * a + i, take(units, 5 * i + a))
@@ -258,57 +258,3 @@ def compress_products(cells, room, tables, has_excess):  # type: ignore[no-untyp
         table, factor = _TABLE[1][b], 2.0 if b == 1 else 1.0
         second = roots[n * b : n * b + n]
         _add_products(rows, excess, second, inverse, tables, table, factor, scaled, out, 10 * b)
-
-
-@njit(**INNER)
-def degrees_of_freedom(squares, curves, w, columns, to_samples, diagonal, out):  # type: ignore[no-untyped-def]
-    """Compute the degrees of freedom of each finite cell of window w, ``2 mean^2 / variance``."""
-    avar, white, quantization = curves.avar[w], curves.white[w], curves.quantization[w]
-    ramp, factor = curves.ramp[w], curves.factor[w]
-    amounts = np.empty(5)
-    for i in range(avar.size):
-        if not np.isfinite(avar[i]):
-            continue
-        mean = squares[0] * quantization[i] * columns[i, 0] + squares[1] * white[i] * columns[i, 1]
-        for a in range(2, 5):
-            share = ramp[i] if a == 4 else 1.0
-            mean += squares[a] * share * columns[i, a]
-            amounts[a] = squares[a] * share * to_samples[a]
-        excess = max(quantization[i] - 1.0, 0.0) * columns[i, 0] / columns[i, 1]
-        amounts[0] = squares[0] * min(quantization[i], 1.0) * to_samples[0]
-        amounts[1] = (squares[1] * white[i] + squares[0] * excess) * to_samples[1]
-        variance = 0.0
-        table = 0
-        for a in range(4):
-            for b in range(a, 5):
-                variance += amounts[a] * amounts[b] * diagonal[i, table]
-                table += 1
-        out[i] = 2.0 * mean * mean / variance * factor[i] if variance > 0.0 else 0.0
-
-
-@njit(**INNER)
-def whole_degrees_of_freedom(squares, columns, to_samples, diagonal, freedom, out):  # type: ignore[no-untyped-def]
-    """Compute the degrees of freedom of the cells of up to eight windows without gaps.
-
-    `squares` holds their squared coefficients (row ``term``), `freedom` is scratch; tables are
-    flat.
-    """
-    s0, s1, s2, s3 = take_four(squares, np.int64(0), np.int64(1))
-    s4 = take(squares, 4)
-    a0 = s0 * number(to_samples, 0)
-    a1 = s1 * number(to_samples, 1)
-    a2 = s2 * number(to_samples, 2)
-    a3 = s3 * number(to_samples, 3)
-    a4 = s4 * number(to_samples, 4)
-    for i in range(out.shape[1]):
-        mean = (
-            s0 * number(columns, 5 * i)
-            + s1 * number(columns, 5 * i + 1)
-            + s2 * number(columns, 5 * i + 2)
-            + s3 * number(columns, 5 * i + 3)
-            + s4 * number(columns, 5 * i + 4)
-        )
-        variance = _sum_products(diagonal, PRODUCTS * i, a0, a1, a2, a3, a4)
-        put(freedom, 0, where_above(variance, 0.0, 2.0 * mean * mean / variance, 0.0))
-        for place in range(out.shape[0]):
-            out[place, i] = freedom[0, place]

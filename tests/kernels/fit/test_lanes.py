@@ -11,7 +11,8 @@ import pytest
 
 from gyrostab.kernels.fit import lanes
 from gyrostab.kernels.fit.covariance import product_tables
-from gyrostab.kernels.fit.least_squares import combine_diagonal, fit_windows
+from gyrostab.kernels.fit.freedoms import combine_diagonal
+from gyrostab.kernels.fit.least_squares import fit_windows
 from gyrostab.kernels.fit.mixture import Curves
 from gyrostab.noise import avar_columns, sample_squares
 
