@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from gyrostab.jobs.job import is_lock as is_lock
     from gyrostab.jobs.job import lock_job as lock_job
-    from gyrostab.jobs.run import load_log as load_log
+    from gyrostab.jobs.load import load_log as load_log
 
 __all__ = ["is_lock", "load_log", "lock_job"]
 
-_HOME = {"is_lock": "job", "load_log": "run", "lock_job": "job"}
+_HOME = {"is_lock": "job", "load_log": "load", "lock_job": "job"}
 
 
 def __getattr__(name: str) -> Any:

@@ -10,7 +10,7 @@ import xarray as xr
 
 from gyrostab.allan.summary import TermSummary, summarise_terms
 from gyrostab.errors import OutputError
-from gyrostab.jobs.run import count_samples, load_log
+from gyrostab.jobs.load import count_samples, load_log
 from gyrostab.progress import Stage, no_stage
 
 WINDOW, STEP = "4h", "30min"

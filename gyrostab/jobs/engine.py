@@ -1,7 +1,7 @@
 """Computation of a product in parts.
 
 Parts are computed in parallel, in any order, and each is written to a block file once the inputs
-are found unchanged. At the end all blocks are written as one file.
+are found unchanged.
 """
 
 from __future__ import annotations
@@ -11,18 +11,15 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import xarray as xr
 
 from gyrostab.allan.band_limit import choose_windows
 from gyrostab.allan.davar import davar_part, davar_sample
 from gyrostab.allan.fit import find_bands, fit_part
 from gyrostab.allan.plan import make_plan, units_of_work
-from gyrostab.io.datasets import to_netcdf, to_zarr
-from gyrostab.jobs.checkpoint import Block, assemble, write_block
+from gyrostab.jobs.checkpoint import Block, write_block
 from gyrostab.jobs.schedule import Pool, run_calls
 from gyrostab.kernels.workspace import Workspace
-from gyrostab.progress import Stage
 
 #: Finished parts by their number.
 Blocks = dict[int, Block]
@@ -115,39 +112,3 @@ def compute_blocks(
         keep()
         raise
     keep()
-
-
-def write_blocks(
-    blocks: Blocks,
-    target: Path,
-    *,
-    attrs: Mapping[str, Any],
-    overwrite: bool,
-    stage: Stage,
-    zarr: bool = False,
-) -> xr.Dataset:
-    """Write all blocks as one file or Zarr store; return what it was written from."""
-    import dask
-
-    dataset = assemble([blocks[number] for number in sorted(blocks)]).assign_attrs(attrs)
-    n_lazy = sum(variable.chunks is not None for variable in dataset.variables.values())
-
-    def tell(share: float) -> None:
-        stage("writing", n_lazy, int(share * n_lazy), "variables")
-
-    tell(0.0)
-    with dask.config.set(scheduler="synchronous"):  # which holds one chunk at a time
-        (to_zarr if zarr else to_netcdf)(dataset, target, overwrite=overwrite, progress=tell)
-    return dataset
-
-
-def find_constant_shares(product: xr.Dataset) -> dict[str, float]:
-    """Find the share of windows in which an axis is constant: zero variance at both end tau."""
-    ends = product["avar"].isel(tau=[0, -1])
-    still = (ends == 0.0).all("tau").mean("time").compute(scheduler="synchronous")
-    return {
-        str(axis): float(share)
-        for axis, share in zip(
-            np.atleast_1d(still["axis"].values), np.atleast_1d(still.values), strict=True
-        )
-    }

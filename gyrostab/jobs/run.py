@@ -14,15 +14,14 @@ from typing import Any, NamedTuple
 import xarray as xr
 
 from gyrostab.errors import FormatError, GyrostabError, OutputError, ResumeError
-from gyrostab.jobs.checkpoint import find_blocks
+from gyrostab.io.datasets import to_netcdf, to_zarr
+from gyrostab.jobs.checkpoint import assemble, find_blocks
 from gyrostab.jobs.checks import check_options
 from gyrostab.jobs.engine import (
     Blocks,
     compute_blocks,
     compute_part,
-    find_constant_shares,
     find_record_bands,
-    write_blocks,
 )
 from gyrostab.jobs.job import (
     begin_job,
@@ -31,7 +30,6 @@ from gyrostab.jobs.job import (
     count_finished_parts,
     describe_differences,
     describe_inputs,
-    format_option,
     has_finished_work,
     hash_fingerprint,
     job_folder,
@@ -42,6 +40,8 @@ from gyrostab.jobs.job import (
     remove_job,
     write_store_checksum,
 )
+from gyrostab.jobs.load import count_samples as count_samples
+from gyrostab.jobs.load import load_log as load_log
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool
 from gyrostab.kernels.workspace import Workspaces
 from gyrostab.progress import Stage, no_stage
@@ -61,69 +61,6 @@ _FORMS: dict[bool, dict[str, Any]] = {
     False: {"suffixes": [".nc", ".zarr"]},
     True: {"find_foreign": find_foreign_item},
 }
-
-
-def load_log(
-    paths: Sequence[str | Path],
-    *,
-    max_gap: str = "10D",
-    time_from: Any = None,
-    time_to: Any = None,
-    exclude: Sequence[Any] = (),
-    **reading: Any,
-) -> xr.Dataset:
-    """Read logs in any format and put them on a uniform time axis.
-
-    Parameters
-    ----------
-    paths : sequence of path
-        Files, in any order; NetCDF and Zarr logs that gyrostab wrote are concatenated without
-        loading them.
-    max_gap : str
-        Longest gap; a larger step of the stamps is treated as a step of the clock.
-    time_from, time_to : str, datetime or duration, optional
-        First time to use, and the time up to which (exclusive): dates and times (ISO 8601, UTC), or
-        durations after the start of the log.
-    exclude : sequence of str or pairs
-        Spans ``"START/END"`` whose samples are treated as missing; see
-        `gyrostab.ingest.uniform.cut_log`.
-    **reading
-        Options of `gyrostab.ingest.read_log`: ``rate``, ``start``, ``epoch``, ``map``, ``unit``,
-        ``kind``, ``channel``, ``strict``, ``limits``, ``on_file``, ``read``.
-
-    Returns
-    -------
-    xarray.Dataset
-        Log of `gyrostab.schema`.
-    """
-    from gyrostab.ingest import read_log
-    from gyrostab.ingest.grid.notes import describe_channels
-    from gyrostab.ingest.grid.regularise import regularise
-    from gyrostab.ingest.uniform import cut_log
-
-    log = read_log(paths, max_gap=max_gap, **reading)
-    if "sampling_rate_hz" not in log.attrs:
-        log = regularise(
-            log, rate=reading.get("rate"), max_gap=max_gap, limits=reading.get("limits")
-        )
-        options = "; ".join(
-            f"{name}: {format_option(value)}"
-            for name, value in reading.items()
-            if value and name not in ("on_file", "read")
-        )
-        if options:
-            log.attrs["history"] += f" (read with {options})"
-    elif reading.get("channel"):
-        log = log.assign_attrs(notes=[*log.attrs.get("notes", []), *describe_channels(log)])
-    log = cut_log(log, time_from=time_from, time_to=time_to, exclude=exclude)
-    for note in log.attrs.get("notes", []):
-        warnings.warn(note, stacklevel=2)
-    return log
-
-
-def count_samples(log: xr.Dataset) -> int:
-    """Count the samples of a log over all its axes."""
-    return int(log.sizes["axis"] * log.sizes["time"])
 
 
 def run(
@@ -348,7 +285,6 @@ def _compute_missing(
     """Compute the missing parts of a job."""
     from gyrostab.allan.davar import davar_parts
     from gyrostab.allan.plan import choose_window
-    from gyrostab.io.datasets import to_zarr
 
     reading, windows, fitting = (job.options[name] for name in ("reading", "windows", "fitting"))
     store = job.folder / "log.zarr"
@@ -433,20 +369,27 @@ def _unpack_log(copy: bytes) -> xr.Dataset:
 
 
 def _write_product(job: _Job, blocks: Blocks, *, overwrite: bool, stage: Stage) -> None:
-    """Write the product, and warn of windows in which an axis is constant.
+    """Write all blocks as the product, and warn of windows in which an axis is constant.
 
     An axis that is constant throughout has a note in the log.
     """
-    product = write_blocks(
-        blocks,
-        job.target,
-        attrs={"gyrostab_job": job.name},
-        overwrite=overwrite,
-        stage=stage,
-        zarr=job.zarr,
-    )
+    import dask
+
+    product = assemble([blocks[number] for number in sorted(blocks)])
+    product = product.assign_attrs(gyrostab_job=job.name)
+    n_lazy = sum(variable.chunks is not None for variable in product.variables.values())
+
+    def tell(share: float) -> None:
+        stage("writing", n_lazy, int(share * n_lazy), "variables")
+
+    tell(0.0)
+    with dask.config.set(scheduler="synchronous"):  # which holds one chunk at a time
+        write = to_zarr if job.zarr else to_netcdf
+        write(product, job.target, overwrite=overwrite, progress=tell)
     stage("checking", 0)
-    for axis, share in find_constant_shares(product).items():
+    is_constant = (product["avar"].isel(tau=[0, -1]) == 0.0).all("tau")  # at both end tau
+    shares = is_constant.mean("time").compute(scheduler="synchronous")
+    for axis, share in shares.to_series().items():
         if 0.0 < share < 1.0:
             warnings.warn(
                 f"gyro axis {axis} is constant in {100 * share:.0f} % of the windows: "

@@ -37,7 +37,7 @@ from gyrostab.jobs.job import (
     make_fingerprint,
     remove_job,
 )
-from gyrostab.jobs.run import load_log
+from gyrostab.jobs.load import load_log
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.schema import log_channels, signal_name
 from gyrostab.store.lazy import find_source

@@ -385,19 +385,19 @@ def test_no_room_for_a_later_block(
 
 
 def test_no_room_for_the_product(log, whole, tmp_path, monkeypatch, free_again, computed, capfd):
-    write = engine.to_netcdf
+    write = to_netcdf
 
     def tight(*arguments, **options):
         limit_file_size(65536)
         return write(*arguments, **options)
 
-    monkeypatch.setattr(engine, "to_netcdf", tight)
+    monkeypatch.setattr("gyrostab.jobs.run.to_netcdf", tight)
     assert call(log, "-o", tmp_path / "product.nc") == 2
     message = one_message(capfd.readouterr())
     assert "product.nc: cannot be written" in message
     assert f"{PARTS} of {PARTS} parts" in message
     limit_file_size(resource.getrlimit(resource.RLIMIT_FSIZE)[1])
-    monkeypatch.setattr(engine, "to_netcdf", write)
+    monkeypatch.setattr("gyrostab.jobs.run.to_netcdf", write)
     del computed[:]
     assert call(log, "-o", tmp_path / "product.nc", "--resume") == 0
     assert computed == []
