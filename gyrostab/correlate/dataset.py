@@ -34,15 +34,25 @@ _STATISTICS = {
     ),
     "effective_samples": ("effective", "effective number of independent samples", "1"),
 }
-_SLOPES = {"": "slope", "_stderr": "stderr", "_low": "low", "_high": "high"}
+#: Key of the entry, and end of the long name of each number of a sensitivity.
+_SLOPES = {
+    "slope": "",
+    "stderr": ", standard error",
+    "low": ", lower end of the {level:g} % interval",
+    "high": ", upper end of the {level:g} % interval",
+    "rising": ", while it rises",
+    "rising_stderr": ", while it rises, standard error",
+    "falling": ", while it falls",
+    "falling_stderr": ", while it falls, standard error",
+}
 _PARTIAL_STATISTICS = {
     "p_value_partial": ("p_partial", "p-value of the sensitivity, given the other drivers", "1")
 }
 #: The same, given the other drivers: only where several channels are named.
 _PARTIAL_SLOPES = {
-    f"_{name}": name for name in ("partial", "partial_stderr", "partial_low", "partial_high")
+    "partial": ", given the other drivers",
+    **{f"partial_{key}": f", given the other drivers{_SLOPES[key]}" for key in list(_SLOPES)[1:4]},
 }
-_SLOPES |= {f"_{name}": name for name in ("rising", "rising_stderr", "falling", "falling_stderr")}
 
 
 def assemble(
@@ -101,9 +111,10 @@ def assemble(
                 "units": slope_units(str(product[name].attrs.get("units", "1")), driver.units),
                 "unit_label": slope_label(product[name], driver.units),
             }
-            for suffix, key in (_SLOPES | (_PARTIAL_SLOPES if is_partial else {})).items():
+            for key, text in (_SLOPES | (_PARTIAL_SLOPES if is_partial else {})).items():
+                suffix = "" if key == "slope" else f"_{key}"
                 series = name.replace("_", " ")
-                label = f"sensitivity of {series} to {driver.label}{_slope_label(key, level)}"
+                label = f"sensitivity of {series} to {driver.label}{text.format(level=100 * level)}"
                 made[f"{name}_per_{driver.name}{suffix}"] = (
                     "axis",
                     table(key)[:, v, d],
@@ -147,24 +158,6 @@ def _limit_flags(
         "flag_meanings": " ".join(masks),
     }
     return bits, {"long_name": "what limits the verdict", **meanings}
-
-
-def _slope_label(key: str, level: float) -> str:
-    ends = {
-        "stderr": "standard error",
-        "low": f"lower end of the {100 * level:g} % interval",
-        "high": f"upper end of the {100 * level:g} % interval",
-    }
-    ramps = {
-        f"{way}{end}": f"while it {verb}{text}"
-        for way, verb in (("rising", "rises"), ("falling", "falls"))
-        for end, text in (("", ""), ("_stderr", ", standard error"))
-    }
-    if key.startswith("partial"):
-        end = ends.get(key.removeprefix("partial_"))
-        return ", given the other drivers" + (f", {end}" if end else "")
-    text = {**ends, **ramps}.get(key)
-    return f", {text}" if text else ""
 
 
 def join(product: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
