@@ -35,7 +35,6 @@ class Examination:
     null_best: Array = field(default_factory=lambda: np.empty(0))  # as in `Identifications`
     reasons: dict[str, str] = field(default_factory=dict)  # effect -> why it cannot show
     expected: tuple[Selection, ...] = ()  # those of the known effects that the record shows
-    memory: dict[bytes, object] = field(default_factory=dict)  # of `compute_evidence`
 
     @property
     def settings(self) -> Settings:
@@ -65,7 +64,6 @@ class Examination:
             state,
             self.folds,
             count_evidence=self.count_evidence,
-            memory=self.memory,
         )
 
     def find_components(

@@ -242,9 +242,7 @@ def _find_shifted(
     components: Sequence[Component], state: State, examination: Examination
 ) -> tuple[str, float] | None:
     """Return the time-shifted channel that beats an effect, and by how much [nats]."""
-    passed, _, nats = passes_time_shift_test(
-        components, state, examination.folds, examination.memory
-    )
+    passed, _, nats = passes_time_shift_test(components, state, examination.folds)
     return None if passed else ("a time-shifted channel", nats)
 
 

@@ -23,7 +23,6 @@ def passes_time_shift_test(
     components: Sequence[Component],
     state: State,
     folds: xr.DataArray,
-    memory: dict[bytes, object] | None = None,
 ) -> tuple[bool, float, float]:
     """Test whether an effect explains more than time-shifted surrogates of its channel.
 
@@ -33,8 +32,6 @@ def passes_time_shift_test(
         Components of the effect.
     state : State
         What is in the model without it.
-    memory : dict, optional
-        As in `compute_evidence`.
 
     Returns
     -------
@@ -75,7 +72,6 @@ def passes_time_shift_test(
             state.blocks,
             state,
             folds,
-            memory=memory,
         )
         values = np.array([evidence.evidence_nats[0, row] for evidence in all_evidence])
         real += float(values[0])

@@ -21,6 +21,20 @@ if TYPE_CHECKING:
     from gyrostab.diagnose.statistics.base import Statistic
 
 Array = NDArray[Any]
+
+
+def content_digest(*items: Array | bytes | None) -> bytes:
+    """Return a digest of arrays, with their types and shapes, and of bytes."""
+    digest = hashlib.blake2b(digest_size=16)
+    for item in items:
+        if isinstance(item, np.ndarray):
+            digest.update(f"{item.dtype.str}{item.shape}".encode())
+            digest.update(np.ascontiguousarray(item).data)
+        else:
+            digest.update(b"none" if item is None else item)
+    return digest.digest()
+
+
 #: Nuisance parameter that is a time.
 TIME_PARAMETER = "at"
 
@@ -88,10 +102,9 @@ class Candidate:
     @cached_property
     def digest(self) -> bytes:
         """Digest of the statistic and of all designs."""
-        digest = hashlib.blake2b(self.statistic.name.encode(), digest_size=16)
-        for variant in self.variants:
-            update_digest(digest, variant.design)
-        return digest.digest()
+        return content_digest(
+            self.statistic.name.encode(), *(variant.design for variant in self.variants)
+        )
 
     @property
     def columns(self) -> set[str]:
@@ -136,15 +149,6 @@ class CandidateEvidence:
     best: tuple[Variant, ...]  # best variant of each row for the first record
     #: (record, row): index of the line for lines; otherwise empty.
     place: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 0), np.int64))
-
-
-def update_digest(digest: hashlib.blake2b, array: Array | None) -> None:
-    """Add an array, with its type and shape, to a digest."""
-    if array is None:
-        digest.update(b"none")
-    else:
-        digest.update(f"{array.dtype.str}{array.shape}".encode())
-        digest.update(np.ascontiguousarray(array).data)
 
 
 def numbered_columns(count: int) -> tuple[str, ...]:

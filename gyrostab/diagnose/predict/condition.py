@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import xarray as xr
@@ -80,12 +81,20 @@ def refit_weights(state: State) -> State:
 def fit_powers(state: State, axis: str, left_out: NDArray[np.bool_] | None = None) -> Array:
     """Fit the powers of an axis, (block, band), and leave some of its power columns out of them."""
     row, shape = state.axes.index(axis), state.weight.shape[1:]
-    columns = [np.broadcast_to(column, shape) for column in state.given[("power", axis)]]
-    named = np.stack(columns, axis=-1)
-    expected, fitted, sizes = _fit_columns(state, row, axis, named)
+    expected = axis_values(state.baseline, "spectrum", axis)
+    level, precision = noise_columns(state.baseline, axis=axis)
+    level_count = level.shape[2]
+    given = [np.broadcast_to(column, shape) for column in state.given[("power", axis)]]
+    columns = np.concatenate([level * expected[..., None], np.stack(given, axis=-1)], axis=-1)
+    prior = np.zeros(columns.shape[2])
+    prior[:level_count] = np.diagonal(precision)
+    power, degrees = (state.blocks[name].values[row] for name in ("power", "shape"))
+    degrees = np.where(state.masked[row][:, None], np.nan, degrees)
+    inputs = expected, columns, prior, power, degrees
+    sizes = state.recall(partial(_fit_sizes, *inputs), b"powers", *inputs)
     if left_out is not None:
-        fitted = fitted - named[..., left_out] @ sizes[left_out]
-    return np.maximum(fitted, MIN_POWER_RATIO * expected)
+        sizes = np.where(np.append(np.zeros(level_count, np.bool_), left_out), 0.0, sizes)
+    return np.maximum(expected + columns @ sizes, MIN_POWER_RATIO * expected)
 
 
 def drop_changed_tails(
@@ -120,26 +129,19 @@ def drop_changed_tails(
 _ROUNDS = 4  # steps of Fisher scoring
 
 
-def _fit_columns(state: State, row: int, axis: str, named: Array) -> tuple[Array, Array, Array]:
-    """Fit the powers of an axis; return them before and after, and sizes of the named columns."""
-    expected = axis_values(state.baseline, "spectrum", axis)
-    level, precision = noise_columns(state.baseline, axis=axis)
-    level_count, flat = level.shape[2], expected.ravel()
-    columns = np.concatenate([level * expected[..., None], named], axis=-1).reshape(flat.size, -1)
+def _fit_sizes(expected: Array, columns: Array, prior: Array, power: Array, shape: Array) -> Array:
+    """Fit the sizes of columns (block, band, column) to powers with gamma distributions."""
+    flat, power, shape = expected.ravel(), power.ravel(), shape.ravel()
+    columns = columns.reshape(flat.size, -1)
     size = np.maximum(np.abs(columns).max(axis=0), 1e-300)
     columns = columns / size
-    prior = np.zeros(columns.shape[1])
-    prior[:level_count] = np.diagonal(precision) / size[:level_count] ** 2
-    power, shape = (state.blocks[name].values[row].ravel() for name in ("power", "shape"))
-    masked = np.repeat(state.masked[row], expected.shape[1])
-    good = np.isfinite(power) & np.isfinite(shape) & ~masked
+    good = np.isfinite(power) & np.isfinite(shape)
     fitted, sizes = flat, np.zeros(size.size)
     for _ in range(_ROUNDS):
         w = np.where(good, shape / fitted**2, 0.0)
         w = np.where(np.isfinite(w), w, 0.0)
-        normal = (columns * w[:, None]).T @ columns + np.diag(prior)
+        normal = (columns * w[:, None]).T @ columns + np.diag(prior / size**2)
         normal += 1e-9 * np.diag(np.maximum(np.diagonal(normal), 1e-300))
         sizes = np.linalg.solve(normal, columns.T @ (w * np.where(good, power - flat, 0.0)))
-        power_fitted = flat + columns @ sizes
-        fitted = np.maximum(power_fitted, MIN_POWER_RATIO * flat)
-    return expected, power_fitted.reshape(expected.shape), (sizes / size)[level_count:]
+        fitted = np.maximum(flat + columns @ sizes, MIN_POWER_RATIO * flat)
+    return np.asarray(sizes / size)

@@ -8,19 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.held_out import LinearModel
-from gyrostab.diagnose.predict.candidates import Candidate
+from gyrostab.diagnose.predict.candidates import Candidate, content_digest
 from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.periodogram import taper
 
 Array = NDArray[Any]
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,19 @@ class State:
     #: the two axes of a pair with a comma between them.
     given: dict[tuple[str, str], list[Array]] = field(default_factory=dict)
     settings: Settings = DEFAULTS
+    #: What was computed for the record, in any of its states, by the digest of the inputs.
+    memory: dict[bytes, object] = field(default_factory=dict)
+
+    def recall(self, compute: Callable[[], Result], *inputs: Array | bytes | None) -> Result:
+        """Compute something, or recall what the same inputs gave before.
+
+        Most of what a search tries again has not changed: an effect on one axis changes nothing on
+        the others, and a line nothing in the means.
+        """
+        key = content_digest(*inputs)
+        if key not in self.memory:
+            self.memory[key] = compute()
+        return cast(Result, self.memory[key])
 
     def given_to(self, statistic: str, axis: str) -> Array | None:
         """Return the given columns of a statistic of an axis, (..., column); None without any."""

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -12,11 +11,10 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.products import held_out_evidence
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
-from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, update_digest
-from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence
+from gyrostab.diagnose.predict.linear_model import Result, State
 
 Array = NDArray[np.float64]
-Result = TypeVar("Result")
 _COLUMNS_AT_ONCE = 300  # limits memory and time, which grow with the square
 _MIN_ROW_NATS = 1.5  # that another axis or statistic must add; design choice
 
@@ -29,7 +27,11 @@ class Trial(NamedTuple):
     folds: xr.DataArray
     counts: CountEvidence | None = None
     rng: np.random.Generator | None = None
-    memory: dict[bytes, object] | None = None
+
+    @property
+    def is_null(self) -> bool:
+        """Whether the data are null records."""
+        return "record" in self.data.dims
 
     def recall(
         self,
@@ -37,22 +39,10 @@ class Trial(NamedTuple):
         group: Sequence[Candidate],
         *inputs: NDArray[Any] | None,
     ) -> Result:
-        """Compute something for candidates, or recall it from the same inputs.
-
-        Most of what a search tries again has not changed: an effect on one axis changes nothing on
-        the others, and a line nothing in the means.
-        """
-        if self.memory is None:
+        """Compute something for candidates; on the recording, recall it if nothing has changed."""
+        if self.is_null:
             return compute()
-        digest = hashlib.blake2b(digest_size=16)
-        for candidate in group:
-            digest.update(candidate.digest)
-        for array in inputs:
-            update_digest(digest, array)
-        key = digest.digest()
-        if key not in self.memory:
-            self.memory[key] = compute()
-        return cast(Result, self.memory[key])
+        return self.state.recall(compute, *(candidate.digest for candidate in group), *inputs)
 
 
 def compute_evidence(
@@ -63,7 +53,6 @@ def compute_evidence(
     *,
     count_evidence: CountEvidence | None = None,
     rng: np.random.Generator | None = None,
-    memory: dict[bytes, object] | None = None,
 ) -> list[CandidateEvidence]:
     """Compute the evidence of candidates on data.
 
@@ -75,11 +64,8 @@ def compute_evidence(
         Without it, sample counts are left out.
     rng : numpy.random.Generator, optional
         For null records: generator of the statistics they do not have.
-    memory : dict, optional
-        Results of earlier calls with the same blocks and folds, to which those of this one are
-        added.
     """
-    trial = Trial(data, state, folds, count_evidence, rng, memory)
+    trial = Trial(data, state, folds, count_evidence, rng)
     groups: dict[tuple[object, ...], list[Candidate]] = {}
     for candidate in candidates:
         kind = (candidate.statistic, candidate.reference, candidate.is_per_axis)

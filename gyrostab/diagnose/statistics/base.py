@@ -209,7 +209,7 @@ class Statistic:
                 model = simulate_noise(model, trial.rng, trial.data.sizes["record"])
             return linear_model_factors(model, trial.folds)
 
-        if trial.memory is None:
+        if trial.is_null:
             return compute_factors()
         bare = self.model([replace(group[0], variants=())], row, data, state)
         inputs = bare.values, bare.weight, bare.given, bare.precision

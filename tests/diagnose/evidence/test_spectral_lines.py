@@ -140,18 +140,17 @@ def test_evidence_is_recalled_only_where_nothing_has_changed() -> None:
             start, baseline=with_walk(start.baseline, "x", np.full(start.masked.shape[1], 1e-3))
         ),
     }
-    memory: dict[bytes, object] = {}
-    compute_evidence(candidates, blocks, start, folds, memory=memory)
+    compute_evidence(candidates, blocks, start, folds)
     added = {}
     for name, state in states.items():
-        before = len(memory)
-        recalled = compute_evidence(candidates, state.blocks, state, folds, memory=memory)
-        added[name] = len(memory) - before
-        fresh = compute_evidence(candidates, state.blocks, state, folds)
+        before = len(start.memory)
+        recalled = compute_evidence(candidates, state.blocks, state, folds)
+        added[name] = len(start.memory) - before
+        fresh = compute_evidence(candidates, state.blocks, replace(state, memory={}), folds)
         for one, other in zip(recalled, fresh, strict=True):
             assert one.candidate is other.candidate
             np.testing.assert_array_equal(one.evidence_nats, other.evidence_nats)
-    first = len(memory) - sum(added.values())
+    first = len(start.memory) - sum(added.values())
     assert added["another line in its band"] == 0
     assert all(0 < added[name] < first for name in states if name != "another line in its band")
 
