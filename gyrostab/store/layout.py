@@ -121,21 +121,11 @@ def read_chunk(
     """
     if zarr:
         return _read_zarr_chunk(path / name, place, opened)
-    chunk = read_written_chunk(path, name, place, opened=opened)
-    if chunk is None:
-        raise ChunkDamage(f"is missing: {name} has no chunk {place}")
-    return chunk
-
-
-def read_written_chunk(
-    path: Path, name: str, place: tuple[int, ...], *, opened: str
-) -> NDArray[Any] | None:
-    """Read one chunk of an HDF5 file as it is on disk; None if it was never written."""
     layout = _read_hdf5_layout(path, name, opened)
     if place not in layout.places:
         if layout.damage:
             raise ChunkDamage(f"is damaged: {layout.damage}")
-        return None
+        raise ChunkDamage(f"is missing: {name} has no chunk {place}")
     begin, size, mask = layout.places[place]
     try:
         with path.open("rb") as file:
@@ -210,12 +200,6 @@ def find_hdf5_codecs(plist: Any) -> tuple[tuple[int, Any], ...]:
             codec = Zstd(*values[:1])
         codecs.append((number, codec))
     return tuple(codecs)
-
-
-def has_known_filters(plist: Any) -> bool:
-    """Whether all filters in the creation property list of an HDF5 dataset are known."""
-    codes = {plist.get_filter(number)[0] for number in range(plist.get_nfilters())}
-    return codes <= {_DEFLATE, _SHUFFLE, _FLETCHER32, _ZSTD}
 
 
 @dataclass(frozen=True)

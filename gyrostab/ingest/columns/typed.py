@@ -77,20 +77,15 @@ def holds_dates(values: Any) -> bool:
     )
 
 
-def read_columns(
-    plan: Plan, rows: int, fetch: Fetch, *, notes: Sequence[str] = (), parallel: bool = False
-) -> xr.Dataset:
-    """Build the raw log of columns that can be fetched by ranges of rows.
-
-    `fetch` is thread-safe if `parallel`.
-    """
+def read_columns(plan: Plan, rows: int, fetch: Fetch, *, notes: Sequence[str] = ()) -> xr.Dataset:
+    """Build the raw log of columns that can be fetched by ranges of rows."""
     step = batch_rows(len(plan.columns))
     spans = ((start, min(start + step, rows)) for start in range(0, rows, step))
 
     def take(span: tuple[int, int]) -> dict[int, Any]:
         return {column.source: fetch(column.source, *span) for column in plan.columns}
 
-    return read_batches(plan, spans, take, notes=notes, parallel=parallel)
+    return read_batches(plan, spans, take, notes=notes)
 
 
 def read_batches(

@@ -11,7 +11,6 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +27,17 @@ from gyrostab.ingest.columns.headers import (
 )
 from gyrostab.ingest.formats.matlab5 import check_structure
 from gyrostab.ingest.formats.packing import ATTRIBUTES
-from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, library, make_reader
+from gyrostab.ingest.formats.tables import (
+    StoredArray,
+    Table,
+    TableColumn,
+    TablesOfFile,
+    library,
+    make_reader,
+)
 from gyrostab.ingest.limits import check_chunk
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.store.hdf5_heaps import check_global_heaps
-from gyrostab.store.rows import LibraryRows, hdf5_rows
 from gyrostab.time.stamps import to_nanoseconds
 
 HDF_SUFFIXES = (".h5", ".hdf5")
@@ -134,14 +139,11 @@ def _columns_of(path: Path, name: str, array: Any, options: ReadOptions) -> Iter
     if chunks := getattr(array, "chunks", None):
         check_chunk(path, name, array.dtype.itemsize * math.prod(chunks), options.limits)
     along, size = int(np.argmax(shape)), min(shape) if len(shape) == 2 else 1
-    locate = (None if isinstance(array, np.ndarray) else hdf5_rows(path, array)) or partial(
-        LibraryRows, array
-    )
     stored = getattr(array, "attrs", {})
     attributes = {key: stored[key] for key in ATTRIBUTES if key in stored}
-    for place in range(size) if size <= MAX_COLUMNS else ():
-        header = name if size == 1 else f"{name}/{place}"
-        yield TableColumn.of_rows(header, locate(along, place), array.dtype, attributes)
+    if size <= MAX_COLUMNS:
+        names = [name] if size == 1 else [f"{name}/{place}" for place in range(size)]
+        yield from StoredArray(array, along).make_columns(names, attributes)
 
 
 def _find_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[tuple[str, Any]]:
@@ -259,5 +261,4 @@ def _make_column(
         values, unit = values.astype("timedelta64[ns]").view(np.int64), "ns"
     if values.dtype.kind in "biuf":
         attributes = {"units": unit} if unit else {}
-        column = TableColumn.of_rows(header, LibraryRows(values), values.dtype, attributes)
-        yield len(values), column
+        yield len(values), *StoredArray(values, 0).make_columns([header], attributes)

@@ -19,14 +19,19 @@ from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.headers import AXIS_PATTERN, split_header
 from gyrostab.ingest.columns.stamps import names_epoch
 from gyrostab.ingest.combine import with_channels
-from gyrostab.ingest.formats.netcdf_classic import read_classic_header
 from gyrostab.ingest.formats.netcdf_logs import open_log, summarise_log
 from gyrostab.ingest.formats.netcdf_variables import (
     StoredVariable,
     open_variables,
 )
 from gyrostab.ingest.formats.recognise import make_matcher
-from gyrostab.ingest.formats.tables import Table, TableColumn, read_tables, scan_tables
+from gyrostab.ingest.formats.tables import (
+    StoredArray,
+    Table,
+    TableColumn,
+    read_tables,
+    scan_tables,
+)
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.schema import texts
 
@@ -46,8 +51,6 @@ def matches(path: Path) -> bool:
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Summarise variables, sizes, and first and last stamps."""
-    if path.is_file():
-        read_classic_header(path)
     log = open_log(path, options)
     if log is not None:
         with log:
@@ -146,9 +149,8 @@ def _holds_axes(variable: StoredVariable, options: ReadOptions) -> bool:
 def _columns_of(
     variables: Mapping[str, StoredVariable], variable: StoredVariable, dim: str
 ) -> list[TableColumn]:
-    stored = variable.dtype, variable.attributes
     if variable.dimensions == (dim,):
-        return [TableColumn.of_rows(variable.name, variable.locate(0, 0), *stored)]
+        return StoredArray(variable.values, 0).make_columns([variable.name], variable.attributes)
     if dim not in variable.dimensions or len(variable.shape) != 2:
         return []
     along = variable.dimensions.index(dim)
@@ -162,7 +164,5 @@ def _columns_of(
             for label in np.ma.getdata(variables[other_dim].values[:])
         ]
     stem = "gyro_" if variable.name.lower() in _SIGNALS else f"{variable.name}/"
-    return [
-        TableColumn.of_rows(f"{stem}{label}", variable.locate(along, place), *stored)
-        for place, label in enumerate(labels)
-    ]
+    names = [f"{stem}{label}" for label in labels]
+    return StoredArray(variable.values, along).make_columns(names, variable.attributes)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError, SchemaError, TimeError
 from gyrostab.ingest.columns.stamps import names_epoch
 from gyrostab.ingest.concat.grid import log_span
-from gyrostab.ingest.formats.netcdf_classic import read_classic_header
+from gyrostab.ingest.formats.netcdf_classic import check_classic_header
 from gyrostab.ingest.formats.netcdf_variables import with_default_fill
 from gyrostab.ingest.formats.packing import decode_variables
 from gyrostab.ingest.limits import check_declared, check_stored
@@ -46,7 +46,7 @@ def open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
     if url := find_url(path):
         return _open_remote(path, url)
     if path.is_file():
-        read_classic_header(path)  # before the library allocates what a damaged header asks for
+        check_classic_header(path)  # before the library allocates what a damaged header asks for
     content = read_attribute(path, "gyrostab_content")
     if content == "log":
         check = partial(check_declared, given=options.limits)

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib import import_module
 from itertools import islice
 from pathlib import Path
@@ -18,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, OptionError
 from gyrostab.ingest.columns.headers import FileColumn
@@ -29,7 +31,7 @@ from gyrostab.ingest.combine import concatenate, with_channels
 from gyrostab.ingest.formats.packing import Decoder, attribute_text, fold_packing
 from gyrostab.ingest.limits import check_stored
 from gyrostab.ingest.options import FileSummary, ReadOptions
-from gyrostab.store.rows import LibraryRows, Rows
+from gyrostab.store.private import library_lock
 from gyrostab.wording import list_some
 
 
@@ -44,24 +46,52 @@ class TableColumn:
     #: Type and CF attributes of stored numbers, which are packed.
     dtype: Any = None
     attributes: Mapping[str, Any] | None = None
-    parallel: bool = False  # whether several threads can read it
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "unit", str(self.unit or "").strip() or None)
-
-    @classmethod
-    def of_rows(
-        cls, name: str, rows: Rows, dtype: Any, attributes: Mapping[str, Any]
-    ) -> TableColumn:
-        """Make a column of stored numbers; the file must be open for rows of a library."""
-        unit = attribute_text(attributes.get("units"))
-        parallel = not isinstance(rows, LibraryRows)
-        return cls((name,), rows.read, unit, None, dtype, attributes, parallel)
 
     def read(self, start: int, stop: int) -> Any:
         """Return the values of rows."""
         is_function = callable(self.values)
         return self.values(start, stop) if is_function else np.asarray(self.values[start:stop])
+
+
+class StoredArray:
+    """Numbers that a library reads from an open file, in rows along the dimension `along`.
+
+    The columns of an array of two dimensions lie in the same chunks of the file, so they share what
+    was read last.
+    """
+
+    def __init__(self, values: Any, along: int):
+        self.values, self.along = values, along
+        self._span, self._block = (0, 0), np.empty((0, 0))
+
+    def make_columns(
+        self, names: Sequence[str], attributes: Mapping[str, Any]
+    ) -> list[TableColumn]:
+        """Make a column, with these CF attributes, of each place along the other dimension."""
+        unit = attribute_text(attributes.get("units"))
+        return [
+            TableColumn(
+                (name,), partial(self._read, place), unit, None, self.values.dtype, attributes
+            )
+            for place, name in enumerate(names)
+        ]
+
+    def _read(self, place: int, start: int, stop: int) -> NDArray[Any]:
+        rows = slice(start, stop)
+        if len(self.values.shape) == 1:
+            return self._read_box(rows)
+        if self._span != (start, stop):
+            every = slice(None)
+            box = (rows, every) if self.along == 0 else (every, rows)
+            self._block, self._span = self._read_box(box), (start, stop)
+        return self._block.take(place, axis=1 - self.along)
+
+    def _read_box(self, box: Any) -> NDArray[Any]:
+        with library_lock():
+            return np.asarray(self.values[box])
 
 
 @dataclass(frozen=True)
@@ -177,10 +207,9 @@ class _PlannedTables:
 
     def read(self, place: int, plan: Plan, notes: Sequence[str] = ()) -> xr.Dataset:
         """Read the columns of one table into a raw log."""
-        rows, columns = self.tables[place].rows, [self.stored[c.source] for c in plan.columns]
-        check_stored(plan.path, rows, len(columns), plan.options.limits)
-        parallel = all(column.parallel for column in columns)
-        return read_columns(plan, rows, self.fetch, notes=notes, parallel=parallel)
+        rows = self.tables[place].rows
+        check_stored(plan.path, rows, len(plan.columns), plan.options.limits)
+        return read_columns(plan, rows, self.fetch, notes=notes)
 
 
 def _leave_out_unplaced(planned: _PlannedTables) -> _PlannedTables:
