@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.store.lazy import RowSource, can_read_directly, find_source, make_dask, read_into
+from gyrostab.store.lazy import RowSource, find_source, make_dask, read_into
 
 #: An array (time), or (axis, time) with the row to read, and its runs: first sample of the grid,
 #: first of the array, length.
@@ -100,54 +100,10 @@ def place_on_grid(
 
     `rows` lists the arrays of each row of the result; where they overlap, the first value that is
     not NaN counts. A `flat` result has one dimension only; `convert` changes samples of a row in
-    place. The dask array has a source if all arrays can be read without dask; otherwise, its tasks
-    depend on those of the arrays.
+    place.
     """
     source = GridSource(rows, (size,) if flat else (len(rows), size), convert)
-    if all(map(can_read_directly, source.parts)):
-        return make_dask(source, chunk if flat else (1, chunk))
-    import dask.array as da
-
-    made = [
-        da.concatenate(
-            [
-                _chunk_of_dask(parts, begin, min(begin + chunk, size), convert)
-                for begin in range(0, size, chunk)
-            ]
-        )
-        for parts in rows
-    ]
-    return made[0] if flat else da.stack(made)
-
-
-def _chunk_of_dask(
-    parts: Sequence[PlacedArray],
-    begin: int,
-    end: int,
-    convert: Callable[[NDArray[np.float64]], None] | None,
-) -> Any:
-    """Make one chunk of one row from dask arrays, by a task that depends on theirs."""
-    import dask
-    import dask.array as da
-
-    pieces = []
-    for array, row, all_runs in parts:
-        if runs := _clip_runs(all_runs, begin, end):
-            # one slice for all runs, because each slice of a dask array takes time
-            low, high = min(run[1] for run in runs), max(run[1] + run[2] for run in runs)
-            line = da.asarray(array if array.ndim == 1 else array[row or 0])
-            pieces.append((line[low:high], np.array(runs) - [0, low, 0]))
-    placed = dask.delayed(_place_pieces, pure=False)(pieces, end - begin, convert)
-    return da.from_delayed(placed, (end - begin,), np.float64)
-
-
-def _place_pieces(
-    pieces: Sequence[tuple[NDArray[Any], NDArray[np.int64]]],
-    size: int,
-    convert: Callable[[NDArray[np.float64]], None] | None,
-) -> NDArray[np.float64]:
-    parts: list[PlacedArray] = [(values, None, runs) for values, runs in pieces]
-    return GridSource([parts], (size,), convert)[:]
+    return make_dask(source, chunk if flat else (1, chunk))
 
 
 def _group_runs(array: Any, runs: Sequence[Run]) -> Iterator[Sequence[Run]]:
