@@ -17,7 +17,6 @@ from gyrostab.errors import GyrostabError
 from gyrostab.ingest.columns.plan_roles import scan_advice
 from gyrostab.ingest.files import expand, scan_file
 from gyrostab.ingest.formats.text import read_head
-from gyrostab.ingest.grid.fill import count_present
 from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.ingest.grid.scan_pass import find_spans
@@ -273,7 +272,7 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
         "gaps": len(gap_table(log))
         if "gap_start" in log.variables
         else len(find_spans(signal.isnull().all("axis").values, 0)),
-        "missing_share": 1.0 - count_present(signal.data) / signal.size,
+        "missing_share": 1.0 - int(signal.count()) / signal.size,
         "odd": "; ".join(notes),
         "notes": tuple(notes),
         "white_noise": _measure_white_noise(log),

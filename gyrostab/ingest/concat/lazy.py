@@ -83,10 +83,6 @@ class GridSource(RowSource):
         if self.convert is not None:
             self.convert(out)
 
-    def has_samples(self, begin: int, end: int) -> bool:
-        """Whether any row has a sample in a range of the grid."""
-        return any(_clip_runs(runs, begin, end) for row in self.rows for _, _, runs in row)
-
 
 def place_on_grid(
     rows: Sequence[Sequence[PlacedArray]],

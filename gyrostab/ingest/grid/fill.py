@@ -10,12 +10,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.ingest.columns.stamps import read_stamps
-from gyrostab.ingest.concat.lazy import GridSource, place_in_memory, place_on_grid
+from gyrostab.ingest.concat.lazy import place_in_memory, place_on_grid
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS
 from gyrostab.kernels.grid.stamps import NO_STAMP, RESTART, STEP
-from gyrostab.store.lazy import find_source, read_slice
-from gyrostab.store.threads import map_in_order
+from gyrostab.store.lazy import read_slice
 from gyrostab.time.grid import grid_times
 
 #: Largest array that is held in memory instead of being computed when needed [numbers].
@@ -46,28 +45,6 @@ def rows_on_grid(
         return out
     placed = [[(rows, row if lead else None, runs)] for row in range(lead[0] if lead else 1)]
     return place_on_grid(placed, size, chunk, flat=not lead, convert=convert)
-
-
-def count_present(array: Any) -> int:
-    """Count the samples of an array on the grid that are not NaN, without chunks in gaps.
-
-    Examples
-    --------
-    >>> count_present(np.array([[1.0, np.nan, 2.0]]))
-    2
-    """
-    source = find_source(array)
-    size = array.shape[-1]
-    spans = [
-        (begin, min(begin + BLOCK_ROWS, size))
-        for begin in range(0, size, BLOCK_ROWS)
-        if not isinstance(source, GridSource) or source.has_samples(begin, begin + BLOCK_ROWS)
-    ]
-
-    def count(ends: tuple[int, int]) -> int:
-        return int(np.count_nonzero(~np.isnan(read_slice(array, *ends))))
-
-    return sum(map_in_order(count, spans))
 
 
 def samples_of(placement: Placement, rows: NDArray[np.int64]) -> NDArray[np.int64]:

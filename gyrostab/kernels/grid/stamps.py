@@ -46,7 +46,6 @@ OPEN_RUN = slice(_RUN_GRID, _RUN_LENGTH + 1)
 _RING = 1 << 14
 _GAIN = 0.05  # of the phase: it follows the clock's course and not the jitter of single stamps
 _UNIT = 1e-9  # samples, of the phase in the state
-_NEAR = 1e-9  # samples, to the middle between two, where only the division tells which is nearer
 
 
 def new_state() -> tuple[np.ndarray, np.ndarray]:
@@ -83,7 +82,6 @@ def track(stamps, period, gain, longest):  # type: ignore[no-untyped-def]
     count = np.zeros(n, dtype=np.int64)
     piece = np.zeros(n, dtype=np.int64)
     phase = 0.0  # of the latest sample, behind its stamp [ns]
-    low, high = (0.5 + _NEAR) * period, (1.5 - _NEAR) * period
     for i in range(1, n):
         step = float(stamps[i] - stamps[i - 1])
         piece[i] = piece[i - 1]
@@ -92,11 +90,6 @@ def track(stamps, period, gain, longest):  # type: ignore[no-untyped-def]
             phase = 0.0
             continue
         moved = step + phase
-        # nearly always one sample; the next stamp shows it without a division
-        if low < moved < high:
-            count[i] = count[i - 1] + 1
-            phase = (1.0 - gain) * (moved - period)
-            continue
         k = int(np.rint(moved / period))
         count[i] = count[i - 1] + k
         phase = (1.0 - gain) * (moved - k * period)
@@ -302,34 +295,12 @@ def _note_event(events, n, cause, sample, row, before, stamp):  # type: ignore[n
 
 
 @njit(**INNER)
-def _skip_even_rows(rows, stamps, j, n, period, expected, row, stamp0):  # type: ignore[no-untyped-def]
-    """Find the first row from j on that does not follow the last one at the `expected` stamp.
-
-    These rows leave the phase at zero, so that none depends on the one before.
-    """
-    first = j
-    while (
-        j < n
-        and rows[j] == row + 1 + j - first
-        and (stamps[j] - stamp0) / period == expected + j - first
-    ):
-        j += 1
-    return j
-
-
-@njit(**INNER)
 def _on_time(rows, stamps, j, n, period, hold, state, ring):  # type: ignore[no-untyped-def]
     """Place rows while each follows the last one on time; returns the first that does not."""
     head, row, latest, phase = state[_HEAD], state[_ROW], state[_LATEST], state[_PHASE]
     grid0, stamp0, begin = state[_GRID0], state[_STAMP0], j
     if not state[STARTED] or state[_PENDING]:
         return j
-    if phase == 0:
-        j = _skip_even_rows(rows, stamps, j, n, period, head + 1 - grid0, row, stamp0)
-        for g in range(max(begin, j - len(ring)), j):
-            ring[(head + 1 + g - begin) & (len(ring) - 1)] = True
-        if j > begin:
-            head, row, latest = head + j - begin, row + j - begin, max(latest, stamps[j - 1])
     while j < n and rows[j] == row + 1 and stamps[j] != NO_STAMP:
         ahead = grid0 - phase * _UNIT + (stamps[j] - stamp0) / period - (head + 1)
         if abs(ahead) > 0.5 or abs(phase * _UNIT) > hold:
