@@ -27,10 +27,7 @@ from gyrostab.store.cf import from_disk
 from gyrostab.store.hdf5_heaps import check_global_heaps
 from gyrostab.store.read import open_stored
 from gyrostab.store.remote import find_url
-from gyrostab.time.grid import grid_times, time_coordinate
-from gyrostab.time.stamps import to_nanoseconds
 
-CHECKED_BLOCKS = 33
 #: Options to open a file with xarray; numbers and stamps are decoded when they are read.
 _UNDECODED: dict[str, Any] = {
     "chunks": None,
@@ -67,11 +64,8 @@ def open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
     log.set_close(regular.close)
     check_stored(path, log.sizes.get("time", 0), log.sizes.get("axis", 1), options.limits)
     try:
-        return _with_uniform_time(log)
-    except SchemaError as error:
-        raise SchemaError(f"{path.name}: {error}") from error
+        return _make_uniform(path, log)
     except TimeError:
-        log.close()
         return None  # its rows are placed by their stamps, like those of other files
 
 
@@ -98,7 +92,6 @@ def _as_in_memory(path: Path, log: xr.Dataset) -> xr.Dataset:
         axis=_read_labels(path, log["axis"]) if log["axis"].ndim else str(log["axis"].values)
     )
     log.attrs = decode_attributes(log.attrs)
-    log.attrs.setdefault("source_files", [path.name])
     return log
 
 
@@ -159,39 +152,17 @@ def _read_labels(path: Path, labels: xr.DataArray) -> NDArray[np.str_]:
 
 def _open_own(path: Path, stored: xr.Dataset) -> xr.Dataset:
     """Open a log that gyrostab wrote."""
-    log = from_disk(stored, path.name)
+    return _make_uniform(path, from_disk(stored, path.name))
+
+
+def _make_uniform(path: Path, log: xr.Dataset) -> xr.Dataset:
     try:
         log = as_uniform(log)
-    except SchemaError as error:
+    except (SchemaError, TimeError) as error:
         log.close()
-        raise SchemaError(f"{path.name}: {error}") from error
+        raise type(error)(f"{path.name}: {error}") from error
     log.attrs.setdefault("source_files", [path.name])
     return log
-
-
-def _with_uniform_time(log: xr.Dataset) -> xr.Dataset:
-    """Return the log on a computed time axis; raise `TimeError` if its stamps are not uniform.
-
-    Stamps that agree with the declared rate in `CHECKED_BLOCKS` blocks are not read in full,
-    because a lost or doubled sample shifts every stamp after it.
-    """
-    rate, size = float(log.attrs["sampling_rate_hz"]), log.sizes["time"]
-    stored = log["time"].variable
-
-    def stamps(start: int, stop: int) -> Any:
-        return to_nanoseconds(stored[start:stop].values)
-
-    if size > CHECKED_BLOCKS * 1024 and np.isfinite(rate) and rate > 0:
-        begin = int(stamps(0, 1)[0])
-        for first in np.unique(np.linspace(0, size - 1024, CHECKED_BLOCKS).astype(int)):
-            block = stamps(int(first), int(first) + 1024)
-            if np.any(
-                np.abs(block - grid_times(begin, rate, np.arange(first, first + len(block)))) > 1000
-            ):
-                break
-        else:
-            log = log.drop_vars("time").assign_coords(time_coordinate(begin, rate, size))
-    return as_uniform(log)
 
 
 def summarise_log(path: Path, log: xr.Dataset) -> FileSummary:
