@@ -396,6 +396,17 @@ def test_plain_hdf5_with_units_as_attributes(tmp_path: Path) -> None:
     assert scan_file(path).format == "hdf5"
 
 
+def test_hdf5_with_a_filter_of_netcdf_is_read(tmp_path: Path) -> None:
+    with netCDF4.Dataset(tmp_path / "log.nc", "w") as file:
+        file.createDimension("time", 500)
+        for name, unit in (("time", "s"), ("gyro_x", "deg/h")):
+            variable = file.createVariable(name, "f8", ("time",), compression="zstd")
+            variable.units = unit
+            variable[:] = np.arange(500) / 100
+    raw = read_log((tmp_path / "log.nc").rename(tmp_path / "log.h5"))
+    assert raw.rate.values[0, -1] == 4.99
+
+
 def test_matlab_file_without_numbers_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "words.mat"
     savemat(path, {"note": "hello", "scalar": 4.0})

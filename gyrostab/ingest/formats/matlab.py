@@ -7,10 +7,12 @@ are variables of tables and timetables, which the library mat-io reads.
 from __future__ import annotations
 
 import math
+import os
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -203,6 +205,7 @@ def _find_hdf_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterat
     import h5py
 
     check_global_heaps(path)
+    _add_filters()
     file = stack.enter_context(h5py.File(path, "r"))
     arrays: list[tuple[str, Any]] = []
 
@@ -224,6 +227,15 @@ def _find_hdf_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterat
 
     file.visititems(visit)
     yield from arrays
+
+
+@cache
+def _add_filters() -> None:
+    """Let h5py find the filters that netCDF4 brings with it, such as zstd."""
+    import h5py
+    import netCDF4
+
+    h5py.h5pl.append(os.fsencode(Path(netCDF4.__file__).with_name("plugins")))
 
 
 def _read_tables(path: Path, objects: list[str]) -> Iterator[tuple[int, TableColumn]]:
