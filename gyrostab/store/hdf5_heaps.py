@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -29,15 +29,13 @@ _BLOCK_BYTES = 1 << 20
 _MAX_OBJECTS = 1 << 16  # their numbers have 16 bits
 
 
-def check_global_heaps(path: Path, *, skip: Sequence[tuple[int, int]] = ()) -> None:
+def check_global_heaps(path: Path) -> None:
     """Check that every global heap near the ends of a file can be walked through.
 
     Parameters
     ----------
     path : Path
         The file. Files that are not HDF5, or whose lengths are not of 8 bytes, pass.
-    skip : sequence of (int, int)
-        First byte and size of values that are not searched, in the order of the file.
 
     Raises
     ------
@@ -48,7 +46,7 @@ def check_global_heaps(path: Path, *, skip: Sequence[tuple[int, int]] = ()) -> N
         size = os.fstat(file.fileno()).st_size
         if _find_size_of_lengths(file, size) != 8:
             return
-        for begin in _find_collections(file, size, skip):
+        for begin in _find_collections(file, size):
             if not _is_finite(file, begin):
                 problem = f"this HDF5 file is damaged (global heap at byte {begin})"
                 raise FormatError(f"{path.name}: {problem}; copy it again")
@@ -66,11 +64,10 @@ def _find_size_of_lengths(file: BinaryIO, size: int) -> int:
     return 0
 
 
-def _find_collections(file: BinaryIO, size: int, skip: Sequence[tuple[int, int]]) -> Iterator[int]:
+def _find_collections(file: BinaryIO, size: int) -> Iterator[int]:
     """Yield the places of the collections at both ends of the file."""
     rear = max(_SEARCHED_BYTES, size - _SEARCHED_BYTES)
-    ends = [(0, min(size, _SEARCHED_BYTES)), (rear, size)]
-    for begin, stop in ends if not skip else _find_rest(size, skip):
+    for begin, stop in ((0, min(size, _SEARCHED_BYTES)), (rear, size)):
         for block in range(begin, stop, _BLOCK_BYTES):
             file.seek(block)
             # blocks overlap by all but one byte of a signature
@@ -79,15 +76,6 @@ def _find_collections(file: BinaryIO, size: int, skip: Sequence[tuple[int, int]]
             while at >= 0:
                 yield block + at
                 at = data.find(_COLLECTION, at + 1)
-
-
-def _find_rest(size: int, skip: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int]]:
-    """Yield begin and end of what lies between the parts of a file to skip."""
-    at = 0
-    for begin, length in [*skip, (size, 0)]:
-        if begin > at:
-            yield at, begin
-        at = max(at, begin + length)
 
 
 def _is_finite(file: BinaryIO, begin: int) -> bool:

@@ -25,7 +25,7 @@ from gyrostab.store.blosc_chunks import check_blosc_chunks
 from gyrostab.store.hdf5_heaps import check_global_heaps
 from gyrostab.store.layout import ChunkCache, ChunkDamage, is_readable, read_chunk
 from gyrostab.store.lazy import FileVariable, RowSource, make_dask
-from gyrostab.store.private import close_function, library_lock
+from gyrostab.store.private import close_function
 from gyrostab.store.remote import ROOT_METADATA, find_kind, find_url, reaching
 from gyrostab.store.times import decode_stamps, index_dim, parse_time_grids, replace_stamps
 from gyrostab.time.grid import grid_times
@@ -91,7 +91,7 @@ def _open_dataset(
     check: Callable[[Path, Mapping[Any, xr.Variable]], None] | None,
 ) -> xr.Dataset:
     if path.is_file():
-        check_global_heaps(path, skip=_find_data(path))
+        check_global_heaps(path)
     elif not any((path / name).exists() for name in ROOT_METADATA):
         inside = sorted(item.name for item in path.iterdir() if item.suffix in (".nc", ".zarr"))
         raise DamageError(
@@ -125,21 +125,6 @@ def _open_dataset(
         # opened again when needed: an archive of any length keeps only a few files open
         stored.close()
     return opened
-
-
-def _find_data(path: Path) -> list[tuple[int, int]]:
-    """Find first byte and size of the chunks in a NetCDF file; none in one that is damaged."""
-    import h5py
-
-    chunks: list[tuple[int, int]] = []
-    try:
-        with library_lock(), h5py.File(path, "r") as file:
-            for variable in file.values():
-                if variable.chunks:
-                    variable.id.chunk_iter(lambda chunk: chunks.append(chunk[2:]))
-    except Exception:  # the library raises errors of many kinds; the caller says what is wrong
-        return []
-    return sorted(chunks)
 
 
 def _make_variables_lazy(
