@@ -273,4 +273,5 @@ def _make_column(
         values, unit = values.astype("timedelta64[ns]").view(np.int64), "ns"
     if values.dtype.kind in "biuf":
         attributes = {"units": unit} if unit else {}
-        yield len(values), *StoredArray(values, 0).make_columns([header], attributes)
+        [column] = StoredArray(values, 0).make_columns([header], attributes)
+        yield len(values), column

@@ -88,7 +88,8 @@ class _Header:
 
     def check(self) -> None:
         """Check the lists, and the last byte of each variable."""
-        records, lengths = self.count(), []
+        records = self.count()
+        lengths: list[int] = []
         for _ in self.items(_DIMENSION):
             self.name()
             lengths.append(self.count())
@@ -123,7 +124,8 @@ def check_classic_header(path: Path) -> None:
         if data[:3] != b"CDF" or data[3:4] not in (b"\1", b"\2", b"\5"):
             return
         try:
-            return _Header(path, data, size).check()
+            _Header(path, data, size).check()
+            return
         except FormatError:
             if size <= head_bytes or head_bytes == _HEAD_BYTES[-1]:
                 raise

@@ -65,7 +65,7 @@ class StoredArray:
 
     def __init__(self, values: Any, along: int):
         self.values, self.along = values, along
-        self._span, self._block = (0, 0), np.empty((0, 0))
+        self._span, self._block = (-1, -1), np.empty((0, 0))
 
     def make_columns(
         self, names: Sequence[str], attributes: Mapping[str, Any]
