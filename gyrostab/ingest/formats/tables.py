@@ -65,7 +65,7 @@ class StoredArray:
 
     def __init__(self, values: Any, along: int):
         self.values, self.along = values, along
-        self._span, self._block = (-1, -1), np.empty((0, 0))
+        self._held: tuple[tuple[int, int], NDArray[Any]] = (-1, -1), np.empty((0, 0))
 
     def make_columns(
         self, names: Sequence[str], attributes: Mapping[str, Any]
@@ -83,11 +83,12 @@ class StoredArray:
         rows = slice(start, stop)
         if len(self.values.shape) == 1:
             return self._read_box(rows)
-        if self._span != (start, stop):
+        held = self._held  # one object, so that threads cannot mix the rows of two blocks
+        if held[0] != (start, stop):
             every = slice(None)
             box = (rows, every) if self.along == 0 else (every, rows)
-            self._block, self._span = self._read_box(box), (start, stop)
-        return self._block.take(place, axis=1 - self.along)
+            held = self._held = (start, stop), self._read_box(box)
+        return np.asarray(held[1].take(place, axis=1 - self.along))
 
     def _read_box(self, box: Any) -> NDArray[Any]:
         with library_lock():
