@@ -6,6 +6,8 @@ by one. After that, all work is on runs of present samples.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -210,9 +212,11 @@ def integrate_two(x, offset, starts, stops, high, low):  # type: ignore[no-untyp
         low[done + 1 : starts[r] + 1] = remainder
         for i in range(starts[r], stops[r]):
             value = x[i] - offset
+            part = value - x[i]
+            small = (x[i] - (value - part)) - (offset + part)
             new = total + value
             part = new - total
-            remainder += (total - (new - part)) + (value - part)
+            remainder += ((total - (new - part)) + (value - part)) + small
             total = new
             high[i + 1] = total
             low[i + 1] = remainder
@@ -233,6 +237,21 @@ def sum_two(high, low):  # type: ignore[no-untyped-def]
         part = new - total
         remainder += ((total - (new - part)) + (value - part)) + small
         total = new
+
+
+@njit(**KERNEL)
+def align_two(high, low):  # type: ignore[no-untyped-def]
+    """Round `high` to a grid that keeps its third differences exact; `low` takes the rest.
+
+    With ``max(|high|) < 2**e``, the grid is ``2**(e - 50)``: a third difference is below
+    ``8 * 2**e``, thus a whole number of at most 53 bits in units of the grid.
+    """
+    # The spacing of the doubles near this number is that of the grid.
+    shift = math.ldexp(6.0, math.frexp(_find_largest(high))[1])
+    for i in range(high.size):
+        rounded = (high[i] + shift) - shift
+        low[i] += high[i] - rounded
+        high[i] = rounded
 
 
 def needs_two_doubles(largest: float, x: NDArray[np.generic]) -> bool:

@@ -96,8 +96,7 @@ def _third_differences_two(high, low, a, b, k, out):  # type: ignore[no-untyped-
     l0, l1, l2 = low[a:b], low[a + k : b + k], low[a + 2 * k : b + 2 * k]
     h3, l3 = high[a + 3 * k : b + 3 * k], low[a + 3 * k : b + 3 * k]
     for i in range(h0.size):
-        middle = h2[i] - h1[i]
-        high_part = ((h3[i] - h2[i]) - middle) - (middle - (h1[i] - h0[i]))
+        high_part = (h3[i] - h0[i]) - 3.0 * (h2[i] - h1[i])
         out[i] = high_part + ((l3[i] - l0[i]) - 3.0 * (l2[i] - l1[i]))
 
 

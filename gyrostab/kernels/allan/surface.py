@@ -24,6 +24,7 @@ from gyrostab.kernels.allan.clusters import (
     pack_mask,
 )
 from gyrostab.kernels.allan.integrate import (
+    align_two,
     block_sums,
     first_present,
     integrate,
@@ -215,13 +216,14 @@ def _interval_blocks(work: _Work, cut: Cut, blocks: Floats) -> None:
     if unit.angle:
         high[:angles], low[:angles] = _line_removed(work), 0.0
     else:
-        largest = integrate(x, offset, starts, stops, high[:angles])
-        precise = summed or needs_two_doubles(largest, x)
+        precise = summed or needs_two_doubles(integrate(x, offset, starts, stops, high[:angles]), x)
         if precise:
             integrate_two(x, offset, starts, stops, high[:angles], low[:angles])
     if summed:
         high[angles] = low[angles] = 0.0
         sum_two(high[: angles + 1], low[: angles + 1])
+    if precise:
+        align_two(high[: angles + summed], low[: angles + summed])
     for part in (high, low) if precise else (high,):
         thin_pyramid(part, angles + summed, int(shifts[-1]), 0, angles + summed)
     spans = unit.spans + unit.angle  # of angles instead of samples
