@@ -178,8 +178,15 @@ class _FileArray(BackendArray):
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
         """Read the values of an indexer of xarray."""
+        # xarray before 2026.2 writes the end of a reversed slice as -1, the last value
+        parts = [
+            slice(part.start, None, part.step)
+            if isinstance(part, slice) and part.stop == -1 and part.step < 0
+            else part
+            for part in key.tuple
+        ]
         return indexing.explicit_indexing_adapter(
-            key, self.shape, indexing.IndexingSupport.BASIC, self._read_key
+            type(key)(tuple(parts)), self.shape, indexing.IndexingSupport.BASIC, self._read_key
         )
 
     def _read_key(self, key: tuple[Any, ...]) -> NDArray[Any]:
