@@ -5,13 +5,16 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import IO, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from gyrostab.ingest.formats.matlab import keep_pandas_options
 from gyrostab.ingest.formats.messages import crc32_mpeg2
 
 ROWS, RATE = 60, 50.0
@@ -264,15 +267,19 @@ def write_kvh(place: Path) -> Made:
     return Made(path, "binary", {"rate": RATE, "epoch": str(START), "unit": units})
 
 
+def import_matio() -> ModuleType:
+    """Import mat-io without the option of pandas that it sets for all tests that follow."""
+    with keep_pandas_options():
+        return import_module("matio")
+
+
 def write_matlab(place: Path, version: str) -> Made:
     """Write a timetable by row times."""
-    from matio import save_to_mat
-
     columns = {f"gyro_{axis}": values * 1e-3 for axis, values in zip("xyz", RATES, strict=True)}
     index = pd.DatetimeIndex(STAMPS, name="Time")
     table = pd.DataFrame({**columns, "temperature": TEMPERATURE}, index=index)
     path = place / "run.mat"
-    save_to_mat(str(path), {"TT": table}, version=version)
+    import_matio().save_to_mat(str(path), {"TT": table}, version=version)
     return Made(path, "matlab", {"unit": {"gyro": "deg/s", "temperature": "degC"}})
 
 

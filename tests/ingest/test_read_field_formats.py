@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from gyrostab.errors import FormatError, GyrostabError, MissingUnitError, OptionError
@@ -23,6 +24,7 @@ from tests.ingest.field_files import (
     TEMPERATURE,
     WRITERS,
     Made,
+    import_matio,
     kvh_message,
     stim_message,
     write_wits0,
@@ -265,11 +267,22 @@ def test_topics_of_an_unknown_type_are_left_out_of_a_bag(tmp_path: Path) -> None
 
 
 def test_timetables_of_matlab_are_read_next_to_vectors(tmp_path: Path) -> None:
-    from matio import load_from_mat, save_to_mat
-
-    made = WRITERS["timetable5"](tmp_path)
-    content = load_from_mat(str(made.path))
-    save_to_mat(str(made.path), {"TT": content["TT"], "bias": np.arange(3.0)[None]}, version="v7")
+    matio, made = import_matio(), WRITERS["timetable5"](tmp_path)
+    content = matio.load_from_mat(str(made.path))
+    matio.save_to_mat(
+        str(made.path), {"TT": content["TT"], "bias": np.arange(3.0)[None]}, version="v7"
+    )
     raw = read_log(made.path, **made.options)
     assert np.array_equal(raw.time.values, STAMPS)
     assert any("bias" in note for note in raw.attrs["notes"])
+
+
+def test_tables_of_matlab_are_read_where_pandas_lacks_the_option_of_mat_io(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(option: str) -> None:
+        raise pd.errors.OptionError(option)
+
+    made = WRITERS["timetable5"](tmp_path)
+    monkeypatch.setattr(pd, "get_option", refuse)  # as pandas 4 is to do
+    assert read_log(made.path, **made.options).sizes["row"] == ROWS

@@ -10,7 +10,7 @@ import math
 import os
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -238,6 +238,17 @@ def _add_filters() -> None:
     h5py.h5pl.append(os.fsencode(Path(netCDF4.__file__).with_name("plugins")))
 
 
+@contextmanager
+def keep_pandas_options() -> Iterator[None]:
+    """Set back the option of pandas that mat-io sets when it is imported; ignore warnings."""
+    option = "future.infer_string"
+    with warnings.catch_warnings(), ExitStack() as stack:
+        warnings.simplefilter("ignore")
+        with suppress(pd.errors.OptionError):  # pandas 4 does not have it
+            stack.enter_context(pd.option_context(option, pd.get_option(option)))
+        yield
+
+
 def _read_tables(path: Path, objects: list[str]) -> Iterator[tuple[int, TableColumn]]:
     """Yield length and column for all tables and timetables; row times are columns too.
 
@@ -245,12 +256,9 @@ def _read_tables(path: Path, objects: list[str]) -> Iterator[tuple[int, TableCol
     """
     if not any(text.startswith(("a table", "a timetable")) for text in objects):
         return
-    option = "future.infer_string"  # of all of pandas, and mat-io sets it
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with pd.option_context(option, pd.get_option(option)):
-            matio = library("matio", path, extra="matlab")
-            content = matio.load_from_mat(str(path), add_table_attrs=True)
+    with keep_pandas_options():
+        matio = library("matio", path, extra="matlab")
+        content = matio.load_from_mat(str(path), add_table_attrs=True)
     for name, table in content.items():
         if not isinstance(table, pd.DataFrame):
             continue
