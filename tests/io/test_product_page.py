@@ -137,10 +137,11 @@ def test_the_python_reader(folder, text):
 def test_the_table_for_excel(folder, text, monkeypatch):
     monkeypatch.chdir(folder)
     exec(re.search(r"^    (product = .*\n)    (product\[.*)$", text, re.M).expand(r"\1\2"))
-    table = pd.read_csv("coefficients.csv")
+    # numbers are read by Python, as pandas 2 rounds those that it reads
+    table = pd.read_csv("coefficients.csv", dtype={"N": str})
     product = gyrostab.open_product("product.nc")
     assert len(table) == product.sizes["axis"] * product.sizes["time"]
-    np.testing.assert_array_equal(table["N"], product["N"].values.ravel())
+    np.testing.assert_array_equal(table["N"].astype(float), product["N"].values.ravel())
 
 
 @pytest.mark.parametrize(
