@@ -326,7 +326,10 @@ def _fit_windows(
             for cell in cells
         ]
         fitted = da.map_blocks(
-            block, *chunked, chunks=(*chunked[0].chunks[:2], (width,)), dtype=np.float64
+            block,
+            *chunked,
+            chunks=(*chunked[0].chunks[:2], (width,)),
+            meta=np.empty((0, 0, 0)),  # without it, dask calls the function with empty arrays
         )
         if not lazy:
             fitted = fitted.compute()

@@ -245,9 +245,8 @@ def find_trends(table: pd.DataFrame, effects: pd.DataFrame) -> pd.DataFrame:
         quantity=effects["effect"] + " " + effects["parameter"] + " " + effects["axes"]
         + " [" + effects["unit"] + "]"
     ).drop_duplicates(["run", "quantity"], keep=False)  # fmt: skip
-    points = pd.concat(
-        [done.melt("run", terms, "quantity"), sizes[["run", "quantity", "value"]]]
-    ).dropna()
+    parts = [done.melt("run", terms, "quantity"), sizes[["run", "quantity", "value"]]]
+    points = pd.concat([part.astype({"value": float}).dropna() for part in parts])
     start = pd.to_datetime(done["start"])
     drivers = {"age [d]": (start - start.min()).dt.total_seconds() / DAY}
     drivers |= {name: done[name] for name in columns if name.endswith(" [degC]")}

@@ -229,9 +229,8 @@ def _create_variable(
             file.createDimension(str(dim), size)
     options = dict(encoding)
     fill = variable.attrs.get("_FillValue", options.pop("_FillValue", None))
-    made = file.createVariable(
-        name, variable.dtype, _dim_names(variable), fill_value=fill, **options
-    )
+    kind = variable.dtype.newbyteorder("=")
+    made = file.createVariable(name, kind, _dim_names(variable), fill_value=fill, **options)
     made.setncatts({key: value for key, value in variable.attrs.items() if key != "_FillValue"})
 
 

@@ -475,6 +475,7 @@ def test_chunks_that_threads_compress_are_those_of_the_library(tmp_path, monkeyp
 
 @pytest.mark.parametrize("kind", [">f8", ">f4", ">i2", ">i4"])
 @pytest.mark.parametrize("form", ["nc", "zarr"])
+@pytest.mark.filterwarnings("error:endian-ness")
 def test_large_data_of_the_other_byte_order_come_back(tmp_path, kind, form):
     writer = to_netcdf if form == "nc" else to_zarr
     values = np.arange(40_000).astype(kind)

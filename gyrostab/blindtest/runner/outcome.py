@@ -203,7 +203,8 @@ def _thin_out(risk: pd.DataFrame) -> pd.DataFrame:
 
 def _select_headlines(rows: Sequence[Mapping[str, Any]], table: pd.DataFrame) -> pd.DataFrame:
     """Select the main lines of all tables."""
-    lines = pd.concat([table, counterpart_table(rows), injection_table(rows)])
+    tables = [table, counterpart_table(rows), injection_table(rows)]
+    lines = pd.concat([lines for lines in tables if len(lines)])
     return lines[lines["quantity"].isin(_HEADLINES)]
 
 
