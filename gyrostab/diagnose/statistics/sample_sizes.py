@@ -79,12 +79,28 @@ def estimate_from_counts(
         return {"width": (width, error, width + error * math.log(INTERVAL_TAILS[0]), width)}
     if effect == "dead_zone":
         width, narrow, wide = (
-            spread * float(ndtri(0.5 + fraction / 2.0))
-            for fraction in (share, low_share, high_share)
+            spread * _zone_width(fraction) for fraction in (share, low_share, high_share)
         )
-        slope = spread / (2.0 * float(_normal_density(width / spread)))
-        return {"width": (width, slope * error / samples, narrow, wide)}
+        return {"width": (width, (wide - narrow) / (2.0 * NORMAL_95), narrow, wide)}
     return {}
+
+
+def _zone_width(share: float) -> float:
+    """Return the half-width of a zone that holds a share of the samples, in their scatter.
+
+    Samples are normal, and those outside the zone are reduced by its width, which reduces their
+    scatter.
+
+    Examples
+    --------
+    >>> samples = np.random.default_rng(1).standard_normal(100_000)
+    >>> samples -= np.clip(samples, -0.5, 0.5)
+    >>> round(float(_zone_width(np.mean(samples == 0.0)) * samples.std()), 2)
+    0.5
+    """
+    edge = float(ndtri(0.5 + share / 2.0))  # in the scatter without the zone
+    outside = (1.0 + edge**2) * float(ndtr(-edge)) - edge * float(_normal_density(edge))
+    return edge / math.sqrt(2.0 * outside)
 
 
 def has_empty_zone(blocks: xr.Dataset, axis: str) -> bool:
