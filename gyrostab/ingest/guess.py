@@ -18,7 +18,6 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from gyrostab.ingest.columns.dates import DAY_FIRST, EITHER_FIRST, MONTH_FIRST
 from gyrostab.ingest.columns.headers import (
     AXIS_PATTERN,
     INCREMENT_PATTERN,
@@ -30,6 +29,7 @@ from gyrostab.ingest.columns.headers import (
 from gyrostab.ingest.columns.stamps import parse_time_unit
 from gyrostab.ingest.guess_unit import given_unit, guess_unit, name_unit
 from gyrostab.ingest.inspect import ColumnInspection, FileInspection
+from gyrostab.time.durations import format_duration
 from gyrostab.time.grid import MAX_RATE_HZ
 
 #: Number of a column, in its name.
@@ -115,11 +115,12 @@ def guess_columns(
     time, time_unit = (
         (None, None) if inspection.time is not None else _guess_time(inspection, reasons)
     )
-    if inspection.time is not None and inspection.time.unit == EITHER_FIRST:
-        time_unit = DAY_FIRST
+    if inspection.date_spans_s:
+        spans = sorted(inspection.date_spans_s.items(), key=lambda span: span[1])
+        (time_unit, span_s), (other, other_span_s) = spans
         warnings.append(
-            f"--unit time={DAY_FIRST} is an assumption, because the dates can be read in two ways: "
-            f"use {MONTH_FIRST} instead if the month comes first"
+            f"--unit time={time_unit} is an assumption, because the dates can be read in two ways: "
+            f"use {other} if {_compare_spans(span_s, other_span_s)}"
         )
     assumed = None
     if inspection.time is None and time is None and rate is None:
@@ -167,6 +168,16 @@ def guess_columns(
         sampling,
         guessed_kind,
     )
+
+
+def _compare_spans(span_s: float, other_span_s: float) -> str:
+    """Say what follows for a file from the other order of its dates."""
+    if span_s == other_span_s:
+        return "that is their order"
+    if math.isinf(other_span_s):
+        return "most of them are no dates"
+    lengths = (format_duration(seconds, " ") for seconds in (other_span_s, span_s))
+    return "the file lasts {}, not {}".format(*lengths)
 
 
 def _unit_seconds(unit: str | None) -> float:

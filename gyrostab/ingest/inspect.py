@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, GyrostabError
+from gyrostab.ingest.columns.dates import DAY_FIRST, EITHER_FIRST, MONTH_FIRST
 from gyrostab.ingest.files import read_file, scan_file
 from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
 
@@ -57,7 +58,11 @@ class ColumnInspection(ColumnSummary):
 
 @dataclass(frozen=True)
 class FileInspection:
-    """Inspection of a file: summary, columns, number of rows, and time column if known."""
+    """Inspection of a file: summary, columns, number of rows, and time column if known.
+
+    `date_spans_s` are the lengths of the file by the order of its dates, if they can be read in two
+    ways.
+    """
 
     summary: FileSummary
     columns: tuple[ColumnInspection, ...]
@@ -65,6 +70,7 @@ class FileInspection:
     time: ColumnSummary | None
     rate_hz: float
     notes: tuple[str, ...] = ()
+    date_spans_s: dict[str, float] = field(default_factory=dict)
 
 
 def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileInspection:
@@ -104,6 +110,13 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
         channel=(),
         kind=None,
     )
+    spans: dict[str, float] = {}
+    if time is not None and time.unit == EITHER_FIRST:
+        spans = {
+            order: _span_s(path, replace(reading, unit={"time": order}))
+            for order in (DAY_FIRST, MONTH_FIRST)
+        }
+        reading = replace(reading, unit={"time": min(spans, key=spans.__getitem__)})
     try:
         log = read_file(path, reading)
     except GyrostabError as error:
@@ -118,7 +131,16 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
     further = len(data_columns) - MAX_COLUMNS
     notes = [f"{further} further columns are not inspected"] if further > 0 else []
     rows = max((log.sizes[str(log[name].dims[0])] for name in names if name in log), default=0)
-    return FileInspection(summary, tuple(columns), rows, time, rates["row"], tuple(notes))
+    return FileInspection(summary, tuple(columns), rows, time, rates["row"], tuple(notes), spans)
+
+
+def _span_s(path: Path, options: ReadOptions) -> float:
+    """Return the time from the first to the last stamp; infinite if most of them are no dates."""
+    try:
+        stamps = np.asarray(read_file(path, options)["time"].values)
+    except FormatError:
+        return math.inf
+    return float((np.nanmax(stamps) - np.nanmin(stamps)) / np.timedelta64(1, "s"))
 
 
 def _row_rate(log: xr.Dataset, dim: str) -> float:

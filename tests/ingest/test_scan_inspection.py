@@ -304,6 +304,23 @@ def test_dates_of_two_meanings_get_an_order_to_be_checked(
     assert call(*words, "--quiet-progress") == 0
 
 
+@pytest.mark.parametrize(
+    ("first", "order"),
+    [("2026-03-07", "%m/%d/%Y"), ("2026-03-12", "%m/%d/%Y"), ("2026-07-03", "%d/%m/%Y")],
+)
+def test_order_of_dates_is_guessed_from_the_length_of_the_file(
+    tmp_path: Path, monkeypatch, capsys, first: str, order: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    stamps = pd.date_range(f"{first} 23:59:50", periods=ROWS, freq="20ms")
+    rows = [f"{stamp:{order} %H:%M:%S.%f},{x}" for stamp, x in zip(stamps, GX, strict=True)]
+    (tmp_path / "log.csv").write_text("\n".join(["time,gyro_x [deg/s]", *rows, ""]))
+    assert call("scan", "log.csv") == 0
+    words = {"%d": "DD", "%m": "MM", "%Y": "YYYY"}
+    expected = "/".join(words[part] for part in order.split("/"))
+    assert f"time={expected}" in next_command(capsys.readouterr().out)
+
+
 def test_unit_of_the_time_is_used_in_the_inspection(tmp_path: Path, capsys) -> None:
     path = write(tmp_path / "log.csv", {"time": TIME * 1e3, "wx": GX})
     call("scan", path, "--unit", "time=ms")
