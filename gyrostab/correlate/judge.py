@@ -21,8 +21,9 @@ LIMITS = {
     "too_few": "there are too few independent windows",
     "clusters": "{driver} differs only between segments separated by a gap",
     "one_moment": "{driver} changes mainly at one moment",
-    "no_reversal": "{driver} never reverses, so a drift or slow noise looks the same",
-    "no_plateau": "{driver} is never constant, so its effect and that of its rate of change "
+    "no_reversal": "{driver} changes mainly in one direction, so a drift or slow noise looks the "
+    "same",
+    "no_plateau": "{driver} is hardly ever constant, so its effect and that of its rate of change "
     "look alike",
     "other_channel": "another channel explains it equally well",
 }
