@@ -72,7 +72,8 @@ def _describe_problem(name: str, blocks: xr.Dataset) -> str:
     if usable_units and unit not in usable_units:
         return (
             f"its unit is {unit!r}, and effects need {' or '.join(map(repr, usable_units))}; "
-            f"give it with --unit {name}=UNIT"
+            f"give it with --unit {name}=UNIT, or in Python convert the channel and set its "
+            "attribute units"
         )
     if np.nanmax(values) == np.nanmin(values) and not _is_compared(name, blocks):
         return "it does not change"

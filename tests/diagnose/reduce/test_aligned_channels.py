@@ -251,7 +251,8 @@ def test_reason_of_an_effect_names_the_unused_channel():
             "temperature",
             "V",
             np.arange(600.0),
-            "its unit is 'V', and effects need 'degree_Celsius'",
+            "its unit is 'V', and effects need 'degree_Celsius'; give it with --unit "
+            "temperature=UNIT, or in Python convert the channel and set its attribute units",
         ),
         (
             "humidity",
