@@ -120,7 +120,7 @@ def guess_columns(
         (time_unit, span_s), (other, other_span_s) = spans
         warnings.append(
             f"--unit time={time_unit} is an assumption, because the dates can be read in two ways: "
-            f"use {other} if {_compare_spans(span_s, other_span_s)}"
+            f"use {other} {_compare_spans(span_s, other_span_s)}"
         )
     assumed = None
     if inspection.time is None and time is None and rate is None:
@@ -173,11 +173,11 @@ def guess_columns(
 def _compare_spans(span_s: float, other_span_s: float) -> str:
     """Say what follows for a file from the other order of its dates."""
     if span_s == other_span_s:
-        return "that is their order"
+        return "if that is their order"
     if math.isinf(other_span_s):
-        return "most of them are no dates"
+        return "only if most of its stamps are wrong"
     lengths = (format_duration(seconds, " ") for seconds in (other_span_s, span_s))
-    return "the file lasts {}, not {}".format(*lengths)
+    return "if the file lasts {}, not {}".format(*lengths)
 
 
 def _unit_seconds(unit: str | None) -> float:

@@ -135,7 +135,7 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
 
 
 def _span_s(path: Path, options: ReadOptions) -> float:
-    """Return the time from the first to the last stamp; infinite if most of them are no dates."""
+    """Return the time from the first to the last stamp; infinite if most cannot be read."""
     try:
         stamps = np.asarray(read_file(path, options)["time"].values)
     except FormatError:
