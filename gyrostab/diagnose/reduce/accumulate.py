@@ -1,8 +1,9 @@
-"""Arrays of block statistics that are filled while a log is read."""
+"""Block statistics of the batches of a log, while it is read."""
 
 from __future__ import annotations
 
 from itertools import combinations
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -42,8 +43,16 @@ _GRID_BLOCKS = 64  # blocks of which samples are kept for the quantization grid;
 _GRID_SAMPLES_PER_AXIS = 2**16  # limits memory
 
 
+class _Masks(NamedTuple):
+    """What the gaps of blocks do to their powers."""
+
+    expected: Array  # (block, line): expected power of white noise
+    shape: Array  # (block, band): shapes of the gamma distributions of the powers
+    neighbours: Array  # (block,): tapered share of neighbouring pairs of samples
+
+
 class Accumulator:
-    """Block statistics of a log, filled batch by batch in order of time.
+    """Block statistics of a log, from its batches in order of time.
 
     Rows are the axes, then the channels on the log's own time stamps.
     """
@@ -54,210 +63,207 @@ class Accumulator:
         self.min_samples = max(_MIN_SPECTRUM_SHARE * length, 2)  # of a block, for its spectrum
         self.axes = log.sizes["axis"]
         self.channels = numeric_channels(log)[0]
-        rows = self.rows = self.axes + len(self.channels)
+        self.rows = self.axes + len(self.channels)
+        self.pairs = [(a, b) for a, b in combinations(range(self.rows), 2) if a < self.axes]
         self.edges = kernel.band_edges(length)
         self.weights = kernel.taper(length)
-        all_present = np.ones((1, length), bool)
-        self.full, mask, squared = kernel.gap_spectra(all_present, self.weights)
-        self.full_shape = kernel.shape_of_bands(
-            mask, squared, self.full, np.array([length]), self.edges, length
-        )[0]
-        self.full_neighbours = _neighbour_share(all_present, self.weights)[0]
-        bands = self.edges.size - 1
-        self.moments = np.full((rows, block_count, 5), np.nan)
-        self.counts = np.zeros((rows, block_count, 9), np.int64)
-        self.resent = np.zeros((self.axes, block_count, 2), np.int64)
-        self.common_zeros = np.zeros((self.axes, block_count), np.int64)
+        full = self._read_masks(np.ones((1, length), bool))
+        self.full = _Masks(full.expected, full.shape[0], full.neighbours[0])
+        self.lagged = [name for name in self.channels if name.startswith(LAGGED_CHANNEL_PREFIXES)]
+        self.batches: list[dict[str, NDArray[Any]]] = []
         self.at_once: dict[tuple[bool, ...], NDArray[np.int64]] = {
             (True,) * self.axes: np.zeros(block_count, np.int64)
         }
-        self.histogram = np.zeros((self.axes, block_count, HISTOGRAM), np.uint32)
         self.peaks: list[list[Peaks]] = [[] for _ in range(self.axes)]
-        self.power = np.full((rows, block_count, bands), np.nan)
-        self.shape = np.full((self.axes, block_count, bands), np.nan)
-        self.neighbours = np.full((self.axes, block_count), np.nan)
-        self.adjacent = np.zeros((self.axes, block_count), np.int64)
-        self.pairs = [(a, b) for a, b in combinations(range(rows), 2) if a < self.axes]
-        self.cross = np.full((len(self.pairs), block_count, bands), np.nan + 0j)
-        self.cross_shape = np.full(self.cross.shape, np.nan)
-        self.cross_neighbours = np.full(self.cross.shape[:2], np.nan)
-        self.cross_samples = np.zeros(self.cross.shape[:2], np.int64)
         self.line_sum = np.zeros((self.axes, RECORD_PARTS, kernel.ordinates(length)))
         self.line_expected = np.zeros_like(self.line_sum)
         self.line_counts = np.zeros((self.axes, RECORD_PARTS, 2))
         self.sines = SineSearch(self.axes, block_count, length, rate)
-        # sums and numbers of samples
-        self.sub_blocks = np.zeros((2, self.axes, block_count, SUB_BLOCKS))
-        self.channel_parts = {
-            name: np.full((block_count, CHANNEL_PARTS), np.nan)
-            for name in self.channels
-            if name.startswith(LAGGED_CHANNEL_PREFIXES)
-        }
         self.kept_samples: list[Array] = []
         self.gaps: list[tuple[int, int]] = []
         self.gap_begin: int | None = None
-        self.rotation = make_rotation_orders(log, length, block_count, rate)
+        self.rotation = make_rotation_orders(log, length, rate)
         self.ramp = self.channels.index("ramp") + self.axes if "ramp" in self.channels else None
         self.ramp_range = finite_range(log["ramp"].data) if self.ramp is not None else (0.0, 0.0)
         if self.ramp_range[0] >= self.ramp_range[1]:
             self.ramp = None
-        self.profile_sums = (
-            np.zeros((self.axes, block_count, RAMP_PHASE_BINS)) if self.ramp is not None else None
-        )
-        self.profile_counts = np.zeros((self.axes, block_count, RAMP_PHASE_BINS), np.int64)
-        self.ramp_turns = np.full(block_count, np.nan) if self.ramp is not None else None
+
+    def collect(self) -> dict[str, NDArray[Any]]:
+        """Return the statistics of all blocks, by name, as arrays (row, block, ...)."""
+        return {
+            name: np.concatenate([batch[name] for batch in self.batches], axis=1)
+            for name in self.batches[0]
+        }
 
     def add(self, batch: BlockBatch) -> None:
         """Add some blocks."""
-        block_range = slice(batch.first, batch.first + batch.values.shape[1])
-        present = ~np.isnan(batch.values)
-        centred = np.empty_like(batch.values)
+        values, axes, count = batch.values, self.axes, batch.values.shape[1]
+        block_range = slice(batch.first, batch.first + count)
+        present = ~np.isnan(values)
+        centred = np.empty_like(values)
+        moments = np.full((self.rows, count, 5), np.nan)
+        counts = np.zeros((self.rows, count, 9), np.int64)
+        resent = np.zeros((axes, count, 2), np.int64)
+        histogram = np.zeros((axes, count, HISTOGRAM), np.uint32)
         for row in range(self.rows):
-            kernel.block_samples(
-                batch.values[row],
-                centred[row],
-                self.moments[row, block_range],
-                self.counts[row, block_range],
-            )
-            if row < self.axes:
-                peaks = find_peaks(batch.values[row], self.histogram[row, block_range])
-                is_sent = present[row] & (batch.values[row] != 0.0)
-                kernel.resent_samples(
-                    np.where(is_sent, batch.values[row].view(np.int64), 0),
-                    _MIN_RESENT,
-                    self.resent[row, block_range],
-                )
-                self.peaks[row].append(peaks._replace(block=peaks.block + batch.first))
-        self._add_spectra(block_range, centred, present)
-        self.sines.add(batch.values[: self.axes].reshape(self.axes, -1))
-        self.common_zeros[:, block_range] = simultaneous_zeros(batch.values[: self.axes])
-        for kind, number in simultaneous_samples(present[: self.axes]).items():
-            self.at_once.setdefault(kind, np.zeros(self.block_count, np.int64))[block_range] = (
-                number
-            )
-        self.adjacent[:, block_range] = np.count_nonzero(
-            present[: self.axes, :, 1:] & present[: self.axes, :, :-1], axis=-1
-        )
-        self._find_gaps(block_range, present[: self.axes])
-        for row in range(self.axes):
-            self.sub_blocks[:, row, block_range] = _sum_parts(batch.values[row], SUB_BLOCKS)
-        for name, fine in self.channel_parts.items():
-            row = self.axes + self.channels.index(name)
-            total, count = _sum_parts(batch.values[row], CHANNEL_PARTS)
+            kernel.block_samples(values[row], centred[row], moments[row], counts[row])
+        for row in range(axes):
+            peaks = find_peaks(values[row], histogram[row])
+            self.peaks[row].append(peaks._replace(block=peaks.block + batch.first))
+            is_sent = present[row] & (values[row] != 0.0)
+            bits = np.where(is_sent, values[row].view(np.int64), 0)
+            kernel.resent_samples(bits, _MIN_RESENT, resent[row])
+        sub_blocks = [_sum_parts(axis_values, SUB_BLOCKS) for axis_values in values[:axes]]
+        by_name: dict[str, NDArray[Any]] = {
+            "moments": moments,
+            "counts": counts,
+            "resent": resent,
+            "histogram": histogram,
+            "common_zeros": simultaneous_zeros(values[:axes]),
+            "adjacent": np.count_nonzero(present[:axes, :, 1:] & present[:axes, :, :-1], axis=-1),
+            "sub_block_sum": np.stack([total for total, _ in sub_blocks]),
+            "sub_block_samples": np.stack([number for _, number in sub_blocks]),
+            **self._measure_spectra(block_range, centred, present),
+        }
+        for name in self.lagged:
+            total, number = _sum_parts(values[axes + self.channels.index(name)], CHANNEL_PARTS)
             with np.errstate(invalid="ignore", divide="ignore"):
-                fine[block_range] = total / count
+                by_name[f"parts_{name}"] = (total / number)[None]
+        self.sines.add(values[:axes].reshape(axes, -1))
+        for kind, at_once in simultaneous_samples(present[:axes]).items():
+            of_kind = self.at_once.setdefault(kind, np.zeros(self.block_count, np.int64))
+            of_kind[block_range] = at_once
+        self._find_gaps(block_range, present[:axes])
         every = max(1, self.block_count // _GRID_BLOCKS)
         samples = slice(_GRID_SAMPLES_PER_AXIS // _GRID_BLOCKS)
         self.kept_samples += [
-            batch.values[: self.axes, number - block_range.start, samples].copy()
+            values[:axes, number - block_range.start, samples].copy()
             for number in range(block_range.start, block_range.stop)
             if number % every == 0
         ]
         if self.rotation is not None:
-            counts = self.counts[: self.axes, block_range, 0]
-            self.rotation.add(block_range, centred[: self.axes], counts, self.min_samples)
-        if self.profile_sums is not None:
-            phase = batch.values[self.ramp]
-            self._count_ramp_turns(block_range, phase)
-            for row in range(self.axes):
-                sums = self.profile_sums[row, block_range]
-                counts = self.profile_counts[row, block_range]
+            by_name |= self.rotation.measure(
+                block_range, centred[:axes], counts[:axes, :, 0], self.min_samples
+            )
+        if self.ramp is not None:
+            profile = np.zeros((2, axes, count, RAMP_PHASE_BINS))
+            sums, numbers = profile[0], profile[1].astype(np.int64)
+            for row in range(axes):
                 kernel.phase_profile(
-                    centred[row], present[row], phase, *self.ramp_range, sums, counts
-                )
+                    centred[row], present[row], values[self.ramp], *self.ramp_range,
+                    sums[row], numbers[row],
+                )  # fmt: skip
+            by_name |= {
+                "profile_sum": sums,
+                "profile_samples": numbers,
+                "ramp_turns": self._measure_ramp_turns(values[self.ramp])[None],
+            }
+        self.batches.append(by_name)
 
-    def _count_ramp_turns(self, block_range: slice, phase: Array) -> None:
+    def _measure_ramp_turns(self, phase: Array) -> Array:
         """Measure the ramp's turns per second; a move between samples is below half a turn."""
-        assert self.ramp_turns is not None
         low, high = self.ramp_range
         moved = np.diff(phase, axis=1) / (high - low)
         moved -= np.round(moved)
         finite = np.isfinite(moved)
         total = np.where(finite, moved, 0.0).sum(axis=1)
-        self.ramp_turns[block_range] = (
-            np.where(finite.any(axis=1), total / np.maximum(finite.sum(axis=1), 1), np.nan)
-            * self.rate
-        )
+        mean = np.where(finite.any(axis=1), total / np.maximum(finite.sum(axis=1), 1), np.nan)
+        return np.asarray(mean * self.rate)
 
-    def _add_spectra(self, block_range: slice, centred: Array, present: NDArray[np.bool_]) -> None:
-        """Add band powers, cross-powers and line spectra.
+    def _measure_spectra(
+        self, block_range: slice, centred: Array, present: NDArray[np.bool_]
+    ) -> dict[str, NDArray[Any]]:
+        """Return band powers and cross-powers, and add line spectra.
 
         A channel counts where a gyro sample is present: gaps spread a slow wave of the channel over
         all bands, and would do so in its cross-powers only.
         """
-        inside = slice(1, kernel.ordinates(self.length) + 1)
-        counts = self.counts[:, block_range, 0]
+        axes = self.axes
         if self.channels:
-            received = present[: self.axes].any(axis=0)
-            present = np.concatenate([present[: self.axes], present[self.axes :] & received])
-            counts = np.count_nonzero(present, axis=-1)
-            centred = np.concatenate(
-                [centred[: self.axes], _subtract_mean(centred[self.axes :], present[self.axes :])]
-            )
-        spectra = np.fft.rfft(centred * self.weights, axis=-1)[..., inside]
+            received = present[:axes].any(axis=0)
+            present = np.concatenate([present[:axes], present[axes:] & received])
+            of_channels = _subtract_mean(centred[axes:], present[axes:])
+            centred = np.concatenate([centred[:axes], of_channels])
+        counts = np.count_nonzero(present, axis=-1)
         used = counts >= self.min_samples
-        places, tables = [], []
-        for row in range(self.rows):
-            place, table = self._tabulate_masks(
-                row, block_range, present[row], counts[row], used[row]
-            )
-            places.append(place)
-            tables.append(table)
-            power = kernel.band_powers(
-                spectra[row], spectra[row], table, place, self.edges, self.rate
-            ).real
-            self.power[row, block_range] = np.where(used[row][:, None], power, np.nan)
-            if row < self.axes:
-                self._add_line_spectra(row, block_range, spectra[row], table, place, used[row])
+        spectra = self._transform(centred)
+        masks = [self._read_gaps(present[row], used[row]) for row in range(self.rows)]
+        power = np.stack(
+            [
+                self._band_powers(spectrum, spectrum, *mask[:2]).real
+                for spectrum, mask in zip(spectra, masks, strict=True)
+            ]
+        )
+        power[~used] = np.nan
+        for row, (place, table, _, _) in enumerate(masks[:axes]):
+            self._add_line_spectra(row, block_range, spectra[row], table, place, used[row])
+        shape, neighbours = (np.stack([mask[part] for mask in masks[:axes]]) for part in (2, 3))
+        first = np.array([a for a, _ in self.pairs], np.int64)
+        cross = np.full((first.size, *power.shape[1:]), np.nan + 0j)
+        cross_shape, cross_neighbours = shape[first], neighbours[first]
+        cross_samples = np.zeros(cross.shape[:2], np.int64)
         for number, (a, b) in enumerate(self.pairs):
-            joint_count = np.count_nonzero(present[a] & present[b], axis=-1)
-            cross = kernel.band_powers(
-                spectra[a], spectra[b], tables[a], places[a], self.edges, self.rate
-            )
+            joint = present[a] & present[b]
+            joint_count = cross_samples[number] = np.count_nonzero(joint, axis=-1)
+            enough = joint_count >= self.min_samples
+            cross[number] = self._band_powers(spectra[a], spectra[b], *masks[a][:2])
             differ = (joint_count != counts[a]) | (joint_count != counts[b])
             differ &= used[a] & used[b]
-            self.cross_shape[number, block_range] = self.shape[a, block_range]
-            self.cross_neighbours[number, block_range] = self.neighbours[a, block_range]
-            self.cross_samples[number, block_range] = joint_count
             if differ.any():
-                joint = (present[a] & present[b])[differ]
-                cross[differ], self.cross_shape[number, block_range][differ] = self._joint_spectra(
-                    centred[[a, b]][:, differ], joint, self.power[[a, b], block_range][:, differ]
+                cross_neighbours[number, differ] = _neighbour_share(joint[differ], self.weights)
+                cross_shape[number, differ & ~enough] = np.nan
+                differ &= enough
+                cross[number, differ], cross_shape[number, differ] = self._joint_spectra(
+                    centred[[a, b]][:, differ], joint[differ], power[[a, b]][:, differ]
                 )
-                self.cross_neighbours[number, block_range][differ] = _neighbour_share(
-                    joint, self.weights
-                )
-            cross[~(used[a] & used[b])] = np.nan
-            cross[joint_count < self.min_samples] = np.nan
-            self.cross[number, block_range] = cross
+            cross[number, ~(used[a] & used[b] & enough)] = np.nan
+        return {
+            "power": power,
+            "shape": shape,
+            "neighbours": neighbours,
+            "cross": cross,
+            "cross_shape": cross_shape,
+            "cross_neighbours": cross_neighbours,
+            "cross_samples": cross_samples,
+        }
 
-    def _tabulate_masks(
+    def _transform(self, centred: Array) -> NDArray[np.complex128]:
+        """Return the tapered spectra (..., line) of blocks (..., sample)."""
+        spectra = np.fft.rfft(centred * self.weights, axis=-1)
+        return np.asarray(spectra[..., 1 : kernel.ordinates(self.length) + 1])
+
+    def _band_powers(
         self,
-        row: int,
-        block_range: slice,
-        present: NDArray[np.bool_],
-        counts: NDArray[np.int64],
-        used: NDArray[np.bool_],
-    ) -> tuple[NDArray[np.int64], Array]:
-        """Return the mask index of each block (0 is full), and the expected powers by mask."""
-        gappy = used & (counts < self.length)
-        place = np.zeros(counts.size, np.int64)
+        spectra: NDArray[np.complex128],
+        other_spectra: NDArray[np.complex128],
+        place: NDArray[np.int64],
+        table: Array,
+    ) -> NDArray[np.complex128]:
+        """Return the cross-powers (block, band), with the expected powers of each mask."""
+        return kernel.band_powers(spectra, other_spectra, table, place, self.edges, self.rate)
+
+    def _read_masks(self, present: NDArray[np.bool_]) -> _Masks:
+        """Return what the gaps of blocks (block, sample) do to their powers."""
+        expected, mask, squared = kernel.gap_spectra(present, self.weights)
+        shape = kernel.shape_of_bands(
+            mask, squared, expected, present.sum(axis=-1), self.edges, self.length
+        )
+        return _Masks(expected, shape, _neighbour_share(present, self.weights))
+
+    def _read_gaps(
+        self, present: NDArray[np.bool_], used: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.int64], Array, Array, Array]:
+        """Return the mask of each block (0 is full), their expected powers, and shares by block."""
+        gappy = used & ~present.all(axis=-1)
+        place = np.zeros(used.size, np.int64)
         place[gappy] = 1 + np.arange(np.count_nonzero(gappy))
-        table = self.full
+        table, full_shape, full_neighbours = self.full
+        shape = np.where(used[:, None], full_shape, np.nan)
+        neighbours = np.where(used, full_neighbours, np.nan)
         if gappy.any():
-            expected, mask, squared = kernel.gap_spectra(present[gappy], self.weights)
+            expected, shape[gappy], neighbours[gappy] = self._read_masks(present[gappy])
             table = np.concatenate([table, expected])
-        if row < self.axes:
-            shape = np.broadcast_to(self.full_shape, (counts.size, self.full_shape.size)).copy()
-            neighbours = np.full(counts.size, self.full_neighbours)
-            if gappy.any():
-                shape[gappy] = kernel.shape_of_bands(
-                    mask, squared, expected, counts[gappy], self.edges, self.length
-                )
-                neighbours[gappy] = _neighbour_share(present[gappy], self.weights)
-            shape[~used] = neighbours[~used] = np.nan
-            self.shape[row, block_range], self.neighbours[row, block_range] = shape, neighbours
-        return place, table
+        return place, table, shape, neighbours
 
     def _add_line_spectra(
         self,
@@ -283,39 +289,20 @@ class Accumulator:
     def _joint_spectra(
         self, centred: Array, present: NDArray[np.bool_], power: Array
     ) -> tuple[NDArray[np.complex128], Array]:
-        """Return cross-periodogram and gamma shape of blocks over the samples of both signals.
+        """Return cross-powers and shapes of blocks over the samples of both signals.
 
         The coherency is that of the joint samples, `power` (2, block, band) that of each signal.
         """
-        out = np.full((present.shape[0], self.edges.size - 1), np.nan + 0j)
-        shape = np.full(out.shape, np.nan)
-        enough = present.sum(axis=-1) >= self.min_samples
-        if enough.any():
-            present, centred = present[enough], centred[:, enough]
-            centred = _subtract_mean(centred, present)
-            spectrum, other_spectrum = np.fft.rfft(centred * self.weights, axis=-1)[
-                ..., 1 : kernel.ordinates(self.length) + 1
-            ]
-            expected, mask, squared = kernel.gap_spectra(present, self.weights)
-            cross, *powers = (
-                kernel.band_powers(
-                    *pair, expected, np.arange(present.shape[0]), self.edges, self.rate
-                )
-                for pair in (
-                    (spectrum, other_spectrum),
-                    (spectrum, spectrum),
-                    (other_spectrum, other_spectrum),
-                )
-            )
-            joint = powers[0].real * powers[1].real
-            scale = np.divide(
-                power[:, enough].prod(axis=0), joint, out=np.zeros_like(joint), where=joint > 0.0
-            )
-            out[enough] = cross * np.sqrt(scale)
-            shape[enough] = kernel.shape_of_bands(
-                mask, squared, expected, present.sum(axis=-1), self.edges, self.length
-            )
-        return out, shape
+        first, second = self._transform(_subtract_mean(centred, present))
+        expected, shape, _ = self._read_masks(present)
+        place = np.arange(len(present))
+        cross, *powers = (
+            self._band_powers(*pair, place, expected)
+            for pair in ((first, second), (first, first), (second, second))
+        )
+        joint = powers[0].real * powers[1].real
+        scale = np.divide(power.prod(axis=0), joint, out=np.zeros_like(joint), where=joint > 0.0)
+        return cross * np.sqrt(scale), shape
 
     def _find_gaps(self, block_range: slice, present: NDArray[np.bool_]) -> None:
         """List the long gaps, in which no axis has a sample."""

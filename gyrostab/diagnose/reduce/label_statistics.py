@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -32,19 +33,19 @@ MIN_MEAN_SHARE = 0.1  # of a block that must be present for its mean; design cho
 
 def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Dataset:
     """Assemble the dataset of block statistics."""
-    axes = slice(0, work.axes)
-    counts, moments = work.counts[axes], work.moments[axes]
+    by_name, axes = work.collect(), slice(0, work.axes)
+    counts, moments = by_name["counts"][axes], by_name["moments"][axes]
     present = counts[..., 0]
     enough = present >= max(MIN_MEAN_SHARE * work.length, 1)
     with np.errstate(invalid="ignore", divide="ignore"):
         kurtosis = moments[..., 2] / moments[..., 1] ** 2 - 3.0
-    peaks, outliers = count_outliers(work.histogram, work.peaks)
+    peaks, outliers = count_outliers(by_name["histogram"], work.peaks)
     subset, at_once = np.array(list(work.at_once), np.bool_), np.stack(list(work.at_once.values()))
-    filled = zeros_beyond_chance(work.common_zeros, counts[..., 1], present, subset, at_once)
+    filled = zeros_beyond_chance(by_name["common_zeros"], counts[..., 1], present, subset, at_once)
     first_values = [_kept_values(work, row, _STEP_VALUES_PER_BLOCK) for row in range(work.axes)]
     steps = np.array([quantization_step(values) for values in first_values])
     # on a quantization grid equal values are frequent by chance
-    resent = np.where(steps[:, None, None] > 0.0, 0, work.resent)
+    resent = np.where(steps[:, None, None] > 0.0, 0, by_name["resent"])
     widths = np.array([bin_widths(_kept_values(work, row), step) for row, step in enumerate(steps)])
     zones = np.array([empty_zone(_kept_values(work, row)) for row in range(work.axes)])
     lowest, highest = _record_range(moments)
@@ -56,20 +57,20 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
     line_total, line_square = np.moveaxis(work.line_counts, -1, 0)
     weight: Array = np.zeros(line_total.shape)
     np.divide(line_total**2, line_square, where=line_square > 0, out=weight)
-    weight *= _equal_block_share(work.power[axes], work.shape, present, weight.shape[1])
+    weight *= _equal_block_share(by_name["power"][axes], by_name["shape"], present, weight.shape[1])
     with np.errstate(invalid="ignore", divide="ignore"):
         lines = work.line_sum / (work.line_expected * work.rate)
     arrays: dict[str, Any] = {
         "mean": np.where(enough, moments[..., 0], np.nan),
         "variance": np.where(enough, moments[..., 1], np.nan),
         "samples": present,
-        "power": work.power[axes],
-        "shape": work.shape,
-        "neighbours": work.neighbours,
-        "kurtosis": np.where(np.isnan(work.neighbours), np.nan, kurtosis),
+        "power": by_name["power"][axes],
+        "shape": by_name["shape"],
+        "neighbours": by_name["neighbours"],
+        "kurtosis": np.where(np.isnan(by_name["neighbours"]), np.nan, kurtosis),
         "peaks": peaks,
         "outliers": outliers,
-        "adjacent": work.adjacent,
+        "adjacent": by_name["adjacent"],
         "repeats": repeats + resent[..., 0],
         "repeat_runs": counts[..., 7] + resent[..., 1],
         "resent": resent[..., 0],
@@ -90,15 +91,15 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
         "zone_width": zones[:, 0],
         "zone_width_stderr": zones[:, 1],
     }
-    arrays |= work.sines.strongest(_line_frequencies(work)) | _sub_block_means(work)
-    arrays |= _phase_locked_statistics(work) | _gap_table(work, log, restart)
+    arrays |= work.sines.strongest(_line_frequencies(work)) | _sub_block_means(by_name)
+    arrays |= _phase_locked_statistics(by_name) | _gap_table(work, log, restart)
     variables = (
         label_variables(arrays)
-        | _cross_spectra(work, log)
-        | _channel_means(work, log)
-        | _channel_part_means(work, log)
+        | _cross_spectra(work, by_name, log)
+        | _channel_means(work, by_name, log)
+        | _channel_part_means(work, by_name, log)
     )
-    if work.ramp_turns is not None:
+    if work.ramp is not None:
         variables["ramp_turns"][2].update(zip(("low", "high"), work.ramp_range, strict=True))
     return xr.Dataset(
         variables, coords=_make_coordinates(work, log), attrs=_make_attributes(work, log, present)
@@ -110,11 +111,12 @@ def _kept_values(work: Accumulator, row: int, max_per_block: int | None = None) 
     return np.concatenate([samples[row][:max_per_block] for samples in work.kept_samples])
 
 
-def _sub_block_means(work: Accumulator) -> dict[str, Any]:
+def _sub_block_means(by_name: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     """Return means over sub-blocks, which show a bias that switches within blocks."""
-    total, count = work.sub_blocks
+    count = by_name["sub_block_samples"]
     with np.errstate(invalid="ignore", divide="ignore"):
-        return {"sub_block_mean": total / count, "sub_block_samples": count.astype(np.int64)}
+        mean = by_name["sub_block_sum"] / count
+    return {"sub_block_mean": mean, "sub_block_samples": count.astype(np.int64)}
 
 
 def _equal_block_share(
@@ -164,23 +166,25 @@ def _count_at_range_ends(moments: Array, counts: NDArray[np.int64]) -> NDArray[n
     return np.where(np.stack([moments[..., 3] == lowest, at_top], axis=-1), counts, 0)
 
 
-def _cross_spectra(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
+def _cross_spectra(
+    work: Accumulator, by_name: Mapping[str, NDArray[Any]], log: xr.Dataset
+) -> dict[str, Any]:
     """Return cross-spectra of the axes, and of each axis with the channels on the log's time."""
     axes = work.axes
     axis_pairs = [number for number, (_, other) in enumerate(work.pairs) if other < axes]
     names = ("cross", "cross_shape", "cross_neighbours", "cross_samples")
-    variables = label_variables({name: getattr(work, name)[axis_pairs] for name in names})
+    variables = label_variables({name: by_name[name][axis_pairs] for name in names})
     if work.channels:
-        shape = (axes, len(work.channels), *work.cross.shape[1:])
+        shape = (axes, len(work.channels), *by_name["cross"].shape[1:])
         with_axes = np.full(shape, np.nan + 0j)
         for number, (a, b) in enumerate(work.pairs):
             if b >= axes:
-                with_axes[a, b - axes] = work.cross[number]
+                with_axes[a, b - axes] = by_name["cross"][number]
         unit_list = ", ".join(
             f"{name} in {log[name].attrs.get('units', '1')}" for name in work.channels
         )
         references = label_variables(
-            {"reference_power": work.power[axes:], "reference_cross": with_axes}
+            {"reference_power": by_name["power"][axes:], "reference_cross": with_axes}
         )
         for _, _, attrs in references.values():
             attrs["units"] += f" ({unit_list})"
@@ -188,19 +192,22 @@ def _cross_spectra(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
     return variables
 
 
-def _phase_locked_statistics(work: Accumulator) -> dict[str, Any]:
+def _phase_locked_statistics(by_name: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     """Return what is locked to the tool rotation and to the ramp phase."""
-    arrays: dict[str, Any] = {}
-    if work.rotation is not None:
-        arrays |= {"order": work.rotation.order, "order_level": work.rotation.order_level}
-    if work.profile_sums is not None:
+    arrays: dict[str, Any] = {
+        name: by_name[name] for name in ("order", "order_level") if name in by_name
+    }
+    if "profile_sum" in by_name:
+        samples = by_name["profile_samples"]
         with np.errstate(invalid="ignore", divide="ignore"):
-            arrays["profile"] = work.profile_sums / work.profile_counts
-        arrays |= {"profile_samples": work.profile_counts, "ramp_turns": work.ramp_turns}
+            arrays["profile"] = by_name["profile_sum"] / samples
+        arrays |= {"profile_samples": samples, "ramp_turns": by_name["ramp_turns"][0]}
     return arrays
 
 
-def _channel_means(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
+def _channel_means(
+    work: Accumulator, by_name: Mapping[str, NDArray[Any]], log: xr.Dataset
+) -> dict[str, Any]:
     """Return block means of the channels; the rms of vibration."""
     variables: dict[str, Any] = {}
     on_log_time, on_own_time = numeric_channels(log)
@@ -209,7 +216,7 @@ def _channel_means(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
         rms = name.startswith("vibration")
         if name in on_log_time:
             mean, spread = np.moveaxis(
-                work.moments[work.axes + on_log_time.index(name), :, :2], -1, 0
+                by_name["moments"][work.axes + on_log_time.index(name), :, :2], -1, 0
             )
             values = np.sqrt(mean**2 + spread) if rms else mean
         else:
@@ -224,9 +231,12 @@ def _channel_means(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
     return variables
 
 
-def _channel_part_means(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
+def _channel_part_means(
+    work: Accumulator, by_name: Mapping[str, NDArray[Any]], log: xr.Dataset
+) -> dict[str, Any]:
     """Return smoothed channels in parts of the blocks, if sampled often enough."""
     variables: dict[str, Any] = {}
+    parts = {name: by_name[f"parts_{name}"][0] for name in work.lagged}
     edges = grid_times(
         work.start,
         work.rate,
@@ -237,10 +247,8 @@ def _channel_part_means(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
             continue
         span = np.ptp(to_nanoseconds(log[f"time_{name}"].values)) / 1e9
         if log.sizes[f"time_{name}"] * work.length >= span * work.rate * CHANNEL_PARTS > 0.0:
-            work.channel_parts[name] = channel_means(log, name, edges, rms=False).reshape(
-                -1, CHANNEL_PARTS
-            )
-    for name, values in work.channel_parts.items():
+            parts[name] = channel_means(log, name, edges, rms=False).reshape(-1, CHANNEL_PARTS)
+    for name, values in parts.items():
         good = np.isfinite(values)
         if good.mean() > 1.0 / 2.0:
             place = np.arange(values.size)
@@ -307,7 +315,7 @@ def _make_coordinates(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
         arrays["reference"] = np.array(work.channels, dtype=object)
     if work.rotation is not None:
         arrays["harmonic"] = np.array(HARMONICS)
-    if work.profile_sums is not None:
+    if work.ramp is not None:
         arrays["phase"] = (np.arange(RAMP_PHASE_BINS) + 0.5) / RAMP_PHASE_BINS
     return label_variables(arrays, COORDINATES)
 

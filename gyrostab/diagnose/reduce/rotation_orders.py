@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -22,7 +23,7 @@ _MIN_TURNS_APART = 0.9  # turns per block from a line that was removed; just bel
 
 
 class RotationOrders:
-    """The axes demodulated at multiples of the tool rotation, in order of time."""
+    """Demodulation of the axes at multiples of the tool rotation, in order of time."""
 
     def __init__(
         self,
@@ -30,20 +31,17 @@ class RotationOrders:
         source: Source,
         factor: float,
         length: int,
-        block_count: int,
         rate: float,
     ):
         self.source, self.factor = source, factor  # rotation rate, and its factor to degree s-1
         self.start, self.rate, self.length = first_stamp(log), rate, length
-        self.order = np.full((log.sizes["axis"], block_count, len(HARMONICS)), np.nan + 0j)
-        self.order_level = np.full(self.order.shape, np.nan)
         self.carry: float | None = None
         self.turns = 0.0
 
-    def add(
+    def measure(
         self, block_range: slice, centred: Array, counts: NDArray[np.int64], min_samples: float
-    ) -> None:
-        """Add blocks of the axes (axis, block, sample), zero where missing, and their samples."""
+    ) -> dict[str, NDArray[Any]]:
+        """Demodulate blocks of the axes (axis, block, sample), zero where samples are missing."""
         index = np.arange(block_range.start * self.length, block_range.stop * self.length)
         instants = grid_times(self.start, self.rate, index)
         rotation, self.carry = self.source.at(instants, self.carry)
@@ -55,23 +53,21 @@ class RotationOrders:
         enough = (np.abs(often) >= 1.0) & (counts >= min_samples)
         wheels = [np.exp(-2j * math.pi * harmonic * turns) for harmonic in HARMONICS]
         present, residual = centred != 0.0, centred  # missing samples count as zero
+        order, order_level = [], []
         with np.errstate(invalid="ignore", divide="ignore"):
-            for number, wheel in enumerate(wheels):
+            for wheel in wheels:
                 value = 2.0 * np.einsum("abi,bi->ab", centred, wheel) / counts
-                self.order[:, block_range, number] = np.where(enough, value, np.nan)
+                order.append(np.where(enough, value, np.nan))
                 residual = residual - np.where(
                     present, (value[..., None] * np.conj(wheel)).real, 0.0
                 )
-            for number, wheel in enumerate(wheels):
-                level = _power_near_order(residual * wheel, often, HARMONICS[number]) / (
-                    counts * self.rate
-                )
-                self.order_level[:, block_range, number] = np.where(enough, level, np.nan)
+            for harmonic, wheel in zip(HARMONICS, wheels, strict=True):
+                level = _power_near_order(residual * wheel, often, harmonic)
+                order_level.append(np.where(enough, level / (counts * self.rate), np.nan))
+        return {"order": np.stack(order, -1), "order_level": np.stack(order_level, -1)}
 
 
-def make_rotation_orders(
-    log: xr.Dataset, length: int, block_count: int, rate: float
-) -> RotationOrders | None:
+def make_rotation_orders(log: xr.Dataset, length: int, rate: float) -> RotationOrders | None:
     """Prepare the orders of the rotation of the tool; None if its rate is not known throughout."""
     name = "rotation_rate"
     if any(name in names for names in numeric_channels(log)):
@@ -83,7 +79,7 @@ def make_rotation_orders(
         is_known = np.isfinite(finite_range(log[name].data)).all()
         if is_known and log_unit.quantity == inner_unit.quantity:
             factor = log_unit.factor / inner_unit.factor
-            return RotationOrders(log, make_source(log, name), factor, length, block_count, rate)
+            return RotationOrders(log, make_source(log, name), factor, length, rate)
     return None
 
 
