@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.calibrate import assemble_baseline
 from gyrostab.diagnose.baseline.expected_statistics import NOISE, line_columns
-from gyrostab.diagnose.baseline.known_effects import expect_known_effects, with_wandering
+from gyrostab.diagnose.baseline.known_effects import expect_known_effects
 from gyrostab.diagnose.baseline.known_lines import independent_line_share
 from gyrostab.diagnose.baseline.noise_level import quiescent_level, scale_axes
 from gyrostab.diagnose.baseline.posterior import DRAWS, Posterior
@@ -30,7 +30,7 @@ def baseline_from_model(
 
     Parameters
     ----------
-    quiet : array_like of bool (block,), or (start, end) or several of these, optional
+    quiet : (start, end) or several of these, optional
         Quiescent time of the recording. One factor for each axis then fits the noise of the model
         to it; the noise terms keep their proportions, and the effects their sizes. By default, and
         with a warning where `quiet` is too short, the noise is taken unchanged.
@@ -88,14 +88,11 @@ def baseline_from_model(
         spectrum=effects.spectrum,
         settings=settings,
     )
-    out = with_wandering(out, effects.wandering, effects.spectrum)
-    extra = effects.lines if effects.cross is None else {"cross": effects.cross, **effects.lines}
-    out = out.assign(label_variables(extra, BASELINE))
-    if effects.lines:
+    out["mean_variance"] *= effects.white_share
+    out = out.assign(label_variables(effects.variables, BASELINE))
+    if "peaks" in out:
         noise = np.stack([line_columns(blocks) @ posterior.square for posterior in posteriors])
-        out["shape_alone"] *= independent_line_share(noise + effects.lines["peaks"], blocks)[
-            :, None
-        ]
+        out["shape_alone"] *= independent_line_share(noise + out["peaks"].values, blocks)[:, None]
     out["coefficient"].loc[{"term": "R"}] = ramp
     out["stderr"].loc[{"term": list(TERMS) if given_blocks is None else ["R"]}] = 0.0
     return out

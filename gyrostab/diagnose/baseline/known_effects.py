@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -20,7 +20,6 @@ from gyrostab.diagnose.predict.linear_model import (
     spread_by_gaps,
 )
 from gyrostab.diagnose.reduce.block_statistics import pair_indices
-from gyrostab.diagnose.reduce.schema import BASELINE, label_variables
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.physics.base import Effect
 from gyrostab.physics.logger import LoggerFilter
@@ -31,29 +30,17 @@ Array = NDArray[np.float64]
 _EVERYWHERE = "lattice"  # the anomaly of every sample
 
 
-class Wandering(NamedTuple):
-    """Random means of all axes: exponentially correlated biases, and random walks."""
-
-    square: Array  # (axis, process): variances of exponentially correlated biases [degree2 hour-2]
-    time: Array  # (process,): their correlation times [s]
-    walk: Array  # (axis, block): growth of the variance of random walks [degree2 hour-2 s-1]
-    power: Array  # (axis, block): power of all of them in the lowest band [degree2 hour-2 Hz-1]
-
-
 class KnownEffects(NamedTuple):
     """Known effects of a model in the statistics of a record."""
 
     mean: Array  # (axis, block): [degree hour-1]
     #: (axis, block, band): expected power of noise and effects [degree2 hour-2 Hz-1].
     spectrum: Array
-    #: (pair, block, band): expected cross-spectrum [degree2 hour-2 Hz-1]; None if the axes have
-    #: nothing in common.
-    cross: NDArray[np.complex128] | None
-    #: At full resolution (axis, line): steady ``lines``, their largest possible power at each
-    #: frequency (``lines_most``), and broad ``peaks``. And ``line_spectrum`` (axis, band): their
-    #: power in the bands, without leakage [degree2 hour-2 Hz-1]. Empty without lines.
-    lines: dict[str, Array]
-    wandering: Wandering  # random processes in the means
+    #: (axis, block): share of the lowest band that is white noise of the means.
+    white_share: Array
+    #: Further variables of `gyrostab.diagnose.reduce.schema.BASELINE`, if there are any: the
+    #: cross-spectrum, lines at full resolution, and random processes in the means.
+    variables: dict[str, NDArray[Any]]
     left_out: list[str]  # effects that also show elsewhere
 
 
@@ -83,14 +70,16 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
         for power in powers
         if power.acting.prediction.line is not None and power.factor.any()
     ]
+    spectrum = spread_by_gaps((noise + added) * response, blocks)
+    variables = _shared_cross(powers, response, blocks)
+    if narrow and "line_power" in blocks:
+        variables |= expect_lines(blocks, narrow, response[:, 0])
+    wandering, power = _add_up_wandering(described, blocks)
     return KnownEffects(
         mean=_expected_means(described, blocks),
-        spectrum=spread_by_gaps((noise + added) * response, blocks),
-        cross=_shared_cross(powers, response, blocks),
-        lines=expect_lines(blocks, narrow, response[:, 0])
-        if narrow and "line_power" in blocks
-        else {},
-        wandering=_add_up_wandering(described, blocks),
+        spectrum=spectrum,
+        white_share=1.0 - power / spectrum[..., 0] if wandering else np.ones(power.shape),
+        variables=variables | wandering,
         left_out=[
             active.effect.name
             for active in acting
@@ -207,10 +196,10 @@ def _filter_response(acting: Sequence[_ActingEffect], blocks: xr.Dataset) -> Arr
 
 def _shared_cross(
     powers: Sequence[_AddedPower], response: Array, blocks: xr.Dataset
-) -> NDArray[np.complex128] | None:
-    """Return the cross-spectrum of coherent effects after a filter (axis, 1, band)."""
+) -> dict[str, NDArray[Any]]:
+    """Return the cross-spectrum of coherent effects after a filter (axis, 1, band), if any."""
     if "cross" not in blocks:
-        return None
+        return {}
     pairs = pair_indices(blocks).T
     shared = np.zeros((len(pairs), blocks.sizes["block"], blocks.sizes["band"]), np.complex128)
     for power in (power for power in powers if power.acting.prediction.coherent):
@@ -221,11 +210,16 @@ def _shared_cross(
             )
     for number, (row, other_row) in enumerate(pairs):
         shared[number] *= np.sqrt(response[row] * response[other_row])
-    return spread_by_gaps(shared, blocks, "pair") if shared.any() else None
+    return {"cross": spread_by_gaps(shared, blocks, "pair")} if shared.any() else {}
 
 
-def _add_up_wandering(acting: Sequence[_ActingEffect], blocks: xr.Dataset) -> Wandering:
-    """Add up the random means of several effects."""
+def _add_up_wandering(
+    acting: Sequence[_ActingEffect], blocks: xr.Dataset
+) -> tuple[dict[str, NDArray[Any]], Array]:
+    """Return the random means of all effects, if any, and their power in the lowest band.
+
+    They are not white noise of the means, whatever they add to that band (axis, block).
+    """
     axes, block_count, bands = (blocks.sizes[name] for name in ("axis", "block", "band"))
     square, time = [], []
     walk, power = np.zeros((axes, block_count)), np.zeros((axes, block_count))
@@ -245,24 +239,10 @@ def _add_up_wandering(acting: Sequence[_ActingEffect], blocks: xr.Dataset) -> Wa
                 density = np.asarray(prediction.spectrum[name])
                 by_band = density.reshape(-1, block_count, bands, density.shape[-1] // bands)
                 power += size[:, None] * by_band[0, :, 0].mean(axis=-1)
-    return Wandering(np.array(square).reshape(-1, axes).T, np.array(time), walk, power)
-
-
-def with_wandering(baseline: xr.Dataset, known: Wandering, spectrum: Array) -> xr.Dataset:
-    """Add random processes of the means to a baseline with these powers (axis, block, band).
-
-    They are not white noise of the means, whatever they add to the lowest band.
-    """
-    if not (known.square.any() or known.walk.any()):
-        return baseline
-    white = baseline["mean_variance"] * (1.0 - known.power / spectrum[..., 0])
-    arrays = {
-        "mean_variance": white.values,
-        "wander_square": known.square,
-        "wander_time": known.time,
-        "wander_walk": known.walk,
-    }
-    return baseline.assign(label_variables(arrays, BASELINE))
+    squares = np.array(square).reshape(-1, axes).T
+    if not (squares.any() or walk.any()):
+        return {}, power
+    return {"wander_square": squares, "wander_time": np.array(time), "wander_walk": walk}, power
 
 
 def expect_known_motion(
