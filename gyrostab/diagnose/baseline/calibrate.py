@@ -133,7 +133,7 @@ def calibrate_noise(
 
     Parameters
     ----------
-    quiet : array_like of bool (block,), or (start, end) or several of these, optional
+    quiet : (start, end) or several of these, optional
         Known quiescent time: seconds since the start, or ISO times. By default blocks with little
         vibration, steady temperature, no rotation, some time after a restart, and no more noise
         than most.

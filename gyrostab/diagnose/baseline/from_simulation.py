@@ -40,7 +40,7 @@ def baseline_from_simulation(
 
     Parameters
     ----------
-    quiet : array_like of bool (block,), or (start, end) or several of these, optional
+    quiet : (start, end) or several of these, optional
         Quiescent time of the recording: one factor for each axis fits the noise of the simulation
         to it.
     """

@@ -11,6 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.predict.windows import fill_linearly
+from gyrostab.diagnose.reduce.block_statistics import iso
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.errors import OptionError
 from gyrostab.time.grid import stamp_ns
@@ -153,8 +154,8 @@ def find_quiescent_blocks(
 
     Parameters
     ----------
-    quiet : array_like of bool (block,), or sequence of (start, end), optional
-        Quiescent time given by the user; spans in seconds since the start, or ISO times.
+    quiet : (start, end) or several of these, optional
+        Quiescent time given by the user: seconds since the start, or ISO times.
     """
     n = blocks.sizes["block"]
     given_blocks = given_quiescent_blocks(blocks, quiet, settings=settings)
@@ -185,27 +186,18 @@ def given_quiescent_blocks(
         return None
     n = blocks.sizes["block"]
     array = np.asarray(quiet)
-    if array.dtype == np.bool_:
-        if array.shape != (n,):
-            raise OptionError(
-                f"quiet has the shape {array.shape}; "
-                f"give one bool for each of the {n} blocks, or (start, end) pairs"
-            )
-        chosen = array.copy()
-    elif array.ndim not in (1, 2) or array.shape[-1] != 2:
+    if array.ndim not in (1, 2) or array.shape[-1] != 2:
         raise OptionError(f"quiet={quiet!r}: give (start, end), or a list of such pairs")
-    else:
-        begin, end = blocks["begin"].values, blocks["end"].values
-        chosen = np.zeros(n, np.bool_)
-        pairs = [quiet] if array.ndim == 1 else list(quiet)
-        for pair in pairs:
-            low, high = (_seconds_since_start(blocks, edge) for edge in pair)
-            if not (low < high and high > begin[0] and low < end[-1]):
-                raise OptionError(
-                    f"quiet: {low:g} s to {high:g} s after the start is outside of the "
-                    f"{_record_length(blocks):g} s of the record, or ends before it starts"
-                )
-            chosen |= (begin >= low - 1e-6) & (end <= high + 1e-6)
+    begin, end = blocks["begin"].values, blocks["end"].values
+    chosen = np.zeros(n, np.bool_)
+    for pair in [quiet] if array.ndim == 1 else list(quiet):
+        low, high = (_seconds_since_start(blocks, edge) for edge in pair)
+        if not (low < high and high > begin[0] and low < end[-1]):
+            raise OptionError(
+                f"quiet: {low:g} s to {high:g} s after the start is outside of the "
+                f"{_record_length(blocks):g} s of the record, or ends before it starts"
+            )
+        chosen |= (begin >= low - 1e-6) & (end <= high + 1e-6)
     if not _is_usable(blocks, chosen, settings.min_quiescent_blocks):
         return None
     return np.broadcast_to(chosen, (blocks.sizes["axis"], n)).copy()
@@ -253,12 +245,6 @@ def _seconds_since_start(blocks: xr.Dataset, edge: Any) -> float:
 
 def find_quiescent_spans(blocks: xr.Dataset, quiet: NDArray[np.bool_]) -> list[list[str]]:
     """Return the spans in which any axis is quiescent, [start, end] as ISO times."""
-    start = np.datetime64(str(blocks.attrs["start"]).removesuffix("Z"), "ms")
-    any_quiet = np.concatenate([[False], quiet.any(axis=0), [False]])
-    edges = np.flatnonzero(any_quiet[1:] != any_quiet[:-1]).reshape(-1, 2)
+    edges = np.flatnonzero(np.diff(quiet.any(axis=0), prepend=False, append=False)).reshape(-1, 2)
     begin, end = blocks["begin"].values, blocks["end"].values
-
-    def iso(seconds: float) -> str:
-        return str(start + np.timedelta64(round(seconds * 1e3), "ms")) + "Z"
-
-    return [[iso(begin[first]), iso(end[last - 1])] for first, last in edges]
+    return [[iso(blocks, begin[first]), iso(blocks, end[last - 1])] for first, last in edges]

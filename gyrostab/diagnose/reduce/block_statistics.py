@@ -151,3 +151,9 @@ def noise_at_orders(blocks: xr.Dataset, expected: Array) -> Array:
         return expected
     nearby = blocks["order_level"].values
     return np.where(nearby > _MIN_NEIGHBOUR_RATIO * expected, nearby, expected)
+
+
+def iso(blocks: xr.Dataset, seconds: float) -> str:
+    """Write a time [s since the start of the record] as ISO 8601."""
+    start = np.datetime64(int(blocks.attrs["start_ns"]), "ns")
+    return f"{(start + np.timedelta64(round(seconds * 1e9), 'ns')).astype('datetime64[ms]')}Z"

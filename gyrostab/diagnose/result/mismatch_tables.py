@@ -11,7 +11,7 @@ import xarray as xr
 from gyrostab.diagnose.identify.identification import Identifications, Selection
 from gyrostab.diagnose.identify.nuisance_alternatives import NUISANCE_ALTERNATIVES
 from gyrostab.diagnose.nulls.scores import MIN_P_VALUE, fit_best_evidence
-from gyrostab.diagnose.reduce.block_statistics import measured
+from gyrostab.diagnose.reduce.block_statistics import iso, measured
 from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
 from gyrostab.diagnose.result.text import (
     chance,
@@ -29,12 +29,6 @@ _NUISANCE_VIEWS = {
     "~bias(t)": "mean", "~levels": "mean", "~red": "mean", "~N(t)": "davar", "~burst": "davar",
     "~S(f)": "davar", "~cov": "cross_axis", "~outliers": "distribution",
 }  # fmt: skip
-
-
-def iso(blocks: xr.Dataset, seconds: float) -> str:
-    """Write a time [s since the start of the record] as ISO 8601."""
-    start = np.datetime64(int(blocks.attrs["start_ns"]), "ns")
-    return f"{(start + np.timedelta64(round(seconds * 1e9), 'ns')).astype('datetime64[ms]')}Z"
 
 
 def _make_mismatch(

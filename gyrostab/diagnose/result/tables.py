@@ -16,10 +16,10 @@ from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.identify.components import are_lines
 from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.predict.windows import channel_units, make_windows
+from gyrostab.diagnose.reduce.block_statistics import iso
 from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
 from gyrostab.diagnose.result.diagnosis import effect_table
 from gyrostab.diagnose.result.families import find_families, group_unrelated
-from gyrostab.diagnose.result.mismatch_tables import iso
 from gyrostab.diagnose.result.text import effect_statement, span_text, unsized_statement
 from gyrostab.diagnose.result.verdict import name_probability
 from gyrostab.diagnose.settings import DEFAULTS, Settings
