@@ -30,7 +30,7 @@ from gyrostab.diagnose.result.diagnosis import Diagnosis, plain
 from gyrostab.diagnose.result.held_out import held_out, select_forecast_start
 from gyrostab.diagnose.result.mismatch_tables import mismatch_tables
 from gyrostab.diagnose.result.size_gate import keep_supported
-from gyrostab.diagnose.result.surfaces import make_surfaces, surfaces_with_blocks
+from gyrostab.diagnose.result.surfaces import make_surfaces
 from gyrostab.diagnose.result.tables import (
     baseline_table,
     effect_tables,
@@ -310,4 +310,4 @@ def _make_surfaces_with_outliers(
     """Return the surfaces with the power of outliers in both simulations."""
     before = add_outlier_power(before, blocks, fit.expected)
     after = add_outlier_power(after, blocks, [*fit.expected, *fit.fitted])
-    return surfaces_with_blocks(make_surfaces(blocks, before, after), blocks, before, after)
+    return make_surfaces(blocks, before, after)

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
+from gyrostab.diagnose.reduce.schema import Variable, label_variables
 from gyrostab.diagnose.statistics.mean import window_means
 from gyrostab.diagnose.statistics.power import allan_surface
 from gyrostab.diagnose.statistics.scores import Array, Windows, sum_over_windows
@@ -17,7 +17,24 @@ from gyrostab.diagnose.statistics.scores import Array, Windows, sum_over_windows
 CASES = ("recording", "before", "after")
 WINDOW_BLOCKS = 15  # 5 min at 20 s: the length of the windows of the DAVAR in the report
 MAX_WINDOWS = 240  # columns that a page can show
+_ATTRIBUTES = ("start", "start_ns", "sampling_rate_hz", "block_s")
 MAX_LINES = 4000  # bins of the line spectrum in `diagnosis.nc`: enough for a page, small on disk
+
+_MEAN, _AVAR = ("case", "axis", "window"), ("case", "axis", "window", "tau")
+_SQUARE, _POWER = "degree2 hour-2", "degree2 hour-2 s"
+_SURFACES = {
+    "avar": Variable(_AVAR, _SQUARE, "Allan variance"),
+    "avar_low": Variable(_AVAR, _SQUARE, "lower end of the 95 % band"),
+    "avar_high": Variable(_AVAR, _SQUARE, "upper end of the 95 % band"),
+    "mean": Variable(_MEAN, "degree hour-1", "mean rate"),
+    "mean_stderr": Variable(_MEAN, "degree hour-1", "standard deviation of the mean"),
+    "time": Variable(("window",), "", "middle of the window"),
+    "begin": Variable(("window",), "s", "start of the window, since the start"),
+    "end": Variable(("window",), "s", "end of the window, since the start"),
+    "tau": Variable(("tau",), "s", "averaging time"),
+    "density": Variable(("case", "axis", "band"), _POWER, "two-sided power density of the record"),
+    "line_density": Variable(("axis", "line"), _POWER, "two-sided power density of the recording"),
+}
 
 
 def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> xr.Dataset:
@@ -35,7 +52,8 @@ def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> 
         ``avar_high``, the band of 95 % of recordings of that simulation (NaN for the recording
         itself); ``mean`` (case, axis, window) [degree hour-1] and ``mean_stderr``, the standard
         deviation of a recording of that simulation; coordinates ``begin``, ``end`` [s since the
-        start], ``time``, ``tau`` [s].
+        start], ``time``, ``tau`` [s]. For the report also block means, channels and spectra of the
+        whole record.
     """
     windows = _make_windows(blocks.sizes["block"])
     plain = before.assign(known_mean=before["known_mean"] * 0.0)
@@ -58,9 +76,45 @@ def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> 
             information = window_means(blocks, baseline, windows)[1]
             error.append(1.0 / np.sqrt(information))
         mean.append(_predicted_means(blocks, baseline, windows))
-    return _attach_labels(
-        blocks, windows, recorded["columns"]["tau_min_s"][keep], [avar, low, high], [mean, error]
-    )
+    begin, end = blocks["begin"].values[windows.first], blocks["end"].values[windows.stop - 1]
+    start = np.datetime64(int(blocks.attrs["start_ns"]), "ns")
+    has_data = np.isfinite(blocks["power"])
+    density = [
+        case.where(has_data).mean("block").values
+        for case in (blocks["power"], before["spectrum"], after["spectrum"])
+    ]
+    step = -(-blocks.sizes["line"] // MAX_LINES)
+    lines = blocks["line_power"].weighted(blocks["line_weight"].fillna(0.0)).mean("part")
+    coarse = {"line": step}
+    arrays: dict[str, Any] = {
+        "avar": np.stack(np.broadcast_arrays(*avar)),
+        "avar_low": np.stack(np.broadcast_arrays(*low)),
+        "avar_high": np.stack(np.broadcast_arrays(*high)),
+        "mean": np.stack(mean),
+        "mean_stderr": np.stack(np.broadcast_arrays(*error)),
+        "density": np.stack(density),
+        "line_density": lines.coarsen(coarse, boundary="trim").max().values,
+        "time": start + np.rint((begin + end) / 2.0 * 1e9).astype("timedelta64[ns]"),
+        "begin": begin,
+        "end": end,
+        "tau": recorded["columns"]["tau_min_s"][keep],
+    }
+    names = [str(name) for name in blocks.data_vars if str(name).startswith("channel_")]
+    out = xr.Dataset(
+        label_variables(arrays, _SURFACES) | {name: blocks[name].variable for name in names},
+        coords={
+            "case": list(CASES),
+            "axis": [str(axis) for axis in blocks["axis"].values],
+            "block_begin": blocks["begin"].variable,
+            "block_end": blocks["end"].variable,
+            "frequency": blocks["frequency"].variable,
+            "line_frequency": blocks["line_frequency"].variable.coarsen(coarse, np.mean, "trim"),
+        },
+        attrs={name: blocks.attrs[name] for name in _ATTRIBUTES if name in blocks.attrs},
+    ).assign(block_mean=blocks["mean"].variable)
+    resolution = f", highest of {step} lines" if step > 1 else " at full resolution"
+    out["line_density"].attrs["long_name"] += resolution
+    return out.set_coords(["time", "begin", "end", "tau"])
 
 
 def _make_windows(block_count: int) -> Windows:
@@ -107,102 +161,3 @@ def _predicted_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows)
             axis=-1, keepdims=True
         ) / weight.sum(axis=-1, keepdims=True)
     return _average_windows(blocks, known_mean + level, windows)
-
-
-def _attach_labels(
-    blocks: xr.Dataset, windows: Windows, tau: Array, squares: list[Any], means: list[Any]
-) -> xr.Dataset:
-    dims = ("case", "axis", "window", "tau")
-    begin, end = blocks["begin"].values[windows.first], blocks["end"].values[windows.stop - 1]
-    start = np.datetime64(int(blocks.attrs["start_ns"]), "ns")
-    middle = start + np.rint((begin + end) / 2.0 * 1e9).astype("timedelta64[ns]")
-    names = {
-        "avar": ("degree2 hour-2", "Allan variance"),
-        "avar_low": ("degree2 hour-2", "lower end of the 95 % band"),
-        "avar_high": ("degree2 hour-2", "upper end of the 95 % band"),
-        "mean": ("degree hour-1", "mean rate"),
-        "mean_stderr": ("degree hour-1", "standard deviation of the mean"),
-    }
-    data: dict[str, Any] = {}
-    for (name, (units, long_name)), cases in zip(names.items(), [*squares, *means], strict=True):
-        values = np.stack(np.broadcast_arrays(*cases))
-        data[name] = (dims[: values.ndim], values, {"units": units, "long_name": long_name})
-    coordinates: dict[str, Any] = {
-        "case": ("case", list(CASES)),
-        "axis": ("axis", [str(axis) for axis in blocks["axis"].values]),
-        "time": ("window", middle, {"long_name": "middle of the window"}),
-        **{
-            name: (dim, values, {"units": "s", "long_name": long_name})
-            for name, dim, values, long_name in (
-                ("begin", "window", begin, "start of the window, since the start"),
-                ("end", "window", end, "end of the window, since the start"),
-                ("tau", "tau", tau, "averaging time"),
-            )
-        },
-    }
-    attributes = {
-        name: blocks.attrs[name]
-        for name in ("start", "start_ns", "sampling_rate_hz", "block_s")
-        if name in blocks.attrs
-    }
-    return xr.Dataset(data, coords=coordinates, attrs=attributes)
-
-
-def surfaces_with_blocks(
-    surfaces: xr.Dataset, blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset
-) -> xr.Dataset:
-    """Add block means, channels and spectra of the whole record to the surfaces, for the report."""
-    power = "degree2 hour-2 s"
-    channels = {
-        str(name): blocks[name] for name in blocks.data_vars if str(name).startswith("channel_")
-    }
-    with np.errstate(invalid="ignore"):
-        cases = [blocks["power"], before["spectrum"], after["spectrum"]]
-        has_data = np.isfinite(blocks["power"].values)
-        density = np.stack([_average_where(case.values, has_data) for case in cases])
-        lines = blocks["line_power"].weighted(blocks["line_weight"].fillna(0.0)).mean("part")
-    step = -(-lines.sizes["line"] // MAX_LINES)
-    lines = lines.coarsen(line=step, boundary="trim").max()
-    frequency = blocks["line_frequency"].coarsen(line=step, boundary="trim").mean()
-    added = xr.Dataset(
-        {
-            "block_mean": (("axis", "block"), blocks["mean"].values, dict(blocks["mean"].attrs)),
-            "density": (
-                ("case", "axis", "band"),
-                density,
-                {"units": power, "long_name": "two-sided power density of the record"},
-            ),
-            "line_density": (
-                ("axis", "line"),
-                lines.values,
-                {
-                    "units": power,
-                    "long_name": "two-sided power density of the recording"
-                    + (f", highest of {step} lines" if step > 1 else " at full resolution"),
-                },
-            ),
-            **{
-                name: ("block", values.values, dict(values.attrs))
-                for name, values in channels.items()
-            },
-        },
-        coords={
-            "block_begin": ("block", blocks["begin"].values, dict(blocks["begin"].attrs)),
-            "block_end": ("block", blocks["end"].values, dict(blocks["end"].attrs)),
-            "frequency": ("band", blocks["frequency"].values, dict(blocks["frequency"].attrs)),
-            "line_frequency": ("line", frequency.values, dict(blocks["line_frequency"].attrs)),
-        },
-    )
-    return surfaces.merge(added, compat="no_conflicts", join="exact")
-
-
-def _average_where(values: Array, has_data: NDArray[np.bool_]) -> Array:
-    count = has_data.sum(axis=1)
-    return np.asarray(
-        np.divide(
-            np.where(has_data, values, 0.0).sum(axis=1),
-            count,
-            out=np.full(count.shape, np.nan),
-            where=count > 0,
-        )
-    )
