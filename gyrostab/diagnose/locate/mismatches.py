@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.locate.regions import merge_regions, merge_wandering_regions
+from gyrostab.diagnose.locate.regions import Region, merge_regions, merge_wandering_regions
 from gyrostab.diagnose.nulls.scores import NullScores, standardise
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS, Statistic
@@ -20,24 +18,6 @@ Array = NDArray[np.float64]
 MAX_PER_ROW = 8  # mismatches of one statistic and row
 MAX_MISMATCHES = 30  # of a record
 
-#: Fields of a mismatch, and their units.
-FIELDS = {
-    "statistic": None,
-    "view": None,
-    "axes": None,
-    "what": None,
-    "begin": "s",
-    "end": "s",
-    "tau_min_s": "s",
-    "tau_max_s": "s",
-    "frequency": "Hz",
-    "sign": "1",
-    "z": "1",
-    "ratio": "1",
-    "estimate": None,
-    "p_value": "1",
-}
-
 
 def locate_mismatches(
     blocks: xr.Dataset,
@@ -46,7 +26,7 @@ def locate_mismatches(
     *,
     level: float = 0.01,
     settings: Settings = DEFAULTS,
-) -> xr.Dataset:
+) -> list[Region]:
     """Locate where a recording differs from the simulation by more than noise does.
 
     Every statistic scores its cells, in standard deviations of the null records. The p-value of a
@@ -63,27 +43,22 @@ def locate_mismatches(
 
     Returns
     -------
-    xarray.Dataset
-        Along ``mismatch``, the surest first: ``statistic``, ``view``, ``axes`` (separated by
-        blanks), ``what``, ``begin``, ``end`` [s since the start], ``start_time``, ``end_time``,
-        ``tau_min_s``, ``tau_max_s`` [s], ``frequency`` [Hz], ``sign`` (0 for a mean that wanders),
-        ``z``, ``ratio`` (observed over expected; for means and restarts the number of standard
-        deviations), ``estimate`` (depends on the statistic), ``p_value``.
+    list of Region
+        The surest first.
 
     Examples
     --------
     >>> null = null_scores(baseline, null_records(blocks, baseline, rng=rng))  # doctest: +SKIP
     >>> found = locate_mismatches(blocks, baseline, null)  # doctest: +SKIP
-    >>> found.axes.values, found.begin.values, found.end.values  # doctest: +SKIP
-    (array(['x']), array([1500.]), array([1800.]))
+    >>> [(region["axes"], region["begin"], region["end"]) for region in found]  # doctest: +SKIP
+    [('x', 1500.0, 1800.0)]
     """
-    regions: list[dict[str, Any]] = []
+    regions: list[Region] = []
     for statistic in STATISTICS:
         if statistic.name in null.statistics:
             prepared = statistic.prepare(blocks, baseline, regions)
             regions += _locate_regions(statistic, prepared, baseline, null, level, settings)
-    merged = merge_regions(regions, settings=settings)
-    return _make_table(merged[:MAX_MISMATCHES], blocks, null, level)
+    return merge_regions(regions, settings=settings)[:MAX_MISMATCHES]
 
 
 def _locate_regions(
@@ -93,7 +68,7 @@ def _locate_regions(
     null: NullScores,
     level: float,
     settings: Settings,
-) -> list[dict[str, Any]]:
+) -> list[Region]:
     """Locate the regions of one statistic, row by row.
 
     A step at one place shifts the mean of the whole record: each region of the mean is located with
@@ -128,7 +103,7 @@ def _locate_regions(
 
 
 def _without_region(
-    region: dict[str, Any], blocks: xr.Dataset, baseline: xr.Dataset, row: int
+    region: Region, blocks: xr.Dataset, baseline: xr.Dataset, row: int
 ) -> xr.Dataset:
     """Complete a region of the mean, and return the baseline with its mean in it."""
     inside = (blocks["begin"].values >= region["begin"] - 1e-9) & (
@@ -152,7 +127,7 @@ def _take_region(
     null: NullScores,
     level: float,
     settings: Settings,
-) -> dict[str, Any] | None:
+) -> Region | None:
     """Return the region around the largest score left, or None; remove it from `remaining`."""
     critical = null.critical(statistic.name, level)
     if not np.isfinite(remaining).any() or np.nanmax(np.abs(remaining)) < critical:
@@ -291,23 +266,3 @@ def _find_columns(
         return np.array([column]), np.arange(first, last)
     overlap = (low <= high[grown].max() * 1.01) & (high >= low[grown].min() * 0.99)
     return region, np.flatnonzero(overlap)
-
-
-def _make_table(
-    regions: list[dict[str, Any]], blocks: xr.Dataset, null: NullScores, level: float
-) -> xr.Dataset:
-    variables: dict[str, Any] = {}
-    kinds = dict.fromkeys(("statistic", "view", "axes", "what"), str) | {"sign": int}
-    for field, units in FIELDS.items():
-        kind = kinds.get(field, float)
-        values = np.array([region[field] for region in regions], dtype=kind)
-        variables[field] = ("mismatch", values, {"units": units} if units else {})
-    start = np.datetime64(int(blocks.attrs["start_ns"]), "ns")
-    for field, edge in (("start_time", "begin"), ("end_time", "end")):
-        seconds = np.array([region[edge] for region in regions], dtype=float)
-        variables[field] = ("mismatch", start + np.rint(seconds * 1e9).astype("timedelta64[ns]"))
-    attributes = {"level": level, "null_records": null.records}
-    attributes |= {f"critical_{name}": null.critical(name, level) for name in null.statistics}
-    return xr.Dataset(
-        variables, coords={"mismatch": np.arange(1, len(regions) + 1)}, attrs=attributes
-    )

@@ -8,6 +8,11 @@ from typing import Any
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import find_statistic
 
+#: Fields of a place where recording and simulation differ: ``statistic``, ``view``, ``axes``
+#: (separated by blanks), ``what``, ``begin``, ``end`` [s since the start], ``tau_min_s``,
+#: ``tau_max_s`` [s], ``frequency`` [Hz], ``sign`` (0 for a mean that wanders), ``z``, ``ratio``
+#: (observed over expected; for means and restarts the number of standard deviations), ``estimate``
+#: (depends on the statistic), ``p_value``.
 Region = dict[str, Any]
 TAU_TOLERANCE = 0.99  # ratio of averaging times that are equal but for rounding
 _SEPARATE_KINDS = ("slow", "variance", "drifting")
@@ -17,8 +22,7 @@ def merge_regions(regions: Sequence[Region], *, settings: Settings = DEFAULTS) -
     """Merge regions, the surest first; the surest gives the numbers.
 
     Regions of different axes are merged when they share most of their time. Those of the same axes
-    are also merged when they are adjacent, and then span both. The fields of a region are those of
-    `gyrostab.diagnose.locate.mismatches.FIELDS`.
+    are also merged when they are adjacent, and then span both.
 
     Examples
     --------

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache, partial
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion
 from gyrostab.diagnose.identify.identification import Selection
+from gyrostab.diagnose.locate.regions import Region
 from gyrostab.diagnose.nulls.scores import NullScores
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import mean_columns
@@ -98,7 +98,7 @@ def join_blocks(
 
 
 def attribute_mismatches(
-    located: xr.Dataset,
+    located: Sequence[Region],
     identified: Sequence[Selection],
     blocks: xr.Dataset,
     after: xr.Dataset,
@@ -120,7 +120,7 @@ def attribute_mismatches(
 
     Parameters
     ----------
-    located : xarray.Dataset
+    located : sequence of Region
         Mismatches from `gyrostab.diagnose.locate.mismatches.locate_mismatches`.
     blocks, after : xarray.Dataset
         The recording, and the baseline with the effects.
@@ -130,20 +130,16 @@ def attribute_mismatches(
     still : xarray.Dataset, optional
         Line spectra of the recording without the blocks in which an effect moves the rate.
     """
-    regions = [
-        {str(name): located[name].values[number] for name in located.data_vars}
-        for number in range(located.sizes["mismatch"])
-    ]
 
     @cache
     def scores_without(out: tuple[Selection, ...]) -> Scores:
         remaining = [identification for identification in identified if identification not in out]
         baseline = without(out) if without is not None and out else after
         return statistic_scores(
-            blocks, baseline, null, regions, remaining, still=still, settings=settings
+            blocks, baseline, null, located, remaining, still=still, settings=settings
         )
 
-    def score_without(region: Mapping[str, Any], out: Sequence[Selection]) -> tuple[float, float]:
+    def score_without(region: Region, out: Sequence[Selection]) -> tuple[float, float]:
         scores = scores_without(tuple(out))
         return score_left(region, scores, null, level, settings.score_error_share)
 
@@ -152,7 +148,7 @@ def attribute_mismatches(
         _moving_spans(identification, blocks, after, settings) for identification in identified
     ]
     explained = []
-    for region in regions:
+    for region in located:
         score, limit = score_without(region, ())
         axes = set(str(region["axes"]).split())
         shown = []
@@ -201,7 +197,7 @@ def attribute_mismatches(
 
 
 def drop_expected(
-    located: xr.Dataset,
+    located: Sequence[Region],
     expected: Sequence[Selection],
     blocks: xr.Dataset,
     before: xr.Dataset,
@@ -209,19 +205,19 @@ def drop_expected(
     *,
     level: float,
     settings: Settings = DEFAULTS,
-) -> xr.Dataset:
+) -> list[Region]:
     """Drop the mismatches that effects of the simulation itself explain.
 
     Parameters
     ----------
-    located : xarray.Dataset
+    located : sequence of Region
         Mismatches located with the expected anomalous samples left out. Effects with such samples
         therefore explain mismatches of the sample distribution only.
     blocks, before : xarray.Dataset
         The recording, and the baseline with these effects.
     """
     if not expected:
-        return located
+        return list(located)
     anomalous = [
         identification
         for identification in expected
@@ -238,15 +234,15 @@ def drop_expected(
         )
         for identified in (anomalous, others)
     )
-    is_expected = [
-        bool(named) or (bool(counted) and view == "distribution")
-        for view, counted, named in zip(located["view"].values, by_count, by_all, strict=True)
+    return [
+        region
+        for region, counted, named in zip(located, by_count, by_all, strict=True)
+        if not (named or (counted and region["view"] == "distribution"))
     ]
-    return located.isel(mismatch=~np.array(is_expected, np.bool_))
 
 
 def _is_caused_elsewhere(
-    region: Mapping[str, Any],
+    region: Region,
     components: Sequence[Component],
     score_without: Callable[[], tuple[float, float]],
 ) -> bool:
@@ -276,11 +272,11 @@ def _explained_spans(
     return join_blocks(active_blocks(identification, blocks, settings=settings), begin, end)
 
 
-def _overlap_seconds(region: Mapping[str, Any], span: tuple[float, float]) -> float:
+def _overlap_seconds(region: Region, span: tuple[float, float]) -> float:
     return float(min(region["end"], span[1]) - max(region["begin"], span[0]))
 
 
-def _is_within_blocks(region: Mapping[str, Any], blocks: xr.Dataset) -> bool:
+def _is_within_blocks(region: Region, blocks: xr.Dataset) -> bool:
     """Return whether a mismatch concerns the inside of blocks rather than their means."""
     return str(region["view"]) in ("spectrum", "distribution") or float(
         region["tau_max_s"]

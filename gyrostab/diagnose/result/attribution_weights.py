@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import xarray as xr
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.known_effects import remove_known_motion
 from gyrostab.diagnose.identify.identification import Selection, components_of
+from gyrostab.diagnose.locate.regions import Region
 from gyrostab.diagnose.nulls.scores import NullScores, standardise
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import drop_changed_tails
@@ -20,7 +20,6 @@ from gyrostab.diagnose.statistics import STATISTICS, find_statistic
 from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
 
 Scores = Sequence[tuple[str, xr.Dataset, NDArray[np.float64]]]
-Region = Mapping[str, Any]
 
 
 def statistic_scores(
@@ -156,8 +155,8 @@ def needed_effects(
 
     Parameters
     ----------
-    region : mapping
-        The mismatch, with the fields of `gyrostab.diagnose.locate.mismatches.FIELDS`.
+    region : Region
+        The mismatch.
     shown : sequence of (Selection, sequence of Component)
         Effects that act there and together remove it, each with its components that can show in its
         statistic.

@@ -287,7 +287,7 @@ def _attributed_mismatches(
 
     lines = (
         lines_without_motion(task, blocks, after)
-        if identified and (mismatches["view"] == "spectrum").any()
+        if identified and any(region["view"] == "spectrum" for region in mismatches)
         else None
     )
     explained = attribute_mismatches(

@@ -10,6 +10,7 @@ import xarray as xr
 
 from gyrostab.diagnose.identify.identification import Identifications, Selection
 from gyrostab.diagnose.identify.nuisance_alternatives import NUISANCE_ALTERNATIVES
+from gyrostab.diagnose.locate.regions import Region
 from gyrostab.diagnose.nulls.scores import MIN_P_VALUE, fit_best_evidence
 from gyrostab.diagnose.reduce.block_statistics import iso, measured
 from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
@@ -58,7 +59,7 @@ def _make_mismatch(
 
 
 def mismatch_tables(
-    located: xr.Dataset,
+    located: Sequence[Region],
     explained: Sequence[Sequence[str]],
     identifications: Identifications,
     blocks: xr.Dataset,
@@ -72,20 +73,15 @@ def mismatch_tables(
 
 
 def _located_mismatches(
-    mismatches: xr.Dataset, blocks: xr.Dataset, explained: Sequence[Sequence[str]]
+    mismatches: Sequence[Region], blocks: xr.Dataset, explained: Sequence[Sequence[str]]
 ) -> list[dict[str, Any]]:
     """Return the located mismatches."""
     record_s = float(blocks["end"].values[-1])
     out = []
-    for number, names in enumerate(explained):
-        region = {
-            str(name): mismatches[name].values[number].item()
-            for name in mismatches.data_vars
-            if mismatches[name].dtype.kind != "M"
-        }
-        axes = region["axes"] = str(region["axes"]).split()
+    for region, names in zip(mismatches, explained, strict=True):
+        axes = region["axes"].split()
         span, taus = ((region["begin"], region["end"]), (region["tau_min_s"], region["tau_max_s"]))
-        text = mismatch_statement(region, record_s)
+        text = mismatch_statement(region | {"axes": axes}, record_s)
         table = _make_mismatch(blocks, region["view"], axes, span, taus, region["p_value"], text)
         out.append(table | {"ratio": region["ratio"], "explained_by": list(names)})
     return out
