@@ -180,11 +180,7 @@ def measure_evidence(
         left_out = tuple(compress(renewed.identified, is_left_out))
         return predict_baseline(renewed, noise, known, left_out=left_out)
 
-    before = (
-        partial(expected_baseline, without_telegraph, baseline)
-        if without_telegraph.expected
-        else baseline
-    )
+    before = partial(expected_baseline, without_telegraph, baseline)
     after = partial(train, judged) if judged.identified else before
     with_phase_locked = partial(train, without_telegraph) if identified else before
     settings = identifications.state.settings

@@ -12,16 +12,13 @@ from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
 
+def _read_number(held: Mapping[str, Any], name: str) -> float:
+    """Return a number of the held-out evidence, NaN for the null of JSON."""
+    return math.nan if held[name] is None else float(held[name])
+
+
 def _has_gain(held: Mapping[str, Any]) -> bool:
-    gain = held["log_likelihood_gain"]
-    return gain is not None and math.isfinite(gain) and gain > 0.0
-
-
-def _has_coverage(held: Mapping[str, Any], tolerance: float) -> bool:
-    before, after = held["coverage95_before"], held["coverage95_after"]
-    if before is None or after is None or not math.isfinite(before) or not math.isfinite(after):
-        return True
-    return bool(after >= min(before, 0.95) - tolerance)
+    return 0.0 < _read_number(held, "log_likelihood_gain") < math.inf
 
 
 def failed_checks(held: Mapping[str, Any], *, settings: Settings = DEFAULTS) -> list[str]:
@@ -34,18 +31,26 @@ def failed_checks(held: Mapping[str, Any], *, settings: Settings = DEFAULTS) -> 
     >>> failed_checks(held)
     ['the forecast of the last 30 % is worse (-3 nats)']
     """
+    gain, forecast, before, after = (
+        _read_number(held, name)
+        for name in (
+            "log_likelihood_gain",
+            "forecast_gain",
+            "coverage95_before",
+            "coverage95_after",
+        )
+    )
     failed = []
     if not _has_gain(held):
-        gain = math.nan if held["log_likelihood_gain"] is None else held["log_likelihood_gain"]
         failed.append(
             f"held-out data are not predicted better (log-likelihood gain {gain:.3g} nats)"
         )
-    if held["forecast_gain"] is not None and held["forecast_gain"] < 0.0:
-        failed.append(f"the forecast of the last 30 % is worse ({held['forecast_gain']:.3g} nats)")
-    if not _has_coverage(held, settings.coverage_tolerance):
+    if forecast < 0.0:
+        failed.append(f"the forecast of the last 30 % is worse ({forecast:.3g} nats)")
+    if after < min(before, 0.95) - settings.coverage_tolerance:
         failed.append(
-            f"fewer cells lie inside their 95 % band ({100 * held['coverage95_after']:.1f} %, "
-            f"before {100 * held['coverage95_before']:.1f} %)"
+            f"fewer cells lie inside their 95 % band ({100 * after:.1f} %, "
+            f"before {100 * before:.1f} %)"
         )
     return failed
 
