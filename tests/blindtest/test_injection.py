@@ -26,6 +26,7 @@ from gyrostab.blindtest.generator.measured_noise import (
 from gyrostab.blindtest.generator.record import make_log
 from gyrostab.blindtest.generator.scenario import draw_scenario
 from gyrostab.blindtest.scenarios.injection import estimate_noise, inject_effect
+from gyrostab.blindtest.scenarios.real import plan_injections
 
 RATE, SECONDS = 20.0, 1500.0
 
@@ -229,3 +230,9 @@ def test_truth_of_an_injection_has_the_axes_of_the_log() -> None:
     assert effect["axes"] == list(effect["waveform_10s"]) == ["z"]
     assert list(effect["parameters"]["sensitivity"]["values"]) == ["z"]
     assert {tuple(truth["noise"]) for _, truth in copies.values()} == {("z",)}
+
+
+def test_half_of_the_injections_have_the_strength_from_which_most_should_be_named() -> None:
+    strengths = [plan["strength"] for plan in plan_injections(400, seed=3)[::4]]
+    assert set(strengths) == {2.5, 5.0, 8.0}
+    assert 0.4 < strengths.count(5.0) / len(strengths) < 0.6

@@ -580,17 +580,17 @@ def test_only_names_added_by_an_injection_count():
         "injections of strength 1.5 or more: named correctly", ["value", "n"]
     ].tolist() == [1.0, 1]
     assert (
-        table.loc["injections of 3 times the limit in fitted noise or more: named correctly", "n"]
+        table.loc["injections of 5 times the limit in fitted noise or more: named correctly", "n"]
         == 0
     )  # its 4.5 nats in fitted noise are below the limit
     strong = [
-        row | ({"learned_strength": 3.5} if row["copy"] == "injected" else {})
+        row | ({"learned_strength": 4.996} if row["copy"] == "injected" else {})
         for row in injection_rows(injected=["shupe"])
     ]
-    assert injection_differences(strong)[0]["learned_strength"] == 3.5
+    assert injection_differences(strong)[0]["learned_strength"] == 4.996
     assert injection_table(strong).set_index("quantity").loc[
-        "injections of 3 times the limit in fitted noise or more: named correctly", ["value", "n"]
-    ].tolist() == [1.0, 1]
+        "injections of 5 times the limit in fitted noise or more: named correctly", ["value", "n"]
+    ].tolist() == [1.0, 1]  # drawn at 5, to 0.1 %
     assert injection_table([]).empty
     main = score_table(injection_rows(injected=["shupe"], untouched=["spikes"])).set_index(
         "quantity"

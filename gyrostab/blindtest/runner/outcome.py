@@ -64,7 +64,7 @@ _HEADLINES = (
     "probability of a name: expected calibration error",
     "simulated records nearer to the recording with the effects, without refit",
     "injections of strength 1.5 or more: named correctly",
-    "injections of 3 times the limit in fitted noise or more: named correctly",
+    "injections of 5 times the limit in fitted noise or more: named correctly",
     "injection adds another name",
 )
 _MAX_LISTED = 40
