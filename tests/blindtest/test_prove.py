@@ -7,9 +7,6 @@ import importlib
 import json
 import os
 import shutil
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import ClassVar
 
@@ -592,46 +589,3 @@ def test_processes_keep_order_and_use_one_thread():
 def test_dead_process_raises_worker_error():
     with pytest.raises(WorkerError, match="--resume"):
         run_in_processes(os._exit, [(1,)], workers=1)
-
-
-@pytest.mark.skipif(not Path("/proc").exists(), reason="looks at processes in /proc")
-def test_no_process_outlives_its_parent():
-    work = "run_in_processes(time.sleep, [(300,), (300,)], workers=2)"
-    code = f"import time\nfrom gyrostab.blindtest.runner.pool import run_in_processes\n{work}\n"
-    parent = subprocess.Popen(
-        [
-            sys.executable,
-            "-c",
-            f"if __name__ == '__main__':\n    {code.replace(chr(10), chr(10) + '    ')}",
-        ]
-    )
-    try:
-        children = wait_for(lambda: working(parent.pid))
-    finally:
-        parent.kill()
-        parent.wait()
-    assert wait_for(lambda: not any(Path(f"/proc/{child}/task").exists() for child in children))
-
-
-def working(parent: int) -> list[int]:
-    """List the two worker processes of a parent once both are sleeping."""
-    children = [
-        int(number) for number in Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
-    ]
-    children = [
-        child for child in children if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text()
-    ]
-    ready = [child for child in children if len(list(Path(f"/proc/{child}/task").iterdir())) > 1]
-    return ready if len(ready) == 2 else []
-
-
-def wait_for(truth, *, seconds: float = 30.0):
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        try:
-            if value := truth():
-                return value
-        except OSError:
-            pass
-        time.sleep(0.05)
-    return None

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import os
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from gyrostab.blindtest.runner.folder import (
     FIRST_PUBLIC_SEED,
@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from gyrostab.progress import Stage
+
+T = TypeVar("T")
+#: Runs a step: takes its label, the function of a case, the jobs, and the number of cases done.
+RunStep = Callable[..., list[Any]]
 
 _DEFAULTS = {"cases": 40, "nulls": 400, "counterparts": 4}
 
@@ -118,7 +122,10 @@ def prove(
     >>> proof = gyrostab.prove("proof", cases=20)  # doctest: +SKIP
     >>> print(proof.table)  # doctest: +SKIP
     """
+    from gyrostab.blindtest.runner.outcome import score_rows, write_outcome
+    from gyrostab.blindtest.scenarios.commitment import open_truth
     from gyrostab.blindtest.scenarios.real import check_recordings
+    from gyrostab.blindtest.scoring.table import list_missed, score_table
     from gyrostab.jobs import lock_job
     from gyrostab.progress import no_stage
 
@@ -138,20 +145,31 @@ def prove(
     with lock_job(folder):
         job = begin_run(folder, requested, fresh, resume=resume, overwrite=overwrite)
         tell(_describe_run(job, folder))
-        number = (
-            len(os.sched_getaffinity(0))
-            if hasattr(os, "sched_getaffinity")
-            else os.cpu_count() or 1
-        )
-        number = number if workers is None else workers
         plans = _plan_all(job)
-        names = list(plans)
-        sums, commitment = _draw_and_commit(
-            folder, plans, number, stage, None if real is None else Path(real)
+
+        def run_step(
+            label: str, function: Callable[..., T], jobs: Sequence[tuple[Any, ...]], done: int = 0
+        ) -> list[T]:
+            def report(number: int) -> None:
+                stage(label, done + len(jobs), done + number, "cases")
+
+            report(0)
+            return run_in_processes(function, jobs, workers=workers, report=report)
+
+        sums, commitment = read_sums(folder) or _draw_and_commit(
+            folder, plans, run_step, None if real is None else Path(real)
         )
-        tell(f"committed: {len(names)} truths, SHA-256 of their list {commitment}")
-        failed = _diagnose_all(folder, job, names, number, stage)
-        return _score_and_write(folder, job, names, sums, commitment, failed, number, stage)
+        tell(f"committed: {len(plans)} truths, SHA-256 of their list {commitment}")
+        failed = _diagnose_all(folder, job, list(plans), run_step)
+        truths = {
+            name: open_truth(folder / "truth" / f"{name}.json", sha256=sums[name]) for name in plans
+        }
+        baseline_scores = _compare_all(folder, truths, run_step)
+        stage("counting", 0)
+        rows = score_rows(_read_diagnoses(folder, plans, failed), truths, baseline_scores)
+        table = score_table(rows)
+        files = write_outcome(folder, rows, table, job=job, commitment=commitment, failed=failed)
+        return Proof(job["seed"], commitment, table, list_missed(table), failed, files)
 
 
 def _plan_all(job: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -185,33 +203,22 @@ def _describe_run(job: dict[str, Any], folder: Path) -> str:
     return text + (f"\n{done} cases are diagnosed already" if done else "")
 
 
-def _count_cases(stage: Stage, label: str, total: int, first: int = 0) -> Callable[[int], None]:
-    stage(label, total, first, "cases")
-    return lambda done: stage(label, total, first + done, "cases")
-
-
 def _draw_and_commit(
-    folder: Path, plans: dict[str, dict[str, Any]], workers: int, stage: Stage, real: Path | None
+    folder: Path, plans: dict[str, dict[str, Any]], run_step: RunStep, real: Path | None
 ) -> tuple[dict[str, str], str]:
-    """Draw the missing cases and commit all truths; committed cases are never drawn again."""
-    committed = read_sums(folder)
-    if committed is not None:
-        return committed
+    """Draw the missing cases and commit all truths."""
     if real is None and any("recording" in plan for plan in plans.values()):
         raise ResumeError(
             f"{folder}: was begun with real recordings that are not drawn yet; "
             "give their folder again with --real DIR"
         )
     jobs = [(folder, name, plan, real) for name, plan in plans.items()]
-    hashes = run_in_processes(
-        draw_case, jobs, workers=workers, report=_count_cases(stage, "drawing", len(jobs))
-    )
-    sums = dict(zip(plans, hashes, strict=True))
+    sums = dict(zip(plans, run_step("drawing", draw_case, jobs), strict=True))
     return sums, write_sums(folder, sums)
 
 
 def _diagnose_all(
-    folder: Path, job: dict[str, Any], names: list[str], workers: int, stage: Stage
+    folder: Path, job: dict[str, Any], names: list[str], run_step: RunStep
 ) -> dict[str, str]:
     """Diagnose the remaining cases; return the name of each that fails -> reason."""
     remaining = [name for name in names if not (folder / "diagnoses" / f"{name}.json").exists()]
@@ -224,8 +231,7 @@ def _diagnose_all(
         )
         for name in remaining
     ]
-    report = _count_cases(stage, "diagnosing", len(names), len(names) - len(remaining))
-    good = run_in_processes(diagnose_case, jobs, workers=workers, report=report)
+    good = run_step("diagnosing", diagnose_case, jobs, len(names) - len(remaining))
     lost = [name for name, flag in zip(remaining, good, strict=True) if not flag]
     return {
         name: (folder / "failed" / f"{name}.txt").read_text(encoding="utf-8").splitlines()[0]
@@ -233,27 +239,11 @@ def _diagnose_all(
     }
 
 
-def _score_and_write(
-    folder: Path,
-    job: dict[str, Any],
-    names: list[str],
-    sums: dict[str, str],
-    commitment: str,
-    failed: dict[str, str],
-    workers: int,
-    stage: Stage,
-) -> Proof:
-    """Check the truths against the commitment, score, and write the results."""
-    from gyrostab.blindtest.runner.outcome import score_rows, write_outcome
-    from gyrostab.blindtest.scenarios.commitment import open_truth
-    from gyrostab.blindtest.scoring.table import list_missed, score_table
-
-    truths = {
-        name: open_truth(folder / "truth" / f"{name}.json", sha256=sums[name]) for name in names
-    }
-    drawn = [
-        name for name in names if "recording" not in truths[name]["plan"]
-    ]  # the noise level of a real recording is unknown
+def _compare_all(
+    folder: Path, truths: dict[str, dict[str, Any]], run_step: RunStep
+) -> dict[str, dict[str, float]]:
+    """Score the drawn cases with other detectors; the noise of a real recording is unknown."""
+    drawn = [name for name, truth in truths.items() if "recording" not in truth["plan"]]
     jobs = [
         (
             folder / "recordings" / f"{name}.nc",
@@ -262,16 +252,14 @@ def _score_and_write(
         )
         for name in drawn
     ]
-    baseline_scores = run_in_processes(
-        compare_case, jobs, workers=workers, report=_count_cases(stage, "comparing", len(drawn))
-    )
-    diagnoses = {
+    return dict(zip(drawn, run_step("comparing", compare_case, jobs), strict=True))
+
+
+def _read_diagnoses(
+    folder: Path, names: Iterable[str], failed: Collection[str]
+) -> dict[str, dict[str, Any]]:
+    return {
         name: json.loads((folder / "diagnoses" / f"{name}.json").read_text(encoding="utf-8"))
         for name in names
         if name not in failed
     }
-    stage("counting", 0)
-    rows = score_rows(diagnoses, truths, dict(zip(drawn, baseline_scores, strict=True)))
-    table = score_table(rows)
-    files = write_outcome(folder, rows, table, job=job, commitment=commitment, failed=failed)
-    return Proof(job["seed"], commitment, table, list_missed(table), failed, files)

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import multiprocessing
 import os
-import signal
-import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing.connection import wait
 from typing import Any, TypeVar
 
 from gyrostab.errors import WorkerError
+from gyrostab.jobs import open_pool, run_calls
 
 T = TypeVar("T")
 
@@ -25,8 +20,8 @@ def run_in_processes(
     function: Callable[..., T],
     jobs: Sequence[tuple[Any, ...]],
     *,
-    workers: int,
-    report: Callable[[int], None] | None = None,
+    workers: int | None,
+    report: Callable[[int], None] = lambda done: None,
 ) -> list[T]:
     """Call `function` with each of `jobs`, and return the results in the order of the jobs.
 
@@ -36,8 +31,8 @@ def run_in_processes(
         Module-level function.
     jobs : sequence of tuple
         Arguments of each call.
-    workers : int
-        Number of processes; 0 to work in this process.
+    workers : int, optional
+        Number of processes (one per core by default); 0 to work in this process.
     report : callable, optional
         Receives the number of finished jobs.
 
@@ -51,21 +46,19 @@ def run_in_processes(
     >>> run_in_processes(divmod, [(7, 2), (9, 4)], workers=0)
     [(3, 1), (2, 1)]
     """
-    report = report or (lambda done: None)
+    results: dict[int, T] = {}
     if workers == 0 or not jobs:
-        done: list[T] = []
-        for job in jobs:
-            done.append(function(*job))
-            report(len(done))
-        return done
-    with _limit_threads(), _open_executor(min(workers, len(jobs))) as executor:
-        places = {executor.submit(function, *job): place for place, job in enumerate(jobs)}
-        results: dict[int, T] = {}
+        for place, job in enumerate(jobs):
+            results[place] = function(*job)
+            report(len(results))
+        return list(results.values())
+    calls = [(_call_quietly, place, function, *job) for place, job in enumerate(jobs)]
+    with _limit_threads(), open_pool("processes", workers=workers) as pool:
         try:
-            for future in as_completed(places):
-                results[places[future]] = future.result()
+            for (_, place, *_), result in run_calls(pool, calls):
+                results[place] = result
                 report(len(results))
-        except BrokenProcessPool as error:
+        except WorkerError as error:
             raise WorkerError(
                 "a process that worked on a case has died, perhaps for want of memory; "
                 "continue with --resume and fewer --workers"
@@ -88,34 +81,10 @@ def _limit_threads() -> Iterator[None]:
                 os.environ[name] = value
 
 
-@contextlib.contextmanager
-def _open_executor(workers: int) -> Iterator[ProcessPoolExecutor]:
-    other_processes = set(multiprocessing.active_children())
-    executor = ProcessPoolExecutor(
-        workers, mp_context=multiprocessing.get_context("spawn"), initializer=_prepare_process
-    )
-    try:
-        yield executor
-    except BaseException:
-        executor.shutdown(wait=False, cancel_futures=True)
-        for process in set(multiprocessing.active_children()) - other_processes:
-            process.terminate()
-        raise
-    executor.shutdown()
-
-
-def _prepare_process() -> None:
-    """Prepare a process: leave Ctrl-C to its parent, end with it, and keep dask to one thread."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
-    warnings.simplefilter("ignore")
+def _call_quietly(place: int, function: Callable[..., T], *arguments: Any) -> T:
+    """Call a function in one thread and without warnings; `place` numbers the call."""
     import dask
 
-    dask.config.set(scheduler="synchronous")
-
-
-def _end_with(sentinel: int) -> None:
-    wait([sentinel])
-    os._exit(1)
+    with warnings.catch_warnings(), dask.config.set(scheduler="synchronous"):
+        warnings.simplefilter("ignore")
+        return function(*arguments)
