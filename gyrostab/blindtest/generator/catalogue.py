@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from gyrostab.blindtest.generator import (
     digitisation,
@@ -13,79 +15,80 @@ from gyrostab.blindtest.generator import (
     thermal,
     wander,
 )
-from gyrostab.blindtest.generator.scenario import Effect
+from gyrostab.blindtest.generator.record import UNITS
+from gyrostab.blindtest.generator.scenario import Effect, Scenario
 
 
 @dataclass(frozen=True)
 class Entry:
     """How to draw an effect.
 
-    `make` draws it, `channel` drives it, `cuts` is the least number of power cuts, and `needs`
-    names what the scenario must contain. `can_be_sub_threshold` is set where the effect can be
-    invisible in the raw trace and the Allan plot, yet identifiable.
+    `draw` has the name of the effect, `driver` drives it, `cuts` is the least number of power cuts,
+    and `needs` names what the scenario must contain. `can_be_sub_threshold` is set where the effect
+    can be invisible in the raw trace and the Allan plot, yet identifiable.
     """
 
-    make: Callable[..., Effect]
-    channel: str | None = None
+    draw: Callable[..., Effect]
+    driver: str | None = None
     cuts: int = 0
     needs: str = ""
     can_be_sub_threshold: bool = False
 
+    @property
+    def channel(self) -> str | None:
+        """Driver that is a channel of the log."""
+        return self.driver if self.driver in UNITS else None
 
-CATALOGUE: dict[str, Entry] = {
-    "vibration_noise": Entry(motion.vibration_noise, "vibration", needs="vibration"),
-    "vibration_rectification": Entry(
+    def make(self, scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+        """Draw the effect."""
+        effect = self.draw(scenario, rng, strength=strength)
+        return replace(effect, name=self.draw.__name__, driver=self.driver)
+
+
+def _by_name(*entries: Entry) -> dict[str, Entry]:
+    return {entry.draw.__name__: entry for entry in entries}
+
+
+CATALOGUE = _by_name(
+    Entry(motion.vibration_noise, "vibration", needs="vibration"),
+    Entry(
         motion.vibration_rectification, "vibration", needs="vibration", can_be_sub_threshold=True
     ),
-    "shupe": Entry(thermal.shupe, "temperature", needs="heat", can_be_sub_threshold=True),
-    "temperature_bias": Entry(
-        thermal.temperature_bias, "temperature", needs="heat", can_be_sub_threshold=True
-    ),
-    "thermal_hysteresis": Entry(
-        thermal.thermal_hysteresis, "temperature", needs="heat", can_be_sub_threshold=True
-    ),
-    "warm_up": Entry(thermal.warm_up, cuts=2, can_be_sub_threshold=True),
-    "temperature_noise": Entry(
-        thermal.temperature_noise, "temperature", needs="heat", can_be_sub_threshold=True
-    ),
-    "light_power_noise": Entry(
-        thermal.light_power_noise, "light_power", needs="dips", can_be_sub_threshold=True
-    ),
-    "ageing_noise": Entry(thermal.ageing_noise, can_be_sub_threshold=True),
-    "shared_source": Entry(electronics.shared_source, can_be_sub_threshold=True),
-    "spectral_line": Entry(electronics.spectral_line, can_be_sub_threshold=True),
-    "earth_rate": Entry(
-        motion.earth_rate, "rotation_rate", needs="rotation", can_be_sub_threshold=True
-    ),
-    "rotation_line": Entry(
-        motion.rotation_line, "rotation_rate", needs="rotation", can_be_sub_threshold=True
-    ),
-    "scale_factor": Entry(
-        motion.scale_factor, "rotation_rate", needs="rotation", can_be_sub_threshold=True
-    ),
-    "misalignment": Entry(motion.misalignment),
-    "logger_filter": Entry(electronics.logger_filter),
-    "aliased_vibration": Entry(motion.aliased_vibration, "vibration", needs="vibration"),
-    "spikes": Entry(electronics.spikes),
-    "held_samples": Entry(electronics.held_samples, needs="unquantized angle"),
-    "bias_jump": Entry(electronics.bias_jump, cuts=1, can_be_sub_threshold=True),
-    "supply_bias": Entry(electronics.supply_bias, "supply_voltage", can_be_sub_threshold=True),
-    "feedback_reset": Entry(electronics.feedback_reset, "ramp"),
-    "rate_quantization": Entry(digitisation.rate_quantization, needs="unquantized angle"),
-    "dead_zone": Entry(digitisation.dead_zone, needs="unquantized angle"),
-    "clipping": Entry(digitisation.clipping, needs="unquantized angle"),
-    "gauss_markov": Entry(wander.gauss_markov),
-    "telegraph": Entry(wander.telegraph),
-    "ageing_bias": Entry(wander.ageing_bias, can_be_sub_threshold=True),
-}
+    Entry(thermal.shupe, "temperature", needs="heat", can_be_sub_threshold=True),
+    Entry(thermal.temperature_bias, "temperature", needs="heat", can_be_sub_threshold=True),
+    Entry(thermal.thermal_hysteresis, "temperature", needs="heat", can_be_sub_threshold=True),
+    Entry(thermal.warm_up, cuts=2, can_be_sub_threshold=True),
+    Entry(thermal.temperature_noise, "temperature", needs="heat", can_be_sub_threshold=True),
+    Entry(thermal.light_power_noise, "light_power", needs="dips", can_be_sub_threshold=True),
+    Entry(thermal.ageing_noise, "time", can_be_sub_threshold=True),
+    Entry(electronics.shared_source, can_be_sub_threshold=True),
+    Entry(electronics.spectral_line, can_be_sub_threshold=True),
+    Entry(motion.earth_rate, "rotation_rate", needs="rotation", can_be_sub_threshold=True),
+    Entry(motion.rotation_line, "rotation_rate", needs="rotation", can_be_sub_threshold=True),
+    Entry(motion.scale_factor, "rotation_rate", needs="rotation", can_be_sub_threshold=True),
+    Entry(motion.misalignment, "other axes"),
+    Entry(electronics.logger_filter),
+    Entry(motion.aliased_vibration, "vibration", needs="vibration"),
+    Entry(electronics.spikes),
+    Entry(electronics.held_samples, needs="unquantized angle"),
+    Entry(electronics.bias_jump, cuts=1, can_be_sub_threshold=True),
+    Entry(electronics.supply_bias, "supply_voltage", can_be_sub_threshold=True),
+    Entry(electronics.feedback_reset, "ramp"),
+    Entry(digitisation.rate_quantization, needs="unquantized angle"),
+    Entry(digitisation.dead_zone, needs="unquantized angle"),
+    Entry(digitisation.clipping, needs="unquantized angle"),
+    Entry(wander.gauss_markov),
+    Entry(wander.telegraph),
+    Entry(wander.ageing_bias, "time", can_be_sub_threshold=True),
+)
 
-OUT_OF_CATALOGUE: dict[str, Entry] = {
-    "breathing_noise": Entry(out_of_catalogue.breathing_noise),
-    "chirped_line": Entry(out_of_catalogue.chirped_line),
-    "slow_memory": Entry(out_of_catalogue.slow_memory),
-    "three_levels": Entry(out_of_catalogue.three_levels),
-    "informative_gaps": Entry(out_of_catalogue.informative_gaps),
-}
+OUT_OF_CATALOGUE = _by_name(
+    Entry(out_of_catalogue.breathing_noise),
+    Entry(out_of_catalogue.chirped_line),
+    Entry(out_of_catalogue.slow_memory),
+    Entry(out_of_catalogue.three_levels),
+    Entry(out_of_catalogue.informative_gaps),
+)
 
 #: Effects that the data may be unable to distinguish.
 AMBIGUITY: tuple[frozenset[str], ...] = tuple(

@@ -32,9 +32,7 @@ def rate_quantization(scenario: Scenario, rng: np.random.Generator, *, strength:
         scenario,
         lambda a: 1 + (a**2 / 12 / sd**2)[:, None],
         strength=strength,
-        name="rate_quantization",
         axes=AXES,
-        driver=None,
         form="cut off towards zero" if cut else "rounded to the nearest step",
         form_differs=cut,
         first=1e-3 * float(sd.min()),
@@ -63,9 +61,7 @@ def dead_zone(scenario: Scenario, rng: np.random.Generator, *, strength: float) 
         return out
 
     return Effect(
-        name="dead_zone",
         axes=(AXES[axis],),
-        driver=None,
         form="held at zero, and pulled softly beyond",
         form_differs=True,
         size=strength,
@@ -98,9 +94,7 @@ def clipping(scenario: Scenario, rng: np.random.Generator, *, strength: float) -
         return out
 
     return Effect(
-        name="clipping",
         axes=(AXES[axis],),
-        driver=None,
         form=("on both sides" if is_two_sided else "above")
         + (", with a soft knee" if soft else ""),
         form_differs=soft,

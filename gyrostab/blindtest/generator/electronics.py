@@ -53,8 +53,6 @@ def spectral_line(scenario: Scenario, rng: np.random.Generator, *, strength: flo
         np.sin(phase + rng.uniform(0, 6)),
         shares,
         strength=strength,
-        name="spectral_line",
-        driver=None,
         form="sine with a phase that wanders by a radian" if wander else "sine",
         form_differs=wander,
         tau=(max(1 / scenario.rate, 0.1 / frequency), 2 / frequency),
@@ -84,8 +82,6 @@ def supply_bias(scenario: Scenario, rng: np.random.Generator, *, strength: float
         to_samples(scenario, shape),
         draw_shares(rng),
         strength=strength,
-        name="supply_bias",
-        driver="supply_voltage",
         form="slow and bent" if slow else "proportional to the voltage",
         form_differs=slow,
         regressor=("voltage", to_samples(scenario, v), "deg/h/V"),
@@ -122,8 +118,6 @@ def bias_jump(scenario: Scenario, rng: np.random.Generator, *, strength: float) 
         to_samples(scenario, shape),
         draw_shares(rng),
         strength=strength,
-        name="bias_jump",
-        driver=None,
         form="step with a settling tail at every start" if tail else "step at every start",
         form_differs=tail,
     )
@@ -146,8 +140,6 @@ def feedback_reset(scenario: Scenario, rng: np.random.Generator, *, strength: fl
         loop.reset_error(phase, settle=settle),
         shares,
         strength=strength,
-        name="feedback_reset",
-        driver="ramp",
         form=f"exponential in {settle:.2f} of the ramp, at {resets:.2f} resets a second",
         form_differs=True,
         tau=(1 / scenario.rate, 2 / resets),
@@ -183,9 +175,7 @@ def shared_source(scenario: Scenario, rng: np.random.Generator, *, strength: flo
     shares = shares * min(amplitude_for(size_of, strength, first=1e-2), _MAX_SHARE)
     size = shared_size(scenario, shares, power)
     return Effect(
-        name="shared_source",
         axes=axes_with_share(shares),
-        driver=None,
         form=f"common noise low-passed at {corner:.2f} of Nyquist"
         if coloured
         else "white common noise",
@@ -239,9 +229,7 @@ def logger_filter(scenario: Scenario, rng: np.random.Generator, *, strength: flo
         scenario,
         ratio,
         strength=strength,
-        name="logger_filter",
         axes=AXES,
-        driver=None,
         form={
             "three": "three weights",
             "pole": "one pole",
@@ -299,9 +287,7 @@ def spikes(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> 
         return out
 
     return Effect(
-        name="spikes",
         axes=(AXES[axis],),
-        driver=None,
         form=f"{number} flips of bit 12",
         form_differs=True,
         size=strength,
@@ -330,9 +316,7 @@ def held_samples(scenario: Scenario, rng: np.random.Generator, *, strength: floa
         "length": {"value": frame / scenario.rate, "unit": "s"},
     }
     return Effect(
-        name="held_samples",
         axes=AXES,
-        driver=None,
         form=f"{starts.size} frames of {frame} samples " + ("held" if hold else "sent twice"),
         form_differs=not hold,
         size=math.sqrt(nats / NATS),

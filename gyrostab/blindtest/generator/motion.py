@@ -44,8 +44,6 @@ def vibration_rectification(
         to_samples(scenario, shape),
         draw_shares(rng),
         strength=strength,
-        name="vibration_rectification",
-        driver="vibration",
         form=f"power {exponent:.3g} of the rms, saturating at {saturation:g} g",
         form_differs=not (exponent == 2.0 and math.isinf(saturation)),
         active=scenario.busy,
@@ -90,7 +88,7 @@ def _make_shaking_noise(
     rng: np.random.Generator,
     *,
     strength: float,
-    name: str,
+    in_band: bool,
     band: tuple[float, float],
     mount: tuple[Array, Array],
     kind: str,
@@ -108,9 +106,7 @@ def _make_shaking_noise(
         scenario,
         lambda a: 1 + a**2 * unit,
         strength=strength,
-        name=name,
         axes=axes_with_share(shares),
-        driver="vibration",
         form=form,
         form_differs=True,
         first=1e-3,
@@ -123,7 +119,7 @@ def _make_shaking_noise(
         ]
     )
     parameters: dict[str, Any] = {"sensitivity_at_4_khz": {"value": amplitude, "unit": "deg/h/g"}}
-    if name == "vibration_noise":  # a flat model should find white noise of the same power
+    if in_band:  # a flat model should find white noise of the same power
         white = scale_by_axis(
             np.abs(shares), amplitude * math.sqrt(float(density.mean())) / white_level(1.0)
         )
@@ -148,7 +144,7 @@ def vibration_noise(scenario: Scenario, rng: np.random.Generator, *, strength: f
         scenario,
         rng,
         strength=strength,
-        name="vibration_noise",
+        in_band=True,
         band=(low, high),
         mount=vibration.mount_filter(resonance, quality=quality),
         kind=kind,
@@ -168,7 +164,7 @@ def aliased_vibration(scenario: Scenario, rng: np.random.Generator, *, strength:
         scenario,
         rng,
         strength=strength,
-        name="aliased_vibration",
+        in_band=False,
         band=(low, high),
         mount=vibration.mount_filter(resonance, quality=rng.uniform(3, 15)),
         kind=kind,
@@ -209,8 +205,6 @@ def earth_rate(scenario: Scenario, rng: np.random.Generator, *, strength: float)
         np.stack([x, y, np.zeros_like(x)]),
         np.array([1.0, 1.0, 0.0]),
         strength=strength,
-        name="earth_rate",
-        driver="rotation_rate",
         form="cosine and sine of the toolface",
         form_differs=False,
         tau=_rotation_tau(scenario),
@@ -238,8 +232,6 @@ def rotation_line(scenario: Scenario, rng: np.random.Generator, *, strength: flo
         np.asarray(comb * speed),
         shares,
         strength=strength,
-        name="rotation_line",
-        driver="rotation_rate",
         form="harmonics of the toolface, proportional to the speed",
         form_differs=True,
         tau=_rotation_tau(scenario),
@@ -257,8 +249,6 @@ def scale_factor(scenario: Scenario, rng: np.random.Generator, *, strength: floa
         to_samples(scenario, shape, dt=ROTATION_STEP_S),
         np.array([0.0, 0.0, 1.0]),
         strength=strength,
-        name="scale_factor",
-        driver="rotation_rate",
         form="linear and cubic in the rotation rate"
         if bend
         else "proportional to the rotation rate",
@@ -288,8 +278,6 @@ def misalignment(scenario: Scenario, rng: np.random.Generator, *, strength: floa
         shape,
         shares,
         strength=strength,
-        name="misalignment",
-        driver="other axes",
         form="proportional to the rate of z",
         form_differs=False,
     )

@@ -41,8 +41,6 @@ def shupe(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> E
         shape,
         shares,
         strength=strength,
-        name="shupe",
-        driver="temperature",
         form=form,
         form_differs=True,
     )
@@ -65,8 +63,6 @@ def temperature_bias(scenario: Scenario, rng: np.random.Generator, *, strength: 
         to_samples(scenario, shape),
         draw_shares(rng),
         strength=strength,
-        name="temperature_bias",
-        driver="temperature",
         form=form,
         form_differs=bend,
         regressor=regressor,
@@ -99,8 +95,6 @@ def thermal_hysteresis(scenario: Scenario, rng: np.random.Generator, *, strength
         to_samples(scenario, np.asarray(loop)),
         shares,
         strength=strength,
-        name="thermal_hysteresis",
-        driver="temperature",
         form="eight dead bands of different widths" if many else "one dead band",
         form_differs=many,
     )
@@ -137,8 +131,6 @@ def warm_up(scenario: Scenario, rng: np.random.Generator, *, strength: float) ->
         to_samples(scenario, shape),
         shares,
         strength=strength,
-        name="warm_up",
-        driver=None,
         form=f"{kind}, {tau:.0f} s",
         form_differs=bool(kind != "exponential"),
         active=x < 2,
@@ -198,14 +190,7 @@ def temperature_noise(scenario: Scenario, rng: np.random.Generator, *, strength:
         else "loss of light with temperature, detector budget"
     )
     return _make_light_noise(
-        scenario,
-        rng,
-        strength=strength,
-        loss=loss,
-        name="temperature_noise",
-        driver="temperature",
-        form=form,
-        form_differs=curved,
+        scenario, rng, strength=strength, loss=loss, form=form, form_differs=curved
     )
 
 
@@ -218,14 +203,7 @@ def ageing_noise(scenario: Scenario, rng: np.random.Generator, *, strength: floa
     )
     form = f"loss of light with the power {power:g} of time, detector budget"
     return _make_light_noise(
-        scenario,
-        rng,
-        strength=strength,
-        loss=loss,
-        name="ageing_noise",
-        driver="time",
-        form=form,
-        form_differs=power != 1.0,
+        scenario, rng, strength=strength, loss=loss, form=form, form_differs=power != 1.0
     )
 
 
@@ -234,12 +212,5 @@ def light_power_noise(scenario: Scenario, rng: np.random.Generator, *, strength:
     loss = -10 * np.log10(lag(scenario.light, rng.uniform(0, 5)))
     form = "shot, thermal and excess noise"
     return _make_light_noise(
-        scenario,
-        rng,
-        strength=strength,
-        loss=loss,
-        name="light_power_noise",
-        driver="light_power",
-        form=form,
-        form_differs=True,
+        scenario, rng, strength=strength, loss=loss, form=form, form_differs=True
     )

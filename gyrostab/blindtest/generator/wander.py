@@ -75,7 +75,6 @@ def _make_random_bias(
     size, nats = wander_size(scenario, shares, time=time, rms=rms)
     return Effect(
         axes=axes_with_share(shares),
-        driver=None,
         size=size,
         nats=nats,
         learned_nats=learned_random_nats(
@@ -110,7 +109,6 @@ def gauss_markov(scenario: Scenario, rng: np.random.Generator, *, strength: floa
         rng,
         waveform,
         strength=strength,
-        name="gauss_markov",
         time=time,
         form=form,
         form_differs=heavy,
@@ -136,7 +134,6 @@ def telegraph(scenario: Scenario, rng: np.random.Generator, *, strength: float) 
         rng,
         waveform,
         strength=strength,
-        name="telegraph",
         time=time,
         form=form,
         form_differs=gamma,
@@ -156,8 +153,6 @@ def ageing_bias(scenario: Scenario, rng: np.random.Generator, *, strength: float
         to_samples(scenario, shape),
         shares,
         strength=strength,
-        name="ageing_bias",
-        driver="time",
         form={
             "line": "a line",
             "logarithm": f"logarithm, {first:.0f} s",
