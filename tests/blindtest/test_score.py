@@ -20,7 +20,7 @@ from gyrostab.blindtest.scoring.curves import (
     reliability,
 )
 from gyrostab.blindtest.scoring.injections import injection_differences, injection_table
-from gyrostab.blindtest.scoring.proportions import Target, median, share, spread, wilson
+from gyrostab.blindtest.scoring.proportions import median, share, spread, wilson
 from gyrostab.blindtest.scoring.score import intersection_over_union, score_case
 from gyrostab.blindtest.scoring.table import list_missed, markdown, score_table
 from gyrostab.errors import SchemaError
@@ -528,7 +528,7 @@ def test_names_given_to_a_single_effect_are_counted():
 
 
 def test_68_percent_of_normal_errors_are_within_one_sigma():
-    target = Target("0.8-1.25", 0.8, 1.25)
+    target = "0.8-1.25"
 
     def errors(values) -> list[dict]:
         return [{"index": place, "pull": value} for place, value in enumerate(values)]

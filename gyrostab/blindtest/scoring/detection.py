@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from gyrostab.blindtest.scoring.proportions import Target, resample, share
+from gyrostab.blindtest.scoring.proportions import make_lines, resample
 from gyrostab.blindtest.scoring.score import CATALOGUE_KINDS, answered_rows, drawn_rows, first_rows
 from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH
 
@@ -140,40 +140,22 @@ def counterpart_table(rows: Sequence[Row]) -> pd.DataFrame:
         return pd.DataFrame()
     cases = {row["index"]: row for row in drawn_rows(rows)}
     pairs: list[Row] = [
-        {**row, "case": cases[row["index"]]} for row in mine if row["index"] in cases
+        {
+            **row,
+            "case": case,
+            "only_with": case["detected"] and not row["detected"],
+            "both": case["detected"] and row["detected"],
+            "only_without": row["detected"] and not case["detected"],
+        }
+        for row in mine
+        if (case := cases.get(row["index"]))
     ]
-    noise = answered_rows([row for row in rows if row["kind"] in ("null", "counterpart")])
     names: list[Row] = [
         {"index": row["index"], "both": entry["name"] in counterpart_names}
         for row in pairs
         for counterpart_names in [{other["name"] for other in row["identifications"]}]
         for entry in row["case"]["identifications"]
     ]
-    return pd.DataFrame(
-        [
-            share("false alarms: effect named on a counterpart", mine, "identifications"),
-            share(
-                "effect named on a counterpart or a null record",
-                noise,
-                "identifications",
-                Target("<= 1 %, upper bound <= 1.5 %", most=0.01, surely=0.015),
-            ),
-            share("counterparts with any mismatch", mine, "detected"),
-            share(
-                "detected with its effects, and not without them",
-                pairs,
-                lambda row: row["case"]["detected"] and not row["detected"],
-            ),
-            share(
-                "detected with its effects, and without them too",
-                pairs,
-                lambda row: row["case"]["detected"] and row["detected"],
-            ),
-            share(
-                "detected only without its effects",
-                pairs,
-                lambda row: row["detected"] and not row["case"]["detected"],
-            ),
-            share("names of a case that its counterpart has too", names, "both"),
-        ]
-    )
+    noise = answered_rows([row for row in rows if row["kind"] in ("null", "counterpart")])
+    groups = {"counterparts": mine, "noise": noise, "pairs": pairs, "names": names}
+    return pd.DataFrame(make_lines("counterparts", groups))

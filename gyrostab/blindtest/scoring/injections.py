@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 
 from gyrostab.blindtest.generator.catalogue import merge_ambiguous
-from gyrostab.blindtest.scoring.proportions import share
+from gyrostab.blindtest.scoring.proportions import make_lines
 from gyrostab.blindtest.scoring.score import answered_rows
 from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH
 
@@ -78,23 +78,15 @@ def injection_table(rows: Sequence[Row]) -> pd.DataFrame:
     differences = injection_differences(rows)
     if not differences:
         return pd.DataFrame(columns=["quantity", "value", "low", "high", "n", "target", "state"])
-    new = [line for line in differences if not line["there_before"]]
     least = _NAMED_STRENGTH * (1.0 - _STRENGTH_TOLERANCE)
-    lines = [
-        share(
-            f"injections of strength {CLEAR_STRENGTH:g} or more: named correctly",
-            [line for line in new if line["strength"] >= CLEAR_STRENGTH],
-            "named",
-        ),
-        share(
-            f"injections of {_NAMED_STRENGTH:g} times the limit in fitted noise or more: named "
-            "correctly",
-            [line for line in new if (line["learned_strength"] or 0.0) >= least],
-            "named",
-        ),
-        share("injection adds another name", answered_rows(differences), "others"),
-        share("reversing the sign adds a name", differences, "flipped"),
-        share("reversing time adds a name", differences, "reversed"),
-        share("effect already named without injection", differences, "there_before"),
+    new = [
+        {
+            **line,
+            "is_clear": line["strength"] >= CLEAR_STRENGTH,
+            "is_strong": (line["learned_strength"] or 0.0) >= least,
+        }
+        for line in differences
+        if not line["there_before"]
     ]
-    return pd.DataFrame(lines)
+    groups = {"all": differences, "answered": answered_rows(differences), "new": new}
+    return pd.DataFrame(make_lines("injections", groups))

@@ -11,9 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from gyrostab.blindtest.scoring.proportions import (
-    NO_TARGET,
     Line,
-    Target,
     make_line,
     resample,
     share_interval,
@@ -133,24 +131,24 @@ def probability_lines(rows: Sequence[Row]) -> list[Line]:
     A sample of exact probabilities has a calibration error too; a line gives its mean.
     """
     entries, stated, right = _collect_probabilities(rows)
-    scores: dict[str, tuple[Callable[[Array, Array], float], Target]] = {
+    scores: dict[str, tuple[Callable[[Array, Array], float], str]] = {
         "probability of a name: expected calibration error": (
             expected_calibration_error,
-            Target("<= 0.05", most=0.05),
+            "<= 0.05",
         ),
-        "Brier score of the probabilities": (_brier_score, NO_TARGET),
-        "Brier score of one probability for all names": (_constant_brier_score, NO_TARGET),
-        "log score of the probabilities, nats per name": (_log_score, NO_TARGET),
+        "Brier score of the probabilities": (_brier_score, ""),
+        "Brier score of one probability for all names": (_constant_brier_score, ""),
+        "log score of the probabilities, nats per name": (_log_score, ""),
     }
     exact = "calibration error of exact probabilities in as many names, mean and 95 % range"
     if not stated.size:
         nothing = (math.nan, math.nan, math.nan, 0)
         return [
             *(make_line(name, *nothing, target) for name, (_, target) in scores.items()),
-            make_line(exact, *nothing, NO_TARGET),
+            make_line(exact, *nothing, ""),
         ]
 
-    def score_line(name: str, score: Callable[[Array, Array], float], target: Target) -> Line:
+    def score_line(name: str, score: Callable[[Array, Array], float], target: str) -> Line:
         ends = resample(entries, lambda chosen: score(stated[chosen], right[chosen]))
         return make_line(name, score(stated, right), *ends, stated.size, target)
 
@@ -161,7 +159,7 @@ def probability_lines(rows: Sequence[Row]) -> list[Line]:
     mean = float(np.mean(by_chance))
     return [
         *(score_line(name, *scored) for name, scored in scores.items()),
-        make_line(exact, mean, low, high, stated.size, NO_TARGET),
+        make_line(exact, mean, low, high, stated.size, ""),
     ]
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -12,58 +14,33 @@ from numpy.typing import NDArray
 
 Line = dict[str, Any]
 Row = Mapping[str, Any]
-#: Key of a value of a row, or function that computes it.
-Read = str | Callable[[Row], Any]
 
 _RESAMPLINGS = 1000
 _SEED = 0  # of the resamplings
 _LEAST_RECORDS = 6  # for an interval from resampled records
 
 
-@dataclass(frozen=True)
-class Target:
-    """Range in which a figure should lie; the target is met if its whole interval lies there.
+def judge(target: str, value: float, low: float, high: float) -> str:
+    """Decide whether a figure and its interval meet a target: met, missed, or not shown.
 
-    `surely`, if given, replaces `most` for the upper end of the interval; `text` states the target.
+    A target such as ">= 95 %", "92-98 %" or "<= 1 %, upper bound <= 2 %" is met if the whole
+    interval lies in it; the upper bound, if given, is that of the interval.
+
+    Examples
+    --------
+    >>> judge(">= 95 %", 0.97, 0.92, 0.99)
+    'not shown'
     """
-
-    text: str
-    least: float = -math.inf
-    most: float = math.inf
-    surely: float | None = None
-
-    def state(self, value: float, low: float, high: float) -> str:
-        """Decide between met, missed and not shown.
-
-        Examples
-        --------
-        >>> Target(">= 95 %", least=0.95).state(0.97, 0.92, 0.99)
-        'not shown'
-        """
-        if not self.text:
-            return ""
-        if not math.isfinite(value):
-            return "not shown"
-        if not self.least <= value <= self.most:
-            return "missed"
-        return (
-            "met"
-            if low >= self.least and high <= (self.most if self.surely is None else self.surely)
-            else "not shown"
-        )
-
-
-NO_TARGET = Target("")
-
-
-def at_least(least: float) -> Target:
-    """Make the target of a share that should be so large."""
-    return Target(f">= {100 * least:.0f} %", least=least)
-
-
-def at_most(most: float) -> Target:
-    """Make the target of a share that should be so small."""
-    return Target(f"<= {100 * most:.0f} %", most=most)
+    if not target:
+        return ""
+    unit = 100.0 if "%" in target else 1.0
+    first, *more = (float(number) / unit for number in re.findall(r"[\d.]+", target))
+    least, most = (-math.inf, first) if target.startswith("<=") else (first, math.inf)
+    highest = more[0] if more else most
+    most = highest if "-" in target else most
+    if math.isfinite(value) and not least <= value <= most:
+        return "missed"
+    return "met" if math.isfinite(value) and low >= least and high <= highest else "not shown"
 
 
 def wilson(hits: int, total: int) -> tuple[float, float]:
@@ -136,67 +113,78 @@ def share_interval(rows: Sequence[Row], flags: Sequence[bool]) -> tuple[float, f
     return max(0.0, low), min(1.0, high)
 
 
-def share_columns(key: str, rows: Sequence[Row], flag: Read) -> dict[str, float]:
+def share_columns(key: str, rows: Sequence[Row], flag: str) -> dict[str, float]:
     """Make the columns of a share of rows and of the ends of its interval."""
-    flags = [bool(value) for value in _read_values(rows, flag)]
+    flags = [bool(row[flag]) for row in rows]
     low, high = share_interval(rows, flags)
     return {key: sum(flags) / len(flags), f"{key}_low": low, f"{key}_high": high}
 
 
-def _read_values(rows: Sequence[Row], read: Read) -> list[Any]:
-    return [row[read] if isinstance(read, str) else read(row) for row in rows]
-
-
-def make_line(
-    name: str, value: float, low: float, high: float, number: int, target: Target
-) -> Line:
+def make_line(name: str, value: float, low: float, high: float, number: int, target: str) -> Line:
     """Make a line of the table."""
-    state = target.state(value, low, high)
     return {
         "quantity": name,
         "value": float(value),
         "low": float(low),
         "high": float(high),
         "n": number,
-        "target": target.text,
-        "state": state,
+        "target": target,
+        "state": judge(target, value, low, high),
     }
 
 
-def share(name: str, rows: Sequence[Row], flag: Read, target: Target = NO_TARGET) -> Line:
-    """Make the line of the share of rows in which a value is true, or not zero or empty."""
+def share(name: str, rows: Sequence[Row], flag: str, target: str = "") -> Line:
+    """Make the line of the share of rows in which a value is true, or not zero or empty.
+
+    Rows without a value, None, do not count.
+    """
+    rows = [row for row in rows if row[flag] is not None]
     if not rows:
         return make_line(name, math.nan, math.nan, math.nan, 0, target)
     value, low, high = share_columns("share", rows, flag).values()
     return make_line(name, value, low, high, len(rows), target)
 
 
-def median(name: str, rows: Sequence[Row], read: Read, target: Target = NO_TARGET) -> Line:
+def median(name: str, rows: Sequence[Row], column: str, target: str = "") -> Line:
     """Make the line of a median of the finite values of rows."""
-    return _quantile_line(name, rows, read, 0.5, target)
+    return _quantile_line(name, rows, column, 0.5, target)
 
 
-def spread(name: str, rows: Sequence[Row], read: Read, target: Target = NO_TARGET) -> Line:
+def spread(name: str, rows: Sequence[Row], column: str, target: str = "") -> Line:
     """Make the line of the 68 % quantile of normalised errors, 1 where these are right."""
-    return _quantile_line(name, rows, read, 0.6827, target, size_of=abs)
+    return _quantile_line(name, rows, column, 0.6827, target, size_of=abs)
 
 
 def _quantile_line(
     name: str,
     rows: Sequence[Row],
-    read: Read,
+    column: str,
     level: float,
-    target: Target,
+    target: str,
     *,
     size_of: Callable[[float], float] = float,
 ) -> Line:
-    pairs = [
-        (row, size_of(value))
-        for row, value in zip(rows, _read_values(rows, read), strict=True)
-        if value is not None and math.isfinite(value)
-    ]
-    if not pairs:
+    used = [row for row in rows if row[column] is not None and math.isfinite(row[column])]
+    if not used:
         return make_line(name, math.nan, math.nan, math.nan, 0, target)
-    used, sizes = [row for row, _ in pairs], np.array([value for _, value in pairs])
+    sizes = np.array([size_of(row[column]) for row in used])
     low, high = resample(used, lambda chosen: float(np.quantile(sizes[chosen], level)))
     return make_line(name, float(np.quantile(sizes, level)), low, high, sizes.size, target)
+
+
+_STATISTICS = {"share": share, "median": median, "spread": spread}
+
+
+def make_lines(table: str, groups: Mapping[str, Sequence[Row]]) -> list[Line]:
+    """Make the lines of a table that ``figures.csv`` lists, from groups of rows by name."""
+    text = resources.files(__package__).joinpath("figures.csv").read_text(encoding="utf-8")
+    figures = csv.DictReader(
+        (line for line in text.splitlines() if not line.startswith("#")), delimiter=";"
+    )
+    lines = []
+    for figure in (figure for figure in figures if figure["table"] == table):
+        where, rows = figure["where"], groups[figure["rows"]]
+        rows = [row for row in rows if row[where]] if where else rows
+        make = _STATISTICS[figure["statistic"]]
+        lines.append(make(figure["quantity"], rows, figure["column"], figure["target"]))
+    return lines
