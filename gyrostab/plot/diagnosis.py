@@ -18,7 +18,6 @@ from gyrostab.plot.style import (
     PAGE_MM,
     axis_names,
     draws_figure,
-    is_narrow,
     label_log_axis,
     log_edges,
     new_figure,
@@ -115,9 +114,8 @@ def _draw_maps(
     norm: Any,
     cmap: str,
     label: str,
-    width: float,
 ) -> Figure:
-    """Draw one row of maps per axis; on a narrow figure, one map per row.
+    """Draw one row of maps per axis.
 
     `columns` are titles, values by (axis, window, tau), and the opacity of each cell, or None.
     """
@@ -126,14 +124,8 @@ def _draw_maps(
     names, tau = axis_names(surfaces), surfaces["tau"].values
     begin, end = surfaces["begin"].values, surfaces["end"].values
     size, unit = unit_of_time(float(end[-1]))
-    figure = new_figure(width / INCH_MM, 0.5 + 1.6 * len(names))
-    shape = (len(names), len(columns))
-    if is_narrow(figure):
-        figure.set_figheight(0.5 + 1.2 * len(names) * len(columns))
-        panels = figure.subplots(len(names) * len(columns), 1, sharex=True, sharey=True)
-    else:
-        panels = figure.subplots(*shape, sharex=True, sharey=True)
-    panels = np.reshape(panels, shape)
+    figure = new_figure(PAGE_MM / INCH_MM, 0.5 + 1.6 * len(names))
+    panels = figure.subplots(len(names), len(columns), sharex=True, sharey=True, squeeze=False)
     for row, name in enumerate(names):
         for column, (title, values, opacity) in enumerate(columns):
             panel = panels[row, column]
@@ -149,11 +141,9 @@ def _draw_maps(
             panel.set_xlim(begin[0] / size, end[-1] / size)
             panel.set_ylim(*log_edges(tau)[[0, -1]])
             _frame_mismatches(panel, name, content, size, taus=tau, faint=column > 0)
-            if is_narrow(figure):
-                panel.set_title(f"Axis {name}: {title[:1].lower()}{title[1:]}", loc="left")
-            elif row == 0:
+            if row == 0:
                 panel.set_title(title)
-            if column == 0 and not is_narrow(figure):
+            if column == 0:
                 panel.set_ylabel(f"axis {name}")
     label_log_axis(panels[0, 0].yaxis, tau[0], tau[-1])
     bar = ScalarMappable(norm, cmap)  # the maps may be partly transparent
@@ -165,9 +155,7 @@ def _draw_maps(
 
 
 @draws_figure
-def plot_surfaces(
-    surfaces: xr.Dataset, content: Mapping[str, Any], *, width: float = PAGE_MM
-) -> Figure:
+def plot_surfaces(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     """Draw the Allan deviation over time and averaging time, of the recording and both simulations.
 
     Parameters
@@ -177,8 +165,6 @@ def plot_surfaces(
         [degree2 hour-2].
     content : mapping
         Contents of `diagnosis.json`; its mismatches are framed.
-    width : float
-        Width of the figure [mm]: 180 for a page, 85 for a column.
     """
     from matplotlib.colors import LogNorm
 
@@ -189,15 +175,11 @@ def plot_surfaces(
     columns = [
         (_TITLES.get(name, name), deviation[place], None) for place, name in enumerate(cases)
     ]
-    return _draw_maps(
-        surfaces, content, columns, norm, "viridis", "Allan deviation σ(τ) [deg/h]", width
-    )
+    return _draw_maps(surfaces, content, columns, norm, "viridis", "Allan deviation σ(τ) [deg/h]")
 
 
 @draws_figure
-def plot_change(
-    surfaces: xr.Dataset, content: Mapping[str, Any], *, width: float = PAGE_MM
-) -> Figure:
+def plot_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     """Draw the Allan deviation of the recording over that of the simulations before and after."""
     from matplotlib.colors import LogNorm
     from matplotlib.ticker import FixedLocator, NullFormatter
@@ -207,7 +189,7 @@ def plot_change(
         for case, word in (("before", "without"), ("after", "with"))
     ]
     figure = _draw_maps(
-        surfaces, content, columns, LogNorm(0.5, 2.0), "PuOr_r", "ratio of Allan deviations", width
+        surfaces, content, columns, LogNorm(0.5, 2.0), "PuOr_r", "ratio of Allan deviations"
     )
     bar = figure.axes[-1]
     bar.yaxis.set_major_locator(FixedLocator([0.5, 0.7, 1.0, 1.4, 2.0]))
@@ -217,9 +199,7 @@ def plot_change(
 
 
 @draws_figure
-def plot_means(
-    surfaces: xr.Dataset, content: Mapping[str, Any], *, width: float = PAGE_MM
-) -> Figure:
+def plot_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     """Draw the mean rate over time with the simulations, and the channels below.
 
     Parameters
@@ -229,8 +209,6 @@ def plot_means(
         and the ``channel_<name>(block)``.
     content : mapping
         Contents of `diagnosis.json`.
-    width : float
-        Width of the figure [mm]: 180 for a page, 85 for a column.
     """
     names = axis_names(surfaces)
     channels = select_channels(surfaces, content)
@@ -238,7 +216,7 @@ def plot_means(
     time = (surfaces["begin"].values + surfaces["end"].values) / (2.0 * size)
     block = (surfaces["block_begin"].values + surfaces["block_end"].values) / (2.0 * size)
     ratios = [1.9] * len(names) + [1.3] * len(channels)
-    figure = new_figure(width / INCH_MM, 0.7 + 0.75 * sum(ratios))
+    figure = new_figure(PAGE_MM / INCH_MM, 0.7 + 0.75 * sum(ratios))
     panels = figure.subplots(
         len(ratios), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": ratios}
     )[:, 0]
@@ -279,7 +257,7 @@ def plot_means(
         handles,
         labels,
         loc="outside upper center",
-        ncols=2 if is_narrow(figure) else 4,
+        ncols=4,
         frameon=False,
     )
     return figure
@@ -304,16 +282,13 @@ def _mark_spans(panel: Axes, axis: str, content: Mapping[str, Any], size: float)
 def _draw_cases(
     surfaces: xr.Dataset,
     draw_axis: Callable[[Axes, str], None],
-    width: float,
     *,
     xlabel: str,
     ylabel: str,
 ) -> Figure:
-    """Draw one panel per axis, side by side, or in a column if the figure is narrow."""
-    figure, names = new_figure(width / INCH_MM, 2.6), axis_names(surfaces)
-    shape = (len(names), 1) if is_narrow(figure) else (1, len(names))
-    figure.set_figheight(0.8 + 1.8 * shape[0])
-    panels = np.ravel(figure.subplots(*shape, sharex=True, sharey=True))
+    """Draw one panel per axis, side by side."""
+    figure, names = new_figure(PAGE_MM / INCH_MM, 2.6), axis_names(surfaces)
+    panels = figure.subplots(1, len(names), sharex=True, sharey=True, squeeze=False)[0]
     for panel, name in zip(panels, names, strict=True):
         draw_axis(panel, name)
         panel.set(xscale="log", yscale="log", title=f"axis {name}")
@@ -327,7 +302,7 @@ def _draw_cases(
 
 
 @draws_figure
-def plot_deviations(surfaces: xr.Dataset, *, width: float = PAGE_MM) -> Figure:
+def plot_deviations(surfaces: xr.Dataset) -> Figure:
     """Draw the Allan deviation of the whole record, one panel per axis."""
     tau = surfaces["tau"].values
     with np.errstate(invalid="ignore"):
@@ -339,11 +314,11 @@ def plot_deviations(surfaces: xr.Dataset, *, width: float = PAGE_MM) -> Figure:
             panel.plot(tau, values, **style, label=_TITLES[case].lower())
 
     labels = {"xlabel": "averaging time τ [s]", "ylabel": "Allan deviation σ(τ) [deg/h]"}
-    return _draw_cases(surfaces, draw_axis, width, **labels)
+    return _draw_cases(surfaces, draw_axis, **labels)
 
 
 @draws_figure
-def plot_spectra(surfaces: xr.Dataset, *, width: float = PAGE_MM) -> Figure:
+def plot_spectra(surfaces: xr.Dataset) -> Figure:
     """Draw the power spectrum of the whole record, one panel per axis.
 
     Parameters
@@ -362,4 +337,4 @@ def plot_spectra(surfaces: xr.Dataset, *, width: float = PAGE_MM) -> Figure:
             panel.plot(frequency, values, **_STYLES[case], label=_TITLES[case].lower())
 
     labels = {"xlabel": "frequency [Hz]", "ylabel": "power density [(deg/h)²/Hz]"}
-    return _draw_cases(surfaces, draw_axis, width, **labels)
+    return _draw_cases(surfaces, draw_axis, **labels)
