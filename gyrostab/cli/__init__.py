@@ -21,7 +21,6 @@ from gyrostab.cli.console import (
     describe_error,
     print_error,
     read_config,
-    relaxed_gc,
     show_plain_warnings,
     sigterm_as_interrupt,
 )
@@ -63,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         app.config = read_config(
             tokens, [command for command in app if not command.startswith("-")]
         )
-        with show_plain_warnings(), sigterm_as_interrupt(), relaxed_gc():
+        with show_plain_warnings(), sigterm_as_interrupt():
             attached = attach_negative_values(tokens)
             command, bound, _ = app.parse_args(attached, exit_on_error=False, print_error=False)
             with protect_inputs(find_inputs(bound.arguments)):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import gc
 import re
 import signal
 import sys
@@ -115,17 +114,6 @@ def sigterm_as_interrupt() -> Iterator[None]:
     finally:
         for number in ours:
             signal.signal(number, signal.SIG_DFL)
-
-
-@contextmanager
-def relaxed_gc() -> Iterator[None]:
-    """Run the garbage collector less often: by default it scans all modules four times at start."""
-    thresholds = gc.get_threshold()
-    gc.set_threshold(15 * thresholds[0], *thresholds[1:])
-    try:
-        yield
-    finally:
-        gc.set_threshold(*thresholds)
 
 
 def print_error(text: str, code: int) -> int:

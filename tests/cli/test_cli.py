@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import io
 import os
 import pty
@@ -336,21 +335,6 @@ def test_an_interrupt_while_the_program_loads_is_exit_code_3(monkeypatch, capsys
     monkeypatch.setattr("gyrostab.cli.main", interrupted)
     assert start() == 3
     assert "interrupted" in capsys.readouterr().err
-
-
-def test_cycles_are_looked_for_seldom_and_afterwards_as_before(monkeypatch):
-    before, thresholds = gc.get_threshold(), []
-
-    class Failing(list):
-        def parse_args(self, *arguments, **options) -> None:
-            thresholds.append(gc.get_threshold())
-            raise RuntimeError("no")
-
-    monkeypatch.setattr("gyrostab.cli.app", Failing())
-    assert call("scan", "log.csv") == 1
-    assert thresholds[0][0] >= 10 * before[0]
-    assert thresholds[0][1:] == before[1:]
-    assert gc.get_threshold() == before
 
 
 @pytest.mark.parametrize(
