@@ -10,6 +10,9 @@ from scipy.signal import lfilter
 
 Array = NDArray[np.float64]
 
+#: Length of the fiber [m].
+LENGTH = 500.0
+
 
 def diffusion_time(thickness: float, diffusivity: float) -> float:
     """Compute the slowest time constant [s] of a slab of `thickness` [m] insulated on one face.
@@ -85,17 +88,15 @@ def layer_temperatures(
     return np.asarray(vectors @ modes + face[0])
 
 
-def layer_weights(
-    layers: int, *, length: float = 500.0, trim: float = 0.0, scatter: Array | None = None
-) -> Array:
+def layer_weights(layers: int, *, trim: float = 0.0, scatter: Array | None = None) -> Array:
     """Compute the weight ``integral of (L - 2 l) dl`` [m2] of each layer of a quadrupole winding.
+
+    The fiber has the length `LENGTH`.
 
     Parameters
     ----------
     layers : int
         Layers, a multiple of 4.
-    length : float
-        Length of the fiber [m].
     trim : float
         Offset between the middle of the fiber and the middle of the winding, as a share of the
         length.
@@ -112,7 +113,7 @@ def layer_weights(
     """
     if layers % 4:
         raise ValueError(f"a quadrupole has a multiple of 4 layers, not {layers}")
-    half = length / layers
+    half = LENGTH / layers
     lengths = np.full(layers, half) * (1.0 if scatter is None else 1.0 + scatter)
     side = np.where(np.isin(np.arange(layers) % 4, (0, 3)), 1.0, -1.0)
     weights = np.zeros(layers)
@@ -123,4 +124,4 @@ def layer_weights(
         weights[mine] = sign * (
             ends**2 - begins**2
         )  # (L - 2 l) integrated, l counted from the middle
-    return weights + 2.0 * trim * length * lengths
+    return weights + 2.0 * trim * LENGTH * lengths

@@ -11,28 +11,19 @@ Array = NDArray[np.float64]
 
 CHARGE = 1.602176634e-19
 BOLTZMANN = 1.380649e-23
+#: Current of the detector per light power [A/W], and temperature of its load [K].
+RESPONSIVITY, LOAD_TEMPERATURE = 0.9, 300.0
 
 
-def detector_psd(
-    power: Array,
-    *,
-    responsivity: float = 0.9,
-    load: float = 50e3,
-    temperature: float = 300.0,
-    rin: float = 1e-12,
-) -> dict[str, Array]:
+def detector_psd(power: Array, *, load: float = 50e3, rin: float = 1e-12) -> dict[str, Array]:
     """Compute the one-sided densities [A2/Hz] of a detector's current under `power` [W].
 
     Parameters
     ----------
     power : ndarray
         Light at the detector [W].
-    responsivity : float
-        Current per light power [A/W].
     load : float
         Load resistance [ohm].
-    temperature : float
-        Temperature of the load [K].
     rin : float
         Relative intensity noise of the source [1/Hz]: about its coherence time.
 
@@ -47,10 +38,10 @@ def detector_psd(
     >>> f"{parts['shot'][0]:.3g}"  # 2 e i at 9 uA
     '2.88e-24'
     """
-    current = responsivity * np.asarray(power, dtype=float)
+    current = RESPONSIVITY * np.asarray(power, dtype=float)
     return {
         "shot": 2 * CHARGE * current,
-        "thermal": np.full_like(current, 4 * BOLTZMANN * temperature / load),
+        "thermal": np.full_like(current, 4 * BOLTZMANN * LOAD_TEMPERATURE / load),
         "excess": rin * current**2,
     }
 
@@ -69,7 +60,7 @@ def relative_psd(power: Array, *, depth: float = 0.75 * math.pi, **detector: flo
     """
     detected_power = np.asarray(power, dtype=float) * (1 + math.cos(depth))
     total = sum(detector_psd(detected_power, **detector).values())
-    slope = detector.get("responsivity", 0.9) * np.asarray(power) * math.sin(depth)
+    slope = RESPONSIVITY * np.asarray(power) * math.sin(depth)
     return np.asarray(total / slope**2)
 
 

@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-def reset_frequency(
-    rate: Array, *, diameter: float = 0.04, index: float = 1.45, wavelength: float = 1.55e-6
-) -> Array:
+#: Diameter of the coil [m], refractive index of its fiber, and wavelength of the light [m].
+_DIAMETER, _INDEX, _WAVELENGTH = 0.04, 1.45, 1.55e-6
+
+
+def reset_frequency(rate: Array) -> Array:
     """Compute the reset frequency [Hz] at a rotation rate [deg/h]: ``D w / (n lambda)``.
 
     Examples
@@ -20,10 +22,10 @@ def reset_frequency(
     >>> round(float(reset_frequency(np.array(15.0))), 2)
     1.29
     """
-    return np.asarray(diameter * np.radians(np.asarray(rate) / 3600.0) / (index * wavelength))
+    return np.asarray(_DIAMETER * np.radians(np.asarray(rate) / 3600.0) / (_INDEX * _WAVELENGTH))
 
 
-def ramp_phase(rate: Array, *, dt: float, first: float = 0.0, **coil: float) -> Array:
+def ramp_phase(rate: Array, *, dt: float, first: float = 0.0) -> Array:
     """Compute the phase of the ramp, 0 to 1 between resets, from rates [deg/h] every `dt` [s].
 
     Examples
@@ -32,7 +34,7 @@ def ramp_phase(rate: Array, *, dt: float, first: float = 0.0, **coil: float) -> 
     >>> int((np.diff(phase) < 0).sum())  # 10 s at 1.29 Hz
     12
     """
-    turned = first + np.cumsum(reset_frequency(rate, **coil)) * dt
+    turned = first + np.cumsum(reset_frequency(rate)) * dt
     return np.asarray(turned % 1.0)
 
 

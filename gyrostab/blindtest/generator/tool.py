@@ -14,14 +14,11 @@ EARTH_RATE = 15.041
 
 
 def rotation(
-    rng: np.random.Generator,
-    seconds: float,
-    *,
-    dt: float,
-    fastest: float = 120.0,
-    stick_slip: bool = True,
+    rng: np.random.Generator, seconds: float, *, dt: float, fastest: float = 120.0
 ) -> Array:
     """Draw the rotation rate [deg/s] of a tool that alternately drills and rests.
+
+    In some intervals stick-slip makes the rate oscillate at 0.1-0.5 Hz.
 
     Parameters
     ----------
@@ -31,8 +28,6 @@ def rotation(
         Step [s].
     fastest : float
         Highest speed [revolutions per minute]; `dt` and the rate of the log must resolve it.
-    stick_slip : bool
-        Whether the rate oscillates at 0.1-0.5 Hz in some intervals.
 
     Examples
     --------
@@ -48,7 +43,7 @@ def rotation(
         end = begin + rng.uniform(0.1, 0.35) * seconds
         mean = rng.uniform(0.4, 1.0) * fastest * 6.0
         inside = (t >= begin) & (t < end)
-        swing = rng.uniform(0.3, 0.95) if stick_slip and rng.random() < 0.5 else 0.0
+        swing = rng.uniform(0.3, 0.95) if rng.random() < 0.5 else 0.0
         beat = rng.uniform(0.1, 0.5)
         drift = 1 + 0.02 * np.sin(2 * math.pi * t / rng.uniform(40, 200))
         rate[inside] = (mean / (1 + swing) * drift * (1 + swing * np.sin(2 * math.pi * beat * t)))[
