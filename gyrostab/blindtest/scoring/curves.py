@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
@@ -34,27 +34,18 @@ def curves(rows: Sequence[Row]) -> pd.DataFrame:
         ``effect``, ``strength``, ``n``, ``detected``, ``detected_low``, ``detected_high``,
         ``named``, ``named_low``, ``named_high``.
     """
-    selected = [
-        row
-        for row in rows
-        if row["kind"] in (*CATALOGUE_KINDS, "out_of_catalogue") and row["effect"]
-    ]
-    out = []
-    for effect in ["all", *sorted({row["effect"] for row in selected})]:
-        for strength in sorted({row["strength"] for row in selected}):
-            part = [
-                row
-                for row in selected
-                if row["strength"] == strength
-                and (
-                    row["effect"] == effect
-                    or (effect == "all" and row["kind"] != "out_of_catalogue")
-                )
-            ]
-            if not part:
-                continue
-            out.append({"effect": effect, "strength": strength, **_count_shares(part)})
-    return pd.DataFrame(out)
+    groups = defaultdict(list)
+    for row in rows:
+        if row["kind"] in (*CATALOGUE_KINDS, "out_of_catalogue") and row["effect"]:
+            groups[row["effect"], row["strength"]].append(row)
+            if row["kind"] != "out_of_catalogue":
+                groups["all", row["strength"]].append(row)
+    return pd.DataFrame(
+        [
+            {"effect": effect, "strength": strength, **_count_shares(groups[effect, strength])}
+            for effect, strength in sorted(groups, key=lambda key: (key[0] != "all", key))
+        ]
+    )
 
 
 def fitted_noise_curve(rows: Sequence[Row]) -> pd.DataFrame:
@@ -96,23 +87,19 @@ def _column_of(row: Row, key: str) -> str:
 
 def reliability(rows: Sequence[Row]) -> pd.DataFrame:
     """Compute the share of correct identifications by name, with Wilson's interval."""
-    correct: dict[str, list[bool]] = {}
-    for row in first_rows(drawn_rows(rows)):
-        for identification in row["identifications"]:
-            correct.setdefault(identification["name"], []).append(identification["right"])
-    out = []
-    for name, flags in sorted(correct.items()):
-        low, high = wilson(sum(flags), len(flags))
-        out.append(
-            {
-                "name": name,
-                "n": len(flags),
-                "right": sum(flags) / len(flags),
-                "low": low,
-                "high": high,
-            }
-        )
-    return pd.DataFrame(out, columns=["name", "n", "right", "low", "high"])
+    right = pd.DataFrame(
+        [
+            (identification["name"], identification["right"])
+            for row in first_rows(drawn_rows(rows))
+            for identification in row["identifications"]
+        ],
+        columns=["name", "right"],
+    )
+    counts = right.groupby("name")["right"].agg(["size", "sum"]).astype(int)
+    return pd.DataFrame(
+        [(name, n, hits / n, *wilson(hits, n)) for name, n, hits in counts.itertuples()],
+        columns=["name", "n", "right", "low", "high"],
+    )
 
 
 def rank_histogram(rows: Sequence[Row]) -> pd.DataFrame:
