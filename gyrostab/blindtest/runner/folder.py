@@ -27,18 +27,10 @@ FIRST_PUBLIC_SEED = 1_000_000
 _SCHEMA = "gyrostab.prove/3"
 _SUMS = "SHA256SUMS"
 _FOLDERS = ("recordings", "truth", "diagnoses", "comparisons", "failed")
-_CASE_FILE = re.compile(r"[0-9a-f]{12}\.(nc|json|txt)")
-_FILES = (
-    "benchmark.json",
-    _SUMS,
-    "scores.csv",
-    "table.md",
-    "completeness.png",
-    "reliability.png",
-    "calibration.png",
-    "ranks.png",
-    "roc.png",
-    "lock",
+_FILE = re.compile(
+    r"benchmark\.json|SHA256SUMS|scores\.csv|table\.md"
+    r"|(completeness|reliability|calibration|ranks|roc)\.png"
+    rf"|({'|'.join(_FOLDERS)})/[0-9a-f]{{12}}\.(nc|json|txt)"
 )
 
 
@@ -248,20 +240,16 @@ def find_foreign_file(directory: Path) -> str | None:
         place = path.relative_to(directory)
         if ours and any(is_leftover(part) for part in place.parts):
             continue
-        if path.is_symlink() or not (path.is_file() or place.as_posix() in _FOLDERS):
-            return str(place)
-        is_known = is_lock(path) if str(place) == "lock" else ours and _is_of_benchmark(place)
-        if path.is_file() and not is_known:
+        name = place.as_posix()
+        if path.is_dir():
+            is_known = name in _FOLDERS
+        elif name == "lock":
+            is_known = path.is_file() and is_lock(path)
+        else:
+            is_known = path.is_file() and ours and _FILE.fullmatch(name) is not None
+        if path.is_symlink() or not is_known:
             return str(place)
     return None
-
-
-def _is_of_benchmark(place: Path) -> bool:
-    return (
-        place.name in _FILES
-        if len(place.parts) == 1
-        else _CASE_FILE.fullmatch(place.name) is not None
-    )
 
 
 def write_sums(directory: Path, sums: Mapping[str, str]) -> str:
