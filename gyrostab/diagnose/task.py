@@ -14,6 +14,7 @@ from gyrostab.diagnose.baseline.known_effects import expect_known_motion
 from gyrostab.diagnose.baseline.known_lines import remove_known_lines
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identification import Identifications
+from gyrostab.diagnose.locate.regions import Region
 from gyrostab.diagnose.nulls.scores import NullScores
 from gyrostab.diagnose.reduce.moving_blocks import without_motion
 from gyrostab.diagnose.settings import Settings
@@ -53,7 +54,7 @@ class Comparison(NamedTuple):
 
     blocks: xr.Dataset
     baseline: xr.Dataset  # what the simulation predicts for them
-    mismatches: xr.Dataset  # from `gyrostab.diagnose.locate.mismatches.locate_mismatches`
+    mismatches: list[Region]  # from `gyrostab.diagnose.locate.mismatches.locate_mismatches`
     identifications: Identifications  # the effects that explain the differences
     null: NullScores
 

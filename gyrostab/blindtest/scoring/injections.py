@@ -88,5 +88,9 @@ def injection_table(rows: Sequence[Row]) -> pd.DataFrame:
         for line in differences
         if not line["there_before"]
     ]
-    groups = {"all": differences, "answered": answered_rows(differences), "new": new}
+    groups: dict[str, Sequence[Row]] = {
+        "all": differences,
+        "answered": answered_rows(differences),
+        "new": new,
+    }
     return pd.DataFrame(make_lines("injections", groups))

@@ -63,12 +63,12 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
         np.maximum(_expected_squares(described, square, blocks), 0.0),
     )
     added = np.zeros(noise.shape)
-    for power in powers:
-        added += power.on_axes
+    for extra in powers:
+        added += extra.on_axes
     narrow = [
-        (power.acting.effect, power.acting.rows, power.on_axes)
-        for power in powers
-        if power.acting.prediction.line is not None and power.factor.any()
+        (extra.acting.effect, extra.acting.rows, extra.on_axes)
+        for extra in powers
+        if extra.acting.prediction.line is not None and extra.factor.any()
     ]
     spectrum = spread_by_gaps((noise + added) * response, blocks)
     variables = _shared_cross(powers, response, blocks)

@@ -240,7 +240,9 @@ class Accumulator:
         table: Array,
     ) -> NDArray[np.complex128]:
         """Return the cross-powers (block, band), with the expected powers of each mask."""
-        return kernel.band_powers(spectra, other_spectra, table, place, self.edges, self.rate)
+        return np.asarray(
+            kernel.band_powers(spectra, other_spectra, table, place, self.edges, self.rate)
+        )
 
     def _read_masks(self, present: NDArray[np.bool_]) -> _Masks:
         """Return what the gaps of blocks (block, sample) do to their powers."""

@@ -108,7 +108,10 @@ def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> 
             "block_begin": blocks["begin"].variable,
             "block_end": blocks["end"].variable,
             "frequency": blocks["frequency"].variable,
-            "line_frequency": blocks["line_frequency"].variable.coarsen(coarse, np.mean, "trim"),
+            "line_frequency": blocks["line_frequency"]
+            .coarsen(coarse, boundary="trim")
+            .mean()
+            .variable,
         },
         attrs={name: blocks.attrs[name] for name in _ATTRIBUTES if name in blocks.attrs},
     ).assign(block_mean=blocks["mean"].variable)
