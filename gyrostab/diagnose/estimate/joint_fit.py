@@ -153,9 +153,12 @@ def _fit_components(
     by_statistic: dict[Statistic, list[Component]] = {}
     for component in components:
         by_statistic.setdefault(component.statistic, []).append(component)
-    statistic = max(
+    statistic = max(  # one size for all axes before sizes that each axis has for itself
         by_statistic,
-        key=lambda name: sum(component.evidence_nats for component in by_statistic[name]),
+        key=lambda name: (
+            not by_statistic[name][0].candidate.is_per_axis,
+            sum(component.evidence_nats for component in by_statistic[name]),
+        ),
     )
     filtered = by_statistic[statistic][0].is_filter
     sizes: Mapping[str, tuple[float, ...]]

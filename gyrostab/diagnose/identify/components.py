@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
+from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component, Variant
 from gyrostab.diagnose.predict.search import combine_rows
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
@@ -30,9 +30,23 @@ def find_components(
             evidence.rows[number],
             float(evidence_nats[number]),
             int(evidence.place[0, number]) if evidence.place.size else -1,
+            close=_close_variants(evidence, number, settings),
         )
         for number in rows
     ]
+
+
+def _close_variants(
+    evidence: CandidateEvidence, row: int, settings: Settings
+) -> tuple[Variant, ...]:
+    """Return the variants that explain a row as well as the best, but for errors of its form."""
+    if not evidence.variant_nats.size:
+        return ()
+    nats = evidence.variant_nats[:, row]
+    order, best = np.argsort(-nats, kind="stable"), float(nats.max())
+    allowed = settings.ambiguous_nats + settings.form_error_share * max(best, 0.0)
+    good = nats[order] >= best - allowed
+    return tuple(evidence.candidate.variants[place] for place in order[good].tolist())
 
 
 def group_components(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,14 +51,27 @@ def keep_physical(
     )
     if other_course:
         return [], other_course
+    possible = [_with_possible_size(component, state) for component in components]
     forms = [
         _find_winner(component.statistic.axis_competitors(component, state))
-        if _is_possible(component, state)
+        if component
         else ("an impossible size", math.nan)
-        for component in components
+        for component in possible
     ]
-    remaining = [component for component, form in zip(components, forms, strict=True) if not form]
+    remaining = [
+        component for component, form in zip(possible, forms, strict=True) if component and not form
+    ]
     return remaining, next(iter(forms), None) if not remaining else None
+
+
+def _with_possible_size(component: Component, state: State) -> Component | None:
+    """Return the component in the best form that gives a possible size; None without any.
+
+    Where the record leaves a nuisance parameter open, the best form has any size: a toolface, for
+    example, shows in the mean of one axis only by the cosine of an angle.
+    """
+    forms = (replace(component, variant=variant) for variant in component.close[1:])
+    return next((form for form in (component, *forms) if _is_possible(form, state)), None)
 
 
 def _find_winner(competitors: Iterable[Competitor]) -> tuple[str, float] | None:

@@ -88,7 +88,11 @@ def _without_locked_lines(
     passing: list[str], components: Mapping[str, list[Component]], state: State
 ) -> list[str]:
     """Drop lines that a passing phase-locked effect explains."""
-    locked = [key for key in passing if components[key][0].statistic.is_phase_locked]
+    locked = [
+        key
+        for key in passing
+        if any(component.statistic.is_phase_locked for component in components[key])
+    ]
     lines = [key for key in passing if components[key][0].candidate.statistic.is_line]
     if not lines:
         return passing

@@ -122,6 +122,7 @@ class Component:
     evidence_nats: float  # held-out evidence [nats]
     place: int = -1  # index of the line, or of the set of harmonics; -1 if there is none
     note: str = ""  # sentence about terms that the record does not separate
+    close: tuple[Variant, ...] = ()  # variants that explain the row about as well, the best first
 
     @property
     def statistic(self) -> Statistic:
@@ -149,6 +150,8 @@ class CandidateEvidence:
     best: tuple[Variant, ...]  # best variant of each row for the first record
     #: (record, row): index of the line for lines; otherwise empty.
     place: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 0), np.int64))
+    #: (variant, row): log Bayes factors on the first record with their prior, or empty [nats].
+    variant_nats: Array = field(default_factory=lambda: np.empty((0, 0)))
 
 
 def numbered_columns(count: int) -> tuple[str, ...]:

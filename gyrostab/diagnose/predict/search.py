@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -121,10 +122,15 @@ def collect_evidence(
     first = np.stack([row[0, :, 0] + np.log(prior[:, 0]) for row, prior in weighted], axis=-1)
     out = []
     for number, candidate in enumerate(group):
-        place = first[owner == number].argmax(axis=0)
+        variant_nats = first[owner == number]
+        place = variant_nats.argmax(axis=0)
         best = tuple(variants[number][at] for at in place.tolist())
-        lines = place[None] if spread > 1 else np.empty((0, 0), np.int64)
-        out.append(CandidateEvidence(candidate, rows, evidence_nats[number], best, lines))
+        evidence = CandidateEvidence(candidate, rows, evidence_nats[number], best)
+        out.append(
+            replace(evidence, place=place[None])
+            if spread > 1
+            else replace(evidence, variant_nats=variant_nats)
+        )
     return out
 
 
