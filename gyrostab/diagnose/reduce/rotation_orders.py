@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -52,19 +53,57 @@ class RotationOrders:
         often = np.diff(edges).reshape(turns.shape).sum(axis=-1)
         enough = (np.abs(often) >= 1.0) & (counts >= min_samples)
         wheels = [np.exp(-2j * math.pi * harmonic * turns) for harmonic in HARMONICS]
-        present, residual = centred != 0.0, centred  # missing samples count as zero
-        order, order_level = [], []
+        # a harmonic above half of the sampling rate has the samples of one below
+        is_sampled = np.abs(often)[:, None] * HARMONICS < self.length / 2.0
+        order, residual = _fit_harmonics(centred, wheels, enough, is_sampled)
+        order_level = []
         with np.errstate(invalid="ignore", divide="ignore"):
-            for wheel in wheels:
-                value = 2.0 * np.einsum("abi,bi->ab", centred, wheel) / counts
-                order.append(np.where(enough, value, np.nan))
-                residual = residual - np.where(
-                    present, (value[..., None] * np.conj(wheel)).real, 0.0
-                )
             for harmonic, wheel in zip(HARMONICS, wheels, strict=True):
                 level = _power_near_order(residual * wheel, often, harmonic)
                 order_level.append(np.where(enough, level / (counts * self.rate), np.nan))
-        return {"order": np.stack(order, -1), "order_level": np.stack(order_level, -1)}
+        return {"order": order, "order_level": np.stack(order_level, -1)}
+
+
+def _fit_harmonics(
+    values: Array,
+    wheels: Sequence[NDArray[np.complex128]],
+    enough: NDArray[np.bool_],
+    is_sampled: NDArray[np.bool_],
+) -> tuple[NDArray[np.complex128], Array]:
+    """Fit a constant and harmonics to the samples of each block by least squares.
+
+    Where the rotation is uneven, as in stick-slip, or samples are missing, harmonics are not
+    orthogonal: products with each of them would show the first one in all.
+
+    Parameters
+    ----------
+    values : ndarray, shape (axis, block, sample)
+        Zero where samples are missing.
+    wheels : sequence of ndarray, shape (block, sample)
+        Each demodulates a harmonic.
+    enough : ndarray of bool, shape (axis, block)
+        Blocks to fit.
+    is_sampled : ndarray of bool, shape (block, harmonic)
+        Harmonics to fit.
+
+    Returns
+    -------
+    amplitudes : ndarray, shape (axis, block, harmonic)
+        Complex; NaN where not fitted.
+    residual : ndarray, shape (axis, block, sample)
+        Values less the harmonics; zero where samples are missing.
+    """
+    basis = np.stack([part for wheel in wheels for part in (wheel.real, -wheel.imag)], axis=-1)
+    amplitudes = np.full((*enough.shape, len(wheels)), np.nan + 0j)
+    residual = values.copy()
+    for axis, block in np.argwhere(enough):
+        present, fitted = values[axis, block] != 0.0, is_sampled[block]
+        columns = basis[block][present][:, np.repeat(fitted, 2)]
+        with_constant = np.column_stack([columns, np.ones(len(columns))])
+        sizes = np.linalg.lstsq(with_constant, values[axis, block, present], rcond=None)[0][:-1]
+        amplitudes[axis, block, fitted] = sizes[::2] - 1j * sizes[1::2]
+        residual[axis, block, present] -= columns @ sizes
+    return amplitudes, residual
 
 
 def make_rotation_orders(log: xr.Dataset, length: int, rate: float) -> RotationOrders | None:

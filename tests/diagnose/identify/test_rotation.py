@@ -168,3 +168,28 @@ def test_tiny_share_of_the_rotation_is_a_scale_factor_error():
     assert identification.axes == ("z",)
     assert "real_motion" not in identification.alternatives
     assert np.isfinite(identification.evidence_nats)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stick_slip", [0.0, 0.3])
+def test_earth_rate_is_the_only_effect_on_a_tool_that_starts_to_rotate(stick_slip: float):
+    """It is constant at rest and a line while the tool rotates: no accelerometer explains both."""
+    rotation = {
+        "profile": "rotation",
+        "points": [[0, 0], [900, 0], [910, 90], [3000, 90], [3010, 0]],
+        "sensor_rate": 50,
+        "stick_slip": stick_slip,
+        "period": "4 s",
+        "inclination": 30,
+    }
+    earth = {"name": "earth_rate", "latitude": 60, "inclination": 30, "azimuth": 60}
+    model = {
+        "noise": {"N": 0.006, "B": 0.03, "K": 0.05},
+        "environment": [rotation],
+        "effect": [earth],
+    }
+    log = simulate(model, duration="1h", rate=10.0, seed=3).compute()
+    (effect,) = diagnose(log, nulls=100, seed=1).effects
+    assert (effect["name"], effect["axes"]) == ("earth_rate", ["x", "y"])
+    # towards the high side 9.77 deg/h, and to the right of it -6.51 deg/h
+    assert effect["parameters"]["toolface"]["value"] == pytest.approx(33.7, abs=1.0)

@@ -250,6 +250,21 @@ def test_orders_are_the_amplitudes_at_the_tool_rotation():
     assert np.abs(order[:, 1].mean()) < 0.15
 
 
+def test_orders_of_an_uneven_rotation_with_losses_show_one_harmonic_only():
+    time = np.arange(6_000) / 10.0
+    turns = 0.25 * time + 0.05 * np.sin(0.5 * np.pi * time)  # stick-slip, once per turn
+    inside = np.diff(turns, append=2.0 * turns[-1] - turns[-2])
+    rate = 5.0 * np.cos(2.0 * np.pi * (turns + inside / 2.0) + 0.7)
+    rate[np.random.default_rng(1).random(rate.size) < 0.1] = np.nan
+    channels = {"rotation_rate": (3600.0 * inside, "deg/s")}
+    log = make_log(rate[None], rate=10.0, unit="deg/h", channels=channels)
+    order = reduce_log(log, block="20s")["order"].values[0]
+    fitted = np.isfinite(order).all(axis=1)
+    assert fitted.mean() > 0.9
+    np.testing.assert_allclose(np.abs(order[fitted, 0]), 5.0, rtol=1e-6)
+    assert np.abs(order[fitted, 1:]).max() < 1e-6
+
+
 def test_orders_use_a_slower_rotation_sensor_and_are_missing_at_rest():
     model = {
         "noise": {"N": 1e-4},
