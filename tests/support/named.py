@@ -10,6 +10,8 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.identify.forward_search import identify_effects, prepare_examination
+from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
@@ -101,3 +103,10 @@ def nulls(
     return baseline, list(
         null_records(blocks, baseline, count=count, rng=np.random.default_rng(seed), chunk=count)
     )
+
+
+def name_effects(
+    blocks: xr.Dataset, baseline: xr.Dataset, records: Any, **options: Any
+) -> Identifications:
+    """Identify the effects of block statistics, as a diagnosis does before it compares again."""
+    return identify_effects(prepare_examination(blocks, baseline, records, **options))

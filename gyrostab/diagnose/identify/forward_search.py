@@ -30,37 +30,6 @@ from gyrostab.progress import Stage, no_stage
 Array = NDArray[np.float64]
 
 
-def name_effects(
-    blocks: xr.Dataset,
-    baseline: xr.Dataset,
-    nulls: Iterable[xr.Dataset],
-    *,
-    level: float = 0.005,
-    seed: int = 0,
-    known: Sequence[Effect] = (),
-    progress: Stage = no_stage,
-    settings: Settings = DEFAULTS,
-) -> Identifications:
-    """Identify the effects that a recording shows beyond its baseline.
-
-    Effects are selected one after the other by how much better they predict held-out data. The
-    best evidence in null records gives the threshold.
-
-    It is `prepare_examination` followed by `identify_effects`, with their parameters.
-    """
-    examination = prepare_examination(
-        blocks,
-        baseline,
-        nulls,
-        level=level,
-        seed=seed,
-        known=known,
-        progress=progress,
-        settings=settings,
-    )
-    return identify_effects(examination)
-
-
 def prepare_examination(
     blocks: xr.Dataset,
     baseline: xr.Dataset,
@@ -108,7 +77,10 @@ def prepare_examination(
 
 
 def identify_effects(examination: Examination) -> Identifications:
-    """Identify the effects of a recording that is prepared for it."""
+    """Identify the effects that a recording shows beyond its baseline.
+
+    Effects are selected one after the other by how much better they predict held-out data.
+    """
     examination = identify_expected_effects(examination)
     identified, unidentified, rejected, state = select_effects(examination)
     return Identifications(

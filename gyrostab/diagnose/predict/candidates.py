@@ -103,7 +103,8 @@ class Candidate:
     def digest(self) -> bytes:
         """Digest of the statistic and of all designs."""
         return content_digest(
-            self.statistic.name.encode(), *(variant.design for variant in self.variants)
+            f"{self.statistic.name}, per axis: {self.is_per_axis}".encode(),
+            *(variant.design for variant in self.variants),
         )
 
     @property

@@ -186,7 +186,7 @@ class Accumulator:
             centred = np.concatenate([centred[:axes], of_channels])
         counts = np.count_nonzero(present, axis=-1)
         used = counts >= self.min_samples
-        spectra = self._transform(centred)
+        spectra = self._transform_axes(centred)
         masks = [self._read_gaps(present[row], used[row]) for row in range(self.rows)]
         power = np.stack(
             [
@@ -227,7 +227,7 @@ class Accumulator:
             "cross_samples": cross_samples,
         }
 
-    def _transform(self, centred: Array) -> NDArray[np.complex128]:
+    def _transform_axes(self, centred: Array) -> NDArray[np.complex128]:
         """Return the tapered spectra (..., line) of blocks (..., sample)."""
         spectra = np.fft.rfft(centred * self.weights, axis=-1)
         return np.asarray(spectra[..., 1 : kernel.ordinates(self.length) + 1])
@@ -295,7 +295,7 @@ class Accumulator:
 
         The coherency is that of the joint samples, `power` (2, block, band) that of each signal.
         """
-        first, second = self._transform(_subtract_mean(centred, present))
+        first, second = self._transform_axes(_subtract_mean(centred, present))
         expected, shape, _ = self._read_masks(present)
         place = np.arange(len(present))
         cross, *powers = (

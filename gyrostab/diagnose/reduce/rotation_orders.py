@@ -73,7 +73,9 @@ def _fit_harmonics(
     """Fit a constant and harmonics to the samples of each block by least squares.
 
     Where the rotation is uneven, as in stick-slip, or samples are missing, harmonics are not
-    orthogonal: products with each of them would show the first one in all.
+    orthogonal: products with each of them would show the first one in all. The errors used later
+    are those of an even rotation. Stick-slip of 0.6 once per turn has 1.2 times their variance, of
+    0.9 up to 1.4 times.
 
     Parameters
     ----------

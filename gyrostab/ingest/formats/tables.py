@@ -74,12 +74,12 @@ class StoredArray:
         unit = attribute_text(attributes.get("units"))
         return [
             TableColumn(
-                (name,), partial(self._read, place), unit, None, self.values.dtype, attributes
+                (name,), partial(self._read_rows, place), unit, None, self.values.dtype, attributes
             )
             for place, name in enumerate(names)
         ]
 
-    def _read(self, place: int, start: int, stop: int) -> NDArray[Any]:
+    def _read_rows(self, place: int, start: int, stop: int) -> NDArray[Any]:
         rows = slice(start, stop)
         if len(self.values.shape) == 1:
             return self._read_box(rows)

@@ -9,11 +9,10 @@ from scipy.signal import lfilter
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
-from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 from gyrostab.units import HOUR
-from tests.support.named import nulls
+from tests.support.named import name_effects, nulls
 from tests.support.repetitions import first_of
 
 RATE, N = 20.0, 0.05

@@ -11,14 +11,13 @@ from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.baseline.quantization_grid import angle_share, rounded_rates
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.identify.ambiguity import find_equivalent_effects
-from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.reduce.zero_bin import possibly_truncated_axes, truncated_axes
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.ingest.make_log import make_log
-from tests.support.named import nulls
+from tests.support.named import name_effects, nulls
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -13,7 +13,6 @@ from gyrostab.diagnose.estimate.conditioned_baseline import add_outlier_power, p
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.estimate.recalibrate import recalibrate
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
-from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result import finish as conclude
@@ -22,7 +21,7 @@ from gyrostab.diagnose.statistics.sample_sizes import centre_of_range, estimate_
 from gyrostab.ingest.make_log import make_log
 from gyrostab.physics.registry import make_effect
 from tests.support.effect_bench import run
-from tests.support.named import nulls
+from tests.support.named import name_effects, nulls
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

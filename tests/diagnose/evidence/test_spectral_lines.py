@@ -14,7 +14,6 @@ from gyrostab.diagnose.evidence.spectral_lines import line_evidence, line_skirt
 from gyrostab.diagnose.evidence.wandering import with_walk
 from gyrostab.diagnose.identify import selection
 from gyrostab.diagnose.identify.components import merge_lines
-from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identification import Selection, add_selection, form_error
 from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
@@ -28,7 +27,7 @@ from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.diagnose.statistics.spectral_line import estimate_line
 from gyrostab.ingest.make_log import make_log
 from tests.support.candidates import find_components
-from tests.support.named import nulls
+from tests.support.named import name_effects, nulls
 
 WEIGHT = np.full((1, 8), 22.0)
 

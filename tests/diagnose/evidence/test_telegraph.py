@@ -11,7 +11,6 @@ from scipy.signal import lfilter
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.evidence.telegraph import telegraph_courses, telegraph_evidence
-from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import keep_physical
 from gyrostab.diagnose.identify.identification import Identifications, Selection
 from gyrostab.diagnose.identify.switching import drop_explained_jumps, put_followers_first
@@ -24,7 +23,7 @@ from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.diagnose.statistics.base import SizeFit
 from gyrostab.ingest.make_log import make_log
 from gyrostab.simulate import simulate
-from tests.support.named import nulls
+from tests.support.named import name_effects, nulls
 
 BLOCKS, STEP, WHITE = 100, 20.0, 0.01
 WALKS, FLICKERS = np.array([0.0, 0.1, 0.3, 1.0, 3.0, 10.0]), np.array([0.0, 0.05, 0.2])

@@ -10,7 +10,6 @@ from scipy.signal import lfilter
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.components import sum_evidence
-from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import keep_physical
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.nulls.records import null_records
@@ -23,7 +22,7 @@ from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.diagnose.statistics.power_forms import burst_intervals
 from gyrostab.ingest.make_log import make_log
 from tests.support.candidates import find_components
-from tests.support.named import nulls
+from tests.support.named import name_effects, nulls
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

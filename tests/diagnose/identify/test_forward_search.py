@@ -15,7 +15,6 @@ from gyrostab.diagnose.evidence.mixture import Mixture
 from gyrostab.diagnose.evidence.sample_counts import expected_counts, sample_count_evidence
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence
 from gyrostab.diagnose.identify import identifiability
-from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import _is_possible, keep_physical
 from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
@@ -28,7 +27,7 @@ from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.ingest.make_log import make_log
 from tests.support.candidates import select_candidate
-from tests.support.named import WORLD, nulls, record
+from tests.support.named import WORLD, name_effects, nulls, record
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

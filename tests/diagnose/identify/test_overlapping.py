@@ -7,7 +7,6 @@ import pytest
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.identify.components import renew_component, split_layers
-from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identification import Selection, with_axes_of
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
@@ -15,6 +14,7 @@ from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.simulate import simulate
 from tests.support import named
+from tests.support.named import name_effects
 
 VARIANT = Variant({}, ("size",), np.ones((1, 1, 3)))
 

@@ -13,7 +13,6 @@ from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence
-from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import find_plainer_effect, keep_physical
 from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
 from gyrostab.diagnose.predict.linear_model import initial_state
@@ -26,7 +25,7 @@ from gyrostab.ingest.make_log import make_log
 from gyrostab.progress import no_stage
 from gyrostab.simulate import simulate
 from tests.support.candidates import find_components
-from tests.support.named import nulls
+from tests.support.named import name_effects, nulls
 from tests.support.repetitions import first_of
 
 _TURNS = [

@@ -7,12 +7,11 @@ import pytest
 import xarray as xr
 from scipy.signal import butter, sosfilt
 
-from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result.verdict import name_probability
 from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.ingest.make_log import make_log
-from tests.support.named import nulls
+from tests.support.named import name_effects, nulls
 
 RATE, SECONDS = 20.0, 1200
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -5,7 +5,6 @@ import pytest
 from scipy.special import gammaln
 
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence
-from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.reduce import steady_sines
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -13,7 +12,7 @@ from gyrostab.diagnose.reduce.steady_sines import SineSearch, sine_factors
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.diagnose.statistics.spectral_line import estimate_line
 from gyrostab.ingest.make_log import make_log
-from tests.support.named import nulls
+from tests.support.named import name_effects, nulls
 
 RATE, LENGTH, BLOCKS = 10.0, 200, 90
 SIZE = LENGTH * BLOCKS

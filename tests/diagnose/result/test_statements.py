@@ -11,7 +11,6 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
-from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.predict.channel_use import unused_channels
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result.diagnosis import Diagnosis
@@ -21,7 +20,7 @@ from gyrostab.diagnose.statistics.wording import COARSE_ANGLE_GRID
 from gyrostab.ingest.make_log import make_log
 from gyrostab.physics.registry import make_effect
 from tests.support.diagnosed import content, model, surfaces
-from tests.support.named import nulls
+from tests.support.named import name_effects, nulls
 from tests.support.repetitions import first_of
 
 RATE = 50.0

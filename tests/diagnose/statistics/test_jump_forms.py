@@ -12,7 +12,6 @@ from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.identify.ambiguity import find_equivalent_effects
 from gyrostab.diagnose.identify.components import sum_evidence
-from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import keep_physical
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.linear_model import State, initial_state
@@ -23,7 +22,7 @@ from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.diagnose.statistics.jump_forms import is_free_jump
 from gyrostab.ingest.make_log import make_log
 from tests.support.candidates import find_components, winning_forms
-from tests.support.named import nulls
+from tests.support.named import name_effects, nulls
 from tests.support.repetitions import first_of
 
 MODEL = {"noise": {"N": 0.003, "B": 0.004, "K": 0.02}, "log": {"axes": ["x", "y"]}}

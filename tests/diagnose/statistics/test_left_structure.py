@@ -13,7 +13,6 @@ from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
 from gyrostab.diagnose.identify.selection import score_candidates
 from gyrostab.diagnose.predict.candidates import CandidateEvidence
@@ -25,7 +24,7 @@ from gyrostab.diagnose.statistics.left_structure import (
     variance_fluctuation,
 )
 from gyrostab.ingest.make_log import make_log
-from tests.support.named import nulls
+from tests.support.named import name_effects, nulls
 
 BLOCKS, LENGTH = 120, 200
 
