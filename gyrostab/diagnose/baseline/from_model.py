@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from typing import Any
 
 import numpy as np
@@ -9,18 +11,21 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.calibrate import assemble_baseline
-from gyrostab.diagnose.baseline.expected_statistics import NOISE, line_columns
+from gyrostab.diagnose.baseline.expected_statistics import NOISE, common_variance, line_columns
 from gyrostab.diagnose.baseline.known_effects import expect_known_effects
 from gyrostab.diagnose.baseline.known_lines import independent_line_share
-from gyrostab.diagnose.baseline.noise_level import quiescent_level, scale_axes
 from gyrostab.diagnose.baseline.posterior import DRAWS, Posterior
 from gyrostab.diagnose.baseline.quiescent import find_quiescent_spans, given_quiescent_blocks
 from gyrostab.diagnose.reduce.schema import BASELINE, label_variables
 from gyrostab.diagnose.settings import DEFAULTS, Settings
-from gyrostab.errors import OptionError
+from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import TERMS
 from gyrostab.simulate.model import Model, read_model
 from gyrostab.units import HOUR
+
+Array = NDArray[np.float64]
+_ROUNDS = 20  # of Fisher scoring, which converges quadratically
+_MIN_FACTOR_RATIO = 0.1  # of the factor before: no round may reach zero
 
 
 def baseline_from_model(
@@ -72,7 +77,12 @@ def baseline_from_model(
     if given_blocks is not None:
         chosen = given_blocks
         attrs["calibrated_on"] = find_quiescent_spans(blocks, chosen)
-        posteriors = _scale_to_quiescent(blocks, parsed, posteriors, chosen)
+        square = np.stack([posterior.square for posterior in posteriors])
+        spectrum, added = (
+            expect_known_effects(blocks, parsed, values).spectrum
+            for values in (square, 0.0 * square)
+        )
+        posteriors, _ = scale_to_quiescent(blocks, posteriors, spectrum - added, added, chosen)
     effects = expect_known_effects(
         blocks, parsed, np.stack([posterior.square for posterior in posteriors])
     )
@@ -98,12 +108,83 @@ def baseline_from_model(
     return out
 
 
-def _scale_to_quiescent(
-    blocks: xr.Dataset, model: Model, posteriors: list[Posterior], quiet: NDArray[np.bool_]
-) -> list[Posterior]:
-    """Scale the noise of a model to the quiescent blocks (axis, block), given its effects."""
-    square = np.stack([posterior.square for posterior in posteriors])
-    spectrum, added = (
-        expect_known_effects(blocks, model, values).spectrum for values in (square, 0.0 * square)
+def scale_to_quiescent(
+    blocks: xr.Dataset,
+    posteriors: list[Posterior],
+    noise: Array,
+    added: Array,
+    quiet: NDArray[np.bool_],
+) -> tuple[list[Posterior], Array]:
+    """Scale the noise of a simulation to its level in quiescent blocks of the recording; say so.
+
+    Parameters
+    ----------
+    noise, added : ndarray, shape (axis, block, band)
+        Expected power of the noise, and power that effects of the simulation add.
+    quiet : ndarray of bool, shape (axis, block)
+        Blocks to calibrate on.
+
+    Returns
+    -------
+    posteriors : list of Posterior
+        The draws include the error of the factor.
+    factor : ndarray, shape (axis,)
+        Factor of `noise` with the largest gamma likelihood.
+
+    Raises
+    ------
+    SchemaError
+        If an axis has no spectrum in its quiescent blocks.
+    """
+    power, shape = (blocks[name].values for name in ("power", "shape"))
+    common, shape_alone = common_variance(blocks)
+    factors = []
+    for row, axis in enumerate(blocks["axis"].values):
+        good = np.isfinite(power[row]) & np.isfinite(shape[row]) & quiet[row][:, None]
+        good &= noise[row] > 0.0
+        if not good.any():
+            raise SchemaError(
+                f"axis {axis}: the quiescent blocks hold no spectrum to calibrate the simulation "
+                "on; give other stretches with --quiet, or none, to take the simulation as it is"
+            )
+        separate_shape = np.where(good, shape_alone[row], 0.0).sum(axis=1)
+        # see `common_variance`
+        reduction = 1.0 / (1.0 + np.where(quiet[row], common[row], 0.0) * separate_shape)
+        weight = (shape[row] * np.broadcast_to(reduction[:, None], good.shape))[good]
+        factors.append(_fit_factor(power[row][good], noise[row][good], added[row][good], weight))
+    sizes = ", ".join(
+        f"{math.sqrt(factor):.3g} on axis {axis}"
+        for axis, (factor, _) in zip(blocks["axis"].values, factors, strict=True)
     )
-    return scale_axes(blocks, posteriors, *quiescent_level(blocks, spectrum - added, added, quiet))
+    warnings.warn(
+        f"the noise of the simulation is multiplied by {sizes}: its level in the given quiescent "
+        "stretches",
+        stacklevel=2,
+    )
+    scaled = []
+    for row, (posterior, (factor, error)) in enumerate(zip(posteriors, factors, strict=True)):
+        rng = np.random.default_rng(row)
+        scatter = rng.gamma(error**-2, error**2, (len(posterior.draws), 1))
+        scaled.append(
+            posterior._replace(
+                square=posterior.square * factor,
+                error=np.hypot(posterior.error, posterior.square * error) * factor,
+                K=posterior.K * math.sqrt(factor),
+                B=posterior.B * math.sqrt(factor),
+                draws=posterior.draws * factor * scatter,
+                slow=posterior.slow * factor * scatter,
+            )
+        )
+    return scaled, np.array([factor for factor, _ in factors])
+
+
+def _fit_factor(power: Array, noise: Array, added: Array, weight: Array) -> tuple[float, float]:
+    """Fit ``factor * noise + added`` to gamma-distributed powers; return also the error share."""
+    factor = float((weight * power / (noise + added)).sum() / weight.sum())
+    information = 0.0
+    for _ in range(_ROUNDS):
+        expected = factor * noise + added
+        information = float((weight * (noise / expected) ** 2).sum())
+        change = float((weight * noise * (power - expected) / expected**2).sum()) / information
+        factor = max(factor + change, _MIN_FACTOR_RATIO * factor)
+    return factor, 1.0 / (factor * math.sqrt(information))

@@ -1,4 +1,4 @@
-"""The baseline of a simulated log: its noise, with its level over time and other statistics."""
+"""The baseline of a simulated log: noise, its level over time, spectral shape, coherency, lines."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.special import chdtrc
 
 from gyrostab.diagnose.baseline.calibrate import MIN_BANDS, assemble_baseline, calibrate_axes
 from gyrostab.diagnose.baseline.expected_statistics import noise_powers, sum_noise
-from gyrostab.diagnose.baseline.noise_level import quiescent_level, scale_axes
+from gyrostab.diagnose.baseline.from_model import scale_to_quiescent
 from gyrostab.diagnose.baseline.posterior import Posterior
 from gyrostab.diagnose.baseline.quiescent import (
     find_quiescent_blocks,
@@ -18,14 +19,20 @@ from gyrostab.diagnose.baseline.quiescent import (
     given_quiescent_blocks,
     noise_level_excess,
 )
-from gyrostab.diagnose.baseline.simulated import (
-    add_extra_statistics,
-    measure_extra_statistics,
-    worst_band,
+from gyrostab.diagnose.evidence.spectral_lines import (
+    expected_lines,
+    line_evidence,
+    line_skirt,
 )
+from gyrostab.diagnose.predict.linear_model import band_widths, unspread_share
+from gyrostab.diagnose.reduce.block_statistics import pair_indices
+from gyrostab.diagnose.reduce.schema import BASELINE, label_variables
 from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.kernels.spectra.line_levels import local_level
 
 Array = NDArray[np.float64]
+_MAX_LINES = 100  # on an axis; limits time
+_SMOOTHING_LINES = 5  # over which a peak is smoothed; design choice
 
 
 def baseline_from_simulation(
@@ -48,24 +55,35 @@ def baseline_from_simulation(
     posteriors, level, unexplained = _calibrate_simulation(simulated, chosen, settings)
     squares = [posterior.square for posterior in posteriors]
     plain = sum_noise(noise_powers(simulated), squares) * level[..., None]
-    shown = measure_extra_statistics(simulated, plain, unexplained, settings=settings)
-    noise = sum_noise(noise_powers(blocks), squares)
-    attrs = {
-        "source": "simulation",
-        "calibrated_on": find_quiescent_spans(simulated, chosen),
-    }
-    spectrum = noise * level[..., None] * shown.form[:, None]
+    form, form_shape = _spectral_form(simulated, plain)
+    # An unexplained band reaches into others.
+    is_measured = unexplained.any(axis=1, keepdims=True)
+    form, form_shape = np.where(is_measured, form, 1.0), np.where(is_measured, form_shape, np.inf)
+    spectrum = sum_noise(noise_powers(blocks), squares) * level[..., None] * form[:, None]
+    spans = find_quiescent_spans(simulated, chosen)
     given_blocks = given_quiescent_blocks(blocks, quiet, settings=settings)
     if given_blocks is not None:
-        chosen = given_blocks
-        attrs["calibrated_on"] = find_quiescent_spans(blocks, chosen)
-        factor, error = quiescent_level(blocks, spectrum, 0.0 * spectrum, chosen)
-        posteriors = scale_axes(blocks, posteriors, factor, error)
+        chosen, spans = given_blocks, find_quiescent_spans(blocks, given_blocks)
+        posteriors, factor = scale_to_quiescent(
+            blocks, posteriors, spectrum, 0.0 * spectrum, chosen
+        )
         spectrum = spectrum * factor[:, None, None]
-    baseline = assemble_baseline(
-        blocks, posteriors, quiet=chosen, attrs=attrs, spectrum=spectrum, settings=settings
+    extra = (
+        {"form_shape": form_shape}
+        | _shared_statistics(
+            simulated, plain * form[:, None], spectrum, settings.coherency_probability
+        )
+        | _line_statistics(simulated, blocks, plain, unexplained, settings)
     )
-    return add_extra_statistics(baseline, shown, blocks)
+    baseline = assemble_baseline(
+        blocks,
+        posteriors,
+        quiet=chosen,
+        attrs={"source": "simulation", "calibrated_on": spans},
+        spectrum=spectrum,
+        settings=settings,
+    )
+    return baseline.assign(label_variables(extra, BASELINE))
 
 
 def _calibrate_simulation(
@@ -85,9 +103,11 @@ def _calibrate_simulation(
         posteriors = calibrate_axes(explained, chosen, settings)
         plain = sum_noise(columns, [posterior.square for posterior in posteriors])
         level = _level_over_time(explained, plain, settings)
-        newly_unexplained = worst_band(
-            explained, plain * level[..., None], min_sigma=settings.excess_sigma
-        ) & (unexplained.sum(axis=1, keepdims=True) < unexplained.shape[1] - MIN_BANDS)
+        form, shape = _spectral_form(explained, plain * level[..., None])
+        off = np.abs(form - 1.0) * np.sqrt(shape)
+        is_worst = (off > settings.excess_sigma) & (off == off.max(axis=1, keepdims=True))
+        is_enough = unexplained.sum(axis=1, keepdims=True) < unexplained.shape[1] - MIN_BANDS
+        newly_unexplained = is_worst & is_enough
         if not newly_unexplained.any():
             return posteriors, level, unexplained
         unexplained |= newly_unexplained
@@ -103,3 +123,120 @@ def _level_over_time(simulated: xr.Dataset, plain: Array, settings: Settings) ->
         )
         level[row] = np.where(deviation > settings.excess_sigma, risen, 1.0)
     return level
+
+
+def _spectral_form(simulated: xr.Dataset, expected: Array) -> tuple[Array, Array]:
+    """Return powers over expected powers, (axis, band), and the shape of their distribution."""
+    power, shape = (simulated[name].values for name in ("power", "shape"))
+    return _weighted_mean(power / expected, shape)
+
+
+def _weighted_mean(values: NDArray[Any], shape: Array) -> tuple[NDArray[Any], Array]:
+    """Return the mean over the blocks, and the sum of the shapes."""
+    good = np.isfinite(values) & np.isfinite(shape) & (shape > 0.0)
+    weight = np.where(good, shape, 0.0)
+    total = weight.sum(axis=1)
+    return (weight * np.where(good, values, 0.0)).sum(axis=1) / np.where(
+        total > 0.0, total, 1.0
+    ), total
+
+
+def _shared_statistics(
+    simulated: xr.Dataset, expected: Array, spectrum: Array, p_value: float
+) -> dict[str, NDArray[Any]]:
+    """Return the cross-spectrum of the axes and the error of the coherency, where significant.
+
+    `expected` is the power of the simulation (axis, block, band), `spectrum` that of the baseline.
+    """
+    if "cross" not in simulated:
+        return {}
+    cross, shape = (simulated[name].values for name in ("cross", "cross_shape"))
+    first, second = pair_indices(simulated)
+    coherency, coherency_shape = _weighted_mean(
+        cross / np.sqrt(expected[first] * expected[second]), shape
+    )
+    has_data = coherency_shape > 0.0
+    total = 2.0 * (np.abs(coherency) ** 2 * coherency_shape).sum(axis=1, keepdims=True)
+    significant = has_data & (chdtrc(2.0 * has_data.sum(axis=1, keepdims=True), total) < p_value)
+    coherency = np.where(significant, coherency, 0.0)
+    if not coherency.any():
+        return {}
+    with np.errstate(divide="ignore"):
+        error = np.where(significant, 1.0 / np.sqrt(2.0 * coherency_shape), 0.0)
+    geometric_mean = np.sqrt(spectrum[first] * spectrum[second])
+    return {"cross": coherency[:, None] * geometric_mean, "cross_error": error}
+
+
+def _line_statistics(
+    simulated: xr.Dataset,
+    blocks: xr.Dataset,
+    expected: Array,
+    unexplained: NDArray[np.bool_],
+    settings: Settings,
+) -> dict[str, Array]:
+    """Return significant lines, the most that they may be, and unexplained peaks, if any.
+
+    `expected` (axis, block, band) is the power of the noise terms in the simulation, with their
+    level over time; `unexplained` (axis, band) are bands that they do not explain.
+    """
+    power, weight = simulated["line_power"].values, simulated["line_weight"].values
+    frequency = simulated["line_frequency"].values
+    slope = expected_lines(
+        xr.Dataset(
+            {"spectrum": (("axis", "block", "band"), expected)},
+            coords={"axis": simulated["axis"], "frequency": simulated["frequency"]},
+        ),
+        frequency,
+    )
+    evidence_nats = line_evidence(power[None], weight, slope)[0]
+    lines, largest, peaks = (np.zeros(evidence_nats.shape) for _ in range(3))
+    inside, near_unexplained = _lines_in_bands(simulated), unexplained.copy()
+    near_unexplained[:, 1:] |= unexplained[:, :-1]
+    near_unexplained[:, :-1] |= unexplained[:, 1:]
+    for row, axis in enumerate(simulated["axis"].values):
+        in_skirt = np.zeros(evidence_nats.shape[1], np.bool_)
+        for _ in range(_MAX_LINES):
+            place = int(np.argmax(np.where(in_skirt, -np.inf, evidence_nats[row])))
+            if in_skirt[place] or not evidence_nats[row, place] > settings.line_nats:
+                break
+            in_skirt |= line_skirt(simulated, str(axis), place, settings)
+        good = (weight[row] > 0.0) & np.isfinite(power[row]).all(axis=1)
+        if not good.any():
+            continue
+        mean = np.average(power[row][good], axis=0, weights=weight[row][good])
+        level = np.where(in_skirt, local_level(mean[None])[0], mean)
+        lines[row] = np.maximum(mean - level, 0.0)
+        if "sine_nats" in simulated:
+            weak = (simulated["sine_nats"].values[row] > settings.line_nats) & ~in_skirt
+            square, stderr = (
+                simulated[f"sine_square{end}"].values[row] / (4.0 * frequency[0])
+                for end in ("", "_stderr")
+            )
+            lines[row] = np.where(weak, square, lines[row])
+            largest[row] = np.where(weak, square + settings.clear_sigma * stderr, 0.0)
+        largest[row] = np.maximum(largest[row], lines[row])
+        smooth = np.convolve(
+            np.pad(level, _SMOOTHING_LINES // 2, mode="edge"),
+            np.full(_SMOOTHING_LINES, 1.0 / _SMOOTHING_LINES),
+            "valid",
+        )
+        peaks[row] = np.where(inside[near_unexplained[row]].any(axis=0), smooth - slope[row], 0.0)
+    if not (lines.any() or peaks.any()):
+        return {}
+    in_bands = (lines + peaks) @ _lines_in_bands(blocks).T
+    line_power = in_bands * blocks["line_frequency"].values[0] / band_widths(blocks)
+    return {
+        "lines": lines,
+        "lines_most": largest,
+        "peaks": peaks,
+        "line_spectrum": line_power * unspread_share(blocks).mean(axis=1)[:, None],
+    }
+
+
+def _lines_in_bands(blocks: xr.Dataset) -> NDArray[np.bool_]:
+    """Return whether a line is in a band, (band, line)."""
+    frequency = blocks["line_frequency"].values
+    return np.asarray(
+        (frequency >= blocks["band_low"].values[:, None])
+        & (frequency < blocks["band_high"].values[:, None])
+    )
