@@ -62,6 +62,9 @@ def baseline(
             "known_mean": (("axis", "block"), np.zeros(shape)),
             "mean_variance": (("axis", "block"), np.full(shape, level * f["rate"] / f["samples"])),
             "coefficient": (("axis", "term"), coefficient),
+            "grid_K": (("axis", "grid"), np.full((len(axes), 1), walk)),
+            "grid_B": (("axis", "grid"), np.full((len(axes), 1), flicker)),
+            "grid_calibrated": (("axis", "grid"), np.zeros((len(axes), 1))),
         },
         coords={"axis": list(axes), "term": list(TERMS), "frequency": ("band", frequency)},
     )

@@ -11,8 +11,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks
-from gyrostab.diagnose.evidence.products import mean_products
-from gyrostab.diagnose.evidence.wandering import expected_processes
+from gyrostab.diagnose.evidence.held_out import mean_residual, noise_weight
+from gyrostab.diagnose.evidence.products import axis_noise, mean_products
+from gyrostab.diagnose.reduce.block_statistics import pair_indices
 from gyrostab.diagnose.statistics.power import allan_surface
 from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score
 from gyrostab.noise import NORMAL_95
@@ -77,28 +78,28 @@ def held_out(
     """
     windows = cut_stretches(blocks)
     fold_of_window = np.arange(windows.first.size) % FOLDS
-    fold = np.repeat(fold_of_window, windows.length)
-    more = np.array([more_gain, 2.0 * abs(more_gain)])
-    gain, moves = more, False
+    stretches = np.repeat(fold_of_window, windows.length)
+    gains: list[Array] = []
+    moves = False
     squares: dict[str, list[Array]] = {"before": [], "after": []}
-    for number in range(FOLDS):
-        held = fold == number
-        models = {"before": _fit_model(before, ~held), "after": _fit_model(after, ~held)}
-        gain = gain + _compare_models(blocks, models["before"], models["after"], held)
-        moves |= not models["after"]["known_mean"].equals(models["before"]["known_mean"])
-        if shown is not None:
-            models["after"] = _fit_model(shown, ~held)
-        chosen = fold_of_window == number
-        for name, baseline in models.items():
-            inside = Windows(windows.first[chosen], windows.stop[chosen])
-            squares[name].append(_allan_scores(blocks, baseline, inside))
-    gains = [gain]
-    for fold in fold_blocks(blocks).values[1:] if moves else ():
-        gain = more
-        for held in (fold == number for number in range(FOLDS)):
+    for fold in (stretches, *fold_blocks(blocks).values[1:]):
+        gain = np.array([more_gain, 2.0 * abs(more_gain)])
+        for number in range(FOLDS):
+            held = fold == number
             models = {"before": _fit_model(before, ~held), "after": _fit_model(after, ~held)}
             gain = gain + _compare_models(blocks, models["before"], models["after"], held)
+            moves |= not models["after"]["known_mean"].equals(models["before"]["known_mean"])
+            if gains:
+                continue  # the Allan variance is compared on the stretches
+            if shown is not None:
+                models["after"] = _fit_model(shown, ~held)
+            chosen = fold_of_window == number
+            inside = Windows(windows.first[chosen], windows.stop[chosen])
+            for name, baseline in models.items():
+                squares[name].append(_allan_scores(blocks, baseline, inside))
         gains.append(gain)
+        if not moves:
+            break
     evidence_nats, variance = max(gain.tolist() for gain in gains)
     known = select_forecast_start(blocks)
     late, early = (
@@ -159,7 +160,7 @@ def log_likelihood(
         Blocks to predict from, and blocks to predict.
     """
     total = float((_power_terms(blocks, baseline) + _cross_terms(blocks, baseline))[held].sum())
-    for axis in range(blocks.sizes["axis"]):
+    for axis in map(str, blocks["axis"].values):
         total += _mean_evidence(blocks, baseline, axis, known | held) - _mean_evidence(
             blocks, baseline, axis, known
         )
@@ -189,9 +190,7 @@ def _cross_terms(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:
     block_count = blocks.sizes["block"]
     if "cross" not in baseline or "cross" not in blocks:
         return np.zeros(block_count)
-    axes = [str(axis) for axis in blocks["axis"].values]
-    left = [axes.index(str(axis)) for axis in blocks["first"].values]
-    right = [axes.index(str(axis)) for axis in blocks["second"].values]
+    left, right = pair_indices(blocks)
     power, shape = (np.moveaxis(blocks[name].values, 0, -1) for name in ("power", "shape"))
     spectrum = np.moveaxis(baseline["spectrum"].values, 0, -1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -204,7 +203,7 @@ def _cross_terms(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:
         & np.isfinite(model).all(axis=-1)
         & np.isfinite(flat).all(axis=-1)
     )
-    size = len(axes)
+    size = blocks.sizes["axis"]
     expected = np.zeros((*has_data.shape, size, size), dtype=np.complex128)
     observed = expected.copy()
     expected[..., range(size), range(size)] = 1.0
@@ -218,34 +217,23 @@ def _cross_terms(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:
 
 
 def _mean_evidence(
-    blocks: xr.Dataset, baseline: xr.Dataset, axis: int, used: NDArray[np.bool_]
+    blocks: xr.Dataset, baseline: xr.Dataset, axis: str, used: NDArray[np.bool_]
 ) -> float:
     """Return the log-likelihood of the used block means with a free constant.
 
     It is averaged over the calibrated random walk and flicker.
     """
-    residual = blocks["mean"].values[axis] - baseline["known_mean"].values[axis]
-    variance = baseline["mean_variance"].values[axis]
+    residual = mean_residual(blocks, baseline, axis)[:, 0]
+    noise = axis_noise(baseline, axis)
+    variance = noise["variance"]
     present = used & np.isfinite(residual) & np.isfinite(variance) & (variance > 0)
-    if "grid_K" in baseline:
-        walk, flicker = baseline["grid_K"].values[axis], baseline["grid_B"].values[axis]
-        weight = baseline["grid_calibrated"].values[axis]
-    else:
-        terms = [str(term) for term in baseline["term"].values]
-        walk, flicker = (
-            np.nan_to_num(baseline["coefficient"].values[axis, [terms.index(term)]])
-            for term in ("K", "B")
-        )
-        weight = np.zeros(1)
+    weight = noise_weight(baseline, axis, "calibrated")
     products = mean_products(
         np.where(present, residual, 0.0)[:, None],
         np.empty((residual.size, 0)),
-        variance=np.where(present, variance, 1.0),
+        **noise | {"variance": np.where(present, variance, 1.0)},
         step=float(blocks.attrs["block_s"]),
-        K=np.asarray(walk, dtype=float),
-        B=np.asarray(flicker, dtype=float),
         present=present,
-        wander=expected_processes(baseline, axis),
     )
     log = (
         weight
