@@ -43,8 +43,6 @@ _SOURCE_TEXT = {
     "model": "the given model",
     "simulation": "the given simulated log",
 }
-#: Reasons of `diagnosis.json` that the report words otherwise.
-_REASON_TEXT = {"below limit": "looked for, not seen"}
 MAX_LISTED_STRETCHES = 6
 
 
@@ -90,9 +88,21 @@ def write_diagnosis_report(
             ],
             charts=diagnosis_charts(diagnosis.surfaces, content),
             figures=_make_figures(diagnosis),
-            evidence=_evidence_rows(content),
-            limits=_limit_rows(content),
-            noise=_noise_rows(content),
+            held=content["held_out"],
+            limits=sorted(
+                content["not_found"].items(),
+                key=lambda item: (item[1]["upper_limit"] is None, item[0]),
+            ),
+            rejected={
+                rejection["name"]: rejection_text(rejection["beaten_by"], rejection["nats"])
+                for rejection in content.get("rejected", [])
+            },
+            noise=content["baseline"]["noise"],
+            laws=LAWS,
+            number=_format_number,
+            parameter=_format_parameter,
+            plain_name=plain_name,
+            unit=unit_symbol,
             level=f"{100.0 * content['false_alarm_level']:g} %",
             # effects have one half of the level, places the other
             effect_level=f"{50.0 * content['false_alarm_level']:g} %",
@@ -173,20 +183,9 @@ def _effect_card(
     evidence, title = effect["held_out_gain"], plain_name(effect["name"])
     axes = set(effect["axes"]).union(*(other["axes"] for other in others))
     return {
+        **effect,
         "title": f"{title[0].upper()}{title[1:]}, {axes_text(effect['axes'])}",
-        "name": effect["name"],
-        "driver": effect["driver"] or "",
-        "statement": effect["statement"],
         "family": family_text(effect, others) if others else "",
-        "rows": [
-            {
-                "name": name.replace("_", " "),
-                "value": _format_parameter(entry, "value"),
-                "range": f"{_format_parameter(entry, 'low')} to {_format_parameter(entry, 'high')}",
-                "unit": unit_symbol(entry["unit"]),
-            }
-            for name, entry in effect["parameters"].items()
-        ],
         "evidence": (
             f"{_format_number(evidence['nats'])} ± {_format_number(evidence['stderr'], 2)} nats "
             f"(threshold {_format_number(evidence['threshold'], 2)})"
@@ -202,89 +201,6 @@ def _effect_card(
             if effect["name"] in region["explained_by"] and axes & set(region["axes"])
         ],
     }
-
-
-def _evidence_rows(content: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
-    """Return the rows of the evidence: quantity, before, after, and how to read it."""
-    held = content["held_out"]
-
-    def share(value: Any) -> str:
-        return "–" if value is None else f"{100.0 * value:.3g} %"
-
-    forecast = (
-        "–" if held["forecast_gain"] is None else f"{_format_number(held['forecast_gain'])} nats"
-    )
-    gain = (
-        f"{_format_number(held['log_likelihood_gain'])} ± {_format_number(held['stderr'], 2)} nats"
-    )
-    return [
-        (
-            "Log-likelihood of held-out data",
-            "0",
-            gain,
-            "Each stretch is predicted from the others. Above 0 is better; 5 nats are odds of 150 "
-            "to 1.",
-        ),
-        (
-            "Misfit of the Allan variance (mean z²)",
-            _format_number(held["misfit_before"]),
-            _format_number(held["misfit_after"]),
-            "1 for a model that fits.",
-        ),
-        (
-            "Cells inside their 95 % band",
-            share(held["coverage95_before"]),
-            share(held["coverage95_after"]),
-            "95 % for a model that fits.",
-        ),
-        (
-            "Forecast of the last 30 %",
-            "0",
-            forecast,
-            "Fitted to the first 70 % only. A dash: no effect acts in both parts.",
-        ),
-    ]
-
-
-def _limit_rows(content: Mapping[str, Any]) -> list[dict[str, str]]:
-    rows = []
-    rejected = {
-        rejection["name"]: rejection_text(rejection["beaten_by"], rejection["nats"])
-        for rejection in content.get("rejected", [])
-    }
-    for name, entry in content["not_found"].items():
-        unit = unit_symbol(entry["unit"])
-        reason = _REASON_TEXT.get(entry["reason"], entry["reason"])
-        limit = (
-            "–"
-            if entry["upper_limit"] is None
-            else f"< {_format_number(entry['upper_limit'], 2)} {unit}".rstrip()
-        )
-        rows.append(
-            {
-                "name": name,
-                "plain": plain_name(name),
-                "limit": limit,
-                "reason": "; ".join(filter(None, [reason, rejected.get(name)])),
-            }
-        )
-    return sorted(rows, key=lambda row: (row["limit"] == "–", row["name"]))
-
-
-def _noise_rows(content: Mapping[str, Any]) -> list[dict[str, str]]:
-    rows = []
-    for axis, terms in content["baseline"]["noise"].items():
-        for symbol, entry in terms.items():
-            error = "" if entry["stderr"] is None else f" ± {_format_number(entry['stderr'], 2)}"
-            rows.append(
-                {
-                    "axis": axis,
-                    "term": f"{symbol}, {LAWS[symbol].name}",
-                    "value": f"{_format_number(entry['value'])}{error}",
-                    "unit": unit_symbol(entry["unit"]),
-                }
-            )
-    return rows
 
 
 def _make_figures(diagnosis: Diagnosis) -> list[dict[str, str]]:
