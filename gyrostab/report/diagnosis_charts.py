@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.noise import NORMAL_95
-from gyrostab.plot.diagnosis_content import find_change, find_regions, select_channels
+from gyrostab.plot.diagnosis import find_change, find_regions, select_channels
 from gyrostab.plot.style import COLOURS, axis_names, axis_style, unit_label
 from gyrostab.report.charts import (
     DEVIATION_LABEL,

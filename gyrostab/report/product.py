@@ -69,9 +69,7 @@ def write_report(
 
     terms = summarise_terms(product)
     axes = dict.fromkeys(term.axis for term in terms)
-    table = [
-        (axis, _coefficient_rows([term for term in terms if term.axis == axis])) for axis in axes
-    ]
+    table = [(axis, [term for term in terms if term.axis == axis]) for axis in axes]
     gaps = None if log is None or "gap_start" not in log.variables else _list_gaps(log)
     with new_output(path, overwrite=overwrite) as temporary:
         text = page_text(
@@ -82,6 +80,10 @@ def write_report(
             findings=_describe_findings(product, table),
             facts=_list_facts(product),
             table=table,
+            laws=LAWS,
+            number=_number_text,
+            share=format_share,
+            unit=unit_symbol,
             charts={chart.name: chart for chart in product_charts(product, log)},
             window_data=window_data(product),
             figures=[] if plotly else _make_figures(product, log),
@@ -143,16 +145,18 @@ def _summarise_record(product: xr.Dataset) -> str:
 
 
 def _describe_findings(
-    product: xr.Dataset, table: list[tuple[str, list[dict[str, Any]]]]
+    product: xr.Dataset, table: list[tuple[str, list[TermSummary]]]
 ) -> list[str]:
     from gyrostab.allan.summary import describe_record
 
     lines = []
-    for axis, rows in table:
+    for axis, terms in table:
         medians = [
-            f"{row['symbol']} = {row['median']} {row['unit']}{row['rare']}"
-            for row in rows
-            if row["median"] != "–"
+            f"{term.symbol} = {_number_text(term.median)} {unit_symbol(term.unit)}"
+            + f" (observed in {format_share(term.observed_share)} of the windows only)"
+            * (term.observed_share < 0.5)
+            for term in terms
+            if np.isfinite(term.median)
         ]
         text = (
             f"Axis {axis}, medians: {', '.join(medians)}."
@@ -208,36 +212,6 @@ def _estimator_shares(product: xr.Dataset) -> list[tuple[str, float]]:
         np.asarray(product["estimator"].values, dtype=np.int64).ravel(), minlength=len(labels)
     )
     return [(label, float(counts[number] / counts.sum())) for number, label in enumerate(labels)]
-
-
-def _coefficient_rows(terms: list[TermSummary]) -> list[dict[str, Any]]:
-    return [
-        {
-            "symbol": term.symbol,
-            "value": _value_text(term),
-            "name": LAWS[term.symbol].name,
-            "unit": unit_symbol(term.unit),
-            "median": _number_text(term.median),
-            "range": f"{_number_text(term.low)} to {_number_text(term.high)}"
-            if np.isfinite(term.median)
-            else "–",
-            "observed": format_share(term.observed_share),
-            "rare": f" (observed in {format_share(term.observed_share)} of the windows only)"
-            if term.observed_share < 0.5
-            else "",
-            "limited": format_share(term.limited_share),
-            "limit": f"< {_number_text(term.limit)}" if np.isfinite(term.limit) else "–",
-        }
-        for term in terms
-    ]
-
-
-def _value_text(term: TermSummary) -> str:
-    """State the median of the observed values, else of the upper limits."""
-    if term.status == "not_observable":
-        return "not observable"
-    below = "< " if term.status == "upper_limit_only" else ""
-    return f"{below}{_number_text(term.value)}"
 
 
 def _list_gaps(log: xr.Dataset) -> list[dict[str, Any]]:
