@@ -21,7 +21,6 @@ from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.nulls.shared_noise import (
     SharedNoise,
     draw_shared_spectra,
-    draw_shared_white,
     find_shared_noise,
 )
 from gyrostab.diagnose.reduce.block_statistics import pair_indices
@@ -286,11 +285,9 @@ def _draw_means(setup: _NullSetup, squares: Array, slow: Array, rng: np.random.G
     level[:, apart] = 1.0  # the draws are of the noise of the powers
     white = np.sqrt(baseline["mean_variance"].values * level)
     times = flicker_times(1.0 / step, low=1.0 / (2.0 * np.pi * 8.0 * n * step))
-    drawn = (
-        rng.standard_normal(white.shape)
-        if setup.shared is None
-        else draw_shared_white(setup.shared, len(white), rng)
-    )
+    drawn = rng.standard_normal(white.shape)
+    if setup.shared is not None:  # with the correlation of the lowest band
+        drawn = np.einsum("bij,rjb->rib", setup.shared.white, drawn)
     total = baseline["known_mean"].values + white * drawn
     for place in np.ndindex(*white.shape[:2]):
         B2, K2 = slow[place]

@@ -15,7 +15,7 @@ from gyrostab.diagnose.statistics import STATISTICS
 Array = NDArray[np.float64]
 _KEPT_BELOW_SIGMA = 1.4  # below the largest of independent cells, from which scores are kept
 _POWERS_AT_ONCE = 1_000_000  # band powers of null records scored at once; limits memory
-_FIRST_RECORDS = 20  # null records for the first estimate of a standard deviation
+_MIN_RECORDS_AT_ONCE = 20  # null records for the first estimate of a standard deviation
 _MIN_TAIL_SCALE = 0.7  # of half a squared score; that of a single normal cell is 1
 _MIN_EVIDENCE_SCALE = 0.1  # [nats]; keeps the tail from vanishing when null records score alike
 MIN_P_VALUE = 1e-12  # floor of an extrapolated probability; decides nothing: no level is that low
@@ -91,7 +91,8 @@ def null_scores(
     records = 0
     for chunk in nulls:
         records += chunk.sizes["record"]
-        size = max(1, _POWERS_AT_ONCE * chunk.sizes["record"] // chunk["power"].size)
+        size = _POWERS_AT_ONCE * chunk.sizes["record"] // chunk["power"].size
+        size = max(_MIN_RECORDS_AT_ONCE, size)
         for first in range(0, chunk.sizes["record"], size):
             part = chunk.isel(record=slice(first, first + size))
             for statistic in STATISTICS:
@@ -152,7 +153,6 @@ class _ScoreSums:
         self.shape = scores["z"].shape[1:]
         self.sums = np.zeros((3, int(np.prod(self.shape))))
         self.extremes: list[tuple[NDArray[np.int64], NDArray[np.int64], Array]] = []
-        self.waiting: list[Array] = []
         self.records = 0
         self.one_sided = bool(scores.attrs["one_sided"])
         self.floor = np.broadcast_to(scores["floor"].values, self.shape).ravel()
@@ -170,22 +170,15 @@ class _ScoreSums:
         self.sums += np.stack(
             [present.sum(axis=0), filled.sum(axis=0), np.square(filled).sum(axis=0)]
         )
-        self.waiting.append(z)
-        if self.records + sum(len(part) for part in self.waiting) >= _FIRST_RECORDS:
-            self._keep_extremes()
-
-    def _keep_extremes(self) -> None:
-        """Keep extreme scores by the moments so far, which suffice to drop the rest."""
+        # the moments so far suffice to drop the scores that are not extreme
         mean, spread = self._pooled_moments(self.sums, self._pool_variance(), self.floor)
-        for z in self.waiting:
-            with np.errstate(invalid="ignore"):
-                deviation = (z - mean) / spread
-                record, cell = np.nonzero(
-                    (deviation if self.one_sided else np.abs(deviation)) > self.kept
-                )
-            self.extremes.append((record + self.records, cell, z[record, cell]))
-            self.records += len(z)
-        self.waiting = []
+        with np.errstate(invalid="ignore"):
+            deviation = (z - mean) / spread
+            record, cell = np.nonzero(
+                (deviation if self.one_sided else np.abs(deviation)) > self.kept
+            )
+        self.extremes.append((record + self.records, cell, z[record, cell]))
+        self.records += len(z)
 
     def _pool_variance(self) -> Array:
         """Return the variance of each cell, averaged over windows of equal length."""
@@ -204,7 +197,6 @@ class _ScoreSums:
 
     def finish(self) -> tuple[Array, Array, Array]:
         """Return mean and spread of every cell, and the largest scores by the other records."""
-        self._keep_extremes()
         pooled_variance = self._pool_variance()
         mean, spread = self._pooled_moments(self.sums, pooled_variance, self.floor)
         record, cell, z = (np.concatenate(part) for part in zip(*self.extremes, strict=True))

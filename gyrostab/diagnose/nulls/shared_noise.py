@@ -103,14 +103,3 @@ def _unpaired_scatter(pair_shape: Array, first_shape: Array, second_shape: Array
     with np.errstate(divide="ignore", invalid="ignore"):
         excess = 1.0 / pair_shape - 1.0 / np.minimum(first_shape, second_shape)
     return np.sqrt(np.maximum(np.nan_to_num(excess, posinf=0.0), 0.0) / 2.0)
-
-
-def draw_shared_white(shared: SharedNoise, count: int, rng: np.random.Generator) -> Array:
-    """Draw unit white noise (record, axis, block) with the correlation of the lowest band."""
-    return np.asarray(
-        np.einsum(
-            "bij,rjb->rib",
-            shared.white,
-            rng.standard_normal((count, len(shared.axis_shape), len(shared.white))),
-        )
-    )
