@@ -1,10 +1,12 @@
-"""What the charts of a page share: frame, axes, escaping, and the plotly script."""
+"""What pages and their charts share: template, frame, axes, escaping, and the plotly script."""
 
 from __future__ import annotations
 
 import functools
 import html
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib import metadata, resources
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -41,6 +43,37 @@ def plotly_script() -> str:
     from plotly.offline import get_plotlyjs
 
     return str(get_plotlyjs())
+
+
+def page_text(template: str, *, title: str, plotly: str = "", **content: Any) -> str:
+    """Render a template, with the time and the version that made the page.
+
+    Parameters
+    ----------
+    template : str
+        Name of the template, which extends ``frame.html.jinja``.
+    plotly : str
+        Address of plotly.js, relative to the page; by default the page holds all of it.
+    """
+    import jinja2
+
+    templates = jinja2.Environment(
+        loader=jinja2.PackageLoader("gyrostab", "report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+    )
+    script = resources.files("gyrostab.report").joinpath("charts.js")
+    made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    return templates.get_template(template).render(
+        title=title,
+        made=made,
+        version=metadata.version("gyrostab"),
+        plotly="" if plotly else plotly_script(),
+        plotly_address=plotly,
+        charts_script=script.read_text(encoding="utf-8"),
+        **content,
+    )
 
 
 def embeddable(text: str) -> str:

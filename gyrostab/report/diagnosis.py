@@ -12,7 +12,7 @@ import numpy as np
 from gyrostab.diagnose.result.content import check_diagnosis
 from gyrostab.diagnose.result.diagnosis import Diagnosis
 from gyrostab.diagnose.result.families import group_families
-from gyrostab.diagnose.result.record_text import noise_texts, summary
+from gyrostab.diagnose.result.record_text import noise_texts, span_seconds, summary
 from gyrostab.diagnose.result.text import (
     chance_share,
     family_text,
@@ -25,8 +25,8 @@ from gyrostab.diagnose.result.text import (
 from gyrostab.diagnose.statistics.wording import axes_text, length_text
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import embedded, unit_symbol
+from gyrostab.report.charts import page_text
 from gyrostab.report.diagnosis_charts import diagnosis_charts
-from gyrostab.report.page import page_text
 from gyrostab.store.output import new_output
 from gyrostab.wording import value_digits
 
@@ -131,10 +131,7 @@ def _recording_text(content: Mapping[str, Any]) -> str:
 
 def _fact_rows(content: Mapping[str, Any]) -> list[tuple[str, str]]:
     recording, baseline = content["recording"], content["baseline"]
-    length = (
-        np.datetime64(recording["end"].removesuffix("Z"))
-        - np.datetime64(recording["start"].removesuffix("Z"))
-    ) / np.timedelta64(1, "s")
+    length = span_seconds(recording["start"], recording["end"])
     stretches = baseline["calibrated_on"]
     spans = "; ".join(
         f"{_format_time(first)} to {_format_time(last)}"
@@ -148,7 +145,7 @@ def _fact_rows(content: Mapping[str, Any]) -> list[tuple[str, str]]:
         (
             "Span (UTC)",
             f"{_format_time(recording['start'])} to {_format_time(recording['end'])}, "
-            f"{length_text(float(length))}",
+            f"{length_text(length)}",
         ),
         (
             "Axes, sampling rate",

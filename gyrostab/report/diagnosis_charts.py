@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 _RED = "#D00000"
 _CASES = {"before": "simulation before", "after": "simulation after"}
-_MAX_LINES = 4000
 
 
 def diagnosis_charts(surfaces: xr.Dataset, content: Mapping[str, Any]) -> list[Chart]:
@@ -231,23 +230,13 @@ def _draw_spectra(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure
     )
     for name in axis_names(surfaces):
         colour = axis_style(surfaces, name)["color"]
-        chosen = _find_highest(lines.sel(axis=name).values)
         figure.add_scatter(
-            x=single(frequency[chosen]), y=single(lines.sel(axis=name).values[chosen]),
+            x=single(frequency), y=single(lines.sel(axis=name).values),
             mode="lines", name=f"axis {plain_text(name)}, recording", legendgroup=name,
             line={"color": colour, "width": 0.7}, opacity=0.6,
         )  # fmt: skip
     _add_cases(figure, surfaces, surfaces["frequency"].values, surfaces["density"])
     return figure
-
-
-def _find_highest(values: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Select at most `_MAX_LINES` places: the highest value of each group of neighbours."""
-    step = -(-values.size // _MAX_LINES)
-    padded = np.full(-(-values.size // step) * step, -np.inf)
-    padded[: values.size] = np.nan_to_num(values, nan=-np.inf)
-    groups = padded.reshape(-1, step)
-    return np.asarray(np.arange(len(groups)) * step + groups.argmax(axis=1))
 
 
 _CHANGE_TEXT = (

@@ -28,7 +28,7 @@ from gyrostab.plot.style import (
     unit_label,
     unit_symbol,
 )
-from gyrostab.report.page import page_text
+from gyrostab.report.charts import page_text
 from gyrostab.store.output import new_output
 from gyrostab.store.remote import find_url, upload_file
 from gyrostab.units import HOUR

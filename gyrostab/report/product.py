@@ -13,7 +13,7 @@ from gyrostab.allan.variance import variance_name
 from gyrostab.ingest.convert import as_log
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import axis_names, duration, embedded, unit_symbol
-from gyrostab.report.page import page_text
+from gyrostab.report.charts import page_text
 from gyrostab.report.product_charts import product_charts, window_data
 from gyrostab.schema import GAP_CAUSES, check_product, texts
 from gyrostab.store.output import new_output

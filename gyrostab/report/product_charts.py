@@ -214,7 +214,10 @@ def _add_coefficient(
 ) -> None:
     """Add estimates as points with standard errors, and upper limits as open arrows."""
     state = product["observable"].sel(term=symbol).values
-    figure.layout[panel.replace("y", "yaxis")].update(_scale_of(product, symbol))
+    shown = find_shown_values(product, symbol)
+    is_wide = shown.size > 0 and shown.max() > 10 * shown.min()  # than a decade
+    scale = log_axis("", shown, labels=5) if is_wide else {"rangemode": "tozero"}
+    figure.layout[panel.replace("y", "yaxis")].update(scale)
     for row, name in enumerate(axis_names(product)):
         colour = axis_style(product, name)["color"]
         shared = {"x": milliseconds(product), "yaxis": panel, "legendgroup": name}
@@ -248,13 +251,6 @@ def _add_coefficient(
             hovertemplate=f"%{{y:.3g}} {label}",
             showlegend=symbol == "N",
         )
-
-
-def _scale_of(product: xr.Dataset, symbol: str) -> dict[str, Any]:
-    """Choose a logarithmic scale for numbers over more than a decade, else one from zero."""
-    shown = find_shown_values(product, symbol)
-    is_wide = shown.size > 0 and shown.max() > 10 * shown.min()
-    return log_axis("", shown, labels=5) if is_wide else {"rangemode": "tozero"}
 
 
 def _log_deviation(product: xr.Dataset) -> NDArray[np.float64]:

@@ -345,20 +345,6 @@ def test_change_is_the_ratio_of_recording_and_simulation():
     }
 
 
-def test_a_narrow_line_survives_the_thinning_of_the_spectrum():
-    stored = surfaces().drop_vars(["line_density", "line_frequency"])
-    density = np.ones((stored.sizes["axis"], 100_003))
-    density[:, 77_777] = 50.0
-    stored = stored.assign_coords(line_frequency=("line", np.arange(1.0, 100_004.0)))
-    stored["line_density"] = (("axis", "line"), density)
-    figure = {chart.name: chart.figure for chart in diagnosis_charts(stored, content())}["spectra"]
-    trace = json.loads(figure)["data"][0]
-    values = _decode_numbers(trace["y"])
-    assert values.size <= 4000
-    assert values.max() == 50.0
-    assert _decode_numbers(trace["x"])[values.argmax()] == 77_778
-
-
 @pytest.mark.slow
 @_needs_browser
 @pytest.mark.parametrize("width", [1280, 400])
