@@ -18,8 +18,8 @@ from gyrostab.diagnose.statistics.power import allan_surface
 from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score
 from gyrostab.noise import NORMAL_95
 
-#: A baseline, or a function that fits one to the blocks where its argument, a mask, is true.
-Trained = xr.Dataset | Callable[[NDArray[np.bool_]], xr.Dataset]
+#: Fits a baseline to the blocks where its argument, a mask, is true.
+Model = Callable[[NDArray[np.bool_]], xr.Dataset]
 STRETCH_S = 100.0  # length of a held-out stretch; longer ones would hide a whole event
 MIN_STRETCHES = 36  # in records shorter than an hour the stretches are shorter instead
 FORECAST_FROM_SHARE = 0.7  # share of the record that a forecast begins from
@@ -28,12 +28,12 @@ SHORT_WINDOW_BLOCKS = 5  # length of the middle one of the three windows of the 
 
 def held_out(
     blocks: xr.Dataset,
-    before: Trained,
-    after: Trained,
+    before: Model,
+    after: Model,
     *,
     more_gain: float = 0.0,
-    shown: Trained | None = None,
-    forecast: Trained | None = None,
+    shown: Model | None = None,
+    forecast: Model | None = None,
 ) -> dict[str, float]:
     """Compare two models of a recording on data that they were not fitted to.
 
@@ -45,20 +45,19 @@ def held_out(
 
     Parameters
     ----------
-    before, after : xarray.Dataset or callable
-        Baselines, the second with the effects in its ``spectrum``, ``known_mean`` and, for noise in
-        common, ``cross`` (pair, block, band). A callable takes the mask of the blocks that it may
-        use, and returns the baseline fitted to them. A Dataset is used as it is: its result is held
-        out only if the Dataset was fitted to other data.
+    before, after : callable
+        Take the mask of the blocks that they may use, and return the baseline fitted to them, the
+        second with the effects in its ``spectrum``, ``known_mean`` and, for noise in common,
+        ``cross`` (pair, block, band).
     more_gain : float
         Held-out gain [nats] of what is in neither means nor powers nor cross-spectra, to be added:
         sample counts, phase-locked components, telegraph biases. Lines are in the powers of their
         bands already and would count twice.
-    shown : xarray.Dataset or callable, optional
-        Baseline with all effects, those of `more_gain` included, for the Allan variance; `after` by
+    shown : callable, optional
+        The same with all effects, those of `more_gain` included, for the Allan variance; `after` by
         default.
-    forecast : xarray.Dataset or callable, optional
-        Baseline with the effects that can be forecast; `after` by default.
+    forecast : callable, optional
+        The same with the effects that can be forecast; `after` by default.
 
     Returns
     -------
@@ -72,7 +71,7 @@ def held_out(
     Examples
     --------
     >>> refit = lambda known: calibrate_noise(blocks.isel(block=known))  # doctest: +SKIP
-    >>> evidence = held_out(blocks, baseline, refit)  # doctest: +SKIP
+    >>> evidence = held_out(blocks, lambda known: baseline, refit)  # doctest: +SKIP
     >>> evidence["log_likelihood_gain"], evidence["stderr"]  # doctest: +SKIP
     (41.2, 6.0)
     """
@@ -86,13 +85,13 @@ def held_out(
         gain = np.array([more_gain, 2.0 * abs(more_gain)])
         for number in range(FOLDS):
             held = fold == number
-            models = {"before": _fit_model(before, ~held), "after": _fit_model(after, ~held)}
+            models = {"before": before(~held), "after": after(~held)}
             gain = gain + _compare_models(blocks, models["before"], models["after"], held)
             moves |= not models["after"]["known_mean"].equals(models["before"]["known_mean"])
             if gains:
                 continue  # the Allan variance is compared on the stretches
             if shown is not None:
-                models["after"] = _fit_model(shown, ~held)
+                models["after"] = shown(~held)
             chosen = fold_of_window == number
             inside = Windows(windows.first[chosen], windows.stop[chosen])
             for name, baseline in models.items():
@@ -103,8 +102,7 @@ def held_out(
     evidence_nats, variance = max(gain.tolist() for gain in gains)
     known = select_forecast_start(blocks)
     late, early = (
-        log_likelihood(blocks, _fit_model(model, known), known, ~known)
-        for model in (after if forecast is None else forecast, before)
+        log_likelihood(blocks, model(known), known, ~known) for model in (forecast or after, before)
     )
     return {
         "blocks": windows.first.size,
@@ -165,10 +163,6 @@ def log_likelihood(
             blocks, baseline, axis, known
         )
     return total
-
-
-def _fit_model(model: Trained, known: NDArray[np.bool_]) -> xr.Dataset:
-    return model if isinstance(model, xr.Dataset) else model(known)
 
 
 def _power_terms(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:

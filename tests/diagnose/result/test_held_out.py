@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.result.held_out import cut_stretches, held_out, log_likelihood
+from gyrostab.diagnose.result import held_out as evidence
+from gyrostab.diagnose.result.held_out import cut_stretches, log_likelihood
 from gyrostab.diagnose.result.surfaces import CASES, make_surfaces
 from gyrostab.noise import LAWS
 from tests.support.reduced_records import BLOCK_S, RATE, baseline, records
@@ -14,6 +15,14 @@ from tests.support.reduced_records import BLOCK_S, RATE, baseline, records
 LEVEL = 3600.0 * 0.003**2
 VARIANCE = LEVEL / BLOCK_S
 ON = slice(60, 90)
+
+
+def held_out(blocks, *models, **others):
+    """Compare models, those that are fitted to held-out blocks and those that are given."""
+    models = [model if callable(model) else lambda known, model=model: model for model in models]
+    if "shown" in others:
+        others["shown"] = lambda known, model=others["shown"]: model
+    return evidence.held_out(blocks, *models, **others)
 
 
 def _record(seed=1, **options):
@@ -292,6 +301,19 @@ def test_band_of_a_known_mean_holds_95_percent():
         inside.append(((recorded >= low) & (recorded <= high)).where(np.isfinite(recorded)))
     share = xr.concat(inside, "seed").mean(["seed", "axis", "window"])
     np.testing.assert_allclose(share, 0.95, atol=0.05)
+
+
+def test_a_narrow_line_survives_the_thinning_of_the_spectrum():
+    base = baseline(rate=1000.0)
+    blocks = records(base, 1, np.random.default_rng(1), rate=1000.0).isel(record=0)
+    blocks["line_power"][0, :, 7_777] = 50.0
+    density = make_surfaces(blocks, base, base)["line_density"].isel(axis=0)
+    assert blocks.sizes["line"] == 10_000
+    assert density.sizes["line"] <= 4000
+    assert float(density.max()) == pytest.approx(50.0)
+    assert density["line_frequency"].values[int(density.argmax())] == pytest.approx(
+        blocks["line_frequency"].values[7_777], rel=1e-3
+    )
 
 
 def test_surfaces_of_a_long_record_stay_small():
