@@ -121,58 +121,41 @@ def prefer_plainer(component: Component, state: State) -> Component:
     """
     if not (component.statistic.is_linear_in_means or component.statistic.is_power):
         return component
-    if len(component.variant.columns) == 1:
-        return _prefer_first_term(component, state)
-    mean, covariance = component_mixture(component, state).moments()
-    error = np.sqrt(np.diagonal(covariance))
-    correlation = float(np.abs(np.tril(covariance / np.outer(error, error), -1)).max())
-    named_terms = (
-        (name, _single_term_variant(component, name)) for name in component.variant.columns
-    )
-    terms = {name: variant for name, variant in named_terms if variant is not None}
-    if not terms:
-        return component
+    settings = state.settings
+    if is_single := len(component.variant.columns) == 1:
+        single = (part.columns for part in component.candidate.variants if len(part.columns) == 1)
+        names = tuple(columns[0] for columns in single)
+    else:
+        names = component.variant.columns
+    terms = {
+        name: variant
+        for name in dict.fromkeys(names)
+        if (variant := _single_term_variant(component, name)) is not None
+    }
     gains = {name: _explained_nats(component, state, variant) for name, variant in terms.items()}
-    needed, share = state.settings.reject_nats, state.settings.form_error_share
-    best = max(gains.values())
-    # the first that explains as much as the best
-    name = next(
-        name for name in component.variant.columns if gains.get(name, -np.inf) > best - needed
-    )
-    total_nats = 0.5 * float(mean @ np.linalg.solve(covariance, mean))
-    if (
-        correlation < state.settings.term_correlation
-        and total_nats - gains[name] > needed + share * gains[name]
-    ):
+    if is_single:  # rounding or chance may have put another term ahead
+        own = component.variant.columns[0]
+        own_nats = _explained_nats(component, state, component.variant)
+        needed_nats = own_nats - settings.ambiguous_nats - settings.form_error_share * own_nats
+        close = [name for name in terms if name == own or gains[name] > needed_nats]
+        if len(close) < 2:
+            return component
+        name, *other_names = close
+    elif not terms:
         return component
-    other_names = [other for other in component.variant.columns if other != name]
+    else:
+        best = max(gains.values())
+        # the first that explains as much as the best
+        name = next(name for name in terms if gains[name] > best - settings.reject_nats)
+        mean, covariance = component_mixture(component, state).moments()
+        error = np.sqrt(np.diagonal(covariance))
+        correlation = float(np.abs(np.tril(covariance / np.outer(error, error), -1)).max())
+        total_nats = 0.5 * float(mean @ np.linalg.solve(covariance, mean))
+        needed_nats = settings.reject_nats + settings.form_error_share * gains[name]
+        if correlation < settings.term_correlation and total_nats - gains[name] > needed_nats:
+            return component
+        other_names = [other for other in component.variant.columns if other != name]
     return replace(component, variant=terms[name], note=_describe_unseparated(name, other_names))
-
-
-def _prefer_first_term(component: Component, state: State) -> Component:
-    """Return a component of one term with the first of the terms that explain as much.
-
-    Rounding or chance may have put another one ahead.
-    """
-    names = dict.fromkeys(
-        variant.columns[0] for variant in component.candidate.variants if len(variant.columns) == 1
-    )
-    terms = [
-        variant for name in names if (variant := _single_term_variant(component, name)) is not None
-    ]
-    own_nats = _explained_nats(component, state, component.variant)
-    correlation = [
-        variant
-        for variant in terms
-        if variant.columns == component.variant.columns
-        or _explained_nats(component, state, variant)
-        > own_nats - state.settings.ambiguous_nats - state.settings.form_error_share * own_nats
-    ]
-    if len(correlation) < 2:
-        return component
-    first, *other_terms = correlation
-    note = _describe_unseparated(first.columns[0], [variant.columns[0] for variant in other_terms])
-    return replace(component, variant=first, note=note)
 
 
 def _explained_nats(component: Component, state: State, variant: Variant) -> float:

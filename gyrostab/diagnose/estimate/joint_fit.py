@@ -114,27 +114,27 @@ def _fit_identification(
         or not component.candidate.is_per_axis
         for component in identification.components
     )
-    if fitted_together:
-        return [
-            _fit_components(
-                identification,
-                axes_of(components, identification.axes),
-                components,
-                state_beside,
-                identifications,
-            )
+    parts = (
+        [
+            part
             for harmonic in split_harmonics(identification, state)
-            for components, state_beside in split_steps(harmonic, state)
+            for part in split_steps(harmonic, state)
         ]
+        if fitted_together
+        else [
+            ([component for component in identification.components if axis in component.row], state)
+            for axis in identification.axes
+        ]
+    )
     return [
         _fit_components(
             identification,
-            (axis,),
-            [component for component in identification.components if axis in component.row],
-            state,
+            axes_of(components, identification.axes),
+            components,
+            state_beside,
             identifications,
         )
-        for axis in identification.axes
+        for components, state_beside in parts
     ]
 
 

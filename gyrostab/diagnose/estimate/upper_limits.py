@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,63 +25,52 @@ MAX_VARIANTS = 9  # evenly spread over the grid of a mean: enough for a smooth m
 ONE_SIDED_SIGMA = float(ndtri(CONFIDENCE))  # quantile of the normal law
 
 
-@dataclass(frozen=True)
-class UpperLimit:
-    """The 95 % upper limit of an effect that was not found; NaN where the record has none."""
-
-    upper_limit: float
-    unit: str
-    reason: str
-
-
-def find_upper_limits(identifications: Identifications) -> dict[str, UpperLimit]:
+def find_upper_limits(identifications: Identifications) -> dict[str, dict[str, Any]]:
     """Find how large each effect may be that was not identified.
 
     Returns
     -------
-    dict of str to UpperLimit
-        Of the effect's first size in means, powers or cross-spectra; the largest over the axes.
+    dict of str to dict
+        ``upper_limit``, 95 %, of the effect's first size in means, powers or cross-spectra, the
+        largest over the axes; NaN where the record has none. Its ``unit``, and the ``reason``.
     """
     named = {
         identification.effect
         for identification in (*identifications.expected, *identifications.identified)
     }
-    out = {}
-    for name, kind in effects().items():
-        if name in named:
-            continue
-        unit = next(
-            (item.unit for item in kind.parameters() if item.name in kind.size_parameters), "1"
-        )
-        if name in identifications.reasons:
-            out[name] = UpperLimit(math.nan, unit, identifications.reasons[name])
-            continue
-        limits = [
-            _limit_candidate(candidate, identifications.state)
-            for candidate in identifications.candidates
-            if candidate.effect == name
-            and candidate.statistic.has_course
-            and candidate.statistic.has_size
-        ]
-        finite_limits = [(value, column) for value, column in limits if math.isfinite(value)]
-        if not finite_limits:
-            out[name] = UpperLimit(
-                math.nan,
-                unit,
-                "not identifiable: free noise does as much" if limits else "below limit",
-            )
-            continue
-        first = min((column for _, column in finite_limits), key=_place_of(kind))
-        value, column = max(limit for limit in finite_limits if limit[1] == first)
-        unit = next((item.unit for item in kind.parameters() if item.name == column), unit)
-        out[name] = UpperLimit(value, unit, "below limit")
-    return out
+    return {
+        name: _limit_effect(kind, identifications)
+        for name, kind in effects().items()
+        if name not in named
+    }
 
 
-def _place_of(kind: type[Effect]) -> Callable[[str], int]:
-    """Return the place of a parameter among those of an effect, and the last for other names."""
-    names = [item.name for item in kind.parameters()]
-    return lambda name: names.index(name) if name in names else len(names)
+def _limit_effect(kind: type[Effect], identifications: Identifications) -> dict[str, Any]:
+    units = {item.name: item.unit for item in kind.parameters()}
+    unit = next((units[name] for name in units if name in kind.size_parameters), "1")
+    if kind.name in identifications.reasons:
+        reason = identifications.reasons[kind.name]
+        return {"upper_limit": math.nan, "unit": unit, "reason": reason}
+    limits = [
+        _limit_candidate(candidate, identifications.state)
+        for candidate in identifications.candidates
+        if candidate.effect == kind.name
+        and candidate.statistic.has_course
+        and candidate.statistic.has_size
+    ]
+    by_column: dict[str, float] = {}  # the largest
+    for value, column in limits:
+        if math.isfinite(value):
+            by_column[column] = max(value, by_column.get(column, value))
+    if not by_column:
+        reason = "not identifiable: free noise does as much" if limits else "below limit"
+        return {"upper_limit": math.nan, "unit": unit, "reason": reason}
+    column = next((name for name in units if name in by_column), next(iter(by_column)))
+    return {
+        "upper_limit": by_column[column],
+        "unit": units.get(column, unit),
+        "reason": "below limit",
+    }
 
 
 def _limit_candidate(candidate: Candidate, state: State) -> tuple[float, str]:
@@ -89,23 +78,19 @@ def _limit_candidate(candidate: Candidate, state: State) -> tuple[float, str]:
 
     It is over all lags, time constants and dead bands of the grid, weighted by their likelihood.
     """
-    if not candidate.variants[0].columns:
+    first = candidate.variants[0]
+    if not first.columns:
         return math.nan, ""
     family = _select_variants(
         candidate,
-        [
-            variant
-            for variant in candidate.variants
-            if variant.columns == candidate.variants[0].columns
-        ],
+        [variant for variant in candidate.variants if variant.columns == first.columns],
     )
-    rows = candidate.statistic.rows(candidate, state)
-    row_limits = [
-        _limit_row(Component(candidate, family[0], row, 0.0), family, state) for row in rows
-    ]
-    finite_limits = [bound for bound in row_limits if math.isfinite(bound)]
-    worst = max(finite_limits) if finite_limits else math.nan
-    return (math.sqrt(worst) if family[0].squared else worst), family[0].columns[0]
+    limits = (
+        _limit_row(Component(candidate, family[0], row, 0.0), family, state)
+        for row in candidate.statistic.rows(candidate, state)
+    )
+    worst = max(filter(math.isfinite, limits), default=math.nan)
+    return (math.sqrt(worst) if family[0].squared else worst), first.columns[0]
 
 
 def _select_variants(candidate: Candidate, family: Sequence[Variant]) -> Sequence[Variant]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from itertools import compress
 from typing import Any, NamedTuple
@@ -83,9 +83,7 @@ def finish_diagnosis(task: Task, comparison: Comparison, started: float) -> Diag
         "mismatches": mismatches,
         "effects": effects,
         "unexplained": unexplained,
-        "not_found": {
-            name: asdict(limit) for name, limit in find_upper_limits(fit.identifications).items()
-        },
+        "not_found": find_upper_limits(fit.identifications),
         "rejected": rejected_tables(fit.identifications),
         "unused_channels": unused_channels(blocks, used),
         "held_out": held,

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from gyrostab.diagnose.estimate.joint_fit import Estimate, Fitted
+from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.identify.components import axes_of, sum_evidence
 from gyrostab.diagnose.identify.identification import (
     Identifications,
@@ -15,11 +15,6 @@ from gyrostab.diagnose.identify.identification import (
     reduce_selection,
 )
 from gyrostab.physics.registry import effects
-
-
-def _has_zero(estimate: Estimate) -> bool:
-    """Return whether the 95 % interval of a parameter contains zero, or is unknown."""
-    return not (estimate.low > 0.0 or estimate.high < 0.0)
 
 
 def supported_axes(fitted: Fitted) -> tuple[str, ...]:
@@ -46,7 +41,8 @@ def supported_axes(fitted: Fitted) -> tuple[str, ...]:
         axis_sizes = [
             estimate for name, estimate in measured.items() if name.partition(".")[2] in ("", axis)
         ]
-        if not axis_sizes or not all(_has_zero(estimate) for estimate in axis_sizes):
+        # zero is not in a 95 % interval; an unknown one may contain it
+        if not axis_sizes or any(size.low > 0.0 or size.high < 0.0 for size in axis_sizes):
             axes.append(axis)
     return tuple(axes)
 

@@ -157,9 +157,9 @@ def test_limit_of_an_effect_slower_than_the_grid():
             mean=drawn["mean"].isel(record=number).transpose("axis", "block") + means
         )
         limits.append(
-            find_upper_limits(replace(frame, state=initial_state(changed, baseline)))[
-                "shupe"
-            ].upper_limit
+            find_upper_limits(replace(frame, state=initial_state(changed, baseline)))["shupe"][
+                "upper_limit"
+            ]
         )
     assert np.mean(np.array(limits) >= size) >= 0.9
     assert np.median(limits) < 4.0 * size

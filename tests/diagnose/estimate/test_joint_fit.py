@@ -247,12 +247,12 @@ def test_effects_not_found_have_a_limit_or_a_reason(shaken):
     identifications, _ = shaken
     limits = find_upper_limits(identifications)
     assert "vibration_rectification" not in limits
-    assert limits["shupe"].reason == "below limit"
-    assert 0.0 < limits["shupe"].upper_limit < 5.0
-    assert limits["shupe"].unit == "deg/h/(degC/min)"
-    assert 0.0 < limits["vibration_noise"].upper_limit < 1e-3
-    assert np.isnan(limits["feedback_reset"].upper_limit)
-    assert limits["feedback_reset"].reason.startswith("not identifiable")
+    assert limits["shupe"]["reason"] == "below limit"
+    assert 0.0 < limits["shupe"]["upper_limit"] < 5.0
+    assert limits["shupe"]["unit"] == "deg/h/(degC/min)"
+    assert 0.0 < limits["vibration_noise"]["upper_limit"] < 1e-3
+    assert np.isnan(limits["feedback_reset"]["upper_limit"])
+    assert limits["feedback_reset"]["reason"].startswith("not identifiable")
 
 
 def test_size_of_a_line():
